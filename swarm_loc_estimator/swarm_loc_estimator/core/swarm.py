@@ -1,0 +1,254 @@
+"""The description of a swarm: robots, what they carry, how their sensors err, and the landmarks.
+
+Everything here is immutable and in SI units and radians. Each number states its unit and allowed range beside its default, so that the
+reader of `swarm.yaml`, the documentation and the calibration share one table; a new parameter is one line in one of these classes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from typing import Any
+
+Pose2 = tuple[float, float, float]
+"""x [m], y [m], heading [rad]."""
+
+
+@dataclass(frozen=True)
+class NumberSpec:
+    """What one number may be.
+
+    Attributes:
+        unit: SI unit, "1" for none.
+        low: Smallest allowed value, itself allowed unless `above`.
+        high: Largest allowed value.
+        above: Whether `low` itself is refused.
+        doc: One line for people.
+    """
+
+    unit: str
+    low: float
+    high: float
+    above: bool
+    doc: str
+
+    def allows(self, value: float) -> bool:
+        """Whether the value is finite and in range."""
+        return math.isfinite(value) and (self.low < value if self.above else self.low <= value) and value <= self.high
+
+    @property
+    def range_text(self) -> str:
+        """The allowed range for an error message, such as "(0, 10] m"."""
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        return f"{'(' if self.above else '['}{self.low:g}, {self.high:g}]{unit}"
+
+
+def number(default: float, unit: str, low: float, high: float, doc: str, *, above: bool = False) -> Any:
+    """A dataclass field that carries its `NumberSpec`."""
+    return field(default=default, metadata={"spec": NumberSpec(unit, low, high, above, doc)})
+
+
+def number_specs(cls: type) -> dict[str, NumberSpec]:
+    """The numbers of a dataclass: field name -> what it may be, in the order of definition."""
+    return {f.name: f.metadata["spec"] for f in fields(cls) if "spec" in f.metadata}
+
+
+@dataclass(frozen=True)
+class OdometryModel:
+    """How a robot's odometry errs: noise of the wheels, and a calibration of the motion it reports.
+
+    Reported path length d [m] and turn w [rad] of a step become
+    d' = distance_scale * d - distance_per_turn * |w| and w' = turn_scale * w, `delay_s` after their stamp.
+    """
+
+    wheel_separation: float = number(0.053, "m", 0.001, 10.0, "distance between the two wheels")
+    wheel_noise: float = number(2e-4, "m", 0.0, 1.0, "variance of each wheel's path per metre it rolls [m^2/m]")
+    distance_noise: float = number(0.0, "m", 0.0, 1.0, "additional variance of the path per metre driven [m^2/m]")
+    turn_noise: float = number(0.0, "rad", 0.0, 10.0, "additional variance of the turn per radian turned [rad^2/rad]")
+    distance_drift: float = number(0.0, "m^2/s", 0.0, 1.0, "variance of the path per second while moving")
+    turn_drift: float = number(0.0, "rad^2/s", 0.0, 10.0, "variance of the turn per second while moving")
+    distance_scale: float = number(1.0, "1", 0.1, 10.0, "true path per reported path")
+    distance_per_turn: float = number(0.0, "m/rad", -1.0, 1.0, "path lost per radian turned")
+    turn_scale: float = number(1.0, "1", 0.1, 10.0, "true turn per reported turn")
+    delay_s: float = number(0.0, "s", -2.0, 2.0, "the motion happens this much after its stamp")
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """How a robot's sightings err: noise, calibration and gate.
+
+    A sighting's logged range r [m] and bearing b [rad] (positive to the left) become
+    distance = r * exp(range_log_scale + range_skew * b + range_curve * b^2) + range_offset and
+    bearing = bearing_scale * b + bearing_offset, taken `time_offset_s` after the stamp.
+    """
+
+    forward_sigma: float = number(0.02, "m", 0.0, 10.0, "noise along the optical axis, sightings with heading", above=True)
+    left_sigma: float = number(0.01, "m", 0.0, 10.0, "noise across the optical axis, sightings with heading", above=True)
+    heading_sigma: float = number(0.1, "rad", 0.0, 10.0, "noise of the marker's heading", above=True)
+    range_sigma: float = number(0.15, "m", 0.0, 10.0, "noise of the range, sightings without heading", above=True)
+    range_sigma_per_m: float = number(0.0, "1", 0.0, 10.0, "growth of the range noise with distance [m per m]")
+    bearing_sigma: float = number(0.05, "rad", 0.0, 10.0, "noise of the bearing, sightings without heading", above=True)
+    range_log_scale: float = number(0.0, "1", -2.0, 2.0, "a of the range curve")
+    range_skew: float = number(0.0, "1/rad", -10.0, 10.0, "c of the range curve")
+    range_curve: float = number(0.0, "1/rad^2", -10.0, 10.0, "q of the range curve; 0.5 when depth is logged as range")
+    range_offset: float = number(0.0, "m", -5.0, 5.0, "added to the scaled range")
+    bearing_offset: float = number(0.0, "rad", -math.pi, math.pi, "added to the scaled bearing")
+    bearing_scale: float = number(1.0, "1", 0.1, 10.0, "true bearing per logged bearing")
+    time_offset_s: float = number(0.0, "s", -2.0, 2.0, "the picture was taken this much after its stamp (negative: before)")
+    gate_probability: float = number(0.9999, "1", 0.5, 1.0, "share of good sightings that must pass the gate; 1 passes all")
+
+
+@dataclass(frozen=True)
+class CameraMount:
+    """Where the camera sits in base_link (x forward, y left, z up).
+
+    The camera looks along R = Rz(yaw) Ry(pitch) Rx(roll) times base_link's x axis; positive pitch looks down.
+    """
+
+    x: float = number(0.0, "m", -10.0, 10.0, "forward of base_link")
+    y: float = number(0.0, "m", -10.0, 10.0, "left of base_link")
+    z: float = number(0.0, "m", -10.0, 10.0, "above base_link")
+    yaw: float = number(0.0, "rad", -math.pi, math.pi, "turned to the left")
+    pitch: float = number(0.0, "rad", -math.pi, math.pi, "turned down")
+    roll: float = number(0.0, "rad", -math.pi, math.pi, "turned about the optical axis")
+
+
+@dataclass(frozen=True)
+class Face:
+    """A marker on a robot's body, in base_link.
+
+    Attributes:
+        name: What the robot's type calls this side.
+        id: Marker id, unique in the swarm.
+        x: [m], forward.
+        y: [m], left.
+        z: [m], up.
+        yaw: Direction out of the face [rad]; None when the marker shows no heading.
+    """
+
+    name: str
+    id: int
+    x: float = number(0.0, "m", -10.0, 10.0, "forward of base_link")
+    y: float = number(0.0, "m", -10.0, 10.0, "left of base_link")
+    z: float = number(0.0, "m", -10.0, 10.0, "above base_link")
+    yaw: float | None = number(0.0, "rad", -math.pi, math.pi, "direction out of the face; null: shows no heading")
+
+
+@dataclass(frozen=True)
+class Landmark:
+    """A marker that does not move, in map.
+
+    Attributes:
+        id: Marker id, unique in the swarm.
+        x: [m].
+        y: [m].
+        z: [m].
+        yaw: Direction out of the marker's face [rad]; None when it shows no heading.
+    """
+
+    id: int
+    x: float = number(0.0, "m", -1e6, 1e6, "in map")
+    y: float = number(0.0, "m", -1e6, 1e6, "in map")
+    z: float = number(0.0, "m", -1e4, 1e4, "in map")
+    yaw: float | None = number(0.0, "rad", -math.pi, math.pi, "direction out of its face; null: shows no heading")
+
+
+@dataclass(frozen=True)
+class StartSigma:
+    """How sure the start pose is, one standard deviation."""
+
+    x: float = number(0.01, "m", 0.0, 1e3, "along map x", above=True)
+    y: float = number(0.01, "m", 0.0, 1e3, "along map y", above=True)
+    theta: float = number(0.02, "rad", 0.0, 10.0, "heading", above=True)
+
+
+@dataclass(frozen=True)
+class Robot:
+    """One robot.
+
+    Attributes:
+        name: Its namespace and prefix of its frames.
+        type: The type its settings come from; "" when it has none.
+        odometry: Noise and calibration of its motion.
+        camera: Where its camera sits; None when it has none and only others see it.
+        sensor: Noise, calibration and gate of its sightings.
+        faces: Markers on its body.
+        start: Pose in map at the first datum; None: unknown, it waits for a fix.
+        start_sigma: How sure the start is.
+    """
+
+    name: str
+    type: str = ""
+    odometry: OdometryModel = OdometryModel()
+    camera: CameraMount | None = CameraMount()
+    sensor: SensorModel = SensorModel()
+    faces: tuple[Face, ...] = ()
+    start: Pose2 | None = None
+    start_sigma: StartSigma = StartSigma()
+
+
+@dataclass(frozen=True)
+class MarkerOwner:
+    """Whom a marker id belongs to.
+
+    Attributes:
+        robot_index: Index into `Swarm.robots`; -1 for a landmark.
+        landmark_index: Index into `Swarm.landmarks`; -1 for a robot's face.
+        marker: The face (in base_link) or the landmark (in map).
+    """
+
+    robot_index: int
+    landmark_index: int
+    marker: Face | Landmark
+
+
+class SwarmError(ValueError):
+    """A swarm that contradicts itself; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class Swarm:
+    """All robots and landmarks.
+
+    Raises:
+        SwarmError: A robot name or marker id appears twice.
+    """
+
+    robots: tuple[Robot, ...] = ()
+    landmarks: tuple[Landmark, ...] = ()
+
+    def __post_init__(self) -> None:
+        names: set[str] = set()
+        for robot in self.robots:
+            if robot.name in names:
+                raise SwarmError(f"robot name '{robot.name}' is given to two robots; names must be unique.")
+            names.add(robot.name)
+        owners: dict[int, str] = {}
+        for marker_id, owner in self._named_ids():
+            if marker_id in owners:
+                raise SwarmError(f"marker id {marker_id} belongs to both {owners[marker_id]} and {owner}; ids must be unique.")
+            owners[marker_id] = owner
+
+    def _named_ids(self) -> Iterator[tuple[int, str]]:
+        """Every marker id with its owner in words."""
+        for robot in self.robots:
+            for face in robot.faces:
+                yield face.id, f"face '{face.name}' of robot '{robot.name}'"
+        for landmark in self.landmarks:
+            yield landmark.id, f"landmark {landmark.id}"
+
+    @cached_property
+    def index_of(self) -> Mapping[str, int]:
+        """Robot name -> index."""
+        return {robot.name: index for index, robot in enumerate(self.robots)}
+
+    @cached_property
+    def owner_of(self) -> Mapping[int, MarkerOwner]:
+        """Marker id -> whom it belongs to."""
+        owners = {
+            face.id: MarkerOwner(index, -1, face) for index, robot in enumerate(self.robots) for face in robot.faces
+        }
+        owners.update({mark.id: MarkerOwner(-1, index, mark) for index, mark in enumerate(self.landmarks)})
+        return owners
