@@ -1,0 +1,1 @@
+"""Drivers and simulated hardware of the robots of a swarm."""

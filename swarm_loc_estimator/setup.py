@@ -1,0 +1,31 @@
+"""Installs swarm_loc_estimator: the modules, the launch files and configurations beside them, and the executables."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = "swarm_loc_estimator"
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    packages=find_packages(exclude=["test", "test.*", "bench", "bench.*"]),
+    package_data={NAME: ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/config", sorted(glob("config/*.yaml"))),
+        (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=False,
+    maintainer="Swarm localization maintainers",
+    maintainer_email="maintainers@users.noreply.h-seed-05ed3d07.example",
+    description="The central estimator of a robot swarm: one buffered EKF over all robots, its replay, its player and its reports.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "graph = swarm_loc_estimator.cli.graph:main",
+        ],
+    },
+)

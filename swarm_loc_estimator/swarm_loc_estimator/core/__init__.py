@@ -1,0 +1,1 @@
+"""The estimator itself: no ROS, no files, no clock."""

@@ -1,0 +1,1 @@
+"""The ROS nodes, one per file: convert, call the core, publish."""

@@ -1,0 +1,29 @@
+"""Installs swarm_loc_vision: the modules, the launch files and configurations beside them, and the executables."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = "swarm_loc_vision"
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    packages=find_packages(exclude=["test", "test.*", "bench", "bench.*"]),
+    package_data={NAME: ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/config", sorted(glob("config/*.yaml"))),
+        (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=False,
+    maintainer="Swarm localization maintainers",
+    maintainer_email="maintainers@users.noreply.h-seed-05ed3d07.example",
+    description="Detectors that turn the images of a robot swarm into marker detections.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [],
+    },
+)

@@ -1,0 +1,1 @@
+"""Detectors that turn the images of a robot swarm into marker detections."""
