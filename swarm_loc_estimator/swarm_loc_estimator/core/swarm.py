@@ -1,16 +1,19 @@
 """The description of a swarm: robots, what they carry, how their sensors err, and the landmarks.
 
-Everything here is immutable and in SI units and radians. Each number states its unit and allowed range beside its default, so that the
-reader of `swarm.yaml`, the documentation and the calibration share one table; a new parameter is one line in one of these classes.
+Everything here is immutable and in SI units and radians. Each number states its unit and allowed range
+beside its default, so that the reader of `swarm.yaml`, the documentation and the calibration share one
+table; a new parameter is one line in one of these classes.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
 
 Pose2 = tuple[float, float, float]
 """x [m], y [m], heading [rad]."""
@@ -36,7 +39,11 @@ class NumberSpec:
 
     def allows(self, value: float) -> bool:
         """Whether the value is finite and in range."""
-        return math.isfinite(value) and (self.low < value if self.above else self.low <= value) and value <= self.high
+        return (
+            math.isfinite(value)
+            and (self.low < value if self.above else self.low <= value)
+            and value <= self.high
+        )
 
     @property
     def range_text(self) -> str:
@@ -64,15 +71,23 @@ class OdometryModel:
     """
 
     wheel_separation: float = number(0.053, "m", 0.001, 10.0, "distance between the two wheels")
-    wheel_noise: float = number(2e-4, "m", 0.0, 1.0, "variance of each wheel's path per metre it rolls [m^2/m]")
-    distance_noise: float = number(0.0, "m", 0.0, 1.0, "additional variance of the path per metre driven [m^2/m]")
-    turn_noise: float = number(0.0, "rad", 0.0, 10.0, "additional variance of the turn per radian turned [rad^2/rad]")
+    wheel_noise: float = number(
+        2e-4, "m", 0.0, 1.0, "variance of each wheel's path per metre it rolls [m^2/m]"
+    )
+    distance_noise: float = number(
+        0.0, "m", 0.0, 1.0, "additional variance of the path per metre driven [m^2/m]"
+    )
+    turn_noise: float = number(
+        0.0, "rad", 0.0, 10.0, "additional variance of the turn per radian turned [rad^2/rad]"
+    )
     distance_drift: float = number(0.0, "m^2/s", 0.0, 1.0, "variance of the path per second while moving")
     turn_drift: float = number(0.0, "rad^2/s", 0.0, 10.0, "variance of the turn per second while moving")
     distance_scale: float = number(1.0, "1", 0.1, 10.0, "true path per reported path")
     distance_per_turn: float = number(0.0, "m/rad", -1.0, 1.0, "path lost per radian turned")
     turn_scale: float = number(1.0, "1", 0.1, 10.0, "true turn per reported turn")
     delay_s: float = number(0.0, "s", -2.0, 2.0, "the motion happens this much after its stamp")
+    timeout_s: float = number(1.0, "s", 0.01, 3600.0, "after this much silence the motion counts as unknown")
+    max_speed: float = number(1.0, "m/s", 0.001, 100.0, "no step is believed that would need more")
 
 
 @dataclass(frozen=True)
@@ -84,20 +99,36 @@ class SensorModel:
     bearing = bearing_scale * b + bearing_offset, taken `time_offset_s` after the stamp.
     """
 
-    forward_sigma: float = number(0.02, "m", 0.0, 10.0, "noise along the optical axis, sightings with heading", above=True)
-    left_sigma: float = number(0.01, "m", 0.0, 10.0, "noise across the optical axis, sightings with heading", above=True)
+    forward_sigma: float = number(
+        0.02, "m", 0.0, 10.0, "noise along the optical axis, sightings with heading", above=True
+    )
+    left_sigma: float = number(
+        0.01, "m", 0.0, 10.0, "noise across the optical axis, sightings with heading", above=True
+    )
     heading_sigma: float = number(0.1, "rad", 0.0, 10.0, "noise of the marker's heading", above=True)
-    range_sigma: float = number(0.15, "m", 0.0, 10.0, "noise of the range, sightings without heading", above=True)
-    range_sigma_per_m: float = number(0.0, "1", 0.0, 10.0, "growth of the range noise with distance [m per m]")
-    bearing_sigma: float = number(0.05, "rad", 0.0, 10.0, "noise of the bearing, sightings without heading", above=True)
+    range_sigma: float = number(
+        0.15, "m", 0.0, 10.0, "noise of the range, sightings without heading", above=True
+    )
+    range_sigma_per_m: float = number(
+        0.0, "1", 0.0, 10.0, "growth of the range noise with distance [m per m]"
+    )
+    bearing_sigma: float = number(
+        0.05, "rad", 0.0, 10.0, "noise of the bearing, sightings without heading", above=True
+    )
     range_log_scale: float = number(0.0, "1", -2.0, 2.0, "a of the range curve")
     range_skew: float = number(0.0, "1/rad", -10.0, 10.0, "c of the range curve")
-    range_curve: float = number(0.0, "1/rad^2", -10.0, 10.0, "q of the range curve; 0.5 when depth is logged as range")
+    range_curve: float = number(
+        0.0, "1/rad^2", -10.0, 10.0, "q of the range curve; 0.5 when depth is logged as range"
+    )
     range_offset: float = number(0.0, "m", -5.0, 5.0, "added to the scaled range")
     bearing_offset: float = number(0.0, "rad", -math.pi, math.pi, "added to the scaled bearing")
     bearing_scale: float = number(1.0, "1", 0.1, 10.0, "true bearing per logged bearing")
-    time_offset_s: float = number(0.0, "s", -2.0, 2.0, "the picture was taken this much after its stamp (negative: before)")
-    gate_probability: float = number(0.9999, "1", 0.5, 1.0, "share of good sightings that must pass the gate; 1 passes all")
+    time_offset_s: float = number(
+        0.0, "s", -2.0, 2.0, "the picture was taken this much after its stamp (negative: before)"
+    )
+    gate_probability: float = number(
+        0.9999, "1", 0.5, 1.0, "share of good sightings that must pass the gate; 1 passes all"
+    )
 
 
 @dataclass(frozen=True)
@@ -133,7 +164,9 @@ class Face:
     x: float = number(0.0, "m", -10.0, 10.0, "forward of base_link")
     y: float = number(0.0, "m", -10.0, 10.0, "left of base_link")
     z: float = number(0.0, "m", -10.0, 10.0, "above base_link")
-    yaw: float | None = number(0.0, "rad", -math.pi, math.pi, "direction out of the face; null: shows no heading")
+    yaw: float | None = number(
+        0.0, "rad", -math.pi, math.pi, "direction out of the face; null: shows no heading"
+    )
 
 
 @dataclass(frozen=True)
@@ -152,7 +185,9 @@ class Landmark:
     x: float = number(0.0, "m", -1e6, 1e6, "in map")
     y: float = number(0.0, "m", -1e6, 1e6, "in map")
     z: float = number(0.0, "m", -1e4, 1e4, "in map")
-    yaw: float | None = number(0.0, "rad", -math.pi, math.pi, "direction out of its face; null: shows no heading")
+    yaw: float | None = number(
+        0.0, "rad", -math.pi, math.pi, "direction out of its face; null: shows no heading"
+    )
 
 
 @dataclass(frozen=True)
@@ -228,7 +263,10 @@ class Swarm:
         owners: dict[int, str] = {}
         for marker_id, owner in self._named_ids():
             if marker_id in owners:
-                raise SwarmError(f"marker id {marker_id} belongs to both {owners[marker_id]} and {owner}; ids must be unique.")
+                raise SwarmError(
+                    f"marker id {marker_id} belongs to both {owners[marker_id]} and {owner};"
+                    " ids must be unique."
+                )
             owners[marker_id] = owner
 
     def _named_ids(self) -> Iterator[tuple[int, str]]:
@@ -248,7 +286,9 @@ class Swarm:
     def owner_of(self) -> Mapping[int, MarkerOwner]:
         """Marker id -> whom it belongs to."""
         owners = {
-            face.id: MarkerOwner(index, -1, face) for index, robot in enumerate(self.robots) for face in robot.faces
+            face.id: MarkerOwner(index, -1, face)
+            for index, robot in enumerate(self.robots)
+            for face in robot.faces
         }
         owners.update({mark.id: MarkerOwner(-1, index, mark) for index, mark in enumerate(self.landmarks)})
         return owners

@@ -1,0 +1,358 @@
+"""Raw CDR bytes to numbers, for the messages that come by the thousand.
+
+A subscription with `raw=True` and a bag both deliver the serialized message. Reading the few numbers that
+matter straight from it costs a few microseconds, a tenth of building the message object. Bytes that are not
+a whole message of the type raise `CdrError`.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+Array = npt.NDArray[np.float64]
+
+ENCAPSULATION = 4
+"""Bytes before the payload; alignment counts from behind them."""
+
+_MAX_PADDING = 7
+_NANOSECONDS = 1_000_000_000
+_COVARIANCE_XYYAW = np.array([[0, 1, 5], [6, 7, 11], [30, 31, 35]])
+
+
+class CdrError(ValueError):
+    """Bytes that are not a whole message of the expected type; the message is one sentence."""
+
+
+class OdometryMessage(NamedTuple):
+    """What the estimator reads of nav_msgs/Odometry.
+
+    Attributes:
+        stamp_ns: Acquisition time.
+        frame_id: Frame of the pose.
+        child_frame_id: Frame of the twist.
+        pose: (x [m], y [m], yaw [rad]); yaw is NaN when the quaternion is zero.
+        twist: (vx [m/s], vy [m/s], yaw rate [rad/s]).
+        covariance: 3x3, of x, y, yaw, as published.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    child_frame_id: str
+    pose: tuple[float, float, float]
+    twist: tuple[float, float, float]
+    covariance: Array
+
+
+class PoseMessage(NamedTuple):
+    """What evaluation reads of geometry_msgs/PoseStamped: pose is (x [m], y [m], yaw [rad])."""
+
+    stamp_ns: int
+    frame_id: str
+    pose: tuple[float, float, float]
+
+
+class DetectionArrayMessage(NamedTuple):
+    """swarm_loc_msgs/MarkerDetectionArray: `detections` has dtype `DETECTION_DTYPE`."""
+
+    stamp_ns: int
+    frame_id: str
+    detections: npt.NDArray[np.void]
+
+
+@dataclass(frozen=True)
+class OdometryBatch:
+    """Many odometry messages of one robot as columns.
+
+    Attributes:
+        stamp_ns: (N,) int64.
+        pose: (N, 3) x [m], y [m], yaw [rad].
+        twist: (N, 3) vx [m/s], vy [m/s], yaw rate [rad/s].
+        valid: (N,) bool; False where the bytes were no odometry message (its row is NaN, its stamp 0).
+    """
+
+    stamp_ns: npt.NDArray[np.int64]
+    pose: Array
+    twist: Array
+    valid: npt.NDArray[np.bool_]
+
+
+_DETECTION_FIELDS: tuple[tuple[str, str, tuple[int, ...]], ...] = (
+    ("id", "u4", ()),
+    ("family", "u1", ()),
+    ("content", "u1", ()),
+    ("id_margin", "f4", ()),
+    ("corners_px", "f8", (4, 2)),
+    ("position", "f8", (3,)),
+    ("orientation", "f8", (4,)),
+    ("covariance", "f8", (6, 6)),
+    ("alternative_position", "f8", (3,)),
+    ("alternative_orientation", "f8", (4,)),
+    ("alternative_ratio", "f4", ()),
+)
+
+
+def _detection_dtype(order: str) -> np.dtype[np.void]:
+    """One detection's bytes when it starts 4 bytes behind a multiple of 8.
+
+    All but the first of an array do, since each ends there.
+    """
+    offset = 4
+    offsets = []
+    for _, kind, shape in _DETECTION_FIELDS:
+        size = int(kind[1])
+        offset += -offset % size
+        offsets.append(offset - 4)
+        offset += size * math.prod(shape)
+    names = [name for name, _, _ in _DETECTION_FIELDS]
+    formats = [(order + kind, shape) for _, kind, shape in _DETECTION_FIELDS]
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": offset - 4})
+
+
+DETECTION_DTYPE = _detection_dtype("<")
+"""One detection as it lies in little-endian CDR; quaternions are x, y, z, w."""
+
+DETECTION_PADDING = slice(6, 8)
+"""Bytes of `DETECTION_DTYPE` that mean nothing."""
+
+DETECTION_GAP = 12
+"""A detection that starts at a multiple of 8 has 4 bytes of padding here, before its first double."""
+
+
+class _Layout:
+    """Everything that depends on the byte order."""
+
+    def __init__(self, order: str) -> None:
+        self.header = struct.Struct(order + "iII")
+        self.count = struct.Struct(order + "I")
+        self.pose = struct.Struct(order + "7d")
+        self.twist = struct.Struct(order + "6d")
+        self.double = np.dtype(order + "f8")
+        self.detection = _detection_dtype(order)
+        self.stamp = np.dtype([("sec", order + "i4"), ("nanosec", order + "u4")])
+        # pose, its covariance, twist; the covariance of the twist follows
+        self.odometry = np.dtype(
+            [("pose", order + "f8", 7), ("covariance", order + "f8", 36), ("twist", order + "f8", 6)]
+        )
+
+
+_LAYOUTS = {b"\x00\x00": _Layout(">"), b"\x00\x01": _Layout("<")}
+_ODOMETRY_DOUBLES = 7 + 36 + 6 + 36
+
+
+@lru_cache(maxsize=4096)
+def _text(raw: bytes) -> str:
+    """The characters of a string field, its terminating zero included in `raw`."""
+    if raw and raw[-1] != 0:
+        raise CdrError("a string is not terminated.")
+    try:
+        return raw[:-1].decode()
+    except UnicodeDecodeError:
+        raise CdrError("a string is not UTF-8.") from None
+
+
+def _layout(data: bytes) -> _Layout:
+    """The byte order's layout, from the encapsulation header."""
+    layout = _LAYOUTS.get(bytes(data[:2]))
+    if layout is None or len(data) < ENCAPSULATION:
+        raise CdrError(f"encapsulation {bytes(data[:ENCAPSULATION]).hex() or 'missing'} is not plain CDR.")
+    return layout
+
+
+def _string(data: bytes, layout: _Layout, offset: int) -> tuple[str, int]:
+    """A string field at or after `offset`, and the offset behind it."""
+    offset += -offset % 4
+    begin = offset + 4
+    if begin > len(data):
+        raise CdrError(f"cut off after {len(data)} bytes.")
+    end = begin + int(layout.count.unpack_from(data, offset)[0])
+    if end > len(data):
+        raise CdrError(f"cut off after {len(data)} bytes.")
+    return _text(bytes(data[begin:end])), end
+
+
+def _header(data: bytes, layout: _Layout) -> tuple[int, str, int]:
+    """Stamp [ns], frame and the offset behind a std_msgs/Header."""
+    if len(data) < ENCAPSULATION + 12:
+        raise CdrError(f"cut off after {len(data)} bytes.")
+    sec, nanosec, length = layout.header.unpack_from(data, ENCAPSULATION)
+    if nanosec >= _NANOSECONDS:
+        raise CdrError(f"stamp has {nanosec} nanoseconds, more than a second.")
+    end = ENCAPSULATION + 12 + length
+    if end > len(data):
+        raise CdrError(f"cut off after {len(data)} bytes.")
+    return sec * _NANOSECONDS + nanosec, _text(bytes(data[ENCAPSULATION + 12 : end])), end
+
+
+def _check_end(data: bytes, end: int) -> None:
+    """Refuse a message that is too short for its type, or too long to be of it."""
+    if len(data) < end:
+        raise CdrError(f"cut off after {len(data)} of {end} bytes.")
+    if len(data) > end + _MAX_PADDING:
+        raise CdrError(f"{len(data) - end} bytes more than the message has.")
+
+
+def _pose2(x: float, y: float, qx: float, qy: float, qz: float, qw: float) -> tuple[float, float, float]:
+    """Planar pose; the quaternion need not be normalised."""
+    sine, cosine = 2.0 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz
+    return x, y, math.atan2(sine, cosine) if sine or cosine else math.nan
+
+
+def decode_odometry(data: bytes) -> OdometryMessage:
+    """Read a nav_msgs/Odometry.
+
+    Args:
+        data: The serialized message with its encapsulation header.
+
+    Raises:
+        CdrError: The bytes are not one whole message.
+    """
+    layout = _layout(data)
+    stamp_ns, frame_id, offset = _header(data, layout)
+    child_frame_id, offset = _string(data, layout, offset)
+    offset += -(offset - ENCAPSULATION) % 8
+    _check_end(data, offset + 8 * _ODOMETRY_DOUBLES)
+    x, y, _, qx, qy, qz, qw = layout.pose.unpack_from(data, offset)
+    vx, vy, _, _, _, rate = layout.twist.unpack_from(data, offset + 8 * 43)
+    covariance = (
+        np.frombuffer(data, layout.double, 36, offset + 56)
+        .take(_COVARIANCE_XYYAW)
+        .astype(np.float64, copy=False)
+    )
+    return OdometryMessage(
+        stamp_ns, frame_id, child_frame_id, _pose2(x, y, qx, qy, qz, qw), (vx, vy, rate), covariance
+    )
+
+
+def decode_pose_stamped(data: bytes) -> PoseMessage:
+    """Read a geometry_msgs/PoseStamped.
+
+    Raises:
+        CdrError: The bytes are not one whole message.
+    """
+    layout = _layout(data)
+    stamp_ns, frame_id, offset = _header(data, layout)
+    offset += -(offset - ENCAPSULATION) % 8
+    _check_end(data, offset + 56)
+    x, y, _, qx, qy, qz, qw = layout.pose.unpack_from(data, offset)
+    return PoseMessage(stamp_ns, frame_id, _pose2(x, y, qx, qy, qz, qw))
+
+
+def decode_detections(data: bytes) -> DetectionArrayMessage:
+    """Read a swarm_loc_msgs/MarkerDetectionArray.
+
+    Returns:
+        Stamp, frame and a new array of `DETECTION_DTYPE`.
+
+    Raises:
+        CdrError: The bytes are not one whole message.
+    """
+    layout = _layout(data)
+    stamp_ns, frame_id, offset = _header(data, layout)
+    offset += -offset % 4
+    if offset + 4 > len(data):
+        raise CdrError(f"cut off after {len(data)} bytes.")
+    (count,) = layout.count.unpack_from(data, offset)
+    return DetectionArrayMessage(stamp_ns, frame_id, _detections(data, layout, offset + 4, count))
+
+
+def _detections(data: bytes, layout: _Layout, offset: int, count: int) -> npt.NDArray[np.void]:
+    """The sequence's elements, without the padding that the first one may have."""
+    if count == 0:
+        _check_end(data, offset)
+        return np.empty(0, DETECTION_DTYPE)
+    end = offset + count * layout.detection.itemsize
+    if (offset - ENCAPSULATION) % 8 == 0:
+        _check_end(data, end + 4)
+        packed = bytearray(data[offset : offset + DETECTION_GAP]) + data[offset + DETECTION_GAP + 4 : end + 4]
+    else:
+        _check_end(data, end)
+        packed = bytearray(data[offset:end])
+    detections = np.frombuffer(packed, layout.detection)
+    if layout.detection == DETECTION_DTYPE:
+        return detections
+    native = np.zeros(count, DETECTION_DTYPE)
+    native[:] = detections
+    return native
+
+
+def decode_odometry_batch(messages: Sequence[bytes]) -> OdometryBatch:
+    """Read many nav_msgs/Odometry at once, about ten times faster than one by one.
+
+    Args:
+        messages: Serialized messages, best of one robot: those with the same frame names are read at once.
+
+    Returns:
+        Columns in the order of `messages`; malformed ones are marked, never raised.
+    """
+    count = len(messages)
+    batch = OdometryBatch(
+        np.zeros(count, np.int64),
+        np.full((count, 3), np.nan),
+        np.full((count, 3), np.nan),
+        np.zeros(count, np.bool_),
+    )
+    by_length: dict[int, list[int]] = {}
+    for index, length in enumerate(map(len, messages)):
+        by_length.setdefault(length, []).append(index)
+    for length, indices in by_length.items():
+        joined = b"".join([messages[index] for index in indices])
+        todo, rows = np.array(indices), np.frombuffer(joined, np.uint8).reshape(len(indices), length)
+        while todo.size:
+            alike = _decode_alike(todo, rows, batch)
+            todo, rows = todo[~alike], rows[~alike]
+    return batch
+
+
+def _decode_alike(
+    todo: npt.NDArray[np.intp], rows: npt.NDArray[np.uint8], batch: OdometryBatch
+) -> npt.NDArray[np.bool_]:
+    """Read the messages that differ from the first one in numbers only; says which those are."""
+    model = rows[0].tobytes()
+    try:
+        decode_odometry(model)
+    except CdrError:
+        first: npt.NDArray[np.bool_] = todo == todo[0]
+        return first
+    layout = _layout(model)
+    names_end = _string(model, layout, _string(model, layout, ENCAPSULATION + 8)[1])[1]
+    same_names = (rows[:, ENCAPSULATION + 8 : names_end] == rows[0, ENCAPSULATION + 8 : names_end]).all(
+        axis=1
+    )
+    same_order = (rows[:, :2] == rows[0, :2]).all(axis=1)
+    alike: npt.NDArray[np.bool_] = np.logical_and(same_names, same_order)
+    everything = bool(alike.all())
+    start = names_end + -(names_end - ENCAPSULATION) % 8
+    _fill(batch, todo if everything else todo[alike], rows if everything else rows[alike], layout, start)
+    return alike
+
+
+def _fill(
+    batch: OdometryBatch,
+    chosen: npt.NDArray[np.intp],
+    rows: npt.NDArray[np.uint8],
+    layout: _Layout,
+    start: int,
+) -> None:
+    """Write the numbers of like rows into the batch."""
+    stamp = np.ascontiguousarray(rows[:, ENCAPSULATION : ENCAPSULATION + 8]).view(layout.stamp)[:, 0]
+    body = np.ascontiguousarray(rows[:, start : start + layout.odometry.itemsize]).view(layout.odometry)[:, 0]
+    valid = stamp["nanosec"] < _NANOSECONDS
+    batch.valid[chosen] = valid
+    batch.stamp_ns[chosen] = np.where(
+        valid, stamp["sec"].astype(np.int64) * _NANOSECONDS + stamp["nanosec"], 0
+    )
+    qx, qy, qz, qw = body["pose"][:, 3:].T
+    sine, cosine = 2.0 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz
+    yaw = np.where((sine != 0.0) | (cosine != 0.0), np.arctan2(sine, cosine), np.nan)
+    batch.pose[chosen] = np.where(valid[:, None], np.column_stack([body["pose"][:, :2], yaw]), np.nan)
+    batch.twist[chosen] = np.where(valid[:, None], body["twist"][:, [0, 1, 5]], np.nan)
