@@ -19,6 +19,10 @@ Pose2 = tuple[float, float, float]
 """x [m], y [m], heading [rad]."""
 
 
+TURN = 6.2832
+"""Angles may be written up to a whole turn either way [rad]."""
+
+
 @dataclass(frozen=True)
 class NumberSpec:
     """What one number may be.
@@ -29,6 +33,7 @@ class NumberSpec:
         high: Largest allowed value.
         above: Whether `low` itself is refused.
         doc: One line for people.
+        optional: Whether None is allowed and means unknown.
     """
 
     unit: str
@@ -36,6 +41,7 @@ class NumberSpec:
     high: float
     above: bool
     doc: str
+    optional: bool = False
 
     def allows(self, value: float) -> bool:
         """Whether the value is finite and in range."""
@@ -52,9 +58,11 @@ class NumberSpec:
         return f"{'(' if self.above else '['}{self.low:g}, {self.high:g}]{unit}"
 
 
-def number(default: float, unit: str, low: float, high: float, doc: str, *, above: bool = False) -> Any:
-    """A dataclass field that carries its `NumberSpec`."""
-    return field(default=default, metadata={"spec": NumberSpec(unit, low, high, above, doc)})
+def number(
+    default: float | None, unit: str, low: float, high: float, doc: str, *, above: bool = False
+) -> Any:
+    """A dataclass field that carries its `NumberSpec`; a default of None says that None is allowed."""
+    return field(default=default, metadata={"spec": NumberSpec(unit, low, high, above, doc, default is None)})
 
 
 def number_specs(cls: type) -> dict[str, NumberSpec]:
@@ -88,6 +96,7 @@ class OdometryModel:
     delay_s: float = number(0.0, "s", -2.0, 2.0, "the motion happens this much after its stamp")
     timeout_s: float = number(1.0, "s", 0.01, 3600.0, "after this much silence the motion counts as unknown")
     max_speed: float = number(1.0, "m/s", 0.001, 100.0, "no step is believed that would need more")
+    max_turn_rate: float = number(10.0, "rad/s", 0.01, 1000.0, "bounds the turn while the motion is unknown")
 
 
 @dataclass(frozen=True)
@@ -121,7 +130,7 @@ class SensorModel:
         0.0, "1/rad^2", -10.0, 10.0, "q of the range curve; 0.5 when depth is logged as range"
     )
     range_offset: float = number(0.0, "m", -5.0, 5.0, "added to the scaled range")
-    bearing_offset: float = number(0.0, "rad", -math.pi, math.pi, "added to the scaled bearing")
+    bearing_offset: float = number(0.0, "rad", -TURN, TURN, "added to the scaled bearing")
     bearing_scale: float = number(1.0, "1", 0.1, 10.0, "true bearing per logged bearing")
     time_offset_s: float = number(
         0.0, "s", -2.0, 2.0, "the picture was taken this much after its stamp (negative: before)"
@@ -141,9 +150,9 @@ class CameraMount:
     x: float = number(0.0, "m", -10.0, 10.0, "forward of base_link")
     y: float = number(0.0, "m", -10.0, 10.0, "left of base_link")
     z: float = number(0.0, "m", -10.0, 10.0, "above base_link")
-    yaw: float = number(0.0, "rad", -math.pi, math.pi, "turned to the left")
-    pitch: float = number(0.0, "rad", -math.pi, math.pi, "turned down")
-    roll: float = number(0.0, "rad", -math.pi, math.pi, "turned about the optical axis")
+    yaw: float = number(0.0, "rad", -TURN, TURN, "turned to the left")
+    pitch: float = number(0.0, "rad", -TURN, TURN, "turned down")
+    roll: float = number(0.0, "rad", -TURN, TURN, "turned about the optical axis")
 
 
 @dataclass(frozen=True)
@@ -164,9 +173,7 @@ class Face:
     x: float = number(0.0, "m", -10.0, 10.0, "forward of base_link")
     y: float = number(0.0, "m", -10.0, 10.0, "left of base_link")
     z: float = number(0.0, "m", -10.0, 10.0, "above base_link")
-    yaw: float | None = number(
-        0.0, "rad", -math.pi, math.pi, "direction out of the face; null: shows no heading"
-    )
+    yaw: float | None = number(None, "rad", -TURN, TURN, "direction out of the face; null: shows no heading")
 
 
 @dataclass(frozen=True)
@@ -185,9 +192,7 @@ class Landmark:
     x: float = number(0.0, "m", -1e6, 1e6, "in map")
     y: float = number(0.0, "m", -1e6, 1e6, "in map")
     z: float = number(0.0, "m", -1e4, 1e4, "in map")
-    yaw: float | None = number(
-        0.0, "rad", -math.pi, math.pi, "direction out of its face; null: shows no heading"
-    )
+    yaw: float | None = number(None, "rad", -TURN, TURN, "direction out of its face; null: shows no heading")
 
 
 @dataclass(frozen=True)

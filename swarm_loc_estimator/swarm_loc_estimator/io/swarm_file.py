@@ -1,0 +1,288 @@
+"""The swarm description: `swarm.yaml` to `Swarm`.
+
+```yaml
+fileversion: 1
+defaults:                 # any of odometry, camera, sensor, faces, start_sigma
+  sensor: {range_sigma: 0.1}
+types:
+  epuck:                  # the same keys; what is not said comes from defaults
+    odometry: {wheel_separation: 0.053}
+    camera: {x: 0.035, z: 0.028}            # null: it has none
+    faces: {front: {x: 0.035, yaw: 0.0}}    # markers on the body; null takes one away
+robots:
+  epuck1:                 # the same keys; what is not said comes from its type
+    type: epuck
+    ids: {front: 12}      # which marker is on which face
+    start: {x: 0.0, y: 0.0, theta: 0.0}     # null or left out: unknown
+landmarks:
+  100: {x: 1.2, y: -0.4, yaw: 3.14159}      # yaw null or left out: shows no heading
+```
+Numbers, units, ranges and defaults are those of the classes in `core.swarm`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from swarm_loc_estimator.core.swarm import (
+    CameraMount,
+    Face,
+    Landmark,
+    NumberSpec,
+    OdometryModel,
+    Pose2,
+    Robot,
+    SensorModel,
+    StartSigma,
+    Swarm,
+    SwarmError,
+    number_specs,
+)
+from swarm_loc_estimator.io.yaml_tree import Tree, YamlTreeError, read_tree, shown
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+
+FILE_VERSION = 1
+
+_SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks")
+_LAYER = ("odometry", "camera", "sensor", "faces", "start_sigma")
+_ROBOT = ("type", *_LAYER, "ids", "start")
+_MODELS: dict[str, type] = {"odometry": OdometryModel, "sensor": SensorModel, "start_sigma": StartSigma}
+_START = {
+    "x": number_specs(Landmark)["x"],
+    "y": number_specs(Landmark)["y"],
+    "theta": number_specs(CameraMount)["yaw"],
+}
+_MAX_ID = 2**32 - 1
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+
+Numbers = dict[str, "float | None"]
+
+
+class SwarmFileError(ValueError):
+    """A swarm description that cannot be used; the message is one sentence with file, key and value."""
+
+
+def load_swarm(path: Path) -> Swarm:
+    """Read and check a swarm description.
+
+    Args:
+        path: The file.
+
+    Raises:
+        SwarmFileError: One sentence with file, dotted key, value and what is allowed.
+    """
+    try:
+        tree = read_tree(path)
+    except YamlTreeError as error:
+        raise SwarmFileError(str(error)) from error
+    return _Loader(path).swarm(tree)
+
+
+@dataclass
+class _Layer:
+    """What one of defaults, type and robot says; what it leaves out is missing here."""
+
+    models: dict[str, Numbers]
+    camera: Numbers | None
+    says_camera: bool
+    faces: dict[str, Numbers | None]
+
+
+class _Loader:
+    """Checks the tree of one file on the way to the dataclasses."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def swarm(self, tree: Tree) -> Swarm:
+        """The whole file."""
+        sections = self._mapping(tree, "the file", _SECTIONS)
+        version = sections.get("fileversion")
+        if version != FILE_VERSION or isinstance(version, bool):
+            raise self._error("fileversion", version, f"must be {FILE_VERSION}")
+        defaults = self._layer(sections.get("defaults", {}), "defaults", _LAYER)
+        types = {
+            name: self._layer(tree, f"types.{name}", _LAYER)
+            for name, tree in self._named(sections.get("types", {}), "types")
+        }
+        robots = tuple(
+            self._robot(name, tree, defaults, types)
+            for name, tree in self._named(sections.get("robots", {}), "robots")
+        )
+        if not robots:
+            raise SwarmFileError(f"{self._path}: robots is empty but must name at least one robot.")
+        landmarks = self._landmarks(sections.get("landmarks", {}))
+        try:
+            return Swarm(robots, landmarks)
+        except SwarmError as error:
+            raise SwarmFileError(f"{self._path}: {error}") from error
+
+    def _robot(self, name: str, tree: Tree, defaults: _Layer, types: Mapping[str, _Layer]) -> Robot:
+        """One robot from its three layers."""
+        key = f"robots.{name}"
+        mapping = self._mapping(tree, key, _ROBOT)
+        type_name = mapping.get("type", "")
+        if type_name and (not isinstance(type_name, str) or type_name not in types):
+            raise self._error(
+                f"{key}.type", type_name, f"must be one of the types{_nearest(type_name, types)}"
+            )
+        own = self._layer(mapping, key, _ROBOT)
+        layers = [defaults, *([types[type_name]] if type_name else []), own]
+        models = {
+            section: cls(**{k: v for layer in layers for k, v in layer.models.get(section, {}).items()})
+            for section, cls in _MODELS.items()
+        }
+        return Robot(
+            name=name,
+            type=type_name or "",
+            camera=_camera(layers),
+            faces=self._faces(key, layers, mapping.get("ids", {})),
+            start=self._start(mapping.get("start"), f"{key}.start"),
+            **models,
+        )
+
+    def _layer(self, tree: Tree, key: str, known: Iterable[str]) -> _Layer:
+        """The settings that one layer says."""
+        mapping = self._mapping(tree, key, known)
+        models = {
+            section: self._numbers(mapping[section], f"{key}.{section}", number_specs(cls))
+            for section, cls in _MODELS.items()
+            if section in mapping
+        }
+        camera = mapping.get("camera")
+        faces = self._named(mapping.get("faces", {}), f"{key}.faces")
+        specs = number_specs(Face)
+        return _Layer(
+            models,
+            None if camera is None else self._numbers(camera, f"{key}.camera", number_specs(CameraMount)),
+            "camera" in mapping,
+            {
+                name: None if face is None else self._numbers(face, f"{key}.faces.{name}", specs)
+                for name, face in faces
+            },
+        )
+
+    def _faces(self, key: str, layers: Iterable[_Layer], ids_tree: Tree) -> tuple[Face, ...]:
+        """The robot's markers: where they sit from the layers, which they are from its ids."""
+        places: dict[str, Numbers] = {}
+        for layer in layers:
+            for name, numbers in layer.faces.items():
+                if numbers is None:
+                    places.pop(name, None)
+                else:
+                    places[name] = {**places.get(name, {}), **numbers}
+        ids = self._mapping(ids_tree, f"{key}.ids", places)
+        missing = [name for name in places if name not in ids]
+        if missing:
+            raise SwarmFileError(
+                f"{self._path}: {key}.ids has no id for face '{missing[0]}';"
+                f" give one or set faces.{missing[0]} to null."
+            )
+        return tuple(
+            Face(name, self._marker_id(ids[name], f"{key}.ids.{name}"), **numbers)  # type: ignore[arg-type]
+            for name, numbers in places.items()
+        )
+
+    def _landmarks(self, tree: Tree) -> tuple[Landmark, ...]:
+        """All landmarks, in the order of the file."""
+        result = []
+        for number, place in self._mapping(tree, "landmarks").items():
+            key = f"landmarks.{number}"
+            numbers = self._numbers(place, key, number_specs(Landmark), required=("x", "y"))
+            result.append(Landmark(self._marker_id(number, key), **numbers))  # type: ignore[arg-type]
+        return tuple(result)
+
+    def _start(self, tree: Tree, key: str) -> Pose2 | None:
+        """A start pose, or that there is none."""
+        if tree is None:
+            return None
+        numbers = self._numbers(tree, key, _START, required=tuple(_START))
+        return (float(numbers["x"] or 0.0), float(numbers["y"] or 0.0), float(numbers["theta"] or 0.0))
+
+    def _numbers(
+        self, tree: Tree, key: str, specs: Mapping[str, NumberSpec], required: tuple[str, ...] = ()
+    ) -> Numbers:
+        """A mapping of numbers, each in its range."""
+        mapping = self._mapping(tree, key, specs)
+        for name in required:
+            if name not in mapping:
+                raise SwarmFileError(
+                    f"{self._path}: {key} lacks {name}, a number in {specs[name].range_text}."
+                )
+        return {name: self._number(value, f"{key}.{name}", specs[name]) for name, value in mapping.items()}
+
+    def _number(self, value: Tree, key: str, spec: NumberSpec) -> float | None:
+        """One number in its range."""
+        if value is None and spec.optional:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self._error(key, value, f"must be a number in {spec.range_text}")
+        try:
+            number = float(value)
+        except OverflowError:  # a whole number of hundreds of digits
+            number = math.inf
+        if not spec.allows(number):
+            raise self._error(key, value, f"must lie in {spec.range_text}")
+        return number
+
+    def _marker_id(self, value: Tree, key: str) -> int:
+        """A marker id."""
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= _MAX_ID:
+            raise self._error(key, value, f"must be a marker id, a whole number in [0, {_MAX_ID}]")
+        return value
+
+    def _named(self, tree: Tree, key: str) -> list[tuple[str, Tree]]:
+        """A mapping from names that can stand in topics and frames."""
+        mapping = self._mapping(tree, key)
+        for name in mapping:
+            if not isinstance(name, str) or not _NAME.fullmatch(name):
+                raise self._error(
+                    f"a name in {key}",
+                    name,
+                    "must be letters, digits and underscores and start with a letter",
+                )
+        return list(mapping.items())
+
+    def _mapping(self, tree: Tree, key: str, known: Iterable[str] | None = None) -> dict[Any, Tree]:
+        """A mapping; with `known`, only of these keys."""
+        if tree is None:
+            return {}
+        if not isinstance(tree, dict):
+            raise self._error(key, tree, "must be a mapping of keys to values")
+        if known is not None:
+            allowed = tuple(known)
+            for name in tree:
+                if name not in allowed:
+                    where = shown(name) if key == "the file" else shown(f"{key}.{name}")
+                    raise SwarmFileError(
+                        f"{self._path}: {where} is not a known key{_nearest(name, allowed)}."
+                    )
+        return tree
+
+    def _error(self, key: str, value: object, rule: str) -> SwarmFileError:
+        """The one sentence."""
+        return SwarmFileError(f"{self._path}: {key} is {shown(value)} but {rule}.")
+
+
+def _camera(layers: Iterable[_Layer]) -> CameraMount | None:
+    """The camera's mount; the last layer that says null takes it away, numbers behind that bring it back."""
+    numbers: Numbers | None = {}
+    for layer in layers:
+        if layer.says_camera:
+            numbers = None if layer.camera is None else {**(numbers or {}), **layer.camera}
+    return None if numbers is None else CameraMount(**numbers)  # type: ignore[arg-type]
+
+
+def _nearest(name: object, known: Iterable[str]) -> str:
+    """The known word most like it, for the end of a sentence."""
+    words = list(known)
+    if not words:
+        return "; none is known here"
+    return f"; the nearest one is '{difflib.get_close_matches(str(name), words, 1, 0.0)[0]}'"

@@ -1,0 +1,122 @@
+"""`Swarm` to `swarm.yaml`: what robots of a type share stands with the type, the rest with the robot."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from swarm_loc_estimator.core.swarm import (
+    CameraMount,
+    Face,
+    Landmark,
+    OdometryModel,
+    Robot,
+    SensorModel,
+    StartSigma,
+    Swarm,
+    number_specs,
+)
+from swarm_loc_estimator.io.swarm_file import FILE_VERSION
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_MODELS: dict[str, type] = {
+    "odometry": OdometryModel,
+    "camera": CameraMount,
+    "sensor": SensorModel,
+    "start_sigma": StartSigma,
+}
+Mapping = dict[Any, Any]
+
+
+def save_swarm(swarm: Swarm, path: Path, comment: str = "") -> None:
+    """Write a swarm description that `load_swarm` reads back equal.
+
+    Args:
+        swarm: What to write.
+        path: The file; replaced when it exists.
+        comment: Lines that say where the numbers come from.
+    """
+    text = "".join(f"# {line}\n" for line in [*comment.splitlines(), *_units()])
+    text += yaml.safe_dump(_tree(swarm), sort_keys=False, default_flow_style=None, width=100)
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)
+
+
+def _units() -> list[str]:
+    """One comment per group of numbers, with the unit of each."""
+    groups = {**_MODELS, "faces": Face, "landmarks": Landmark}
+    lines = ["Units:"]
+    for name, cls in groups.items():
+        lines.append(
+            f"  {name}: " + ", ".join(f"{key} [{spec.unit}]" for key, spec in number_specs(cls).items())
+        )
+    return lines
+
+
+def _tree(swarm: Swarm) -> Mapping:
+    """The file's content."""
+    types: Mapping = {}
+    for robot in swarm.robots:
+        if robot.type and robot.type not in types:
+            types[robot.type] = _shared([other for other in swarm.robots if other.type == robot.type])
+    robots = {robot.name: _robot(robot, types.get(robot.type, {})) for robot in swarm.robots}
+    landmarks = {mark.id: _numbers(mark, keep=("x", "y")) for mark in swarm.landmarks}
+    tree = {"fileversion": FILE_VERSION, "types": types, "robots": robots, "landmarks": landmarks}
+    return {key: value for key, value in tree.items() if value}
+
+
+def _numbers(model: Any, keep: tuple[str, ...] = ()) -> Mapping:
+    """The numbers of a dataclass that differ from its defaults."""
+    values = asdict(model)
+    defaults = {name: type(model).__dataclass_fields__[name].default for name in number_specs(type(model))}
+    return {name: values[name] for name in defaults if values[name] != defaults[name] or name in keep}
+
+
+def _layer(robot: Robot) -> Mapping:
+    """Everything about a robot that a type can say, as far as it differs from the defaults."""
+    layer: Mapping = {
+        section: _numbers(getattr(robot, section)) for section in _MODELS if section != "camera"
+    }
+    layer["camera"] = None if robot.camera is None else _numbers(robot.camera)
+    layer["faces"] = {face.name: _numbers(face) for face in robot.faces}
+    return layer
+
+
+def _shared(robots: list[Robot]) -> Mapping:
+    """What all robots of a type have in common; cameras and faces as a whole, the rest number by number."""
+    layers = [_layer(robot) for robot in robots]
+    shared: Mapping = {}
+    for section, first in layers[0].items():
+        if section in {"camera", "faces"}:
+            if all(layer[section] == first for layer in layers):
+                shared[section] = first
+        else:
+            shared[section] = {
+                name: value
+                for name, value in first.items()
+                if all(layer[section].get(name) == value for layer in layers)
+            }
+    return {section: value for section, value in shared.items() if value != {}}
+
+
+def _robot(robot: Robot, shared: Mapping) -> Mapping:
+    """A robot without what its type says."""
+    entry: Mapping = {"type": robot.type} if robot.type else {}
+    for section, value in _layer(robot).items():
+        rest = value
+        if section in shared:
+            same = value == shared[section]
+            whole = section in {"camera", "faces"}
+            rest = {} if same or whole else {k: v for k, v in value.items() if k not in shared[section]}
+        if rest != {}:
+            entry[section] = rest
+    if robot.faces:
+        entry["ids"] = {face.name: face.id for face in robot.faces}
+    if robot.start is not None:
+        entry["start"] = dict(zip(("x", "y", "theta"), robot.start, strict=True))
+    return entry

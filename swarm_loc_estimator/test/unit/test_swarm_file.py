@@ -1,0 +1,330 @@
+"""The swarm description: layers, round trip, and one sentence for whatever is wrong with a file."""
+
+from __future__ import annotations
+
+import math
+import string
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from swarm_loc_estimator.core.swarm import (
+    CameraMount,
+    Face,
+    Landmark,
+    OdometryModel,
+    Robot,
+    SensorModel,
+    StartSigma,
+    Swarm,
+    SwarmError,
+    number_specs,
+)
+from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
+from swarm_loc_estimator.io.swarm_writer import save_swarm
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+EXAMPLE = """\
+fileversion: 1
+defaults:
+  sensor: {range_sigma: 0.2, gate_probability: 1}
+  camera: {x: 0.01}
+types:
+  epuck:
+    odometry: {wheel_separation: 0.053, wheel_noise: 2e-5}
+    camera: {x: 0.035, z: 0.028}
+    faces:
+      front: {x: 0.035, yaw: 0}
+      back: {x: -0.035, yaw: 3.1416}
+  blind:
+    camera: null
+robots:
+  one:
+    type: epuck
+    ids: {front: 1, back: 2}
+    start: {x: 1, y: -2.5, theta: 0.5}
+    sensor: {range_sigma: 0.3}
+  two:
+    type: epuck
+    faces: {back: null, front: {z: 0.1}}
+    ids: {front: 3}
+    start_sigma: {theta: 0.5}
+  three: {type: blind}
+  four:
+landmarks:
+  100: {x: 1.5, y: 0.25, yaw: -1.0}
+  101: {x: 0, y: 0}
+"""
+RELAXED = settings(
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], deadline=None
+)
+
+
+def load(folder: Path, text: str | bytes) -> Swarm:
+    path = folder / "swarm.yaml"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return load_swarm(path)
+
+
+def error_of(folder: Path, text: str | bytes) -> str:
+    with pytest.raises(SwarmFileError) as caught:
+        load(folder, text)
+    sentence = str(caught.value)
+    assert sentence.startswith(str(folder / "swarm.yaml"))
+    assert sentence.endswith(".")
+    assert "\n" not in sentence
+    return sentence.removeprefix(str(folder / "swarm.yaml")).removeprefix(": ")
+
+
+def test_layers_fall_from_defaults_to_type_to_robot(tmp_path: Path) -> None:
+    swarm = load(tmp_path, EXAMPLE)
+    one, two, three, four = swarm.robots
+    assert one.odometry == OdometryModel(wheel_separation=0.053, wheel_noise=2e-5)
+    assert (one.sensor.range_sigma, two.sensor.range_sigma, one.sensor.gate_probability) == (0.3, 0.2, 1.0)
+    assert one.camera == CameraMount(x=0.035, z=0.028)
+    assert one.faces == (Face("front", 1, x=0.035, yaw=0.0), Face("back", 2, x=-0.035, yaw=3.1416))
+    assert (one.start, two.start) == ((1.0, -2.5, 0.5), None)
+    assert two.faces == (Face("front", 3, x=0.035, z=0.1, yaw=0.0),)
+    assert two.start_sigma == StartSigma(theta=0.5)
+    assert three.camera is None
+    assert (four.camera, four.type) == (CameraMount(x=0.01), "")
+    assert swarm.landmarks == (Landmark(100, 1.5, 0.25, yaw=-1.0), Landmark(101, 0.0, 0.0, yaw=None))
+
+
+def test_owners_of_marker_ids(tmp_path: Path) -> None:
+    swarm = load(tmp_path, EXAMPLE)
+    assert swarm.index_of["three"] == 2
+    assert (swarm.owner_of[3].robot_index, swarm.owner_of[3].landmark_index) == (1, -1)
+    assert (swarm.owner_of[101].robot_index, swarm.owner_of[101].landmark_index) == (-1, 1)
+    assert swarm.owner_of[2].marker == swarm.robots[0].faces[1]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        (
+            "wheel_separation: 0.053",
+            "wheel_separation: -1",
+            "types.epuck.odometry.wheel_separation is -1 but must lie in [0.001, 10] m.",
+        ),
+        (
+            "wheel_separation: 0.053",
+            "wheel_separation: .nan",
+            "types.epuck.odometry.wheel_separation is nan but must lie in [0.001, 10] m.",
+        ),
+        (
+            "wheel_separation: 0.053",
+            "wheel_separation: -.inf",
+            "types.epuck.odometry.wheel_separation is -inf but must lie in [0.001, 10] m.",
+        ),
+        (
+            "wheel_separation: 0.053",
+            "wheel_separation: true",
+            "types.epuck.odometry.wheel_separation is True but must be a number in [0.001, 10] m.",
+        ),
+        (
+            "wheel_separation: 0.053",
+            "wheel_separation: '1'",
+            "types.epuck.odometry.wheel_separation is '1' but must be a number in [0.001, 10] m.",
+        ),
+        ("range_sigma: 0.2", "range_sigma: 0", "defaults.sensor.range_sigma is 0 but must lie in (0, 10] m."),
+        (
+            "wheel_separation: 0.053",
+            "wheel_seperation: 1",
+            ("'types.epuck.odometry.wheel_seperation' is not a known key;"
+            " the nearest one is 'wheel_separation'."),
+        ),
+        ("landmarks:", "landmark:", "'landmark' is not a known key; the nearest one is 'landmarks'."),
+        (
+            "type: blind",
+            "type: blnd",
+            "robots.three.type is 'blnd' but must be one of the types; the nearest one is 'blind'.",
+        ),
+        (
+            "front: 3",
+            "front: 1",
+            ("marker id 1 belongs to both face 'front' of robot 'one' and face 'front' of robot 'two';"
+            " ids must be unique."),
+        ),
+        (
+            "front: 3",
+            "front: 100",
+            "marker id 100 belongs to both face 'front' of robot 'two' and landmark 100; ids must be unique.",
+        ),
+        (
+            "front: 3",
+            "front: 3.5",
+            "robots.two.ids.front is 3.5 but must be a marker id, a whole number in [0, 4294967295].",
+        ),
+        ("front: 3", "frnt: 3", "'robots.two.ids.frnt' is not a known key; the nearest one is 'front'."),
+        (
+            "front: 1, back: 2",
+            "front: 1",
+            "robots.one.ids has no id for face 'back'; give one or set faces.back to null.",
+        ),
+        (
+            "  101:",
+            "  abc:",
+            "landmarks.abc is 'abc' but must be a marker id, a whole number in [0, 4294967295].",
+        ),
+        ("  101: {x: 0, y: 0}", "  100: {x: 0, y: 0}", "'landmarks.100' is given twice, again in line 29."),
+        ("  101: {x: 0, y: 0}", "  101: {x: 0}", "landmarks.101 lacks y, a number in [-1e+06, 1e+06] m."),
+        (
+            "y: -2.5, theta: 0.5",
+            "y: -2.5",
+            "robots.one.start lacks theta, a number in [-6.2832, 6.2832] rad.",
+        ),
+        (
+            "  three:",
+            "  2three:",
+            ("a name in robots is '2three' but must be letters, digits and underscores"
+            " and start with a letter."),
+        ),
+        ("fileversion: 1", "fileversion: 2", "fileversion is 2 but must be 1."),
+        ("fileversion: 1", "fileversion: true", "fileversion is True but must be 1."),
+        ("fileversion: 1\n", "", "fileversion is None but must be 1."),
+        ("camera: {x: 0.01}", "camera: 3", "defaults.camera is 3 but must be a mapping of keys to values."),
+    ],
+)
+def test_one_sentence_names_key_value_and_range(tmp_path: Path, old: str, new: str, sentence: str) -> None:
+    assert old in EXAMPLE
+    assert error_of(tmp_path, EXAMPLE.replace(old, new, 1)) == sentence
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("", "fileversion is None"),
+        ("fileversion: 1\n", "robots is empty but must name at least one robot"),
+        ("[", "is not YAML"),
+        (b"\xff\xfe\x00", "is not YAML"),
+        ("a: &a [*a]", "contains itself"),
+        ("? [1]\n: 2", "has a key that is no word or number"),
+        ("1.5: 2", "neither a name nor a whole number"),
+        ("[" * 5000 + "]" * 5000, "nested too deeply"),
+        ("fileversion: !!python/name:os.system x", "tag"),
+        (f"fileversion: 1\nrobots: {{a: {{start: {{x: {'9' * 400}, y: 0, theta: 0}}}}}}", "must lie in"),
+    ],
+)
+def test_files_that_are_no_description(tmp_path: Path, text: str | bytes, part: str) -> None:
+    assert part in error_of(tmp_path, text)
+
+
+def test_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SwarmFileError, match="cannot be read: No such file or directory"):
+        load_swarm(tmp_path / "swarm.yaml")
+
+
+def test_numbers_are_read_as_people_write_them(tmp_path: Path) -> None:
+    start = "fileversion: 1\nrobots: {a: {start: {x: %s, y: 0, theta: 0}}}"
+    for text, value in {"1e-4": 1e-4, "-.5": -0.5, "+3": 3.0, "2.": 2.0, "1E3": 1000.0, "010": 10.0}.items():
+        assert load(tmp_path, start % text).robots[0].start == (value, 0.0, 0.0)
+    for text in ("0x10", "1:30", "1_000", "yes"):
+        assert "must be a number" in error_of(tmp_path, start % text)
+
+
+def test_two_robots_of_one_name_are_refused() -> None:
+    with pytest.raises(SwarmError, match="robot name 'a' is given to two robots"):
+        Swarm((Robot("a"), Robot("a")))
+
+
+def numbers(cls: type) -> st.SearchStrategy[dict[str, Any]]:
+    options = {
+        name: st.floats(spec.low, min(spec.high, 1e6), exclude_min=spec.above)
+        | (st.none() if spec.optional else st.nothing())
+        for name, spec in number_specs(cls).items()
+    }
+    return st.fixed_dictionaries({}, optional=options)
+
+
+def build(cls: type) -> st.SearchStrategy[Any]:
+    return numbers(cls).map(lambda values: cls(**values))
+
+
+@st.composite
+def swarms(draw: st.DrawFn) -> Swarm:
+    ids = iter(draw(st.lists(st.integers(0, 2**32 - 1), unique=True, min_size=40, max_size=40)))
+    names = draw(
+        st.lists(st.text(string.ascii_letters, min_size=1, max_size=6), unique=True, min_size=1, max_size=4)
+    )
+    robots = []
+    pool = {cls: [cls(), draw(build(cls))] for cls in (OdometryModel, CameraMount, SensorModel, StartSigma)}
+    face_numbers = draw(st.lists(numbers(Face), max_size=3))
+    for name in names:
+        faces = tuple(Face(f"f{k}", next(ids), **values) for k, values in enumerate(face_numbers))
+        robots.append(
+            Robot(
+                name,
+                draw(st.sampled_from(["", "typ", "other"])),
+                draw(st.sampled_from(pool[OdometryModel])),
+                draw(st.sampled_from([*pool[CameraMount], None])),
+                draw(st.sampled_from(pool[SensorModel])),
+                faces[: draw(st.integers(0, 3))],
+                draw(
+                    st.none() | st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6), st.floats(-6.28, 6.28))
+                ),
+                draw(st.sampled_from(pool[StartSigma])),
+            )
+        )
+    landmarks = tuple(
+        Landmark(next(ids), **values) for values in draw(st.lists(numbers(Landmark), max_size=4))
+    )
+    return Swarm(tuple(robots), landmarks)
+
+
+@RELAXED
+@given(swarm=swarms())
+def test_what_is_written_is_read_back(tmp_path: Path, swarm: Swarm) -> None:
+    save_swarm(swarm, tmp_path / "swarm.yaml", "a comment\nof two lines")
+    assert load_swarm(tmp_path / "swarm.yaml") == swarm
+
+
+def test_written_file_says_shared_things_once(tmp_path: Path) -> None:
+    model = OdometryModel(distance_scale=0.9)
+    robots = tuple(
+        Robot(name, "typ", model, sensor=SensorModel(bearing_offset=k)) for k, name in enumerate("ab")
+    )
+    save_swarm(Swarm(robots), tmp_path / "swarm.yaml")
+    text = (tmp_path / "swarm.yaml").read_text()
+    assert text.count("distance_scale: 0.9") == 1
+    assert "bearing_offset [rad]" in text
+
+
+@RELAXED
+@given(data=st.data())
+def test_mutated_files_load_or_say_one_sentence(tmp_path: Path, data: st.DataObject) -> None:
+    text = EXAMPLE
+    for _ in range(data.draw(st.integers(1, 4))):
+        begin = data.draw(st.integers(0, len(text)))
+        end = data.draw(st.integers(begin, min(len(text), begin + 12)))
+        pieces = st.sampled_from(
+            [
+                "1e999",
+                ".nan",
+                "true",
+                "null",
+                "{",
+                "}",
+                "\n",
+                "  ",
+                ":",
+                "- ",
+                "&a ",
+                "*a",
+                "!!int ",
+                "?",
+                "''",
+                "1",
+                "\t",
+            ]
+        )
+        text = text[:begin] + data.draw(pieces | st.text(max_size=4)) + text[end:]
+    with suppress(SwarmFileError):
+        swarm = load(tmp_path, text.encode("utf-8", "surrogatepass"))
+        assert all(math.isfinite(value) for robot in swarm.robots for value in robot.start or ())
+        return
+    error_of(tmp_path, text.encode("utf-8", "surrogatepass"))
