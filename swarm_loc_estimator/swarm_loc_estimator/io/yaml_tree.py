@@ -29,7 +29,7 @@ class YamlTreeError(ValueError):
     """A file that is not such YAML; the message is one sentence."""
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
     """Resolves plain scalars as YAML 1.2 does.
 
     Not the faster CSafeLoader: deeply nested brackets crash the whole process in it.
