@@ -1,0 +1,1 @@
+"""Simulated swarms: numpy only, seeded, no ROS."""

@@ -1,0 +1,120 @@
+"""Differential-drive motion: true wheels slip at random, odometry reports what the motors were told.
+
+The wheels follow Siegwart and Nourbakhsh: a wheel that is meant to roll ds really rolls ds plus noise of
+variance `wheel_noise` * abs(ds), independently of the other wheel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from swarm_loc_estimator.core import se2
+
+from .record import ODOMETRY_DTYPE, Records, in_order_of_arrival
+from .transport import Lateness, arrival_ns
+
+FloatArray = NDArray[np.float64]
+Controller = Callable[[int, FloatArray], tuple[FloatArray, FloatArray]]
+"""(step index, true poses (N, 3)) -> commanded speed (N,) [m/s] and turn rate (N,) [rad/s]."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A differential drive and its imperfections.
+
+    Attributes:
+        wheel_separation: [m].
+        wheel_noise: Variance of a wheel's path per metre rolled [m].
+        turn_slip: Share of every commanded turn that is lost, in [0, 1).
+    """
+
+    wheel_separation: float
+    wheel_noise: float
+    turn_slip: float = 0.0
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What came of driving.
+
+    Attributes:
+        truth: (T + 1, N, 3) true poses in map.
+        reported: (T + 1, N, 3) poses by odometry, each robot's own frame, starting at zero.
+    """
+
+    truth: FloatArray
+    reported: FloatArray
+
+
+def wheel_paths(speed: FloatArray, turn_rate: FloatArray, separation: float, step_s: float) -> FloatArray:
+    """Paths (..., 2) [m] of the right and left wheel in one step."""
+    half_turn = 0.5 * separation * turn_rate
+    return np.stack([speed + half_turn, speed - half_turn], axis=-1) * step_s
+
+
+def twist_of(wheels: FloatArray, separation: float) -> FloatArray:
+    """The twist (..., 3) of one step in the robot's own frame, from its wheels' paths (..., 2) [m]."""
+    right, left = wheels[..., 0], wheels[..., 1]
+    return np.stack([0.5 * (right + left), np.zeros_like(right), (right - left) / separation], axis=-1)
+
+
+def drive(
+    rng: np.random.Generator,
+    start: FloatArray,
+    control: Controller,
+    model: Drive,
+    *,
+    step_s: float,
+    steps: int,
+) -> Driven:
+    """Drive N robots from `start` (N, 3) for `steps` steps of `step_s`, commanded by `control`."""
+    truth = np.empty((steps + 1, *start.shape))
+    truth[0] = start
+    commanded = np.empty((steps, len(start), 2))
+    noise = rng.standard_normal((steps, len(start), 2)) * np.sqrt(model.wheel_noise)
+    for k in range(steps):
+        speed, turn_rate = control(k, truth[k])
+        commanded[k] = wheel_paths(speed, turn_rate, model.wheel_separation, step_s)
+        rolled = wheel_paths(speed, (1.0 - model.turn_slip) * turn_rate, model.wheel_separation, step_s)
+        rolled += noise[k] * np.sqrt(np.abs(rolled))
+        truth[k + 1] = se2.compose(truth[k], se2.exp(twist_of(rolled, model.wheel_separation)))
+    return Driven(truth, integrate(twist_of(commanded, model.wheel_separation)))
+
+
+def integrate(twists: FloatArray) -> FloatArray:
+    """Odometry (T + 1, N, 3) from zero: each step is laid along its middle heading, e-puck paper eq. (1)."""
+    heading = np.concatenate([np.zeros((1, *twists.shape[1:-1])), np.cumsum(twists[..., 2], axis=0)])
+    middle = heading[:-1] + 0.5 * twists[..., 2]
+    steps = twists[..., :1] * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
+    position = np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
+    return np.concatenate([position, se2.wrap_angle(heading)[..., None]], axis=-1)
+
+
+def report_odometry(
+    rng: np.random.Generator, stamp_ns: NDArray[np.int64], reported: FloatArray, every: int, late: Lateness
+) -> Records:
+    """The odometry messages of N robots, each at its own phase of the common clock.
+
+    Args:
+        rng: Source of phases and delays.
+        stamp_ns: (T,).
+        reported: (T, N, 3) in each robot's odom frame.
+        every: Steps between two messages of a robot.
+        late: Delay on the way.
+
+    Returns:
+        (M,) of ODOMETRY_DTYPE in order of arrival. Every robot's first message is at the first stamp.
+    """
+    robots = reported.shape[1]
+    phase = rng.integers(1, every + 1, robots)
+    step = np.arange(len(stamp_ns))[:, None]
+    chosen, robot = np.nonzero((step == 0) | ((step - phase) % every == 0))
+    messages = np.zeros(len(chosen), ODOMETRY_DTYPE)
+    messages["robot"] = robot
+    messages["stamp_ns"] = stamp_ns[chosen]
+    messages["pose"] = reported[chosen, robot]
+    messages["arrival_ns"] = arrival_ns(rng, messages["stamp_ns"], late)
+    return in_order_of_arrival(messages, int(stamp_ns[-1]))

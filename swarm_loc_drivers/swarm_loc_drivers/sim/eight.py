@@ -1,0 +1,160 @@
+"""Five e-pucks driving the paper's eight among twenty wall markers.
+
+The geometry fits the text of "Vision-based Localization for a Swarm of Ground Mini-Robots": a lemniscate of
+half-width 0.60 m in an arena of 2.4 m by 1.6 m with a marker every 0.4 m of wall; five faces per robot,
+cameras at 7.5 Hz.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from swarm_loc_estimator.core import se2
+from swarm_loc_estimator.core.swarm import (
+    CameraMount,
+    Face,
+    Landmark,
+    OdometryModel,
+    Robot,
+    StartSigma,
+    Swarm,
+)
+
+from .camera import View, exposures
+from .differential_drive import Controller, Drive, drive, report_odometry
+from .lemniscate import Lemniscate
+from .markers import sight_markers
+from .record import SimulatedRun
+from .trajectories import Trajectories
+from .transport import ODOMETRY_LATENESS
+from .worlds import W0, World
+
+FloatArray = NDArray[np.float64]
+
+HALF_WIDTH = 0.60
+ARENA = (2.4, 1.6)
+WALL_MARKER_PITCH = 0.4
+MARKER_HEIGHT = 0.08
+FACE_DISTANCE = 0.033
+FACE_NAMES = ("front_left", "left", "back", "right", "front_right")
+CAMERA = CameraMount(x=0.03, z=0.08)
+VIEW = View(field_of_view=math.radians(60.0), nearest=0.12, farthest=1.5, incidence=math.radians(65.0))
+WHEEL_SEPARATION = 0.053
+CAMERA_RATE_HZ = 7.5
+START_NS = 1_000 * 10**9
+STEP_NS = 5_000_000
+
+_FIRST_LANDMARK_ID = 100
+_ACROSS_GAIN = 25.0
+_HEADING_GAIN = 10.0
+_CATCH_UP_GAIN = 0.5
+
+
+@dataclass(frozen=True)
+class EightSettings:
+    """What to simulate.
+
+    Attributes:
+        seed: Two runs with the same settings are identical.
+        duration_s: [s].
+        robots: How many, evenly spread over the eight; 5 or another odd number never meet in its middle.
+        speed: [m/s].
+        world: The imperfections.
+        odometry_rate_hz: 20, 25, 40 or 50 are multiples of the simulation's step.
+        start_known: Whether the description tells where each robot starts.
+    """
+
+    seed: int = 1
+    duration_s: float = 45.0
+    robots: int = 5
+    speed: float = 0.06
+    world: World = W0
+    odometry_rate_hz: float = 20.0
+    start_known: bool = True
+
+
+def simulate_eight(settings: EightSettings) -> SimulatedRun:
+    """Drive the eight and record what the sensors say."""
+    rng = np.random.default_rng(settings.seed)
+    steps = round(settings.duration_s * 1e9 / STEP_NS)
+    stamp_ns = START_NS + STEP_NS * np.arange(steps + 1, dtype=np.int64)
+    path = Lemniscate(HALF_WIDTH)
+    offset = np.arange(settings.robots) * path.length / settings.robots
+    start, _ = path.at(offset)
+    model = Drive(WHEEL_SEPARATION, settings.world.wheel_noise, settings.world.turn_slip)
+    control = follow(path, offset, settings.speed, STEP_NS * 1e-9)
+    driven = drive(rng, start, control, model, step_s=STEP_NS * 1e-9, steps=steps)
+    truth = Trajectories(stamp_ns, driven.truth)
+    every = round(1e9 / settings.odometry_rate_hz / STEP_NS)
+    odometry = report_odometry(rng, stamp_ns, driven.reported, every, ODOMETRY_LATENESS)
+    swarm = describe(settings, start)
+    pictures = exposures(
+        rng, settings.robots, CAMERA_RATE_HZ, int(stamp_ns[0]) + 200_000_000, int(stamp_ns[-1])
+    )
+    frames, sightings = sight_markers(rng, swarm, truth, pictures, VIEW, settings.world)
+    return SimulatedRun(swarm, truth, odometry, frames, sightings)
+
+
+def describe(settings: EightSettings, start: FloatArray) -> Swarm:
+    """The swarm as its owner would describe it; `start` is (N, 3) in map."""
+    odometry = OdometryModel(wheel_separation=WHEEL_SEPARATION, wheel_noise=settings.world.wheel_noise)
+    robots = tuple(
+        Robot(
+            name=f"epuck{index + 1}",
+            type="epuck",
+            odometry=odometry,
+            camera=CAMERA,
+            sensor=settings.world.described,
+            faces=faces(10 * (index + 1)),
+            start=(float(pose[0]), float(pose[1]), float(pose[2])) if settings.start_known else None,
+            start_sigma=StartSigma(),
+        )
+        for index, pose in enumerate(start)
+    )
+    return Swarm(robots, wall_markers())
+
+
+def faces(first_id: int) -> tuple[Face, ...]:
+    """Five markers around a robot; the camera looks out to the front between two of them."""
+    directions = [math.radians(angle) for angle in (36.0, 108.0, -180.0, -108.0, -36.0)]
+    return tuple(
+        Face(
+            name,
+            first_id + k,
+            FACE_DISTANCE * math.cos(yaw),
+            FACE_DISTANCE * math.sin(yaw),
+            MARKER_HEIGHT,
+            yaw,
+        )
+        for k, (name, yaw) in enumerate(zip(FACE_NAMES, directions, strict=True))
+    )
+
+
+def wall_markers() -> tuple[Landmark, ...]:
+    """The landmarks: one every 0.4 m along each wall, facing inwards."""
+    half_x, half_y = 0.5 * ARENA[0], 0.5 * ARENA[1]
+    along_x = np.arange(-half_x + 0.5 * WALL_MARKER_PITCH, half_x, WALL_MARKER_PITCH)
+    along_y = np.arange(-half_y + 0.5 * WALL_MARKER_PITCH, half_y, WALL_MARKER_PITCH)
+    places = [(x, -half_y, 0.5 * math.pi) for x in along_x] + [(half_x, y, -math.pi) for y in along_y]
+    places += [(x, half_y, -0.5 * math.pi) for x in along_x[::-1]] + [
+        (-half_x, y, 0.0) for y in along_y[::-1]
+    ]
+    return tuple(
+        Landmark(_FIRST_LANDMARK_ID + k, round(float(x), 6), round(float(y), 6), MARKER_HEIGHT, yaw)
+        for k, (x, y, yaw) in enumerate(places)
+    )
+
+
+def follow(path: Lemniscate, offset: FloatArray, speed: float, step_s: float) -> Controller:
+    """Keeps N robots on the path, robot i at length `offset[i]` [m] plus speed [m/s] times time."""
+
+    def control(step: int, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        target, curvature = path.at(offset + speed * step * step_s)
+        error = se2.between(pose, target)
+        forward = speed + _CATCH_UP_GAIN * error[:, 0]
+        return forward, speed * (curvature + _ACROSS_GAIN * error[:, 1] + _HEADING_GAIN * error[:, 2])
+
+    return control

@@ -1,0 +1,134 @@
+"""Sightings of coded markers: what cameras with hidden imperfections report of walls and of other robots."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from swarm_loc_estimator.core import se2
+
+from .camera import Pictures, View, deliver, hidden
+from .record import SIGHTING_DTYPE, Records
+
+if TYPE_CHECKING:
+    from swarm_loc_estimator.core.swarm import Swarm
+
+    from .trajectories import Trajectories
+    from .worlds import World
+
+FloatArray = NDArray[np.float64]
+
+ROBOT_RADIUS = 0.036
+GROSS_RANGE = 0.5
+
+
+@dataclass(frozen=True)
+class _HiddenGeometry:
+    """The world as it is, which its description only approximates.
+
+    Attributes:
+        mounts: (N, 3) camera poses in base_link.
+        scales: (N,) reported distance per true distance.
+        landmarks: (L, 3) in map.
+        faces: (K, 3) in their robot's base_link.
+        face_owner: (K,) robot index.
+        ids: (L + K,) marker ids.
+    """
+
+    mounts: FloatArray
+    scales: FloatArray
+    landmarks: FloatArray
+    faces: FloatArray
+    face_owner: NDArray[np.int64]
+    ids: NDArray[np.uint32]
+
+
+def sight_markers(
+    rng: np.random.Generator, swarm: Swarm, truth: Trajectories, pictures: Pictures, view: View, world: World
+) -> tuple[Records, Records]:
+    """What the pictures show.
+
+    Args:
+        rng: Source of every imperfection.
+        swarm: Geometry as described.
+        truth: Where the robots are.
+        pictures: Who looked when, by the stamps.
+        view: What a camera can see.
+        world: The imperfections.
+
+    Returns:
+        Frames in order of arrival, of FRAME_DTYPE, and their sightings, of SIGHTING_DTYPE.
+    """
+    geometry = _hide(rng, swarm, world)
+    robot, stamp_ns = pictures
+    early_ns = np.rint(rng.uniform(0.0, 1e9 * world.exposure_early_s, len(stamp_ns))).astype(np.int64)
+    poses = truth.all_at(stamp_ns - early_ns)
+    cameras = se2.compose(poses[np.arange(len(robot)), robot], geometry.mounts[robot])
+    marks = _marker_poses(geometry, poses)
+    in_camera = se2.between(cameras[:, None], marks)
+    seen = view.sees(in_camera) & ~_occluded(geometry, robot, cameras, marks, poses)
+    frame, mark = np.nonzero(seen)
+    sightings = np.zeros(len(frame), SIGHTING_DTYPE)
+    sightings["marker_id"] = geometry.ids[mark]
+    sightings["value"] = _disturb(rng, in_camera[frame, mark], geometry.scales[robot[frame]], world)
+    return deliver(rng, pictures, frame, sightings, end_ns=int(truth.stamp_ns[-1]), loss=world.frame_loss)
+
+
+def _hide(rng: np.random.Generator, swarm: Swarm, world: World) -> _HiddenGeometry:
+    """Draw the world that the description only approximates."""
+    mounts = np.array([[r.camera.x, r.camera.y, r.camera.yaw] for r in swarm.robots if r.camera is not None])
+    mounts[:, 2] += world.camera_yaw_sigma * rng.standard_normal(len(mounts))
+    scales = 1.0 + world.scale_sigma * rng.standard_normal(len(mounts))
+    landmarks = np.array([[m.x, m.y, m.yaw] for m in swarm.landmarks], dtype=float)
+    spread = np.array([world.map_position_sigma, world.map_position_sigma, world.map_heading_sigma])
+    landmarks += spread * rng.standard_normal(landmarks.shape)
+    all_faces = [(index, face) for index, robot in enumerate(swarm.robots) for face in robot.faces]
+    faces = np.array([[face.x, face.y, face.yaw] for _, face in all_faces], dtype=float)
+    faces[:, :2] += world.face_position_sigma * rng.standard_normal((len(faces), 2))
+    owner = np.array([index for index, _ in all_faces], dtype=np.int64)
+    ids = [mark.id for mark in swarm.landmarks] + [face.id for _, face in all_faces]
+    return _HiddenGeometry(mounts, scales, landmarks, faces, owner, np.array(ids, dtype=np.uint32))
+
+
+def _marker_poses(geometry: _HiddenGeometry, poses: FloatArray) -> FloatArray:
+    """All markers (F, L + K, 3) in map, for robots at (F, N, 3)."""
+    walls = np.broadcast_to(geometry.landmarks, (len(poses), *geometry.landmarks.shape))
+    return np.concatenate([walls, se2.compose(poses[:, geometry.face_owner], geometry.faces)], axis=1)
+
+
+def _occluded(
+    geometry: _HiddenGeometry,
+    robot: NDArray[np.int64],
+    cameras: FloatArray,
+    marks: FloatArray,
+    poses: FloatArray,
+) -> NDArray[np.bool_]:
+    """Which markers (F, M) a third robot hides; a robot's own markers count as hidden from it."""
+    frames, count = marks.shape[:2]
+    owner = np.concatenate([np.full(count - len(geometry.face_owner), -1), geometry.face_owner])
+    discs = np.broadcast_to(poses[:, None, :, :2], (frames, count, poses.shape[1], 2)).copy()
+    discs[np.arange(frames), :, robot] = np.nan
+    own_face = np.flatnonzero(owner >= 0)
+    discs[:, own_face, owner[own_face]] = np.nan
+    with np.errstate(invalid="ignore"):
+        behind = hidden(cameras[:, None, :2], marks[..., :2], discs, ROBOT_RADIUS)
+    own: NDArray[np.bool_] = owner[None, :] == robot[:, None]
+    return behind | own
+
+
+def _disturb(rng: np.random.Generator, exact: FloatArray, scale: FloatArray, world: World) -> FloatArray:
+    """Exact sightings (S, 3) turned into reported ones."""
+    count = len(exact)
+    value: FloatArray = exact.copy()
+    flipped = rng.random(count) < world.flip_probability
+    towards = np.arctan2(exact[:, 1], exact[:, 0]) + math.pi
+    value[:, 2] = np.where(flipped, 2.0 * towards - exact[:, 2], exact[:, 2])
+    value[:, :2] *= scale[:, None]
+    value += rng.standard_normal((count, 3)) * [world.forward_sigma, world.left_sigma, world.heading_sigma]
+    gross = rng.random(count) < world.gross_probability
+    value += gross[:, None] * rng.uniform(-1.0, 1.0, (count, 3)) * [GROSS_RANGE, GROSS_RANGE, math.pi]
+    value[:, 2] = se2.wrap_angle(value[:, 2])
+    return value
