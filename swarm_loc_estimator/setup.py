@@ -1,5 +1,6 @@
-"""Installs swarm_loc_estimator: the modules, the launch files and configurations beside them, and the executables."""
+"""Installs modules, executables, launch files and configurations."""
 
+import sys
 from glob import glob
 
 from setuptools import find_packages, setup
@@ -18,10 +19,12 @@ setup(
         (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
     ],
     install_requires=["setuptools"],
+    # A first line of a script cannot hold a path with a space; `ros2 run` then needs python3 on the PATH.
+    options={"build_scripts": {"executable": "/usr/bin/env python3"}} if " " in sys.executable else {},
     zip_safe=False,
     maintainer="Swarm localization maintainers",
     maintainer_email="maintainers@users.noreply.h-seed-05ed3d07.example",
-    description="The central estimator of a robot swarm: one buffered EKF over all robots, its replay, its player and its reports.",
+    description="The central estimator of a robot swarm, its replay, its player and its reports.",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [

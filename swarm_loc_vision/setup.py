@@ -1,5 +1,6 @@
-"""Installs swarm_loc_vision: the modules, the launch files and configurations beside them, and the executables."""
+"""Installs modules, executables, launch files and configurations."""
 
+import sys
 from glob import glob
 
 from setuptools import find_packages, setup
@@ -18,6 +19,8 @@ setup(
         (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
     ],
     install_requires=["setuptools"],
+    # A first line of a script cannot hold a path with a space; `ros2 run` then needs python3 on the PATH.
+    options={"build_scripts": {"executable": "/usr/bin/env python3"}} if " " in sys.executable else {},
     zip_safe=False,
     maintainer="Swarm localization maintainers",
     maintainer_email="maintainers@users.noreply.h-seed-05ed3d07.example",

@@ -1,0 +1,186 @@
+"""The virtual environment: made once, filled by pip, and its ROS wheels' CMake exports put right."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Callable
+from pathlib import Path
+
+from workspace import host
+from workspace.layout import LOGS, REQUIREMENTS, STATE, VENV, VENV_PYTHON, WorkspaceError
+from workspace.progress import run_logged, say
+from workspace.stamps import Stamp, digest
+
+STAMP = Stamp(VENV / "workspace.stamp")
+
+NETWORK_TROUBLE = re.compile(
+    r"NewConnectionError|NameResolutionError|ConnectTimeoutError|ReadTimeoutError|ProxyError|ConnectionError"
+    r"|Connection refused|Network is unreachable|Temporary failure in name resolution|Could not fetch URL"
+)
+
+FOREIGN_PATHS = re.compile(
+    r"/opt/python/cp3\d+-cp3\d+/(?P<rest>include/python3\.\d+|lib/python3\.\d+/site-packages)(?=[/\";>])"
+)
+"""Where the machine that built the wheels had its Python."""
+
+
+def _wanted(groups: tuple[str, ...]) -> dict[str, str]:
+    """What the environment must be, as its stamp says it: folder, origin, a hash per requirements file."""
+    facts = {"venv": str(VENV), "ros": str(host.ros_prefix() or "wheels")}
+    facts |= {f"group.{group}": digest([REQUIREMENTS / f"{group}.txt"]) for group in groups}
+    return facts
+
+
+def ensure(*, bench: bool) -> None:
+    """Make sure that `.venv` holds what the requirements say.
+
+    Args:
+        bench: Whether the benchmarks' requirements belong to it.
+
+    Raises:
+        WorkspaceError: Something is missing, or pip failed.
+    """
+    found = json.loads(STAMP.read() or "{}")
+    ros = host.ros_prefix()
+    groups = ("workspace",) if ros else ("ros", "workspace")
+    if bench or "group.bench" in found:
+        groups += ("bench",)
+    wanted = _wanted(groups)
+    if found == wanted and VENV_PYTHON.exists():
+        return
+    reusable = VENV_PYTHON.exists() and all(found.get(key) == wanted[key] for key in ("venv", "ros"))
+    STAMP.clear()
+    if not reusable:
+        _create(system_packages=ros is not None)
+    for group in groups:
+        if found.get(f"group.{group}") != wanted[f"group.{group}"] or not reusable:
+            _pip_install(group, ros)
+    if ros is None:
+        _patch_cmake_exports()
+    STAMP.write(json.dumps(wanted, sort_keys=True))
+
+
+def identity() -> str:
+    """What a build owes to the environment it was made in."""
+    facts = json.loads(STAMP.read() or "{}")
+    python = next(VENV.glob("lib/python3*"), Path()).name
+    return json.dumps([python, facts.get("ros"), facts.get("group.ros")])
+
+
+def _create(*, system_packages: bool) -> None:
+    """Make an empty virtual environment in place of whatever is there."""
+    host.check_python()
+    host.check_build_tools()
+    if VENV.exists():
+        say("  removing the old or unfinished .venv")
+        shutil.rmtree(VENV)
+    say(f"  making .venv with Python {sys.version.split()[0]}")
+    options = ["--system-site-packages"] if system_packages else []
+    command: list[str | Path] = [sys.executable, "-m", "venv", *options, VENV]
+    status, output = run_logged(command, "venv.log", lambda _: None)
+    if status:
+        log = LOGS / "venv.log"
+        raise WorkspaceError(f"Python could not make .venv: {_last_line(output)} (whole output: {log}).")
+
+
+def _pip_install(group: str, ros: Path | None) -> None:
+    """Install one requirements file, told in one line, with the whole of pip's words in a log."""
+    say(f"  installing requirements/{group}.txt")
+    log_name = f"pip-{group}.log"
+    command: list[str | Path] = [
+        VENV_PYTHON,
+        "-m",
+        "pip",
+        "install",
+        "--disable-pip-version-check",
+        "--no-input",
+    ]
+    command += ["--retries", "2", "--progress-bar", "off", "--prefer-binary"]
+    command += ["--requirement", REQUIREMENTS / f"{group}.txt"]
+    if ros:
+        command += ["--constraint", _system_constraints()]
+    status, output = run_logged(command, log_name, _pip_status())
+    if not status:
+        return
+    if NETWORK_TROUBLE.search(output):
+        raise WorkspaceError(
+            "pip cannot reach its package index: connect this machine to a network, run again."
+        )
+    raise WorkspaceError(
+        f"pip could not install requirements/{group}.txt: {_last_line(output, 'ERROR: ')} "
+        f"(whole output: {LOGS / log_name})."
+    )
+
+
+def _system_constraints() -> Path:
+    """Hold numpy at the version of the sourced ROS 2, whose messages do not load under another."""
+    constraints = STATE / "constraints.txt"
+    probe: list[str | Path] = [VENV_PYTHON, "-c", "import numpy; print(numpy.__version__)"]
+    found = subprocess.run(probe, capture_output=True, text=True, check=False).stdout.strip()
+    constraints.write_text(f"numpy=={found}\n" if found else "", encoding="utf-8")
+    return constraints
+
+
+def _pip_status() -> Callable[[str], str | None]:
+    """A reader of pip's output that counts the packages."""
+    count = 0
+
+    def status(line: str) -> str | None:
+        nonlocal count
+        words = line.split()
+        if line.startswith("Collecting"):
+            count += 1
+            return f"{count} packages found, now {words[1]}"
+        if line.startswith("Installing collected packages"):
+            return f"unpacking {len(words) - 3} packages"
+        if "Retrying" in line:
+            return "the package index does not answer, trying again"
+        return None
+
+    return status
+
+
+def _last_line(output: str, start: str = "") -> str:
+    """The last line that says something, without its `start` and full stop."""
+    lines = [line.strip() for line in output.splitlines() if line.strip()]
+    matching = [line for line in lines if line.startswith(start)]
+    return (matching or lines or ["no output"])[-1].removeprefix(start).rstrip(".")
+
+
+def _patch_cmake_exports() -> None:
+    """Let the wheels' CMake files name this Python where they name that of the machine they were built on."""
+    own = {
+        "include": sysconfig.get_path("include"),
+        "lib": str(next(VENV.glob("lib/python3*/site-packages"))),
+    }
+    for path in VENV.glob("share/**/*.cmake"):
+        text = path.read_text(encoding="utf-8")
+        patched = FOREIGN_PATHS.sub(lambda match: own[match["rest"].split("/")[0]], text)
+        if patched != text:
+            path.write_text(patched, encoding="utf-8")
+
+
+def base_environment() -> dict[str, str]:
+    """The environment that ROS programs and colcon need, without this workspace's packages.
+
+    With a sourced ROS 2 that is the present one with `.venv` in front; else the wheels in `.venv` are ROS 2.
+    """
+    env = dict(os.environ)
+    env["PATH"] = os.pathsep.join([str(VENV / "bin"), env.get("PATH", "")])
+    env["VIRTUAL_ENV"] = str(VENV)
+    env.pop("PYTHONHOME", None)
+    if host.ros_prefix() is None:
+        env["AMENT_PREFIX_PATH"] = env["CMAKE_PREFIX_PATH"] = str(VENV)
+        libraries = [VENV / "lib", *sorted(VENV.glob("lib/python3*/site-packages/ros_*.libs"))]
+        env["LD_LIBRARY_PATH"] = os.pathsep.join(
+            [*map(str, libraries), *filter(None, [env.get("LD_LIBRARY_PATH")])]
+        )
+        # The wheels start Python a second time to set the same path, unless told that it is set.
+        env["_ROS_WHEELS_BOOTSTRAP_COMPLETE"] = "1"
+    return env
