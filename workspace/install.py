@@ -48,7 +48,7 @@ def ensure(*, bench: bool) -> None:
     """
     found = json.loads(STAMP.read() or "{}")
     ros = host.ros_prefix()
-    groups = ("workspace",) if ros else ("ros", "workspace")
+    groups: tuple[str, ...] = ("workspace",) if ros else ("ros", "workspace")
     if bench or "group.bench" in found:
         groups += ("bench",)
     wanted = _wanted(groups)
