@@ -1,0 +1,180 @@
+"""The exact error covariance of everything estimated, and its updates.
+
+The filter knows columns and Jacobians, not robots or sensors. The mean lives outside: an update gives
+the correction, which its owner applies on the manifold.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+from swarm_loc_estimator.core.compiled import compiled
+from swarm_loc_estimator.core.se2 import FloatArray
+
+IndexArray = NDArray[np.int64]
+
+
+class DenseFilter:
+    """A full covariance matrix, held symmetric positive definite by the form of every update.
+
+    Args:
+        size: Number of columns; each starts with unit variance, independent.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.covariance: FloatArray = np.eye(size)
+
+    def copy(self) -> DenseFilter:
+        """An independent copy."""
+        other = DenseFilter.__new__(DenseFilter)
+        other.covariance = self.covariance.copy()
+        return other
+
+    def place(self, columns: IndexArray, covariance: FloatArray) -> None:
+        """Forget all that is known of the columns (k,) and give them this covariance (k, k), independent of the rest."""
+        self.covariance[columns, :] = 0.0
+        self.covariance[:, columns] = 0.0
+        self.covariance[columns[:, None], columns[None, :]] = covariance
+
+    def predict(self, columns: IndexArray, noise: FloatArray) -> None:
+        """Add noise (b, k, k) to the diagonal blocks at columns (b, k), all distinct; eq. (9) with F = I."""
+        self.covariance[columns[:, :, None], columns[:, None, :]] += noise
+
+    def marginals(self, columns: IndexArray) -> FloatArray:
+        """The covariance blocks (b, k, k) at columns (b, k)."""
+        blocks: FloatArray = self.covariance[columns[:, :, None], columns[:, None, :]]
+        return blocks
+
+    def update(
+        self, columns: IndexArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
+    ) -> FloatArray:
+        """Use many measurements with independent errors at once; return the correction (n,) of all columns.
+
+        Eqs. (11)-(14) of the e-puck paper in information form, P = (P^-1 + H^T R^-1 H)^-1: two inversions,
+        whose cost does not grow with the number of measurements.
+
+        Args:
+            columns: (m, c) what each measurement depends on; a column may be named twice.
+            jacobian: (m, r, c) its Jacobian; a zero row is a component that was not measured.
+            innovation: (m, r) measured minus predicted.
+            noise: (m, r, r) covariance of the measurement.
+        """
+        weighted = np.linalg.solve(noise, jacobian)  # R^-1 H, (m, r, c)
+        information = _inverse(self.covariance)
+        added = np.swapaxes(jacobian, 1, 2) @ weighted
+        np.add.at(information, (columns[:, :, None], columns[:, None, :]), added)
+        gradient = np.zeros(self.covariance.shape[0])
+        np.add.at(gradient, columns, np.einsum("mrc,mr->mc", weighted, innovation))
+        self.covariance = _inverse(information)
+        correction: FloatArray = self.covariance @ gradient
+        return correction
+
+
+@compiled
+def update_one(
+    covariance: FloatArray,
+    columns: IndexArray,
+    jacobian: FloatArray,
+    innovation: FloatArray,
+    noise: FloatArray,
+) -> FloatArray:
+    """Use one measurement: change the covariance (n, n) in place, return the correction (n,) of all columns.
+
+    Eqs. (11), (13), (14), and (12) in Joseph's form, which keeps the covariance positive definite. Of the
+    covariance only what the measurement's columns touch is multiplied.
+
+    Args:
+        covariance: (n, n) of everything estimated.
+        columns: (c,) what the measurement depends on; a column may be named twice.
+        jacobian: (3, c).
+        innovation: (3,) measured minus predicted.
+        noise: (3, 3) covariance of the measurement.
+    """
+    size = covariance.shape[0]
+    ph = _projected(covariance, columns, jacobian)
+    factor = cholesky3(innovation_covariance(ph, columns, jacobian, noise))
+    gain = np.empty((size, 3))
+    for i in range(size):
+        solve3(factor, ph[i], gain[i])
+    for i in range(size):
+        for j in range(size):
+            covariance[i, j] -= gain[i, 0] * ph[j, 0] + gain[i, 1] * ph[j, 1] + gain[i, 2] * ph[j, 2]
+    rest = _projected(covariance, columns, jacobian)
+    rest -= gain @ noise
+    for i in range(size):
+        for j in range(i + 1):
+            value = 0.5 * (covariance[i, j] + covariance[j, i])
+            for r in range(3):
+                value -= 0.5 * (rest[i, r] * gain[j, r] + rest[j, r] * gain[i, r])
+            covariance[i, j] = value
+            covariance[j, i] = value
+    return gain @ innovation
+
+
+@compiled
+def _projected(covariance: FloatArray, columns: IndexArray, jacobian: FloatArray) -> FloatArray:
+    """P H^T (n, 3)."""
+    size = covariance.shape[0]
+    ph = np.zeros((size, 3))
+    for c in range(columns.size):
+        column = columns[c]
+        for r in range(3):
+            factor = jacobian[r, c]
+            if factor != 0.0:
+                for i in range(size):
+                    ph[i, r] += covariance[column, i] * factor
+    return ph
+
+
+@compiled
+def innovation_covariance(
+    projected: FloatArray, columns: IndexArray, jacobian: FloatArray, noise: FloatArray
+) -> FloatArray:
+    """S = H P H^T + R (3, 3) from P H^T (n, 3); eq. (13)."""
+    s = noise.copy()
+    for c in range(columns.size):
+        for i in range(3):
+            for j in range(3):
+                s[i, j] += jacobian[i, c] * projected[columns[c], j]
+    return s
+
+
+@compiled
+def cholesky3(matrix: FloatArray) -> FloatArray:
+    """Lower Cholesky factor (3, 3) of a positive definite matrix (3, 3)."""
+    factor = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            value = matrix[i, j]
+            for k in range(j):
+                value -= factor[i, k] * factor[j, k]
+            factor[i, j] = math.sqrt(value) if i == j else value / factor[j, j]
+    return factor
+
+
+@compiled
+def solve3(factor: FloatArray, right: FloatArray, out: FloatArray) -> None:
+    """Write the solution (3,) of L L^T x = right for a lower factor L (3, 3)."""
+    a = right[0] / factor[0, 0]
+    b = (right[1] - factor[1, 0] * a) / factor[1, 1]
+    c = (right[2] - factor[2, 0] * a - factor[2, 1] * b) / factor[2, 2]
+    c = c / factor[2, 2]
+    b = (b - factor[2, 1] * c) / factor[1, 1]
+    out[0] = (a - factor[1, 0] * b - factor[2, 0] * c) / factor[0, 0]
+    out[1], out[2] = b, c
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Inverse of a symmetric positive definite matrix, symmetric to the last bit."""
+    factor, info = lapack.dpotrf(matrix.T, lower=0, clean=0)
+    if not info:
+        inverse, info = lapack.dpotri(factor, lower=0)
+    if info:
+        raise np.linalg.LinAlgError("the covariance is not positive definite")
+    upper = np.triu(inverse)
+    symmetric: FloatArray = upper + np.triu(upper, 1).T
+    return symmetric

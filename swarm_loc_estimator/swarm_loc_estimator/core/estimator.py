@@ -1,0 +1,247 @@
+"""The central estimator: odometry and sightings of a whole swarm in, poses out. No ROS, no clock of its own."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from swarm_loc_estimator.core import se2
+from swarm_loc_estimator.core.fusion import Fusion, Verdict
+from swarm_loc_estimator.core.gate import gate_threshold
+from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE, NOBODY, Kind, MeasurementArray
+from swarm_loc_estimator.core.odometry import OdometryTracks
+from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.settings import EstimatorSettings
+from swarm_loc_estimator.core.sightings import SightingConverter
+from swarm_loc_estimator.core.state import NEVER_NS, SwarmState, robot_columns
+from swarm_loc_estimator.core.swarm import Swarm
+from swarm_loc_estimator.core.timeline import Timeline
+
+_FARTHEST_M = 1e6
+_FIX_GATE = float(gate_threshold(0.9999))
+
+
+class Status(IntEnum):
+    """How a robot stands; the values of SwarmPose.status."""
+
+    WAITING = 0  # not located
+    TRACKED = 1
+    STALE = 2  # located, but its odometry is silent
+
+
+@dataclass(frozen=True)
+class SwarmEstimate:
+    """Poses of all robots at one instant.
+
+    Attributes:
+        stamp_ns: The instant.
+        poses: (N, 3) x [m], y [m], theta [rad] in `map`; NaN for robots that are not located.
+        covariances: (N, 3, 3) of x, y, theta; NaN likewise.
+        map_to_odom: (N, 3) from `map` to the driver's own odom frame; NaN likewise.
+        status: (N,) of `Status`.
+        fix_age_s: (N,) since the newest measurement tied to a landmark or an absolute fix; -1: never.
+    """
+
+    stamp_ns: int
+    poses: FloatArray
+    covariances: FloatArray
+    map_to_odom: FloatArray
+    status: NDArray[np.uint8]
+    fix_age_s: FloatArray
+
+
+class SwarmEstimator:
+    """Joint, buffered estimation of all poses of a swarm.
+
+    Data may come in any order and late; each counts at its own stamp when it is no older than the horizon. All that
+    arrives is used at the next `tick`. Every datum that is not used has a reason in `drops`.
+
+    Args:
+        swarm: Robots and landmarks.
+        settings: How to buffer and judge.
+    """
+
+    def __init__(self, swarm: Swarm, settings: EstimatorSettings | None = None) -> None:
+        self.swarm = swarm
+        self.settings = settings or EstimatorSettings()
+        self._robots = np.arange(len(swarm.robots))
+        self._tracks = OdometryTracks([robot.odometry for robot in swarm.robots])
+        self._converter = SightingConverter(swarm)
+        self._fusion = Fusion(swarm, self.settings, self._tracks)
+        self._timeline = Timeline(self.settings, self._fusion.step, SwarmState(len(swarm.robots)))
+        self._future_ns = round(self.settings.future_tolerance_s * 1e9)
+        self._jump_back_ns = round(self.settings.jump_back_s * 1e9)
+        self._ingest_drops: Counter[str] = Counter()
+        self.time_jumps = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        self._now_ns: int | None = None
+        self._odometry: list[tuple[int, int, float, float, float]] = []
+        self._detections: list[tuple[int, int, NDArray[np.void]]] = []
+
+    def reset(self) -> None:
+        """Forget all data and begin anew with the configured starts; the counters go on."""
+        self._ingest_drops.update(self._timeline_drops())
+        self._tracks.clear()
+        self._timeline.restart(SwarmState(self._robots.size))
+        self._begin()
+
+    def add_odometry(self, robot: int, stamp_ns: int, pose: tuple[float, float, float], now_ns: int) -> None:
+        """Take in one odometry message: the robot's pose (x [m], y [m], yaw [rad]) in its own odom frame."""
+        if self._in_time(stamp_ns, now_ns):
+            self._odometry.append((robot, stamp_ns, *pose))
+
+    def add_detections(self, robot: int, stamp_ns: int, detections: NDArray[np.void], now_ns: int) -> None:
+        """Take in what a robot's camera saw in one picture.
+
+        Args:
+            robot: Index of the robot that carries the camera.
+            stamp_ns: Exposure time.
+            detections: (d,) structured, see `SightingConverter.convert`.
+            now_ns: Time of arrival.
+        """
+        if detections.size and self._in_time(stamp_ns, now_ns, detections.size):
+            self._detections.append((robot, stamp_ns, detections))
+
+    def add_fix(self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike, now_ns: int) -> None:
+        """Take in an absolute fix: pose (3,) in `map` and its covariance (3, 3); a heading of NaN was not measured."""
+        fix = self._about(robot, stamp_ns, pose, covariance, Kind.CARTESIAN)
+        if np.isnan(fix["value"][0, 2]):
+            fix["has_heading"], fix["value"][0, 2] = 0, 0.0
+            fix["covariance"][0, 2, :] = fix["covariance"][0, :, 2] = [0.0, 0.0, 1.0]
+        if self._in_time(stamp_ns, now_ns):
+            self._add_measurements(fix)
+
+    def seat(self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike) -> None:
+        """Set a robot to a pose (3,) in `map` with covariance (3, 3), whatever was believed."""
+        self._timeline.add(self._about(robot, stamp_ns, pose, covariance, Kind.SEAT))
+
+    def forget(self, robot: int, stamp_ns: int) -> None:
+        """Take a robot out of the estimate; it waits for a fix."""
+        self._timeline.add(self._about(robot, stamp_ns, np.zeros(3), np.eye(3), Kind.FORGET))
+
+    def drop(self, reason: str, count: int = 1) -> None:
+        """Count data that could not even be handed in."""
+        self._ingest_drops[reason] += count
+
+    @property
+    def drops(self) -> dict[str, int]:
+        """Data not used, by reason, since construction."""
+        total = self._ingest_drops + Counter(self._timeline_drops())
+        return {reason: count for reason, count in sorted(total.items()) if count}
+
+    @property
+    def used(self) -> int:
+        """Measurements used since the last reset."""
+        return int(self._timeline.verdict_counts()[Verdict.USED])
+
+    def recent(self) -> tuple[MeasurementArray, NDArray[np.uint8], FloatArray]:
+        """The measurements within the horizon, their verdicts and normalised innovations squared."""
+        return self._timeline.measurements, self._timeline.verdicts, self._timeline.nis
+
+    def tick(self, now_ns: int) -> SwarmEstimate:
+        """Use all that has arrived and give the poses at `now_ns`."""
+        self._check_clock(now_ns)
+        self._use_odometry()
+        self._use_detections()
+        self._timeline.advance(now_ns)
+        self._tracks.trim(now_ns - round((self.settings.horizon_s + 1.0) * 1e9))
+        return self._estimate(now_ns)
+
+    def _check_clock(self, now_ns: int) -> None:
+        """Begin anew when time has jumped back, as at the loop of a bag."""
+        if self._now_ns is not None and now_ns < self._now_ns - self._jump_back_ns:
+            self.reset()
+            self.time_jumps += 1
+        self._now_ns = now_ns if self._now_ns is None else max(now_ns, self._now_ns)
+
+    def _in_time(self, stamp_ns: int, now_ns: int, count: int = 1) -> bool:
+        self._check_clock(now_ns)
+        if stamp_ns > now_ns + self._future_ns:
+            self.drop("future_stamp", count)
+            return False
+        return True
+
+    def _use_odometry(self) -> None:
+        if not self._odometry:
+            return
+        robots = np.array([row[0] for row in self._odometry], dtype=np.int64)
+        stamps = np.array([row[1] for row in self._odometry], dtype=np.int64)
+        raw = np.array([row[2:] for row in self._odometry])
+        self._odometry = []
+        finite = np.isfinite(raw).all(axis=1)
+        near = finite & (np.abs(np.where(finite[:, None], raw, 0.0)).max(axis=1) <= _FARTHEST_M)
+        self.drop("odometry_non_finite", int(np.sum(~finite)))
+        self.drop("odometry_absurd", int(np.sum(finite & ~near)))
+        change = self._tracks.extend(robots[near], stamps[near], raw[near])
+        self.drop("odometry_duplicate", change.duplicates)
+        self.drop("odometry_too_old", change.too_old)
+        self.drop("odometry_jump", change.jumps)
+        self._timeline.invalidate(change.changed_from_ns)
+
+    def _use_detections(self) -> None:
+        if not self._detections:
+            return
+        counts = [detections.size for _, _, detections in self._detections]
+        robots = np.repeat([robot for robot, _, _ in self._detections], counts)
+        stamps = np.repeat([stamp for _, stamp, _ in self._detections], counts)
+        conversion = self._converter.convert(
+            robots, stamps, np.concatenate([d for _, _, d in self._detections])
+        )
+        self._detections = []
+        self._ingest_drops.update(conversion.dropped)
+        self._add_measurements(conversion.measurements)
+
+    def _add_measurements(self, measurements: MeasurementArray) -> None:
+        """Hand measurements on whose numbers are finite and whose noise is a covariance."""
+        noise = measurements["covariance"]
+        finite = np.isfinite(noise).all(axis=(1, 2)) & np.isfinite(measurements["value"]).all(axis=1)
+        symmetric = np.where(finite[:, None, None], 0.5 * (noise + np.swapaxes(noise, 1, 2)), np.eye(3))
+        sound = finite & (np.linalg.eigvalsh(symmetric)[:, 0] > 0.0)
+        self.drop("bad_covariance", int(np.sum(~sound)))
+        self._timeline.add(measurements[sound])
+
+    def _about(
+        self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike, kind: Kind
+    ) -> MeasurementArray:
+        """A measurement (1,) without observer."""
+        measurement = np.zeros(1, dtype=MEASUREMENT_DTYPE)
+        measurement["stamp_ns"], measurement["target"], measurement["kind"] = stamp_ns, robot, kind
+        measurement["received_from"] = measurement["observer"] = NOBODY
+        measurement["value"], measurement["covariance"] = pose, covariance
+        measurement["has_heading"], measurement["gate"] = 1, _FIX_GATE
+        return measurement
+
+    def _timeline_drops(self) -> dict[str, int]:
+        verdicts = self._timeline.verdict_counts()
+        return {
+            "gated": int(verdicts[Verdict.GATED]),
+            "untied": int(verdicts[Verdict.UNTIED]),
+            "duplicate": self._timeline.duplicates,
+            "too_old": self._timeline.too_old,
+        }
+
+    def _estimate(self, now_ns: int) -> SwarmEstimate:
+        state = self._timeline.state
+        if state.fresh.any():  # robots whose odometry has begun but which took part in no measurement yet
+            state = state.copy()
+            self._fusion.enter_at_start(state, now_ns)
+        sample = self._tracks.at(self._robots, np.full(self._robots.size, now_ns))
+        poses = se2.compose(state.transform, sample.pose)
+        error = state.filter.marginals(robot_columns(self._robots)) + state.map_noise(
+            self._robots, sample.noise
+        )
+        covariances = se2.pose_covariance(poses, error)
+        map_to_odom = se2.compose(poses, se2.inverse(sample.raw))
+        silent = sample.silence_s > [robot.odometry.timeout_s for robot in self.swarm.robots]
+        status = np.where(state.tracked, np.where(silent, Status.STALE, Status.TRACKED), Status.WAITING)
+        for values in (poses, covariances, map_to_odom):
+            values[~state.tracked] = np.nan
+        never = state.last_fix_ns == NEVER_NS
+        age = np.where(never, -1.0, (now_ns - np.where(never, now_ns, state.last_fix_ns)) * 1e-9)
+        return SwarmEstimate(now_ns, poses, covariances, map_to_odom, status.astype(np.uint8), age)

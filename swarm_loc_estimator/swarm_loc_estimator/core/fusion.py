@@ -1,0 +1,181 @@
+"""Steps of the joint filter: robots enter and leave, measurements are fused in order or together."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core import judgement, se2
+from swarm_loc_estimator.core.fix import ClueBook
+from swarm_loc_estimator.core.measurements import NOBODY, Kind, MeasurementArray, MeasurementColumns
+from swarm_loc_estimator.core.odometry import OdometryTracks
+from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.settings import EstimatorSettings
+from swarm_loc_estimator.core.state import SwarmState
+from swarm_loc_estimator.core.swarm import Swarm
+
+_MANY = 24
+
+
+class Verdict(IntEnum):
+    """What became of a measurement."""
+
+    OPEN = judgement.OPEN  # not looked at yet
+    USED = judgement.USED
+    GATED = judgement.GATED  # its innovation is too unlikely
+    CLUE = 3  # kept to locate a robot that waits
+    UNTIED = 4  # neither side is located, or a robot has sent no odometry
+
+
+class Fusion:
+    """The steps of the filter over one swarm.
+
+    Args:
+        swarm: Who takes part.
+        settings: Limits for giving a robot up.
+        tracks: The robots' odometry.
+    """
+
+    def __init__(self, swarm: Swarm, settings: EstimatorSettings, tracks: OdometryTracks) -> None:
+        self._tracks = tracks
+        self._limits = (settings.lost_sigma, settings.lost_heading_sigma, int(settings.lost_after))
+        self._together = settings.fusion_period_s > 0.0
+        self._starts = {
+            i: (
+                np.array(r.start),
+                np.diag(np.square([r.start_sigma.x, r.start_sigma.y, r.start_sigma.theta])),
+            )
+            for i, r in enumerate(swarm.robots)
+            if r.start is not None
+        }
+        self._clues = ClueBook(tracks, settings.fix_window_s)
+
+    def enter_at_start(self, state: SwarmState, stamp_ns: int) -> None:
+        """Take in the robots with a configured start whose odometry has begun by `stamp_ns`."""
+        for robot in np.flatnonzero(state.fresh):
+            if robot in self._starts and self._tracks.begun(robot, stamp_ns):
+                start, covariance = self._starts[robot]
+                transform = se2.compose(start, se2.inverse(self._tracks.arrays.begin_pose[robot]))
+                state.enter(int(robot), transform, se2.error_covariance(start, covariance), np.zeros((3, 3)))
+
+    def step(
+        self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        """Fuse measurements into the state.
+
+        One after the other, each at its exact stamp; or, where many share a period of `fusion_period_s`, together:
+        each is related to the poses at its own stamp, but the noise gathered between is taken at their mean per robot.
+
+        Args:
+            state: Changed in place.
+            measurements: (m,) in order of their stamps.
+            verdicts: (m,) written, of `Verdict`.
+            nis: (m,) normalised innovations squared, written; NaN where there is none.
+        """
+        nis[:] = np.nan
+        if state.fresh.any():
+            self.enter_at_start(state, int(measurements["stamp_ns"][-1]))
+        if self._together and measurements.size >= _MANY and np.all(measurements["kind"] < Kind.SEAT):
+            self._fuse_together(state, measurements, verdicts, nis)
+        else:
+            self._fuse_in_order(state, measurements, verdicts, nis)
+
+    def _fuse_in_order(
+        self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        columns = MeasurementColumns.of(measurements)
+        k = 0
+        while True:
+            k, reason, robot = judgement.fuse_in_order(
+                columns, k, self._tracks.arrays, state.arrays(), self._limits, verdicts, nis
+            )
+            if reason == judgement.FINISHED:
+                return
+            if reason == judgement.LOST:
+                state.lose(robot)
+                continue
+            one = measurements[k : k + 1]
+            verdicts[k] = self._obey(state, one) if one["kind"][0] >= Kind.SEAT else self._note(state, one)
+            k += 1
+
+    def _fuse_together(
+        self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        known = np.append(state.tracked, True)  # NOBODY (-1) finds the last
+        tied = known[measurements["observer"]] & known[measurements["target"]]
+        rows = np.flatnonzero(tied)
+        if rows.size:
+            poses, lost = self._advance(state, measurements[rows])
+            good = ~(lost[measurements["observer"][rows]] | lost[measurements["target"][rows]])
+            tied[rows[~good]] = False
+            rows = rows[good]
+            verdicts[rows], nis[rows] = self._update(state, measurements[rows], poses[good])
+        for k in np.flatnonzero(~tied):
+            verdicts[k] = self._note(state, measurements[k : k + 1])
+
+    def _advance(
+        self, state: SwarmState, measurements: MeasurementArray
+    ) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Predict the robots involved to the mean of their measurements; those no longer sure where they are leave.
+
+        Returns:
+            Poses (m, 2, 3) of observers and targets at the stamps, and whether each robot, and nobody, was lost (N + 1,).
+        """
+        sides = np.stack([measurements["observer"], measurements["target"]], axis=1)
+        sides = np.where(sides == NOBODY, sides[:, ::-1], sides)  # nobody's pose does not matter
+        sample = self._tracks.at(sides.ravel(), np.repeat(measurements["stamp_ns"], 2))
+        involved, inverse, times = np.unique(sides.ravel(), return_inverse=True, return_counts=True)
+        noise = np.zeros((involved.size, 3, 3))
+        np.add.at(noise, inverse, sample.noise)
+        state.advance(involved, noise / times[:, None, None])
+        poses = se2.compose(state.transform[sides.ravel()], sample.pose)
+        newest = np.zeros((involved.size, 3))
+        newest[inverse] = poses
+        lost = np.zeros(state.tracked.size + 1, dtype=bool)
+        belief = state.arrays()
+        for robot, pose in zip(involved, newest, strict=True):
+            if judgement.is_unsure(belief, robot, pose, self._limits[0], self._limits[1]):
+                state.lose(int(robot))
+                lost[robot] = True
+        return poses.reshape(-1, 2, 3), lost
+
+    def _update(
+        self, state: SwarmState, measurements: MeasurementArray, poses: FloatArray
+    ) -> tuple[NDArray[np.uint8], FloatArray]:
+        """Judge measurements (m,) against one belief and use those that pass; return verdicts and squared innovations."""
+        m = measurements.size
+        columns, jacobian = np.empty((m, 6), dtype=np.int64), np.empty((m, 3, 6))
+        difference, noise = np.empty((m, 3)), np.empty((m, 3, 3))
+        passed, nis = np.empty(m, dtype=bool), np.empty(m)
+        fields = MeasurementColumns.of(measurements)
+        judgement.judge_all(fields, state.arrays(), poses, columns, jacobian, difference, noise, passed, nis)
+        if passed.any():
+            state.correct(
+                state.filter.update(columns[passed], jacobian[passed], difference[passed], noise[passed])
+            )
+        belief = state.arrays()
+        for k in range(m):
+            lost = judgement.count(fields, k, belief, passed[k], self._limits[2])
+            if lost >= 0:
+                state.lose(lost)
+        return np.where(passed, Verdict.USED, Verdict.GATED).astype(np.uint8), nis
+
+    def _note(self, state: SwarmState, one: MeasurementArray) -> Verdict:
+        """Keep a measurement (1,) as a clue if it ties a waiting robot to something located."""
+        return Verdict.CLUE if self._clues.note(state, one) else Verdict.UNTIED
+
+    def _obey(self, state: SwarmState, order: MeasurementArray) -> Verdict:
+        """Seat a robot anew or forget it, as the order (1,) says."""
+        robot = int(order["target"][0])
+        if order["kind"][0] == Kind.FORGET:
+            state.lose(robot)
+            return Verdict.USED
+        if not self._tracks.begun(robot, int(order["stamp_ns"][0])):
+            return Verdict.UNTIED
+        track = self._tracks.at(order["target"], order["stamp_ns"])
+        pose, covariance = order["value"][0], order["covariance"][0]
+        transform = se2.compose(pose, se2.inverse(track.pose[0]))
+        state.enter(robot, transform, se2.error_covariance(pose, covariance), track.noise[0])
+        return Verdict.USED

@@ -1,0 +1,153 @@
+"""Measurements as the filter knows them: who saw whom, when, what value, how sure. No sensors here.
+
+Every measurement observes the pose of a marker in a sensor's frame,
+
+    rel = (X_observer S)^-1 (X_target M),
+
+the transform chains (3) and (5) of the e-puck paper in the plane (whose printed eq. (6) has three wrong
+signs: the chain is used, not the print). S is the sensor on the observer, M the marker on the target. A
+landmark has no target robot (M is its pose in `map`), an absolute fix has no observer (S is the identity).
+
+With right-invariant errors X = exp(xi) X_hat the chain depends on xi_target - xi_observer only, so one
+Jacobian (3 x 3) serves both robots, with opposite signs.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.compiled import compiled, composed, wrap
+from swarm_loc_estimator.core.se2 import FloatArray
+
+NOBODY = -1
+"""Index in place of a robot: the observer of an absolute fix, the target of a landmark sighting."""
+
+
+class Kind(IntEnum):
+    """What a value is: its first two components, or an order about the target robot."""
+
+    CARTESIAN = 0  # forward [m], left [m]
+    POLAR = 1  # range [m], bearing [rad], positive to the left
+    SEAT = 2  # the target is at `value` in map with `covariance`, whatever was believed
+    FORGET = 3  # the target is not where it was believed to be
+
+
+MEASUREMENT_DTYPE = np.dtype(
+    [
+        ("stamp_ns", np.int64),  # when it was true
+        ("received_from", np.int64),  # robot whose message it came in; -1 for a message about the whole swarm
+        ("observer", np.int64),  # robot index or NOBODY
+        ("target", np.int64),  # robot index or NOBODY
+        ("marker_id", np.int64),
+        ("kind", np.int64),  # Kind
+        ("has_heading", np.int64),  # 1 when value[2] was measured, else 0
+        ("has_alternative", np.int64),  # 1 when `alternative` is a second, mirrored solution, else 0
+        ("gate", np.float64),  # largest squared distance of its first two components that is believed
+        ("sensor", np.float64, (3,)),  # S: x [m], y [m], yaw [rad] in the observer's base_link
+        ("marker", np.float64, (3,)),  # M: in the target's base_link, or in map
+        ("value", np.float64, (3,)),  # two by kind, then the heading [rad] of the marker's face
+        ("alternative", np.float64, (3,)),
+        (
+            "covariance",
+            np.float64,
+            (3, 3),
+        ),  # of value; a heading not measured has no covariance and variance 1
+    ]
+)
+
+MeasurementArray = NDArray[np.void]
+
+
+class MeasurementColumns(NamedTuple):
+    """The fields of measurements (m,) as compiled code reads them."""
+
+    stamp_ns: NDArray[np.int64]
+    observer: NDArray[np.int64]
+    target: NDArray[np.int64]
+    kind: NDArray[np.int64]
+    has_heading: NDArray[np.int64]
+    has_alternative: NDArray[np.int64]
+    gate: FloatArray
+    sensor: FloatArray
+    marker: FloatArray
+    value: FloatArray
+    alternative: FloatArray
+    covariance: FloatArray
+
+    @classmethod
+    def of(cls, measurements: MeasurementArray) -> MeasurementColumns:
+        """The columns of an array of MEASUREMENT_DTYPE."""
+        return cls(*(measurements[name] for name in cls._fields))
+
+
+def predict(
+    measurements: MeasurementArray, observer_pose: FloatArray, target_pose: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Predicted values (m, 3) and their Jacobians (m, 3, 3) by xi_target - xi_observer.
+
+    A heading that was not measured has a zero row.
+
+    Args:
+        measurements: (m,) of MEASUREMENT_DTYPE.
+        observer_pose: (m, 3) in `map`; rows without an observer are ignored.
+        target_pose: (m, 3); rows without a target are ignored.
+    """
+    value, jacobian = np.zeros((measurements.size, 3)), np.zeros((measurements.size, 3, 3))
+    columns = MeasurementColumns.of(measurements)
+    for k in range(measurements.size):
+        predict_one(columns, k, observer_pose[k], target_pose[k], value[k], jacobian[k])
+    return value, jacobian
+
+
+@compiled
+def predict_one(
+    measurements: MeasurementColumns,
+    k: int,
+    observer_pose: FloatArray,
+    target_pose: FloatArray,
+    value: FloatArray,
+    jacobian: FloatArray,
+) -> None:
+    """Write the predicted value (3,) of measurement k and its Jacobian (3, 3), see `predict`."""
+    sensor, marker = measurements.sensor[k], measurements.marker[k]
+    sx, sy, stheta = sensor[0], sensor[1], sensor[2]
+    if measurements.observer[k] >= 0:
+        sx, sy, stheta = composed(observer_pose[0], observer_pose[1], observer_pose[2], sx, sy, stheta)
+    mx, my, mtheta = marker[0], marker[1], marker[2]
+    if measurements.target[k] >= 0:
+        mx, my, mtheta = composed(target_pose[0], target_pose[1], target_pose[2], mx, my, mtheta)
+    cos, sin = math.cos(stheta), math.sin(stheta)
+    x, y = cos * (mx - sx) + sin * (my - sy), -sin * (mx - sx) + cos * (my - sy)
+    value[0], value[1], value[2] = x, y, wrap(mtheta - stheta)
+    # moving the target by xi moves its marker by rho + phi * (-my, mx)
+    jacobian[0, 0], jacobian[0, 1], jacobian[0, 2] = cos, sin, -cos * my + sin * mx
+    jacobian[1, 0], jacobian[1, 1], jacobian[1, 2] = -sin, cos, sin * my + cos * mx
+    jacobian[2, 0], jacobian[2, 1], jacobian[2, 2] = 0.0, 0.0, float(measurements.has_heading[k])
+    if measurements.kind[k] == 1:  # Kind.POLAR
+        distance = max(math.hypot(x, y), 1e-6)
+        ux, uy = x / distance, y / distance
+        value[0], value[1] = distance, math.atan2(y, x)
+        for j in range(3):
+            forward, left = jacobian[0, j], jacobian[1, j]
+            jacobian[0, j] = ux * forward + uy * left
+            jacobian[1, j] = (ux * left - uy * forward) / distance
+
+
+@compiled
+def innovation(
+    measurements: MeasurementColumns, k: int, measured: FloatArray, predicted: FloatArray, out: FloatArray
+) -> None:
+    """Write measured minus predicted (3,), angles wrapped, zero for a heading that was not measured.
+
+    Eq. (11) of the e-puck paper subtracts without wrapping, which is wrong across +-pi.
+    """
+    out[0] = measured[0] - predicted[0]
+    out[1] = measured[1] - predicted[1]
+    out[2] = wrap(measured[2] - predicted[2]) if measurements.has_heading[k] else 0.0
+    if measurements.kind[k] == 1:  # Kind.POLAR
+        out[1] = wrap(out[1])
