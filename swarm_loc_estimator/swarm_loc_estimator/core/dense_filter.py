@@ -35,7 +35,7 @@ class DenseFilter:
         return other
 
     def place(self, columns: IndexArray, covariance: FloatArray) -> None:
-        """Forget all that is known of the columns (k,) and give them this covariance (k, k), independent of the rest."""
+        """Give the columns (k,) this covariance (k, k), independent of the rest, whatever was known."""
         self.covariance[columns, :] = 0.0
         self.covariance[:, columns] = 0.0
         self.covariance[columns[:, None], columns[None, :]] = covariance

@@ -1,4 +1,4 @@
-"""The central estimator: odometry and sightings of a whole swarm in, poses out. No ROS, no clock of its own."""
+"""The central estimator: odometry and sightings of a swarm in, poses out; no ROS, no clock of its own."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ class SwarmEstimate:
 class SwarmEstimator:
     """Joint, buffered estimation of all poses of a swarm.
 
-    Data may come in any order and late; each counts at its own stamp when it is no older than the horizon. All that
-    arrives is used at the next `tick`. Every datum that is not used has a reason in `drops`.
+    Data may come in any order and late; each counts at its own stamp when it is no older than the
+    horizon. All that arrives is used at the next `tick`. Every datum that is not used has a reason in `drops`.
 
     Args:
         swarm: Robots and landmarks.
@@ -109,7 +109,7 @@ class SwarmEstimator:
             self._detections.append((robot, stamp_ns, detections))
 
     def add_fix(self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike, now_ns: int) -> None:
-        """Take in an absolute fix: pose (3,) in `map` and its covariance (3, 3); a heading of NaN was not measured."""
+        """Take in an absolute fix: pose (3,) in `map`, its heading NaN when not measured, and covariance (3, 3)."""
         fix = self._about(robot, stamp_ns, pose, covariance, Kind.CARTESIAN)
         if np.isnan(fix["value"][0, 2]):
             fix["has_heading"], fix["value"][0, 2] = 0, 0.0

@@ -2,8 +2,8 @@
 
 Each sighting between a waiting robot and something located says that one point of the robot's track (the
 place where it saw the marker, or its own marker) lies at one point of the map. Two such points give the
-transform in closed form (a rigid alignment); a sighting with heading gives it alone. The transform on which most clues agree
-is refined by least squares and accepted when it is unique and sure.
+transform in closed form (a rigid alignment); a sighting with heading gives it alone. The transform on
+which most clues agree is refined by least squares and accepted when it is unique and sure.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class ClueBook:
         self._window_ns = int(window_s * 1e9)
 
     def note(self, state: SwarmState, one: MeasurementArray) -> bool:
-        """Keep a measurement (1,) that ties one waiting robot to something located; a robot whose fix succeeds enters.
+        """Keep a measurement (1,) that ties one waiting robot to something located; with a fix the robot enters.
 
         Returns:
             Whether the measurement was kept.
@@ -126,7 +126,7 @@ def locate(clues: NDArray[np.void], track_noise: FloatArray) -> Fix | None:
 
     Args:
         clues: (k,) of CLUE_DTYPE.
-        track_noise: (3, 3) noise that the track has gathered by now; what came since a clue makes it less sure.
+        track_noise: (3, 3) noise the track has gathered by now; what came since a clue makes it less sure.
     """
     if clues.size < _LEAST_CLUES or np.unique(clues["stamp_ns"]).size < 2:
         return None
@@ -146,7 +146,7 @@ def locate(clues: NDArray[np.void], track_noise: FloatArray) -> Fix | None:
 
 
 def _as_seen(one: MeasurementArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A measurement's (1,) point (1, 2) and heading (1,) in the sensor's frame with their covariance (3, 3)."""
+    """Point (1, 2) and heading (1,) of a measurement (1,) in the sensor's frame, with covariance (3, 3)."""
     value, covariance = one["value"], one["covariance"][0]
     if one["kind"][0] == Kind.CARTESIAN:
         return value[:, :2], value[:, 2], covariance
@@ -174,7 +174,7 @@ def _drift(clues: NDArray[np.void], track_noise: FloatArray) -> FloatArray:
 
 
 def _hypotheses(clues: NDArray[np.void]) -> FloatArray:
-    """Transforms (h, 3) from each clue with a heading and from each pair of clues that are far enough apart."""
+    """Transforms (h, 3) from each clue with a heading and from each pair of clues far enough apart."""
     first, second = np.triu_indices(clues.size, 1)
     local = clues["local"][second] - clues["local"][first]
     target = clues["map"][second] - clues["map"][first]
@@ -199,7 +199,7 @@ def _placing(turn: FloatArray, local: FloatArray, target: FloatArray) -> FloatAr
 def _residuals(
     clues: NDArray[np.void], spread: FloatArray, transforms: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Residuals (h, k, 2) of the clues' points under transforms (h, 3), and their squared distances (h, k)."""
+    """Residuals (h, k, 2) of the clues' points under transforms (h, 3), and squared distances (h, k)."""
     residual = clues["map"] - se2.transform_points(transforms[:, None, :], clues["local"])
     covariance = clues["map_covariance"] + _rotated(spread, transforms[:, 2, None])
     weighted = np.linalg.solve(covariance, residual[..., None])[..., 0]

@@ -65,8 +65,9 @@ class Fusion:
     ) -> None:
         """Fuse measurements into the state.
 
-        One after the other, each at its exact stamp; or, where many share a period of `fusion_period_s`, together:
-        each is related to the poses at its own stamp, but the noise gathered between is taken at their mean per robot.
+        One after the other, each at its exact stamp; or, where many share a period of `fusion_period_s`,
+        together: each is related to the poses at its own stamp, but the noise gathered between the stamps
+        is taken at their mean per robot.
 
         Args:
             state: Changed in place.
@@ -118,10 +119,11 @@ class Fusion:
     def _advance(
         self, state: SwarmState, measurements: MeasurementArray
     ) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Predict the robots involved to the mean of their measurements; those no longer sure where they are leave.
+        """Predict the robots involved to the mean of their measurements; those unsure where they are leave.
 
         Returns:
-            Poses (m, 2, 3) of observers and targets at the stamps, and whether each robot, and nobody, was lost (N + 1,).
+            Poses (m, 2, 3) of observers and targets at the stamps, and (N + 1,) whether each robot, and
+            nobody, was lost.
         """
         sides = np.stack([measurements["observer"], measurements["target"]], axis=1)
         sides = np.where(sides == NOBODY, sides[:, ::-1], sides)  # nobody's pose does not matter
@@ -144,7 +146,7 @@ class Fusion:
     def _update(
         self, state: SwarmState, measurements: MeasurementArray, poses: FloatArray
     ) -> tuple[NDArray[np.uint8], FloatArray]:
-        """Judge measurements (m,) against one belief and use those that pass; return verdicts and squared innovations."""
+        """Judge measurements (m,) against one belief, use those that pass; return verdicts and their NIS."""
         m = measurements.size
         columns, jacobian = np.empty((m, 6), dtype=np.int64), np.empty((m, 3, 6))
         difference, noise = np.empty((m, 3)), np.empty((m, 3, 3))

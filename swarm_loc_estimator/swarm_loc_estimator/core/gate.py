@@ -40,9 +40,9 @@ def position_distance(innovation: FloatArray, covariance: FloatArray) -> float:
 
 @compiled
 def soften_heading(innovation: FloatArray, covariance: FloatArray, noise: FloatArray) -> None:
-    """Enlarge the heading's standard deviation in `noise` (3, 3) where its innovation is unlikely, so that flips count little.
+    """Enlarge the heading's part of `noise` (3, 3) where its innovation is unlikely: flips count little.
 
-    Student's t with 4 degrees of freedom instead of a normal distribution; `covariance` (3, 3) is the innovation's.
+    Student's t with 4 degrees of freedom instead of a normal; `covariance` (3, 3) is the innovation's.
     """
     normalised = innovation[2] * innovation[2] / covariance[2, 2]
     factor = (_STUDENT_DOF + normalised) / (_STUDENT_DOF + 1.0)

@@ -19,7 +19,7 @@ OPEN, USED, GATED = 0, 1, 2
 """Verdicts that the inner loop gives, see `fusion.Verdict`."""
 
 FINISHED, UNTIED, LOST = 0, 1, 2
-"""Why `fuse_in_order` came back: all done, a measurement between robots not both located, a robot given up."""
+"""Why `fuse_in_order` came back: all done, a measurement not between robots located, a robot given up."""
 
 
 @compiled
@@ -39,8 +39,8 @@ def fuse_in_order(
         begin: The first one to fuse.
         tracks: Odometry.
         belief: Changed in place.
-        limits: Largest standard deviation of a position [m] and heading [rad], and gated measurements in a row, with
-            which a robot still counts as located.
+        limits: Largest standard deviation of a position [m] and heading [rad], and gated measurements in a
+            row, with which a robot still counts as located.
         verdicts: (m,) written.
         nis: (m,) normalised innovations squared, written.
 
@@ -114,7 +114,7 @@ def judge(
     difference: FloatArray,
     noise: FloatArray,
 ) -> tuple[bool, float]:
-    """Linearise measurement k and decide on it; return whether it passes, and its normalised innovation squared.
+    """Linearise measurement k and decide on it; return whether it passes, and its NIS.
 
     Of a planar marker's two solutions the likelier counts. Arguments as of `judge_all`, for one.
     """
@@ -153,7 +153,7 @@ def judge(
 
 @compiled
 def advance(belief: BeliefArrays, robot: int, noise: FloatArray) -> None:
-    """Predict a robot up to where its track has gathered `noise` (3, 3): P += Ad(T) (G - G_accounted) Ad(T)^T."""
+    """Predict a robot to where its track gathered `noise` (3, 3): P += Ad(T) (G - G_accounted) Ad(T)^T."""
     x, y, theta = belief.transform[robot, 0], belief.transform[robot, 1], belief.transform[robot, 2]
     cos, sin = math.cos(theta), math.sin(theta)
     adjoint = ((cos, -sin, y), (sin, cos, -x), (0.0, 0.0, 1.0))
@@ -179,7 +179,7 @@ def to_map(belief: BeliefArrays, robot: int, pose: FloatArray) -> None:
 
 @compiled
 def is_unsure(belief: BeliefArrays, robot: int, pose: FloatArray, position: float, heading: float) -> bool:
-    """Whether the standard deviation of the robot's position or heading exceeds its limit at `pose` (3,) in `map`."""
+    """Whether the standard deviation of the robot's position or heading at `pose` (3,) exceeds its limit."""
     p = belief.covariance[3 * robot : 3 * robot + 3, 3 * robot : 3 * robot + 3]
     x = p[0, 0] - 2.0 * pose[1] * p[0, 2] + pose[1] * pose[1] * p[2, 2]
     y = p[1, 1] + 2.0 * pose[0] * p[1, 2] + pose[0] * pose[0] * p[2, 2]

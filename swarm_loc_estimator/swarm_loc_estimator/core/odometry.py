@@ -82,7 +82,7 @@ class TrackChange:
     """What `OdometryTracks.extend` did.
 
     Attributes:
-        changed_from_ns: (N,) per robot the instant after which its look-ups may now differ; UNCHANGED_NS for most.
+        changed_from_ns: (N,) per robot the instant after which look-ups may now differ, or UNCHANGED_NS.
         duplicates: Rows dropped because the robot has a row with that stamp.
         too_old: Rows dropped because they lie before the oldest stamp kept.
         jumps: Steps that no robot can drive; the step was replaced by unknown motion.
@@ -153,7 +153,7 @@ class OdometryTracks:
         return sample
 
     def trim(self, oldest_ns: int) -> None:
-        """Let rows go that no look-up at or after `oldest_ns` needs; rows older than it are refused from now on."""
+        """Let rows go that no look-up from `oldest_ns` on needs; older ones are refused from now on."""
         self._oldest_ns = oldest_ns
         capacity = self.arrays.stamp_ns.shape[1]
         for robot in np.flatnonzero(self.arrays.count > capacity // 2):
@@ -224,10 +224,11 @@ class OdometryTracks:
 def look_up(
     tracks: TrackArrays, robot: int, stamp_ns: int, pose: FloatArray, raw: FloatArray, noise: FloatArray
 ) -> float:
-    """Write the robot's pose O (3,), raw pose (3,) and gathered noise G (3, 3) at an instant; return its silence [s].
+    """Write the robot's pose O (3,), raw pose (3,) and noise G (3, 3) at an instant; return its silence [s].
 
-    Within a step the motion is an arc of constant twist. Past the newest row the last twist goes on for a moment,
-    then the robot stands; after its `timeout_s` its motion counts as unknown. Before the first row it stands.
+    Within a step the motion is an arc of constant twist. Past the newest row the last twist goes on for a
+    moment, then the robot stands; after its `timeout_s` its motion counts as unknown. Before the first row
+    it stands.
     """
     count = tracks.count[robot]
     if count == 0:
@@ -287,7 +288,7 @@ def _interpolate(start: FloatArray, end: FloatArray, fraction: float, out: Float
 def _integrate(
     tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray, raw: FloatArray
 ) -> tuple[int, int]:
-    """Append rows sorted by robot and stamp; return how many were duplicates and how many steps were jumps."""
+    """Append rows sorted by robot and stamp; return how many were duplicates, how many steps jumps."""
     duplicates, jumps = 0, 0
     for k in range(robots.size):
         robot = robots[k]

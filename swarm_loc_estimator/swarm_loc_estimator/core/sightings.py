@@ -75,7 +75,7 @@ class SightingConverter:
         Args:
             robots: (d,) index of the robot whose camera saw each.
             stamps_ns: (d,) exposure times.
-            detections: (d,) with fields id, content, position (3,), orientation (4,) x y z w, covariance (6, 6),
+            detections: (d,) with fields id, content, position (3,), orientation (4,) xyzw, covariance (6, 6),
                 alternative_orientation (4,), as published in the optical frame.
         """
         dropped: dict[str, int] = {}
@@ -178,7 +178,7 @@ def _face_heading(level: FloatArray, quaternion: FloatArray) -> FloatArray:
 
 
 def _pose_noise(published: FloatArray, level: FloatArray, sensor: dict[str, FloatArray]) -> FloatArray:
-    """Covariances (d, 3, 3) of forward, left, heading: as published, or the sensor's where that is unknown (-1)."""
+    """Covariances (d, 3, 3) of forward, left, heading: as published, or the sensor's where unknown (-1)."""
     to_plane = np.zeros((published.shape[0], 3, 6))
     to_plane[:, :2, :3] = level[:, :2, :]
     to_plane[:, 2, 3:] = level[:, 2, :]  # the rotation about the vertical
