@@ -1,29 +1,43 @@
 # make demo     sets up what is missing, then localizes a simulated swarm through the live graph
 # make test     lint, types, unit tests without ROS, node tests over DDS
-# make bench-NAME [ARGS="..."]   prints a table, writes out/bench/NAME.json
-# make setup | lint | clean
+# make bench-NAME [ARGS="..."]   prints a table, draws it under out/, writes out/bench/NAME.json
+# make setup | lint | unit | node | clean
 
 PYTHON ?= python3
-export PYTHON
+PACKAGES := swarm_loc_estimator swarm_loc_vision swarm_loc_drivers
+TESTED := $(PACKAGES) workspace
 
-.PHONY: demo test lint setup clean
+.PHONY: demo test lint unit node setup clean
 
 demo: setup
-	./run swarm_loc_estimator demo $(ARGS)
+	@./run swarm_loc_estimator demo $(ARGS)
 
-test: setup
-	./run -- workspace/check all
+test: lint unit node
 
 lint: setup
-	./run -- workspace/check lint
+	./run -- ruff check
+	./run -- ruff format --check
+	./run -- mypy conftest.py setup_workspace.py workspace
+	@set -e; for package in $(PACKAGES); do \
+	    for part in $$package launch test bench; do \
+	        if [ -n "$$(find $$package/$$part -name '*.py' 2>/dev/null)" ]; then \
+	            echo "./run -- mypy $$package/$$part"; ./run -- mypy $$package/$$part; \
+	        fi; \
+	    done; \
+	done
+
+unit: setup
+	./run -- pytest --numprocesses 2 $(wildcard $(TESTED:=/test/unit)) $(ARGS)
+
+node: setup
+	./run -- pytest --numprocesses 2 $(wildcard $(TESTED:=/test/node)) $(ARGS)
 
 setup:
 	@$(PYTHON) setup_workspace.py
 
 bench-%:
 	@$(PYTHON) setup_workspace.py --bench
-	./run -- python swarm_loc_estimator/bench/$*.py $(ARGS)
+	@./run -- python swarm_loc_estimator/bench/$*.py $(ARGS)
 
 clean:
-	rm -rf .venv .workspace out
-	rm -rf .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv .workspace out .mypy_cache .pytest_cache .ruff_cache .hypothesis

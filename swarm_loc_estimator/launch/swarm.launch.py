@@ -1,0 +1,53 @@
+"""Start the whole graph: ros2 launch swarm_loc_estimator swarm.launch.py swarm_file:=FILE [bag:=BAG]."""
+
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from swarm_loc_estimator.graph import GraphOptions, NodeSpec, graph_nodes
+
+
+def generate_launch_description() -> LaunchDescription:
+    """The graph's options as launch arguments, then its nodes."""
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("swarm_file", description="path of the swarm description"),
+            DeclareLaunchArgument("bag", default_value="", description="bag to play into the graph"),
+            DeclareLaunchArgument("rate", default_value="1.0", description="speed of the bag"),
+            DeclareLaunchArgument("use_sim_time", default_value="false", choices=["true", "false"]),
+            DeclareLaunchArgument("params_file", default_value="", description="ROS parameters of all nodes"),
+            OpaqueFunction(function=start_nodes),
+        ]
+    )
+
+
+def start_nodes(context: LaunchContext) -> list[Node]:
+    """The actions that start the graph's nodes."""
+
+    def argument(name: str) -> str:
+        return str(LaunchConfiguration(name).perform(context))
+
+    options = GraphOptions(
+        swarm_file=argument("swarm_file"),
+        bag=argument("bag") or None,
+        rate=float(argument("rate")),
+        use_sim_time=argument("use_sim_time") == "true",
+        parameter_file=argument("params_file") or None,
+    )
+    return [node_action(spec) for spec in graph_nodes(options)]
+
+
+def node_action(spec: NodeSpec) -> Node:
+    """The launch action of one node."""
+    files = [] if spec.parameter_file is None else [spec.parameter_file]
+    return Node(
+        package=spec.package,
+        executable=spec.executable,
+        name=spec.name,
+        namespace=spec.namespace,
+        parameters=[*files, dict(spec.parameters)],
+        remappings=list(spec.remappings),
+        output="screen",
+        on_exit=[Shutdown(reason=f"{spec.name} ended")] if spec.required else [],
+    )

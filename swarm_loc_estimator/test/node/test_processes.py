@@ -1,0 +1,106 @@
+"""A graph's processes live and die together.
+
+All processes share one output pipe, so its end says that none of them is left.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from swarm_loc_estimator import processes
+from swarm_loc_estimator.graph import NodeSpec
+
+PROGRAMS = {
+    "forever": "trap 'echo asked; exit 0' INT\necho up\nwhile :; do sleep 0.2 & wait; done\n",
+    "deaf": "trap '' INT\necho up > {fifo}\nexec sleep 60\n",
+    "failing": "read line < {fifo}\nexit 7\n",
+    "short": "exit 0\n",
+}
+
+RUN_GRAPH = """
+import sys
+from swarm_loc_estimator.graph import NodeSpec
+from swarm_loc_estimator.processes import run_graph
+nodes = [NodeSpec("fake", name, name, required=name != "short") for name in sys.argv[1:]]
+sys.exit(run_graph(nodes, lambda line: print(line, flush=True)))
+"""
+
+
+@pytest.fixture(autouse=True)
+def _fake_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package `fake` with executables that end well, badly, or never."""
+    marker = tmp_path / "share/ament_index/resource_index/packages/fake"
+    programs = tmp_path / "lib/fake"
+    for folder in (marker.parent, programs):
+        folder.mkdir(parents=True)
+    marker.touch()
+    os.mkfifo(tmp_path / "fifo")
+    for name, lines in PROGRAMS.items():
+        (programs / name).write_text("#!/bin/sh\n" + lines.format(fifo=tmp_path / "fifo"), encoding="utf-8")
+        (programs / name).chmod(0o755)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+
+
+def _start(*names: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", RUN_GRAPH, *names]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+
+def _read_until(graph: subprocess.Popen[str], line: str, count: int = 1) -> None:
+    assert graph.stdout is not None
+    while count:
+        text = graph.stdout.readline()
+        assert text, f"the graph ended before it said '{line}'"
+        count -= text.strip() == line
+
+
+def test_a_required_node_that_ends_takes_the_others_along(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processes, "GRACE_S", 0.2)
+    said: list[str] = []
+    nodes = [NodeSpec("fake", "deaf", "one"), NodeSpec("fake", "failing", "two")]
+
+    assert processes.run_graph(nodes, said.append) == 7
+    assert "two: ended with status 7" in said
+    assert said[-1] == "one: does not end, SIGTERM"
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_every_node_in_order(stop: signal.Signals) -> None:
+    graph = _start("forever", "short", "forever")
+    _read_until(graph, "up", 2)
+    graph.send_signal(stop)
+    rest, _ = graph.communicate(timeout=60)
+
+    assert rest.splitlines().count("asked") == 2
+    assert graph.returncode == 0
+
+
+def test_a_killed_graph_leaves_no_orphan() -> None:
+    graph = _start("forever", "forever")
+    _read_until(graph, "up", 2)
+    graph.kill()
+    graph.communicate(timeout=60)
+
+    assert graph.returncode == -signal.SIGKILL
+
+
+@pytest.mark.parametrize(
+    ("package", "executable", "message"),
+    [
+        ("fake", "nothing", r"There is no executable 'nothing' in package 'fake'\."),
+        ("nothing", "forever", r"There is no package 'nothing' in this environment\."),
+    ],
+)
+def test_what_is_missing_is_said_before_anything_starts(package: str, executable: str, message: str) -> None:
+    said: list[str] = []
+    nodes = [NodeSpec("fake", "forever", "one"), NodeSpec(package, executable, "two")]
+
+    with pytest.raises(processes.GraphError, match=message):
+        processes.run_graph(nodes, said.append)
+    assert not said

@@ -1,0 +1,56 @@
+"""Which nodes a graph has, and how a node is told who it is."""
+
+from __future__ import annotations
+
+from swarm_loc_estimator.cli import graph as command
+from swarm_loc_estimator.graph import GraphOptions, NodeSpec, graph_nodes
+
+
+def test_a_live_graph_is_the_estimator_on_the_wall_clock() -> None:
+    (estimator,) = graph_nodes(GraphOptions("swarm.yaml"))
+
+    assert (estimator.package, estimator.executable) == ("swarm_loc_estimator", "estimator_node")
+    assert estimator.parameters == {"swarm_file": "swarm.yaml", "use_sim_time": False}
+
+
+def test_a_bag_brings_its_player_and_its_clock() -> None:
+    estimator, player = graph_nodes(GraphOptions("swarm.yaml", bag="bags/eight", rate=4.0))
+
+    assert estimator.parameters["use_sim_time"] is True
+    assert player.executable == "play"
+    assert player.parameters == {"bag": "bags/eight", "rate": 4.0}
+
+
+def test_arguments_keep_types_spaces_and_order() -> None:
+    node = NodeSpec(
+        "package",
+        "executable",
+        "node",
+        namespace="epuck1",
+        parameters={"file": "a b: c.yaml", "on": True, "count": 5, "gain": 5.0, "code": "012"},
+        parameter_file="all.yaml",
+        remappings=(("odom", "wheel_odom"),),
+    )
+
+    assert node.ros_arguments() == [
+        *("--ros-args", "-r", "__node:=node", "-r", "__ns:=/epuck1", "--params-file", "all.yaml"),
+        *(
+            "-p",
+            'file:="a b: c.yaml"',
+            "-p",
+            "on:=true",
+            "-p",
+            "count:=5",
+            "-p",
+            "gain:=5.0",
+            "-p",
+            'code:="012"',
+        ),
+        *("-r", "odom:=wheel_odom"),
+    ]
+
+
+def test_the_command_line_becomes_options() -> None:
+    line = ["swarm.yaml", "--bag", "bags/eight", "--rate", "2", "--params-file", "all.yaml"]
+
+    assert command.parse(line) == GraphOptions("swarm.yaml", "bags/eight", 2.0, parameter_file="all.yaml")
