@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from workspace import build, install
+from workspace import build, host, install
 from workspace.layout import WorkspaceError
 from workspace.stamps import only_one
 
@@ -23,6 +23,7 @@ def ensure(*, bench: bool = False) -> None:
     Raises:
         WorkspaceError: Something is missing, or a step failed.
     """
+    host.check_python_age()
     with only_one():
         install.ensure(bench=bench)
         build.ensure()

@@ -42,11 +42,18 @@ def ros_prefix() -> Path | None:
     return None
 
 
-def check_python() -> None:
+def check_python_age() -> None:
+    """Raise WorkspaceError where this Python is too old for the workspace."""
+    if sys.version_info < LOWEST_PYTHON:
+        raise WorkspaceError(
+            f"Python {sys.version_info.major}.{sys.version_info.minor} is too old: "
+            "3.10 or newer is needed, PYTHON=... tells make which."
+        )
+
+
+def check_python_parts() -> None:
     """Raise WorkspaceError where this Python cannot make the virtual environment."""
     version = f"{sys.version_info.major}.{sys.version_info.minor}"
-    if sys.version_info < LOWEST_PYTHON:
-        raise WorkspaceError(f"Python {version} is too old: 3.10 or newer is needed, PYTHON=... names one.")
     if ros_prefix() is None and sys.version_info[:2] > HIGHEST_WHEEL_PYTHON:
         raise WorkspaceError(
             f"There are no ROS 2 wheels for Python {version}: run make with PYTHON= a Python 3.10 to 3.13."

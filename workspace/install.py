@@ -8,7 +8,6 @@ import re
 import shutil
 import subprocess
 import sys
-import sysconfig
 from collections.abc import Callable
 from pathlib import Path
 
@@ -75,7 +74,7 @@ def identity() -> str:
 
 def _create(*, system_packages: bool) -> None:
     """Make an empty virtual environment in place of whatever is there."""
-    host.check_python()
+    host.check_python_parts()
     host.check_build_tools()
     if VENV.exists():
         say("  removing the old or unfinished .venv")
@@ -155,10 +154,9 @@ def _last_line(output: str, start: str = "") -> str:
 
 def _patch_cmake_exports() -> None:
     """Let the wheels' CMake files name this Python where they name that of the machine they were built on."""
-    own = {
-        "include": sysconfig.get_path("include"),
-        "lib": str(next(VENV.glob("lib/python3*/site-packages"))),
-    }
+    probe = "import sysconfig; print(sysconfig.get_path('include')); print(sysconfig.get_path('purelib'))"
+    found = subprocess.run([VENV_PYTHON, "-c", probe], capture_output=True, text=True, check=True).stdout
+    own = dict(zip(("include", "lib"), found.splitlines(), strict=True))
     for path in VENV.glob("share/**/*.cmake"):
         text = path.read_text(encoding="utf-8")
         patched = FOREIGN_PATHS.sub(lambda match: own[match["rest"].split("/")[0]], text)

@@ -64,19 +64,17 @@ def run_logged(
     LOGS.mkdir(parents=True, exist_ok=True)
     line = StatusLine()
     output: list[str] = []
-    with (
-        (LOGS / log_name).open("w", encoding="utf-8") as log,
-        subprocess.Popen(
-            [str(part) for part in command],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            stdin=subprocess.DEVNULL,
-            text=True,
-            errors="replace",
-            env=env,
-            cwd=cwd,
-        ) as process,
-    ):
+    process = subprocess.Popen(
+        [str(part) for part in command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        stdin=subprocess.DEVNULL,
+        text=True,
+        errors="replace",
+        env=env,
+        cwd=cwd,
+    )
+    with process, (LOGS / log_name).open("w", encoding="utf-8") as log:
         for text in process.stdout or ():
             log.write(text)
             output.append(text)

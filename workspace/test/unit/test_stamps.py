@@ -27,7 +27,7 @@ def test_a_write_that_breaks_off_leaves_the_old_text(tmp_path: Path, monkeypatch
     def cut(_: int) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr(stamps.os, "fsync", cut)
+    monkeypatch.setattr("os.fsync", cut)
     with pytest.raises(OSError, match="disk full"):
         stamps.write_whole(path, "new")
 
