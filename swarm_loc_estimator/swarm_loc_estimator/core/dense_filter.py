@@ -170,11 +170,20 @@ def solve3(factor: FloatArray, right: FloatArray, out: FloatArray) -> None:
 
 def _inverse(matrix: FloatArray) -> FloatArray:
     """Inverse of a symmetric positive definite matrix, symmetric to the last bit."""
+    # in Fortran order the upper triangle is faster, and the transpose of a symmetric matrix costs no copy
     factor, info = lapack.dpotrf(matrix.T, lower=0, clean=0)
     if not info:
-        inverse, info = lapack.dpotri(factor, lower=0)
+        inverse, info = lapack.dpotri(factor, lower=0, overwrite_c=1)
     if info:
         raise np.linalg.LinAlgError("the covariance is not positive definite")
-    upper = np.triu(inverse)
-    symmetric: FloatArray = upper + np.triu(upper, 1).T
+    symmetric: FloatArray = inverse.T
+    _mirror(symmetric)
     return symmetric
+
+
+@compiled
+def _mirror(matrix: FloatArray) -> None:
+    """Copy the lower triangle to the upper one."""
+    for i in range(matrix.shape[0]):
+        for j in range(i):
+            matrix[j, i] = matrix[i, j]

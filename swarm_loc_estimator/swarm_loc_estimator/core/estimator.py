@@ -58,7 +58,7 @@ class SwarmEstimator:
     """Joint, buffered estimation of all poses of a swarm.
 
     Data may come in any order and late; each counts at its own stamp when it is no older than the
-    horizon. All that arrives is used at the next `tick`. Every datum that is not used has a reason in `drops`.
+    horizon. All that arrives is used at the next `tick`. Every datum not used has a reason in `drops`.
 
     Args:
         swarm: Robots and landmarks.
@@ -109,7 +109,7 @@ class SwarmEstimator:
             self._detections.append((robot, stamp_ns, detections))
 
     def add_fix(self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike, now_ns: int) -> None:
-        """Take in an absolute fix: pose (3,) in `map`, its heading NaN when not measured, and covariance (3, 3)."""
+        """Take in an absolute fix: pose (3,) in `map`, heading NaN if not measured, and covariance (3, 3)."""
         fix = self._about(robot, stamp_ns, pose, covariance, Kind.CARTESIAN)
         if np.isnan(fix["value"][0, 2]):
             fix["has_heading"], fix["value"][0, 2] = 0, 0.0
@@ -190,9 +190,11 @@ class SwarmEstimator:
         counts = [detections.size for _, _, detections in self._detections]
         robots = np.repeat([robot for robot, _, _ in self._detections], counts)
         stamps = np.repeat([stamp for _, stamp, _ in self._detections], counts)
-        conversion = self._converter.convert(
-            robots, stamps, np.concatenate([d for _, _, d in self._detections])
-        )
+        joined = b"".join(
+            d.tobytes() for _, _, d in self._detections
+        )  # concatenating structured arrays is slow
+        detections = np.frombuffer(joined, dtype=self._detections[0][2].dtype)
+        conversion = self._converter.convert(robots, stamps, detections)
         self._detections = []
         self._ingest_drops.update(conversion.dropped)
         self._add_measurements(conversion.measurements)

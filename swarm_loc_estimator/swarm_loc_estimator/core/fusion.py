@@ -157,11 +157,8 @@ class Fusion:
             state.correct(
                 state.filter.update(columns[passed], jacobian[passed], difference[passed], noise[passed])
             )
-        belief = state.arrays()
-        for k in range(m):
-            lost = judgement.count(fields, k, belief, passed[k], self._limits[2])
-            if lost >= 0:
-                state.lose(lost)
+        for robot in np.flatnonzero(judgement.count_all(fields, state.arrays(), passed, self._limits[2])):
+            state.lose(int(robot))
         return np.where(passed, Verdict.USED, Verdict.GATED).astype(np.uint8), nis
 
     def _note(self, state: SwarmState, one: MeasurementArray) -> Verdict:

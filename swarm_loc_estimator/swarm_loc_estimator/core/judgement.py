@@ -196,6 +196,19 @@ def correct(belief: BeliefArrays, correction: FloatArray) -> None:
 
 
 @compiled
+def count_all(
+    measurements: MeasurementColumns, belief: BeliefArrays, passed: NDArray[np.bool_], most_gated: int
+) -> NDArray[np.bool_]:
+    """Count all measurements (m,); return whether each robot (N,) has locked out too many in a row."""
+    lost = np.zeros(belief.tracked.size, dtype=np.bool_)
+    for k in range(passed.size):
+        robot = count(measurements, k, belief, passed[k], most_gated)
+        if robot >= 0:
+            lost[robot] = True
+    return lost
+
+
+@compiled
 def count(
     measurements: MeasurementColumns, k: int, belief: BeliefArrays, passed: bool, most_gated: int
 ) -> int:
