@@ -1,18 +1,33 @@
 """Compilation of the inner loops, and the plane's geometry on single numbers for use inside them.
 
 The estimator's hot paths touch a handful of numbers a hundred thousand times, where calls of array
-functions cost ten to fifty times the arithmetic. Compiled code is cached beside the source.
+functions cost ten to fifty times the arithmetic. Compiled code is cached in the user's cache folder.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar
 
 import numba
 
 Function = TypeVar("Function", bound=Callable[..., object])
+
+
+def _cache_folder() -> Path:
+    """A folder of its own for every state of the sources: numba alone would miss a change in another file."""
+    sources = sorted(Path(__file__).parent.glob("*.py"))
+    digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
+    root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(root) / "swarm_loc_estimator" / digest
+
+
+if "NUMBA_CACHE_DIR" not in os.environ:
+    numba.config.CACHE_DIR = str(_cache_folder())
 
 
 def compiled(function: Function) -> Function:
