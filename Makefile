@@ -37,7 +37,7 @@ setup:
 
 bench-%:
 	@$(PYTHON) setup_workspace.py --bench
-	@./run -- python swarm_loc_estimator/bench/$*.py $(ARGS)
+	@PYTHONPATH=swarm_loc_estimator ./run -- python -m bench.$* $(ARGS)
 
 clean:
 	rm -rf .venv .workspace out .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
 from swarm_loc_estimator.core import se2
 
 from .record import FRAME_DTYPE, Records, in_order_of_arrival

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
 from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.swarm import (
     CameraMount,

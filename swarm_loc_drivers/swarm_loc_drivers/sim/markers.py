@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
 from swarm_loc_estimator.core import se2
 
 from .camera import Pictures, View, deliver, hidden

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+
 from swarm_loc_estimator.core import se2
 
 if TYPE_CHECKING:

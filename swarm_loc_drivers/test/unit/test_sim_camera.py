@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+
 from swarm_loc_drivers.sim.camera import View, deliver, exposures, hidden
 from swarm_loc_drivers.sim.eight import VIEW, EightSettings, describe, simulate_eight, wall_markers
 from swarm_loc_drivers.sim.grid import SENSOR, GridSettings, border, cells, simulate_grid

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+
 from swarm_loc_drivers.sim.differential_drive import (
     Controller,
     Drive,

@@ -1,0 +1,198 @@
+"""How far one core carries: simulated swarms of growing size, beside filterpy and gtsam on the same data.
+
+The swarm is a grid with about three neighbours in view of each robot (`swarm_loc_drivers.sim.grid`):
+odometry at 20 Hz, cameras at 7.5 Hz, 150-300 ms late. Everybody gives all poses ten times a second. Measured
+is CPU time of this process per simulated second, without reading messages; the optimum is gtsam's batch
+solution of all data that have arrived by the same moment.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench._common import new_plot, save_plot, table, write_figures
+from bench.peers import filterpy_ekf, gtsam_batch, gtsam_lag
+from swarm_loc_drivers.sim.detections import as_detections
+from swarm_loc_drivers.sim.grid import GridSettings, simulate_grid
+from swarm_loc_estimator.core import se2
+from swarm_loc_estimator.core.estimator import SwarmEstimator
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from swarm_loc_drivers.sim.record import SimulatedRun
+    from swarm_loc_estimator.core.se2 import FloatArray
+
+SIZES = (5, 20, 50, 100, 200, 300)
+LARGEST_FOR_BATCH = 50
+DURATION_S = 20.0
+PEER_ROBOT_SECONDS = 1500.0
+"""Peers get the first part of a large swarm's run: their cost per second does not change with its length."""
+SETTLING_S = 3.0
+"""Errors count from here on."""
+TICK_NS = 100_000_000
+
+
+@dataclass(frozen=True)
+class CoreResult:
+    """What the estimator made of a run.
+
+    Attributes:
+        cpu_s: [s].
+        poses: (K, N, 3) at every tick.
+        covariances: (K, N, 3, 3).
+    """
+
+    cpu_s: float
+    poses: FloatArray
+    covariances: FloatArray
+
+
+def run_core(run: SimulatedRun, tick_ns: NDArray[np.int64]) -> CoreResult:
+    """Feed a run in order of arrival to the estimator, and tick it."""
+    estimator = SwarmEstimator(run.swarm)
+    detections = as_detections(run)
+    odometry = [(int(r), int(s), tuple(p), int(a)) for r, s, a, p in run.odometry.tolist()]
+    frames = [(r, s, detections[f : f + c], a) for r, s, a, f, c in run.frames.tolist()]
+    next_odometry = next_frame = 0
+    estimates = []
+    begun = time.process_time()
+    for now_ns in tick_ns.tolist():
+        while next_odometry < len(odometry) and odometry[next_odometry][3] <= now_ns:
+            estimator.add_odometry(*odometry[next_odometry])
+            next_odometry += 1
+        while next_frame < len(frames) and frames[next_frame][3] <= now_ns:
+            estimator.add_detections(*frames[next_frame])
+            next_frame += 1
+        estimates.append(estimator.tick(now_ns))
+    cpu_s = time.process_time() - begun
+    return CoreResult(
+        cpu_s, np.array([one.poses for one in estimates]), np.array([one.covariances for one in estimates])
+    )
+
+
+def measure(robots: int, duration_s: float, seed: int) -> dict[str, float]:
+    """All figures of one size."""
+    run = simulate_grid(GridSettings(robots=robots, seed=seed, duration_s=duration_s))
+    tick_ns = ticks(run)
+    core = run_core(run, tick_ns)
+    settled = tick_ns >= run.start_ns + SETTLING_S * 1e9
+    errors = errors_of(core.poses, run, tick_ns)[settled]
+    figures = {
+        "cpu_s_per_s": core.cpu_s / run.duration_s,
+        "position_rmse_mm": 1e3 * position_rmse(errors),
+        "heading_rmse_deg": float(np.degrees(np.sqrt(np.mean(errors[..., 2] ** 2)))),
+        "nees": nees(errors, core.covariances[settled]),
+    }
+    part = first_part(run, min(duration_s, max(2.0, PEER_ROBOT_SECONDS / robots)))
+    for name, peer in (("filterpy", filterpy_ekf), ("gtsam", gtsam_lag)):
+        figures[f"{name}_cpu_s_per_s"] = peer.solve(part, ticks(part)).cpu_s / part.duration_s
+    if robots <= LARGEST_FOR_BATCH:
+        chosen = np.flatnonzero(settled)[:: max(1, int(settled.sum()) * robots // 240)]
+        best = gtsam_batch.solve(run, tick_ns[chosen])
+        optimum = position_rmse(errors_of(best.poses, run, tick_ns[chosen]))
+        reached = position_rmse(errors_of(core.poses[chosen], run, tick_ns[chosen]))
+        figures["position_rmse_ratio_to_batch"] = reached / optimum
+    return figures
+
+
+def ticks(run: SimulatedRun) -> NDArray[np.int64]:
+    """When all poses are asked for (K,)."""
+    return np.arange(run.start_ns + TICK_NS, run.end_ns + 1, TICK_NS)
+
+
+def first_part(run: SimulatedRun, duration_s: float) -> SimulatedRun:
+    """The run as if it had ended after `duration_s`."""
+    end_ns = run.start_ns + round(duration_s * 1e9)
+    kept = run.truth.stamp_ns <= end_ns
+    truth = replace(run.truth, stamp_ns=run.truth.stamp_ns[kept], poses=run.truth.poses[kept])
+    odometry = run.odometry[run.odometry["arrival_ns"] <= end_ns]
+    frames = run.frames[run.frames["arrival_ns"] <= end_ns]
+    return replace(
+        run, truth=truth, odometry=odometry, frames=frames, sightings=run.sightings[: frames["count"].sum()]
+    )
+
+
+def errors_of(poses: FloatArray, run: SimulatedRun, stamp_ns: NDArray[np.int64]) -> FloatArray:
+    """Errors x, y, theta (K, N, 3) of poses at stamps (K,)."""
+    errors: FloatArray = poses - run.truth.all_at(stamp_ns)
+    errors[..., 2] = se2.wrap_angle(errors[..., 2])
+    return errors
+
+
+def position_rmse(errors: FloatArray) -> float:
+    """Root mean square of the distance [m]."""
+    return float(np.sqrt(np.mean(np.sum(errors[..., :2] ** 2, axis=-1))))
+
+
+def nees(errors: FloatArray, covariances: FloatArray) -> float:
+    """Mean normalised error squared; 3 is ideal."""
+    solved = np.linalg.solve(covariances, errors[..., None])[..., 0]
+    return float(np.mean(np.sum(errors * solved, axis=-1)))
+
+
+def draw(results: dict[int, dict[str, float]]) -> None:
+    """CPU time and consistency against swarm size."""
+    figure, (speed, quality) = new_plot(2)
+    sizes = list(results)
+    names = (("", "this estimator"), ("filterpy_", "filterpy EKF"), ("gtsam_", "gtsam fixed-lag smoother"))
+    for prefix, label in names:
+        speed.plot(sizes, [results[n][f"{prefix}cpu_s_per_s"] for n in sizes], "o-", label=label)
+    speed.axhline(1.0, color="0.5", linestyle=":", label="real time")
+    speed.set(xscale="log", yscale="log", xlabel="robots", ylabel="CPU seconds per second")
+    speed.legend()
+    quality.plot(sizes, [results[n]["nees"] / 3.0 for n in sizes], "o-", label="NEES / 3")
+    with_batch = [n for n in sizes if "position_rmse_ratio_to_batch" in results[n]]
+    ratios = [results[n]["position_rmse_ratio_to_batch"] for n in with_batch]
+    quality.plot(with_batch, ratios, "s-", label="position RMSE / batch optimum")
+    quality.axhline(1.0, color="0.5", linestyle=":")
+    quality.set(xscale="log", xlabel="robots", ylim=(0.8, 1.2))
+    quality.legend()
+    print(f"plot: {save_plot(figure, 'scaling')}")
+
+
+def report(results: dict[int, dict[str, float]]) -> None:
+    """Print the table, draw the plot and write the figures."""
+    keys = {
+        "cpu_s_per_s": "CPU s/s",
+        "filterpy_cpu_s_per_s": "filterpy s/s",
+        "gtsam_cpu_s_per_s": "gtsam s/s",
+        "position_rmse_mm": "RMSE mm",
+        "heading_rmse_deg": "RMSE deg",
+        "position_rmse_ratio_to_batch": "RMSE / batch",
+        "nees": "NEES",
+    }
+    rows = [[robots, *(figures.get(key) for key in keys)] for robots, figures in results.items()]
+    print(table(["robots", *keys.values()], rows))
+    draw(results)
+    flat = {
+        f"n{robots}.{key}": value for robots, figures in results.items() for key, value in figures.items()
+    }
+    print(f"figures: {write_figures('scaling', flat)}")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--robots", type=int, nargs="+", default=SIZES, help="swarm sizes")
+    parser.add_argument("--duration", type=float, default=DURATION_S, help="simulated time [s]")
+    parser.add_argument("--seed", type=int, default=1, help="of the simulation")
+    options = parser.parse_args(arguments)
+    warm_up = simulate_grid(GridSettings(robots=4, duration_s=2.0))
+    run_core(warm_up, ticks(warm_up))  # compiles what is not compiled yet
+    results = {}
+    for robots in options.robots:
+        print(f"{robots} robots ...", flush=True)
+        results[robots] = measure(robots, options.duration, options.seed)
+    report(results)
+
+
+if __name__ == "__main__":
+    main()
