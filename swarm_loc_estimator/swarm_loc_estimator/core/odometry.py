@@ -29,7 +29,6 @@ UNCHANGED_NS = np.iinfo(np.int64).max
 
 _BEFORE_ALL_NS = np.iinfo(np.int64).min
 _FIRST_CAPACITY = 256
-_RUN_ON_S = 0.2
 _ROWS = ("stamp_ns", "raw", "pose", "noise")
 
 
@@ -226,9 +225,9 @@ def look_up(
 ) -> float:
     """Write the robot's pose O (3,), raw pose (3,) and noise G (3, 3) at an instant; return its silence [s].
 
-    Within a step the motion is an arc of constant twist. Past the newest row the last twist goes on for a
-    moment, then the robot stands; after its `timeout_s` its motion counts as unknown. Before the first row
-    it stands.
+    Within a step the motion is an arc of constant twist. Past the newest row the last twist goes on, less and
+    less sure; after `timeout_s` the motion since that row counts as unknown. Before the first row the robot
+    stands.
     """
     count = tracks.count[robot]
     if count == 0:
@@ -245,15 +244,15 @@ def look_up(
         fraction = max(0.0, (stamp_ns - tracks.stamp_ns[robot, row]) / duration)
         if silence > timeout:
             fraction = 1.0
-        elif fraction > 1.0:
-            fraction = 1.0 + min(silence, _RUN_ON_S) * 1e9 / duration
     _interpolate(tracks.pose[robot, row], tracks.pose[robot, after], fraction, pose)
     _interpolate(tracks.raw[robot, row], tracks.raw[robot, after], fraction, raw)
     for i in range(3):
         for j in range(3):
             start = tracks.noise[robot, row, i, j]
             noise[i, j] = start + fraction * (tracks.noise[robot, after, i, j] - start)
-    if silence > timeout:
+    if 0.0 < silence <= timeout:
+        _add_run_on(tracks.model[robot], silence, pose[0], pose[1], pose[2], noise)
+    elif silence > timeout:
         _add_unknown_motion(tracks.model[robot], silence, pose[0], pose[1], pose[2], noise)
     return silence
 
@@ -371,6 +370,14 @@ def _add_step_noise(
         heading += model.turn_drift * duration_s
     cross = 0.5 * wheel * (right - left) / separation
     _add_in_track_frame(x, y, theta, along, 0.0, heading, cross, noise)
+
+
+@compiled
+def _add_run_on(model: np.void, silence: float, x: float, y: float, theta: float, noise: FloatArray) -> None:
+    """Add the noise of a speed and a turn rate that walk at random while no message tells them."""
+    grown = silence**3 / 3.0
+    along, heading = model.speed_change**2 * grown, model.turn_rate_change**2 * grown
+    _add_in_track_frame(x, y, theta, along, 0.0, heading, 0.0, noise)
 
 
 @compiled

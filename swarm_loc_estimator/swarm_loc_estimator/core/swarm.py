@@ -97,6 +97,12 @@ class OdometryModel:
     timeout_s: float = number(1.0, "s", 0.01, 3600.0, "after this much silence the motion counts as unknown")
     max_speed: float = number(1.0, "m/s", 0.001, 100.0, "no step is believed that would need more")
     max_turn_rate: float = number(10.0, "rad/s", 0.01, 1000.0, "bounds the turn while the motion is unknown")
+    speed_change: float = number(
+        0.1, "m/s/s^0.5", 0.0, 100.0, "random walk of the speed past the newest message"
+    )
+    turn_rate_change: float = number(
+        2.0, "rad/s/s^0.5", 0.0, 1000.0, "random walk of the turn rate past the newest message"
+    )
 
 
 @dataclass(frozen=True)
