@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -52,9 +53,8 @@ def _units() -> list[str]:
     groups = {**_MODELS, "faces": Face, "landmarks": Landmark}
     lines = ["Units:"]
     for name, cls in groups.items():
-        lines.append(
-            f"  {name}: " + ", ".join(f"{key} [{spec.unit}]" for key, spec in number_specs(cls).items())
-        )
+        units = ", ".join(f"{key} [{spec.unit}]" for key, spec in number_specs(cls).items())
+        lines += textwrap.wrap(f"{name}: {units}", 100, initial_indent="  ", subsequent_indent="      ")
     return lines
 
 

@@ -1,0 +1,73 @@
+"""Turn a folder of the MRCLAM dataset into a bag with its swarm.yaml.
+
+    import_mrclam MRCLAM_Dataset1 bags/mrclam1
+    import_mrclam MRCLAM_Dataset1 bags/mrclam1_late --delay-ms 150 300 7
+
+The bag holds <robot>/odom, <robot>/detections and <robot>/ground_truth; `swarm.yaml` lies inside its folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from swarm_loc_estimator.cli.progress import ProgressLine
+from swarm_loc_estimator.io.bag_file import BagError
+from swarm_loc_estimator.io.mrclam import MrclamError, read_dataset
+from swarm_loc_estimator.io.mrclam_bag import Delay, convert
+from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    low_ms, high_ms, seed = options.delay_ms
+    if not 0 <= low_ms <= high_ms or seed < 0:
+        parser.error(f"--delay-ms {low_ms} {high_ms} {seed}: 0 <= LO <= HI and 0 <= SEED are needed")
+    began = time.monotonic()
+    progress = ProgressLine()
+    try:
+        progress(0.0, "reading")
+        dataset = read_dataset(options.folder)
+        done = convert(dataset, options.bag, Delay(low_ms * 1_000_000, high_ms * 1_000_000, seed), progress)
+    except (MrclamError, BagError, DefinitionsNotFoundError) as error:
+        progress.close()
+        print(error, file=sys.stderr)
+        return 1
+    progress.close()
+    for remark in done.remarks:
+        print(remark)
+    names = ", ".join(f"robot{robot.subject}" for robot in dataset.robots)
+    print(
+        f"{done.message_count} messages of {names} written to {options.bag} in {time.monotonic() - began:.1f} s"
+    )
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="import_mrclam", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", type=Path, help="folder with Robot*_Odometry.dat and the other files")
+    parser.add_argument("bag", type=Path, help="bag folder to create")
+    parser.add_argument(
+        "--delay-ms",
+        nargs=3,
+        type=int,
+        default=(0, 0, 0),
+        metavar=("LO", "HI", "SEED"),
+        help="detections arrive evenly between LO and HI milliseconds late (default: at once)",
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())
