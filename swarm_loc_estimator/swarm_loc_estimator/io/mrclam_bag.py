@@ -118,8 +118,10 @@ def _start_remarks(whole: RobotLog, used: RobotLog) -> list[str]:
     cut_ns = int(used.odometry.stamp_ns[0] - whole.odometry.stamp_ns[0])
     if cut_ns:
         return [
-            (f"robot {used.subject} joins {cut_ns * 1e-9:.1f} s after its first odometry,"
-            " where its ground truth begins.")
+            (
+                f"robot {used.subject} joins {cut_ns * 1e-9:.1f} s after its first odometry,"
+                " where its ground truth begins."
+            )
         ]
     if used.truth is not None and _start(used) is None:
         return [f"robot {used.subject} starts unknown: its ground truth does not tell where it starts."]
@@ -245,7 +247,7 @@ def _truth(subject: int, truth: Track, begin_ns: int, end_ns: int) -> _Stream:
     return _Stream(f"robot{subject}/ground_truth", POSE_STAMPED, stamp_ns, data)
 
 
-def _write(folder: Path, streams: list[_Stream], progress: Callable[[float, str], None]) -> Conversion:
+def _write(folder: Path, streams: list[_Stream], progress: Callable[[float, str], None]) -> int:
     """Write all messages in order of arrival, equal times in the order of the streams."""
     log_ns = np.concatenate([stream.log_ns for stream in streams])
     source = np.repeat(np.arange(len(streams)), [len(stream.data) for stream in streams])
