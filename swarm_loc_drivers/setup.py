@@ -27,6 +27,8 @@ setup(
     description="Drivers and simulated hardware of the robots of a swarm.",
     license="Apache-2.0",
     entry_points={
-        "console_scripts": [],
+        "console_scripts": [
+            "generate_bag = swarm_loc_drivers.cli.generate_bag:main",
+        ],
     },
 )

@@ -8,6 +8,7 @@ cameras at 7.5 Hz.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,7 +70,7 @@ class EightSettings:
     """
 
     seed: int = 1
-    duration_s: float = 45.0
+    duration_s: float = 54.0
     robots: int = 5
     speed: float = 0.06
     world: World = W0
@@ -110,7 +111,7 @@ def describe(settings: EightSettings, start: FloatArray) -> Swarm:
             camera=CAMERA,
             sensor=settings.world.described,
             faces=faces(10 * (index + 1)),
-            start=(float(pose[0]), float(pose[1]), float(pose[2])) if settings.start_known else None,
+            start=rounded(pose) if settings.start_known else None,
             start_sigma=StartSigma(),
         )
         for index, pose in enumerate(start)
@@ -120,18 +121,18 @@ def describe(settings: EightSettings, start: FloatArray) -> Swarm:
 
 def faces(first_id: int) -> tuple[Face, ...]:
     """Five markers around a robot; the camera looks out to the front between two of them."""
-    directions = [math.radians(angle) for angle in (36.0, 108.0, -180.0, -108.0, -36.0)]
+    directions = [math.radians(angle) for angle in (36.0, 108.0, 180.0, -108.0, -36.0)]
+    places = [(FACE_DISTANCE * math.cos(yaw), FACE_DISTANCE * math.sin(yaw), yaw) for yaw in directions]
     return tuple(
-        Face(
-            name,
-            first_id + k,
-            FACE_DISTANCE * math.cos(yaw),
-            FACE_DISTANCE * math.sin(yaw),
-            MARKER_HEIGHT,
-            yaw,
-        )
-        for k, (name, yaw) in enumerate(zip(FACE_NAMES, directions, strict=True))
+        Face(name, first_id + k, x, y, MARKER_HEIGHT, yaw)
+        for k, (name, (x, y, yaw)) in enumerate(zip(FACE_NAMES, map(rounded, places), strict=True))
     )
+
+
+def rounded(pose: Sequence[float] | FloatArray) -> tuple[float, float, float]:
+    """A pose x, y, theta as people write it down, to the micrometre."""
+    x, y, theta = (round(float(value), 6) for value in pose)
+    return x, y, theta
 
 
 def wall_markers() -> tuple[Landmark, ...]:
@@ -139,13 +140,13 @@ def wall_markers() -> tuple[Landmark, ...]:
     half_x, half_y = 0.5 * ARENA[0], 0.5 * ARENA[1]
     along_x = np.arange(-half_x + 0.5 * WALL_MARKER_PITCH, half_x, WALL_MARKER_PITCH)
     along_y = np.arange(-half_y + 0.5 * WALL_MARKER_PITCH, half_y, WALL_MARKER_PITCH)
-    places = [(x, -half_y, 0.5 * math.pi) for x in along_x] + [(half_x, y, -math.pi) for y in along_y]
+    places = [(x, -half_y, 0.5 * math.pi) for x in along_x] + [(half_x, y, math.pi) for y in along_y]
     places += [(x, half_y, -0.5 * math.pi) for x in along_x[::-1]] + [
         (-half_x, y, 0.0) for y in along_y[::-1]
     ]
     return tuple(
-        Landmark(_FIRST_LANDMARK_ID + k, round(float(x), 6), round(float(y), 6), MARKER_HEIGHT, yaw)
-        for k, (x, y, yaw) in enumerate(places)
+        Landmark(_FIRST_LANDMARK_ID + k, x, y, MARKER_HEIGHT, yaw)
+        for k, (x, y, yaw) in enumerate(map(rounded, places))
     )
 
 

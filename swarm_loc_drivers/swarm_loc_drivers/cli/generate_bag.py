@@ -1,0 +1,105 @@
+"""Simulate a swarm and write what its sensors say as a bag with its swarm.yaml.
+
+    generate_bag eight bags/eight_five_robots --seed 1 --duration 54 --world w0
+    generate_bag grid /tmp/grid100 --robots 100 --duration 20
+
+The bag holds <robot>/odom, <robot>/detections and <robot>/ground_truth; `swarm.yaml` lies inside its folder.
+The same arguments give the same bytes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from swarm_loc_drivers.sim.bag import write_bag
+from swarm_loc_drivers.sim.eight import EightSettings, simulate_eight
+from swarm_loc_drivers.sim.grid import GridSettings, simulate_grid
+from swarm_loc_drivers.sim.worlds import WORLDS
+from swarm_loc_estimator.io.bag_file import BagError
+from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from swarm_loc_drivers.sim.record import SimulatedRun
+
+_SHORTEST_S = 2.0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.duration < _SHORTEST_S:
+        parser.error(f"--duration {options.duration:g} must be at least {_SHORTEST_S:g} s")
+    if options.robots < 1:
+        parser.error(f"--robots {options.robots} must be at least 1")
+    if options.seed < 0:
+        parser.error(f"--seed {options.seed} must be at least 0")
+    words = [f"{name}={value}" for name, value in vars(options).items() if name not in ("bag", "simulate")]
+    try:
+        count = write_bag(options.simulate(options), options.bag, f"Simulated: {', '.join(words)}.")
+    except (BagError, DefinitionsNotFoundError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    print(f"{count} messages of {options.robots} robots written to {options.bag}")
+    return 0
+
+
+def _eight(options: argparse.Namespace) -> SimulatedRun:
+    return simulate_eight(
+        EightSettings(
+            seed=options.seed,
+            duration_s=options.duration,
+            robots=options.robots,
+            speed=options.speed,
+            world=WORLDS[options.world],
+            start_known=not options.start_unknown,
+        )
+    )
+
+
+def _grid(options: argparse.Namespace) -> SimulatedRun:
+    return simulate_grid(GridSettings(seed=options.seed, duration_s=options.duration, robots=options.robots))
+
+
+def _parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="generate_bag", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    swarms = parser.add_subparsers(dest="swarm", required=True, metavar="SWARM")
+    eight = _swarm(swarms, "eight", "e-pucks driving the paper's eight among wall markers", 5, 54.0)
+    eight.set_defaults(simulate=_eight)
+    eight.add_argument(
+        "--world", choices=sorted(WORLDS), default="w0", help="imperfections; see sim/worlds.py"
+    )
+    eight.add_argument("--speed", type=float, default=0.06, help="[m/s]")
+    eight.add_argument("--start-unknown", action="store_true", help="swarm.yaml tells no start poses")
+    _swarm(swarms, "grid", "many robots, each about its cell of a grid", 100, 20.0).set_defaults(
+        simulate=_grid
+    )
+    return parser
+
+
+def _swarm(
+    swarms: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    text: str,
+    robots: int,
+    seconds: float,
+) -> argparse.ArgumentParser:
+    """A sub-command with what all simulated swarms have."""
+    parser = swarms.add_parser(name, help=text, description=text)
+    parser.add_argument("bag", type=Path, help="bag folder to create")
+    parser.add_argument("--seed", type=int, default=1, help="the same seed gives the same bag")
+    parser.add_argument("--duration", type=float, default=seconds, help="simulated time [s]")
+    parser.add_argument("--robots", type=int, default=robots, help="how many")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

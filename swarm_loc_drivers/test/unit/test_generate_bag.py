@@ -1,0 +1,87 @@
+"""A generated bag holds the simulated run, message by message, and is the same every time."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from swarm_loc_drivers.cli.generate_bag import main
+from swarm_loc_drivers.sim.eight import EightSettings, simulate_eight
+from swarm_loc_estimator.io.bags import BagReader
+from swarm_loc_estimator.io.cdr import decode_detections, decode_odometry, decode_pose_stamped
+from swarm_loc_estimator.io.swarm_file import load_swarm
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bags") / "an eight"
+    assert main(["eight", str(path), "--seed", "3", "--duration", "6"]) == 0
+    return path
+
+
+def test_the_description_is_that_of_the_run(bag: Path) -> None:
+    assert load_swarm(bag / "swarm.yaml") == simulate_eight(EightSettings(seed=3, duration_s=6.0)).swarm
+
+
+def test_messages_come_when_they_arrived_with_the_stamps_of_what_they_show(bag: Path) -> None:
+    run = simulate_eight(EightSettings(seed=3, duration_s=6.0))
+    with BagReader(bag) as reader:
+        assert {topic.name for topic in reader.topics} == {
+            f"epuck{robot}/{topic}"
+            for robot in range(1, 6)
+            for topic in ("odom", "detections", "ground_truth")
+        }
+        messages = list(reader.messages())
+    odometry = [
+        (log_ns, decode_odometry(data)) for topic, _, log_ns, data in messages if topic == "epuck2/odom"
+    ]
+    rows = run.odometry[run.odometry["robot"] == 1]
+    assert [log_ns for log_ns, _ in odometry] == rows["arrival_ns"].tolist()
+    assert [one.stamp_ns for _, one in odometry] == rows["stamp_ns"].tolist()
+    np.testing.assert_allclose([one.pose for _, one in odometry], rows["pose"], atol=1e-12)
+    assert odometry[0][1].frame_id == "epuck2/odom"
+    assert np.mean([one.twist[0] for _, one in odometry[1:]]) == pytest.approx(0.06, abs=0.003)
+    pictures = [
+        (log_ns, decode_detections(data))
+        for topic, _, log_ns, data in messages
+        if topic == "epuck2/detections"
+    ]
+    frames = run.frames[run.frames["robot"] == 1]
+    assert [log_ns for log_ns, _ in pictures] == frames["arrival_ns"].tolist()
+    assert [one.stamp_ns for _, one in pictures] == frames["stamp_ns"].tolist()
+    assert [len(one.detections) for _, one in pictures] == frames["count"].tolist()
+    shown = run.sightings[frames[0]["first"] : frames[0]["first"] + frames[0]["count"]]
+    assert pictures[0][1].detections["id"].tolist() == shown["marker_id"].tolist()
+    np.testing.assert_allclose(pictures[0][1].detections["position"][:, 2], shown["value"][:, 0])
+
+
+def test_ground_truth_is_that_of_the_simulation(bag: Path) -> None:
+    run = simulate_eight(EightSettings(seed=3, duration_s=6.0))
+    with BagReader(bag) as reader:
+        truth = [decode_pose_stamped(data) for _, _, _, data in reader.messages(["epuck5/ground_truth"])]
+    assert len(truth) == 61
+    assert {one.frame_id for one in truth} == {"map"}
+    stamps = np.array([one.stamp_ns for one in truth])
+    np.testing.assert_allclose([one.pose for one in truth], run.truth.at(4, stamps), atol=1e-12)
+
+
+def test_the_same_arguments_give_the_same_bytes(bag: Path, tmp_path: Path) -> None:
+    again = tmp_path / bag.name
+    assert main(["eight", str(again), "--seed", "3", "--duration", "6"]) == 0
+    names = sorted(path.name for path in bag.iterdir())
+    assert names == sorted(path.name for path in again.iterdir())
+    for name in names:
+        mine, other = ((folder / name).read_bytes() for folder in (bag, again))
+        assert mine.replace(str(bag).encode(), b"") == other.replace(str(again).encode(), b""), name
+
+
+def test_an_existing_bag_is_not_overwritten(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["eight", str(bag)]) == 1
+    assert str(bag) in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("wrong", [["--duration", "1"], ["--robots", "0"], ["--seed", "-1"]])
+def test_a_value_out_of_range_is_refused(wrong: list[str], tmp_path: Path) -> None:
+    with pytest.raises(SystemExit):
+        main(["grid", str(tmp_path / "bag"), *wrong])
+    assert not (tmp_path / "bag").exists()
