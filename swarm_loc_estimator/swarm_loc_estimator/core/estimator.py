@@ -69,7 +69,7 @@ class SwarmEstimator:
         self.swarm = swarm
         self.settings = settings or EstimatorSettings()
         self._robots = np.arange(len(swarm.robots))
-        self._tracks = OdometryTracks([robot.odometry for robot in swarm.robots])
+        self._tracks = OdometryTracks(swarm.robots)
         self._converter = SightingConverter(swarm)
         self._fusion = Fusion(swarm, self.settings, self._tracks)
         self._timeline = Timeline(self.settings, self._fusion.step, SwarmState(len(swarm.robots)))

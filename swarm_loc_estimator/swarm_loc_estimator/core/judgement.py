@@ -11,7 +11,7 @@ from swarm_loc_estimator.core.compiled import compiled, composed, moved_by_twist
 from swarm_loc_estimator.core.dense_filter import IndexArray, update_one
 from swarm_loc_estimator.core.gate import position_distance, soften_heading, squared_distance
 from swarm_loc_estimator.core.measurements import MeasurementColumns, innovation, predict_one
-from swarm_loc_estimator.core.odometry import TrackArrays, look_up
+from swarm_loc_estimator.core.motion import TrackArrays, look_up
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.state import BeliefArrays
 

@@ -11,52 +11,21 @@ So a prediction costs two look-ups however many odometry messages lie between.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.compiled import compiled, wrap
+from swarm_loc_estimator.core.motion import MODEL_DTYPE, IntArray, TrackArrays, integrate, look_up_all
 from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.swarm import OdometryModel
-
-IntArray = NDArray[np.int64]
+from swarm_loc_estimator.core.swarm import MotionResponse, Robot
 
 UNCHANGED_NS = np.iinfo(np.int64).max
 
+_IDEAL = MotionResponse(speeds=(0.0,), turn_rates=(0.0,), speed_share=((1.0,),), turn_share=((1.0,),))
 _BEFORE_ALL_NS = np.iinfo(np.int64).min
 _FIRST_CAPACITY = 256
-_ROWS = ("stamp_ns", "raw", "pose", "noise")
-
-
-class TrackArrays(NamedTuple):
-    """The rows of all tracks and the models behind them, as compiled code reads them.
-
-    Attributes:
-        count: (N,) rows in use per robot.
-        stamp_ns: (N, capacity) instants, calibrated for delay.
-        raw: (N, capacity, 3) poses as reported, headings unwrapped.
-        pose: (N, capacity, 3) calibrated poses O, headings unwrapped.
-        noise: (N, capacity, 3, 3) gathered noise G in the track's frame.
-        model: (N,) records of the numbers of `OdometryModel`.
-        begin_ns: (N,) instant of the very first row.
-        begin_pose: (N, 3) the pose there, where G is zero.
-    """
-
-    count: IntArray
-    stamp_ns: IntArray
-    raw: FloatArray
-    pose: FloatArray
-    noise: FloatArray
-    model: NDArray[np.void]
-    begin_ns: IntArray
-    begin_pose: FloatArray
-
-
-_MODEL_DTYPE = np.dtype([(f.name, np.float64) for f in fields(OdometryModel)])
+_ROWS = ("stamp_ns", "raw", "pose", "noise", "rate")
 
 
 @dataclass(frozen=True)
@@ -97,15 +66,15 @@ class OdometryTracks:
     """The recent odometry of all robots, in any order of arrival.
 
     Args:
-        models: One motion model per robot.
+        robots: Whose; of each its motion model and response are used.
     """
 
-    def __init__(self, models: Sequence[OdometryModel]) -> None:
+    def __init__(self, robots: Sequence[Robot]) -> None:
+        models = [robot.odometry for robot in robots]
         self._robots = len(models)
-        names = _MODEL_DTYPE.names or ()
-        self._model = np.array(
-            [tuple(getattr(m, name) for name in names) for m in models], dtype=_MODEL_DTYPE
-        )
+        self._response = _stacked([robot.response or _IDEAL for robot in robots])
+        names = MODEL_DTYPE.names or ()
+        self._model = np.array([tuple(getattr(m, name) for name in names) for m in models], dtype=MODEL_DTYPE)
         self._delay_ns = np.array([round(m.delay_s * 1e9) for m in models], dtype=np.int64)
         self.clear()
 
@@ -136,7 +105,7 @@ class OdometryTracks:
             self.arrays.count + np.bincount(robots, minlength=self._robots) > self.arrays.stamp_ns.shape[1]
         ):
             self._grow()
-        duplicates, jumps = _integrate(self.arrays, robots[order], stamps[order], raw[order])
+        duplicates, jumps = integrate(self.arrays, robots[order], stamps[order], raw[order])
         return TrackChange(changed_from, duplicates, int((~fresh).sum()), jumps)
 
     def at(self, robots: IntArray, stamps_ns: IntArray) -> TrackSample:
@@ -148,7 +117,7 @@ class OdometryTracks:
         """
         m = robots.size
         sample = TrackSample(np.zeros((m, 3)), np.zeros((m, 3)), np.zeros((m, 3, 3)), np.zeros(m))
-        _look_up_all(self.arrays, robots, stamps_ns, sample.pose, sample.raw, sample.noise, sample.silence_s)
+        look_up_all(self.arrays, robots, stamps_ns, sample.pose, sample.raw, sample.noise, sample.silence_s)
         return sample
 
     def trim(self, oldest_ns: int) -> None:
@@ -171,7 +140,11 @@ class OdometryTracks:
             raw=np.zeros((*shape, 3)),
             pose=np.zeros((*shape, 3)),
             noise=np.zeros((*shape, 3, 3)),
+            rate=np.zeros((*shape, 2)),
             model=self._model,
+            response=self._response[0],
+            response_speed=self._response[1],
+            response_turn_rate=self._response[2],
             begin_ns=np.zeros(self._robots, dtype=np.int64),
             begin_pose=np.zeros((self._robots, 3)),
         )
@@ -219,193 +192,13 @@ class OdometryTracks:
         return columns[0], columns[1], columns[2], changed_from
 
 
-@compiled
-def look_up(
-    tracks: TrackArrays, robot: int, stamp_ns: int, pose: FloatArray, raw: FloatArray, noise: FloatArray
-) -> float:
-    """Write the robot's pose O (3,), raw pose (3,) and noise G (3, 3) at an instant; return its silence [s].
-
-    Within a step the motion is an arc of constant twist. Past the newest row the last twist goes on, less and
-    less sure; after `timeout_s` the motion since that row counts as unknown. Before the first row the robot
-    stands.
-    """
-    count = tracks.count[robot]
-    if count == 0:
-        pose[:], raw[:], noise[:] = 0.0, 0.0, 0.0
-        return math.inf
-    row = np.searchsorted(tracks.stamp_ns[robot, :count], stamp_ns, side="right") - 1
-    row = max(0, min(row, count - 2))
-    after = min(row + 1, count - 1)
-    duration = tracks.stamp_ns[robot, after] - tracks.stamp_ns[robot, row]
-    silence = max(0.0, (stamp_ns - tracks.stamp_ns[robot, after]) * 1e-9)
-    timeout = tracks.model[robot].timeout_s
-    fraction = 0.0
-    if duration > 0:
-        fraction = max(0.0, (stamp_ns - tracks.stamp_ns[robot, row]) / duration)
-        if silence > timeout:
-            fraction = 1.0
-    _interpolate(tracks.pose[robot, row], tracks.pose[robot, after], fraction, pose)
-    _interpolate(tracks.raw[robot, row], tracks.raw[robot, after], fraction, raw)
-    for i in range(3):
-        for j in range(3):
-            start = tracks.noise[robot, row, i, j]
-            noise[i, j] = start + fraction * (tracks.noise[robot, after, i, j] - start)
-    if 0.0 < silence <= timeout:
-        _add_run_on(tracks.model[robot], silence, pose[0], pose[1], pose[2], noise)
-    elif silence > timeout:
-        _add_unknown_motion(tracks.model[robot], silence, pose[0], pose[1], pose[2], noise)
-    return silence
-
-
-@compiled
-def _look_up_all(
-    tracks: TrackArrays,
-    robots: IntArray,
-    stamps_ns: IntArray,
-    pose: FloatArray,
-    raw: FloatArray,
-    noise: FloatArray,
-    silence_s: FloatArray,
-) -> None:
-    for k in range(robots.size):
-        silence_s[k] = look_up(tracks, robots[k], stamps_ns[k], pose[k], raw[k], noise[k])
-
-
-@compiled
-def _interpolate(start: FloatArray, end: FloatArray, fraction: float, out: FloatArray) -> None:
-    """The pose on the arc of constant twist from `start` to `end`; a `fraction` past 1 runs on."""
-    turn = end[2] - start[2]
-    back = -0.5 * (1.0 - fraction) * turn
-    cos, sin = math.cos(back), math.sin(back)
-    dx, dy = end[0] - start[0], end[1] - start[1]
-    out[0] = start[0] + fraction * (cos * dx - sin * dy)
-    out[1] = start[1] + fraction * (sin * dx + cos * dy)
-    out[2] = start[2] + fraction * turn
-
-
-@compiled
-def _integrate(
-    tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray, raw: FloatArray
-) -> tuple[int, int]:
-    """Append rows sorted by robot and stamp; return how many were duplicates, how many steps jumps."""
-    duplicates, jumps = 0, 0
-    for k in range(robots.size):
-        robot = robots[k]
-        row = tracks.count[robot]
-        if row and stamps_ns[k] <= tracks.stamp_ns[robot, row - 1]:
-            duplicates += 1
-            continue
-        tracks.stamp_ns[robot, row] = stamps_ns[k]
-        tracks.raw[robot, row] = raw[k]
-        if row == 0:  # a track begins where its driver says
-            tracks.pose[robot, 0] = raw[k]
-            tracks.noise[robot, 0] = 0.0
-            tracks.begin_ns[robot], tracks.begin_pose[robot] = stamps_ns[k], raw[k]
-        else:
-            tracks.raw[robot, row, 2] = tracks.raw[robot, row - 1, 2] + wrap(
-                raw[k, 2] - tracks.raw[robot, row - 1, 2]
-            )
-            jumps += _integrate_step(tracks, robot, row)
-        tracks.count[robot] = row + 1
-    return duplicates, jumps
-
-
-@compiled
-def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
-    """Fill pose and noise of a row from the row before; return 1 when no robot can have driven the step."""
-    model = tracks.model[robot]
-    before, after = tracks.raw[robot, row - 1], tracks.raw[robot, row]
-    duration_s = (tracks.stamp_ns[robot, row] - tracks.stamp_ns[robot, row - 1]) * 1e-9
-    turn = after[2] - before[2]
-    middle = before[2] + 0.5 * turn
-    dx, dy = after[0] - before[0], after[1] - before[1]
-    distance = math.cos(middle) * dx + math.sin(middle) * dy
-    lateral = -math.sin(middle) * dx + math.cos(middle) * dy
-    # half a robot's width of slack: stamps jitter
-    jump = math.hypot(dx, dy) > model.max_speed * duration_s + 0.5 * model.wheel_separation
-    unknown = jump or duration_s > model.timeout_s
-    distance = model.distance_scale * distance - model.distance_per_turn * abs(turn)
-    turn = model.turn_scale * turn
-    if unknown:
-        distance, lateral, turn = 0.0, 0.0, 0.0
-    start = tracks.pose[robot, row - 1]
-    middle = start[2] + 0.5 * turn
-    cos, sin = math.cos(middle), math.sin(middle)
-    step_x, step_y = cos * distance - sin * lateral, sin * distance + cos * lateral
-    tracks.pose[robot, row, 0] = start[0] + step_x
-    tracks.pose[robot, row, 1] = start[1] + step_y
-    tracks.pose[robot, row, 2] = start[2] + turn
-    noise = tracks.noise[robot, row]
-    noise[:] = tracks.noise[robot, row - 1]
-    middle_x, middle_y = start[0] + 0.5 * step_x, start[1] + 0.5 * step_y
-    if unknown:
-        _add_unknown_motion(model, duration_s, middle_x, middle_y, middle, noise)
-    else:
-        _add_step_noise(model, distance, turn, duration_s, middle_x, middle_y, middle, noise)
-    return int(jump)
-
-
-@compiled
-def _add_step_noise(
-    model: np.void,
-    distance: float,
-    turn: float,
-    duration_s: float,
-    x: float,
-    y: float,
-    theta: float,
-    noise: FloatArray,
-) -> None:
-    """Add a step's noise in the track's frame.
-
-    Wheels: covar(ds_r, ds_l) = diag(k |ds_r|, k |ds_l|) (Siegwart and Nourbakhsh), the U Q U^T of the e-puck
-    paper's eq. (9), whose Q is not printed.
-    """
-    separation, wheel = model.wheel_separation, model.wheel_noise
-    right, left = abs(distance + 0.5 * separation * turn), abs(distance - 0.5 * separation * turn)
-    along = 0.25 * wheel * (right + left) + model.distance_noise * abs(distance)
-    heading = wheel * (right + left) / separation**2 + model.turn_noise * abs(turn)
-    if right + left > 0.0:
-        along += model.distance_drift * duration_s
-        heading += model.turn_drift * duration_s
-    cross = 0.5 * wheel * (right - left) / separation
-    _add_in_track_frame(x, y, theta, along, 0.0, heading, cross, noise)
-
-
-@compiled
-def _add_run_on(model: np.void, silence: float, x: float, y: float, theta: float, noise: FloatArray) -> None:
-    """Add the noise of a speed and a turn rate that walk at random while no message tells them."""
-    grown = silence**3 / 3.0
-    along, heading = model.speed_change**2 * grown, model.turn_rate_change**2 * grown
-    _add_in_track_frame(x, y, theta, along, 0.0, heading, 0.0, noise)
-
-
-@compiled
-def _add_unknown_motion(
-    model: np.void, duration_s: float, x: float, y: float, theta: float, noise: FloatArray
-) -> None:
-    """Add the noise of a robot that may have driven anywhere its speed allows."""
-    reach = (model.max_speed * duration_s) ** 2 / 3.0
-    turned = min(model.max_turn_rate * duration_s, math.pi) ** 2 / 3.0  # pi: any heading
-    _add_in_track_frame(x, y, theta, reach, reach, turned, 0.0, noise)
-
-
-@compiled
-def _add_in_track_frame(
-    x: float,
-    y: float,
-    theta: float,
-    along: float,
-    across: float,
-    heading: float,
-    cross: float,
-    noise: FloatArray,
-) -> None:
-    """Add Ad(pose) Q Ad(pose)^T for body variances along, across, heading and cov(along, heading)."""
-    cos, sin = math.cos(theta), math.sin(theta)
-    forward, left, turning = (cos, sin, 0.0), (-sin, cos, 0.0), (y, -x, 1.0)
-    for i in range(3):
-        for j in range(3):
-            noise[i, j] += along * forward[i] * forward[j] + across * left[i] * left[j]
-            noise[i, j] += heading * turning[i] * turning[j]
-            noise[i, j] += cross * (forward[i] * turning[j] + turning[i] * forward[j])
+def _stacked(responses: Sequence[MotionResponse]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Shares (N, 2, V, W), speeds (N, V) and turn rates (N, W) of all robots, smaller grids filled up."""
+    v = max((len(r.speeds) for r in responses), default=1)
+    w = max((len(r.turn_rates) for r in responses), default=1)
+    shares = np.ones((len(responses), 2, v, w))
+    speeds, turn_rates = np.full((len(responses), v), np.inf), np.full((len(responses), w), np.inf)
+    for i, r in enumerate(responses):
+        speeds[i, : len(r.speeds)], turn_rates[i, : len(r.turn_rates)] = r.speeds, r.turn_rates
+        shares[i, :, : len(r.speeds), : len(r.turn_rates)] = r.speed_share, r.turn_share
+    return shares, speeds, turn_rates

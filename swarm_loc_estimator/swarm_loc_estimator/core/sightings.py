@@ -144,8 +144,10 @@ class SightingConverter:
         s = {name: values[rows] for name, values in sensor.items()}
         curve = s["range_log_scale"] + s["range_skew"] * logged_bearing + s["range_curve"] * logged_bearing**2
         distance = logged_range * np.exp(curve) + s["range_offset"]
+        distance += s["robot_range_offset"] * (result["target"][rows] != NOBODY)
+        bearing = (s["bearing_scale"] + s["bearing_curve"] * logged_bearing) * logged_bearing
         result["value"][rows, 0] = distance
-        result["value"][rows, 1] = s["bearing_scale"] * logged_bearing + s["bearing_offset"]
+        result["value"][rows, 1] = bearing + s["bearing_offset"]
         covariance = np.zeros((distance.size, 3, 3))
         covariance[:, 0, 0] = (s["range_sigma"] + s["range_sigma_per_m"] * np.abs(distance)) ** 2
         covariance[:, 1, 1] = s["bearing_sigma"] ** 2

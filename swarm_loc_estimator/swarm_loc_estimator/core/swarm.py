@@ -7,6 +7,7 @@ table; a new parameter is one line in one of these classes.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -72,10 +73,11 @@ def number_specs(cls: type) -> dict[str, NumberSpec]:
 
 @dataclass(frozen=True)
 class OdometryModel:
-    """How a robot's odometry errs: noise of the wheels, and a calibration of the motion it reports.
+    """How a robot's odometry errs: noise of the motion, and a calibration of the motion it reports.
 
-    Reported path length d [m] and turn w [rad] of a step become
-    d' = distance_scale * d - distance_per_turn * |w| and w' = turn_scale * w, `delay_s` after their stamp.
+    The reported speed v and turn rate w of a step become distance_scale * v and turn_scale * w, further
+    scaled by the robot's `MotionResponse` if it has one. They take effect `delay_s` after their stamp,
+    through a first-order lag `lag_s`. base_link moves along `course_offset` and lies `axle_offset` ahead of the wheels' axle.
     """
 
     wheel_separation: float = number(0.053, "m", 0.001, 10.0, "distance between the two wheels")
@@ -85,15 +87,27 @@ class OdometryModel:
     distance_noise: float = number(
         0.0, "m", 0.0, 1.0, "additional variance of the path per metre driven [m^2/m]"
     )
+    distance_turn_noise: float = number(
+        0.0, "m^2/rad", 0.0, 1.0, "additional variance of the path per radian turned"
+    )
+    lateral_noise: float = number(0.0, "m", 0.0, 1.0, "variance across the path per metre driven [m^2/m]")
     turn_noise: float = number(
         0.0, "rad", 0.0, 10.0, "additional variance of the turn per radian turned [rad^2/rad]"
     )
+    turn_change_noise: float = number(
+        0.0, "rad s", 0.0, 10.0, "additional variance of the turn per change of turn rate [rad^2/(rad/s)]"
+    )
     distance_drift: float = number(0.0, "m^2/s", 0.0, 1.0, "variance of the path per second while moving")
+    lateral_drift: float = number(0.0, "m^2/s", 0.0, 1.0, "variance across the path per second while moving")
     turn_drift: float = number(0.0, "rad^2/s", 0.0, 10.0, "variance of the turn per second while moving")
     distance_scale: float = number(1.0, "1", 0.1, 10.0, "true path per reported path")
-    distance_per_turn: float = number(0.0, "m/rad", -1.0, 1.0, "path lost per radian turned")
     turn_scale: float = number(1.0, "1", 0.1, 10.0, "true turn per reported turn")
+    course_offset: float = number(
+        0.0, "rad", -math.pi, math.pi, "direction of motion against base_link's x axis"
+    )
+    axle_offset: float = number(0.0, "m", -1.0, 1.0, "base_link ahead of the wheels' axle")
     delay_s: float = number(0.0, "s", -2.0, 2.0, "the motion happens this much after its stamp")
+    lag_s: float = number(0.0, "s", 0.0, 10.0, "time constant with which the motion follows the report")
     timeout_s: float = number(1.0, "s", 0.01, 3600.0, "after this much silence the motion counts as unknown")
     max_speed: float = number(1.0, "m/s", 0.001, 100.0, "no step is believed that would need more")
     max_turn_rate: float = number(10.0, "rad/s", 0.01, 1000.0, "bounds the turn while the motion is unknown")
@@ -106,12 +120,51 @@ class OdometryModel:
 
 
 @dataclass(frozen=True)
+class MotionResponse:
+    """How much of the reported speed and turn rate is true, for odometry that is a command or that slips.
+
+    Between the points of the grid the shares are interpolated, beyond it they are those of its border.
+
+    Attributes:
+        speeds: (V,) reported speeds [m/s], ascending, from 0 on.
+        turn_rates: (W,) reported turn rates [rad/s], ascending, from 0 on; their sign does not matter.
+        speed_share: (V, W) true speed per reported speed.
+        turn_share: (V, W) true turn rate per reported turn rate.
+
+    Raises:
+        SwarmError: Sizes do not fit, an axis does not ascend, or a share is not in [0, 10].
+    """
+
+    speeds: tuple[float, ...]
+    turn_rates: tuple[float, ...]
+    speed_share: tuple[tuple[float, ...], ...]
+    turn_share: tuple[tuple[float, ...], ...]
+
+    def __post_init__(self) -> None:
+        for name in ("speeds", "turn_rates"):
+            axis = getattr(self, name)
+            ascends = all(low < high for low, high in itertools.pairwise(axis))
+            if not axis or not all(0.0 <= v <= 1e3 for v in axis) or not ascends:
+                raise SwarmError(f"response.{name} is {list(axis)} but must ascend within [0, 1000].")
+        for name in ("speed_share", "turn_share"):
+            table = getattr(self, name)
+            if len(table) != len(self.speeds) or any(len(row) != len(self.turn_rates) for row in table):
+                raise SwarmError(
+                    f"response.{name} must have {len(self.speeds)} rows, one per speed,"
+                    f" of {len(self.turn_rates)} numbers, one per turn rate."
+                )
+            if not all(0.0 <= v <= 10.0 for row in table for v in row):
+                raise SwarmError(f"response.{name} must hold numbers in [0, 10] only.")
+
+
+@dataclass(frozen=True)
 class SensorModel:
     """How a robot's sightings err: noise, calibration and gate.
 
     A sighting's logged range r [m] and bearing b [rad] (positive to the left) become
-    distance = r * exp(range_log_scale + range_skew * b + range_curve * b^2) + range_offset and
-    bearing = bearing_scale * b + bearing_offset, taken `time_offset_s` after the stamp.
+    distance = r * exp(range_log_scale + range_skew * b + range_curve * b^2) + range_offset, to a robot's
+    marker with robot_range_offset more, and
+    bearing = bearing_scale * b + bearing_curve * b^2 + bearing_offset, taken `time_offset_s` after the stamp.
     """
 
     forward_sigma: float = number(
@@ -136,6 +189,8 @@ class SensorModel:
         0.0, "1/rad^2", -10.0, 10.0, "q of the range curve; 0.5 when depth is logged as range"
     )
     range_offset: float = number(0.0, "m", -5.0, 5.0, "added to the scaled range")
+    robot_range_offset: float = number(0.0, "m", -5.0, 5.0, "added besides to the range of a robot's marker")
+    bearing_curve: float = number(0.0, "1/rad", -10.0, 10.0, "quadratic term of the bearing")
     bearing_offset: float = number(0.0, "rad", -TURN, TURN, "added to the scaled bearing")
     bearing_scale: float = number(1.0, "1", 0.1, 10.0, "true bearing per logged bearing")
     time_offset_s: float = number(
@@ -218,6 +273,7 @@ class Robot:
         name: Its namespace and prefix of its frames.
         type: The type its settings come from; "" when it has none.
         odometry: Noise and calibration of its motion.
+        response: Share of the reported motion that is true; None: all of it.
         camera: Where its camera sits; None when it has none and only others see it.
         sensor: Noise, calibration and gate of its sightings.
         faces: Markers on its body.
@@ -228,6 +284,7 @@ class Robot:
     name: str
     type: str = ""
     odometry: OdometryModel = OdometryModel()
+    response: MotionResponse | None = None
     camera: CameraMount | None = CameraMount()
     sensor: SensorModel = SensorModel()
     faces: tuple[Face, ...] = ()

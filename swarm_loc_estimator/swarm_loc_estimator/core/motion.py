@@ -1,0 +1,298 @@
+"""The motion behind odometry: what a reported step means, how sure it is, where a robot is in between."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.compiled import compiled, wrap
+from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.swarm import OdometryModel
+
+IntArray = NDArray[np.int64]
+
+MODEL_DTYPE = np.dtype([(f.name, np.float64) for f in fields(OdometryModel)])
+"""The numbers of an `OdometryModel` as a record."""
+
+
+class TrackArrays(NamedTuple):
+    """The rows of all tracks and the models behind them, as compiled code reads them.
+
+    Attributes:
+        count: (N,) rows in use per robot.
+        stamp_ns: (N, capacity) instants, calibrated for delay.
+        raw: (N, capacity, 3) poses as reported, headings unwrapped.
+        pose: (N, capacity, 3) calibrated poses O, headings unwrapped.
+        noise: (N, capacity, 3, 3) gathered noise G in the track's frame.
+        rate: (N, capacity, 2) calibrated speed [m/s] and turn rate [rad/s] at the row, behind the lag.
+        model: (N,) records of the numbers of `OdometryModel`.
+        response: (N, 2, V, W) shares of speed and of turn rate of `MotionResponse`.
+        response_speed: (N, V) speeds of its grid, filled up with infinity.
+        response_turn_rate: (N, W) turn rates likewise.
+        begin_ns: (N,) instant of the very first row.
+        begin_pose: (N, 3) the pose there, where G is zero.
+    """
+
+    count: IntArray
+    stamp_ns: IntArray
+    raw: FloatArray
+    pose: FloatArray
+    noise: FloatArray
+    rate: FloatArray
+    model: NDArray[np.void]
+    response: FloatArray
+    response_speed: FloatArray
+    response_turn_rate: FloatArray
+    begin_ns: IntArray
+    begin_pose: FloatArray
+
+
+@compiled
+def look_up(
+    tracks: TrackArrays, robot: int, stamp_ns: int, pose: FloatArray, raw: FloatArray, noise: FloatArray
+) -> float:
+    """Write the robot's pose O (3,), raw pose (3,) and noise G (3, 3) at an instant; return its silence [s].
+
+    Within a step the motion is an arc of constant twist. Past the newest row the last twist goes on, less and
+    less sure; after `timeout_s` the motion since that row counts as unknown. Before the first row the robot
+    stands.
+    """
+    count = tracks.count[robot]
+    if count == 0:
+        pose[:], raw[:], noise[:] = 0.0, 0.0, 0.0
+        return math.inf
+    row = np.searchsorted(tracks.stamp_ns[robot, :count], stamp_ns, side="right") - 1
+    row = max(0, min(row, count - 2))
+    after = min(row + 1, count - 1)
+    duration = tracks.stamp_ns[robot, after] - tracks.stamp_ns[robot, row]
+    silence = max(0.0, (stamp_ns - tracks.stamp_ns[robot, after]) * 1e-9)
+    timeout = tracks.model[robot].timeout_s
+    fraction = 0.0
+    if duration > 0:
+        fraction = max(0.0, (stamp_ns - tracks.stamp_ns[robot, row]) / duration)
+        if silence > timeout:
+            fraction = 1.0
+    _interpolate(tracks.pose[robot, row], tracks.pose[robot, after], fraction, pose)
+    _interpolate(tracks.raw[robot, row], tracks.raw[robot, after], fraction, raw)
+    for i in range(3):
+        for j in range(3):
+            start = tracks.noise[robot, row, i, j]
+            noise[i, j] = start + fraction * (tracks.noise[robot, after, i, j] - start)
+    if 0.0 < silence <= timeout:
+        _add_run_on(tracks.model[robot], silence, pose[0], pose[1], pose[2], noise)
+    elif silence > timeout:
+        _add_unknown_motion(tracks.model[robot], silence, pose[0], pose[1], pose[2], noise)
+    return silence
+
+
+@compiled
+def look_up_all(
+    tracks: TrackArrays,
+    robots: IntArray,
+    stamps_ns: IntArray,
+    pose: FloatArray,
+    raw: FloatArray,
+    noise: FloatArray,
+    silence_s: FloatArray,
+) -> None:
+    """Look up m robots at m instants; see `look_up`."""
+    for k in range(robots.size):
+        silence_s[k] = look_up(tracks, robots[k], stamps_ns[k], pose[k], raw[k], noise[k])
+
+
+@compiled
+def _interpolate(start: FloatArray, end: FloatArray, fraction: float, out: FloatArray) -> None:
+    """The pose on the arc of constant twist from `start` to `end`; a `fraction` past 1 runs on."""
+    turn = end[2] - start[2]
+    back = -0.5 * (1.0 - fraction) * turn
+    cos, sin = math.cos(back), math.sin(back)
+    dx, dy = end[0] - start[0], end[1] - start[1]
+    out[0] = start[0] + fraction * (cos * dx - sin * dy)
+    out[1] = start[1] + fraction * (sin * dx + cos * dy)
+    out[2] = start[2] + fraction * turn
+
+
+@compiled
+def integrate(tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray, raw: FloatArray) -> tuple[int, int]:
+    """Append rows sorted by robot and stamp; return how many were duplicates, how many steps jumps."""
+    duplicates, jumps = 0, 0
+    for k in range(robots.size):
+        robot = robots[k]
+        row = tracks.count[robot]
+        if row and stamps_ns[k] <= tracks.stamp_ns[robot, row - 1]:
+            duplicates += 1
+            continue
+        tracks.stamp_ns[robot, row] = stamps_ns[k]
+        tracks.raw[robot, row] = raw[k]
+        if row == 0:  # a track begins where its driver says
+            tracks.pose[robot, 0] = raw[k]
+            tracks.noise[robot, 0] = 0.0
+            tracks.rate[robot, 0] = 0.0
+            tracks.begin_ns[robot], tracks.begin_pose[robot] = stamps_ns[k], raw[k]
+        else:
+            before = tracks.raw[robot, row - 1, 2]
+            tracks.raw[robot, row, 2] = before + wrap(raw[k, 2] - before)
+            jumps += _integrate_step(tracks, robot, row)
+        tracks.count[robot] = row + 1
+    return duplicates, jumps
+
+
+@compiled
+def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
+    """Fill pose, noise and rate of a row from the row before; return 1 when no robot can drive so fast."""
+    model = tracks.model[robot]
+    before, after = tracks.raw[robot, row - 1], tracks.raw[robot, row]
+    duration_s = (tracks.stamp_ns[robot, row] - tracks.stamp_ns[robot, row - 1]) * 1e-9
+    turn = after[2] - before[2]
+    middle = before[2] + 0.5 * turn
+    dx, dy = after[0] - before[0], after[1] - before[1]
+    # half a robot's width of slack: stamps jitter
+    jump = math.hypot(dx, dy) > model.max_speed * duration_s + 0.5 * model.wheel_separation
+    start, noise, rate = tracks.pose[robot, row - 1], tracks.noise[robot, row], tracks.rate[robot, row]
+    noise[:] = tracks.noise[robot, row - 1]
+    if jump or duration_s > model.timeout_s:  # where it went is unknown
+        tracks.pose[robot, row] = start
+        rate[:] = 0.0
+        _add_unknown_motion(model, duration_s, start[0], start[1], start[2], noise)
+        return int(jump)
+    distance = math.cos(middle) * dx + math.sin(middle) * dy
+    lateral = -math.sin(middle) * dx + math.cos(middle) * dy
+    before_rate = tracks.rate[robot, row - 1]
+    distance, turn = _true_motion(tracks, robot, distance, turn, duration_s, before_rate, rate)
+    forward = math.cos(model.course_offset) * distance
+    lateral += math.sin(model.course_offset) * distance + model.axle_offset * turn
+    middle = start[2] + 0.5 * turn
+    cos, sin = math.cos(middle), math.sin(middle)
+    step_x, step_y = cos * forward - sin * lateral, sin * forward + cos * lateral
+    tracks.pose[robot, row, 0] = start[0] + step_x
+    tracks.pose[robot, row, 1] = start[1] + step_y
+    tracks.pose[robot, row, 2] = start[2] + turn
+    changed = abs(rate[1] - before_rate[1])
+    x, y = start[0] + 0.5 * step_x, start[1] + 0.5 * step_y
+    _add_step_noise(model, distance, turn, changed, duration_s, x, y, middle, noise)
+    return 0
+
+
+@compiled
+def _true_motion(
+    tracks: TrackArrays,
+    robot: int,
+    distance: float,
+    turn: float,
+    duration_s: float,
+    before_rate: FloatArray,
+    rate: FloatArray,
+) -> tuple[float, float]:
+    """Calibrated path and turn of a reported step; writes speed and turn rate (2,) at its end."""
+    model = tracks.model[robot]
+    speed, turn_rate = distance / duration_s, turn / duration_s
+    speed_share, turn_share = _response(tracks, robot, abs(speed), abs(turn_rate))
+    speed *= model.distance_scale * speed_share
+    turn_rate *= model.turn_scale * turn_share
+    remaining, mean = 0.0, 0.0  # of what is left to follow: at the end, and on average over the step
+    if model.lag_s > 0.0:
+        remaining = math.exp(-duration_s / model.lag_s)
+        mean = (1.0 - remaining) * model.lag_s / duration_s
+    behind_speed, behind_turn_rate = before_rate[0] - speed, before_rate[1] - turn_rate
+    rate[0] = speed + remaining * behind_speed
+    rate[1] = turn_rate + remaining * behind_turn_rate
+    return (speed + mean * behind_speed) * duration_s, (turn_rate + mean * behind_turn_rate) * duration_s
+
+
+@compiled
+def _response(tracks: TrackArrays, robot: int, speed: float, turn_rate: float) -> tuple[float, float]:
+    """Shares of speed and turn rate that are true, bilinear in the grid of the robot's response."""
+    i, a = _bracket(tracks.response_speed[robot], speed)
+    j, b = _bracket(tracks.response_turn_rate[robot], turn_rate)
+    table = tracks.response[robot]
+    ii, jj = min(i + 1, table.shape[1] - 1), min(j + 1, table.shape[2] - 1)
+    shares = np.empty(2)
+    for k in range(2):
+        low = table[k, i, j] * (1.0 - b) + table[k, i, jj] * b
+        high = table[k, ii, j] * (1.0 - b) + table[k, ii, jj] * b
+        shares[k] = low * (1.0 - a) + high * a
+    return shares[0], shares[1]
+
+
+@compiled
+def _bracket(axis: FloatArray, value: float) -> tuple[int, float]:
+    """The interval of an ascending axis nearest to the value, and how far in the value lies (0 to 1)."""
+    i = max(0, min(np.searchsorted(axis, value, side="right") - 1, axis.size - 1))
+    if i + 1 == axis.size or math.isinf(axis[i + 1]):
+        return i, 0.0
+    return i, min(1.0, max(0.0, (value - axis[i]) / (axis[i + 1] - axis[i])))
+
+
+@compiled
+def _add_step_noise(
+    model: np.void,
+    distance: float,
+    turn: float,
+    turn_rate_change: float,
+    duration_s: float,
+    x: float,
+    y: float,
+    theta: float,
+    noise: FloatArray,
+) -> None:
+    """Add a step's noise in the track's frame.
+
+    Wheels: covar(ds_r, ds_l) = diag(k |ds_r|, k |ds_l|) (Siegwart and Nourbakhsh), the U Q U^T of the e-puck
+    paper's eq. (9), whose Q is not printed.
+    """
+    separation, wheel = model.wheel_separation, model.wheel_noise
+    right, left = abs(distance + 0.5 * separation * turn), abs(distance - 0.5 * separation * turn)
+    along = 0.25 * wheel * (right + left) + model.distance_noise * abs(distance)
+    along += model.distance_turn_noise * abs(turn)
+    across = model.lateral_noise * abs(distance)
+    heading = wheel * (right + left) / separation**2 + model.turn_noise * abs(turn)
+    heading += model.turn_change_noise * turn_rate_change
+    if right + left > 0.0:
+        along += model.distance_drift * duration_s
+        across += model.lateral_drift * duration_s
+        heading += model.turn_drift * duration_s
+    cross = 0.5 * wheel * (right - left) / separation
+    _add_in_track_frame(x, y, theta, along, across, heading, cross, noise)
+
+
+@compiled
+def _add_run_on(model: np.void, silence: float, x: float, y: float, theta: float, noise: FloatArray) -> None:
+    """Add the noise of a speed and a turn rate that walk at random while no message tells them."""
+    grown = silence**3 / 3.0
+    along, heading = model.speed_change**2 * grown, model.turn_rate_change**2 * grown
+    _add_in_track_frame(x, y, theta, along, 0.0, heading, 0.0, noise)
+
+
+@compiled
+def _add_unknown_motion(
+    model: np.void, duration_s: float, x: float, y: float, theta: float, noise: FloatArray
+) -> None:
+    """Add the noise of a robot that may have driven anywhere its speed allows."""
+    reach = (model.max_speed * duration_s) ** 2 / 3.0
+    turned = min(model.max_turn_rate * duration_s, math.pi) ** 2 / 3.0  # pi: any heading
+    _add_in_track_frame(x, y, theta, reach, reach, turned, 0.0, noise)
+
+
+@compiled
+def _add_in_track_frame(
+    x: float,
+    y: float,
+    theta: float,
+    along: float,
+    across: float,
+    heading: float,
+    cross: float,
+    noise: FloatArray,
+) -> None:
+    """Add Ad(pose) Q Ad(pose)^T for body variances along, across, heading and cov(along, heading)."""
+    cos, sin = math.cos(theta), math.sin(theta)
+    forward, left, turning = (cos, sin, 0.0), (-sin, cos, 0.0), (y, -x, 1.0)
+    for i in range(3):
+        for j in range(3):
+            noise[i, j] += along * forward[i] * forward[j] + across * left[i] * left[j]
+            noise[i, j] += heading * turning[i] * turning[j]
+            noise[i, j] += cross * (forward[i] * turning[j] + turning[i] * forward[j])
