@@ -1,6 +1,6 @@
 """Simulate a swarm and write what its sensors say as a bag with its swarm.yaml.
 
-    generate_bag eight bags/eight_five_robots --seed 1 --duration 54 --world w0
+    generate_bag eight bags/eight_five_robots --seed 3 --duration 54 --world w0
     generate_bag grid /tmp/grid100 --robots 100 --duration 20
 
 The bag holds <robot>/odom, <robot>/detections and <robot>/ground_truth; `swarm.yaml` lies inside its folder.
