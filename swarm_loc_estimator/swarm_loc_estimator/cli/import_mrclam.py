@@ -45,9 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for remark in done.remarks:
         print(remark)
     names = ", ".join(f"robot{robot.subject}" for robot in dataset.robots)
-    print(
-        f"{done.message_count} messages of {names} written to {options.bag} in {time.monotonic() - began:.1f} s"
-    )
+    took_s = time.monotonic() - began
+    print(f"{done.message_count} messages of {names} written to {options.bag} in {took_s:.1f} s")
     return 0
 
 

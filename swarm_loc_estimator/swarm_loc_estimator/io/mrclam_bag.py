@@ -171,8 +171,8 @@ def _robot(robot: RobotLog, barcode: int | None) -> Robot:
     return Robot(
         f"robot{robot.subject}",
         ROBOT_TYPE,
-        OdometryModel(wheel_separation=WHEEL_SEPARATION),
-        CameraMount(),
+        odometry=OdometryModel(wheel_separation=WHEEL_SEPARATION),
+        camera=CameraMount(),
         faces=() if barcode is None else (Face("body", barcode),),
         start=_start(robot),
     )

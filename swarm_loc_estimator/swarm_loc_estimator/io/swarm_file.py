@@ -2,11 +2,16 @@
 
 ```yaml
 fileversion: 1
-defaults:                 # any of odometry, camera, sensor, faces, start_sigma
+defaults:                 # any of odometry, response, camera, sensor, faces, start_sigma
   sensor: {range_sigma: 0.1}
 types:
   epuck:                  # the same keys; what is not said comes from defaults
     odometry: {wheel_separation: 0.053}
+    response:                               # null: all of the reported motion is true
+      speeds: [0.0, 0.1]
+      turn_rates: [0.0, 0.5, 1.0]
+      speed_share: [[1.0, 0.9, 0.9], [1.0, 0.8, 0.7]]
+      turn_share: [[1.0, 0.9, 0.9], [1.0, 0.9, 0.9]]
     camera: {x: 0.035, z: 0.028}            # null: it has none
     faces: {front: {x: 0.035, yaw: 0.0}}    # markers on the body; null takes one away
 robots:
@@ -32,6 +37,7 @@ from swarm_loc_estimator.core.swarm import (
     CameraMount,
     Face,
     Landmark,
+    MotionResponse,
     NumberSpec,
     OdometryModel,
     Pose2,
@@ -51,7 +57,7 @@ if TYPE_CHECKING:
 FILE_VERSION = 1
 
 _SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks")
-_LAYER = ("odometry", "camera", "sensor", "faces", "start_sigma")
+_LAYER = ("odometry", "response", "camera", "sensor", "faces", "start_sigma")
 _ROBOT = ("type", *_LAYER, "ids", "start")
 _MODELS: dict[str, type] = {"odometry": OdometryModel, "sensor": SensorModel, "start_sigma": StartSigma}
 _START = {
@@ -59,6 +65,7 @@ _START = {
     "y": number_specs(Landmark)["y"],
     "theta": number_specs(CameraMount)["yaw"],
 }
+_RESPONSE = ("speeds", "turn_rates", "speed_share", "turn_share")
 _MAX_ID = 2**32 - 1
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
@@ -92,6 +99,8 @@ class _Layer:
     models: dict[str, Numbers]
     camera: Numbers | None
     says_camera: bool
+    response: MotionResponse | None
+    says_response: bool
     faces: dict[str, Numbers | None]
 
 
@@ -142,6 +151,7 @@ class _Loader:
         return Robot(
             name=name,
             type=type_name or "",
+            response=next((layer.response for layer in reversed(layers) if layer.says_response), None),
             camera=_camera(layers),
             faces=self._faces(key, layers, mapping.get("ids", {})),
             start=self._start(mapping.get("start"), f"{key}.start"),
@@ -163,11 +173,51 @@ class _Loader:
             models,
             None if camera is None else self._numbers(camera, f"{key}.camera", number_specs(CameraMount)),
             "camera" in mapping,
+            self._response(mapping.get("response"), f"{key}.response"),
+            "response" in mapping,
             {
                 name: None if face is None else self._numbers(face, f"{key}.faces.{name}", specs)
                 for name, face in faces
             },
         )
+
+    def _response(self, tree: Tree, key: str) -> MotionResponse | None:
+        """A table of shares, or that there is none; said as a whole by one layer."""
+        if tree is None:
+            return None
+        mapping = self._mapping(tree, key, _RESPONSE)
+        for name in _RESPONSE:
+            if name not in mapping:
+                raise SwarmFileError(f"{self._path}: {key} lacks {name}, a list of numbers.")
+        axes = {name: self._list(mapping[name], f"{key}.{name}") for name in ("speeds", "turn_rates")}
+        tables = {
+            name: tuple(
+                self._list(row, f"{key}.{name}[{index}]")
+                for index, row in enumerate(self._items(mapping[name], f"{key}.{name}"))
+            )
+            for name in ("speed_share", "turn_share")
+        }
+        try:
+            return MotionResponse(
+                axes["speeds"], axes["turn_rates"], tables["speed_share"], tables["turn_share"]
+            )
+        except SwarmError as error:
+            raise SwarmFileError(f"{self._path}: {key.removesuffix('response')}{error}") from error
+
+    def _items(self, tree: Tree, key: str) -> list[Tree]:
+        """A list."""
+        if not isinstance(tree, list):
+            raise self._error(key, tree, "must be a list")
+        return tree
+
+    def _list(self, tree: Tree, key: str) -> tuple[float, ...]:
+        """A list of numbers."""
+        values = []
+        for index, value in enumerate(self._items(tree, key)):
+            if isinstance(value, bool) or not isinstance(value, int | float) or not -1e9 < value < 1e9:
+                raise self._error(f"{key}[{index}]", value, "must be a number")
+            values.append(float(value))
+        return tuple(values)
 
     def _faces(self, key: str, layers: Iterable[_Layer], ids_tree: Tree) -> tuple[Face, ...]:
         """The robot's markers: where they sit from the layers, which they are from its ids."""

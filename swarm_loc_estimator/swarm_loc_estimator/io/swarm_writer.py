@@ -12,6 +12,7 @@ from swarm_loc_estimator.core.swarm import (
     CameraMount,
     Face,
     Landmark,
+    MotionResponse,
     OdometryModel,
     Robot,
     SensorModel,
@@ -30,6 +31,7 @@ _MODELS: dict[str, type] = {
     "sensor": SensorModel,
     "start_sigma": StartSigma,
 }
+_WHOLE = frozenset({"camera", "faces", "response"})
 Mapping = dict[Any, Any]
 
 
@@ -82,9 +84,20 @@ def _layer(robot: Robot) -> Mapping:
     layer: Mapping = {
         section: _numbers(getattr(robot, section)) for section in _MODELS if section != "camera"
     }
+    layer["response"] = {} if robot.response is None else _lists(robot.response)
     layer["camera"] = None if robot.camera is None else _numbers(robot.camera)
     layer["faces"] = {face.name: _numbers(face) for face in robot.faces}
     return layer
+
+
+def _lists(response: MotionResponse) -> Mapping:
+    """The table of a motion response."""
+    return {name: _listed(value) for name, value in asdict(response).items()}
+
+
+def _listed(value: Any) -> Any:
+    """Tuples as lists, which YAML has."""
+    return [_listed(item) for item in value] if isinstance(value, tuple) else value
 
 
 def _shared(robots: list[Robot]) -> Mapping:
@@ -92,7 +105,7 @@ def _shared(robots: list[Robot]) -> Mapping:
     layers = [_layer(robot) for robot in robots]
     shared: Mapping = {}
     for section, first in layers[0].items():
-        if section in {"camera", "faces"}:
+        if section in _WHOLE:
             if all(layer[section] == first for layer in layers):
                 shared[section] = first
         else:
@@ -111,7 +124,7 @@ def _robot(robot: Robot, shared: Mapping) -> Mapping:
         rest = value
         if section in shared:
             same = value == shared[section]
-            whole = section in {"camera", "faces"}
+            whole = section in _WHOLE
             rest = {} if same or whole else {k: v for k, v in value.items() if k not in shared[section]}
         if rest != {}:
             entry[section] = rest

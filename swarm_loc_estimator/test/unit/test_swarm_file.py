@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+
 from swarm_loc_estimator.core.swarm import (
     CameraMount,
     Face,
     Landmark,
+    MotionResponse,
     OdometryModel,
     Robot,
     SensorModel,
@@ -59,6 +61,9 @@ landmarks:
   100: {x: 1.5, y: 0.25, yaw: -1.0}
   101: {x: 0, y: 0}
 """
+RESPONSE = MotionResponse(
+    (0.0, 0.1), (0.0, 0.5, 1.0), ((1.0, 0.9, 0.9), (1.0, 0.8, 0.7)), ((1.0, 0.9, 0.8),) * 2
+)
 RELAXED = settings(
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], deadline=None
 )
@@ -93,6 +98,27 @@ def test_layers_fall_from_defaults_to_type_to_robot(tmp_path: Path) -> None:
     assert three.camera is None
     assert (four.camera, four.type) == (CameraMount(x=0.01), "")
     assert swarm.landmarks == (Landmark(100, 1.5, 0.25, yaw=-1.0), Landmark(101, 0.0, 0.0, yaw=None))
+
+
+SHARES = "speeds: [0, 0.1], turn_rates: [0.0], speed_share: [[1], [0.9]], turn_share: [[1], [0.8]]"
+
+
+def test_motion_response_is_said_as_a_whole(tmp_path: Path) -> None:
+    text = (
+        "fileversion: 1\ntypes: {t: {response: {%s}}}\nrobots: {a: {type: t}, b: {type: t, response: null}}\n"
+    )
+    one, two = load(tmp_path, text % SHARES).robots
+    assert one.response == MotionResponse((0.0, 0.1), (0.0,), ((1.0,), (0.9,)), ((1.0,), (0.8,)))
+    assert two.response is None
+    for old, new, sentence in (
+        ("0.1]", "-1]", "types.t.response.speeds is [0.0, -1.0] but must ascend within [0, 1000]."),
+        ("[0.9]", "[.nan]", "types.t.response.speed_share[1][0] is nan but must be a number."),
+        ("[0.8]", "0.8", "types.t.response.turn_share[1] is 0.8 but must be a list."),
+        (", turn_rates: [0.0]", "", "types.t.response lacks turn_rates, a list of numbers."),
+        ("speeds", "speedz", "'types.t.response.speedz' is not a known key; the nearest one is 'speeds'."),
+    ):
+        assert old in SHARES
+        assert error_of(tmp_path, text % SHARES.replace(old, new, 1)) == sentence
 
 
 def test_owners_of_marker_ids(tmp_path: Path) -> None:
@@ -135,8 +161,10 @@ def test_owners_of_marker_ids(tmp_path: Path) -> None:
         (
             "wheel_separation: 0.053",
             "wheel_seperation: 1",
-            ("'types.epuck.odometry.wheel_seperation' is not a known key;"
-            " the nearest one is 'wheel_separation'."),
+            (
+                "'types.epuck.odometry.wheel_seperation' is not a known key;"
+                " the nearest one is 'wheel_separation'."
+            ),
         ),
         ("landmarks:", "landmark:", "'landmark' is not a known key; the nearest one is 'landmarks'."),
         (
@@ -147,8 +175,10 @@ def test_owners_of_marker_ids(tmp_path: Path) -> None:
         (
             "front: 3",
             "front: 1",
-            ("marker id 1 belongs to both face 'front' of robot 'one' and face 'front' of robot 'two';"
-            " ids must be unique."),
+            (
+                "marker id 1 belongs to both face 'front' of robot 'one' and face 'front' of robot 'two';"
+                " ids must be unique."
+            ),
         ),
         (
             "front: 3",
@@ -181,8 +211,10 @@ def test_owners_of_marker_ids(tmp_path: Path) -> None:
         (
             "  three:",
             "  2three:",
-            ("a name in robots is '2three' but must be letters, digits and underscores"
-            " and start with a letter."),
+            (
+                "a name in robots is '2three' but must be letters, digits and underscores"
+                " and start with a letter."
+            ),
         ),
         ("fileversion: 1", "fileversion: 2", "fileversion is 2 but must be 1."),
         ("fileversion: 1", "fileversion: true", "fileversion is True but must be 1."),
@@ -260,14 +292,15 @@ def swarms(draw: st.DrawFn) -> Swarm:
             Robot(
                 name,
                 draw(st.sampled_from(["", "typ", "other"])),
-                draw(st.sampled_from(pool[OdometryModel])),
-                draw(st.sampled_from([*pool[CameraMount], None])),
-                draw(st.sampled_from(pool[SensorModel])),
-                faces[: draw(st.integers(0, 3))],
-                draw(
+                odometry=draw(st.sampled_from(pool[OdometryModel])),
+                response=draw(st.sampled_from([None, RESPONSE])),
+                camera=draw(st.sampled_from([*pool[CameraMount], None])),
+                sensor=draw(st.sampled_from(pool[SensorModel])),
+                faces=faces[: draw(st.integers(0, 3))],
+                start=draw(
                     st.none() | st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6), st.floats(-6.28, 6.28))
                 ),
-                draw(st.sampled_from(pool[StartSigma])),
+                start_sigma=draw(st.sampled_from(pool[StartSigma])),
             )
         )
     landmarks = tuple(
