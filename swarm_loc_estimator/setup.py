@@ -28,7 +28,9 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
+            "estimator_node = swarm_loc_estimator.nodes.estimator_node:main",
             "graph = swarm_loc_estimator.cli.graph:main",
+            "play = swarm_loc_estimator.nodes.play_node:main",
         ],
     },
 )

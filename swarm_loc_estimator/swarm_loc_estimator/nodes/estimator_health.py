@@ -1,0 +1,232 @@
+"""How the estimator is doing, in words and figures: the content of /diagnostics. No ROS here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.estimator import Status, SwarmEstimate
+from swarm_loc_estimator.core.fusion import Verdict
+from swarm_loc_estimator.core.measurements import MeasurementArray
+from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.swarm import Robot, Swarm
+from swarm_loc_estimator.io.ingest import Ingest, InputKind, InputTopic
+
+_SHOWN_NAMES = 8
+_FULL_LOAD = 0.95
+
+
+@dataclass
+class Report:
+    """One status of /diagnostics.
+
+    Attributes:
+        name: Whose.
+        message: One sentence.
+        warning: Whether something is wrong.
+        values: Figures with their units.
+    """
+
+    name: str
+    message: str
+    warning: bool = False
+    values: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class TickCost:
+    """What the ticks since the last report cost.
+
+    Attributes:
+        count: How many.
+        sum_s: Together.
+        max_s: The longest.
+    """
+
+    count: int = 0
+    sum_s: float = 0.0
+    max_s: float = 0.0
+
+    def note(self, seconds: float) -> None:
+        """Count one tick."""
+        self.count += 1
+        self.sum_s += seconds
+        self.max_s = max(self.max_s, seconds)
+
+
+Recent = tuple[MeasurementArray, NDArray[np.uint8], FloatArray]
+
+
+class Health:
+    """Makes the reports, once per interval.
+
+    Args:
+        swarm: The robots.
+        ingest: What came in.
+        odom_frame: Name below the robot's of the frame that its odometry should be in.
+        why_missing: Says of a topic without messages why that may be, such as " (no publisher)".
+    """
+
+    def __init__(
+        self, swarm: Swarm, ingest: Ingest, odom_frame: str, why_missing: Callable[[str], str]
+    ) -> None:
+        self._swarm = swarm
+        self._ingest = ingest
+        self._odom_frame = odom_frame
+        self._why_missing = why_missing
+        self._was_located = np.zeros(len(swarm.robots), dtype=bool)
+        self._received = [0] * len(ingest.topics)
+        self._reported_ns: int | None = None
+
+    def missing(self) -> list[str]:
+        """The expected topics on which nothing has come yet."""
+        pairs = zip(self._ingest.topics, self._ingest.statistics, strict=True)
+        return [topic.name for topic, statistics in pairs if topic.expected and not statistics.received]
+
+    def missing_text(self) -> str:
+        """The missing topics in words, by cause; "" when there are none."""
+        by_cause: dict[str, list[str]] = {}
+        for name in self.missing():
+            by_cause.setdefault(self._why_missing(name), []).append(name)
+        return "; ".join(f"nothing received on {_listed(names)}{cause}" for cause, names in by_cause.items())
+
+    def reports(
+        self, now_ns: int, estimate: SwarmEstimate, recent: Recent, drops: Mapping[str, int]
+    ) -> list[Report]:
+        """One per robot, then the swarm's inputs and drops; begins a new interval.
+
+        Args:
+            now_ns: The node's time.
+            estimate: The newest.
+            recent: The estimator's measurements with verdicts and normalised innovations squared.
+            drops: Data not used, by reason.
+        """
+        elapsed_s = (now_ns - self._reported_ns) * 1e-9 if self._reported_ns is not None else 0.0
+        self._reported_ns = now_ns
+        measurements, verdicts, nis = recent
+        used = verdicts == Verdict.USED
+        reports = []
+        for index, robot in enumerate(self._swarm.robots):
+            mine = used & (measurements["received_from"] == index)
+            report = self._robot_report(index, robot, estimate, now_ns, elapsed_s)
+            report.values["measurements used"] = str(int(mine.sum()))
+            report.values["NIS mean"] = _figure(float(nis[mine].mean()) if mine.any() else None)
+            reports.append(report)
+        self._was_located |= estimate.status != Status.WAITING
+        missing = self.missing_text()
+        values = {f"dropped: {reason}": str(count) for reason, count in drops.items()}
+        summary = {int(status): int(np.sum(estimate.status == status)) for status in Status}
+        words = ", ".join(f"{summary[status]} {status.name.lower()}" for status in Status if summary[status])
+        reports.append(Report("estimator", missing or words, bool(missing), values))
+        return reports
+
+    def _robot_report(
+        self, index: int, robot: Robot, estimate: SwarmEstimate, now_ns: int, elapsed_s: float
+    ) -> Report:
+        """State and inputs of one robot."""
+        troubles: list[str] = []
+        values: dict[str, str] = {}
+        for handle in range(len(self._ingest.topics)):
+            topic = self._ingest.topics[handle]
+            if topic.robot == index:
+                troubles += self._input_troubles(handle, topic, robot, now_ns)
+                values.update(self._input_values(handle, topic, now_ns, elapsed_s))
+        status = Status(int(estimate.status[index]))
+        if status is Status.WAITING and not troubles:
+            lost = "lost, " if self._was_located[index] else ""
+            troubles.append(f"{lost}waiting for a sighting that locates it")
+        values["status"] = status.name.lower()
+        values["fix age [s]"] = _figure(estimate.fix_age_s[index])
+        sigma = np.sqrt(np.diagonal(estimate.covariances[index]))
+        values["sigma x [m]"], values["sigma y [m]"] = _figure(sigma[0]), _figure(sigma[1])
+        values["sigma theta [rad]"] = _figure(sigma[2])
+        return Report(robot.name, "; ".join(troubles) or status.name.lower(), bool(troubles), values)
+
+    def _input_troubles(self, handle: int, topic: InputTopic, robot: Robot, now_ns: int) -> list[str]:
+        """What is wrong with an input, in words."""
+        statistics = self._ingest.statistics[handle]
+        if not statistics.received:
+            return (
+                [f"nothing received on {topic.name}{self._why_missing(topic.name)}"] if topic.expected else []
+            )
+        if statistics.last_arrival_ns is None:
+            return [f"no message on {topic.name} is a {topic.kind.message_type}"]
+        if topic.kind is not InputKind.ODOMETRY:
+            return []
+        silent_s = (now_ns - statistics.last_arrival_ns) * 1e-9
+        expected = f"{robot.name}/{self._odom_frame}"
+        found = self._ingest.frame_id(handle)
+        silence = (
+            [f"{topic.name} is silent for {silent_s:.1f} s"] if silent_s > robot.odometry.timeout_s else []
+        )
+        foreign = (
+            [f"{topic.name} is in frame '{found}' but transforms are published for '{expected}'"]
+            if found != expected
+            else []
+        )
+        return silence + foreign
+
+    def _input_values(self, handle: int, topic: InputTopic, now_ns: int, elapsed_s: float) -> dict[str, str]:
+        """Figures of an input over the interval; begins its next one."""
+        statistics, name = self._ingest.statistics[handle], topic.kind.value
+        arrived = statistics.received - self._received[handle]
+        self._received[handle] = statistics.received
+        arrival_ns, count = statistics.last_arrival_ns, statistics.late_count
+        values = {
+            f"{name} received": str(statistics.received),
+            f"{name} malformed": str(statistics.malformed),
+            f"{name} rate [1/s]": _figure(arrived / elapsed_s if elapsed_s > 0.0 else None),
+            f"{name} age [s]": _figure(None if arrival_ns is None else (now_ns - arrival_ns) * 1e-9),
+            f"{name} lateness mean [s]": _figure(statistics.late_sum_ns * 1e-9 / count if count else None),
+            f"{name} lateness max [s]": _figure(
+                None if statistics.late_max_ns is None else statistics.late_max_ns * 1e-9
+            ),
+        }
+        statistics.restart()
+        return values
+
+
+def load_report(cost: TickCost, elapsed_s: float, period_s: float, fusion_period_s: float) -> Report:
+    """What the ticks cost, and what to do when that is too much.
+
+    Args:
+        cost: The ticks of the interval.
+        elapsed_s: Length of the interval by the wall clock.
+        period_s: Parameter tick_period_s.
+        fusion_period_s: Parameter fusion_period_s.
+    """
+    load = cost.sum_s / elapsed_s if elapsed_s > 0.0 else 0.0
+    values = {
+        "ticks": str(cost.count),
+        "tick mean [ms]": _figure(1e3 * cost.sum_s / cost.count if cost.count else None),
+        "tick max [ms]": _figure(1e3 * cost.max_s),
+        "load [1]": _figure(load),
+    }
+    if load < _FULL_LOAD:
+        return Report("load", f"ticks take {100.0 * load:.0f} % of the time", values=values)
+    advice = (
+        f"a tick takes {1e3 * cost.sum_s / cost.count:.0f} ms, more than its share: raise fusion_period_s"
+        f" (now {fusion_period_s:g} s) or tick_period_s (now {period_s:g} s)"
+    )
+    return Report("load", advice, warning=True, values=values)
+
+
+def merged(reports: Sequence[Report], name: str) -> Report:
+    """Several reports as one; the sentences of those that warn come first."""
+    warnings = [report.message for report in reports if report.warning]
+    values = {key: value for report in reports for key, value in report.values.items()}
+    return Report(name, "; ".join(warnings or [report.message for report in reports]), bool(warnings), values)
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Names for people, not too many."""
+    more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
+    return ", ".join(names[:_SHOWN_NAMES]) + more
+
+
+def _figure(value: float | None) -> str:
+    """A number for people; "-" when there is none."""
+    return "-" if value is None or not np.isfinite(value) else f"{value:.4g}"

@@ -1,0 +1,56 @@
+"""The topics that `estimator_node` publishes its poses on."""
+
+from __future__ import annotations
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from tf2_msgs.msg import TFMessage
+
+from swarm_loc_estimator.core.estimator import Status, SwarmEstimate
+from swarm_loc_estimator.core.swarm import Swarm
+from swarm_loc_estimator.io.outputs import PoseEncoder, SwarmPosesEncoder, TransformsEncoder
+from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
+from swarm_loc_msgs.msg import SwarmPoses
+
+_RELIABLE = QoSProfile(depth=10)
+_TF = QoSProfile(depth=100)  # what tf2's own broadcaster offers
+
+
+class EstimateOutputs:
+    """Publishes estimates.
+
+    Args:
+        node: Whose publishers they are.
+        swarm: Names of the robots.
+        parameters: Frames, and what is wanted.
+    """
+
+    def __init__(self, node: Node, swarm: Swarm, parameters: EstimatorParameters) -> None:
+        names = [robot.name for robot in swarm.robots]
+        frame = parameters.map_frame
+        self._swarm_poses = node.create_publisher(SwarmPoses, "swarm/poses", _RELIABLE)
+        self._swarm_poses_encoder = SwarmPosesEncoder(names, frame)
+        self._pose_encoder = PoseEncoder(frame)
+        self._robot_poses = [
+            node.create_publisher(PoseWithCovarianceStamped, f"{name}/pose", _RELIABLE)
+            for name in (names if parameters.publish_robot_poses else [])
+        ]
+        # tf2's listeners know this one absolute name, whatever the namespace
+        self._tf = node.create_publisher(TFMessage, "/tf", _TF) if parameters.publish_tf else None
+        self._tf_encoder = TransformsEncoder(frame, [f"{name}/{parameters.odom_frame}" for name in names])
+
+    def publish(self, estimate: SwarmEstimate) -> None:
+        """Publish all poses; robots that wait for a fix are in `swarm/poses` only, as waiting."""
+        e = estimate
+        located = e.status != Status.WAITING
+        self._swarm_poses.publish(
+            self._swarm_poses_encoder.encode(e.stamp_ns, e.poses, e.covariances, e.fix_age_s, e.status)
+        )
+        if self._tf is not None and located.any():
+            self._tf.publish(self._tf_encoder.encode(e.stamp_ns, located, e.map_to_odom))
+        if self._robot_poses and located.any():
+            messages = self._pose_encoder.encode(e.stamp_ns, e.poses[located], e.covariances[located])
+            for robot, message in zip(np.flatnonzero(located), messages, strict=True):
+                self._robot_poses[robot].publish(message)

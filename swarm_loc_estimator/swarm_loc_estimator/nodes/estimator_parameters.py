@@ -1,0 +1,28 @@
+"""What a user may set about `estimator_node`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from swarm_loc_estimator.core.settings import EstimatorSettings
+from swarm_loc_estimator.core.swarm import number
+from swarm_loc_estimator.nodes.parameter_table import flag, text
+
+
+@dataclass(frozen=True)
+class EstimatorParameters:
+    """Parameters of `estimator_node`; those of the estimator itself are its settings."""
+
+    swarm_file: str = text("", "path of the swarm description", required=True)
+    tick_period_s: float = number(
+        0.05, "s", 0.005, 1.0, "period of the node's clock in which data is used and poses are published"
+    )
+    map_frame: str = text("map", "frame that all poses are in", required=True)
+    odom_frame: str = text(
+        "odom", "transforms go from map_frame to <robot>/odom_frame, the frame of its odometry", required=True
+    )
+    publish_tf: bool = flag(True, "publish these transforms")
+    publish_robot_poses: bool = flag(True, "publish <robot>/pose beside swarm/poses")
+    settings: EstimatorSettings = field(
+        default_factory=EstimatorSettings, metadata={"numbers_of": EstimatorSettings}
+    )

@@ -1,0 +1,162 @@
+"""Plays a bag into the graph with /clock, as `ros2 bag play --clock` does, for machines without it.
+
+    ./run swarm_loc_estimator play --ros-args -p bag:=FOLDER -p rate:=4.0
+
+Topics keep the bag's names and types; remappings work as for any node. It ends when the bag does.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock as ClockMessage
+
+from swarm_loc_estimator.io.bags import BagReader, BagTopic, RawMessage
+from swarm_loc_estimator.nodes.declare import declare_parameters
+from swarm_loc_estimator.nodes.pace import PlayedSoFar, play
+from swarm_loc_estimator.nodes.parameter_table import ParameterError
+from swarm_loc_estimator.nodes.player_parameters import PlayerParameters
+from swarm_loc_estimator.nodes.running import run_node
+
+_QOS = QoSProfile(depth=1000)
+"""Reliable, so that subscribers of either kind hear it."""
+_LATCHED_QOS = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_LATCHED_TOPICS = frozenset({"tf_static", "robot_description", "map"})
+_CLOCK = "clock"
+_POLL_S = 0.05
+_SAY_EVERY_S = 5.0
+_LAST_WORDS = Duration(seconds=10)
+
+
+class PlayNode(Node):
+    """Publishes the messages of a bag at their times.
+
+    Args:
+        node_arguments: Further arguments of `rclpy.node.Node`.
+
+    Raises:
+        ParameterError: A parameter cannot be used.
+        BagError: There is nothing to play.
+    """
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("player", **node_arguments)
+        self._parameters = declare_parameters(self, PlayerParameters)
+        self._reader = BagReader(Path(self._parameters.bag))
+        self._publisher_of: dict[str, Publisher] = {}
+        for topic in self._chosen_topics():
+            self._add_publisher(topic)
+        self._clock = self.create_publisher(ClockMessage, "/clock", _QOS) if self._parameters.clock else None
+        self._executor = EventsExecutor()
+        self._executor.add_node(self)
+        self.so_far = PlayedSoFar()
+
+    def run(self) -> int:
+        """Play to the end; the exit status."""
+        try:
+            self._wait_for_subscribers()
+            self._play_once()
+            while self._parameters.loop:
+                self._play_once()
+            self._wait_for_acknowledgements()
+        finally:
+            for loss in self._reader.losses:
+                print(f"play: {loss}", file=sys.stderr)
+            print(self.so_far.summary(), flush=True)
+        return 0
+
+    def destroy_node(self) -> None:
+        """Close the bag, too."""
+        self._reader.close()
+        self._executor.shutdown()
+        super().destroy_node()
+
+    def _chosen_topics(self) -> list[BagTopic]:
+        """The topics to play; the bag's own /clock is not among them."""
+        topics = {topic.name: topic for topic in self._reader.topics if topic.name != _CLOCK}
+        wanted = [name.lstrip("/") for name in self._parameters.topics]
+        for name in wanted:
+            if name not in topics:
+                raise ParameterError(
+                    f"parameter topics names '{name}', but '{self._parameters.bag}' has: {', '.join(topics)}."
+                )
+        return [topics[name] for name in wanted or topics]
+
+    def _add_publisher(self, topic: BagTopic) -> None:
+        """Get ready to publish a topic, if its type is installed."""
+        package, _, name = topic.type.replace("/msg/", "/").partition("/")
+        try:
+            message_class = getattr(import_module(f"{package}.msg"), name)
+        except (ImportError, AttributeError):
+            self.get_logger().warning(f"{topic.name} is not played: there is no type {topic.type} here")
+            return
+        qos = _LATCHED_QOS if topic.name in _LATCHED_TOPICS else _QOS
+        self._publisher_of[topic.name] = self.create_publisher(message_class, topic.name, qos)
+
+    def _play_once(self) -> None:
+        begin_ns = self._reader.time_range_ns[0] + round(self._parameters.start_offset_s * 1e9)
+        play(
+            self._reader.messages(self._publisher_of),
+            begin_ns,
+            self._parameters.rate,
+            self._publish,
+            self._publish_clock,
+            time.monotonic,
+            self._wait_until,
+            self.so_far,
+        )
+
+    def _publish(self, message: RawMessage) -> None:
+        topic, _, _, data = message
+        self._publisher_of[topic].publish(bytes(data))
+
+    def _publish_clock(self, now_ns: int) -> None:
+        if self._clock is not None:
+            self._clock.publish(ClockMessage(clock=Time(nanoseconds=now_ns).to_msg()))
+
+    def _wait_until(self, instant_s: float) -> None:
+        """Serve the node's parameters meanwhile, and notice signals."""
+        self._executor.spin_once(timeout_sec=max(0.0, instant_s - time.monotonic()))
+        while (left_s := instant_s - time.monotonic()) > 0.0:
+            self._executor.spin_once(timeout_sec=left_s)
+
+    def _wait_for_subscribers(self) -> None:
+        """Return once as many topics are heard as the user asked for; say what is waited for."""
+        wanted = self._parameters.wait_for_subscribers
+        said_s = time.monotonic()
+        while wanted:
+            heard = sum(p.get_subscription_count() > 0 for p in self._publisher_of.values())
+            clock_heard = self._clock is None or self._clock.get_subscription_count() > 0
+            if heard >= wanted and clock_heard:
+                return
+            if time.monotonic() > said_s + _SAY_EVERY_S:
+                said_s = time.monotonic()
+                clock = "" if clock_heard else " and for one of /clock (use_sim_time of the others)"
+                self.get_logger().info(f"waiting for subscribers: {heard} of {wanted} topics have one{clock}")
+            self._executor.spin_once(timeout_sec=_POLL_S)
+
+    def _wait_for_acknowledgements(self) -> None:
+        """Stay until everyone has received the last message."""
+        publishers = self._publisher_of.items()
+        silent = [name for name, publisher in publishers if not publisher.wait_for_all_acked(_LAST_WORDS)]
+        if silent:
+            self.get_logger().warning(f"not everything was received on {', '.join(silent)}")
+
+
+def main() -> int:
+    """Play a bag; 1 when a parameter or the bag cannot be used."""
+    return run_node("play", PlayNode, PlayNode.run)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

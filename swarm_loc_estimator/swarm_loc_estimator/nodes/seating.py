@@ -1,0 +1,42 @@
+"""What a person asks for with the service `set_robot_pose`, made planar and checked."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovariance
+
+from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.swarm import StartSigma
+
+_PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
+
+
+class SeatRequestError(ValueError):
+    """A pose that a robot cannot be set to; the message is one sentence."""
+
+
+def planar_seat(pose: PoseWithCovariance, start_sigma: StartSigma) -> tuple[FloatArray, FloatArray]:
+    """The pose (3,) x [m], y [m], theta [rad] and its covariance (3, 3).
+
+    Args:
+        pose: In map.
+        start_sigma: Taken when the covariance was left at zero.
+
+    Raises:
+        SeatRequestError: Numbers that are not finite, no quaternion, or no covariance.
+    """
+    position, q = pose.pose.position, pose.pose.orientation
+    sine, cosine = 2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z
+    planar = np.array([position.x, position.y, math.atan2(sine, cosine)])
+    if not np.isfinite(planar).all() or not (sine or cosine):
+        raise SeatRequestError("the pose must be finite numbers and a quaternion that is not zero.")
+    covariance = np.array(pose.covariance, dtype=float).reshape(6, 6)[_PLANAR]
+    if not covariance.any():
+        covariance = np.diag([start_sigma.x**2, start_sigma.y**2, start_sigma.theta**2])
+    if not np.isfinite(covariance).all() or np.linalg.eigvalsh(0.5 * (covariance + covariance.T))[0] <= 0.0:
+        raise SeatRequestError(
+            "the covariance of x, y and yaw must be positive definite, or zero for the default."
+        )
+    return planar, 0.5 * (covariance + covariance.T)
