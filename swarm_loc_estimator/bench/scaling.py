@@ -21,6 +21,7 @@ from swarm_loc_drivers.sim.detections import as_detections
 from swarm_loc_drivers.sim.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.estimator import SwarmEstimator
+from swarm_loc_estimator.core.settings import EstimatorSettings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -55,9 +56,9 @@ class CoreResult:
     covariances: FloatArray
 
 
-def run_core(run: SimulatedRun, tick_ns: NDArray[np.int64]) -> CoreResult:
+def run_core(run: SimulatedRun, tick_ns: NDArray[np.int64], settings: EstimatorSettings) -> CoreResult:
     """Feed a run in order of arrival to the estimator, and tick it."""
-    estimator = SwarmEstimator(run.swarm)
+    estimator = SwarmEstimator(run.swarm, settings)
     detections = as_detections(run)
     odometry = [(int(r), int(s), tuple(p), int(a)) for r, s, a, p in run.odometry.tolist()]
     frames = [(r, s, detections[f : f + c], a) for r, s, a, f, c in run.frames.tolist()]
@@ -78,11 +79,11 @@ def run_core(run: SimulatedRun, tick_ns: NDArray[np.int64]) -> CoreResult:
     )
 
 
-def measure(robots: int, duration_s: float, seed: int) -> dict[str, float]:
+def measure(robots: int, duration_s: float, seed: int, settings: EstimatorSettings) -> dict[str, float]:
     """All figures of one size."""
     run = simulate_grid(GridSettings(robots=robots, seed=seed, duration_s=duration_s))
     tick_ns = ticks(run)
-    core = run_core(run, tick_ns)
+    core = run_core(run, tick_ns, settings)
     settled = tick_ns >= run.start_ns + SETTLING_S * 1e9
     errors = errors_of(core.poses, run, tick_ns)[settled]
     figures = {
@@ -184,13 +185,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--robots", type=int, nargs="+", default=SIZES, help="swarm sizes")
     parser.add_argument("--duration", type=float, default=DURATION_S, help="simulated time [s]")
     parser.add_argument("--seed", type=int, default=1, help="of the simulation")
+    parser.add_argument("--fusion-period", type=float, default=0.0, help="of the estimator [s]; 0: exact")
     options = parser.parse_args(arguments)
+    settings = EstimatorSettings(fusion_period_s=options.fusion_period)
     warm_up = simulate_grid(GridSettings(robots=4, duration_s=2.0))
-    run_core(warm_up, ticks(warm_up))  # compiles what is not compiled yet
+    run_core(warm_up, ticks(warm_up), settings)  # compiles what is not compiled yet
     results = {}
     for robots in options.robots:
         print(f"{robots} robots ...", flush=True)
-        results[robots] = measure(robots, options.duration, options.seed)
+        results[robots] = measure(robots, options.duration, options.seed, settings)
     report(results)
 
 
