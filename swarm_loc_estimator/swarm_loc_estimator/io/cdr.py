@@ -70,19 +70,17 @@ class DetectionArrayMessage(NamedTuple):
 
 
 @dataclass(frozen=True)
-class OdometryBatch:
-    """Many odometry messages of one robot as columns.
+class PoseBatch:
+    """Many stamped poses as columns.
 
     Attributes:
         stamp_ns: (N,) int64.
         pose: (N, 3) x [m], y [m], yaw [rad].
-        twist: (N, 3) vx [m/s], vy [m/s], yaw rate [rad/s].
-        valid: (N,) bool; False where the bytes were no odometry message (its row is NaN, its stamp 0).
+        valid: (N,) bool; False where the bytes were no stamped pose (its row is NaN, its stamp 0).
     """
 
     stamp_ns: npt.NDArray[np.int64]
     pose: Array
-    twist: Array
     valid: npt.NDArray[np.bool_]
 
 
@@ -139,10 +137,6 @@ class _Layout:
         self.double = np.dtype(order + "f8")
         self.detection = _detection_dtype(order)
         self.stamp = np.dtype([("sec", order + "i4"), ("nanosec", order + "u4")])
-        # pose, its covariance, twist; the covariance of the twist follows
-        self.odometry = np.dtype(
-            [("pose", order + "f8", 7), ("covariance", order + "f8", 36), ("twist", order + "f8", 6)]
-        )
 
 
 _LAYOUTS = {b"\x00\x00": _Layout(">"), b"\x00\x01": _Layout("<")}
@@ -285,22 +279,17 @@ def _detections(data: bytes, layout: _Layout, offset: int, count: int) -> npt.ND
     return native
 
 
-def decode_odometry_batch(messages: Sequence[bytes]) -> OdometryBatch:
-    """Read many nav_msgs/Odometry at once, about ten times faster than one by one.
+def decode_pose_batch(messages: Sequence[bytes]) -> PoseBatch:
+    """Read many geometry_msgs/PoseStamped at once, about ten times faster than one by one.
 
     Args:
-        messages: Serialized messages, best of one robot: those with the same frame names are read at once.
+        messages: Serialized messages, best of one topic: those with the same frame are read in one pass.
 
     Returns:
         Columns in the order of `messages`; malformed ones are marked, never raised.
     """
     count = len(messages)
-    batch = OdometryBatch(
-        np.zeros(count, np.int64),
-        np.full((count, 3), np.nan),
-        np.full((count, 3), np.nan),
-        np.zeros(count, np.bool_),
-    )
+    batch = PoseBatch(np.zeros(count, np.int64), np.full((count, 3), np.nan), np.zeros(count, np.bool_))
     by_length: dict[int, list[int]] = {}
     for index, length in enumerate(map(len, messages)):
         by_length.setdefault(length, []).append(index)
@@ -314,45 +303,35 @@ def decode_odometry_batch(messages: Sequence[bytes]) -> OdometryBatch:
 
 
 def _decode_alike(
-    todo: npt.NDArray[np.intp], rows: npt.NDArray[np.uint8], batch: OdometryBatch
+    todo: npt.NDArray[np.intp], rows: npt.NDArray[np.uint8], batch: PoseBatch
 ) -> npt.NDArray[np.bool_]:
     """Read the messages that differ from the first one in numbers only; says which those are."""
     model = rows[0].tobytes()
     try:
-        decode_odometry(model)
+        decode_pose_stamped(model)
     except CdrError:
         first: npt.NDArray[np.bool_] = todo == todo[0]
         return first
     layout = _layout(model)
-    names_end = _string(model, layout, _string(model, layout, ENCAPSULATION + 8)[1])[1]
-    same_names = (rows[:, ENCAPSULATION + 8 : names_end] == rows[0, ENCAPSULATION + 8 : names_end]).all(
-        axis=1
-    )
+    name = slice(ENCAPSULATION + 8, _header(model, layout)[2])
     same_order = (rows[:, :2] == rows[0, :2]).all(axis=1)
-    alike: npt.NDArray[np.bool_] = np.logical_and(same_names, same_order)
-    everything = bool(alike.all())
-    start = names_end + -(names_end - ENCAPSULATION) % 8
-    _fill(batch, todo if everything else todo[alike], rows if everything else rows[alike], layout, start)
+    alike: npt.NDArray[np.bool_] = (rows[:, name] == rows[0, name]).all(axis=1) & same_order
+    start = name.stop + -(name.stop - ENCAPSULATION) % 8
+    _fill(batch, todo[alike], rows[alike], layout, start)
     return alike
 
 
 def _fill(
-    batch: OdometryBatch,
-    chosen: npt.NDArray[np.intp],
-    rows: npt.NDArray[np.uint8],
-    layout: _Layout,
-    start: int,
+    batch: PoseBatch, chosen: npt.NDArray[np.intp], rows: npt.NDArray[np.uint8], layout: _Layout, start: int
 ) -> None:
     """Write the numbers of like rows into the batch."""
     stamp = np.ascontiguousarray(rows[:, ENCAPSULATION : ENCAPSULATION + 8]).view(layout.stamp)[:, 0]
-    body = np.ascontiguousarray(rows[:, start : start + layout.odometry.itemsize]).view(layout.odometry)[:, 0]
+    numbers = np.ascontiguousarray(rows[:, start : start + 56]).view(layout.double)
     valid = stamp["nanosec"] < _NANOSECONDS
     batch.valid[chosen] = valid
-    batch.stamp_ns[chosen] = np.where(
-        valid, stamp["sec"].astype(np.int64) * _NANOSECONDS + stamp["nanosec"], 0
-    )
-    qx, qy, qz, qw = body["pose"][:, 3:].T
+    stamp_ns = stamp["sec"].astype(np.int64) * _NANOSECONDS + stamp["nanosec"]
+    batch.stamp_ns[chosen] = np.where(valid, stamp_ns, 0)
+    qx, qy, qz, qw = numbers[:, 3:].T
     sine, cosine = 2.0 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz
     yaw = np.where((sine != 0.0) | (cosine != 0.0), np.arctan2(sine, cosine), np.nan)
-    batch.pose[chosen] = np.where(valid[:, None], np.column_stack([body["pose"][:, :2], yaw]), np.nan)
-    batch.twist[chosen] = np.where(valid[:, None], body["twist"][:, [0, 1, 5]], np.nan)
+    batch.pose[chosen] = np.where(valid[:, None], np.column_stack([numbers[:, :2], yaw]), np.nan)
