@@ -77,7 +77,8 @@ class OdometryModel:
 
     The reported speed v and turn rate w of a step become distance_scale * v and turn_scale * w, further
     scaled by the robot's `MotionResponse` if it has one. They take effect `delay_s` after their stamp,
-    through a first-order lag `lag_s`. base_link moves along `course_offset` and lies `axle_offset` ahead of the wheels' axle.
+    through a first-order lag `lag_s`. base_link moves along `course_offset` and lies `axle_offset` ahead of
+    the wheels' axle.
     """
 
     wheel_separation: float = number(0.053, "m", 0.001, 10.0, "distance between the two wheels")
@@ -108,7 +109,7 @@ class OdometryModel:
     axle_offset: float = number(0.0, "m", -1.0, 1.0, "base_link ahead of the wheels' axle")
     delay_s: float = number(0.0, "s", -2.0, 2.0, "the motion happens this much after its stamp")
     lag_s: float = number(0.0, "s", 0.0, 10.0, "time constant with which the motion follows the report")
-    timeout_s: float = number(1.0, "s", 0.01, 3600.0, "after this much silence the motion counts as unknown")
+    timeout_s: float = number(1.0, "s", 0.01, 60.0, "after this much silence the motion counts as unknown")
     max_speed: float = number(1.0, "m/s", 0.001, 100.0, "no step is believed that would need more")
     max_turn_rate: float = number(10.0, "rad/s", 0.01, 1000.0, "bounds the turn while the motion is unknown")
     speed_change: float = number(
