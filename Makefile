@@ -6,6 +6,9 @@
 PYTHON ?= python3
 PACKAGES := swarm_loc_estimator swarm_loc_vision swarm_loc_drivers
 TESTED := $(PACKAGES) workspace
+# Only the plug-ins named here: what else is installed on a machine must not change how tests run.
+PYTEST := ./run -- env PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 pytest \
+    -p xdist.plugin -p pytest_timeout -p _hypothesis_pytestplugin --numprocesses 2
 
 .PHONY: demo test lint unit node setup clean
 
@@ -27,10 +30,10 @@ lint: setup
 	done
 
 unit: setup
-	./run -- pytest --numprocesses 2 $(wildcard $(TESTED:=/test/unit)) $(ARGS)
+	@$(PYTEST) $(wildcard $(TESTED:=/test/unit)) $(ARGS)
 
 node: setup
-	./run -- pytest --numprocesses 2 $(wildcard $(TESTED:=/test/node)) $(ARGS)
+	@$(PYTEST) $(wildcard $(TESTED:=/test/node)) $(ARGS)
 
 setup:
 	@$(PYTHON) setup_workspace.py
