@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,7 +11,7 @@ from swarm_loc_estimator.core.gate import position_distance, soften_heading, squ
 from swarm_loc_estimator.core.measurements import MeasurementColumns, innovation, predict_one
 from swarm_loc_estimator.core.motion import TrackArrays, look_up
 from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.state import BeliefArrays
+from swarm_loc_estimator.core.state import BeliefArrays, advance
 
 OPEN, USED, GATED = 0, 1, 2
 """Verdicts that the inner loop gives, see `fusion.Verdict`."""
@@ -149,24 +147,6 @@ def judge(
             if i < 2:
                 s[2, i] = s[i, 2]
     return passed, squared_distance(difference, s)
-
-
-@compiled
-def advance(belief: BeliefArrays, robot: int, noise: FloatArray) -> None:
-    """Predict a robot to where its track gathered `noise` (3, 3): P += Ad(T) (G - G_accounted) Ad(T)^T."""
-    x, y, theta = belief.transform[robot, 0], belief.transform[robot, 1], belief.transform[robot, 2]
-    cos, sin = math.cos(theta), math.sin(theta)
-    adjoint = ((cos, -sin, y), (sin, cos, -x), (0.0, 0.0, 1.0))
-    added = noise - belief.accounted[robot]
-    first = 3 * robot
-    for i in range(3):
-        for j in range(3):
-            value = 0.0
-            for a in range(3):
-                for b in range(3):
-                    value += adjoint[i][a] * added[a, b] * adjoint[j][b]
-            belief.covariance[first + i, first + j] += value
-    belief.accounted[robot] = noise
 
 
 @compiled

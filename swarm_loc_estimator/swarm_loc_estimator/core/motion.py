@@ -65,28 +65,38 @@ def look_up(
     if count == 0:
         pose[:], raw[:], noise[:] = 0.0, 0.0, 0.0
         return math.inf
-    row = np.searchsorted(tracks.stamp_ns[robot, :count], stamp_ns, side="right") - 1
-    row = max(0, min(row, count - 2))
-    after = min(row + 1, count - 1)
-    duration = tracks.stamp_ns[robot, after] - tracks.stamp_ns[robot, row]
-    silence = max(0.0, (stamp_ns - tracks.stamp_ns[robot, after]) * 1e-9)
-    timeout = tracks.model[robot].timeout_s
-    fraction = 0.0
-    if duration > 0:
-        fraction = max(0.0, (stamp_ns - tracks.stamp_ns[robot, row]) / duration)
-        if silence > timeout:
-            fraction = 1.0
-    _interpolate(tracks.pose[robot, row], tracks.pose[robot, after], fraction, pose)
-    _interpolate(tracks.raw[robot, row], tracks.raw[robot, after], fraction, raw)
-    for i in range(3):
-        for j in range(3):
-            start = tracks.noise[robot, row, i, j]
-            noise[i, j] = start + fraction * (tracks.noise[robot, after, i, j] - start)
-    if 0.0 < silence <= timeout:
-        _add_run_on(tracks.model[robot], silence, pose[0], pose[1], pose[2], noise)
-    elif silence > timeout:
-        _add_unknown_motion(tracks.model[robot], silence, pose[0], pose[1], pose[2], noise)
-    return silence
+    stamps, timeout_ns = tracks.stamp_ns[robot, :count], tracks.model[robot].timeout_s * 1e9
+    row = max(0, np.searchsorted(stamps, stamp_ns, side="right") - 1)
+    if row + 1 < count and stamps[row + 1] - stamps[row] <= timeout_ns:
+        elapsed = max(0, stamp_ns - stamps[row])
+        _along_step(tracks, robot, row, elapsed / (stamps[row + 1] - stamps[row]), pose, raw, noise)
+        return 0.0
+    silence_ns = max(0, stamp_ns - stamps[row])
+    if row > 0 and silence_ns <= timeout_ns and stamps[row] - stamps[row - 1] <= timeout_ns:
+        fraction = 1.0 + silence_ns / (stamps[row] - stamps[row - 1])
+        _along_step(tracks, robot, row - 1, fraction, pose, raw, noise)
+    else:
+        pose[:], raw[:] = tracks.pose[robot, row], tracks.raw[robot, row]
+        noise[:] = tracks.noise[robot, row]
+    _add_silence(tracks.model[robot], silence_ns * 1e-9, tracks.pose[robot, row], noise)
+    return silence_ns * 1e-9
+
+
+@compiled
+def _along_step(
+    tracks: TrackArrays,
+    robot: int,
+    row: int,
+    fraction: float,
+    pose: FloatArray,
+    raw: FloatArray,
+    noise: FloatArray,
+) -> None:
+    """Write pose, raw pose and noise at a fraction of the step from a row to the next, or beyond it."""
+    _interpolate(tracks.pose[robot, row], tracks.pose[robot, row + 1], fraction, pose)
+    _interpolate(tracks.raw[robot, row], tracks.raw[robot, row + 1], fraction, raw)
+    before, after = tracks.noise[robot, row], tracks.noise[robot, row + 1]
+    noise[:] = before + fraction * (after - before)
 
 
 @compiled
@@ -157,7 +167,7 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
     if jump or duration_s > model.timeout_s:  # where it went is unknown
         tracks.pose[robot, row] = start
         rate[:] = 0.0
-        _add_unknown_motion(model, duration_s, start[0], start[1], start[2], noise)
+        _add_silence(model, duration_s, start, noise)
         return int(jump)
     distance = math.cos(middle) * dx + math.sin(middle) * dy
     lateral = -math.sin(middle) * dx + math.cos(middle) * dy
@@ -260,21 +270,20 @@ def _add_step_noise(
 
 
 @compiled
-def _add_run_on(model: np.void, silence: float, x: float, y: float, theta: float, noise: FloatArray) -> None:
-    """Add the noise of a speed and a turn rate that walk at random while no message tells them."""
-    grown = silence**3 / 3.0
-    along, heading = model.speed_change**2 * grown, model.turn_rate_change**2 * grown
-    _add_in_track_frame(x, y, theta, along, 0.0, heading, 0.0, noise)
+def _add_silence(model: np.void, silence_s: float, pose: FloatArray, noise: FloatArray) -> None:
+    """Add the noise of a robot that has been silent since it was at `pose` (3,) on its track.
 
-
-@compiled
-def _add_unknown_motion(
-    model: np.void, duration_s: float, x: float, y: float, theta: float, noise: FloatArray
-) -> None:
-    """Add the noise of a robot that may have driven anywhere its speed allows."""
-    reach = (model.max_speed * duration_s) ** 2 / 3.0
-    turned = min(model.max_turn_rate * duration_s, math.pi) ** 2 / 3.0  # pi: any heading
-    _add_in_track_frame(x, y, theta, reach, reach, turned, 0.0, noise)
+    At first its speed and turn rate walk at random; after its timeout it may have driven anywhere. Both act
+    about the last pose known: so the noise never shrinks with time.
+    """
+    reach = (model.max_speed * silence_s) ** 2 / 3.0
+    turned = min(model.max_turn_rate * silence_s, math.pi) ** 2 / 3.0  # pi: any heading
+    along, across, heading = reach, reach, turned
+    if silence_s <= model.timeout_s:
+        walked = silence_s**3 / 3.0
+        along, across = min(along, model.speed_change**2 * walked), 0.0
+        heading = min(heading, model.turn_rate_change**2 * walked)
+    _add_in_track_frame(pose[0], pose[1], pose[2], along, across, heading, 0.0, noise)
 
 
 @compiled

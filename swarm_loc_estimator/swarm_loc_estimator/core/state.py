@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.dense_filter import DenseFilter, IndexArray
+from swarm_loc_estimator.core.compiled import compiled
+from swarm_loc_estimator.core.dense_filter import DenseFilter, IndexArray, cholesky3
 from swarm_loc_estimator.core.se2 import FloatArray
 
 NEVER_NS = np.iinfo(np.int64).min
@@ -96,13 +98,16 @@ class SwarmState:
 
     def advance(self, robots: NDArray[np.int64], noise: FloatArray) -> None:
         """Predict distinct robots (k,) up to where their tracks have gathered `noise` (k, 3, 3)."""
-        self.filter.predict(robot_columns(robots), self.map_noise(robots, noise))
-        self.accounted[robots] = noise
+        belief = self.arrays()
+        for robot, gathered in zip(robots, noise, strict=True):
+            advance(belief, robot, gathered)
 
     def map_noise(self, robots: NDArray[np.int64], noise: FloatArray) -> FloatArray:
         """The track noise (k, 3, 3) not accounted for yet, as covariance of the error in `map`."""
-        adjoint = se2.adjoint(self.transform[robots])
-        added: FloatArray = adjoint @ (noise - self.accounted[robots]) @ np.swapaxes(adjoint, 1, 2)
+        added = np.zeros_like(noise)
+        belief = self.arrays()
+        for robot, gathered, one in zip(robots, noise, added, strict=True):
+            new_noise(belief, robot, gathered, one)
         return added
 
     def correct(self, correction: FloatArray) -> None:
@@ -110,6 +115,36 @@ class SwarmState:
         moved = np.flatnonzero(self.tracked)
         twist = correction.reshape(-1, 3)[moved]
         self.transform[moved] = se2.compose(se2.exp(twist), self.transform[moved])
+
+
+@compiled
+def advance(belief: BeliefArrays, robot: int, noise: FloatArray) -> None:
+    """Predict a robot to where its track gathered `noise` (3, 3): P += Ad(T) (G - G_accounted) Ad(T)^T."""
+    added = np.zeros((3, 3))
+    if new_noise(belief, robot, noise, added):
+        first = 3 * robot
+        for i in range(3):
+            for j in range(3):
+                belief.covariance[first + i, first + j] += added[i, j]
+        belief.accounted[robot] = noise
+
+
+@compiled
+def new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, added: FloatArray) -> bool:
+    """Write Ad(T) (G - G_accounted) Ad(T)^T (3, 3) and return True; or leave it when that is no covariance.
+
+    The latter happens only when odometry comes so late that more was assumed of a silence beyond the horizon.
+    """
+    x, y, theta = belief.transform[robot, 0], belief.transform[robot, 1], belief.transform[robot, 2]
+    cos, sin = math.cos(theta), math.sin(theta)
+    adjoint = np.array(((cos, -sin, y), (sin, cos, -x), (0.0, 0.0, 1.0)))
+    difference = noise - belief.accounted[robot]
+    rounding = 1e-12 + 1e-9 * (abs(difference[0, 0]) + abs(difference[1, 1]) + abs(difference[2, 2]))
+    factor = cholesky3(difference + rounding * np.eye(3))
+    if not math.isfinite(factor[0, 0] + factor[1, 1] + factor[2, 2]):
+        return False
+    added[:] = adjoint @ difference @ adjoint.T
+    return True
 
 
 def robot_columns(robots: NDArray[np.int64]) -> IndexArray:

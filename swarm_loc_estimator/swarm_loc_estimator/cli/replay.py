@@ -1,0 +1,109 @@
+"""Replay a bag through the estimator: poses, errors against ground truth, pictures and a page.
+
+    replay bags/eight_five_robots
+    replay recording.mcap --swarm swarm.yaml --out out/recording --set horizon_s=1.0
+
+The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. The report
+(report.txt, report.html, paths.png, errors.png) and the poses (poses.csv) are written to --out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+
+from swarm_loc_estimator.cli.progress import ProgressLine
+from swarm_loc_estimator.core.settings import EstimatorSettings, SettingsError
+from swarm_loc_estimator.io.bag_file import BagError
+from swarm_loc_estimator.io.report import write_report
+from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
+from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
+from swarm_loc_estimator.replay import TICK_S, replay
+from swarm_loc_estimator.replay_result import ReplayResult
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    options = _parser().parse_args(arguments)
+    progress = ProgressLine()
+    try:
+        settings = read_settings(options.set)
+        swarm = load_swarm(options.swarm or swarm_beside(options.bag))
+        result = replay(options.bag, swarm, settings, tick_s=options.tick, progress=progress)
+    except (BagError, SwarmFileError, SettingsError, DefinitionsNotFoundError) as error:
+        progress.close()
+        print(error, file=sys.stderr)
+        return 1
+    progress(1.0, "writing the report")
+    files = write_report(result, options.out)
+    write_poses(result, options.out / "poses.csv")
+    progress.close()
+    print(files.text.read_text(encoding="utf-8"))
+    print(f"Report: {files.page}")
+    return 0
+
+
+def swarm_beside(bag: Path) -> Path:
+    """The swarm description that belongs to a bag."""
+    return (bag if bag.is_dir() else bag.parent) / "swarm.yaml"
+
+
+def read_settings(pairs: Sequence[str]) -> EstimatorSettings:
+    """Settings from texts such as `horizon_s=1.0`; raises SettingsError."""
+    known = [f.name for f in fields(EstimatorSettings)]
+    values = {}
+    for pair in pairs:
+        name, _, text = pair.partition("=")
+        if name not in known:
+            raise SettingsError(f"--set {pair}: '{name}' is no setting; there are {', '.join(known)}.")
+        try:
+            values[name] = float(text)
+        except ValueError:
+            raise SettingsError(f"--set {pair}: '{text}' is not a number.") from None
+    return EstimatorSettings(**values)
+
+
+def write_poses(result: ReplayResult, path: Path) -> None:
+    """Write all poses: stamp_ns, robot, x, y, theta, and the upper triangle of their covariance."""
+    upper = np.triu_indices(3)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(
+            ["stamp_ns", "robot", "x_m", "y_m", "theta_rad", "xx", "xy", "xtheta", "yy", "ytheta", "thetatheta"]
+        )
+        for stamp_ns, poses, covariances in zip(
+            result.stamp_ns.tolist(), result.pose, result.covariance, strict=True
+        ):
+            for robot, pose, covariance in zip(result.swarm.robots, poses, covariances, strict=True):
+                if np.isfinite(pose).all():
+                    writer.writerow([stamp_ns, robot.name, *pose.tolist(), *covariance[upper].tolist()])
+
+
+def _parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="replay", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("bag", type=Path, help="rosbag2 folder, .mcap or .db3 file")
+    parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
+    parser.add_argument("--out", type=Path, default=Path("out/replay"), help="folder for the report")
+    parser.add_argument("--tick", type=_positive, default=TICK_S, help="seconds between two outputs")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="estimator setting")
+    return parser
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 1e-3 <= value <= 3600.0:
+        raise argparse.ArgumentTypeError(f"{text} must lie in [0.001, 3600] s")
+    return value
+
+
+if __name__ == "__main__":
+    sys.exit(main())
