@@ -22,6 +22,7 @@ from swarm_loc_estimator.core.swarm import Swarm
 from swarm_loc_estimator.core.timeline import Timeline
 
 _FARTHEST_M = 1e6
+_LEAST_VARIANCE, _MOST_VARIANCE = 1e-14, 1e14
 _FIX_GATE = float(gate_threshold(0.9999))
 
 
@@ -72,7 +73,10 @@ class SwarmEstimator:
         self._tracks = OdometryTracks(swarm.robots)
         self._converter = SightingConverter(swarm)
         self._fusion = Fusion(swarm, self.settings, self._tracks)
-        self._timeline = Timeline(self.settings, self._fusion.step, SwarmState(len(swarm.robots)))
+        self._timeline = Timeline(
+            self.settings, self._fusion.step, SwarmState(len(swarm.robots)), self._tracks.reach_ns
+        )
+        self._horizon_ns = round(self.settings.horizon_s * 1e9)
         self._future_ns = round(self.settings.future_tolerance_s * 1e9)
         self._jump_back_ns = round(self.settings.jump_back_s * 1e9)
         self._ingest_drops: Counter[str] = Counter()
@@ -86,6 +90,8 @@ class SwarmEstimator:
 
     def reset(self) -> None:
         """Forget all data and begin anew with the configured starts; the counters go on."""
+        self.drop("reset", len(self._odometry) + sum(d.size for _, _, d in self._detections))
+        self.drop("reset", self._timeline.waiting)
         self._ingest_drops.update(self._timeline_drops())
         self._tracks.clear()
         self._timeline.restart(SwarmState(self._robots.size))
@@ -119,7 +125,7 @@ class SwarmEstimator:
 
     def seat(self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike) -> None:
         """Set a robot to a pose (3,) in `map` with covariance (3, 3), whatever was believed."""
-        self._timeline.add(self._about(robot, stamp_ns, pose, covariance, Kind.SEAT))
+        self._add_measurements(self._about(robot, stamp_ns, pose, covariance, Kind.SEAT))
 
     def forget(self, robot: int, stamp_ns: int) -> None:
         """Take a robot out of the estimate; it waits for a fix."""
@@ -146,19 +152,21 @@ class SwarmEstimator:
 
     def tick(self, now_ns: int) -> SwarmEstimate:
         """Use all that has arrived and give the poses at `now_ns`."""
-        self._check_clock(now_ns)
+        newest_ns = self._check_clock(now_ns)
+        oldest_ns = newest_ns - self._horizon_ns
+        self._tracks.trim(oldest_ns, oldest_ns - 2 * self._tracks.reach_ns)
         self._use_odometry()
         self._use_detections()
-        self._timeline.advance(now_ns)
-        self._tracks.trim(now_ns - round((self.settings.horizon_s + 1.0) * 1e9))
+        self._timeline.advance(newest_ns)
         return self._estimate(now_ns)
 
-    def _check_clock(self, now_ns: int) -> None:
-        """Begin anew when time has jumped back, as at the loop of a bag."""
+    def _check_clock(self, now_ns: int) -> int:
+        """Begin anew when time has jumped back, as at the loop of a bag; return the newest time since."""
         if self._now_ns is not None and now_ns < self._now_ns - self._jump_back_ns:
             self.reset()
             self.time_jumps += 1
         self._now_ns = now_ns if self._now_ns is None else max(now_ns, self._now_ns)
+        return self._now_ns
 
     def _in_time(self, stamp_ns: int, now_ns: int, count: int = 1) -> bool:
         self._check_clock(now_ns)
@@ -201,12 +209,14 @@ class SwarmEstimator:
 
     def _add_measurements(self, measurements: MeasurementArray) -> None:
         """Hand measurements on whose numbers are finite and whose noise is a covariance."""
-        noise = measurements["covariance"]
-        finite = np.isfinite(noise).all(axis=(1, 2)) & np.isfinite(measurements["value"]).all(axis=1)
-        symmetric = np.where(finite[:, None, None], 0.5 * (noise + np.swapaxes(noise, 1, 2)), np.eye(3))
-        sound = finite & (np.linalg.eigvalsh(symmetric)[:, 0] > 0.0)
-        self.drop("bad_covariance", int(np.sum(~sound)))
-        self._timeline.add(measurements[sound])
+        value = measurements["value"]
+        finite = np.isfinite(value).all(axis=1)
+        near = finite & (np.abs(np.nan_to_num(value)).max(axis=1) <= _FARTHEST_M)
+        sound = _is_covariance(measurements["covariance"])
+        self.drop("non_finite", int(np.sum(~finite)))
+        self.drop("absurd", int(np.sum(finite & ~near)))
+        self.drop("bad_covariance", int(np.sum(near & ~sound)))
+        self._timeline.add(measurements[near & sound])
 
     def _about(
         self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike, kind: Kind
@@ -229,10 +239,7 @@ class SwarmEstimator:
         }
 
     def _estimate(self, now_ns: int) -> SwarmEstimate:
-        state = self._timeline.state
-        if state.fresh.any():  # robots whose odometry has begun but which took part in no measurement yet
-            state = state.copy()
-            self._fusion.enter_at_start(state, now_ns)
+        state = self._fusion.with_starts(self._timeline.state, now_ns)
         sample = self._tracks.at(self._robots, np.full(self._robots.size, now_ns))
         poses = se2.compose(state.transform, sample.pose)
         error = state.filter.marginals(robot_columns(self._robots)) + state.map_noise(
@@ -247,3 +254,15 @@ class SwarmEstimator:
         never = state.last_fix_ns == NEVER_NS
         age = np.where(never, -1.0, (now_ns - np.where(never, now_ns, state.last_fix_ns)) * 1e-9)
         return SwarmEstimate(now_ns, poses, covariances, map_to_odom, status.astype(np.uint8), age)
+
+
+def _is_covariance(matrices: FloatArray) -> NDArray[np.bool_]:
+    """Whether matrices (m, 3, 3) are symmetric, positive definite and of a magnitude to reckon with."""
+    variance = np.diagonal(matrices, axis1=1, axis2=2)
+    sound: NDArray[np.bool_] = np.isfinite(matrices).all(axis=(1, 2))
+    sound &= ((variance >= _LEAST_VARIANCE) & (variance <= _MOST_VARIANCE)).all(axis=1)
+    sigma = np.sqrt(np.where(sound[:, None], variance, 1.0))
+    scaled = np.where(sound[:, None, None], matrices, np.eye(3)) / (sigma[:, :, None] * sigma[:, None, :])
+    sound &= np.abs(scaled - np.swapaxes(scaled, 1, 2)).max(axis=(1, 2), initial=0.0) < 1e-6
+    definite: NDArray[np.bool_] = sound & (np.linalg.eigvalsh(scaled)[:, 0] > 1e-9)
+    return definite

@@ -52,13 +52,37 @@ class Fusion:
         }
         self._clues = ClueBook(tracks, settings.fix_window_s)
 
-    def enter_at_start(self, state: SwarmState, stamp_ns: int) -> None:
-        """Take in the robots with a configured start whose odometry has begun by `stamp_ns`."""
-        for robot in np.flatnonzero(state.fresh):
-            if robot in self._starts and self._tracks.begun(robot, stamp_ns):
-                start, covariance = self._starts[robot]
-                transform = se2.compose(start, se2.inverse(self._tracks.arrays.begin_pose[robot]))
-                state.enter(int(robot), transform, se2.error_covariance(start, covariance), np.zeros((3, 3)))
+    def with_starts(self, state: SwarmState, stamp_ns: int) -> SwarmState:
+        """The state, together with those robots at their starts about whom there was no measurement yet."""
+        ready = [robot for robot in self._starts if self._may_enter(state, robot, stamp_ns)]
+        if ready:
+            state = state.copy()
+            for robot in ready:
+                self._enter_at_start(state, robot)
+        return state
+
+    def _may_enter(self, state: SwarmState, robot: int, stamp_ns: int) -> bool:
+        """Whether the robot may enter at its configured start: its odometry has begun by `stamp_ns`."""
+        return bool(state.fresh[robot]) and robot in self._starts and self._tracks.begun(robot, stamp_ns)
+
+    def _enter_at_start(self, state: SwarmState, robot: int) -> None:
+        start, covariance = self._starts[robot]
+        transform = se2.compose(start, se2.inverse(self._tracks.arrays.begin_pose[robot]))
+        state.enter(robot, transform, se2.error_covariance(start, covariance), np.zeros((3, 3)))
+
+    def _enter_those_measured(self, state: SwarmState, measurements: MeasurementArray) -> bool:
+        """Let robots enter at their starts with the first measurement (m,) about them; whether any did.
+
+        Not before: only a measurement about a robot is computed again when its first odometry arrives late.
+        """
+        entered = False
+        for side in ("observer", "target"):
+            new = np.append(state.fresh, False)[measurements[side]]  # NOBODY (-1) finds the last
+            for robot, stamp_ns in zip(measurements[side][new], measurements["stamp_ns"][new], strict=True):
+                if self._may_enter(state, int(robot), int(stamp_ns)):
+                    self._enter_at_start(state, int(robot))
+                    entered = True
+        return entered
 
     def step(
         self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
@@ -76,8 +100,6 @@ class Fusion:
             nis: (m,) normalised innovations squared, written; NaN where there is none.
         """
         nis[:] = np.nan
-        if state.fresh.any():
-            self.enter_at_start(state, int(measurements["stamp_ns"][-1]))
         if self._together and measurements.size >= _MANY and np.all(measurements["kind"] < Kind.SEAT):
             self._fuse_together(state, measurements, verdicts, nis)
         else:
@@ -98,12 +120,18 @@ class Fusion:
                 state.lose(robot)
                 continue
             one = measurements[k : k + 1]
-            verdicts[k] = self._obey(state, one) if one["kind"][0] >= Kind.SEAT else self._note(state, one)
+            if one["kind"][0] >= Kind.SEAT:
+                verdicts[k] = self._obey(state, one)
+            elif self._enter_those_measured(state, one):
+                continue
+            else:
+                verdicts[k] = self._note(state, one)
             k += 1
 
     def _fuse_together(
         self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
     ) -> None:
+        self._enter_those_measured(state, measurements)
         known = np.append(state.tracked, True)  # NOBODY (-1) finds the last
         tied = known[measurements["observer"]] & known[measurements["target"]]
         rows = np.flatnonzero(tied)

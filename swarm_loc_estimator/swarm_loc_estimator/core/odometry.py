@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from swarm_loc_estimator.core.motion import MODEL_DTYPE, IntArray, TrackArrays, integrate, look_up_all
-from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.se2 import FloatArray, wrap_angle
 from swarm_loc_estimator.core.swarm import MotionResponse, Robot
 
 UNCHANGED_NS = np.iinfo(np.int64).max
@@ -83,6 +83,12 @@ class OdometryTracks:
         self._oldest_ns = _BEFORE_ALL_NS
         self.arrays = self._allocated(_FIRST_CAPACITY)
 
+    @property
+    def reach_ns(self) -> int:
+        """How far before its stamp a row may change look-ups."""
+        timeout_ns = np.ceil(self._model["timeout_s"] * 1e9).astype(np.int64)
+        return int(np.max(timeout_ns - np.minimum(0, self._delay_ns), initial=0))
+
     def begun(self, robot: int, stamp_ns: int) -> bool:
         """Whether the robot's odometry has begun by an instant."""
         return bool(self.arrays.count[robot] and self.arrays.begin_ns[robot] <= stamp_ns)
@@ -96,11 +102,11 @@ class OdometryTracks:
             raw: (k, 3) finite poses as the driver reports them, in its own odom frame.
         """
         stamps = stamps_ns + self._delay_ns[robots]
-        fresh = stamps >= self._oldest_ns
+        fresh = stamps_ns >= self._oldest_ns
         robots, stamps, raw, changed_from = self._take_back_later_rows(
             robots[fresh], stamps[fresh], raw[fresh]
         )
-        order = np.lexsort((raw[:, 2], raw[:, 1], raw[:, 0], stamps, robots))
+        order = np.lexsort((wrap_angle(raw[:, 2]), raw[:, 1], raw[:, 0], stamps, robots))
         while np.any(
             self.arrays.count + np.bincount(robots, minlength=self._robots) > self.arrays.stamp_ns.shape[1]
         ):
@@ -120,13 +126,13 @@ class OdometryTracks:
         look_up_all(self.arrays, robots, stamps_ns, sample.pose, sample.raw, sample.noise, sample.silence_s)
         return sample
 
-    def trim(self, oldest_ns: int) -> None:
-        """Let rows go that no look-up from `oldest_ns` on needs; older ones are refused from now on."""
+    def trim(self, oldest_ns: int, kept_ns: int) -> None:
+        """Refuse rows stamped before `oldest_ns`; let those go that no look-up from `kept_ns` on needs."""
         self._oldest_ns = oldest_ns
         capacity = self.arrays.stamp_ns.shape[1]
         for robot in np.flatnonzero(self.arrays.count > capacity // 2):
             count = self.arrays.count[robot]
-            first = int(np.searchsorted(self.arrays.stamp_ns[robot, :count], oldest_ns, side="right")) - 2
+            first = int(np.searchsorted(self.arrays.stamp_ns[robot, :count], kept_ns, side="right")) - 2
             if first > capacity // 4:
                 for rows in (getattr(self.arrays, name) for name in _ROWS):
                     rows[robot, : count - first] = rows[robot, first:count].copy()
@@ -168,7 +174,7 @@ class OdometryTracks:
         arrays = self.arrays
         taken: list[tuple[IntArray, IntArray, FloatArray]] = [(robots, stamps, raw)]
         newest = arrays.stamp_ns[robots, np.maximum(arrays.count[robots] - 1, 0)]
-        late = (arrays.count[robots] > 0) & (stamps < newest)
+        late = (arrays.count[robots] > 0) & (stamps <= newest)  # of two rows with one stamp the order decides
         for robot in np.unique(robots[late]):
             count = arrays.count[robot]
             first = int(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from swarm_loc_estimator.core.state import SwarmState
 
 Step = Callable[[SwarmState, MeasurementArray, NDArray[np.uint8], FloatArray], None]
 
-_CHECKPOINTS_PER_HORIZON = 40
+_CHECKPOINTS = 40
 _BEFORE_ALL = np.iinfo(np.int64).min
 
 
@@ -41,14 +42,17 @@ class Timeline:
         settings: Horizon, and how stamps are grouped into steps.
         step: Fuses the measurements of one step into a state, see `Fusion.step`.
         state: Where to begin.
+        reach_ns: How far before its stamp late odometry may change what measurements meant; those are kept
+            so much longer than the horizon.
     """
 
-    def __init__(self, settings: EstimatorSettings, step: Step, state: SwarmState) -> None:
+    def __init__(self, settings: EstimatorSettings, step: Step, state: SwarmState, reach_ns: int) -> None:
         self._step = step
         self._horizon_ns = round(settings.horizon_s * 1e9)
         self._state_period_ns = round(settings.state_period_s * 1e9)
         self._fusion_period_ns = round(settings.fusion_period_s * 1e9)
-        self._spacing_ns = self._horizon_ns // _CHECKPOINTS_PER_HORIZON
+        self._kept_ns = self._horizon_ns + reach_ns
+        self._spacing_ns = self._kept_ns // _CHECKPOINTS
         self.restart(state)
 
     def restart(self, state: SwarmState) -> None:
@@ -69,6 +73,11 @@ class Timeline:
         """Take measurements (m,) in; they count from the next `advance` on."""
         if measurements.size:
             self._new.append(measurements)
+
+    @property
+    def waiting(self) -> int:
+        """How many measurements wait for the next `advance`."""
+        return sum(measurements.size for measurements in self._new)
 
     def invalidate(self, changed_from_ns: NDArray[np.int64]) -> None:
         """Have the steps computed again whose robots' tracks have changed.
@@ -95,7 +104,7 @@ class Timeline:
         changed = [] if self._redo_from_ns is None else [self._key(self._redo_from_ns)]
         self._redo_from_ns = None
         self._compute_from(min([*changed, *first_new], default=None))
-        self._forget_before(self._key(now_ns - self._horizon_ns))
+        self._forget_before(self._key(now_ns - self._kept_ns))
 
     def _key(self, stamp_ns: int) -> int:
         """The step that a stamp belongs to, as the stamp at which the step begins."""
@@ -122,16 +131,8 @@ class Timeline:
         first_ns = int(new["stamp_ns"].min())
         keep = int(np.searchsorted(self.measurements["stamp_ns"], first_ns))
         tail = np.concatenate([self.measurements[keep:], new])
-        order = np.lexsort(
-            (tail["value"][:, 0], tail["marker_id"], tail["target"], tail["observer"], tail["stamp_ns"])
-        )
-        tail = tail[order]
-        again = np.zeros(tail.size, dtype=bool)
-        again[1:] = True
-        for name in ("stamp_ns", "observer", "target", "marker_id"):
-            again[1:] &= tail[name][1:] == tail[name][:-1]
-        self.duplicates += int(again.sum())
-        tail = tail[~again]
+        tail, duplicates = _in_order(tail)
+        self.duplicates += duplicates
         self.measurements = np.concatenate([self.measurements[:keep], tail])
         self.verdicts = np.concatenate([self.verdicts[:keep], np.zeros(tail.size, dtype=np.uint8)])
         self.nis = np.concatenate([self.nis[:keep], np.full(tail.size, np.nan)])
@@ -168,3 +169,26 @@ class Timeline:
         self.settled += np.bincount(self.verdicts[:passed], minlength=len(Verdict))
         self.measurements, self.verdicts = self.measurements[passed:], self.verdicts[passed:]
         self.nis = self.nis[passed:]
+
+
+def _in_order(measurements: MeasurementArray) -> tuple[MeasurementArray, int]:
+    """Measurements in the order of their stamps, each once, and how many were repetitions.
+
+    The order does not depend on that of arrival, not even among measurements that share a stamp.
+    """
+    keys = [measurements[name] for name in ("kind", "marker_id", "target", "observer", "stamp_ns")]
+    order = np.lexsort(keys)
+    if not _equal_to_the_one_before([key[order] for key in keys]).any():
+        return measurements[order], 0
+    numbers = [*measurements["value"].T, *measurements["alternative"].T]
+    numbers += [measurements["covariance"][:, i, i] for i in range(3)]
+    order = np.lexsort([*numbers, *keys])
+    again = _equal_to_the_one_before([key[order] for key in [*numbers, *keys]])
+    return measurements[order][~again], int(again.sum())
+
+
+def _equal_to_the_one_before(columns: list[NDArray[Any]]) -> NDArray[np.bool_]:
+    """Whether each row of the columns, each (m,), equals the row before it."""
+    equal = np.zeros(columns[0].size, dtype=bool)
+    equal[1:] = np.logical_and.reduce([column[1:] == column[:-1] for column in columns])
+    return equal
