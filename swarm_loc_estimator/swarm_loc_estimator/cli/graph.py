@@ -21,10 +21,15 @@ def parse(arguments: Sequence[str]) -> GraphOptions:
     return GraphOptions(**vars(parser.parse_args(arguments)))
 
 
+def say(line: str) -> None:
+    """Print a line in one piece, since the nodes print to the same terminal."""
+    print(f"[graph] {line}\n", end="", flush=True)
+
+
 def main() -> int:
     """Run until a node ends or Ctrl-C."""
     try:
-        return run_graph(graph_nodes(parse(sys.argv[1:])), lambda line: print(f"[graph] {line}", flush=True))
+        return run_graph(graph_nodes(parse(sys.argv[1:])), say)
     except GraphError as error:
         print(error, file=sys.stderr)
         return 1

@@ -9,6 +9,8 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -28,7 +30,7 @@ import sys
 from swarm_loc_estimator.graph import NodeSpec
 from swarm_loc_estimator.processes import run_graph
 nodes = [NodeSpec("fake", name, name, required=name != "short") for name in sys.argv[1:]]
-sys.exit(run_graph(nodes, lambda line: print(line, flush=True)))
+sys.exit(run_graph(nodes, lambda line: print(f"{line}\\n", end="", flush=True)))
 """
 
 
@@ -47,9 +49,18 @@ def _fake_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
 
 
-def _start(*names: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", RUN_GRAPH, *names]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+@pytest.fixture
+def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Starts a graph of `fake` executables by their names; it does not outlive the test."""
+    with ExitStack() as stack:
+
+        def started(*names: str) -> subprocess.Popen[str]:
+            command = [sys.executable, "-c", RUN_GRAPH, *names]
+            graph = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+            stack.callback(graph.kill)
+            return graph
+
+        yield started
 
 
 def _read_until(graph: subprocess.Popen[str], line: str, count: int = 1) -> None:
@@ -71,8 +82,8 @@ def test_a_required_node_that_ends_takes_the_others_along(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_every_node_in_order(stop: signal.Signals) -> None:
-    graph = _start("forever", "short", "forever")
+def test_a_signal_ends_every_node(stop: signal.Signals, start: Callable[..., subprocess.Popen[str]]) -> None:
+    graph = start("forever", "short", "forever")
     _read_until(graph, "up", 2)
     graph.send_signal(stop)
     rest, _ = graph.communicate(timeout=60)
@@ -81,8 +92,8 @@ def test_a_signal_ends_every_node_in_order(stop: signal.Signals) -> None:
     assert graph.returncode == 0
 
 
-def test_a_killed_graph_leaves_no_orphan() -> None:
-    graph = _start("forever", "forever")
+def test_a_killed_graph_leaves_no_orphan(start: Callable[..., subprocess.Popen[str]]) -> None:
+    graph = start("forever", "forever")
     _read_until(graph, "up", 2)
     graph.kill()
     graph.communicate(timeout=60)
