@@ -91,7 +91,12 @@ def graph_nodes(options: GraphOptions) -> list[NodeSpec]:
         )
     ]
     if options.bag is not None:
-        player: dict[str, ParameterValue] = {"bag": options.bag, "rate": options.rate}
+        # The estimator starts more slowly than the player: the bag begins when someone listens.
+        player: dict[str, ParameterValue] = {
+            "bag": options.bag,
+            "rate": options.rate,
+            "wait_for_subscribers": 1,
+        }
         nodes.append(
             NodeSpec(package, "play", "player", parameters=player, parameter_file=options.parameter_file)
         )

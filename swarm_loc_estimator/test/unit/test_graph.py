@@ -18,7 +18,7 @@ def test_a_bag_brings_its_player_and_its_clock() -> None:
 
     assert estimator.parameters["use_sim_time"] is True
     assert player.executable == "play"
-    assert player.parameters == {"bag": "bags/eight", "rate": 4.0}
+    assert player.parameters == {"bag": "bags/eight", "rate": 4.0, "wait_for_subscribers": 1}
 
 
 def test_arguments_keep_types_spaces_and_order() -> None:
