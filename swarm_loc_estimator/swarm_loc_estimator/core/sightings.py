@@ -7,16 +7,27 @@ the mount's pitch and roll taken out.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from swarm_loc_estimator.core.compiled import compiled
 from swarm_loc_estimator.core.gate import gate_threshold
-from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE, NOBODY, Kind, MeasurementArray
+from swarm_loc_estimator.core.measurements import (
+    MEASUREMENT_DTYPE,
+    NOBODY,
+    Kind,
+    MeasurementArray,
+    MeasurementColumns,
+)
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import CameraMount, SensorModel, Swarm
+
+IntArray = NDArray[np.int64]
 
 CONTENT_POSITION = 1
 """Detection content: position only (MarkerDetection.CONTENT_POSITION)."""
@@ -25,8 +36,12 @@ CONTENT_POSE = 2
 CONTENT_POSE_TWO = 3
 """Detection content: likewise, with a mirrored second solution."""
 
+_FATES = ("measured", "unknown_id", "own_marker", "no_camera", "non_finite", "absurd")
+_MEASURED, _UNKNOWN_ID, _OWN_MARKER, _NO_CAMERA, _NON_FINITE, _ABSURD = range(len(_FATES))
+_POLAR = int(Kind.POLAR)
 _FARTHEST_M = 1e3
 _FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_SENSOR_DTYPE = np.dtype([(f.name, np.float64) for f in fields(SensorModel)])
 
 
 @dataclass(frozen=True)
@@ -42,6 +57,36 @@ class Conversion:
     dropped: dict[str, int]
 
 
+class _Cameras(NamedTuple):
+    """All cameras, per robot: whether it has one, S (N, 3), axes optical to level (N, 3, 3), errors, gate."""
+
+    present: NDArray[np.bool_]
+    mount: FloatArray
+    level: FloatArray
+    sensor: NDArray[np.void]
+    gate: FloatArray
+
+
+class _Markers(NamedTuple):
+    """All markers by ascending id (k,): whose they are, and M (k, 3), its heading NaN when it shows none."""
+
+    id: IntArray
+    owner: IntArray
+    pose: FloatArray
+
+
+class _Detections(NamedTuple):
+    """The fields of detections (d,) that count."""
+
+    id: NDArray[np.uint32]
+    content: NDArray[np.uint8]
+    position: FloatArray
+    orientation: FloatArray
+    covariance: FloatArray
+    alternative_position: FloatArray
+    alternative_orientation: FloatArray
+
+
 class SightingConverter:
     """Converts the detections of all cameras of a swarm at once.
 
@@ -50,144 +95,178 @@ class SightingConverter:
     """
 
     def __init__(self, swarm: Swarm) -> None:
-        owners = sorted(swarm.owner_of.items())
-        self._id = np.array([marker_id for marker_id, _ in owners], dtype=np.int64)
-        self._owner = np.array([owner.robot_index for _, owner in owners], dtype=np.int64)
-        markers = [owner.marker for _, owner in owners]
-        yaw = [np.nan if m.yaw is None else m.yaw for m in markers]
-        self._marker = np.array([[m.x, m.y, y] for m, y in zip(markers, yaw, strict=True)]).reshape(-1, 3)
-        self._has_camera = np.array([robot.camera is not None for robot in swarm.robots])
         mounts = [robot.camera or CameraMount() for robot in swarm.robots]
-        self._mount = np.array([[m.x, m.y, m.yaw] for m in mounts]).reshape(-1, 3)
-        tilt = Rotation.from_euler("yx", [[m.pitch, m.roll] for m in mounts]) if mounts else None
-        self._level = tilt.as_matrix() @ _FROM_OPTICAL if tilt else np.zeros((0, 3, 3))
-        self._sensor = {
-            f.name: np.array([getattr(robot.sensor, f.name) for robot in swarm.robots], dtype=float)
-            for f in fields(SensorModel)
-        }
-        self._gate = gate_threshold(self._sensor["gate_probability"])
+        tilts = [Rotation.from_euler("yx", [m.pitch, m.roll]).as_matrix() @ _FROM_OPTICAL for m in mounts]
+        sensors = [
+            tuple(getattr(robot.sensor, name) for name in _SENSOR_DTYPE.names or ()) for robot in swarm.robots
+        ]
+        self._cameras = _Cameras(
+            present=np.array([robot.camera is not None for robot in swarm.robots], dtype=bool),
+            mount=np.array([[m.x, m.y, m.yaw] for m in mounts]).reshape(-1, 3),
+            level=np.array(tilts).reshape(-1, 3, 3),
+            sensor=np.array(sensors, dtype=_SENSOR_DTYPE),
+            gate=gate_threshold([robot.sensor.gate_probability for robot in swarm.robots]),
+        )
+        owners = sorted(swarm.owner_of.items())
+        markers = [owner.marker for _, owner in owners]
+        self._markers = _Markers(
+            id=np.array([marker_id for marker_id, _ in owners], dtype=np.int64),
+            owner=np.array([owner.robot_index for _, owner in owners], dtype=np.int64),
+            pose=np.array([[m.x, m.y, np.nan if m.yaw is None else m.yaw] for m in markers]).reshape(-1, 3),
+        )
 
-    def convert(
-        self, robots: NDArray[np.int64], stamps_ns: NDArray[np.int64], detections: NDArray[np.void]
-    ) -> Conversion:
+    def convert(self, robots: IntArray, stamps_ns: IntArray, detections: NDArray[np.void]) -> Conversion:
         """Turn detections into measurements.
 
         Args:
             robots: (d,) index of the robot whose camera saw each.
             stamps_ns: (d,) exposure times.
             detections: (d,) with fields id, content, position (3,), orientation (4,) xyzw, covariance (6, 6),
-                alternative_orientation (4,), as published in the optical frame.
+                alternative_position, alternative_orientation, as published in the optical frame.
         """
-        dropped: dict[str, int] = {}
-        place = np.clip(np.searchsorted(self._id, detections["id"]), 0, max(0, self._id.size - 1))
-        known = (
-            self._id[place] == detections["id"] if self._id.size else np.zeros(detections.size, dtype=bool)
+        measurements = np.zeros(robots.size, dtype=MEASUREMENT_DTYPE)
+        measurements["stamp_ns"] = stamps_ns
+        measurements["received_from"] = measurements["observer"] = robots
+        fates = np.zeros(robots.size, dtype=np.int64)
+        _convert_all(
+            _Detections(*(detections[name] for name in _Detections._fields)),
+            self._cameras,
+            self._markers,
+            MeasurementColumns.of(measurements),
+            measurements["marker_id"],
+            fates,
         )
-        checks = {
-            "unknown_id": known,
-            "own_marker": ~known | (self._owner[place] != robots) if self._id.size else known,
-            "no_camera": self._has_camera[robots],
-            "non_finite": _all_finite(detections),
-            "absurd": ~(np.abs(detections["position"]).max(axis=1, initial=0.0) > _FARTHEST_M),
-        }
-        good = np.ones(detections.size, dtype=bool)
-        for reason, passed in checks.items():
-            dropped[reason] = int(np.sum(good & ~passed))
-            good &= passed
-        measurements = self._measure(robots[good], stamps_ns[good], detections[good], place[good])
-        return Conversion(measurements, {reason: count for reason, count in dropped.items() if count})
-
-    def _measure(
-        self,
-        robots: NDArray[np.int64],
-        stamps_ns: NDArray[np.int64],
-        detections: NDArray[np.void],
-        place: NDArray[np.intp],
-    ) -> MeasurementArray:
-        result = np.zeros(robots.size, dtype=MEASUREMENT_DTYPE)
-        sensor = {name: values[robots] for name, values in self._sensor.items()}
-        result["stamp_ns"] = stamps_ns + np.rint(sensor["time_offset_s"] * 1e9).astype(np.int64)
-        result["received_from"] = result["observer"] = robots
-        result["target"] = np.where(self._owner[place] >= 0, self._owner[place], NOBODY)
-        result["marker_id"] = self._id[place]
-        result["sensor"] = self._mount[robots]
-        result["marker"] = np.nan_to_num(self._marker[place])
-        level = self._level[robots]
-        position = np.einsum("dij,dj->di", level, detections["position"])
-        with_heading = (detections["content"] != CONTENT_POSITION) & ~np.isnan(self._marker[place][:, 2])
-        result["has_heading"] = with_heading
-        result["kind"] = np.where(with_heading, Kind.CARTESIAN, Kind.POLAR)
-        result["has_alternative"] = with_heading & (detections["content"] == CONTENT_POSE_TWO)
-        self._fill_polar(result, position, sensor, ~with_heading)
-        for name in ("value", "alternative"):
-            orientation = "orientation" if name == "value" else "alternative_orientation"
-            heading = _face_heading(level[with_heading], detections[orientation][with_heading])
-            result[name][with_heading] = np.column_stack([position[with_heading, :2], heading])
-        result["gate"] = self._gate[robots]
-        result["covariance"][with_heading] = _pose_noise(
-            detections["covariance"][with_heading],
-            level[with_heading],
-            {k: v[with_heading] for k, v in sensor.items()},
-        )
-        return result
-
-    def _fill_polar(
-        self,
-        result: MeasurementArray,
-        position: FloatArray,
-        sensor: dict[str, FloatArray],
-        rows: NDArray[np.bool_],
-    ) -> None:
-        """Calibrated range and bearing of detections without a heading."""
-        logged_range = np.hypot(position[rows, 0], position[rows, 1])
-        logged_bearing = np.arctan2(position[rows, 1], position[rows, 0])
-        s = {name: values[rows] for name, values in sensor.items()}
-        curve = s["range_log_scale"] + s["range_skew"] * logged_bearing + s["range_curve"] * logged_bearing**2
-        distance = logged_range * np.exp(curve) + s["range_offset"]
-        distance += s["robot_range_offset"] * (result["target"][rows] != NOBODY)
-        bearing = (s["bearing_scale"] + s["bearing_curve"] * logged_bearing) * logged_bearing
-        result["value"][rows, 0] = distance
-        result["value"][rows, 1] = bearing + s["bearing_offset"]
-        covariance = np.zeros((distance.size, 3, 3))
-        covariance[:, 0, 0] = (s["range_sigma"] + s["range_sigma_per_m"] * np.abs(distance)) ** 2
-        covariance[:, 1, 1] = s["bearing_sigma"] ** 2
-        covariance[:, 2, 2] = 1.0
-        result["covariance"][rows] = covariance
+        counts = np.bincount(fates, minlength=len(_FATES)).tolist()
+        dropped = {_FATES[fate]: counts[fate] for fate in range(1, len(_FATES)) if counts[fate]}
+        return Conversion(measurements[fates == _MEASURED], dropped)
 
 
-def _all_finite(detections: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Whether all numbers that the content promises are finite (d,); a zero quaternion is none."""
-    with_pose = detections["content"] != CONTENT_POSITION
-    with_two = detections["content"] == CONTENT_POSE_TWO
-    finite: NDArray[np.bool_] = np.isfinite(detections["position"]).all(axis=1)
-    finite &= ~with_pose | np.isfinite(detections["covariance"]).all(axis=(1, 2))
-    for name, needed in (("orientation", with_pose), ("alternative_orientation", with_two)):
-        quaternion = detections[name]
-        finite &= ~needed | (
-            np.isfinite(quaternion).all(axis=1) & (np.abs(quaternion).max(axis=1, initial=0.0) > 1e-6)
-        )
-    return finite
+@compiled
+def _convert_all(
+    detections: _Detections,
+    cameras: _Cameras,
+    markers: _Markers,
+    out: MeasurementColumns,
+    marker_id: IntArray,
+    fates: IntArray,
+) -> None:
+    """Fill the measurements (d,), whose stamps and observers are there, and say what became of each."""
+    position, other_position = np.empty(3), np.empty(3)
+    for k in range(fates.size):
+        robot = out.observer[k]
+        place = min(np.searchsorted(markers.id, detections.id[k]), markers.id.size - 1)
+        fates[k] = _fate(detections, k, cameras, markers, robot, place)
+        if fates[k] != _MEASURED:
+            continue
+        sensor, level, marker = cameras.sensor[robot], cameras.level[robot], markers.pose[place]
+        marker_id[k] = markers.id[place]
+        out.stamp_ns[k] += round(sensor.time_offset_s * 1e9)
+        out.target[k] = markers.owner[place]
+        out.sensor[k] = cameras.mount[robot]
+        out.gate[k] = cameras.gate[robot]
+        out.marker[k, 0], out.marker[k, 1] = marker[0], marker[1]
+        _levelled(level, detections.position[k], position)
+        if detections.content[k] == CONTENT_POSITION or math.isnan(marker[2]):
+            out.kind[k] = _POLAR
+            _calibrate(sensor, position, out.target[k], out.value[k], out.covariance[k])
+            continue
+        out.has_heading[k], out.marker[k, 2] = 1, marker[2]
+        out.value[k, 0], out.value[k, 1] = position[0], position[1]
+        out.value[k, 2] = _face_heading(level, detections.orientation[k])
+        if detections.content[k] == CONTENT_POSE_TWO:
+            out.has_alternative[k] = 1
+            _levelled(level, detections.alternative_position[k], other_position)
+            out.alternative[k, 0], out.alternative[k, 1] = other_position[0], other_position[1]
+            out.alternative[k, 2] = _face_heading(level, detections.alternative_orientation[k])
+        _pose_noise(sensor, level, detections.covariance[k], out.covariance[k])
 
 
-def _face_heading(level: FloatArray, quaternion: FloatArray) -> FloatArray:
-    """Heading (d,) in the sensor's plane of the direction out of each face, its z axis."""
-    if not quaternion.shape[0]:
-        return np.zeros(0)
-    out_of_face = Rotation.from_quat(quaternion).as_matrix()[:, :, 2]
-    levelled = np.einsum("dij,dj->di", level, out_of_face)
-    heading: FloatArray = np.arctan2(levelled[:, 1], levelled[:, 0])
-    return heading
+@compiled
+def _fate(
+    detections: _Detections, k: int, cameras: _Cameras, markers: _Markers, robot: int, place: int
+) -> int:
+    """Whether detection k, of the marker that may be at `place`, becomes a measurement, or why not."""
+    if place < 0 or markers.id[place] != detections.id[k]:
+        return _UNKNOWN_ID
+    if markers.owner[place] == robot:
+        return _OWN_MARKER
+    if not cameras.present[robot]:
+        return _NO_CAMERA
+    position, sound = detections.position[k], True
+    for i in range(3):
+        sound = sound and math.isfinite(position[i])
+    if detections.content[k] != CONTENT_POSITION:
+        sound = sound and _is_rotation(detections.orientation[k])
+        for i in range(6):
+            for j in range(6):
+                sound = sound and math.isfinite(detections.covariance[k, i, j])
+    if detections.content[k] == CONTENT_POSE_TWO:
+        sound = sound and _is_rotation(detections.alternative_orientation[k])
+        for i in range(3):
+            sound = sound and math.isfinite(detections.alternative_position[k, i])
+    if not sound:
+        return _NON_FINITE
+    if max(abs(position[0]), abs(position[1]), abs(position[2])) > _FARTHEST_M:
+        return _ABSURD
+    return _MEASURED
 
 
-def _pose_noise(published: FloatArray, level: FloatArray, sensor: dict[str, FloatArray]) -> FloatArray:
-    """Covariances (d, 3, 3) of forward, left, heading: as published, or the sensor's where unknown (-1)."""
-    to_plane = np.zeros((published.shape[0], 3, 6))
-    to_plane[:, :2, :3] = level[:, :2, :]
-    to_plane[:, 2, 3:] = level[:, 2, :]  # the rotation about the vertical
-    planar = to_plane @ published @ np.swapaxes(to_plane, 1, 2)
-    unknown = published[:, 0, 0] < 0.0
-    configured = np.zeros_like(planar)
-    for i, name in enumerate(("forward_sigma", "left_sigma", "heading_sigma")):
-        configured[:, i, i] = sensor[name] ** 2
-    noise: FloatArray = np.where(unknown[:, None, None], configured, planar)
-    return noise
+@compiled
+def _is_rotation(quaternion: FloatArray) -> bool:
+    """Whether a quaternion (4,) is finite and not zero."""
+    norm = 0.0
+    for i in range(4):
+        norm += quaternion[i] * quaternion[i]
+    return math.isfinite(norm) and norm > 1e-12
+
+
+@compiled
+def _levelled(level: FloatArray, optical: FloatArray, out: FloatArray) -> None:
+    """Write a vector (3,) of the optical frame in the level axes forward, left, up of the camera."""
+    for i in range(3):
+        out[i] = level[i, 0] * optical[0] + level[i, 1] * optical[1] + level[i, 2] * optical[2]
+
+
+@compiled
+def _face_heading(level: FloatArray, quaternion: FloatArray) -> float:
+    """Heading in the sensor plane of the z axis of an orientation xyzw (4,), the direction out of a face."""
+    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    out_of_face, axes = np.empty(3), np.empty(3)
+    out_of_face[0], out_of_face[1] = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x)
+    out_of_face[2] = w * w - x * x - y * y + z * z
+    _levelled(level, out_of_face, axes)
+    return math.atan2(axes[1], axes[0])
+
+
+@compiled
+def _calibrate(
+    sensor: np.void, position: FloatArray, target: int, value: FloatArray, noise: FloatArray
+) -> None:
+    """Write calibrated range and bearing (3,) and their covariance (3, 3); see `SensorModel`."""
+    logged = math.atan2(position[1], position[0])
+    curve = sensor.range_log_scale + sensor.range_skew * logged + sensor.range_curve * logged * logged
+    distance = math.hypot(position[0], position[1]) * math.exp(curve) + sensor.range_offset
+    if target != NOBODY:
+        distance += sensor.robot_range_offset
+    value[0] = distance
+    value[1] = (sensor.bearing_scale + sensor.bearing_curve * logged) * logged + sensor.bearing_offset
+    noise[0, 0] = (sensor.range_sigma + sensor.range_sigma_per_m * abs(distance)) ** 2
+    noise[1, 1] = sensor.bearing_sigma**2
+    noise[2, 2] = 1.0
+
+
+@compiled
+def _pose_noise(sensor: np.void, level: FloatArray, published: FloatArray, noise: FloatArray) -> None:
+    """Write the covariance (3, 3) of forward, left, heading; the sensor model is for unknown ones (-1)."""
+    if published[0, 0] < 0.0:
+        noise[0, 0], noise[1, 1] = sensor.forward_sigma**2, sensor.left_sigma**2
+        noise[2, 2] = sensor.heading_sigma**2
+        return
+    to_plane = np.zeros((3, 6))
+    to_plane[0, :3], to_plane[1, :3] = level[0], level[1]
+    to_plane[2, 3:] = level[2]  # the rotation about the vertical
+    for i in range(3):
+        for j in range(3):
+            for a in range(6):
+                for b in range(6):
+                    noise[i, j] += to_plane[i, a] * published[a, b] * to_plane[j, b]
