@@ -17,7 +17,7 @@ demo: setup
 
 test: lint unit node
 
-lint: setup
+lint:
 	./run -- ruff check
 	./run -- ruff format --check
 	./run -- mypy conftest.py setup_workspace.py workspace

@@ -14,11 +14,12 @@ from workspace.layout import WorkspaceError
 from workspace.stamps import only_one
 
 
-def ensure(*, bench: bool = False) -> None:
+def ensure(*, bench: bool = False, compiled: bool = False) -> None:
     """Do what is not done yet.
 
     Args:
         bench: Whether the benchmarks' requirements belong to it.
+        compiled: Whether the estimator's inner loops are compiled, too.
 
     Raises:
         WorkspaceError: Something is missing, or a step failed.
@@ -27,6 +28,8 @@ def ensure(*, bench: bool = False) -> None:
     with only_one():
         install.ensure(bench=bench)
         build.ensure()
+        if compiled:
+            build.compile_estimator()
 
 
 def main() -> int:
@@ -35,7 +38,7 @@ def main() -> int:
     parser.add_argument("--bench", action="store_true", help="add what the benchmarks compare with")
     arguments = parser.parse_args()
     try:
-        ensure(bench=arguments.bench)
+        ensure(bench=arguments.bench, compiled=True)
     except WorkspaceError as error:
         print(error, file=sys.stderr)
         return 1
