@@ -32,7 +32,7 @@ from swarm_loc_estimator.nodes.declare import declare_parameters
 from swarm_loc_estimator.nodes.estimator_health import Health, Report, TickCost, load_report, merged
 from swarm_loc_estimator.nodes.estimator_outputs import EstimateOutputs
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
-from swarm_loc_estimator.nodes.running import run_node
+from swarm_loc_estimator.nodes.running import run_node, spin
 from swarm_loc_estimator.nodes.seating import SeatRequestError, planar_seat
 from swarm_loc_estimator.nodes.warm_up import warm_up
 from swarm_loc_msgs.msg import MarkerDetectionArray
@@ -49,6 +49,7 @@ _ORDINARY_DROPS = frozenset(
     {"duplicate", "gated", "odometry_duplicate", "odometry_too_old", "too_old", "untied"}
 )
 """Late, double or outlying data is a matter of course."""
+_MOST_WITHOUT_CLOCK = 20_000
 _PATIENCE_S = 5.0
 """How long nothing may come before the log names what is missing."""
 
@@ -72,7 +73,7 @@ class EstimatorNode(Node):
         self._parameters = declare_parameters(self, EstimatorParameters)
         self._swarm = load_swarm(Path(self._parameters.swarm_file))
         self.get_logger().info("compiling the estimator: a minute the first time on a machine")
-        warm_up()
+        warm_up(self._parameters.settings)
         self._estimator = create_estimator(self._swarm, self._parameters.settings)
         self._ingest = Ingest(self._swarm, self._estimator)
         self._backlog: list[tuple[int, bytes, int]] = []
@@ -123,22 +124,23 @@ class EstimatorNode(Node):
     def _on_tick(self) -> None:
         begin_s = time.perf_counter()
         now_ns = self.get_clock().now().nanoseconds
-        self._use_backlog()
         if not now_ns:
+            self._limit_backlog()
             return
+        for handle, data, arrival_ns in self._backlog:
+            self._ingest.receive(handle, data, arrival_ns or now_ns)
+        self._backlog.clear()
         self._estimate = self._estimator.tick(now_ns)
         self._say_time_jumps()
         self._outputs.publish(self._estimate)
         self._cost.note(time.perf_counter() - begin_s)
 
-    def _use_backlog(self) -> None:
-        """Hand what has arrived to the estimator; before the first /clock nothing can be placed in time."""
-        for handle, data, arrival_ns in self._backlog:
-            if arrival_ns:
-                self._ingest.receive(handle, data, arrival_ns)
-            else:
-                self._estimator.drop("no_clock")
-        self._backlog.clear()
+    def _limit_backlog(self) -> None:
+        """Before the first /clock nothing can be placed in time; keep the newest."""
+        surplus = len(self._backlog) - _MOST_WITHOUT_CLOCK
+        if surplus > 0:
+            del self._backlog[:surplus]
+            self._estimator.drop("no_clock", surplus)
 
     def _say_time_jumps(self) -> None:
         """The estimator itself begins anew when time has jumped back; say so, once per jump."""
@@ -254,7 +256,7 @@ class EstimatorNode(Node):
 
 def main() -> int:
     """Run until SIGINT or SIGTERM; 1 when a parameter or the swarm description cannot be used."""
-    return run_node("estimator_node", EstimatorNode)
+    return run_node("estimator_node", EstimatorNode, spin)
 
 
 if __name__ == "__main__":

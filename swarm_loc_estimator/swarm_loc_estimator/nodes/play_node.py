@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 import time
 from importlib import import_module
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from swarm_loc_estimator.nodes.declare import declare_parameters
 from swarm_loc_estimator.nodes.pace import PlayedSoFar, play
 from swarm_loc_estimator.nodes.parameter_table import ParameterError
 from swarm_loc_estimator.nodes.player_parameters import PlayerParameters
-from swarm_loc_estimator.nodes.running import run_node
+from swarm_loc_estimator.nodes.running import Stop, run_node
 
 _QOS = QoSProfile(depth=1000)
 """Reliable, so that subscribers of either kind hear it."""
@@ -61,18 +62,17 @@ class PlayNode(Node):
         self._executor.add_node(self)
         self.so_far = PlayedSoFar()
 
-    def run(self) -> int:
-        """Play to the end; the exit status."""
-        try:
-            self._wait_for_subscribers()
-            self._play_once()
-            while self._parameters.loop:
-                self._play_once()
-            self._wait_for_acknowledgements()
-        finally:
-            for loss in self._reader.losses:
-                print(f"play: {loss}", file=sys.stderr)
-            print(self.so_far.summary(), flush=True)
+    def run(self, stop: Stop) -> int:
+        """Play to the end, or until asked to stop; the exit status."""
+        self._wait_for_subscribers(stop)
+        if not stop.requested:
+            self._play_once(stop)
+        while self._parameters.loop and not stop.requested:
+            self._play_once(stop)
+        self._wait_for_acknowledgements()
+        for loss in self._reader.losses:
+            print(f"play: {loss}", file=sys.stderr)
+        print(self.so_far.summary(), flush=True)
         return 0
 
     def destroy_node(self) -> None:
@@ -103,10 +103,10 @@ class PlayNode(Node):
         qos = _LATCHED_QOS if topic.name in _LATCHED_TOPICS else _QOS
         self._publisher_of[topic.name] = self.create_publisher(message_class, topic.name, qos)
 
-    def _play_once(self) -> None:
+    def _play_once(self, stop: Stop) -> None:
         begin_ns = self._reader.time_range_ns[0] + round(self._parameters.start_offset_s * 1e9)
         play(
-            self._reader.messages(self._publisher_of),
+            takewhile(lambda _: not stop.requested, self._reader.messages(self._publisher_of)),
             begin_ns,
             self._parameters.rate,
             self._publish,
@@ -125,16 +125,16 @@ class PlayNode(Node):
             self._clock.publish(ClockMessage(clock=Time(nanoseconds=now_ns).to_msg()))
 
     def _wait_until(self, instant_s: float) -> None:
-        """Serve the node's parameters meanwhile, and notice signals."""
+        """Serve the node's parameters meanwhile."""
         self._executor.spin_once(timeout_sec=max(0.0, instant_s - time.monotonic()))
         while (left_s := instant_s - time.monotonic()) > 0.0:
             self._executor.spin_once(timeout_sec=left_s)
 
-    def _wait_for_subscribers(self) -> None:
+    def _wait_for_subscribers(self, stop: Stop) -> None:
         """Return once as many topics are heard as the user asked for; say what is waited for."""
         wanted = self._parameters.wait_for_subscribers
         said_s = time.monotonic()
-        while wanted:
+        while wanted and not stop.requested:
             heard = sum(p.get_subscription_count() > 0 for p in self._publisher_of.values())
             clock_heard = self._clock is None or self._clock.get_subscription_count() > 0
             if heard >= wanted and clock_heard:

@@ -1,16 +1,19 @@
-"""From the command line to a node and back: start, spin, and end cleanly however it ends."""
+"""From the command line to a node and back: start, work, and end cleanly however it ends."""
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable
+from types import FrameType
+from typing import TypeVar
 
 import rclpy
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from swarm_loc_estimator.io.bag_file import BagError
 from swarm_loc_estimator.io.swarm_file import SwarmFileError
@@ -19,42 +22,70 @@ from swarm_loc_estimator.nodes.parameter_table import ParameterError
 KNOWN_ERRORS = (BagError, ParameterError, ParameterException, SwarmFileError)
 """Mistakes of a user, told in one sentence."""
 
-_WAKE_S = 0.5
+_WAKE_S = 0.2
+"""How long a signal may go unnoticed while nothing happens."""
+
+SomeNode = TypeVar("SomeNode", bound=Node)
 
 
-def run_node(name: str, create: Callable[[], Node], work: Callable[[Node], int] | None = None) -> int:
+class Stop:
+    """Whether SIGINT or SIGTERM has come.
+
+    rclpy's own handlers take the ROS context away at once, and a callback that is just publishing fails. So
+    while a node works the signal is only noted; before that it interrupts what is going on.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._noted_only = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def defer(self) -> None:
+        """From now on only note signals."""
+        self._noted_only = True
+
+    def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
+        self.requested = True
+        if not self._noted_only:
+            raise KeyboardInterrupt
+
+
+def run_node(name: str, create: Callable[[], SomeNode], work: Callable[[SomeNode, Stop], int]) -> int:
     """Create a node, let it work, and end.
 
     Args:
         name: Name of the executable, for errors.
         create: Makes the node once ROS is up.
-        work: What the node does, returning the exit status; spins until a signal when left out.
+        work: What the node does until it is asked to stop, such as `spin`; returns the exit status.
 
     Returns:
-        The exit status: that of `work`, 0 after SIGINT or SIGTERM, 1 after a mistake of the user.
+        The exit status: that of `work`, 0 when stopped before, 1 after a mistake of the user.
     """
-    node: Node | None = None
+    node: SomeNode | None = None
+    stop = Stop()
     try:
-        rclpy.init()
-    except rclpy_implementation.RCLError as error:
-        print(f"{name}: {str(error).splitlines()[0]}", file=sys.stderr)
-        return 1
-    try:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = create()
-        return (work or spin)(node)
+        stop.defer()
+        return work(node, stop)
     except KNOWN_ERRORS as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except rclpy_implementation.RCLInvalidROSArgsError as error:
+        print(f"{name}: {str(error).splitlines()[0]}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
         return 0
     finally:
+        stop.defer()
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
 
 
-def spin(node: Node) -> int:
-    """Handle a node's events until a signal.
+def spin(node: Node, stop: Stop) -> int:
+    """Handle a node's events until it is asked to stop.
 
     The executor: the default ones build their wait set anew at every wake, which costs 18 us per subscription
     and saturates a core at 50 robots. Of the EventsExecutor only `spin_once` with a timeout works in Jazzy;
@@ -62,10 +93,8 @@ def spin(node: Node) -> int:
     """
     executor = EventsExecutor()
     executor.add_node(node)
-    try:
-        while node.context.ok():
-            executor.spin_once(timeout_sec=_WAKE_S)
-    finally:
-        executor.remove_node(node)
-        executor.shutdown()
+    while not stop.requested:
+        executor.spin_once(timeout_sec=_WAKE_S)
+    executor.remove_node(node)
+    executor.shutdown()
     return 0

@@ -5,27 +5,47 @@ from __future__ import annotations
 import numpy as np
 
 from swarm_loc_estimator.core.estimator import SwarmEstimator
+from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.sightings import CONTENT_POSE_TWO, CONTENT_POSITION
 from swarm_loc_estimator.core.swarm import Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
 
 _SECOND = 1_000_000_000
+_FIRST_LANDMARK = 10
+_LANDMARKS = 20  # more than are fused one by one where many may be fused together
+_FACING = (0.0, 1.0, 0.0, 0.0)  # x y z w: a marker that looks at the camera
+_AWAY = (0.0, 0.7, 0.0, 0.7)
 
 
-def warm_up() -> None:
-    """Run a small estimator through all that it does: a minute the first time on a machine, then a second."""
-    first = Robot("a", faces=(Face("front", 1, yaw=0.0),), start=(0.0, 0.0, 0.0))
-    second = Robot("b", faces=(Face("front", 2, yaw=0.0),))
-    estimator = SwarmEstimator(Swarm((first, second), (Landmark(3, x=1.0, yaw=3.0),)))
-    detections = np.zeros(3, DETECTION_DTYPE)
-    detections["id"] = [2, 3, 3]
-    detections["content"] = [CONTENT_POSE_TWO, CONTENT_POSE_TWO, CONTENT_POSITION]
-    detections["position"] = [0.0, 0.0, 1.0]
-    detections["orientation"] = detections["alternative_orientation"] = [0.0, 1.0, 0.0, 0.1]
-    detections["covariance"][:, 0, 0] = -1.0
-    for step in range(4):
-        now_ns = (10 + step) * _SECOND
-        for robot in range(2):
-            estimator.add_odometry(robot, now_ns, (0.01 * step, 0.0, 0.0), now_ns)
-        estimator.add_detections(0, now_ns - _SECOND // 2, detections, now_ns)
+def warm_up(settings: EstimatorSettings) -> None:
+    """Run a small estimator through all that it does: a minute the first time on a machine, then a second.
+
+    Args:
+        settings: Those that will be used; others may need other compiled code.
+    """
+    robots = [Robot(name, faces=(Face("front", k, yaw=0.0),)) for k, name in enumerate("ab")]
+    robots.append(Robot("c", faces=(Face("front", 2, yaw=0.0),), start=(0.0, 0.0, 0.0)))
+    places = range(_LANDMARKS)
+    marks = tuple(Landmark(_FIRST_LANDMARK + k, x=1.0, y=0.2 * k, yaw=3.1) for k in places)
+    estimator = SwarmEstimator(Swarm(tuple(robots), marks), settings)
+    for step in range(8):
+        now_ns = 10 * _SECOND + step * _SECOND // 4
+        for robot in range(len(robots)):
+            estimator.add_odometry(robot, now_ns, (0.01 * step, 0.0, 0.001 * step), now_ns)
+            estimator.add_detections(robot, now_ns - _SECOND // 8, _sight(robot), now_ns)
         estimator.tick(now_ns)
+
+
+def _sight(observer: int) -> np.ndarray[tuple[int], np.dtype[np.void]]:
+    """Detections (d,) of landmarks and of another robot: with two solutions, mirrored ones, and without heading."""
+    detections = np.zeros(_LANDMARKS + 1, DETECTION_DTYPE)
+    detections["id"][:_LANDMARKS] = _FIRST_LANDMARK + np.arange(_LANDMARKS)
+    detections["id"][_LANDMARKS] = (observer + 1) % 3
+    detections["content"] = CONTENT_POSE_TWO
+    detections["content"][0] = CONTENT_POSITION
+    detections["position"][:, 0] = -0.2 * np.arange(_LANDMARKS + 1)
+    detections["position"][:, 2] = 1.0
+    detections["orientation"], detections["alternative_orientation"] = _FACING, _AWAY
+    detections["orientation"][1], detections["alternative_orientation"][1] = _AWAY, _FACING
+    detections["covariance"][:, 0, 0] = -1.0
+    return detections
