@@ -23,11 +23,11 @@ class EstimatorSettings:
         2.0, "s", 0.05, 60.0, "data up to this late count at their own time; older are dropped"
     )
     fusion_period_s: float = number(
-        0.0,
+        0.2,
         "s",
         0.0,
         1.0,
-        "measurements of one such period are fused in one step; 0: one step per stamp, exact",
+        "where a large swarm has many measurements in such a period, they are fused together; 0: never",
     )
     state_period_s: float = number(
         0.0,
