@@ -259,8 +259,8 @@ class SwarmEstimator:
 def _is_covariance(matrices: FloatArray) -> NDArray[np.bool_]:
     """Whether matrices (m, 3, 3) are symmetric, positive definite and of a magnitude to reckon with."""
     variance = np.diagonal(matrices, axis1=1, axis2=2)
-    sound: NDArray[np.bool_] = np.isfinite(matrices).all(axis=(1, 2))
-    sound &= ((variance >= _LEAST_VARIANCE) & (variance <= _MOST_VARIANCE)).all(axis=1)
+    usable = np.isfinite(matrices).all(axis=2) & (variance >= _LEAST_VARIANCE) & (variance <= _MOST_VARIANCE)
+    sound: NDArray[np.bool_] = np.all(usable, axis=1)
     sigma = np.sqrt(np.where(sound[:, None], variance, 1.0))
     scaled = np.where(sound[:, None, None], matrices, np.eye(3)) / (sigma[:, :, None] * sigma[:, None, :])
     sound &= np.abs(scaled - np.swapaxes(scaled, 1, 2)).max(axis=(1, 2), initial=0.0) < 1e-6

@@ -15,6 +15,8 @@ from swarm_loc_estimator.core.swarm import OdometryModel
 
 IntArray = NDArray[np.int64]
 
+_FARTHEST_M = 1e3
+
 MODEL_DTYPE = np.dtype([(f.name, np.float64) for f in fields(OdometryModel)])
 """The numbers of an `OdometryModel` as a record."""
 
@@ -78,7 +80,8 @@ def look_up(
     else:
         pose[:], raw[:] = tracks.pose[robot, row], tracks.raw[robot, row]
         noise[:] = tracks.noise[robot, row]
-    _add_silence(tracks.model[robot], silence_ns * 1e-9, tracks.pose[robot, row], noise)
+    unknown = silence_ns > timeout_ns
+    _add_silence(tracks.model[robot], silence_ns * 1e-9, unknown, tracks.pose[robot, row], noise)
     return silence_ns * 1e-9
 
 
@@ -127,8 +130,10 @@ def _interpolate(start: FloatArray, end: FloatArray, fraction: float, out: Float
 
 
 @compiled
-def integrate(tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray, raw: FloatArray) -> tuple[int, int]:
-    """Append rows sorted by robot and stamp; return how many were duplicates, how many steps jumps."""
+def integrate(
+    tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray, raw: FloatArray, new: NDArray[np.bool_]
+) -> tuple[int, int]:
+    """Append rows sorted by robot and stamp; return how many were duplicates, how many new ones jumps."""
     duplicates, jumps = 0, 0
     for k in range(robots.size):
         robot = robots[k]
@@ -146,14 +151,15 @@ def integrate(tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray, raw: F
         else:
             before = tracks.raw[robot, row - 1, 2]
             tracks.raw[robot, row, 2] = before + wrap(raw[k, 2] - before)
-            jumps += _integrate_step(tracks, robot, row)
+            jumped = _integrate_step(tracks, robot, row)
+            jumps += jumped and new[k]
         tracks.count[robot] = row + 1
     return duplicates, jumps
 
 
 @compiled
-def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
-    """Fill pose, noise and rate of a row from the row before; return 1 when no robot can drive so fast."""
+def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
+    """Fill pose, noise and rate of a row from the row before; return whether no robot can drive so fast."""
     model = tracks.model[robot]
     before, after = tracks.raw[robot, row - 1], tracks.raw[robot, row]
     duration_s = (tracks.stamp_ns[robot, row] - tracks.stamp_ns[robot, row - 1]) * 1e-9
@@ -167,8 +173,8 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
     if jump or duration_s > model.timeout_s:  # where it went is unknown
         tracks.pose[robot, row] = start
         rate[:] = 0.0
-        _add_silence(model, duration_s, start, noise)
-        return int(jump)
+        _add_silence(model, duration_s, True, start, noise)
+        return bool(jump)
     distance = math.cos(middle) * dx + math.sin(middle) * dy
     lateral = -math.sin(middle) * dx + math.cos(middle) * dy
     before_rate = tracks.rate[robot, row - 1]
@@ -184,7 +190,7 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
     changed = abs(rate[1] - before_rate[1])
     x, y = start[0] + 0.5 * step_x, start[1] + 0.5 * step_y
     _add_step_noise(model, distance, turn, changed, duration_s, x, y, middle, noise)
-    return 0
+    return False
 
 
 @compiled
@@ -270,16 +276,19 @@ def _add_step_noise(
 
 
 @compiled
-def _add_silence(model: np.void, silence_s: float, pose: FloatArray, noise: FloatArray) -> None:
+def _add_silence(
+    model: np.void, silence_s: float, unknown: bool, pose: FloatArray, noise: FloatArray
+) -> None:
     """Add the noise of a robot that has been silent since it was at `pose` (3,) on its track.
 
-    At first its speed and turn rate walk at random; after its timeout it may have driven anywhere. Both act
-    about the last pose known: so the noise never shrinks with time.
+    At first its speed and turn rate walk at random; once its motion is unknown it may have driven anywhere.
+    Both act about the last pose known: so the noise never shrinks with time.
     """
-    reach = (model.max_speed * silence_s) ** 2 / 3.0
+    # bounded: beside much larger numbers the noise of the steps after it would be lost to rounding
+    reach = min(model.max_speed * silence_s, _FARTHEST_M) ** 2 / 3.0
     turned = min(model.max_turn_rate * silence_s, math.pi) ** 2 / 3.0  # pi: any heading
     along, across, heading = reach, reach, turned
-    if silence_s <= model.timeout_s:
+    if not unknown:
         walked = silence_s**3 / 3.0
         along, across = min(along, model.speed_change**2 * walked), 0.0
         heading = min(heading, model.turn_rate_change**2 * walked)

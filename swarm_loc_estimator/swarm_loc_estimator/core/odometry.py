@@ -52,8 +52,8 @@ class TrackChange:
     Attributes:
         changed_from_ns: (N,) per robot the instant after which look-ups may now differ, or UNCHANGED_NS.
         duplicates: Rows dropped because the robot has a row with that stamp.
-        too_old: Rows dropped because they lie before the oldest stamp kept.
-        jumps: Steps that no robot can drive; the step was replaced by unknown motion.
+        too_old: Rows dropped because they are older than the oldest accepted.
+        jumps: New rows to which no robot can have driven; the step was replaced by unknown motion.
     """
 
     changed_from_ns: IntArray
@@ -106,12 +106,13 @@ class OdometryTracks:
         robots, stamps, raw, changed_from = self._take_back_later_rows(
             robots[fresh], stamps[fresh], raw[fresh]
         )
+        new = np.arange(robots.size) < np.sum(fresh)  # not those taken back
         order = np.lexsort((wrap_angle(raw[:, 2]), raw[:, 1], raw[:, 0], stamps, robots))
         while np.any(
             self.arrays.count + np.bincount(robots, minlength=self._robots) > self.arrays.stamp_ns.shape[1]
         ):
             self._grow()
-        duplicates, jumps = integrate(self.arrays, robots[order], stamps[order], raw[order])
+        duplicates, jumps = integrate(self.arrays, robots[order], stamps[order], raw[order], new[order])
         return TrackChange(changed_from, duplicates, int((~fresh).sum()), jumps)
 
     def at(self, robots: IntArray, stamps_ns: IntArray) -> TrackSample:
