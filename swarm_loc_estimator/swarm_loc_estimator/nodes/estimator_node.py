@@ -73,7 +73,7 @@ class EstimatorNode(Node):
         self._parameters = declare_parameters(self, EstimatorParameters)
         self._swarm = load_swarm(Path(self._parameters.swarm_file))
         self.get_logger().info("compiling the estimator: a minute the first time on a machine")
-        warm_up(self._parameters.settings)
+        warm_up()
         self._estimator = create_estimator(self._swarm, self._parameters.settings)
         self._ingest = Ingest(self._swarm, self._estimator)
         self._backlog: list[tuple[int, bytes, int]] = []

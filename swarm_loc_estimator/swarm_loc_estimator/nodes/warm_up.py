@@ -17,12 +17,13 @@ _FACING = (0.0, 1.0, 0.0, 0.0)  # x y z w: a marker that looks at the camera
 _AWAY = (0.0, 0.7, 0.0, 0.7)
 
 
-def warm_up(settings: EstimatorSettings) -> None:
-    """Run a small estimator through all that it does: a minute the first time on a machine, then a second.
+def warm_up() -> None:
+    """Run small estimators through all that they do: a minute the first time on a machine, then a second."""
+    for fusion_period_s in (0.0, 0.1):
+        _run(EstimatorSettings(fusion_period_s=fusion_period_s))
 
-    Args:
-        settings: Those that will be used; others may need other compiled code.
-    """
+
+def _run(settings: EstimatorSettings) -> None:
     robots = [Robot(name, faces=(Face("front", k, yaw=0.0),)) for k, name in enumerate("ab")]
     robots.append(Robot("c", faces=(Face("front", 2, yaw=0.0),), start=(0.0, 0.0, 0.0)))
     places = range(_LANDMARKS)
@@ -37,7 +38,7 @@ def warm_up(settings: EstimatorSettings) -> None:
 
 
 def _sight(observer: int) -> np.ndarray[tuple[int], np.dtype[np.void]]:
-    """Detections (d,) of landmarks and of another robot: with two solutions, mirrored ones, and without heading."""
+    """Detections (d,) of landmarks and a robot: with two solutions, the wrong one first, and without heading."""
     detections = np.zeros(_LANDMARKS + 1, DETECTION_DTYPE)
     detections["id"][:_LANDMARKS] = _FIRST_LANDMARK + np.arange(_LANDMARKS)
     detections["id"][_LANDMARKS] = (observer + 1) % 3
