@@ -96,7 +96,7 @@ class SightingConverter:
 
     def __init__(self, swarm: Swarm) -> None:
         mounts = [robot.camera or CameraMount() for robot in swarm.robots]
-        tilts = [Rotation.from_euler("yx", [m.pitch, m.roll]).as_matrix() @ _FROM_OPTICAL for m in mounts]
+        tilts = [Rotation.from_euler("YX", [m.pitch, m.roll]).as_matrix() @ _FROM_OPTICAL for m in mounts]
         sensors = [
             tuple(getattr(robot.sensor, name) for name in _SENSOR_DTYPE.names or ()) for robot in swarm.robots
         ]
