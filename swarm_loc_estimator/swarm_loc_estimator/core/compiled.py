@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import TypeVar
 
 import numba
+import numpy as np
+from numpy.typing import NDArray
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -34,6 +36,21 @@ def compiled(function: Function) -> Function:
     """Compile a function on its first call; calls among compiled functions cost nothing."""
     result: Function = numba.njit(cache=True, error_model="numpy")(function)
     return result
+
+
+@compiled
+def assign(target: NDArray[np.float64], source: NDArray[np.float64]) -> None:
+    """Copy a vector; a slice assignment would cost seconds of compilation at every place it stands."""
+    for i in range(target.size):
+        target[i] = source[i]
+
+
+@compiled
+def assign_matrix(target: NDArray[np.float64], source: NDArray[np.float64]) -> None:
+    """Copy a matrix."""
+    for i in range(target.shape[0]):
+        for j in range(target.shape[1]):
+            target[i, j] = source[i, j]
 
 
 @compiled

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from swarm_loc_estimator.core.compiled import compiled
+from swarm_loc_estimator.core.compiled import assign_matrix, compiled
 from swarm_loc_estimator.core.se2 import FloatArray
 
 IndexArray = NDArray[np.int64]
@@ -104,7 +104,12 @@ def update_one(
         for j in range(size):
             covariance[i, j] -= gain[i, 0] * ph[j, 0] + gain[i, 1] * ph[j, 1] + gain[i, 2] * ph[j, 2]
     rest = _projected(covariance, columns, jacobian)
-    rest -= gain @ noise
+    correction = np.zeros(size)
+    for i in range(size):
+        for r in range(3):
+            correction[i] += gain[i, r] * innovation[r]
+            for q in range(3):
+                rest[i, r] -= gain[i, q] * noise[q, r]
     for i in range(size):
         for j in range(i + 1):
             value = 0.5 * (covariance[i, j] + covariance[j, i])
@@ -112,7 +117,7 @@ def update_one(
                 value -= 0.5 * (rest[i, r] * gain[j, r] + rest[j, r] * gain[i, r])
             covariance[i, j] = value
             covariance[j, i] = value
-    return gain @ innovation
+    return correction
 
 
 @compiled
@@ -135,7 +140,8 @@ def innovation_covariance(
     projected: FloatArray, columns: IndexArray, jacobian: FloatArray, noise: FloatArray
 ) -> FloatArray:
     """S = H P H^T + R (3, 3) from P H^T (n, 3); eq. (13)."""
-    s = noise.copy()
+    s = np.empty((3, 3))
+    assign_matrix(s, noise)
     for c in range(columns.size):
         for i in range(3):
             for j in range(3):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.compiled import compiled, composed, moved_by_twist, wrap
+from swarm_loc_estimator.core.compiled import assign, assign_matrix, compiled, composed, moved_by_twist, wrap
 from swarm_loc_estimator.core.dense_filter import IndexArray, update_one
 from swarm_loc_estimator.core.gate import position_distance, soften_heading, squared_distance
 from swarm_loc_estimator.core.measurements import MeasurementColumns, innovation, predict_one
@@ -125,8 +125,9 @@ def judge(
         for i in range(3):
             jacobian[i, j] = -chain[i, j] if observer >= 0 else 0.0
             jacobian[i, 3 + j] = chain[i, j] if target >= 0 else 0.0
-    noise[:] = measurements.covariance[k]
-    s = noise.copy()
+    s = np.empty((3, 3))
+    assign_matrix(noise, measurements.covariance[k])
+    assign_matrix(s, noise)
     for a in range(6):
         for b in range(6):
             p = belief.covariance[columns[a], columns[b]]
@@ -138,7 +139,7 @@ def judge(
         other = np.empty(3)
         innovation(measurements, k, measurements.alternative[k], predicted, other)
         if squared_distance(other, s) < squared_distance(difference, s):
-            difference[:] = other
+            assign(difference, other)
     passed = position_distance(difference, s) <= measurements.gate[k]
     if measurements.has_heading[k]:
         soften_heading(difference, s, noise)

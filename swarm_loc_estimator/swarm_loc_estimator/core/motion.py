@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.compiled import compiled, wrap
+from swarm_loc_estimator.core.compiled import assign, assign_matrix, compiled, wrap
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import OdometryModel
 
@@ -65,7 +65,8 @@ def look_up(
     """
     count = tracks.count[robot]
     if count == 0:
-        pose[:], raw[:], noise[:] = 0.0, 0.0, 0.0
+        for i in range(3):
+            pose[i] = raw[i] = noise[i, 0] = noise[i, 1] = noise[i, 2] = 0.0
         return math.inf
     stamps, timeout_ns = tracks.stamp_ns[robot, :count], tracks.model[robot].timeout_s * 1e9
     row = max(0, np.searchsorted(stamps, stamp_ns, side="right") - 1)
@@ -78,8 +79,9 @@ def look_up(
         fraction = 1.0 + silence_ns / (stamps[row] - stamps[row - 1])
         _along_step(tracks, robot, row - 1, fraction, pose, raw, noise)
     else:
-        pose[:], raw[:] = tracks.pose[robot, row], tracks.raw[robot, row]
-        noise[:] = tracks.noise[robot, row]
+        assign(pose, tracks.pose[robot, row])
+        assign(raw, tracks.raw[robot, row])
+        assign_matrix(noise, tracks.noise[robot, row])
     unknown = silence_ns > timeout_ns
     _add_silence(tracks.model[robot], silence_ns * 1e-9, unknown, tracks.pose[robot, row], noise)
     return silence_ns * 1e-9
@@ -99,7 +101,9 @@ def _along_step(
     _interpolate(tracks.pose[robot, row], tracks.pose[robot, row + 1], fraction, pose)
     _interpolate(tracks.raw[robot, row], tracks.raw[robot, row + 1], fraction, raw)
     before, after = tracks.noise[robot, row], tracks.noise[robot, row + 1]
-    noise[:] = before + fraction * (after - before)
+    for i in range(3):
+        for j in range(3):
+            noise[i, j] = before[i, j] + fraction * (after[i, j] - before[i, j])
 
 
 @compiled
@@ -142,12 +146,13 @@ def integrate(
             duplicates += 1
             continue
         tracks.stamp_ns[robot, row] = stamps_ns[k]
-        tracks.raw[robot, row] = raw[k]
+        assign(tracks.raw[robot, row], raw[k])
         if row == 0:  # a track begins where its driver says
-            tracks.pose[robot, 0] = raw[k]
-            tracks.noise[robot, 0] = 0.0
-            tracks.rate[robot, 0] = 0.0
-            tracks.begin_ns[robot], tracks.begin_pose[robot] = stamps_ns[k], raw[k]
+            assign(tracks.pose[robot, 0], raw[k])
+            assign_matrix(tracks.noise[robot, 0], np.zeros((3, 3)))
+            assign(tracks.rate[robot, 0], np.zeros(2))
+            assign(tracks.begin_pose[robot], raw[k])
+            tracks.begin_ns[robot] = stamps_ns[k]
         else:
             before = tracks.raw[robot, row - 1, 2]
             tracks.raw[robot, row, 2] = before + wrap(raw[k, 2] - before)
@@ -169,10 +174,10 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
     # half a robot's width of slack: stamps jitter
     jump = math.hypot(dx, dy) > model.max_speed * duration_s + 0.5 * model.wheel_separation
     start, noise, rate = tracks.pose[robot, row - 1], tracks.noise[robot, row], tracks.rate[robot, row]
-    noise[:] = tracks.noise[robot, row - 1]
+    assign_matrix(noise, tracks.noise[robot, row - 1])
     if jump or duration_s > model.timeout_s:  # where it went is unknown
-        tracks.pose[robot, row] = start
-        rate[:] = 0.0
+        assign(tracks.pose[robot, row], start)
+        assign(rate, np.zeros(2))
         _add_silence(model, duration_s, True, start, noise)
         return bool(jump)
     distance = math.cos(middle) * dx + math.sin(middle) * dy

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from swarm_loc_estimator.core.compiled import compiled
+from swarm_loc_estimator.core.compiled import assign, compiled
 from swarm_loc_estimator.core.gate import gate_threshold
 from swarm_loc_estimator.core.measurements import (
     MEASUREMENT_DTYPE,
@@ -162,7 +162,7 @@ def _convert_all(
         marker_id[k] = markers.id[place]
         out.stamp_ns[k] += round(sensor.time_offset_s * 1e9)
         out.target[k] = markers.owner[place]
-        out.sensor[k] = cameras.mount[robot]
+        assign(out.sensor[k], cameras.mount[robot])
         out.gate[k] = cameras.gate[robot]
         out.marker[k, 0], out.marker[k, 1] = marker[0], marker[1]
         _levelled(level, detections.position[k], position)
@@ -263,8 +263,9 @@ def _pose_noise(sensor: np.void, level: FloatArray, published: FloatArray, noise
         noise[2, 2] = sensor.heading_sigma**2
         return
     to_plane = np.zeros((3, 6))
-    to_plane[0, :3], to_plane[1, :3] = level[0], level[1]
-    to_plane[2, 3:] = level[2]  # the rotation about the vertical
+    for i in range(3):
+        to_plane[0, i], to_plane[1, i] = level[0, i], level[1, i]
+        to_plane[2, 3 + i] = level[2, i]  # the rotation about the vertical
     for i in range(3):
         for j in range(3):
             for a in range(6):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.compiled import compiled
+from swarm_loc_estimator.core.compiled import assign_matrix, compiled
 from swarm_loc_estimator.core.dense_filter import DenseFilter, IndexArray, cholesky3
 from swarm_loc_estimator.core.se2 import FloatArray
 
@@ -126,7 +126,7 @@ def advance(belief: BeliefArrays, robot: int, noise: FloatArray) -> None:
         for i in range(3):
             for j in range(3):
                 belief.covariance[first + i, first + j] += added[i, j]
-        belief.accounted[robot] = noise
+        assign_matrix(belief.accounted[robot], noise)
 
 
 @compiled
@@ -137,13 +137,23 @@ def new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, added: FloatA
     """
     x, y, theta = belief.transform[robot, 0], belief.transform[robot, 1], belief.transform[robot, 2]
     cos, sin = math.cos(theta), math.sin(theta)
-    adjoint = np.array(((cos, -sin, y), (sin, cos, -x), (0.0, 0.0, 1.0)))
-    difference = noise - belief.accounted[robot]
-    rounding = 1e-12 + 1e-9 * (abs(difference[0, 0]) + abs(difference[1, 1]) + abs(difference[2, 2]))
-    factor = cholesky3(difference + rounding * np.eye(3))
+    adjoint = ((cos, -sin, y), (sin, cos, -x), (0.0, 0.0, 1.0))
+    difference, rounded, rounding = np.empty((3, 3)), np.empty((3, 3)), 1e-12
+    for i in range(3):
+        rounding += 1e-9 * abs(noise[i, i] - belief.accounted[robot, i, i])
+    for i in range(3):
+        for j in range(3):
+            difference[i, j] = noise[i, j] - belief.accounted[robot, i, j]
+            rounded[i, j] = difference[i, j] + (rounding if i == j else 0.0)
+    factor = cholesky3(rounded)
     if not math.isfinite(factor[0, 0] + factor[1, 1] + factor[2, 2]):
         return False
-    added[:] = adjoint @ difference @ adjoint.T
+    for i in range(3):
+        for j in range(3):
+            added[i, j] = 0.0
+            for a in range(3):
+                for b in range(3):
+                    added[i, j] += adjoint[i][a] * difference[a, b] * adjoint[j][b]
     return True
 
 
