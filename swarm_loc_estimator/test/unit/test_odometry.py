@@ -1,0 +1,238 @@
+"""Odometry tracks: the motion against closed forms, its noise against sampling, any order of arrival."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from core_world import SECOND, T0
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.odometry import OdometryTracks, TrackChange, TrackSample
+from swarm_loc_estimator.core.swarm import OdometryModel, Robot
+
+FloatArray = NDArray[np.float64]
+PLAIN = OdometryModel(wheel_separation=0.1, wheel_noise=1e-4)
+STEP_NS = SECOND // 20
+
+
+def tracks(*models: OdometryModel) -> OdometryTracks:
+    return OdometryTracks([Robot(f"r{i}", odometry=model) for i, model in enumerate(models or (PLAIN,))])
+
+
+def arc(speed: float, turn_rate: float, seconds: FloatArray) -> FloatArray:
+    """Poses (k, 3) on a circle, in closed form."""
+    heading = turn_rate * seconds
+    x = speed * seconds if turn_rate == 0.0 else speed / turn_rate * np.sin(heading)
+    y = 0.0 * seconds if turn_rate == 0.0 else speed / turn_rate * (1.0 - np.cos(heading))
+    return np.column_stack([x, y, heading])
+
+
+def feed(track: OdometryTracks, stamps: NDArray[np.int64], raw: FloatArray, robot: int = 0) -> TrackChange:
+    return track.extend(np.full(stamps.size, robot), stamps, raw)
+
+
+def stamps_until(seconds: float) -> NDArray[np.int64]:
+    return T0 + STEP_NS * np.arange(round(seconds * 20) + 1, dtype=np.int64)
+
+
+def look(track: OdometryTracks, stamp_ns: int, robot: int = 0) -> TrackSample:
+    return track.at(np.array([robot]), np.array([stamp_ns]))
+
+
+@pytest.mark.parametrize(("speed", "turn_rate"), [(0.1, 0.0), (0.1, 0.7), (-0.05, -2.0), (0.0, 1.0)])
+def test_a_track_follows_closed_form_arcs_between_the_rows_too(speed: float, turn_rate: float) -> None:
+    track, stamps = tracks(), stamps_until(3.0)
+    feed(track, stamps, arc(speed, turn_rate, (stamps - T0) * 1e-9))
+    for seconds in (0.0, 0.31, 1.0, 2.987):
+        expected = arc(speed, turn_rate, np.array([seconds]))
+        sample = look(track, T0 + round(seconds * 1e9))
+        np.testing.assert_allclose(sample.pose, expected, atol=1e-6)
+        np.testing.assert_allclose(sample.raw, expected, atol=1e-6)
+
+
+def test_headings_across_a_half_turn_are_followed() -> None:
+    track, stamps = tracks(), stamps_until(8.0)
+    raw = arc(0.1, 1.0, (stamps - T0) * 1e-9)
+    raw[:, 2] = np.arctan2(np.sin(raw[:, 2]), np.cos(raw[:, 2]))
+    feed(track, stamps, raw)
+    assert look(track, T0 + 8 * SECOND).pose[0, 2] == pytest.approx(8.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(("speed", "turn_rate"), [(0.2, 0.0), (0.2, 1.5), (0.0, 2.0)])
+def test_gathered_noise_is_that_of_sampled_wheels(speed: float, turn_rate: float) -> None:
+    """Wheels with covar(ds_r, ds_l) = diag(k |ds_r|, k |ds_l|); the error is taken in the track's frame."""
+    track, stamps = tracks(), stamps_until(1.0)
+    raw = arc(speed, turn_rate, (stamps - T0) * 1e-9)
+    feed(track, stamps, raw)
+    rng, samples = np.random.default_rng(0), 20_000
+    pose, dt, width = np.zeros((samples, 3)), 0.05, PLAIN.wheel_separation
+    for _ in range(20):
+        wheels = speed * dt + 0.5 * width * turn_rate * dt * np.array([1.0, -1.0])
+        wheels = wheels + np.sqrt(PLAIN.wheel_noise * np.abs(wheels)) * rng.standard_normal((samples, 2))
+        path, turn = wheels.mean(axis=1), (wheels[:, 0] - wheels[:, 1]) / width
+        middle = pose[:, 2] + 0.5 * turn
+        pose += np.column_stack([path * np.cos(middle), path * np.sin(middle), turn])
+    turned = pose[:, 2] - raw[-1, 2]
+    cos, sin = (
+        np.cos(turned),
+        np.sin(turned),
+    )  # the error exp(xi) = sample times mean^-1, to first order its entries
+    x = pose[:, 0] - (cos * raw[-1, 0] - sin * raw[-1, 1])
+    y = pose[:, 1] - (sin * raw[-1, 0] + cos * raw[-1, 1])
+    sampled = np.cov(np.stack([x, y, turned]))
+    gathered = look(track, int(stamps[-1])).noise[0]
+    np.testing.assert_allclose(gathered, sampled, atol=0.05 * np.abs(gathered).max())
+    np.testing.assert_allclose(np.diag(gathered), np.diag(sampled), rtol=0.08, atol=2e-6)
+
+
+def test_noise_of_a_straight_drive_in_closed_form() -> None:
+    track, stamps = tracks(), stamps_until(2.0)
+    feed(track, stamps, arc(0.3, 0.0, (stamps - T0) * 1e-9))
+    k, d, length = PLAIN.wheel_noise, PLAIN.wheel_separation, 0.6
+    heading = 2.0 * k * length / d**2
+    noise = look(track, int(stamps[-1])).noise[0]
+    assert noise[0, 0] == pytest.approx(0.5 * k * length)
+    assert noise[2, 2] == pytest.approx(heading)
+    assert noise[1, 2] == pytest.approx(-heading * length / 2, rel=1e-9)  # lever arm about the track's origin
+    assert noise[1, 1] == pytest.approx(heading * length**2 / 3, rel=1e-2)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_any_order_and_batching_of_rows_gives_the_same_track(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    lagging = replace(PLAIN, lag_s=0.2, distance_scale=1.1, turn_noise=0.01)
+    orderly, shuffled = tracks(PLAIN, lagging), tracks(PLAIN, lagging)
+    stamps = np.sort(rng.choice(np.arange(60), 50, replace=False)) * STEP_NS + T0
+    raw = arc(0.1, 0.8, (stamps - T0) * 1e-9)
+    raw[20] += 3.0  # no robot can drive so far
+    raw[:, 2] = np.arctan2(np.sin(raw[:, 2]), np.cos(raw[:, 2]))
+    robots, rows = np.repeat([0, 1], 50), np.tile(raw, (2, 1))
+    all_stamps = np.tile(stamps, 2)
+    orderly.extend(robots, all_stamps, rows)
+    conflicting = np.concatenate([rng.permutation(100), rng.integers(0, 100, 10)])  # and ten twice
+    for batch in np.array_split(conflicting, rng.integers(1, 30)):
+        shuffled.extend(robots[batch], all_stamps[batch], rows[batch])
+    who, when = np.repeat([0, 1], 80), np.tile(T0 + np.arange(80) * STEP_NS // 2 * 2 + 7_000_000, 2)
+    for name in ("pose", "raw", "noise", "silence_s"):
+        np.testing.assert_allclose(
+            getattr(shuffled.at(who, when), name), getattr(orderly.at(who, when), name), atol=1e-12
+        )
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_of_two_rows_with_one_stamp_the_same_one_counts_in_any_order(order: tuple[int, int]) -> None:
+    track, rows = tracks(), np.array([[0.02, 0.0, 0.0], [0.01, 0.0, 0.0]])
+    feed(track, np.array([T0]), np.zeros((1, 3)))
+    dropped = [feed(track, np.array([T0 + STEP_NS]), rows[[k]]).duplicates for k in order]
+    assert sum(dropped) == 1
+    assert look(track, T0 + STEP_NS).pose[0, 0] == pytest.approx(0.01)
+
+
+def test_a_late_row_says_from_where_on_look_ups_change() -> None:
+    track, stamps = tracks(PLAIN, PLAIN), stamps_until(1.0)
+    raw = arc(0.1, 0.5, (stamps - T0) * 1e-9)
+    kept = np.arange(stamps.size) != 10
+    feed(track, stamps[kept], raw[kept])
+    before = track.at(np.zeros(21, dtype=np.int64), stamps)
+    change = feed(track, stamps[[10]], raw[[10]] + [0.003, 0.0, 0.0])
+    assert change.changed_from_ns[0] == stamps[9]
+    assert change.changed_from_ns[1] > stamps[-1]
+    after = track.at(np.zeros(21, dtype=np.int64), stamps)
+    np.testing.assert_array_equal(after.pose[:10], before.pose[:10])
+    assert np.abs(after.pose[10] - before.pose[10]).max() > 1e-3
+
+
+@pytest.mark.parametrize("turn_rate", [0.0, 1.5])
+@pytest.mark.parametrize("timeout_s", [0.3, 1.0])
+@pytest.mark.parametrize("then", ["silence", "a row", "a jump"])
+def test_what_noise_is_gathered_between_any_two_instants_is_a_covariance(
+    timeout_s: float, turn_rate: float, then: str
+) -> None:
+    track, stamps = tracks(replace(PLAIN, timeout_s=timeout_s)), stamps_until(0.5)
+    feed(track, stamps, arc(0.3, turn_rate, (stamps - T0) * 1e-9))
+    if then != "silence":
+        late = T0 + round(2.0 * SECOND)
+        feed(
+            track, np.array([late]), arc(0.3, turn_rate, np.array([2.0])) + (5.0 if then == "a jump" else 0.0)
+        )
+    instants = T0 + np.arange(0, 3 * SECOND, 30_000_000)
+    sample = track.at(np.zeros(instants.size, dtype=np.int64), instants)
+    least = np.linalg.eigvalsh(np.diff(sample.noise, axis=0)).min()
+    assert least > -1e-3 * PLAIN.wheel_noise  # the motion of a silent robot is not known better than a step's
+
+
+def test_a_silent_robot_runs_on_for_its_timeout_and_then_may_be_anywhere() -> None:
+    track, stamps = tracks(), stamps_until(1.0)
+    feed(track, stamps, arc(0.1, 0.0, (stamps - T0) * 1e-9))
+    soon, late = look(track, T0 + SECOND + STEP_NS), look(track, T0 + 11 * SECOND)
+    assert soon.pose[0, 0] == pytest.approx(0.105, abs=1e-9)
+    assert soon.silence_s[0] == pytest.approx(0.05)
+    assert late.silence_s[0] == pytest.approx(10.0)
+    reach = PLAIN.max_speed * 10.0
+    np.testing.assert_allclose(np.diag(late.noise[0])[:2], reach**2 / 3, rtol=0.2)
+    assert late.noise[0, 2, 2] > 1.0
+
+
+def test_a_row_after_a_silence_changes_nothing_more_than_a_timeout_before_it() -> None:
+    track, stamps = tracks(), stamps_until(1.0)
+    feed(track, stamps, arc(0.1, 0.3, (stamps - T0) * 1e-9))
+    instants = T0 + np.arange(0, 6 * SECOND, STEP_NS)
+    who = np.zeros(instants.size, dtype=np.int64)
+    before = track.at(who, instants)
+    feed(track, np.array([T0 + 6 * SECOND]), np.array([[0.4, 0.2, 0.5]]))
+    after = track.at(who, instants)
+    np.testing.assert_array_equal(after.pose, before.pose)
+    np.testing.assert_array_equal(after.noise, before.noise)
+
+
+def test_a_jump_is_no_motion_but_makes_the_robot_unsure() -> None:
+    track, stamps = tracks(), stamps_until(1.0)
+    raw = arc(0.1, 0.0, (stamps - T0) * 1e-9)
+    raw[10:, 0] += 4.0  # the driver was restarted
+    assert feed(track, stamps, raw).jumps == 1
+    assert look(track, int(stamps[-1])).pose[0, 0] == pytest.approx(0.1 - 0.005)
+    assert look(track, int(stamps[-1])).raw[0, 0] == pytest.approx(4.1)
+    grown = look(track, int(stamps[10])).noise[0] - look(track, int(stamps[9])).noise[0]
+    assert math.sqrt(grown[0, 0]) > 0.02
+    assert feed(track, stamps[[15]] + 1, raw[[15]]).jumps == 0  # one that comes late counts none again
+
+
+def test_trimming_and_growing_keep_look_ups() -> None:
+    kept, trimmed = tracks(PLAIN, PLAIN), tracks(PLAIN, PLAIN)
+    capacity = trimmed.arrays.stamp_ns.shape[1]
+    for second in range(120):
+        stamps = T0 + second * SECOND + STEP_NS * np.arange(20, dtype=np.int64)
+        raw = arc(0.1, 0.3, (stamps - T0) * 1e-9)
+        for track in (kept, trimmed):
+            feed(track, stamps, raw)
+        now_ns = int(stamps[-1])
+        trimmed.trim(now_ns - 2 * SECOND, now_ns - 4 * SECOND)
+        when = now_ns - np.arange(0, 4 * SECOND, 230_000_000)
+        who = np.zeros(when.size, dtype=np.int64)
+        for name in ("pose", "raw", "noise", "silence_s"):
+            np.testing.assert_array_equal(
+                getattr(trimmed.at(who, when), name), getattr(kept.at(who, when), name)
+            )
+    assert trimmed.arrays.stamp_ns.shape[1] == capacity
+    assert kept.arrays.stamp_ns.shape[1] > capacity
+    assert feed(trimmed, np.array([T0 + 100 * SECOND]), np.zeros((1, 3))).too_old == 1
+
+
+def test_calibration_scales_and_delays_the_motion() -> None:
+    model = replace(PLAIN, distance_scale=0.9, turn_scale=1.2, delay_s=0.25)
+    track, stamps = tracks(model), stamps_until(2.0)
+    feed(track, stamps, arc(0.1, 0.5, (stamps - T0) * 1e-9))
+    expected = arc(0.09, 0.6, np.array([1.0]))
+    np.testing.assert_allclose(look(track, T0 + SECOND + SECOND // 4).pose, expected, atol=1e-5)
+
+
+def test_a_track_begins_with_its_earliest_row_even_when_that_comes_late() -> None:
+    track = tracks()
+    assert not track.begun(0, T0 + SECOND)
+    feed(track, np.array([T0 + STEP_NS]), np.array([[0.01, 0.0, 0.0]]))
+    assert not track.begun(0, T0)
+    feed(track, np.array([T0]), np.array([[0.004, 0.0, 0.0]]))
+    assert track.begun(0, T0)
+    np.testing.assert_allclose(track.arrays.begin_pose[0], [0.004, 0.0, 0.0])
+    np.testing.assert_allclose(look(track, T0 - SECOND).pose[0], [0.004, 0.0, 0.0])

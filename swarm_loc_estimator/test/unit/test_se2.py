@@ -1,0 +1,100 @@
+"""The laws of planar rigid transforms, against homogeneous matrices and the matrix exponential."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from swarm_loc_estimator.core import se2
+
+FloatArray = NDArray[np.float64]
+
+
+def poses(seed: int, *shape: int) -> FloatArray:
+    rng = np.random.default_rng(seed)
+    return np.concatenate([rng.uniform(-5, 5, (*shape, 2)), rng.uniform(-np.pi, np.pi, (*shape, 1))], axis=-1)
+
+
+def matrix(pose: FloatArray) -> FloatArray:
+    x, y, theta = pose
+    return np.array([[np.cos(theta), -np.sin(theta), x], [np.sin(theta), np.cos(theta), y], [0, 0, 1]])
+
+
+def hat(twist: FloatArray) -> FloatArray:
+    x, y, phi = twist
+    return np.array([[0, -phi, x], [phi, 0, y], [0, 0, 0]])
+
+
+def assert_same_pose(a: FloatArray, b: FloatArray, tolerance: float = 1e-12) -> None:
+    difference = np.asarray(a) - np.asarray(b)
+    difference[..., 2] = np.arctan2(np.sin(difference[..., 2]), np.cos(difference[..., 2]))
+    np.testing.assert_allclose(difference, 0.0, atol=tolerance)
+
+
+@pytest.mark.parametrize(
+    "angle", [-np.pi, np.pi, 3 * np.pi, -3 * np.pi, 0.0, 100.0, -1e4, np.nextafter(np.pi, 0)]
+)
+def test_wrapped_angles_lie_in_the_half_open_turn_and_point_the_same_way(angle: float) -> None:
+    wrapped = float(se2.wrap_angle(angle))
+    assert -np.pi <= wrapped < np.pi
+    assert np.cos(wrapped) == pytest.approx(np.cos(angle), abs=1e-9)
+    assert np.sin(wrapped) == pytest.approx(np.sin(angle), abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_compose_and_inverse_are_those_of_homogeneous_matrices(seed: int) -> None:
+    a, b = poses(seed, 2)
+    np.testing.assert_allclose(matrix(se2.compose(a, b)), matrix(a) @ matrix(b), atol=1e-12)
+    np.testing.assert_allclose(matrix(se2.inverse(a)), np.linalg.inv(matrix(a)), atol=1e-12)
+    np.testing.assert_allclose(matrix(se2.between(a, b)), np.linalg.inv(matrix(a)) @ matrix(b), atol=1e-12)
+    point = np.array([0.7, -2.0])
+    np.testing.assert_allclose(se2.transform_points(a, point), (matrix(a) @ [*point, 1.0])[:2], atol=1e-12)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-12, 1e-5, 0.99e-4, 1.01e-4, 0.3, -2.0, 3.1])
+def test_exp_is_the_matrix_exponential_and_log_undoes_it(turn: float) -> None:
+    twist = np.array([0.8, -1.7, turn])
+    np.testing.assert_allclose(matrix(se2.exp(twist)), expm(hat(twist)), atol=1e-12)
+    np.testing.assert_allclose(se2.log(se2.exp(twist)), twist, atol=1e-11)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_adjoint_moves_a_twist_through_a_transform(seed: int) -> None:
+    (pose,) = poses(seed, 1)
+    twist = np.random.default_rng(seed).uniform(-1, 1, 3)
+    moved = se2.exp(se2.adjoint(pose) @ twist)
+    assert_same_pose(se2.compose(pose, se2.exp(twist)), se2.compose(moved, pose))
+
+
+def test_everything_works_on_any_leading_shape_as_on_single_poses() -> None:
+    a, b = poses(1, 2, 3), poses(2, 2, 3)
+    index = (1, 2)
+    for function in (se2.compose, se2.between):
+        np.testing.assert_array_equal(function(a, b)[index], function(a[index], b[index]))
+        np.testing.assert_array_equal(function(a[0, 0], b)[index], function(a[0, 0], b[index]))
+    for function in (se2.inverse, se2.exp, se2.log, se2.adjoint, se2.error_to_pose_jacobian):
+        np.testing.assert_array_equal(function(a)[index], function(a[index]))
+    assert se2.compose(np.zeros((0, 3)), np.zeros((0, 3))).shape == (0, 3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_errors_of_a_pose_follow_from_its_right_invariant_error(seed: int) -> None:
+    (pose,) = poses(seed, 1)
+    step = 1e-6
+    numeric = np.zeros((3, 3))
+    for j in range(3):
+        ahead, behind = (se2.compose(se2.exp(s * step * np.eye(3)[j]), pose) for s in (1, -1))
+        numeric[:, j] = (ahead - behind) / (2 * step)
+    np.testing.assert_allclose(se2.error_to_pose_jacobian(pose), numeric, atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_covariances_go_to_the_error_and_back(seed: int) -> None:
+    pose = poses(seed, 4)
+    factor = np.random.default_rng(seed).standard_normal((4, 3, 3))
+    covariance = factor @ np.swapaxes(factor, 1, 2)
+    error = se2.error_covariance(pose, covariance)
+    np.testing.assert_allclose(se2.pose_covariance(pose, error), covariance, atol=1e-10)
+    sampled = np.random.default_rng(seed).multivariate_normal(np.zeros(3), 1e-6 * error[0], 20_000)
+    spread = se2.compose(se2.exp(sampled), pose[0]) - pose[0]
+    np.testing.assert_allclose(np.cov(spread.T) * 1e6, covariance[0], atol=0.05 * np.trace(covariance[0]))
