@@ -2,57 +2,32 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from swarm_loc_estimator.core import se2
+from swarm_loc_estimator.core.compiled import compiled
+from swarm_loc_estimator.core.dense_filter import cholesky3
 from swarm_loc_estimator.core.fusion import Fusion, Verdict
 from swarm_loc_estimator.core.gate import gate_threshold
 from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE, NOBODY, Kind, MeasurementArray
 from swarm_loc_estimator.core.odometry import OdometryTracks
+from swarm_loc_estimator.core.readout import Status, SwarmEstimate, read_out
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.sightings import SightingConverter
-from swarm_loc_estimator.core.state import NEVER_NS, SwarmState, robot_columns
+from swarm_loc_estimator.core.state import SwarmState
 from swarm_loc_estimator.core.swarm import Swarm
 from swarm_loc_estimator.core.timeline import Timeline
 
+__all__ = ["Status", "SwarmEstimate", "SwarmEstimator"]
+
 _FARTHEST_M = 1e6
 _LEAST_VARIANCE, _MOST_VARIANCE = 1e-14, 1e14
+_ASYMMETRY, _ROUNDING = 1e-6, 1e-9
 _FIX_GATE = float(gate_threshold(0.9999))
-
-
-class Status(IntEnum):
-    """How a robot stands; the values of SwarmPose.status."""
-
-    WAITING = 0  # not located
-    TRACKED = 1
-    STALE = 2  # located, but its odometry is silent
-
-
-@dataclass(frozen=True)
-class SwarmEstimate:
-    """Poses of all robots at one instant.
-
-    Attributes:
-        stamp_ns: The instant.
-        poses: (N, 3) x [m], y [m], theta [rad] in `map`; NaN for robots that are not located.
-        covariances: (N, 3, 3) of x, y, theta; NaN likewise.
-        map_to_odom: (N, 3) from `map` to the driver's own odom frame; NaN likewise.
-        status: (N,) of `Status`.
-        fix_age_s: (N,) since the newest measurement tied to a landmark or an absolute fix; -1: never.
-    """
-
-    stamp_ns: int
-    poses: FloatArray
-    covariances: FloatArray
-    map_to_odom: FloatArray
-    status: NDArray[np.uint8]
-    fix_age_s: FloatArray
 
 
 class SwarmEstimator:
@@ -69,7 +44,7 @@ class SwarmEstimator:
     def __init__(self, swarm: Swarm, settings: EstimatorSettings | None = None) -> None:
         self.swarm = swarm
         self.settings = settings or EstimatorSettings()
-        self._robots = np.arange(len(swarm.robots))
+        self._timeout_s = np.array([robot.odometry.timeout_s for robot in swarm.robots])
         self._tracks = OdometryTracks(swarm.robots)
         self._converter = SightingConverter(swarm)
         self._fusion = Fusion(swarm, self.settings, self._tracks)
@@ -94,7 +69,7 @@ class SwarmEstimator:
         self.drop("reset", self._timeline.waiting)
         self._ingest_drops.update(self._timeline_drops())
         self._tracks.clear()
-        self._timeline.restart(SwarmState(self._robots.size))
+        self._timeline.restart(SwarmState(len(self.swarm.robots)))
         self._begin()
 
     def add_odometry(self, robot: int, stamp_ns: int, pose: tuple[float, float, float], now_ns: int) -> None:
@@ -150,14 +125,15 @@ class SwarmEstimator:
         """The measurements within the horizon, their verdicts and normalised innovations squared."""
         return self._timeline.measurements, self._timeline.verdicts, self._timeline.nis
 
-    def tick(self, now_ns: int) -> SwarmEstimate:
-        """Use all that has arrived and give the poses at `now_ns`."""
+    def tick(self, now_ns: int, *, fuse: bool = True) -> SwarmEstimate:
+        """Use all that has arrived and give the poses at `now_ns`; measurements wait unless `fuse`."""
         newest_ns = self._check_clock(now_ns)
         oldest_ns = newest_ns - self._horizon_ns
         self._tracks.trim(oldest_ns, oldest_ns - 2 * self._tracks.reach_ns)
         self._use_odometry()
-        self._use_detections()
-        self._timeline.advance(newest_ns)
+        if fuse:
+            self._use_detections()
+            self._timeline.advance(newest_ns)
         return self._estimate(now_ns)
 
     def _check_clock(self, now_ns: int) -> int:
@@ -240,29 +216,32 @@ class SwarmEstimator:
 
     def _estimate(self, now_ns: int) -> SwarmEstimate:
         state = self._fusion.with_starts(self._timeline.state, now_ns)
-        sample = self._tracks.at(self._robots, np.full(self._robots.size, now_ns))
-        poses = se2.compose(state.transform, sample.pose)
-        error = state.filter.marginals(robot_columns(self._robots)) + state.map_noise(
-            self._robots, sample.noise
-        )
-        covariances = se2.pose_covariance(poses, error)
-        map_to_odom = se2.compose(poses, se2.inverse(sample.raw))
-        silent = sample.silence_s > [robot.odometry.timeout_s for robot in self.swarm.robots]
-        status = np.where(state.tracked, np.where(silent, Status.STALE, Status.TRACKED), Status.WAITING)
-        for values in (poses, covariances, map_to_odom):
-            values[~state.tracked] = np.nan
-        never = state.last_fix_ns == NEVER_NS
-        age = np.where(never, -1.0, (now_ns - np.where(never, now_ns, state.last_fix_ns)) * 1e-9)
-        return SwarmEstimate(now_ns, poses, covariances, map_to_odom, status.astype(np.uint8), age)
+        return read_out(state, self._tracks.arrays, self._timeout_s, now_ns)
 
 
 def _is_covariance(matrices: FloatArray) -> NDArray[np.bool_]:
     """Whether matrices (m, 3, 3) are symmetric, positive definite and of a magnitude to reckon with."""
-    variance = np.diagonal(matrices, axis1=1, axis2=2)
-    usable = np.isfinite(matrices).all(axis=2) & (variance >= _LEAST_VARIANCE) & (variance <= _MOST_VARIANCE)
-    sound: NDArray[np.bool_] = np.all(usable, axis=1)
-    sigma = np.sqrt(np.where(sound[:, None], variance, 1.0))
-    scaled = np.where(sound[:, None, None], matrices, np.eye(3)) / (sigma[:, :, None] * sigma[:, None, :])
-    sound &= np.abs(scaled - np.swapaxes(scaled, 1, 2)).max(axis=(1, 2), initial=0.0) < 1e-6
-    definite: NDArray[np.bool_] = sound & (np.linalg.eigvalsh(scaled)[:, 0] > 1e-9)
-    return definite
+    sound = np.zeros(matrices.shape[0], dtype=bool)
+    _check_covariances(matrices, sound)
+    return sound
+
+
+@compiled
+def _check_covariances(matrices: FloatArray, sound: NDArray[np.bool_]) -> None:
+    """Write whether each matrix is a covariance."""
+    scaled = np.empty((3, 3))
+    for k in range(sound.size):
+        good = True
+        for i in range(3):
+            good = good and _LEAST_VARIANCE <= matrices[k, i, i] <= _MOST_VARIANCE
+        if not good:
+            continue
+        for i in range(3):
+            for j in range(3):
+                scaled[i, j] = matrices[k, i, j] / math.sqrt(matrices[k, i, i] * matrices[k, j, j])
+        for i in range(3):
+            for j in range(3):
+                good = good and abs(scaled[i, j] - scaled[j, i]) < _ASYMMETRY
+            scaled[i, i] -= _ROUNDING
+        factor = cholesky3(scaled)  # not a number where it has none
+        sound[k] = good and math.isfinite(factor[0, 0] + factor[1, 1] + factor[2, 2])

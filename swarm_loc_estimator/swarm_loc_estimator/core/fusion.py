@@ -20,7 +20,6 @@ _MANY = 64
 """From so many measurements on, and one per robot, one update with all of them costs less than one each."""
 
 
-
 class Verdict(IntEnum):
     """What became of a measurement."""
 

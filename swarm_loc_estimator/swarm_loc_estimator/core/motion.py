@@ -17,6 +17,9 @@ IntArray = NDArray[np.int64]
 
 _FARTHEST_M = 1e3
 
+UNCHANGED_NS = np.iinfo(np.int64).max
+BEFORE_ALL_NS = np.iinfo(np.int64).min
+
 MODEL_DTYPE = np.dtype([(f.name, np.float64) for f in fields(OdometryModel)])
 """The numbers of an `OdometryModel` as a record."""
 
@@ -131,6 +134,23 @@ def _interpolate(start: FloatArray, end: FloatArray, fraction: float, out: Float
     out[0] = start[0] + fraction * (cos * dx - sin * dy)
     out[1] = start[1] + fraction * (sin * dx + cos * dy)
     out[2] = start[2] + fraction * turn
+
+
+@compiled
+def are_newer(tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray, changed_from_ns: IntArray) -> bool:
+    """Whether rows continue the tracks in their order; writes (N,) after which instant each track changes."""
+    newest = np.empty(tracks.count.size, dtype=np.int64)
+    for robot in range(newest.size):
+        count = tracks.count[robot]
+        newest[robot] = tracks.stamp_ns[robot, count - 1] if count else BEFORE_ALL_NS
+    for k in range(robots.size):
+        robot = robots[k]
+        if stamps_ns[k] <= newest[robot]:
+            return False
+        if changed_from_ns[robot] == UNCHANGED_NS:
+            changed_from_ns[robot] = newest[robot]
+        newest[robot] = stamps_ns[k]
+    return True
 
 
 @compiled

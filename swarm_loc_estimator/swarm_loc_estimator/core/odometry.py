@@ -16,14 +16,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swarm_loc_estimator.core.motion import MODEL_DTYPE, IntArray, TrackArrays, integrate, look_up_all
+from swarm_loc_estimator.core.motion import (
+    BEFORE_ALL_NS,
+    MODEL_DTYPE,
+    UNCHANGED_NS,
+    IntArray,
+    TrackArrays,
+    are_newer,
+    integrate,
+    look_up_all,
+)
 from swarm_loc_estimator.core.se2 import FloatArray, wrap_angle
 from swarm_loc_estimator.core.swarm import MotionResponse, Robot
 
-UNCHANGED_NS = np.iinfo(np.int64).max
-
 _IDEAL = MotionResponse(speeds=(0.0,), turn_rates=(0.0,), speed_share=((1.0,),), turn_share=((1.0,),))
-_BEFORE_ALL_NS = np.iinfo(np.int64).min
 _FIRST_CAPACITY = 256
 _ROWS = ("stamp_ns", "raw", "pose", "noise", "rate")
 
@@ -80,7 +86,7 @@ class OdometryTracks:
 
     def clear(self) -> None:
         """Forget every row."""
-        self._oldest_ns = _BEFORE_ALL_NS
+        self._oldest_ns = BEFORE_ALL_NS
         self.arrays = self._allocated(_FIRST_CAPACITY)
 
     @property
@@ -103,16 +109,18 @@ class OdometryTracks:
         """
         stamps = stamps_ns + self._delay_ns[robots]
         fresh = stamps_ns >= self._oldest_ns
-        robots, stamps, raw, changed_from = self._take_back_later_rows(
-            robots[fresh], stamps[fresh], raw[fresh]
-        )
-        new = np.arange(robots.size) < np.sum(fresh)  # not those taken back
-        order = np.lexsort((wrap_angle(raw[:, 2]), raw[:, 1], raw[:, 0], stamps, robots))
+        robots, stamps, raw, new = robots[fresh], stamps[fresh], raw[fresh], fresh[fresh]
+        changed_from = np.full(self._robots, UNCHANGED_NS)
+        if not are_newer(self.arrays, robots, stamps, changed_from):
+            robots, stamps, raw, changed_from = self._take_back_later_rows(robots, stamps, raw)
+            order = np.lexsort((wrap_angle(raw[:, 2]), raw[:, 1], raw[:, 0], stamps, robots))
+            new = (np.arange(robots.size) < new.size)[order]  # not those taken back
+            robots, stamps, raw = robots[order], stamps[order], raw[order]
         while np.any(
             self.arrays.count + np.bincount(robots, minlength=self._robots) > self.arrays.stamp_ns.shape[1]
         ):
             self._grow()
-        duplicates, jumps = integrate(self.arrays, robots[order], stamps[order], raw[order], new[order])
+        duplicates, jumps = integrate(self.arrays, robots, stamps, raw, new)
         return TrackChange(changed_from, duplicates, int((~fresh).sum()), jumps)
 
     def at(self, robots: IntArray, stamps_ns: IntArray) -> TrackSample:
@@ -193,7 +201,7 @@ class OdometryTracks:
         changed_from = np.full(self._robots, UNCHANGED_NS)
         last = np.maximum(arrays.count[robots] - 1, 0)
         changed_from[robots] = np.where(
-            arrays.count[robots] > 0, arrays.stamp_ns[robots, last], _BEFORE_ALL_NS
+            arrays.count[robots] > 0, arrays.stamp_ns[robots, last], BEFORE_ALL_NS
         )
         columns = [np.concatenate(parts) for parts in zip(*taken, strict=True)]
         return columns[0], columns[1], columns[2], changed_from

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.fusion import Verdict
 from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE, MeasurementArray
-from swarm_loc_estimator.core.odometry import UNCHANGED_NS
+from swarm_loc_estimator.core.motion import UNCHANGED_NS
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.state import SwarmState
