@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -77,6 +78,9 @@ class Health:
         self._ingest = ingest
         self._odom_frame = odom_frame
         self._why_missing = why_missing
+        self._inputs_of: list[list[tuple[int, InputTopic]]] = [[] for _ in swarm.robots]
+        for handle, topic in enumerate(ingest.topics):
+            self._inputs_of[topic.robot].append((handle, topic))
         self._was_located = np.zeros(len(swarm.robots), dtype=bool)
         self._received = [0] * len(ingest.topics)
         self._reported_ns: int | None = None
@@ -106,14 +110,12 @@ class Health:
         """
         elapsed_s = (now_ns - self._reported_ns) * 1e-9 if self._reported_ns is not None else 0.0
         self._reported_ns = now_ns
-        measurements, verdicts, nis = recent
-        used = verdicts == Verdict.USED
+        used, nis = _used_per_robot(recent, len(self._swarm.robots))
         reports = []
         for index, robot in enumerate(self._swarm.robots):
-            mine = used & (measurements["received_from"] == index)
             report = self._robot_report(index, robot, estimate, now_ns, elapsed_s)
-            report.values["measurements used"] = str(int(mine.sum()))
-            report.values["NIS mean"] = _figure(float(nis[mine].mean()) if mine.any() else None)
+            report.values["measurements used"] = str(used[index])
+            report.values["NIS mean"] = _figure(nis[index])
             reports.append(report)
         self._was_located |= estimate.status != Status.WAITING
         missing = self.missing_text()
@@ -129,11 +131,9 @@ class Health:
         """State and inputs of one robot."""
         troubles: list[str] = []
         values: dict[str, str] = {}
-        for handle in range(len(self._ingest.topics)):
-            topic = self._ingest.topics[handle]
-            if topic.robot == index:
-                troubles += self._input_troubles(handle, topic, robot, now_ns)
-                values.update(self._input_values(handle, topic, now_ns, elapsed_s))
+        for handle, topic in self._inputs_of[index]:
+            troubles += self._input_troubles(handle, topic, robot, now_ns)
+            values.update(self._input_values(handle, topic, now_ns, elapsed_s))
         status = Status(int(estimate.status[index]))
         if status is Status.WAITING and not troubles:
             lost = "lost, " if self._was_located[index] else ""
@@ -221,6 +221,17 @@ def merged(reports: Sequence[Report], name: str) -> Report:
     return Report(name, "; ".join(warnings or [report.message for report in reports]), bool(warnings), values)
 
 
+def _used_per_robot(recent: Recent, robots: int) -> tuple[list[int], list[float]]:
+    """How many measurements from each robot's camera were used lately, and their mean NIS (NaN for none)."""
+    measurements, verdicts, nis = recent
+    mine = (verdicts == Verdict.USED) & (measurements["received_from"] >= 0) & np.isfinite(nis)
+    observers = measurements["received_from"][mine]
+    count = np.bincount(observers, minlength=robots)
+    total = np.bincount(observers, nis[mine], minlength=robots)
+    mean = np.divide(total, count, out=np.full(robots, np.nan), where=count > 0)
+    return count.tolist(), mean.tolist()
+
+
 def _listed(names: Sequence[str]) -> str:
     """Names for people, not too many."""
     more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
@@ -229,4 +240,4 @@ def _listed(names: Sequence[str]) -> str:
 
 def _figure(value: float | None) -> str:
     """A number for people; "-" when there is none."""
-    return "-" if value is None or not np.isfinite(value) else f"{value:.4g}"
+    return "-" if value is None or not math.isfinite(value) else f"{value:.4g}"

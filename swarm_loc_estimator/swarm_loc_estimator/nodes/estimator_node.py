@@ -70,18 +70,18 @@ class EstimatorNode(Node):
 
     def __init__(self, create_estimator: CreateEstimator = SwarmEstimator, **node_arguments: Any) -> None:
         super().__init__("estimator", **node_arguments)
-        self._parameters = declare_parameters(self, EstimatorParameters)
-        self._swarm = load_swarm(Path(self._parameters.swarm_file))
+        self._wishes = declare_parameters(self, EstimatorParameters)
+        self._swarm = load_swarm(Path(self._wishes.swarm_file))
         self.get_logger().info("compiling the estimator: a minute the first time on a machine")
         warm_up()
-        self._estimator = create_estimator(self._swarm, self._parameters.settings)
+        self._estimator = create_estimator(self._swarm, self._wishes.settings)
         self._ingest = Ingest(self._swarm, self._estimator)
         self._backlog: list[tuple[int, bytes, int]] = []
         self._estimate: SwarmEstimate | None = None
         self._jumps = 0
         self._cost = TickCost()
-        self._health = Health(self._swarm, self._ingest, self._parameters.odom_frame, self._why_missing)
-        self._outputs = EstimateOutputs(self, self._swarm, self._parameters)
+        self._health = Health(self._swarm, self._ingest, self._wishes.odom_frame, self._why_missing)
+        self._outputs = EstimateOutputs(self, self._swarm, self._wishes)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
         self._waiting_since_s = self._reported_s = time.monotonic()
         self._clock_runs = False
@@ -112,13 +112,13 @@ class EstimatorNode(Node):
         return receive
 
     def _start_timers(self) -> None:
-        self.create_timer(self._parameters.tick_period_s, self._on_tick)
+        self.create_timer(self._wishes.tick_period_s, self._on_tick)
         # by a clock that runs also while simulated time stands still
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_DIAGNOSTICS_PERIOD_S, self._on_diagnostics, clock=steady)
         self.get_logger().info(
             f"ready: {len(self._swarm.robots)} robots and {len(self._swarm.landmarks)} landmarks"
-            f" of '{self._parameters.swarm_file}'"
+            f" of '{self._wishes.swarm_file}'"
         )
 
     def _on_tick(self) -> None:
@@ -155,7 +155,7 @@ class EstimatorNode(Node):
         if not self.get_clock().now().nanoseconds:
             reports = [Report("estimator", NO_CLOCK, warning=True)]
         else:
-            period_s, settings = self._parameters.tick_period_s, self._parameters.settings
+            period_s, settings = self._wishes.tick_period_s, self._wishes.settings
             load = load_report(cost, elapsed_s, period_s, settings.fusion_period_s)
             if load.warning:
                 self.get_logger().warning(load.message, throttle_duration_sec=_THROTTLE_S)

@@ -35,6 +35,8 @@ _LATCHED_QOS = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCA
 _LATCHED_TOPICS = frozenset({"tf_static", "robot_description", "map"})
 _CLOCK = "clock"
 _POLL_S = 0.05
+_SETTLED_S = 0.5
+"""A node's subscriptions are discovered one by one; no new one for so long, and all are there."""
 _SAY_EVERY_S = 5.0
 _LAST_WORDS = Duration(seconds=10)
 
@@ -52,14 +54,16 @@ class PlayNode(Node):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("player", **node_arguments)
-        self._parameters = declare_parameters(self, PlayerParameters)
-        self._reader = BagReader(Path(self._parameters.bag))
+        self._wishes = declare_parameters(self, PlayerParameters)
+        self._reader = BagReader(Path(self._wishes.bag))
         self._publisher_of: dict[str, Publisher] = {}
         for topic in self._chosen_topics():
             self._add_publisher(topic)
-        self._clock = self.create_publisher(ClockMessage, "/clock", _QOS) if self._parameters.clock else None
-        self._executor = EventsExecutor()
-        self._executor.add_node(self)
+        self._clock_publisher = (
+            self.create_publisher(ClockMessage, "/clock", _QOS) if self._wishes.clock else None
+        )
+        self._own_executor = EventsExecutor()
+        self._own_executor.add_node(self)
         self.so_far = PlayedSoFar()
 
     def run(self, stop: Stop) -> int:
@@ -67,7 +71,7 @@ class PlayNode(Node):
         self._wait_for_subscribers(stop)
         if not stop.requested:
             self._play_once(stop)
-        while self._parameters.loop and not stop.requested:
+        while self._wishes.loop and not stop.requested:
             self._play_once(stop)
         self._wait_for_acknowledgements()
         for loss in self._reader.losses:
@@ -78,17 +82,17 @@ class PlayNode(Node):
     def destroy_node(self) -> None:
         """Close the bag, too."""
         self._reader.close()
-        self._executor.shutdown()
+        self._own_executor.shutdown()
         super().destroy_node()
 
     def _chosen_topics(self) -> list[BagTopic]:
         """The topics to play; the bag's own /clock is not among them."""
         topics = {topic.name: topic for topic in self._reader.topics if topic.name != _CLOCK}
-        wanted = [name.lstrip("/") for name in self._parameters.topics]
+        wanted = [name.lstrip("/") for name in self._wishes.topics]
         for name in wanted:
             if name not in topics:
                 raise ParameterError(
-                    f"parameter topics names '{name}', but '{self._parameters.bag}' has: {', '.join(topics)}."
+                    f"parameter topics names '{name}', but '{self._wishes.bag}' has: {', '.join(topics)}."
                 )
         return [topics[name] for name in wanted or topics]
 
@@ -104,11 +108,11 @@ class PlayNode(Node):
         self._publisher_of[topic.name] = self.create_publisher(message_class, topic.name, qos)
 
     def _play_once(self, stop: Stop) -> None:
-        begin_ns = self._reader.time_range_ns[0] + round(self._parameters.start_offset_s * 1e9)
+        begin_ns = self._reader.time_range_ns[0] + round(self._wishes.start_offset_s * 1e9)
         play(
             takewhile(lambda _: not stop.requested, self._reader.messages(self._publisher_of)),
             begin_ns,
-            self._parameters.rate,
+            self._wishes.rate,
             self._publish,
             self._publish_clock,
             time.monotonic,
@@ -121,29 +125,32 @@ class PlayNode(Node):
         self._publisher_of[topic].publish(bytes(data))
 
     def _publish_clock(self, now_ns: int) -> None:
-        if self._clock is not None:
-            self._clock.publish(ClockMessage(clock=Time(nanoseconds=now_ns).to_msg()))
+        if self._clock_publisher is not None:
+            self._clock_publisher.publish(ClockMessage(clock=Time(nanoseconds=now_ns).to_msg()))
 
     def _wait_until(self, instant_s: float) -> None:
         """Serve the node's parameters meanwhile."""
-        self._executor.spin_once(timeout_sec=max(0.0, instant_s - time.monotonic()))
+        self._own_executor.spin_once(timeout_sec=max(0.0, instant_s - time.monotonic()))
         while (left_s := instant_s - time.monotonic()) > 0.0:
-            self._executor.spin_once(timeout_sec=left_s)
+            self._own_executor.spin_once(timeout_sec=left_s)
 
     def _wait_for_subscribers(self, stop: Stop) -> None:
-        """Return once as many topics are heard as the user asked for; say what is waited for."""
-        wanted = self._parameters.wait_for_subscribers
-        said_s = time.monotonic()
+        """Return once topics are heard as the user asked for, and no more come; say what is waited for."""
+        wanted = self._wishes.wait_for_subscribers
+        said_s = changed_s = time.monotonic()
+        heard, clock_heard = 0, False
         while wanted and not stop.requested:
+            now_s, before = time.monotonic(), heard
             heard = sum(p.get_subscription_count() > 0 for p in self._publisher_of.values())
-            clock_heard = self._clock is None or self._clock.get_subscription_count() > 0
-            if heard >= wanted and clock_heard:
+            clock_heard = self._clock_publisher is None or self._clock_publisher.get_subscription_count() > 0
+            changed_s = now_s if heard != before else changed_s
+            if heard >= wanted and clock_heard and now_s > changed_s + _SETTLED_S:
                 return
-            if time.monotonic() > said_s + _SAY_EVERY_S:
-                said_s = time.monotonic()
+            if now_s > said_s + _SAY_EVERY_S:
+                said_s = now_s
                 clock = "" if clock_heard else " and for one of /clock (use_sim_time of the others)"
                 self.get_logger().info(f"waiting for subscribers: {heard} of {wanted} topics have one{clock}")
-            self._executor.spin_once(timeout_sec=_POLL_S)
+            self._own_executor.spin_once(timeout_sec=_POLL_S)
 
     def _wait_for_acknowledgements(self) -> None:
         """Stay until everyone has received the last message."""

@@ -18,6 +18,6 @@ class PlayerParameters:
     start_offset_s: float = number(0.0, "s", 0.0, 1e9, "how much of the bag's beginning to leave out")
     topics: tuple[str, ...] = texts("topics to play; all when empty")
     wait_for_subscribers: int = number(
-        0, "1", 0, 100000, "begin when so many topics, and /clock, have a subscriber; 0: at once"
+        0, "1", 0, 100000, "begin when at least so many topics, and /clock, have a subscriber; 0: at once"
     )
     clock: bool = flag(True, "publish /clock")

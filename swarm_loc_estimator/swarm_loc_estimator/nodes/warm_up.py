@@ -34,11 +34,13 @@ def _run(settings: EstimatorSettings) -> None:
         for robot in range(len(robots)):
             estimator.add_odometry(robot, now_ns, (0.01 * step, 0.0, 0.001 * step), now_ns)
             estimator.add_detections(robot, now_ns - _SECOND // 8, _sight(robot), now_ns)
+        # one measurement alone is compiled apart: its columns are contiguous
+        estimator.add_detections(0, now_ns - _SECOND // 16, _sight(0)[:1], now_ns)
         estimator.tick(now_ns)
 
 
 def _sight(observer: int) -> np.ndarray[tuple[int], np.dtype[np.void]]:
-    """Detections (d,) of landmarks and a robot: with two solutions, the wrong one first, and without heading."""
+    """Detections (d,) of landmarks and a robot: of two solutions, also the wrong one first; one position."""
     detections = np.zeros(_LANDMARKS + 1, DETECTION_DTYPE)
     detections["id"][:_LANDMARKS] = _FIRST_LANDMARK + np.arange(_LANDMARKS)
     detections["id"][_LANDMARKS] = (observer + 1) % 3
