@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numba
 import numpy as np
@@ -29,13 +29,12 @@ def _cache_folder() -> Path:
 
 
 if "NUMBA_CACHE_DIR" not in os.environ:
-    numba.config.CACHE_DIR = str(_cache_folder())
+    numba.config.CACHE_DIR = str(_cache_folder())  # type: ignore[attr-defined]
 
 
 def compiled(function: Function) -> Function:
     """Compile a function on its first call; calls among compiled functions cost nothing."""
-    result: Function = numba.njit(cache=True, error_model="numpy")(function)
-    return result
+    return cast("Function", numba.njit(cache=True, error_model="numpy")(function))
 
 
 @compiled

@@ -24,7 +24,8 @@ def squared_distance(innovation: FloatArray, covariance: FloatArray) -> float:
     """Normalised innovation squared of an innovation (3,) under its covariance (3, 3)."""
     weighted = np.empty(3)
     solve3(cholesky3(covariance), innovation, weighted)
-    return innovation[0] * weighted[0] + innovation[1] * weighted[1] + innovation[2] * weighted[2]
+    distance: float = innovation[0] * weighted[0] + innovation[1] * weighted[1] + innovation[2] * weighted[2]
+    return distance
 
 
 @compiled
@@ -35,7 +36,8 @@ def position_distance(innovation: FloatArray, covariance: FloatArray) -> float:
     """
     a, b, d = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     x, y = innovation[0], innovation[1]
-    return (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
+    distance: float = (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
+    return distance
 
 
 @compiled

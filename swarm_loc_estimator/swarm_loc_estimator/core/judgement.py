@@ -164,7 +164,8 @@ def is_unsure(belief: BeliefArrays, robot: int, pose: FloatArray, position: floa
     p = belief.covariance[3 * robot : 3 * robot + 3, 3 * robot : 3 * robot + 3]
     x = p[0, 0] - 2.0 * pose[1] * p[0, 2] + pose[1] * pose[1] * p[2, 2]
     y = p[1, 1] + 2.0 * pose[0] * p[1, 2] + pose[0] * pose[0] * p[2, 2]
-    return max(x, y) > position * position or p[2, 2] > heading * heading
+    unsure: bool = max(x, y) > position * position or p[2, 2] > heading * heading
+    return unsure
 
 
 @compiled

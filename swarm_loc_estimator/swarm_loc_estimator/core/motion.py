@@ -28,7 +28,7 @@ class TrackArrays(NamedTuple):
     """The rows of all tracks and the models behind them, as compiled code reads them.
 
     Attributes:
-        count: (N,) rows in use per robot.
+        filled: (N,) rows in use per robot.
         stamp_ns: (N, capacity) instants, calibrated for delay.
         raw: (N, capacity, 3) poses as reported, headings unwrapped.
         pose: (N, capacity, 3) calibrated poses O, headings unwrapped.
@@ -42,7 +42,7 @@ class TrackArrays(NamedTuple):
         begin_pose: (N, 3) the pose there, where G is zero.
     """
 
-    count: IntArray
+    filled: IntArray
     stamp_ns: IntArray
     raw: FloatArray
     pose: FloatArray
@@ -66,7 +66,7 @@ def look_up(
     less sure; after `timeout_s` the motion since that row counts as unknown. Before the first row the robot
     stands.
     """
-    count = tracks.count[robot]
+    count = tracks.filled[robot]
     if count == 0:
         for i in range(3):
             pose[i] = raw[i] = noise[i, 0] = noise[i, 1] = noise[i, 2] = 0.0
@@ -86,8 +86,9 @@ def look_up(
         assign(raw, tracks.raw[robot, row])
         assign_matrix(noise, tracks.noise[robot, row])
     unknown = silence_ns > timeout_ns
-    _add_silence(tracks.model[robot], silence_ns * 1e-9, unknown, tracks.pose[robot, row], noise)
-    return silence_ns * 1e-9
+    silence_s: float = silence_ns * 1e-9
+    _add_silence(tracks.model[robot], silence_s, unknown, tracks.pose[robot, row], noise)
+    return silence_s
 
 
 @compiled
@@ -139,9 +140,9 @@ def _interpolate(start: FloatArray, end: FloatArray, fraction: float, out: Float
 @compiled
 def are_newer(tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray, changed_from_ns: IntArray) -> bool:
     """Whether rows continue the tracks in their order; writes (N,) after which instant each track changes."""
-    newest = np.empty(tracks.count.size, dtype=np.int64)
+    newest = np.empty(tracks.filled.size, dtype=np.int64)
     for robot in range(newest.size):
-        count = tracks.count[robot]
+        count = tracks.filled[robot]
         newest[robot] = tracks.stamp_ns[robot, count - 1] if count else BEFORE_ALL_NS
     for k in range(robots.size):
         robot = robots[k]
@@ -161,7 +162,7 @@ def integrate(
     duplicates, jumps = 0, 0
     for k in range(robots.size):
         robot = robots[k]
-        row = tracks.count[robot]
+        row = tracks.filled[robot]
         if row and stamps_ns[k] <= tracks.stamp_ns[robot, row - 1]:
             duplicates += 1
             continue
@@ -178,7 +179,7 @@ def integrate(
             tracks.raw[robot, row, 2] = before + wrap(raw[k, 2] - before)
             jumped = _integrate_step(tracks, robot, row)
             jumps += jumped and new[k]
-        tracks.count[robot] = row + 1
+        tracks.filled[robot] = row + 1
     return duplicates, jumps
 
 
@@ -270,7 +271,7 @@ def _bracket(axis: FloatArray, value: float) -> tuple[int, float]:
 
 @compiled
 def _add_step_noise(
-    model: np.void,
+    model: OdometryModel,
     distance: float,
     turn: float,
     turn_rate_change: float,
@@ -302,7 +303,7 @@ def _add_step_noise(
 
 @compiled
 def _add_silence(
-    model: np.void, silence_s: float, unknown: bool, pose: FloatArray, noise: FloatArray
+    model: OdometryModel, silence_s: float, unknown: bool, pose: FloatArray, noise: FloatArray
 ) -> None:
     """Add the noise of a robot that has been silent since it was at `pose` (3,) on its track.
 

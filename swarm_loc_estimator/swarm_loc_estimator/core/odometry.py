@@ -97,7 +97,7 @@ class OdometryTracks:
 
     def begun(self, robot: int, stamp_ns: int) -> bool:
         """Whether the robot's odometry has begun by an instant."""
-        return bool(self.arrays.count[robot] and self.arrays.begin_ns[robot] <= stamp_ns)
+        return bool(self.arrays.filled[robot] and self.arrays.begin_ns[robot] <= stamp_ns)
 
     def extend(self, robots: IntArray, stamps_ns: IntArray, raw: FloatArray) -> TrackChange:
         """Add rows, whatever their order and age.
@@ -117,7 +117,7 @@ class OdometryTracks:
             new = (np.arange(robots.size) < new.size)[order]  # not those taken back
             robots, stamps, raw = robots[order], stamps[order], raw[order]
         while np.any(
-            self.arrays.count + np.bincount(robots, minlength=self._robots) > self.arrays.stamp_ns.shape[1]
+            self.arrays.filled + np.bincount(robots, minlength=self._robots) > self.arrays.stamp_ns.shape[1]
         ):
             self._grow()
         duplicates, jumps = integrate(self.arrays, robots, stamps, raw, new)
@@ -139,18 +139,18 @@ class OdometryTracks:
         """Refuse rows stamped before `oldest_ns`; let those go that no look-up from `kept_ns` on needs."""
         self._oldest_ns = oldest_ns
         capacity = self.arrays.stamp_ns.shape[1]
-        for robot in np.flatnonzero(self.arrays.count > capacity // 2):
-            count = self.arrays.count[robot]
+        for robot in np.flatnonzero(self.arrays.filled > capacity // 2):
+            count = self.arrays.filled[robot]
             first = int(np.searchsorted(self.arrays.stamp_ns[robot, :count], kept_ns, side="right")) - 2
             if first > capacity // 4:
                 for rows in (getattr(self.arrays, name) for name in _ROWS):
                     rows[robot, : count - first] = rows[robot, first:count].copy()
-                self.arrays.count[robot] = count - first
+                self.arrays.filled[robot] = count - first
 
     def _allocated(self, capacity: int) -> TrackArrays:
         shape = (self._robots, capacity)
         return TrackArrays(
-            count=np.zeros(self._robots, dtype=np.int64),
+            filled=np.zeros(self._robots, dtype=np.int64),
             stamp_ns=np.zeros(shape, dtype=np.int64),
             raw=np.zeros((*shape, 3)),
             pose=np.zeros((*shape, 3)),
@@ -182,10 +182,12 @@ class OdometryTracks:
         """
         arrays = self.arrays
         taken: list[tuple[IntArray, IntArray, FloatArray]] = [(robots, stamps, raw)]
-        newest = arrays.stamp_ns[robots, np.maximum(arrays.count[robots] - 1, 0)]
-        late = (arrays.count[robots] > 0) & (stamps <= newest)  # of two rows with one stamp the order decides
+        newest = arrays.stamp_ns[robots, np.maximum(arrays.filled[robots] - 1, 0)]
+        late = (arrays.filled[robots] > 0) & (
+            stamps <= newest
+        )  # of two rows with one stamp the order decides
         for robot in np.unique(robots[late]):
-            count = arrays.count[robot]
+            count = arrays.filled[robot]
             first = int(
                 np.searchsorted(arrays.stamp_ns[robot, :count], stamps[late & (robots == robot)].min())
             )
@@ -197,11 +199,11 @@ class OdometryTracks:
                     arrays.raw[robot, rows].copy(),
                 )
             )
-            arrays.count[robot] = first
+            arrays.filled[robot] = first
         changed_from = np.full(self._robots, UNCHANGED_NS)
-        last = np.maximum(arrays.count[robots] - 1, 0)
+        last = np.maximum(arrays.filled[robots] - 1, 0)
         changed_from[robots] = np.where(
-            arrays.count[robots] > 0, arrays.stamp_ns[robots, last], BEFORE_ALL_NS
+            arrays.filled[robots] > 0, arrays.stamp_ns[robots, last], BEFORE_ALL_NS
         )
         columns = [np.concatenate(parts) for parts in zip(*taken, strict=True)]
         return columns[0], columns[1], columns[2], changed_from

@@ -240,7 +240,7 @@ def _face_heading(level: FloatArray, quaternion: FloatArray) -> float:
 
 @compiled
 def _calibrate(
-    sensor: np.void, position: FloatArray, target: int, value: FloatArray, noise: FloatArray
+    sensor: SensorModel, position: FloatArray, target: int, value: FloatArray, noise: FloatArray
 ) -> None:
     """Write calibrated range and bearing (3,) and their covariance (3, 3); see `SensorModel`."""
     logged = math.atan2(position[1], position[0])
@@ -256,7 +256,7 @@ def _calibrate(
 
 
 @compiled
-def _pose_noise(sensor: np.void, level: FloatArray, published: FloatArray, noise: FloatArray) -> None:
+def _pose_noise(sensor: SensorModel, level: FloatArray, published: FloatArray, noise: FloatArray) -> None:
     """Write the covariance (3, 3) of forward, left, heading; the sensor model is for unknown ones (-1)."""
     if published[0, 0] < 0.0:
         noise[0, 0], noise[1, 1] = sensor.forward_sigma**2, sensor.left_sigma**2
