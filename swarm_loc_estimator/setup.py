@@ -28,9 +28,12 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
+            "demo = swarm_loc_estimator.cli.demo:main",
             "estimator_node = swarm_loc_estimator.nodes.estimator_node:main",
             "graph = swarm_loc_estimator.cli.graph:main",
+            "import_mrclam = swarm_loc_estimator.cli.import_mrclam:main",
             "play = swarm_loc_estimator.nodes.play_node:main",
+            "replay = swarm_loc_estimator.cli.replay:main",
         ],
     },
 )

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 
@@ -21,7 +22,14 @@ GRACE_S = 5.0
 STOP_SIGNALS = {signal.SIGINT, signal.SIGTERM}
 AWAITED_SIGNALS = STOP_SIGNALS | {signal.SIGCHLD}
 
-_PR_SET_PDEATHSIG = 1
+_TIED_TO_PARENT = """
+import ctypes, os, signal, sys
+signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGCHLD})
+PR_SET_PDEATHSIG = 1
+ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+"""What a process does before it becomes the wanted one; between fork and exec only C code would be safe."""
 
 
 class GraphError(Exception):
@@ -51,6 +59,15 @@ def executable_path(package: str, executable: str) -> Path:
     return path
 
 
+def node_command(node: NodeSpec) -> list[str]:
+    """Program and arguments of a node.
+
+    Raises:
+        GraphError: There is no such executable.
+    """
+    return [str(executable_path(node.package, node.executable)), *node.ros_arguments()]
+
+
 def run_graph(nodes: Sequence[NodeSpec], say: Callable[[str], None]) -> int:
     """Run nodes until a required one ends or this process gets SIGINT or SIGTERM; then end all of them.
 
@@ -64,29 +81,32 @@ def run_graph(nodes: Sequence[NodeSpec], say: Callable[[str], None]) -> int:
     Raises:
         GraphError: An executable is missing; nothing was started.
     """
-    commands = [[str(executable_path(n.package, n.executable)), *n.ros_arguments()] for n in nodes]
+    commands = [node_command(node) for node in nodes]
     previous = signal.pthread_sigmask(signal.SIG_BLOCK, AWAITED_SIGNALS)
     children: list[Child] = []
     try:
         for node, command in zip(nodes, commands, strict=True):
-            children.append(Child(node, _start(command)))
+            children.append(Child(node, start(command)))
             say(f"{node.name}: started as process {children[-1].process.pid}")
         return _watch(children, say)
     finally:
-        _stop(children, say)
+        stop(children, say)
         signal.pthread_sigmask(signal.SIG_SETMASK, previous)
 
 
-def _start(command: Sequence[str]) -> subprocess.Popen[bytes]:
-    """Start a process that a terminal's Ctrl-C does not reach directly and that dies with this one."""
-    libc = ctypes.CDLL(None)
+def start(command: Sequence[str], output: IO[bytes] | None = None) -> subprocess.Popen[bytes]:
+    """Start a process that a terminal's Ctrl-C does not reach directly and that dies with this one.
 
-    def prepare() -> None:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, AWAITED_SIGNALS)
-        libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-
-    # This process has one thread, so nothing can hold a lock across the fork.
-    return subprocess.Popen(command, start_new_session=True, preexec_fn=prepare)  # noqa: PLW1509
+    Args:
+        command: Program and arguments.
+        output: Where it writes to; None for where this process does.
+    """
+    return subprocess.Popen(
+        [sys.executable, "-S", "-c", _TIED_TO_PARENT, *command],
+        stdout=output,
+        stderr=output,
+        start_new_session=True,
+    )
 
 
 def _watch(children: Sequence[Child], say: Callable[[str], None]) -> int:
@@ -105,7 +125,7 @@ def _watch(children: Sequence[Child], say: Callable[[str], None]) -> int:
             return 0
 
 
-def _stop(children: Sequence[Child], say: Callable[[str], None]) -> None:
+def stop(children: Sequence[Child], say: Callable[[str], None]) -> None:
     """End what still runs: asked, then told, then killed."""
     for stop_signal, patience_s in (
         (signal.SIGINT, GRACE_S),

@@ -55,7 +55,7 @@ def replay(
     """
     estimator = SwarmEstimator(swarm, settings)
     ingest = Ingest(swarm, estimator)
-    truth = _Truth(swarm)
+    truth = TruthReader(swarm)
     period_ns = round(tick_s * 1e9)
     schedule = _Periodic(period_ns) if stamp_ns is None else _Listed(stamp_ns)
     recorder = _Recorder(estimator, schedule)
@@ -146,8 +146,15 @@ class _Recorder:
         )
 
 
-class _Truth:
-    """Collects ground truth; nothing of it reaches the estimator."""
+class TruthReader:
+    """Collects ground truth; nothing of it reaches the estimator.
+
+    Args:
+        swarm: Whose.
+
+    Attributes:
+        topics: Topic -> robot name.
+    """
 
     def __init__(self, swarm: Swarm) -> None:
         self.topics = {f"{robot.name}/ground_truth": robot.name for robot in swarm.robots}

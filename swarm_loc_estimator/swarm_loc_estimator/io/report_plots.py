@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 # Okabe and Ito: told apart by everyone
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-_INK, _SOFT, _TRUTH = "#22303c", "#8795a1", "#9aa5b1"
+INK, SOFT, TRUTH = "#22303c", "#8795a1", "#9aa5b1"
 _MOST_PANELS = 9
 _MOST_ROWS = 6
 _MOST_POINTS = 1500
@@ -41,7 +41,7 @@ def plot_paths(result: ReplayResult, path: Path) -> None:
         groups = [list(range(len(robots)))]
     columns = min(3, len(groups)) if len(groups) != 4 else 2
     rows = math.ceil(len(groups) / columns)
-    width, height, limits = _map_size(result)
+    width, height, limits = map_size(result)
     panel = 4.4 if len(groups) > 1 else 8.0
     figure = Figure(
         figsize=(panel * columns, panel * min(max(height / width, 0.45), 1.5) * rows + 0.9),
@@ -54,13 +54,13 @@ def plot_paths(result: ReplayResult, path: Path) -> None:
             _draw_path(axis, result, index)
         name = robots[group[0]].name if len(group) == 1 else f"{len(group)} robots"
         axis.set_title(
-            name, loc="left", color=_colour(group[0]) if len(group) == 1 else _INK, fontweight="bold"
+            name, loc="left", color=colour_of(group[0]) if len(group) == 1 else INK, fontweight="bold"
         )
     for place in range(len(groups), len(axes)):
         axes[place].set_visible(False)
         axes[place - columns].tick_params(labelbottom=True)
-    figure.supxlabel("x in map [m]", color=_SOFT, fontsize=9)
-    figure.supylabel("y in map [m]", color=_SOFT, fontsize=9)
+    figure.supxlabel("x in map [m]", color=SOFT, fontsize=9)
+    figure.supylabel("y in map [m]", color=SOFT, fontsize=9)
     _legend(figure, axes[0])
     _save(figure, path)
 
@@ -85,20 +85,20 @@ def plot_errors(result: ReplayResult, path: Path) -> bool:
     begin_ns = int(result.stamp_ns[0])
     limits = _error_limits([result.errors[name] for name in shown])
     for row, name in enumerate(shown):
-        _draw_errors(axes[row], result.errors[name], _colour(_index(result, name)), begin_ns, limits)
-        axes[row, 0].set_ylabel(name, color=_colour(_index(result, name)), fontweight="bold")
+        _draw_errors(axes[row], result.errors[name], colour_of(_index(result, name)), begin_ns, limits)
+        axes[row, 0].set_ylabel(name, color=colour_of(_index(result, name)), fontweight="bold")
     for axis, title in zip(
         axes[0], ("x error [m]", "y error [m]", "heading error [deg]", "NEES"), strict=True
     ):
-        axis.set_title(title, loc="left", color=_INK, fontsize=10)
+        axis.set_title(title, loc="left", color=INK, fontsize=10)
     for axis in axes[-1]:
-        axis.set_xlabel("time [s]", color=_SOFT, fontsize=9)
+        axis.set_xlabel("time [s]", color=SOFT, fontsize=9)
     note = (
         "error (line) within the estimated 3-sigma band (shade); NEES with its 95 % bounds and ideal mean 3"
     )
     if len(shown) < len(names):
         note += f"; the {len(shown)} of {len(names)} robots with the largest errors"
-    figure.suptitle(note, x=0.005, ha="left", fontsize=9, color=_SOFT)
+    figure.suptitle(note, x=0.005, ha="left", fontsize=9, color=SOFT)
     _save(figure, path)
     return True
 
@@ -108,12 +108,12 @@ def _index(result: ReplayResult, name: str) -> int:
     return result.swarm.index_of[name]
 
 
-def _colour(index: int) -> str:
+def colour_of(index: int) -> str:
     """The colour of a robot in all pictures."""
     return _COLOURS[index % len(_COLOURS)]
 
 
-def _map_size(result: ReplayResult) -> tuple[float, float, tuple[float, float, float, float]]:
+def map_size(result: ReplayResult) -> tuple[float, float, tuple[float, float, float, float]]:
     """Width, height and limits (x0, x1, y0, y1) of the world, from truth and landmarks before estimates."""
     points = [track.pose[:, :2] for track in result.truth.values()]
     points += [np.array([[mark.x, mark.y] for mark in result.swarm.landmarks]).reshape(-1, 2)]
@@ -132,13 +132,13 @@ def _map_size(result: ReplayResult) -> tuple[float, float, tuple[float, float, f
 
 def _draw_map(axis: Axes, result: ReplayResult, limits: tuple[float, float, float, float]) -> None:
     """Landmarks with their ids on an even grid."""
-    _style(axis)
+    style(axis)
     axis.set_aspect("equal")
     axis.set_xlim(limits[0], limits[1])
     axis.set_ylim(limits[2], limits[3])
     marks = result.swarm.landmarks
     axis.plot(
-        [m.x for m in marks], [m.y for m in marks], "s", color=_INK, markersize=4, label="landmark", zorder=4
+        [m.x for m in marks], [m.y for m in marks], "s", color=INK, markersize=4, label="landmark", zorder=4
     )
     if len(marks) <= 40:
         for mark in marks:
@@ -148,7 +148,7 @@ def _draw_map(axis: Axes, result: ReplayResult, limits: tuple[float, float, floa
                 (4, 4),
                 textcoords="offset points",
                 fontsize=7,
-                color=_INK,
+                color=INK,
                 zorder=5,
                 annotation_clip=True,
             )
@@ -160,9 +160,9 @@ def _draw_path(axis: Axes, result: ReplayResult, index: int) -> None:
     if robot.name in result.truth:
         track = result.truth[robot.name]
         truth = _broken(track.stamp_ns, track.pose)[:: max(1, len(track.pose) // 8000)]
-        axis.plot(truth[:, 0], truth[:, 1], color=_TRUTH, linewidth=2.6, alpha=0.55, zorder=1, label="truth")
+        axis.plot(truth[:, 0], truth[:, 1], color=TRUTH, linewidth=2.6, alpha=0.55, zorder=1, label="truth")
     pose = result.pose[:, index][:: max(1, len(result.pose) // 8000)]
-    colour = _colour(index)
+    colour = colour_of(index)
     axis.plot(pose[:, 0], pose[:, 1], color=colour, linewidth=0.8, alpha=0.9, zorder=2, label="estimate")
     known = pose[np.isfinite(pose).all(axis=1)]
     if len(known):
@@ -208,19 +208,19 @@ def _draw_errors(
     scale = (1.0, 1.0, math.degrees(1.0))
     for column in range(3):
         axis: Axes = axes[column]
-        _style(axis)
+        style(axis)
         value, sigma = (scale[column] * part[rows, column] for part in (errors.error, errors.sigma))
         axis.fill_between(time_s, -3.0 * sigma, 3.0 * sigma, color=colour, alpha=0.16, linewidth=0)
         line = _broken(errors.stamp_ns[rows], np.column_stack([time_s, value]))
         lone = len(line) > len(rows)  # single points between gaps would be no line
         axis.plot(*line.T, color=colour, linewidth=0.7, marker="." if lone else "", markersize=3)
-        axis.axhline(0.0, color=_SOFT, linewidth=0.5)
+        axis.axhline(0.0, color=SOFT, linewidth=0.5)
         limit = limits[0] if column < 2 else limits[1]
         axis.set_ylim(-limit, limit)
     axis = axes[3]
-    _style(axis)
-    axis.axhspan(*_NEES_95, color=_SOFT, alpha=0.14, linewidth=0)
-    axis.axhline(3.0, color=_SOFT, linewidth=0.8)
+    style(axis)
+    axis.axhspan(*_NEES_95, color=SOFT, alpha=0.14, linewidth=0)
+    axis.axhline(3.0, color=SOFT, linewidth=0.8)
     axis.plot(time_s, errors.nees[rows].clip(1e-3, 1e4), ".", color=colour, markersize=1.6, alpha=0.7)
     axis.set_yscale("log")
     axis.set_ylim(1e-2, 1e3)
@@ -246,7 +246,7 @@ def _thin(errors: Errors) -> npt.NDArray[np.intp]:
     return np.array([start + int(np.argmax(position[start : start + size])) for start in starts])
 
 
-def _style(axis: Axes) -> None:
+def style(axis: Axes) -> None:
     """Quiet axes: the data speak."""
     axis.grid(visible=True, color="#e4e8ec", linewidth=0.6)
     axis.set_axisbelow(True)
@@ -254,7 +254,7 @@ def _style(axis: Axes) -> None:
         axis.spines[side].set_visible(False)
     for side in ("left", "bottom"):
         axis.spines[side].set_color("#c3ccd4")
-    axis.tick_params(colors=_SOFT, labelsize=8, length=3)
+    axis.tick_params(colors=SOFT, labelsize=8, length=3)
 
 
 def _save(figure: Figure, path: Path) -> None:

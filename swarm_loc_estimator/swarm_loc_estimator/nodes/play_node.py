@@ -24,7 +24,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from swarm_loc_estimator.io.bags import BagReader, BagTopic, RawMessage
 from swarm_loc_estimator.nodes.declare import declare_parameters
-from swarm_loc_estimator.nodes.pace import PlayedSoFar, play
+from swarm_loc_estimator.nodes.pace import STEP_S, PlayedSoFar, play
 from swarm_loc_estimator.nodes.parameter_table import ParameterError
 from swarm_loc_estimator.nodes.player_parameters import PlayerParameters
 from swarm_loc_estimator.nodes.running import Stop, run_node
@@ -39,6 +39,8 @@ _SETTLED_S = 0.5
 """A node's subscriptions are discovered one by one; no new one for so long, and all are there."""
 _SAY_EVERY_S = 5.0
 _LAST_WORDS = Duration(seconds=10)
+_RUN_ON_S = 0.25
+"""The clock runs on for so long behind the last message, so that nodes that work by timers use it, too."""
 
 
 class PlayNode(Node):
@@ -65,6 +67,7 @@ class PlayNode(Node):
         self._own_executor = EventsExecutor()
         self._own_executor.add_node(self)
         self.so_far = PlayedSoFar()
+        self._now_ns = 0
 
     def run(self, stop: Stop) -> int:
         """Play to the end, or until asked to stop; the exit status."""
@@ -74,6 +77,8 @@ class PlayNode(Node):
         while self._wishes.loop and not stop.requested:
             self._play_once(stop)
         self._wait_for_acknowledgements()
+        if not stop.requested:
+            self._run_clock_on()
         for loss in self._reader.losses:
             print(f"play: {loss}", file=sys.stderr)
         print(self.so_far.summary(), flush=True)
@@ -125,8 +130,16 @@ class PlayNode(Node):
         self._publisher_of[topic].publish(bytes(data))
 
     def _publish_clock(self, now_ns: int) -> None:
+        self._now_ns = now_ns
         if self._clock_publisher is not None:
             self._clock_publisher.publish(ClockMessage(clock=Time(nanoseconds=now_ns).to_msg()))
+
+    def _run_clock_on(self) -> None:
+        """Let time go on, at its own pace whatever the rate."""
+        begin_s, begin_ns = time.monotonic(), self._now_ns
+        for step in range(1, round(_RUN_ON_S / STEP_S) + 1):
+            self._wait_until(begin_s + step * STEP_S)
+            self._publish_clock(begin_ns + step * round(STEP_S * 1e9))
 
     def _wait_until(self, instant_s: float) -> None:
         """Serve the node's parameters meanwhile."""

@@ -1,0 +1,84 @@
+"""Whether the live graph gives the poses that replay gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core import se2
+from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.settings import EstimatorSettings
+from swarm_loc_estimator.live import LiveRun
+from swarm_loc_estimator.nodes.pace import LONGEST_STEP_NS, STEP_S
+from swarm_loc_estimator.replay import replay
+from swarm_loc_estimator.replay_result import ReplayResult
+
+_TRANSPORT_S = 0.01
+"""Longest that a message is on its way between two processes of a machine that is not overloaded."""
+_EQUAL_M = 1e-6
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Live poses beside those of a replay at the same stamps.
+
+    A live estimator cannot know what is still on its way when it gives a pose: up to a step of the player's
+    clock and the transport. Only at settled stamps do both know the same, and the poses must be equal.
+
+    Attributes:
+        replayed: The replay.
+        distance_m: (T, N) between the positions; NaN where neither is located, infinite where one is not.
+        turn_rad: (T, N) between the headings, likewise, without sign.
+        settled: (T,) whether nothing was on its way.
+    """
+
+    replayed: ReplayResult
+    distance_m: FloatArray
+    turn_rad: FloatArray
+    settled: NDArray[np.bool_]
+
+    @property
+    def equal_share(self) -> float:
+        """Share of the poses that are the same to a micrometre."""
+        return float(np.mean(self.distance_m[~np.isnan(self.distance_m)] < _EQUAL_M))
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square distance at all stamps [m]."""
+        return float(np.sqrt(np.nanmean(self.distance_m**2)))
+
+    @property
+    def settled_max_m(self) -> float:
+        """Largest distance at settled stamps [m]; NaN when there are none."""
+        chosen = self.distance_m[self.settled]
+        return float(np.nanmax(chosen)) if chosen.size else float("nan")
+
+
+def compare_with_replay(live: LiveRun, bag: Path, settings: EstimatorSettings | None = None) -> Agreement:
+    """Replay a bag at the very stamps of live poses.
+
+    Args:
+        live: What came out of the live graph.
+        bag: What was played into it.
+        settings: Those of the live estimator.
+    """
+    replayed = replay(bag, live.result.swarm, settings, stamp_ns=live.result.stamp_ns)
+    difference = live.result.pose - replayed.pose
+    located = np.isfinite(live.result.pose).all(axis=2)
+    difference[located != np.isfinite(replayed.pose).all(axis=2)] = np.inf
+    turn = np.abs(np.where(np.isinf(difference[..., 2]), np.inf, se2.wrap_angle(difference[..., 2])))
+    distance = np.hypot(difference[..., 0], difference[..., 1])
+    return Agreement(replayed, distance, turn, _settled(live))
+
+
+def _settled(live: LiveRun) -> NDArray[np.bool_]:
+    """(T,) whether all messages sent before a stamp were sent long enough before it to have arrived."""
+    step_ns = min(round(STEP_S * live.rate * 1e9), LONGEST_STEP_NS)
+    way_ns = step_ns + round(_TRANSPORT_S * live.rate * 1e9)
+    behind = np.searchsorted(live.arrival_ns, live.result.stamp_ns, side="right")
+    newest_ns = np.concatenate([[np.iinfo(np.int64).min // 2], live.arrival_ns])[behind]
+    settled: NDArray[np.bool_] = live.result.stamp_ns > newest_ns + way_ns
+    return settled
