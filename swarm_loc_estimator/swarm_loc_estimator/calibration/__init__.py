@@ -1,0 +1,1 @@
+"""Fits of sensors, motion and noise to recordings with ground truth; no ROS."""

@@ -1,0 +1,82 @@
+"""Fit sensors, motion and noise to a bag with ground truth.
+
+    calibrate bags/mrclam1 --out calibrated.yaml
+    calibrate recording.mcap --swarm swarm.yaml --out calibrated.yaml --plain
+
+The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. Beside --out a
+picture of the same name shows the errors before and after.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from swarm_loc_estimator.calibration.fit import EVALUATIONS, Options, calibrate
+from swarm_loc_estimator.calibration.picture import draw, text_of
+from swarm_loc_estimator.calibration.recording import CalibrationError, read_recording
+from swarm_loc_estimator.cli.progress import ProgressLine
+from swarm_loc_estimator.io.bag_file import BagError
+from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
+from swarm_loc_estimator.io.swarm_writer import save_swarm
+from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    options = _parser().parse_args(arguments)
+    folder = options.bag if options.bag.is_dir() else options.bag.parent
+    progress = ProgressLine()
+    try:
+        swarm = load_swarm(options.swarm or folder / "swarm.yaml")
+        recording = read_recording(options.bag, swarm, progress)
+        chosen = Options(
+            plain=options.plain, response=not options.no_response, evaluations=options.evaluations
+        )
+        done = calibrate(recording, swarm, chosen, progress)
+    except (BagError, SwarmFileError, CalibrationError, DefinitionsNotFoundError) as error:
+        progress.close()
+        print(error, file=sys.stderr)
+        return 1
+    progress.close()
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    save_swarm(done.swarm, options.out, f"Calibrated with {options.bag.name}.")
+    print("\n".join([text_of(done), *recording.remarks]))
+    print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="calibrate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("bag", type=Path, help="rosbag2 folder, .mcap or .db3 file with <robot>/ground_truth")
+    parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
+    parser.add_argument("--out", type=Path, required=True, help="swarm description to write")
+    parser.add_argument("--plain", action="store_true", help="fit only noise, calibrate nothing")
+    parser.add_argument(
+        "--no-response",
+        action="store_true",
+        help="one share of speed and one of turn rate instead of a table",
+    )
+    parser.add_argument(
+        "--evaluations",
+        type=_count,
+        default=EVALUATIONS,
+        help=f"runs of the estimator to fit the noise (default {EVALUATIONS})",
+    )
+    return parser
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if not 1 <= value <= 10_000:
+        raise argparse.ArgumentTypeError(f"{text} must lie in [1, 10000]")
+    return value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,178 @@
+"""A small world with known models, as a recording in memory."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from swarm_loc_estimator.calibration.recording import Recording, Rows
+from swarm_loc_estimator.core import se2
+from swarm_loc_estimator.core.metrics import Track
+from swarm_loc_estimator.core.odometry import OdometryTracks
+from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.swarm import CameraMount, Face, Landmark, Robot, Swarm
+from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
+
+SECOND = 1_000_000_000
+_MARGIN_S = 2.0
+_ODOMETRY_S, _TRUTH_S, _PICTURE_S = 0.05, 0.02, 0.25
+_VIEW = 0.6
+_FARTHEST = 5.0
+
+
+@dataclass(frozen=True)
+class World:
+    """How the recording errs.
+
+    Attributes:
+        robots: As they truly are; all of one type.
+        seed: Of commands and noise.
+        duration_s: [s].
+        range_sigma: Relative.
+        bearing_sigma: [rad].
+        posed: Whether sightings have a heading.
+        turn_sigma: Of the true turn beside what the model says [rad/sqrt(s)].
+    """
+
+    robots: tuple[Robot, ...]
+    seed: int
+    duration_s: float = 300.0
+    range_sigma: float = 0.005
+    bearing_sigma: float = 0.005
+    posed: bool = False
+    turn_sigma: float = 0.0
+
+
+def described(robots: tuple[Robot, ...]) -> Swarm:
+    """What a user knows: names and markers, nothing of the models."""
+    marks = tuple(
+        Landmark(100 + k, x, y, yaw=np.pi)
+        for k, (x, y) in enumerate(itertools.product(np.arange(-24.0, 24.1, 3.0).tolist(), repeat=2))
+    )
+    plain = tuple(Robot(r.name, r.type, faces=r.faces, camera=CameraMount()) for r in robots)
+    return Swarm(plain, marks)
+
+
+def robot(number: int, true: Robot) -> Robot:
+    """One of several robots with the same models."""
+    return replace(true, name=f"robot{number}", type="rover", faces=(Face("body", number),))
+
+
+def record(world: World) -> tuple[Recording, Swarm]:
+    """Simulate a recording and the swarm as its user would describe it."""
+    swarm = described(world.robots)
+    rng = np.random.default_rng(world.seed)
+    truth: dict[str, Track] = {}
+    odometry, pictures = [], []
+    for index, true in enumerate(world.robots):
+        raw = _raw(rng, world.duration_s)
+        truth[true.name] = _truth(rng, true, raw, world)
+        odometry += [
+            (index, s, s, tuple(pose))
+            for s, pose in zip(raw.stamp_ns.tolist(), raw.pose.tolist(), strict=True)
+        ]
+    for index, true in enumerate(world.robots):
+        stamps = np.arange(3 * SECOND, int((world.duration_s - _MARGIN_S) * SECOND), int(_PICTURE_S * SECOND))
+        for stamp in stamps.tolist():
+            found = _seen(rng, world, swarm, truth, index, stamp, true)
+            if found.size:
+                pictures.append((index, stamp, stamp, found))
+    return Recording("world", _rows(odometry), _rows(pictures), truth), swarm
+
+
+def _rows(messages: list[tuple[int, int, int, object]]) -> Rows:
+    messages = sorted(messages, key=lambda message: message[2])
+    columns = [np.array([m[k] for m in messages], dtype=np.int64) for k in range(3)]
+    return Rows(columns[0], columns[1], columns[2], tuple(m[3] for m in messages))
+
+
+def _raw(rng: np.random.Generator, duration_s: float) -> Track:
+    """Integrated commands that change every few seconds, in place now and then."""
+    count = int(duration_s / _ODOMETRY_S)
+    speed, turn_rate = np.zeros(count), np.zeros(count)
+    begin = 0
+    while begin < count:
+        end = begin + int(rng.uniform(1.0, 4.0) / _ODOMETRY_S)
+        speed[begin:end] = rng.choice([0.0, 0.1, 0.2, 0.3], p=[0.1, 0.2, 0.3, 0.4])
+        turn_rate[begin:end] = rng.choice([-0.6, -0.3, 0.0, 0.3, 0.6])
+        begin = end
+    heading = np.concatenate([[0.0], np.cumsum(turn_rate * _ODOMETRY_S)])
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    x = np.concatenate([[0.0], np.cumsum(speed * _ODOMETRY_S * np.cos(middle))])
+    y = np.concatenate([[0.0], np.cumsum(speed * _ODOMETRY_S * np.sin(middle))])
+    stamps = np.arange(count + 1) * int(_ODOMETRY_S * SECOND) + SECOND
+    return Track(stamps, np.column_stack([x, y, se2.wrap_angle(heading)]))
+
+
+def _truth(rng: np.random.Generator, true: Robot, raw: Track, world: World) -> Track:
+    """Where the robot truly goes, by its motion model."""
+    tracks = OdometryTracks([true])
+    zeros = np.zeros(raw.stamp_ns.size, dtype=np.int64)
+    tracks.extend(zeros, raw.stamp_ns, raw.pose)
+    stamps = np.arange(int(raw.stamp_ns[0]), int(raw.stamp_ns[-1]), int(_TRUTH_S * SECOND))
+    pose = tracks.at(np.zeros(stamps.size, dtype=np.int64), stamps).pose
+    if world.turn_sigma:
+        pose = _with_turn_noise(rng, pose, world.turn_sigma)
+    pose[:, 2] = se2.wrap_angle(pose[:, 2])
+    return Track(stamps, pose)
+
+
+def _with_turn_noise(rng: np.random.Generator, pose: FloatArray, sigma: float) -> FloatArray:
+    """The path with a random walk in heading."""
+    steps = se2.log(se2.between(pose[:-1], pose[1:]))
+    steps[:, 2] += sigma * np.sqrt(_TRUTH_S) * rng.standard_normal(len(steps))
+    walked = [pose[0]]
+    for step in steps:
+        walked.append(se2.compose(walked[-1], se2.exp(step)))
+    return np.array(walked)
+
+
+def _seen(
+    rng: np.random.Generator,
+    world: World,
+    swarm: Swarm,
+    truth: dict[str, Track],
+    index: int,
+    stamp_ns: int,
+    true: Robot,
+) -> np.ndarray[tuple[int], np.dtype[np.void]]:
+    """Detections of one picture."""
+    camera = true.camera or CameraMount()
+    own = _at(truth[true.name], stamp_ns + round(true.sensor.time_offset_s * 1e9))
+    eye = se2.compose(own, [camera.x, camera.y, camera.yaw])
+    marks = np.array([[m.x, m.y, m.yaw or 0.0] for m in swarm.landmarks])
+    ids = np.array([m.id for m in swarm.landmarks])
+    rel = se2.between(np.broadcast_to(eye, marks.shape), marks)
+    distance, bearing = np.hypot(rel[:, 0], rel[:, 1]), np.arctan2(rel[:, 1], rel[:, 0])
+    near = (np.abs(bearing) < _VIEW) & (distance < _FARTHEST) & (distance > 0.3)
+    rows = np.zeros(int(near.sum()), DETECTION_DTYPE)
+    if not rows.size:
+        return rows
+    rows["id"], rows["content"] = ids[near], 2 if world.posed else 1
+    s = true.sensor
+    logged = (bearing[near] - s.bearing_offset) / s.bearing_scale
+    logged += world.bearing_sigma * rng.standard_normal(rows.size)
+    reach = (distance[near] - s.range_offset) / np.exp(
+        s.range_log_scale + s.range_skew * logged + s.range_curve * logged**2
+    )
+    reach *= 1.0 + world.range_sigma * rng.standard_normal(rows.size)
+    rows["position"][:, 0], rows["position"][:, 2] = -reach * np.sin(logged), reach * np.cos(logged)
+    heading = rel[near, 2] + 0.02 * rng.standard_normal(rows.size)
+    rows["orientation"] = np.array([_facing(angle) for angle in heading])
+    rows["covariance"] = -1.0 * np.eye(6)
+    return rows
+
+
+def _facing(heading: float) -> FloatArray:
+    """Quaternion in the optical frame (x right, y down) of a face whose z axis points along a heading."""
+    half = -0.5 * heading
+    return np.array([0.0, np.sin(half), 0.0, np.cos(half)])
+
+
+def _at(track: Track, stamp_ns: int) -> FloatArray:
+    row = int(np.clip(np.searchsorted(track.stamp_ns, stamp_ns), 1, track.stamp_ns.size - 1))
+    share = (stamp_ns - track.stamp_ns[row - 1]) / (track.stamp_ns[row] - track.stamp_ns[row - 1])
+    step = se2.log(se2.between(track.pose[row - 1], track.pose[row]))
+    return np.asarray(se2.compose(track.pose[row - 1], se2.exp(share * step)))

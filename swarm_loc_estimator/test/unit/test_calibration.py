@@ -1,0 +1,170 @@
+"""Fits recover the models that a recording was made with, and refuse what holds nothing to fit to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration_world import World, record, robot
+
+from swarm_loc_estimator.calibration.fit import Options, calibrate, fit_models
+from swarm_loc_estimator.calibration.noise import score, thinned
+from swarm_loc_estimator.calibration.recording import CalibrationError, started_at_truth
+from swarm_loc_estimator.calibration.rerun import rerun
+from swarm_loc_estimator.calibration.response import nodes_of
+from swarm_loc_estimator.calibration.robust import population, ridge, softened
+from swarm_loc_estimator.core.swarm import CameraMount, MotionResponse, OdometryModel, Robot, SensorModel
+
+TRUE = Robot(
+    "true",
+    odometry=OdometryModel(course_offset=0.02, axle_offset=-0.03, delay_s=0.08, lag_s=0.2),
+    response=MotionResponse((0.0,), (0.0, 0.6), ((1.02, 0.8),), ((0.95, 0.95),)),
+    camera=CameraMount(x=-0.03),
+    sensor=SensorModel(
+        range_log_scale=-0.02,
+        range_curve=0.5,
+        range_offset=0.03,
+        bearing_offset=0.02,
+        bearing_scale=0.97,
+        time_offset_s=-0.05,
+    ),
+)
+HONEST = Robot("true")
+
+
+def quiet(_share: float, _what: str) -> None:
+    """Nobody watches."""
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_models_are_recovered(seed: int) -> None:
+    recording, swarm = record(World((robot(1, TRUE), robot(2, TRUE)), seed))
+    models = fit_models(recording, swarm, Options(), quiet)
+    for found in models.swarm.robots:
+        s, o = found.sensor, found.odometry
+        assert s.range_curve == pytest.approx(0.5, abs=0.04)
+        assert s.range_log_scale == pytest.approx(-0.02, abs=0.02)
+        assert s.bearing_offset == pytest.approx(0.02, abs=0.003)
+        assert s.bearing_scale == pytest.approx(0.97, abs=0.01)
+        assert s.time_offset_s == pytest.approx(-0.05, abs=0.02)
+        assert o.delay_s + o.lag_s == pytest.approx(0.28, abs=0.03)
+        assert o.course_offset == pytest.approx(0.02, abs=0.005)
+        assert o.axle_offset == pytest.approx(-0.03, abs=0.005)
+        response = found.response
+        assert response is not None
+        speed_share, turn_share = np.array(response.speed_share), np.array(response.turn_share)
+        wanted = np.interp(response.turn_rates, [0.0, 0.6], [1.02, 0.8])
+        np.testing.assert_allclose(speed_share[-1], wanted, atol=0.03)
+        np.testing.assert_allclose(turn_share[1:, -1], 0.95, atol=0.02)
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_honest_odometry_is_left_as_it_is(seed: int) -> None:
+    recording, swarm = record(World((robot(1, HONEST),), seed))
+    found = fit_models(recording, swarm, Options(), quiet).swarm.robots[0]
+    assert found.response is not None
+    np.testing.assert_allclose(found.response.speed_share, 1.0, atol=0.02)
+    np.testing.assert_allclose(found.response.turn_share, 1.0, atol=0.02)
+    assert abs(found.odometry.delay_s + found.odometry.lag_s) < 0.02
+    assert abs(found.odometry.course_offset) < 0.005
+    assert abs(found.sensor.range_curve) < 0.03
+
+
+def test_without_a_table_two_shares_are_fitted() -> None:
+    recording, swarm = record(World((robot(1, TRUE),), 6))
+    found = fit_models(recording, swarm, Options(response=False), quiet).swarm.robots[0]
+    assert found.response is None
+    assert found.odometry.turn_scale == pytest.approx(0.95, abs=0.01)
+    assert 0.85 < found.odometry.distance_scale < 1.0
+
+
+def test_the_yaw_of_a_camera_that_sees_headings_is_recovered() -> None:
+    turned = replace(HONEST, camera=CameraMount(x=0.02, yaw=0.1))
+    recording, swarm = record(World((robot(1, turned),), 7, posed=True))
+    camera = fit_models(recording, swarm, Options(), quiet).swarm.robots[0].camera
+    assert camera is not None
+    assert camera.yaw == pytest.approx(0.1, abs=0.005)
+    assert camera.x == pytest.approx(0.02, abs=0.01)
+
+
+def test_a_robot_with_sparse_truth_gains_from_its_type() -> None:
+    recording, swarm = record(World((robot(1, TRUE), robot(2, TRUE)), 8))
+    full = recording.truth["robot2"]
+    kept = np.isin(full.stamp_ns, recording.detections.stamp_ns)
+    rows = np.flatnonzero(kept)[::12]
+    sparse = type(full)(full.stamp_ns[rows], full.pose[rows])
+    recording = replace(recording, truth={**recording.truth, "robot2": sparse})
+    found = fit_models(recording, swarm, Options(), quiet).swarm.robots[1]
+    assert found.response is not None
+    assert found.odometry.axle_offset == pytest.approx(-0.03, abs=0.01)
+    assert found.sensor.range_curve == pytest.approx(0.5, abs=0.06)
+
+
+def test_the_noise_makes_the_estimator_consistent_and_better() -> None:
+    recording, swarm = record(World((robot(1, TRUE),), 9, duration_s=120.0, turn_sigma=0.03))
+    done = calibrate(recording, swarm, Options(evaluations=12), quiet)
+    assert done.before is not None
+    assert done.after is not None
+    assert done.after.position_rmse < 0.5 * done.before.position_rmse
+    assert 1.0 < done.after.nees < 5.0
+    assert [r.start for r in done.swarm.robots] == [r.start for r in swarm.robots]
+
+
+def test_a_plain_fit_changes_nothing_but_noise() -> None:
+    recording, swarm = record(World((robot(1, TRUE),), 10, duration_s=60.0))
+    found = calibrate(recording, swarm, Options(plain=True, evaluations=3), quiet).swarm.robots[0]
+    assert found.response is None
+    assert found.camera == swarm.robots[0].camera
+    assert found.sensor.range_curve == 0.0
+    assert found.odometry.delay_s == 0.0
+    assert found.sensor.range_sigma_per_m > 0.0
+
+
+def test_thinned_odometry_gives_nearly_the_same_poses() -> None:
+    recording, swarm = record(World((robot(1, HONEST),), 11, duration_s=60.0))
+    swarm = started_at_truth(swarm, recording)
+    whole, thin = (score([rerun(one, swarm, 0.5)]) for one in (recording, thinned(recording)))
+    assert thin.position_rmse == pytest.approx(whole.position_rmse, rel=0.05)
+
+
+def test_without_ground_truth_there_is_one_sentence() -> None:
+    recording, swarm = record(World((robot(1, TRUE),), 12, duration_s=10.0))
+    with pytest.raises(CalibrationError, match=r"recording 'world' holds no <robot>/ground_truth"):
+        calibrate(replace(recording, truth={}), swarm, Options(), quiet)
+
+
+def test_with_too_little_there_is_one_sentence() -> None:
+    recording, swarm = record(World((robot(1, TRUE),), 13, duration_s=8.0))
+    with pytest.raises(CalibrationError, match="too little ground truth"):
+        calibrate(recording, swarm, Options(), quiet)
+
+
+def test_nodes_follow_what_was_driven() -> None:
+    durations = np.ones(1000)
+    values = np.linspace(0.1, 0.5, 1000)
+    nodes = nodes_of(values, durations)
+    assert nodes[0] == 0.0
+    assert nodes[1] == pytest.approx(0.104, abs=0.002)
+    assert nodes[-1] == pytest.approx(0.496, abs=0.002)
+    assert nodes_of(np.zeros(5), durations[:5]).tolist() == [0.0]
+    assert nodes_of(np.full(5, 0.3), durations[:5]).tolist() == [0.0, 0.3]
+
+
+def test_gross_errors_do_not_spoil_a_regression() -> None:
+    rng = np.random.default_rng(1)
+    basis = rng.standard_normal((200, 2))
+    wanted = basis @ [2.0, -1.0] + 0.01 * rng.standard_normal(200)
+    wanted[:20] += 5.0
+    np.testing.assert_allclose(ridge(basis, wanted, 1e-9 * np.eye(2), np.zeros(2)), [2.0, -1.0], atol=0.02)
+    assert softened(np.array([0.1]))[0] == pytest.approx(0.1, rel=1e-3)
+    assert softened(np.array([-100.0]))[0] > -30.0
+
+
+def test_a_type_is_no_tighter_a_prior_than_its_robots_agree() -> None:
+    alike = np.ones((3, 1))
+    mean, sigma = population(alike, np.full((3, 1), 0.01), np.ones(1))
+    assert mean[0] == pytest.approx(1.0)
+    assert sigma[0] == pytest.approx(0.1)
+    _, apart = population(np.array([[0.0], [2.0]]), np.full((2, 1), 0.01), np.ones(1))
+    assert apart[0] == pytest.approx(1.0)
