@@ -2,8 +2,9 @@
 
 Each sighting between a waiting robot and something located says that one point of the robot's track (the
 place where it saw the marker, or its own marker) lies at one point of the map. Two such points give the
-transform in closed form (a rigid alignment); a sighting with heading gives it alone. The transform on
-which most clues agree is refined by least squares and accepted when it is unique and sure.
+transform in closed form (a rigid alignment); a sighting with heading gives it alone, with a mirrored
+solution it gives two. The transform on which most clues agree is refined by least squares and accepted when
+it is sure, and when no other one explains the clues about as well.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ CLUE_DTYPE = np.dtype(
         ("map", np.float64, (2,)),  # the same point in map [m]
         ("map_covariance", np.float64, (2, 2)),
         ("turn", np.float64),  # heading of the transform that the sighting shows [rad], NaN: none
+        ("other_turn", np.float64),  # of its mirrored solution, NaN: none
         ("turn_variance", np.float64),
     ]
 )
@@ -37,10 +39,13 @@ _MOST_CLUES = 40
 _LEAST_CLUES = 3
 _AGREE = float(chi2.ppf(0.999, 2))
 _LEAST_SHARE = 0.6  # of the clues must agree with a fix
-_RIVAL_SHARE = 0.8  # a second transform with this share of the best one's clues makes the fix ambiguous
+_RIVAL_SHARE = 0.8  # another transform with this share of the best one's support makes the fix ambiguous
+_MOST_RIVALS = 8
+_APART_M, _APART_RAD = 0.1, 0.1
 _HEADING_SIGMA = 0.2
 _POSITION_SIGMA = 0.5
 _REFINEMENTS = 5
+_PRIOR = 1e-6  # so that what no clue shows is unsure instead of singular
 
 
 @dataclass(frozen=True)
@@ -107,7 +112,12 @@ class ClueBook:
         clue["track_noise"] = track.noise
         clue["local_covariance"] = seen if sees else 0.0
         clue["map_covariance"] = lever @ spread @ lever.T + (0.0 if sees else seen)
-        clue["turn"] = map_heading - local_heading if one["has_heading"][0] else np.nan
+        clue["turn"] = clue["other_turn"] = np.nan
+        if one["has_heading"][0]:
+            clue["turn"] = map_heading - local_heading
+        if one["has_alternative"][0]:
+            mirrored = one["alternative"][0, 2] - one["value"][0, 2]
+            clue["other_turn"] = clue["turn"] + (-mirrored if sees else mirrored)
         clue["turn_variance"] = covariance[2, 2] + spread[2, 2]
         return clue
 
@@ -135,14 +145,22 @@ def locate(clues: NDArray[np.void], track_noise: FloatArray) -> Fix | None:
     if not hypotheses.shape[0]:
         return None
     agree = _residuals(clues, spread, hypotheses)[1] <= _AGREE
-    support = agree.sum(axis=1)
+    support = agree.sum(axis=1) + (agree & _turn_agrees(clues, hypotheses)[1]).sum(axis=1)
     best = int(np.argmax(support))
-    if support[best] < max(_LEAST_CLUES, _LEAST_SHARE * clues.size):
+    if agree[best].sum() < max(_LEAST_CLUES, _LEAST_SHARE * clues.size):
         return None
-    fix = _refine(clues[agree[best]], spread[agree[best]], hypotheses[best])
-    if fix is None or _has_rival(hypotheses[support >= _RIVAL_SHARE * support[best]], fix, clues):
+    rivals = np.flatnonzero(support >= _RIVAL_SHARE * support[best])
+    rivals = rivals[np.argsort(hypotheses[rivals, 2])]
+    chosen = rivals[np.unique(np.linspace(0, rivals.size - 1, _MOST_RIVALS).astype(int))]
+    few = np.append(best, chosen)
+    transforms, covariances = _refine(clues, spread, hypotheses[few], agree[few])
+    middle = np.array([*clues["map"].mean(axis=0), 0.0])
+    sigma = np.sqrt(np.diag(se2.pose_covariance(middle, covariances[0])))
+    if not (sigma[2] < _HEADING_SIGMA and max(sigma[0], sigma[1]) < _POSITION_SIGMA):
         return None
-    return fix
+    if _are_apart(transforms, sigma, clues):
+        return None
+    return Fix(transforms[0], covariances[0])
 
 
 def _as_seen(one: MeasurementArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -186,8 +204,13 @@ def _hypotheses(clues: NDArray[np.void]) -> FloatArray:
     middle_local = 0.5 * (clues["local"][first] + clues["local"][second])
     middle_map = 0.5 * (clues["map"][first] + clues["map"][second])
     pairs = _placing(turn[usable], middle_local[usable], middle_map[usable])
-    shown = ~np.isnan(clues["turn"])
-    return np.concatenate([_placing(clues["turn"][shown], clues["local"][shown], clues["map"][shown]), pairs])
+    return np.concatenate([*(_shown(clues, name) for name in ("turn", "other_turn")), pairs])
+
+
+def _shown(clues: NDArray[np.void], name: str) -> FloatArray:
+    """Transforms (h, 3) from the clues that show a heading."""
+    one = clues[~np.isnan(clues[name])]
+    return _placing(one[name], one["local"], one["map"])
 
 
 def _placing(turn: FloatArray, local: FloatArray, target: FloatArray) -> FloatArray:
@@ -206,37 +229,54 @@ def _residuals(
     return residual, np.einsum("hki,hki->hk", residual, weighted)
 
 
-def _refine(clues: NDArray[np.void], spread: FloatArray, transform: FloatArray) -> Fix | None:
-    """Gauss-Newton on the points and on the headings that agree; None when the result is not sure enough."""
+def _turn_agrees(clues: NDArray[np.void], transforms: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """By what turn (h, k) the headings shown, or mirrored, differ from transforms (h, 3); whether by little."""
+    turns = np.stack([clues["turn"], clues["other_turn"]])[:, None, :] - transforms[None, :, None, 2]
+    first, other = se2.wrap_angle(turns)
+    turn = np.where(np.abs(other) < np.abs(first), other, first)  # NaN is not less
+    return turn, np.abs(turn) < 3.0 * np.sqrt(clues["turn_variance"])
+
+
+def _refine(
+    clues: NDArray[np.void], spread: FloatArray, transforms: FloatArray, agree: NDArray[np.bool_]
+) -> tuple[FloatArray, FloatArray]:
+    """Gauss-Newton on the points and headings that agree.
+
+    Args:
+        clues: (k,).
+        spread: (k, 2, 2) covariances of the clues' points on the track.
+        transforms: (h, 3) where to begin.
+        agree: (h, k) which clues' points each transform is to explain.
+
+    Returns:
+        Transforms (h, 3) and covariances (h, 3, 3) of their right-invariant errors.
+    """
     for _ in range(_REFINEMENTS):
-        residual, squared = _residuals(clues, spread, transform[None])
-        covariance = clues["map_covariance"] + _rotated(spread, transform[2])
-        point = se2.transform_points(transform, clues["local"])
-        jacobian = np.zeros((clues.size, 2, 3))
-        jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
-        jacobian[:, 0, 2], jacobian[:, 1, 2] = -point[:, 1], point[:, 0]
-        weighted = np.linalg.solve(covariance, jacobian)
-        information = np.einsum("kij,kil->jl", jacobian, weighted)
-        gradient = np.einsum("kij,ki->j", weighted, residual[0])
-        turn = se2.wrap_angle(clues["turn"] - transform[2])
-        agrees = np.abs(turn) < 3.0 * np.sqrt(clues["turn_variance"])  # NaN does not
-        information[2, 2] += np.sum(1.0 / clues["turn_variance"][agrees])
-        gradient[2] += np.sum(turn[agrees] / clues["turn_variance"][agrees])
-        if np.linalg.cond(information) > 1e12:
-            return None
-        transform = se2.compose(se2.exp(np.linalg.solve(information, gradient)), transform)
-    excess = max(1.0, float(squared.sum()) / max(1, 2 * clues.size - 3))
-    error_covariance = excess * np.linalg.inv(information)
-    middle = np.array([*clues["map"].mean(axis=0), 0.0])
-    sigma = np.sqrt(np.diag(se2.pose_covariance(middle, error_covariance)))
-    sure = sigma[2] < _HEADING_SIGMA and max(sigma[0], sigma[1]) < _POSITION_SIGMA
-    return Fix(transform, error_covariance) if sure else None
+        residual, squared = _residuals(clues, spread, transforms)
+        covariance = clues["map_covariance"] + _rotated(spread, transforms[:, 2, None])
+        point = se2.transform_points(transforms[:, None, :], clues["local"])
+        jacobian = np.zeros((*agree.shape, 2, 3))
+        jacobian[..., 0, 0] = jacobian[..., 1, 1] = 1.0
+        jacobian[..., 0, 2], jacobian[..., 1, 2] = -point[..., 1], point[..., 0]
+        weighted = np.linalg.solve(covariance, jacobian) * agree[..., None, None]
+        information = np.einsum("hkij,hkil->hjl", jacobian, weighted)
+        gradient = np.einsum("hkij,hki->hj", weighted, residual)
+        turn, shown = _turn_agrees(clues, transforms)
+        weight = np.where(agree & shown, 1.0 / clues["turn_variance"], 0.0)
+        information[:, 2, 2] += weight.sum(axis=1)
+        gradient[:, 2] += np.where(weight > 0.0, turn * weight, 0.0).sum(axis=1)
+        information += _PRIOR * np.eye(3)
+        step = np.linalg.solve(information, gradient[..., None])[..., 0]
+        transforms = se2.compose(se2.exp(step), transforms)
+    freedom = np.maximum(1, 2 * agree.sum(axis=1) - 3)
+    excess = np.maximum(1.0, np.sum(squared * agree, axis=1) / freedom)
+    return transforms, excess[:, None, None] * np.linalg.inv(information)
 
 
-def _has_rival(transforms: FloatArray, fix: Fix, clues: NDArray[np.void]) -> bool:
-    """Whether one of the transforms (h, 3) is about as well supported as the fix and clearly elsewhere."""
+def _are_apart(transforms: FloatArray, sigma: FloatArray, clues: NDArray[np.void]) -> bool:
+    """Whether a transform (h, 3) places the track clearly elsewhere than the first, known to sigma (3,)."""
     middle = clues["local"].mean(axis=0)
-    place = se2.transform_points(fix.transform, middle)
-    apart = np.hypot(*(se2.transform_points(transforms, middle) - place).T)
-    turned = np.abs(se2.wrap_angle(transforms[:, 2] - fix.transform[2]))
-    return bool(np.any((apart > 2.0 * _POSITION_SIGMA) | (turned > 5.0 * _HEADING_SIGMA)))
+    places = se2.transform_points(transforms, middle)
+    apart = np.hypot(*(places - places[0]).T)
+    turned = np.abs(se2.wrap_angle(transforms[:, 2] - transforms[0, 2]))
+    return bool(np.any((apart > _APART_M + 3.0 * sigma[:2].max()) | (turned > _APART_RAD + 3.0 * sigma[2])))
