@@ -230,7 +230,7 @@ def _residuals(
 
 
 def _turn_agrees(clues: NDArray[np.void], transforms: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """By what turn (h, k) the headings shown, or mirrored, differ from transforms (h, 3); whether by little."""
+    """By what turn (h, k) headings shown, or mirrored, differ from transforms (h, 3); whether by little."""
     turns = np.stack([clues["turn"], clues["other_turn"]])[:, None, :] - transforms[None, :, None, 2]
     first, other = se2.wrap_angle(turns)
     turn = np.where(np.abs(other) < np.abs(first), other, first)  # NaN is not less
