@@ -84,8 +84,8 @@ def update_one(
 ) -> FloatArray:
     """Use one measurement: change the covariance (n, n) in place, return the correction (n,) of all columns.
 
-    Eqs. (11), (13), (14), and (12) in Joseph's form, which keeps the covariance positive definite. Of the
-    covariance only what the measurement's columns touch is multiplied.
+    Eqs. (11), (13), (14), and (12) in Joseph's form, which keeps the covariance positive definite, multiplied
+    out to P - K H P - (P H^T - K S) K^T, where the last term is what rounding left, and taken symmetrically.
 
     Args:
         covariance: (n, n) of everything estimated.
@@ -96,27 +96,27 @@ def update_one(
     """
     size = covariance.shape[0]
     ph = _projected(covariance, columns, jacobian)
-    factor = cholesky3(innovation_covariance(ph, columns, jacobian, noise))
-    gain = np.empty((size, 3))
+    s = innovation_covariance(ph, columns, jacobian, noise)
+    factor = cholesky3(s)
+    gain, one = np.empty((3, size)), np.empty(3)
+    change, correction = np.empty((3, size)), np.zeros(size)
     for i in range(size):
-        solve3(factor, ph[i], gain[i])
-    for i in range(size):
-        for j in range(size):
-            covariance[i, j] -= gain[i, 0] * ph[j, 0] + gain[i, 1] * ph[j, 1] + gain[i, 2] * ph[j, 2]
-    rest = _projected(covariance, columns, jacobian)
-    correction = np.zeros(size)
-    for i in range(size):
+        solve3(factor, ph[i], one)
         for r in range(3):
-            correction[i] += gain[i, r] * innovation[r]
-            for q in range(3):
-                rest[i, r] -= gain[i, q] * noise[q, r]
+            gain[r, i] = one[r]
+            correction[i] += one[r] * innovation[r]
+            rest = ph[i, r] - one[0] * s[0, r] - one[1] * s[1, r] - one[2] * s[2, r]
+            change[r, i] = 0.5 * (ph[i, r] + rest)
     for i in range(size):
-        for j in range(i + 1):
-            value = 0.5 * (covariance[i, j] + covariance[j, i])
-            for r in range(3):
-                value -= 0.5 * (rest[i, r] * gain[j, r] + rest[j, r] * gain[i, r])
-            covariance[i, j] = value
-            covariance[j, i] = value
+        k0, k1, k2 = gain[0, i], gain[1, i], gain[2, i]
+        c0, c1, c2 = change[0, i], change[1, i], change[2, i]
+        for j in range(
+            size
+        ):  # each pair of terms is the same for (i, j) and (j, i): symmetry to the last bit
+            value = k0 * change[0, j] + c0 * gain[0, j]
+            value += k1 * change[1, j] + c1 * gain[1, j]
+            value += k2 * change[2, j] + c2 * gain[2, j]
+            covariance[i, j] -= value
     return correction
 
 

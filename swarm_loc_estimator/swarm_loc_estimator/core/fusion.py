@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.core import judgement, se2
 from swarm_loc_estimator.core.fix import ClueBook
-from swarm_loc_estimator.core.measurements import NOBODY, Kind, MeasurementArray, MeasurementColumns
+from swarm_loc_estimator.core.measurements import Kind, MeasurementArray, MeasurementColumns
 from swarm_loc_estimator.core.odometry import OdometryTracks
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.settings import EstimatorSettings
@@ -17,7 +17,7 @@ from swarm_loc_estimator.core.state import SwarmState
 from swarm_loc_estimator.core.swarm import Swarm
 
 _MANY = 64
-"""From so many measurements on, and one per robot, one update with all of them costs less than one each."""
+"""From so many measurements on, one update with all of them costs less than one each, at any swarm size."""
 
 
 class Verdict(IntEnum):
@@ -101,7 +101,7 @@ class Fusion:
             nis: (m,) normalised innovations squared, written; NaN where there is none.
         """
         nis[:] = np.nan
-        many = measurements.size >= max(_MANY, state.tracked.size)
+        many = measurements.size >= _MANY
         if self._together and many and np.all(measurements["kind"] < Kind.SEAT):
             self._fuse_together(state, measurements, verdicts, nis)
         else:
@@ -155,23 +155,12 @@ class Fusion:
             Poses (m, 2, 3) of observers and targets at the stamps, and (N + 1,) whether each robot, and
             nobody, was lost.
         """
-        sides = np.stack([measurements["observer"], measurements["target"]], axis=1)
-        sides = np.where(sides == NOBODY, sides[:, ::-1], sides)  # nobody's pose does not matter
-        sample = self._tracks.at(sides.ravel(), np.repeat(measurements["stamp_ns"], 2))
-        involved, inverse, times = np.unique(sides.ravel(), return_inverse=True, return_counts=True)
-        noise = np.zeros((involved.size, 3, 3))
-        np.add.at(noise, inverse, sample.noise)
-        state.advance(involved, noise / times[:, None, None])
-        poses = se2.compose(state.transform[sides.ravel()], sample.pose)
-        newest = np.zeros((involved.size, 3))
-        newest[inverse] = poses
-        lost = np.zeros(state.tracked.size + 1, dtype=bool)
-        belief = state.arrays()
-        for robot, pose in zip(involved, newest, strict=True):
-            if judgement.is_unsure(belief, robot, pose, self._limits[0], self._limits[1]):
-                state.lose(int(robot))
-                lost[robot] = True
-        return poses.reshape(-1, 2, 3), lost
+        poses, lost = np.zeros((measurements.size, 2, 3)), np.zeros(state.tracked.size + 1, dtype=bool)
+        columns = MeasurementColumns.of(measurements)
+        judgement.advance_all(columns, self._tracks.arrays, state.arrays(), self._limits, poses, lost[:-1])
+        for robot in np.flatnonzero(lost):
+            state.lose(int(robot))
+        return poses, lost
 
     def _update(
         self, state: SwarmState, measurements: MeasurementArray, poses: FloatArray

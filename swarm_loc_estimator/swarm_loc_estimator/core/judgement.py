@@ -71,6 +71,49 @@ def fuse_in_order(
 
 
 @compiled
+def advance_all(
+    measurements: MeasurementColumns,
+    tracks: TrackArrays,
+    belief: BeliefArrays,
+    limits: tuple[float, float, int],
+    pose: FloatArray,
+    unsure: NDArray[np.bool_],
+) -> None:
+    """Predict every robot involved to the mean of its measurements.
+
+    Args:
+        measurements: (m,) between robots that are located.
+        tracks: Odometry.
+        belief: Changed in place.
+        limits: See `fuse_in_order`.
+        pose: (m, 2, 3) written: observers and targets in `map` at the stamps; nobody's is not written.
+        unsure: (N,) written: robots involved that no longer know where they are.
+    """
+    robots = belief.tracked.size
+    noise, times = np.zeros((robots, 3, 3)), np.zeros(robots)
+    newest, raw, one = np.zeros((robots, 3)), np.empty(3), np.empty((3, 3))
+    for k in range(measurements.stamp_ns.size):
+        sides = (measurements.observer[k], measurements.target[k])
+        for i in range(2):
+            robot = sides[i]
+            if robot >= 0:
+                look_up(tracks, robot, measurements.stamp_ns[k], pose[k, i], raw, one)
+                to_map(belief, robot, pose[k, i])
+                assign(newest[robot], pose[k, i])
+                times[robot] += 1.0
+                for a in range(3):
+                    for b in range(3):
+                        noise[robot, a, b] += one[a, b]
+    for robot in range(robots):
+        if times[robot] > 0.0:
+            for a in range(3):
+                for b in range(3):
+                    one[a, b] = noise[robot, a, b] / times[robot]
+            advance(belief, robot, one)
+            unsure[robot] = is_unsure(belief, robot, newest[robot], limits[0], limits[1])
+
+
+@compiled
 def judge_all(
     measurements: MeasurementColumns,
     belief: BeliefArrays,

@@ -96,12 +96,6 @@ class SwarmState:
         self.losses[robot] += 1
         self.gated_in_a_row[robot] = 0
 
-    def advance(self, robots: NDArray[np.int64], noise: FloatArray) -> None:
-        """Predict distinct robots (k,) up to where their tracks have gathered `noise` (k, 3, 3)."""
-        belief = self.arrays()
-        for robot, gathered in zip(robots, noise, strict=True):
-            advance(belief, robot, gathered)
-
     def map_noise(self, robots: NDArray[np.int64], noise: FloatArray) -> FloatArray:
         """The track noise (k, 3, 3) not accounted for yet, as covariance of the error in `map`."""
         added = np.zeros_like(noise)
