@@ -23,7 +23,7 @@ setup(
     options={"build_scripts": {"executable": "/usr/bin/env python3"}} if " " in sys.executable else {},
     zip_safe=False,
     maintainer="Swarm localization maintainers",
-    maintainer_email="maintainers@users.noreply.h-seed-05ed3d07.example",
+    maintainer_email="swarm-localization@example.org",
     description="The central estimator of a robot swarm, its replay, its player and its reports.",
     license="Apache-2.0",
     entry_points={
