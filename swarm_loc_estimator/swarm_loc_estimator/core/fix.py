@@ -29,6 +29,7 @@ CLUE_DTYPE = np.dtype(
         ("track_noise", np.float64, (3, 3)),  # noise the track had gathered by then
         ("map", np.float64, (2,)),  # the same point in map [m]
         ("map_covariance", np.float64, (2, 2)),
+        ("shared", np.float64, (3, 3)),  # part of it: right-invariant error of the robot on the other side
         ("turn", np.float64),  # heading of the transform that the sighting shows [rad], NaN: none
         ("other_turn", np.float64),  # of its mirrored solution, NaN: none
         ("turn_variance", np.float64),
@@ -112,6 +113,7 @@ class ClueBook:
         clue["track_noise"] = track.noise
         clue["local_covariance"] = seen if sees else 0.0
         clue["map_covariance"] = lever @ spread @ lever.T + (0.0 if sees else seen)
+        clue["shared"] = spread
         clue["turn"] = clue["other_turn"] = np.nan
         if one["has_heading"][0]:
             clue["turn"] = map_heading - local_heading
@@ -154,6 +156,8 @@ def locate(clues: NDArray[np.void], track_noise: FloatArray) -> Fix | None:
     chosen = rivals[np.unique(np.linspace(0, rivals.size - 1, _MOST_RIVALS).astype(int))]
     few = np.append(best, chosen)
     transforms, covariances = _refine(clues, spread, hypotheses[few], agree[few])
+    # what clues through another robot share does not average out: it moves the track as it moves that robot
+    covariances[0] += clues["shared"].mean(axis=0)
     middle = np.array([*clues["map"].mean(axis=0), 0.0])
     sigma = np.sqrt(np.diag(se2.pose_covariance(middle, covariances[0])))
     if not (sigma[2] < _HEADING_SIGMA and max(sigma[0], sigma[1]) < _POSITION_SIGMA):
