@@ -37,7 +37,6 @@ from bench.mrclam_sets import (
     without_robots,
     without_sightings,
 )
-from bench.smoother import smooth
 from swarm_loc_estimator.calibration.fit import Options, calibrate
 from swarm_loc_estimator.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.calibration.rerun import rerun
@@ -184,6 +183,9 @@ def _early(result: ReplayResult, errors: Errors) -> float:
 
 
 def _smoothed(recording: Recording, swarm: Swarm) -> Sums | None:
+    """Errors of the offline limit."""
+    from bench.smoother import smooth  # noqa: PLC0415 # gtsam is a requirement of benchmarks, not of their tests
+
     online = rerun(recording, swarm, TICK_S)
     if not any(errors.stamp_ns.size for errors in online.errors.values()):
         return None

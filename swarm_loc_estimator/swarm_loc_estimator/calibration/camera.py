@@ -146,6 +146,7 @@ def fit_cameras(recording: Recording, swarm: Swarm, members: Sequence[int]) -> l
             camera.fit(mean, sigma)
         else:
             camera.value = mean
+        camera.value = np.round(camera.value, 5)
         robot = with_numbers(camera.robot, camera.value)
         count = camera.sightings.stamp_ns.size
         if not count:

@@ -30,6 +30,8 @@ _FORGETTING = 0.02
 """Weight of the prior that a number stays near where it began, per squared factor of e."""
 _WORST = 1e6
 
+_OF_SENSOR = frozenset(number_specs(SensorModel))
+
 NumberNames = tuple[str, ...]
 
 
@@ -124,6 +126,7 @@ def fit_noise(
     """
     small = [replace(fold, recording=thinned(fold.recording)) for fold in folds]
     names, start = tuple(begin), np.log(np.array([*begin.values()]))
+    groups = np.array([[name in _OF_SENSOR, name not in _OF_SENSOR] for name in names], dtype=float)
     count = 0
 
     def cost(logarithms: FloatArray) -> float:
@@ -137,20 +140,24 @@ def fit_noise(
         report(count, found, values)
         return found.log_score + _FORGETTING * float(np.mean((logarithms - start) ** 2))
 
-    simplex = np.concatenate([start[None], start + _STEP * np.eye(start.size)])
-    found = minimize(
-        cost,
-        start,
-        method="Nelder-Mead",
-        options={
-            "initial_simplex": simplex,
-            "maxfev": evaluations,
-            "xatol": 0.05,
-            "fatol": 0.002,
-            "adaptive": True,
-        },
-    )
-    return _clipped(names, found.x)
+    # how much noise sensors and motion have as a whole comes first, then each number of its own
+    coarse = _search(lambda factors: cost(start + groups @ factors), np.zeros(2), evaluations // 3)
+    fine = _search(cost, start + groups @ coarse, evaluations - evaluations // 3)
+    return _clipped(names, fine)
+
+
+def _search(cost: Callable[[FloatArray], float], start: FloatArray, evaluations: int) -> FloatArray:
+    """The best point that a number of evaluations finds from a start (p,)."""
+    steps = np.diag(_STEP * (-1.0) ** np.arange(start.size))  # not all in one direction
+    options = {
+        "initial_simplex": np.concatenate([start[None], start + steps]),
+        "maxfev": max(1, evaluations),
+        "xatol": 0.05,
+        "fatol": 0.002,
+        "adaptive": start.size > 2,
+    }
+    found: FloatArray = minimize(cost, start, method="Nelder-Mead", options=options).x
+    return found
 
 
 def _clipped(names: NumberNames, logarithms: FloatArray) -> dict[str, float]:

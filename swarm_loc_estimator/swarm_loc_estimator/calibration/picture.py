@@ -44,13 +44,18 @@ def draw(done: Calibration, path: Path) -> Path:
     responses = [motion.response for motion in done.models.motion if motion.response is not None]
     response = responses[0] if responses and len(responses[0].speeds) > 1 else None
     panels = _panels(done)
-    figure = Figure(figsize=(4.2 * (len(panels) + 2 * (response is not None)), 3.6), layout="constrained")
-    axes: list[Any] = list(figure.subplots(1, len(panels) + 2 * (response is not None), squeeze=False)[0])
+    count = len(panels) + 2 * (response is not None)
+    columns = min(4, max(1, count))
+    rows = -(-count // columns)
+    figure = Figure(figsize=(3.8 * columns, 3.2 * rows), layout="constrained")
+    axes: list[Any] = list(figure.subplots(rows, columns, squeeze=False).ravel())
     for axis, (label, before, after) in zip(axes, panels, strict=False):
         _histogram(axis, label, before, after)
     if response is not None:
-        for axis, name in zip(axes[-2:], ("speed", "turn rate"), strict=True):
+        for axis, name in zip(axes[len(panels) :], ("speed", "turn rate"), strict=False):
             _shares(axis, response, name)
+    for axis in axes[count:]:
+        axis.set_visible(False)
     figure.savefig(path, dpi=120)
     return path
 
@@ -122,6 +127,7 @@ def _histogram(axis: Any, label: str, before: FloatArray, after: FloatArray) -> 
     axis.hist(after, bins, histtype="step", color=_COLOUR, linewidth=1.6, label="after")
     axis.set_xlabel(f"error of {label}")
     axis.set_yticks([])
+    axis.locator_params(axis="x", nbins=5)
     axis.spines[["top", "right", "left"]].set_visible(False)
     axis.legend(frameon=False)
 

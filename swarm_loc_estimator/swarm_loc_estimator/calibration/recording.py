@@ -46,7 +46,7 @@ class Rows:
     robot: IntArray
     stamp_ns: IntArray
     arrival_ns: IntArray
-    data: tuple[object, ...]
+    data: tuple[Any, ...]
 
     def chosen(self, rows: BoolArray) -> Rows:
         """The messages (M,) that are marked."""
@@ -94,7 +94,6 @@ class Recording:
             keep: From a robot's index and its detections (d,) which of them stay.
         """
         rows = self.detections
-        found: Any  # detections hold arrays
         data = tuple(
             found[keep(robot, found)] for robot, found in zip(rows.robot.tolist(), rows.data, strict=True)
         )

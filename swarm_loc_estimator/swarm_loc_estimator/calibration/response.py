@@ -23,9 +23,12 @@ LONGEST_LAG_S = 1.0
 _WINDOW_S = 5.0
 _SHORT_WINDOW_S = 0.5
 _NODES = 5
+_NEAR_ZERO = 0.05
+_CLEARLY = 0.85
+"""Lateness is believed where it lessens the errors of short windows to this share."""
 _MOVING = 1e-3
 """Slower than this is standing [m/s, rad/s]."""
-_SMOOTHNESS, _TO_ONE = 0.02, 0.0005
+_SMOOTHNESS, _TO_ONE = 0.02, 0.001
 """Weight of the prior that neighbouring shares are alike, and that shares are 1."""
 _FIRST_LATENESS = (0.05, 0.1)
 
@@ -79,6 +82,8 @@ def fit_lateness(drives: Sequence[Drive]) -> Lateness:
         method="Nelder-Mead",
         options={"initial_simplex": simplex, "xatol": 3e-3, "fatol": 0.0, "maxfev": 60},
     )
+    if found.fun > _CLEARLY * cost(np.zeros(2)):
+        return Lateness(0.0, 0.0)
     return Lateness(float(found.x[0]), float(found.x[1]) if found.x[1] > 2e-3 else 0.0)
 
 
@@ -96,6 +101,8 @@ def nodes_of(values: FloatArray, duration_s: FloatArray, count: int = _NODES) ->
     order = np.argsort(values[used])
     held = np.cumsum(duration_s[used][order])
     low, high = np.interp([0.01, 0.99], held / held[-1], values[used][order])
+    if low < _NEAR_ZERO * high:  # a point so near to 0 would say what 0 says
+        low = high / count
     spaced = np.linspace(low, high, count) if high > 1.2 * low else np.array([high])
     return np.concatenate([[0.0], np.round(spaced, 4)])
 

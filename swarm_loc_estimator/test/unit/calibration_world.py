@@ -76,7 +76,7 @@ def record(world: World) -> tuple[Recording, Swarm]:
     for index, true in enumerate(world.robots):
         stamps = np.arange(3 * SECOND, int((world.duration_s - _MARGIN_S) * SECOND), int(_PICTURE_S * SECOND))
         for stamp in stamps.tolist():
-            found = _seen(rng, world, swarm, truth, index, stamp, true)
+            found = _seen(rng, world, swarm, truth[true.name], stamp, true)
             if found.size:
                 pictures.append((index, stamp, stamp, found))
     return Recording("world", _rows(odometry), _rows(pictures), truth), swarm
@@ -133,14 +133,13 @@ def _seen(
     rng: np.random.Generator,
     world: World,
     swarm: Swarm,
-    truth: dict[str, Track],
-    index: int,
+    truth: Track,
     stamp_ns: int,
     true: Robot,
 ) -> np.ndarray[tuple[int], np.dtype[np.void]]:
     """Detections of one picture."""
     camera = true.camera or CameraMount()
-    own = _at(truth[true.name], stamp_ns + round(true.sensor.time_offset_s * 1e9))
+    own = _at(truth, stamp_ns + round(true.sensor.time_offset_s * 1e9))
     eye = se2.compose(own, [camera.x, camera.y, camera.yaw])
     marks = np.array([[m.x, m.y, m.yaw or 0.0] for m in swarm.landmarks])
     ids = np.array([m.id for m in swarm.landmarks])

@@ -1,0 +1,86 @@
+"""The MRCLAM benchmark finds sets, hides what a run must not see, and carries models over by robot name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bench import mrclam
+from bench.mrclam_sets import (
+    NoSetsError,
+    find_sets,
+    transferred,
+    unknown_start,
+    with_two_seeing,
+    without_robots,
+    without_sightings,
+)
+
+from swarm_loc_estimator.calibration.recording import Recording, Rows
+from swarm_loc_estimator.core.swarm import Face, Landmark, Robot, SensorModel, Swarm
+from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
+
+SWARM = Swarm(
+    tuple(Robot(f"robot{k}", "create", faces=(Face("body", k),), start=(0.0, 0.0, 0.0)) for k in (1, 2, 3)),
+    (Landmark(10), Landmark(11, 1.0)),
+)
+
+
+def seen(*observations: tuple[int, list[int]]) -> Recording:
+    """A recording in which robots (by index) see ids."""
+    found = []
+    for _, ids in observations:
+        rows = np.zeros(len(ids), DETECTION_DTYPE)
+        rows["id"] = ids
+        found.append(rows)
+    stamps = np.arange(len(found), dtype=np.int64)
+    robots = np.array([robot for robot, _ in observations], dtype=np.int64)
+    none = np.zeros(0, dtype=np.int64)
+    return Recording("r", Rows(none, none, none, ()), Rows(robots, stamps, stamps, tuple(found)), {})
+
+
+def ids_of(recording: Recording) -> list[list[int]]:
+    """What is seen, picture by picture."""
+    return [found["id"].tolist() for found in recording.detections.data]
+
+
+def test_masks_hide_what_they_say() -> None:
+    recording = seen((0, [10, 2]), (1, [11, 1, 3]), (2, [10, 11]))
+    assert ids_of(without_robots(recording, SWARM)) == [[10], [11], [10, 11]]
+    assert ids_of(without_sightings(recording)) == [[], [], []]
+    assert ids_of(with_two_seeing(recording, SWARM, (0, 2))) == [[10, 2], [1, 3], [10, 11]]
+    assert ids_of(recording) == [[10, 2], [11, 1, 3], [10, 11]]
+
+
+def test_models_go_by_name_and_strangers_get_the_mean() -> None:
+    fitted = Swarm(
+        tuple(replace(SWARM.robots[k], sensor=SensorModel(range_offset=0.1 * (k + 1))) for k in (0, 1))
+    )
+    found = transferred(fitted, SWARM).robots
+    assert [robot.sensor.range_offset for robot in found] == pytest.approx([0.1, 0.2, 0.15])
+    assert [robot.name for robot in found] == ["robot1", "robot2", "robot3"]
+    assert all(robot.start == (0.0, 0.0, 0.0) for robot in found)
+    assert all(robot.start is None for robot in unknown_start(SWARM).robots)
+
+
+def test_sets_are_found_by_their_numbers(tmp_path: Path) -> None:
+    for number in (2, 7):
+        (tmp_path / f"MRCLAM_Dataset{number}").mkdir()
+        (tmp_path / f"MRCLAM_Dataset{number}" / "Robot2_Odometry.dat").touch()
+    assert list(find_sets(tmp_path)) == [2, 7]
+    assert list(find_sets(tmp_path / "MRCLAM_Dataset7")) == [7]
+
+
+def test_a_folder_without_sets_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(NoSetsError, match="holds no MRCLAM set"):
+        find_sets(tmp_path)
+    assert mrclam.main([str(tmp_path / "nowhere")]) == 1
+    assert "There is no folder" in capsys.readouterr().err
+
+
+def test_sums_add_up_to_pooled_figures() -> None:
+    pooled = mrclam.Sums(1, 0.01, 0.0, 3.0, 1) + mrclam.Sums(3, 0.03, 0.0, 9.0, 3)
+    assert pooled.figures == pytest.approx({"position_rmse_m": 0.1, "heading_rmse_deg": 0.0, "nees": 3.0})
+    assert len(mrclam.jobs_of(1, SWARM)) == 2 * (5 + 3)
