@@ -19,7 +19,12 @@ from swarm_loc_estimator.io.bag_file import BagError
 from swarm_loc_estimator.io.swarm_file import SwarmFileError
 from swarm_loc_estimator.nodes.parameter_table import ParameterError
 
-KNOWN_ERRORS = (BagError, ParameterError, ParameterException, SwarmFileError)
+
+class RosArgumentsError(ValueError):
+    """ROS does not understand the command line; the message is one sentence."""
+
+
+KNOWN_ERRORS = (BagError, ParameterError, ParameterException, RosArgumentsError, SwarmFileError)
 """Mistakes of a user, told in one sentence."""
 
 _WAKE_S = 0.2
@@ -65,15 +70,12 @@ def run_node(name: str, create: Callable[[], SomeNode], work: Callable[[SomeNode
     node: SomeNode | None = None
     stop = Stop()
     try:
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        _start_ros()
         node = create()
         stop.defer()
         return work(node, stop)
     except KNOWN_ERRORS as error:
         print(f"{name}: {error}", file=sys.stderr)
-        return 1
-    except rclpy_implementation.RCLInvalidROSArgsError as error:
-        print(f"{name}: {str(error).splitlines()[0]}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 0
@@ -82,6 +84,14 @@ def run_node(name: str, create: Callable[[], SomeNode], work: Callable[[SomeNode
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _start_ros() -> None:
+    """Start rclpy by the arguments of the command line, without its signal handlers; see `Stop`."""
+    try:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    except rclpy_implementation.RCLError as error:
+        raise RosArgumentsError(str(error).splitlines()[0]) from error
 
 
 def spin(node: Node, stop: Stop) -> int:

@@ -1,0 +1,279 @@
+"""What the node tests share: a small swarm that stands and sees two landmarks, and ROS around it."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
+from typing_extensions import Self
+
+from swarm_loc_estimator.core import se2
+from swarm_loc_estimator.core.sightings import CONTENT_POSE
+from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.io.messages import encode_detections, encode_odometry
+from swarm_loc_msgs.msg import MarkerDetectionArray, SwarmPose, SwarmPoses
+
+SECOND = 1_000_000_000
+STEP_NS = SECOND // 20
+T0_NS = 1_000 * SECOND
+PATIENCE_S = 60.0
+SWARM_YAML = """
+fileversion: 1
+defaults:
+  sensor: {forward_sigma: 0.02, left_sigma: 0.02, heading_sigma: 0.05}
+  faces: {front: {x: 0.0, yaw: 0.0}}
+robots:
+  alpha: {ids: {front: 1}, start: {x: 0.0, y: 0.0, theta: 0.0}}
+  beta: {ids: {front: 2}}
+landmarks:
+  100: {x: 2.0, y: 0.0, yaw: 3.14159265}
+  101: {x: 2.0, y: 1.0, yaw: 3.14159265}
+"""
+LANDMARKS = {100: (2.0, 0.0, math.pi), 101: (2.0, 1.0, math.pi)}
+TRUE_POSES = {"alpha": (0.0, 0.0, 0.0), "beta": (0.0, 1.0, 0.0)}
+UNKNOWN_ID = 999
+SETTINGS = {"fusion_load": 1.0}
+"""Every tick fuses, however fast the test lets time pass."""
+
+Poses = dict[str, tuple[float, float, float]]
+
+
+def write_swarm(folder: Path) -> Path:
+    """The small swarm's description."""
+    path = folder / "swarm.yaml"
+    path.write_text(SWARM_YAML, encoding="utf-8")
+    return path
+
+
+def odometry_bytes(robot: str, stamp_ns: int, pose: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> bytes:
+    """One nav_msgs/Odometry."""
+    (data,) = encode_odometry(
+        f"{robot}/odom",
+        f"{robot}/base_link",
+        np.array([stamp_ns]),
+        np.array([pose]),
+        np.zeros((1, 3)),
+        np.eye(6),
+        np.eye(6),
+    )
+    return data
+
+
+def sight(pose: tuple[float, float, float], ids: Sequence[int] = tuple(LANDMARKS)) -> NDArray[np.void]:
+    """What a camera at a pose sees of landmarks; an unknown id is seen where the first landmark is."""
+    detections = np.zeros(len(ids), DETECTION_DTYPE)
+    for row, marker_id in zip(detections, ids, strict=True):
+        seen = se2.between(np.array(pose), np.array(LANDMARKS.get(marker_id, LANDMARKS[100])))
+        row["id"], row["content"] = marker_id, CONTENT_POSE
+        row["position"] = (-seen[1], 0.0, seen[0])
+        row["orientation"] = (0.0, math.sin(-seen[2] / 2.0), 0.0, math.cos(-seen[2] / 2.0))
+        row["covariance"][0, 0] = -1.0
+    return detections
+
+
+def detection_bytes(robot: str, stamp_ns: int, detections: NDArray[np.void]) -> bytes:
+    """One swarm_loc_msgs/MarkerDetectionArray."""
+    return encode_detections(f"{robot}/camera_optical_frame", stamp_ns, detections)
+
+
+class Ros:
+    """A ROS context with a node of the test's own, and an executor for all nodes of the test."""
+
+    def __init__(self) -> None:
+        rclpy.init(args=[])
+        self.executor = EventsExecutor()
+        self.nodes: list[Node] = []
+        self.tester = self.add(rclpy.create_node("tester"))
+
+    def add(self, node: Any) -> Any:
+        """Let a node take part."""
+        self.nodes.append(node)
+        self.executor.add_node(node)
+        return node
+
+    def listen(self, message_class: type, topic: str) -> list[Any]:
+        """All messages that come on a topic from now on."""
+        heard: list[Any] = []
+        self.tester.create_subscription(message_class, topic, heard.append, 1000)
+        return heard
+
+    def call(self, service_class: Any, name: str, request: Any) -> Any:
+        """The response of a service."""
+        client = self.tester.create_client(service_class, name)
+        self.until(client.service_is_ready)
+        future = client.call_async(request)
+        self.until(future.done)
+        return future.result()
+
+    def until(self, condition: Callable[[], object], patience_s: float = PATIENCE_S) -> None:
+        """Handle events until something is so."""
+        end_s = time.monotonic() + patience_s
+        while not condition():
+            assert time.monotonic() < end_s, "waited in vain"
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def close(self) -> None:
+        """End all nodes."""
+        for node in self.nodes:
+            self.executor.remove_node(node)
+            node.destroy_node()
+        self.executor.shutdown()
+        rclpy.shutdown()
+
+
+def overrides(**values: Any) -> list[Parameter]:
+    """Parameters of a node as the command line would set them."""
+    return [Parameter(name, value=value) for name, value in values.items()]
+
+
+class Robots:
+    """The two robots' drivers and the simulated clock.
+
+    Args:
+        ros: Whose tester publishes.
+    """
+
+    def __init__(self, ros: Ros) -> None:
+        self._ros = ros
+        self._clock: Publisher = ros.tester.create_publisher(Clock, "/clock", 10)
+        self._odometry = {name: self._publisher(Odometry, f"{name}/odom") for name in TRUE_POSES}
+        self._detections = {
+            name: self._publisher(MarkerDetectionArray, f"{name}/detections") for name in TRUE_POSES
+        }
+        self.poses: list[SwarmPoses] = ros.listen(SwarmPoses, "swarm/poses")
+
+    def _publisher(self, message_class: type, topic: str) -> Publisher:
+        return self._ros.tester.create_publisher(message_class, topic, 100)
+
+    def wait_for_estimator(self) -> None:
+        """Return once it hears all topics and is heard."""
+        inputs = [self._clock, *self._odometry.values(), *self._detections.values()]
+        self._ros.until(lambda: all(publisher.get_subscription_count() for publisher in inputs))
+        self._ros.until(lambda: self._ros.tester.count_publishers("swarm/poses"))
+
+    def wake_estimator(self, now_ns: int) -> None:
+        """Tell the time until an estimator in another process answers.
+
+        Whether it hears cannot be seen from here: DDS believes for a while in one that was killed, and knows
+        of a new one before that one knows of us.
+        """
+        self.poses.clear()
+
+        def answers() -> bool:
+            self.tell_time(now_ns)
+            return bool(self.poses)
+
+        self._ros.until(answers)
+
+    def step(self, now_ns: int, poses: Poses | None = None) -> None:
+        """Publish the clock, everyone's odometry and sightings, and wait for the estimate that follows."""
+        heard = len(self.poses)
+        self.tell_time(now_ns)
+        for name, pose in (poses or TRUE_POSES).items():
+            self.odometry(name, odometry_bytes(name, now_ns, pose))
+            self.detections(name, detection_bytes(name, now_ns, sight(pose)))
+        self._ros.until(lambda: any(stamp_ns(pose) == now_ns for pose in self.poses[heard:]))
+
+    def run(self, begin_ns: int, steps: int, poses: Callable[[int], Poses] | None = None) -> int:
+        """So many steps; returns the time of the last."""
+        for step in range(steps):
+            self.step(begin_ns + step * STEP_NS, poses(begin_ns + step * STEP_NS) if poses else None)
+        return begin_ns + (steps - 1) * STEP_NS
+
+    def tell_time(self, now_ns: int) -> None:
+        """Publish the clock."""
+        self._clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+
+    def odometry(self, robot: str, data: bytes) -> None:
+        """Publish serialized odometry."""
+        self._odometry[robot].publish(data)
+
+    def detections(self, robot: str, data: bytes) -> None:
+        """Publish serialized detections."""
+        self._detections[robot].publish(data)
+
+    def newest(self, robot: str) -> SwarmPose:
+        """The last estimate of a robot."""
+        (pose,) = [pose for pose in self.poses[-1].robots if pose.name == robot]
+        return pose
+
+    def located(self, robot: str) -> bool:
+        """Whether the last estimate says where a robot is."""
+        return bool(self.poses) and self.newest(robot).status == SwarmPose.STATUS_TRACKED
+
+
+def stamp_ns(message: Any) -> int:
+    """A message's stamp."""
+    return int(Time.from_msg(message.header.stamp).nanoseconds)
+
+
+class Program:
+    """An executable of the package as a process of its own, its output in one file.
+
+    Args:
+        name: Module below `nodes`.
+        log: Where its output goes.
+        parameters: ROS parameters.
+        arguments: Further ROS arguments.
+    """
+
+    def __init__(
+        self, name: str, log: Path, parameters: dict[str, object], arguments: Sequence[str] = ()
+    ) -> None:
+        self.log = log
+        command = [sys.executable, "-m", f"swarm_loc_estimator.nodes.{name}", "--ros-args", *arguments]
+        for key, value in parameters.items():
+            command += ["-p", f"{key}:={value}"]
+        with log.open("wb") as out:
+            self.process = subprocess.Popen(command, stdout=out, stderr=out, env=dict(os.environ))
+
+    @property
+    def output(self) -> str:
+        """What it has printed so far."""
+        return self.log.read_text(encoding="utf-8", errors="replace")
+
+    def wait_for(self, text: str) -> None:
+        """Return once it has printed something."""
+        end_s = time.monotonic() + PATIENCE_S
+        while text not in self.output:
+            assert self.process.poll() is None, self.output
+            assert time.monotonic() < end_s, self.output
+            with_patience(self.process, 0.05)
+
+    def end(self, number: signal.Signals | None = None) -> int:
+        """Send a signal, if any, and wait for the exit status."""
+        if number is not None:
+            self.process.send_signal(number)
+        return self.process.wait(PATIENCE_S)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+def with_patience(process: subprocess.Popen[bytes], seconds: float) -> None:
+    """Wait for the end of a process for a while; it need not come."""
+    try:
+        process.wait(seconds)
+    except subprocess.TimeoutExpired:
+        return

@@ -1,0 +1,256 @@
+"""The estimator node over DDS: what comes in leads to what comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from node_world import (
+    STEP_NS,
+    T0_NS,
+    TRUE_POSES,
+    UNKNOWN_ID,
+    Robots,
+    Ros,
+    detection_bytes,
+    odometry_bytes,
+    overrides,
+    sight,
+    stamp_ns,
+)
+from rcl_interfaces.msg import Log
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
+
+from swarm_loc_estimator.core import se2
+from swarm_loc_estimator.core.estimator import SwarmEstimate
+from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
+from swarm_loc_msgs.msg import SwarmPose
+from swarm_loc_msgs.srv import SetRobotPose
+
+
+def planar(pose: Any) -> np.ndarray[Any, Any]:
+    """x, y, theta of a geometry_msgs pose or transform."""
+    place = getattr(pose, "position", None) or pose.translation
+    turn = getattr(pose, "orientation", None) or pose.rotation
+    return np.array([place.x, place.y, 2.0 * np.arctan2(turn.z, turn.w)])
+
+
+def xytheta(pose: SwarmPose) -> np.ndarray[Any, Any]:
+    return np.array([pose.x, pose.y, pose.theta])
+
+
+def report(heard: list[DiagnosticArray], name: str) -> tuple[DiagnosticStatus, dict[str, str]]:
+    """The newest diagnostics of one name, and its values."""
+    (status,) = [status for status in heard[-1].status if status.name == name]
+    return status, {pair.key: pair.value for pair in status.values}
+
+
+def after(heard: list[DiagnosticArray], time_ns: int) -> Callable[[], bool]:
+    """Whether diagnostics came that are newer."""
+    return lambda: bool(heard) and stamp_ns(heard[-1]) >= time_ns
+
+
+def test_poses_and_transforms_of_a_known_and_of_an_unknown_robot(ros: Ros, robots: Robots) -> None:
+    poses = ros.listen(PoseWithCovarianceStamped, "alpha/pose")
+    transforms = ros.listen(TFMessage, "/tf")
+    ros.until(lambda: ros.tester.count_publishers("alpha/pose") and ros.tester.count_publishers("/tf"))
+    now_ns = robots.run(T0_NS, 20)
+    ros.until(lambda: poses and stamp_ns(poses[-1]) == now_ns)
+    ros.until(lambda: transforms and stamp_ns(transforms[-1].transforms[0]) == now_ns)
+
+    assert robots.poses[-1].header.frame_id == "map"
+    for name, pose in TRUE_POSES.items():
+        assert robots.located(name)
+        assert xytheta(robots.newest(name)) == pytest.approx(pose, abs=0.03)
+        assert robots.newest(name).fix_age_s == pytest.approx(0.0, abs=0.1)
+    assert poses[-1].header.frame_id == "map"
+    assert planar(poses[-1].pose.pose) == pytest.approx(xytheta(robots.newest("alpha")))
+    assert np.linalg.eigvalsh(poses[-1].pose.covariance.reshape(6, 6))[0] > 0.0
+    by_child = {transform.child_frame_id: transform for transform in transforms[-1].transforms}
+    assert set(by_child) == {"alpha/odom", "beta/odom"}
+    assert by_child["beta/odom"].header.frame_id == "map"
+    # beta's odometry stands at its true pose, so its odom frame lies in map as the estimate errs
+    beta = se2.compose(planar(by_child["beta/odom"].transform), np.array(TRUE_POSES["beta"]))
+    assert beta == pytest.approx(xytheta(robots.newest("beta")), abs=1e-9)
+
+
+def test_a_waiting_robot_has_a_status_but_no_pose(ros: Ros, robots: Robots) -> None:
+    poses, transforms = ros.listen(PoseWithCovarianceStamped, "beta/pose"), ros.listen(TFMessage, "/tf")
+    robots.tell_time(T0_NS)
+    robots.odometry("alpha", odometry_bytes("alpha", T0_NS))
+    robots.odometry("beta", odometry_bytes("beta", T0_NS))
+    ros.until(lambda: robots.poses and robots.located("alpha"))
+    ros.until(lambda: transforms)
+
+    waiting = robots.newest("beta")
+    assert waiting.status == SwarmPose.STATUS_WAITING
+    assert np.isnan(xytheta(waiting)).all()
+    assert waiting.fix_age_s == -1.0
+    assert [transform.child_frame_id for transform in transforms[-1].transforms] == ["alpha/odom"]
+    assert not poses
+
+
+def test_what_cannot_be_used_is_dropped_and_counted(ros: Ros, robots: Robots) -> None:
+    heard = ros.listen(DiagnosticArray, "/diagnostics")
+    now_ns = robots.run(T0_NS, 4)
+    robots.odometry("alpha", odometry_bytes("alpha", now_ns + 1, (np.nan, 0.0, 0.0)))
+    robots.odometry("alpha", odometry_bytes("alpha", now_ns + 2)[:100])
+    robots.detections(
+        "beta", detection_bytes("beta", now_ns + 3, sight(TRUE_POSES["beta"], [UNKNOWN_ID] * 3))
+    )
+    lame = sight(TRUE_POSES["beta"], [100])
+    lame["position"] = np.inf
+    robots.detections("beta", detection_bytes("beta", now_ns + 4, lame))
+    now_ns = robots.run(now_ns + STEP_NS, 2)
+    ros.until(after(heard, now_ns))
+
+    _, values = report(heard, "estimator")
+    dropped = {key: int(value) for key, value in values.items() if key.startswith("dropped")}
+    assert dropped == {
+        "dropped: odometry_non_finite": 1,
+        "dropped: bad_message": 1,
+        "dropped: unknown_id": 3,
+        "dropped: non_finite": 1,
+    }
+    _, values = report(heard, "estimator: alpha")
+    assert values["odom malformed"] == "1"
+    assert np.isfinite(xytheta(robots.newest("alpha"))).all()
+
+
+def test_time_that_jumps_back_resets_once(ros: Ros, robots: Robots, node: EstimatorNode) -> None:
+    log, heard = ros.listen(Log, "/rosout"), ros.listen(DiagnosticArray, "/diagnostics")
+    robots.run(T0_NS + 100 * STEP_NS, 20)
+    robots.tell_time(T0_NS)  # the tick's timer begins a new period here
+    ros.until(lambda: node.get_clock().now().nanoseconds == T0_NS)
+    now_ns = robots.run(T0_NS + STEP_NS, 20)
+    ros.until(after(heard, now_ns))
+    ros.until(lambda: any("jumped back" in entry.msg for entry in log))
+
+    assert report(heard, "estimator")[1]["time jumps"] == "1"
+    assert sum("jumped back" in entry.msg for entry in log) == 1
+    assert xytheta(robots.newest("beta")) == pytest.approx(TRUE_POSES["beta"], abs=0.03)
+
+
+def test_services_reset_seat_and_forget(ros: Ros, robots: Robots) -> None:
+    now_ns = robots.run(T0_NS, 4)
+    name = "estimator/set_robot_pose"
+
+    forget = SetRobotPose.Request(robot="alpha", forget=True)
+    assert ros.call(SetRobotPose, name, forget).success
+    robots.tell_time(now_ns := now_ns + STEP_NS)
+    ros.until(lambda: robots.newest("alpha").status == SwarmPose.STATUS_WAITING)
+
+    seat = SetRobotPose.Request(robot="alpha")
+    seat.pose.pose.position.x = 5.0
+    assert ros.call(SetRobotPose, name, seat).success
+    robots.tell_time(now_ns := now_ns + STEP_NS)
+    ros.until(lambda: robots.located("alpha"))
+    assert robots.newest("alpha").x == pytest.approx(5.0)
+
+    seat.pose.covariance[0] = -1.0
+    response = ros.call(SetRobotPose, name, seat)
+    assert not response.success
+    assert "positive definite" in response.message
+    response = ros.call(SetRobotPose, name, SetRobotPose.Request(robot="gamma"))
+    assert not response.success
+    assert "gamma" in response.message
+
+    assert ros.call(Trigger, "estimator/reset", Trigger.Request()).success
+    robots.step(now_ns + STEP_NS)
+    assert robots.newest("alpha").x == pytest.approx(0.0, abs=0.03)
+
+
+def test_diagnostics_name_what_is_missing_and_why(ros: Ros, swarm_file: Any) -> None:
+    best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    ros.tester.create_publisher(Odometry, "beta/odom", best_effort)
+    heard = ros.listen(DiagnosticArray, "/diagnostics")
+    ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(swarm_file))))
+    ros.until(lambda: len(heard) > 1)
+
+    status, _ = report(heard, "estimator")
+    assert status.level == DiagnosticStatus.WARN
+    assert (
+        "nothing received on alpha/odom, alpha/detections, beta/detections (no publisher)" in status.message
+    )
+    assert "beta/odom (published best effort, must be reliable)" in status.message
+    status, _ = report(heard, "estimator: alpha")
+    assert status.level == DiagnosticStatus.WARN
+    assert "alpha/odom" in status.message
+
+
+def test_diagnostics_say_that_the_clock_is_missing(ros: Ros, node: EstimatorNode) -> None:
+    heard = ros.listen(DiagnosticArray, "/diagnostics")
+    ros.until(lambda: heard)
+
+    assert node.get_parameter("use_sim_time").value
+    (status,) = heard[-1].status
+    assert status.level == DiagnosticStatus.WARN
+    assert "/clock" in status.message
+
+
+def test_diagnostics_of_a_healthy_robot(ros: Ros, robots: Robots) -> None:
+    heard = ros.listen(DiagnosticArray, "/diagnostics")
+    now_ns = robots.run(T0_NS, 20)
+    ros.until(after(heard, now_ns))
+
+    status, values = report(heard, "estimator: alpha")
+    assert (status.level, status.message) == (DiagnosticStatus.OK, "tracked")
+    assert values["odom received"] == values["detections received"] == "20"
+    assert float(values["NIS mean"]) < 1.0  # the simulated sightings are exact
+    assert int(values["measurements used"]) == 40
+
+
+class StandIn:
+    """An estimator that only remembers what it was told."""
+
+    def __init__(self, *_: object) -> None:
+        self.odometry: list[tuple[int, int]] = []
+        self.time_jumps = 0
+        self.drops: dict[str, int] = {}
+
+    def add_odometry(self, robot: int, stamp: int, _pose: object, now_ns: int) -> None:
+        """Remember whose and when."""
+        assert now_ns >= stamp
+        self.odometry.append((robot, stamp))
+
+    def add_detections(self, *_: object) -> None:
+        """Nobody sends any."""
+        raise AssertionError
+
+    def tick(self, now_ns: int, *, fuse: bool) -> SwarmEstimate:
+        """Always the same."""
+        assert fuse
+        poses = np.array([[1.0, 2.0, 0.5], [np.nan, np.nan, np.nan]])
+        covariances = np.tile(np.eye(3), (2, 1, 1))
+        return SwarmEstimate(
+            now_ns, poses, covariances, poses, np.array([1, 0], np.uint8), np.array([0.25, -1.0])
+        )
+
+
+def test_the_node_only_carries_between_topics_and_estimator(ros: Ros, swarm_file: Any) -> None:
+    told: list[StandIn] = []
+
+    def create(*_: object) -> Any:
+        told.append(StandIn())
+        return told[-1]
+
+    parameters = overrides(swarm_file=str(swarm_file), use_sim_time=True, tick_period_s=1)
+    ros.add(EstimatorNode(create, parameter_overrides=parameters))
+    robots = Robots(ros)
+    robots.wait_for_estimator()
+    for step in range(5):
+        robots.odometry("beta", odometry_bytes("beta", T0_NS + step))
+    robots.tell_time(T0_NS + 10)
+    ros.until(lambda: robots.poses)
+
+    assert told[-1].odometry == [(1, T0_NS + step) for step in range(5)]
+    assert xytheta(robots.newest("alpha")) == pytest.approx([1.0, 2.0, 0.5])
+    assert robots.newest("alpha").fix_age_s == 0.25
+    assert stamp_ns(robots.poses[-1]) == T0_NS + 10

@@ -1,0 +1,102 @@
+"""The estimator as a process: wrong parameters, signals, and a restart in the middle of a run."""
+
+from __future__ import annotations
+
+import math
+import signal
+from pathlib import Path
+
+import pytest
+from node_world import SETTINGS, STEP_NS, T0_NS, Poses, Program, Robots, Ros, overrides
+from rclpy.parameter import Parameter
+
+from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
+from swarm_loc_estimator.nodes.parameter_table import ParameterError
+
+
+def _program(tmp_path: Path, **parameters: object) -> Program:
+    return Program("estimator_node", tmp_path / "log", parameters)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "sentence"),
+    [
+        ("tick_period_s", "7.0", "parameter tick_period_s = 7.0 must lie in [0.005, 1] s."),
+        ("swarm_file", "/nowhere.yaml", "/nowhere.yaml"),
+        ("swarm_file", "", "Couldn't parse"),
+    ],
+)
+def test_a_bad_parameter_ends_the_node_with_one_sentence(
+    tmp_path: Path, swarm_file: Path, name: str, value: str, sentence: str
+) -> None:
+    with _program(tmp_path, **{"swarm_file": swarm_file, name: value}) as program:
+        assert program.end() == 1
+        (line,) = [line for line in program.output.splitlines() if "[rcl]" not in line]
+    assert line.startswith("estimator_node: ")
+    assert sentence in line
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"horizon_s": math.nan}, "parameter horizon_s = nan must lie in [0.05, 60] s."),
+        ({"horizon_s": "long"}, "parameter horizon_s = 'long' must be a number."),
+        ({"publish_tf": 1}, "parameter publish_tf = 1 must be true or false."),
+        ({"map_frame": ""}, "parameter map_frame is not set: frame that all poses are in."),
+        ({"swarm_file": ""}, "parameter swarm_file is not set: path of the swarm description."),
+    ],
+)
+def test_the_sentence_about_a_parameter(
+    ros: Ros, swarm_file: Path, values: dict[str, object], sentence: str
+) -> None:
+    assert ros.tester.context.ok()
+    with pytest.raises(ParameterError) as caught:
+        EstimatorNode(parameter_overrides=overrides(**{"swarm_file": str(swarm_file), **values}))
+    assert str(caught.value) == sentence
+
+
+def test_parameters_describe_themselves_and_cannot_be_changed(node: EstimatorNode) -> None:
+    descriptor = node.describe_parameter("horizon_s")
+    assert descriptor.read_only
+    assert "late" in descriptor.description
+    assert descriptor.floating_point_range[0].to_value == 60.0
+    (result,) = node.set_parameters([Parameter("horizon_s", value=3.0)])
+    assert not result.successful
+
+
+@pytest.mark.parametrize(
+    ("number", "sign"),
+    [(signal.SIGINT, "waiting: nothing received on alpha/odom"), (signal.SIGTERM, "ready")],
+)
+def test_a_signal_ends_the_node_cleanly(
+    tmp_path: Path, swarm_file: Path, number: signal.Signals, sign: str
+) -> None:
+    with _program(tmp_path, swarm_file=swarm_file) as program:
+        program.wait_for(sign)
+        assert program.end(number) == 0
+        assert "Traceback" not in program.output
+        assert program.output.count(sign) == 1
+
+
+def test_an_estimator_that_was_killed_finds_all_robots_again(
+    ros: Ros, tmp_path: Path, swarm_file: Path
+) -> None:
+    def driving(now_ns: int) -> Poses:
+        x = 0.2 * (now_ns - T0_NS) * 1e-9
+        return {"alpha": (x, 0.0, 0.0), "beta": (x, 1.0, 0.0)}
+
+    robots = Robots(ros)
+    with _program(tmp_path, swarm_file=swarm_file, use_sim_time="true", **SETTINGS) as program:
+        robots.wake_estimator(T0_NS)
+        now_ns = robots.run(T0_NS + STEP_NS, 20, driving)
+        assert robots.located("beta")
+        program.end(signal.SIGKILL)
+    with _program(tmp_path, swarm_file=swarm_file, use_sim_time="true", **SETTINGS) as program:
+        begin_ns = now_ns + 40 * STEP_NS
+        robots.wake_estimator(begin_ns)
+        now_ns = robots.run(begin_ns + STEP_NS, 40, driving)
+        assert program.end(signal.SIGTERM) == 0
+    for name, pose in driving(now_ns).items():
+        assert robots.located(name)
+        estimate = robots.newest(name)
+        assert (estimate.x, estimate.y, estimate.theta) == pytest.approx(pose, abs=0.05)

@@ -1,0 +1,124 @@
+"""The player as a process: everything that the bag holds arrives, once and in order."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import pytest
+from nav_msgs.msg import Odometry
+from node_world import SECOND, STEP_NS, T0_NS, Program, Ros, detection_bytes, odometry_bytes, sight
+from rclpy.qos import QoSProfile
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
+
+from swarm_loc_estimator.io.bag_writer import BagWriter
+from swarm_loc_estimator.io.typestore import DETECTIONS, ODOMETRY
+from swarm_loc_msgs.msg import MarkerDetectionArray
+
+COUNT = 200
+LATE_NS = 3_000_000
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    """Ten seconds of alpha's odometry and sightings, and of beta's odometry."""
+    path = tmp_path / "bag"
+    with BagWriter(path) as writer:
+        for name, message_type in (
+            ("alpha/odom", ODOMETRY),
+            ("beta/odom", ODOMETRY),
+            ("alpha/detections", DETECTIONS),
+        ):
+            writer.add_topic(name, message_type)
+        for step in range(COUNT):
+            stamp_ns = T0_NS + step * STEP_NS
+            for name in ("alpha", "beta"):
+                writer.write(f"{name}/odom", stamp_ns + LATE_NS, odometry_bytes(name, stamp_ns))
+            data = detection_bytes("alpha", stamp_ns, sight((0.0, 0.0, 0.0)))
+            writer.write("alpha/detections", stamp_ns + LATE_NS, data)
+    return path
+
+
+class Listener:
+    """Keeps what comes on a topic, as bytes."""
+
+    def __init__(self, ros: Ros, message_class: type, topic: str) -> None:
+        self.heard: list[bytes] = []
+        ros.tester.create_subscription(
+            message_class, topic, self.heard.append, QoSProfile(depth=2 * COUNT), raw=True
+        )
+
+
+def _player(bag: Path | str, tmp_path: Path, *arguments: str, **parameters: object) -> Program:
+    return Program("play_node", tmp_path / "log", {"bag": bag, **parameters}, arguments)
+
+
+def _clock(ros: Ros) -> list[int]:
+    """All times told."""
+    times: list[int] = []
+    ros.tester.create_subscription(
+        Clock, "/clock", lambda message: times.append(int(Time.from_msg(message.clock).nanoseconds)), 10_000
+    )
+    return times
+
+
+def test_every_message_arrives_unchanged_and_never_before_its_time(
+    ros: Ros, bag: Path, tmp_path: Path
+) -> None:
+    odometry = Listener(ros, Odometry, "alpha/odom")
+    detections = Listener(ros, MarkerDetectionArray, "alpha/detections")
+    times = _clock(ros)
+    with _player(bag, tmp_path, rate=20, wait_for_subscribers=2) as player:
+        ros.until(lambda: player.process.poll() is not None)
+        assert player.end() == 0
+        summary = player.output.splitlines()[-1]
+    ros.until(lambda: len(odometry.heard) >= COUNT and len(detections.heard) >= COUNT)
+
+    stamps = [T0_NS + step * STEP_NS for step in range(COUNT)]
+    assert odometry.heard == [odometry_bytes("alpha", stamp) for stamp in stamps]
+    assert detections.heard == [detection_bytes("alpha", stamp, sight((0.0, 0.0, 0.0))) for stamp in stamps]
+    assert summary.startswith(f"played {3 * COUNT} messages of {(COUNT - 1) * STEP_NS / SECOND:.1f} s in ")
+    assert times == sorted(times)
+    assert times[0] == T0_NS + LATE_NS
+    assert times[-1] >= stamps[-1] + LATE_NS
+
+
+def test_a_part_of_a_bag_under_other_names(ros: Ros, bag: Path, tmp_path: Path) -> None:
+    renamed, left_out = Listener(ros, Odometry, "gamma/odom"), Listener(ros, Odometry, "beta/odom")
+    arguments = ("-r", "alpha/odom:=gamma/odom")
+    chosen = {"topics": "['/alpha/odom']", "start_offset_s": 5, "clock": "false"}
+    with _player(bag, tmp_path, *arguments, rate=20, wait_for_subscribers=1, **chosen) as player:
+        ros.until(lambda: player.process.poll() is not None)
+        assert player.end() == 0
+    ros.until(lambda: len(renamed.heard) >= COUNT // 2)
+
+    assert renamed.heard == [odometry_bytes("alpha", T0_NS + k * STEP_NS) for k in range(COUNT // 2, COUNT)]
+    assert not left_out.heard
+
+
+def test_a_loop_begins_anew_until_a_signal(ros: Ros, bag: Path, tmp_path: Path) -> None:
+    times = _clock(ros)
+    Listener(ros, Odometry, "alpha/odom")
+    with _player(bag, tmp_path, rate=50, wait_for_subscribers=1, loop="true") as player:
+        ros.until(lambda: times.count(T0_NS + LATE_NS) == 3)
+        assert player.end(signal.SIGINT) == 0
+        assert "Traceback" not in player.output
+        assert "played" in player.output
+
+
+@pytest.mark.parametrize(
+    ("parameters", "sentence"),
+    [
+        ({"bag": "/nowhere"}, "There is no bag '/nowhere'."),
+        ({"topics": "[gamma/odom]"}, "parameter topics names 'gamma/odom', but"),
+    ],
+)
+def test_a_wrong_parameter_ends_the_player_with_one_sentence(
+    bag: Path, tmp_path: Path, parameters: dict[str, object], sentence: str
+) -> None:
+    with _player(**{"bag": bag, "tmp_path": tmp_path, **parameters}) as player:  # type: ignore[arg-type]
+        assert player.end() == 1
+        (line,) = player.output.splitlines()
+    assert line.startswith("play: ")
+    assert sentence in line
