@@ -3,25 +3,30 @@
 The swarm is a grid with about three neighbours in view of each robot (`swarm_loc_drivers.sim.grid`):
 odometry at 20 Hz, cameras at 7.5 Hz, 150-300 ms late. Everybody gives all poses ten times a second and uses
 new measurements five times a second, as the live node does with a large swarm. Measured is CPU time of this process per simulated second, without reading messages; the optimum is gtsam's batch
-solution of all data that have arrived by the same moment.
+solution of all data that have arrived by the same moment. At the end a hundred robots are played into the
+live graph over DDS in real time.
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench._common import new_plot, save_plot, table, write_figures
+from bench._common import OUT, new_plot, save_plot, table, write_figures
 from bench.peers import filterpy_ekf, gtsam_batch, gtsam_lag
+from swarm_loc_drivers.sim.bag import write_bag
 from swarm_loc_drivers.sim.detections import as_detections
 from swarm_loc_drivers.sim.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.estimator import SwarmEstimator
 from swarm_loc_estimator.core.settings import EstimatorSettings
+from swarm_loc_estimator.live import play_live
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,6 +36,7 @@ if TYPE_CHECKING:
     from swarm_loc_drivers.sim.record import SimulatedRun
     from swarm_loc_estimator.core.se2 import FloatArray
 
+LIVE_ROBOTS = 100
 SIZES = (5, 20, 50, 100, 200, 300)
 LARGEST_FOR_BATCH = 50
 DURATION_S = 20.0
@@ -105,6 +111,20 @@ def measure(robots: int, duration_s: float, seed: int, settings: EstimatorSettin
     return figures
 
 
+def measure_live(duration_s: float, seed: int) -> dict[str, float]:
+    """A large swarm through the live graph in real time: what is lost, the estimator's load, the poses' age."""
+    run = simulate_grid(GridSettings(robots=LIVE_ROBOTS, seed=seed, duration_s=duration_s))
+    with tempfile.TemporaryDirectory() as work:
+        bag = Path(work, f"grid{LIVE_ROBOTS}")
+        write_bag(run, bag, "A simulated grid.")
+        live = play_live(bag, bag / "swarm.yaml", log=OUT / "scaling" / "nodes.log")
+    return {
+        "lost_messages": float(live.lost),
+        "estimator_core": live.estimator_core,
+        "pose_age_ms": 1e3 * float(np.percentile(live.age_s, 95.0)),
+    }
+
+
 def ticks(run: SimulatedRun) -> NDArray[np.int64]:
     """When all poses are asked for (K,)."""
     return np.arange(run.start_ns + TICK_NS, run.end_ns + 1, TICK_NS)
@@ -160,8 +180,8 @@ def draw(results: dict[int, dict[str, float]]) -> None:
     print(f"plot: {save_plot(figure, 'scaling')}")
 
 
-def report(results: dict[int, dict[str, float]]) -> None:
-    """Print the table, draw the plot and write the figures."""
+def report(results: dict[int, dict[str, float]], live: dict[str, float]) -> None:
+    """Print the tables, draw the plot and write the figures."""
     keys = {
         "cpu_s_per_s": "CPU s/s",
         "filterpy_cpu_s_per_s": "filterpy s/s",
@@ -173,10 +193,13 @@ def report(results: dict[int, dict[str, float]]) -> None:
     }
     rows = [[robots, *(figures.get(key) for key in keys)] for robots, figures in results.items()]
     print(table(["robots", *keys.values()], rows))
+    print(f"\n{LIVE_ROBOTS} robots over DDS")
+    print(table(["messages lost", "estimator core", "pose age ms (95 %)"], [list(live.values())]))
     draw(results)
     flat = {
         f"n{robots}.{key}": value for robots, figures in results.items() for key, value in figures.items()
     }
+    flat |= {f"live{LIVE_ROBOTS}.{key}": value for key, value in live.items()}
     print(f"figures: {write_figures('scaling', flat)}")
 
 
@@ -194,7 +217,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for robots in options.robots:
         print(f"{robots} robots ...", flush=True)
         results[robots] = measure(robots, options.duration, options.seed, settings)
-    report(results)
+    print(f"{LIVE_ROBOTS} robots over DDS, in real time ...", flush=True)
+    report(results, measure_live(options.duration, options.seed))
 
 
 if __name__ == "__main__":

@@ -276,7 +276,7 @@ def play_live(
         data_s=(content.end_ns - content.begin_ns) * 1e-9,
         wall_s=played_s,
     )
-    age_s: FloatArray = (np.array(recorder.received_ns) - result.stamp_ns) * 1e-9
+    age_s = (np.array(recorder.received_ns) - result.stamp_ns).astype(np.float64) * 1e-9
     status = np.array([one.status for one in poses])
     return LiveRun(result, content.arrival_ns, rate, status, recorder.inputs, core, age_s)
 

@@ -1,0 +1,72 @@
+"""The live graph: what comes out over DDS is what replay gives, also after the estimator was killed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from swarm_loc_estimator.core.estimator import Status
+from swarm_loc_estimator.core.metrics import interpolate
+from swarm_loc_estimator.graph import GraphOptions
+from swarm_loc_estimator.io.bag_cut import copy_beginning
+from swarm_loc_estimator.io.swarm_file import load_swarm
+from swarm_loc_estimator.live import ESTIMATOR, PLAYER, LiveError, LiveGraph, play_live, read_bag
+from swarm_loc_estimator.live_agreement import compare_with_replay
+from swarm_loc_estimator.nodes.recorder import read_poses
+
+DEMO = Path(__file__).parents[3] / "bags" / "eight_five_robots"
+SWARM_FILE = DEMO / "swarm.yaml"
+PATIENCE_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first seconds of the demo's bag."""
+    folder = tmp_path_factory.mktemp("bags") / "short"
+    copy_beginning(DEMO, folder, 10.0)
+    return folder
+
+
+def test_live_poses_are_those_of_replay(bag: Path, tmp_path: Path) -> None:
+    live = play_live(bag, SWARM_FILE, log=tmp_path / "nodes.log")
+
+    assert live.received == live.sent > 1000
+    compared = compare_with_replay(live, bag)
+    assert compared.settled[-1]
+    assert compared.settled_max_m < 1e-6
+    assert np.nanmax(compared.turn_rad[compared.settled]) < 1e-6
+    assert np.nanmedian(compared.distance_m) < 1e-3
+
+
+def test_poses_come_back_after_the_estimator_was_killed(bag: Path, tmp_path: Path) -> None:
+    swarm = load_swarm(SWARM_FILE)
+    content = read_bag(bag, swarm)
+    options = GraphOptions(str(SWARM_FILE), bag=str(bag), rate=0.5)
+    with LiveGraph(options, tmp_path / "nodes.log") as graph:
+        recorder = graph.recorder
+        graph.wait_for(lambda: len(recorder.raw) > 20, "publish poses", PATIENCE_S)
+        before = len(recorder.raw)
+        graph.restart(ESTIMATOR)
+        graph.wait_for(lambda: len(recorder.raw) > before + 5, "publish poses again", PATIENCE_S)
+        ended = graph.process(PLAYER).poll
+        graph.wait_for(lambda: ended() is not None, "play on", PATIENCE_S, needed=[ESTIMATOR])
+        last = read_poses(recorder.raw[-1])
+
+    assert (last.status == Status.TRACKED).all()
+    for robot, pose in zip(swarm.robots, last.pose, strict=True):
+        truth, _ = interpolate(
+            content.truth[robot.name], np.array([min(last.stamp_ns, content.end_ns)]), 200_000_000
+        )
+        assert np.hypot(*(pose - truth[0])[:2]) < 0.05, robot.name
+
+
+def test_a_graph_that_fails_says_so(bag: Path, tmp_path: Path) -> None:
+    options = GraphOptions(str(tmp_path / "missing.yaml"), bag=str(bag))
+    with (
+        LiveGraph(options, tmp_path / "nodes.log") as graph,
+        pytest.raises(LiveError, match=r"Node estimator has ended, status 1;.*missing\.yaml"),
+    ):
+        graph.wait_for(lambda: bool(graph.recorder.raw), "publish poses", PATIENCE_S)
+    assert graph.process(PLAYER).returncode is not None
