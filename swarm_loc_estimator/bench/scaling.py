@@ -3,8 +3,8 @@
 The swarm is a grid with about three neighbours in view of each robot (`swarm_loc_drivers.sim.grid`):
 odometry at 20 Hz, cameras at 7.5 Hz, 150-300 ms late. Everybody gives all poses ten times a second and uses
 new measurements five times a second, as the live node does with a large swarm. Measured is CPU time of this process per simulated second, without reading messages; the optimum is gtsam's batch
-solution of all data that have arrived by the same moment. At the end a hundred robots are played into the
-live graph over DDS in real time.
+solution of all data that have arrived by the same moment.
+At the end a hundred robots are played into the live graph over DDS in real time.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def measure(robots: int, duration_s: float, seed: int, settings: EstimatorSettin
 
 
 def measure_live(duration_s: float, seed: int) -> dict[str, float]:
-    """A large swarm through the live graph in real time: what is lost, the estimator's load, the poses' age."""
+    """A large swarm through the live graph: messages lost, the estimator's load, the poses' age."""
     run = simulate_grid(GridSettings(robots=LIVE_ROBOTS, seed=seed, duration_s=duration_s))
     with tempfile.TemporaryDirectory() as work:
         bag = Path(work, f"grid{LIVE_ROBOTS}")
