@@ -156,8 +156,11 @@ def locate(clues: NDArray[np.void], track_noise: FloatArray) -> Fix | None:
     chosen = rivals[np.unique(np.linspace(0, rivals.size - 1, _MOST_RIVALS).astype(int))]
     few = np.append(best, chosen)
     transforms, covariances = _refine(clues, spread, hypotheses[few], agree[few])
-    # what clues through another robot share does not average out: it moves the track as it moves that robot
-    covariances[0] += clues["shared"].mean(axis=0)
+    # what clues share does not average out: the error of a robot seen, the drift of the track since
+    weight = agree[best] / np.trace(spread + clues["map_covariance"], axis1=1, axis2=2)
+    drift = np.average(track_noise - clues["track_noise"], axis=0, weights=weight)
+    adjoint = se2.adjoint(transforms[0])
+    covariances[0] += np.average(clues["shared"], axis=0, weights=weight) + adjoint @ drift @ adjoint.T
     middle = np.array([*clues["map"].mean(axis=0), 0.0])
     sigma = np.sqrt(np.diag(se2.pose_covariance(middle, covariances[0])))
     if not (sigma[2] < _HEADING_SIGMA and max(sigma[0], sigma[1]) < _POSITION_SIGMA):
