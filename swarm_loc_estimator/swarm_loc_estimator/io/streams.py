@@ -44,14 +44,17 @@ class _Alike:
         names: Their bytes from `_NAMES` to `end`.
         end: Offset behind the frame names.
         start: Offset of the numbers.
-        size: Length of the message; 0 where it varies.
+        size: Length of the message; -1 where it varies, or none has come.
     """
 
     first: bytes
     names: bytes
     end: int
     start: int
-    size: int = 0
+    size: int = -1
+
+
+_NONE = _Alike(b"", b"", 0, 0)
 
 
 class OdometryStream:
@@ -63,7 +66,7 @@ class OdometryStream:
 
     def __init__(self) -> None:
         self.frame_id = ""
-        self._alike = _Alike(b"", b"", 0, 0)
+        self._alike = _NONE
 
     def read(self, data: bytes) -> tuple[int, Pose2]:
         """The stamp [ns] and the pose x [m], y [m], yaw [rad] in the robot's odom frame.
@@ -81,6 +84,7 @@ class OdometryStream:
                 return sec * _NANOSECONDS + nanosec, (x, y, yaw)
         message = decode_odometry(data)
         self.frame_id = message.frame_id
+        self._alike = _NONE
         if data[:2] == _LITTLE_ENDIAN:
             end = _behind_string(data, _behind_string(data, _NAMES))
             start = end + -(end - ENCAPSULATION) % 8
@@ -97,7 +101,7 @@ class DetectionStream:
 
     def __init__(self) -> None:
         self.frame_id = ""
-        self._alike = _Alike(b"", b"", 0, 0)
+        self._alike = _NONE
 
     def read(self, data: bytes) -> tuple[int, NDArray[np.void]]:
         """The stamp [ns] and (d,) detections of `DETECTION_DTYPE`.
@@ -120,6 +124,7 @@ class DetectionStream:
                 return sec * _NANOSECONDS + nanosec, found
         message = decode_detections(data)
         self.frame_id = message.frame_id
+        self._alike = _NONE
         if data[:2] == _LITTLE_ENDIAN:
             end = _behind_string(data, _NAMES)
             self._alike = _Alike(_LITTLE_ENDIAN, bytes(data[_NAMES:end]), end, end + -end % 4 + 4)

@@ -46,7 +46,7 @@ NO_CLOCK = "use_sim_time is true but no /clock has come"
 _DIAGNOSTICS_PERIOD_S = 1.0
 _THROTTLE_S = 30.0
 _ORDINARY_DROPS = frozenset(
-    {"duplicate", "gated", "odometry_duplicate", "odometry_too_old", "too_old", "untied"}
+    {"duplicate", "gated", "odometry_duplicate", "odometry_too_old", "reset", "too_old", "untied"}
 )
 """Late, double or outlying data is a matter of course."""
 _MOST_WITHOUT_CLOCK = 20_000

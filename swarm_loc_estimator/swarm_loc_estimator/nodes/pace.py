@@ -74,8 +74,8 @@ def play(
             clock_ns += step_ns
             wait_until(begin_s + (clock_ns - begin_ns) / (rate * _SECOND))
             publish_clock(clock_ns)
-        publish(message)
         late_s = now_s() - begin_s - (log_ns - begin_ns) / (rate * _SECOND)
+        publish(message)
         so_far.messages += 1
         so_far.bag_ns = bag_before_ns + log_ns - begin_ns
         so_far.wall_s = wall_before_s + now_s() - begin_s

@@ -1,0 +1,125 @@
+"""What /diagnostics says, from figures alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from swarm_loc_estimator.core.estimator import Status, SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.core.fusion import Verdict
+from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE
+from swarm_loc_estimator.core.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.io.ingest import Ingest
+from swarm_loc_estimator.io.messages import encode_odometry
+from swarm_loc_estimator.nodes.estimator_health import Health, Recent, TickCost, load_report
+
+SECOND = 1_000_000_000
+SWARM = Swarm((Robot("a", odometry=OdometryModel(timeout_s=1.0)), Robot("b", camera=None)))
+
+
+class World:
+    """Health of a swarm of two, fed by hand."""
+
+    def __init__(self) -> None:
+        self.ingest = Ingest(SWARM, SwarmEstimator(SWARM))
+        self.health = Health(SWARM, self.ingest, "odom", lambda name: f" (why {name[0]})")
+
+    def odometry(self, robot: str, stamp_ns: int, now_ns: int, frame: str | None = None) -> None:
+        """One message."""
+        (data,) = encode_odometry(
+            frame or f"{robot}/odom",
+            "base",
+            np.array([stamp_ns]),
+            np.zeros((1, 3)),
+            np.zeros((1, 3)),
+            np.eye(6),
+            np.eye(6),
+        )
+        self.ingest.receive(self.ingest.handle_of[f"{robot}/odom"], data, now_ns)
+
+
+def estimate(now_ns: int, *status: Status) -> SwarmEstimate:
+    n = len(status)
+    return SwarmEstimate(
+        now_ns,
+        np.zeros((n, 3)),
+        np.tile(4.0 * np.eye(3), (n, 1, 1)),
+        np.zeros((n, 3)),
+        np.array(status, np.uint8),
+        np.zeros(n),
+    )
+
+
+def recent(*rows: tuple[int, Verdict, float]) -> Recent:
+    """Measurements: who sent it, what was thought of it, its NIS."""
+    measurements = np.zeros(len(rows), MEASUREMENT_DTYPE)
+    measurements["received_from"] = [row[0] for row in rows]
+    return (
+        measurements,
+        np.array([row[1] for row in rows], np.uint8),
+        np.array([row[2] for row in rows], dtype=float),
+    )
+
+
+def test_missing_topics_are_grouped_by_cause() -> None:
+    world = World()
+    assert world.health.missing() == ["a/odom", "a/detections", "b/odom"]
+    assert world.health.missing_text() == (
+        "nothing received on a/odom, a/detections (why a); nothing received on b/odom (why b)"
+    )
+    world.odometry("b", 0, 0)
+    assert "b/odom" not in world.health.missing_text()
+
+
+def test_rates_and_lateness_are_those_of_the_interval() -> None:
+    world = World()
+    both = (Status.TRACKED, Status.TRACKED)
+    world.odometry("b", 1 * SECOND, 2 * SECOND)
+    world.health.reports(10 * SECOND, estimate(10 * SECOND, *both), recent(), {})
+    for k in range(4):
+        world.odometry("b", 10 * SECOND, 10 * SECOND + k * SECOND // 2)
+    _, b, _ = world.health.reports(12 * SECOND, estimate(12 * SECOND, *both), recent(), {})
+    assert b.values["odom received"] == "5"
+    assert b.values["odom rate [1/s]"] == "2"
+    assert b.values["odom age [s]"] == "0.5"
+    assert b.values["odom lateness mean [s]"] == "0.75"
+    assert b.values["odom lateness max [s]"] == "1.5"
+    assert b.values["sigma x [m]"] == "2"
+    assert (b.warning, b.message) == (False, "tracked")
+
+
+def test_a_robot_is_told_apart_as_waiting_lost_silent_or_in_a_foreign_frame() -> None:
+    world = World()
+    world.odometry("b", 0, 0)
+    _, b, whole = world.health.reports(0, estimate(0, Status.TRACKED, Status.WAITING), recent(), {"gated": 3})
+    assert (b.warning, b.message) == (True, "waiting for a sighting that locates it")
+    assert whole.values == {"dropped: gated": "3"}
+    world.health.reports(0, estimate(0, Status.TRACKED, Status.TRACKED), recent(), {})
+    _, b, _ = world.health.reports(0, estimate(0, Status.TRACKED, Status.WAITING), recent(), {})
+    assert b.message == "lost, waiting for a sighting that locates it"
+    now_ns = 5 * SECOND
+    _, b, _ = world.health.reports(now_ns, estimate(now_ns, Status.TRACKED, Status.STALE), recent(), {})
+    assert b.message == "b/odom is silent for 5.0 s"
+    world.odometry("b", now_ns, now_ns, frame="odom")
+    _, b, _ = world.health.reports(now_ns, estimate(now_ns, Status.TRACKED, Status.TRACKED), recent(), {})
+    assert b.message == "b/odom is in frame 'odom' but transforms are published for 'b/odom'"
+
+
+def test_nis_is_the_mean_of_what_was_used() -> None:
+    rows = recent(
+        (0, Verdict.USED, 2.0), (0, Verdict.USED, 4.0), (0, Verdict.GATED, 900.0), (-1, Verdict.USED, 7.0)
+    )
+    a, b, _ = World().health.reports(0, estimate(0, Status.TRACKED, Status.TRACKED), rows, {})
+    assert (a.values["measurements used"], a.values["NIS mean"]) == ("2", "3")
+    assert (b.values["measurements used"], b.values["NIS mean"]) == ("0", "-")
+
+
+@pytest.mark.parametrize(("tick_s", "warning"), [(0.002, False), (0.06, True)])
+def test_ticks_that_take_all_the_time_name_what_helps(tick_s: float, warning: bool) -> None:
+    cost = TickCost()
+    for _ in range(16):
+        cost.note(tick_s)
+    report = load_report(cost, elapsed_s=1.0, period_s=0.05, fusion_period_s=0.0)
+    assert report.warning == warning
+    assert ("fusion_period_s" in report.message) == warning
+    assert report.values["tick mean [ms]"] == f"{1e3 * tick_s:.4g}"

@@ -1,0 +1,57 @@
+"""One table of parameters makes the node's parameters and the README's."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from swarm_loc_estimator.core.settings import EstimatorSettings
+from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
+from swarm_loc_estimator.nodes.parameter_table import (
+    ParameterError,
+    ParameterSpec,
+    from_values,
+    markdown_table,
+    parameter_specs,
+)
+from swarm_loc_estimator.nodes.player_parameters import PlayerParameters
+
+README = Path(__file__).parents[2] / "README.md"
+
+
+@pytest.mark.parametrize("cls", [EstimatorParameters, PlayerParameters])
+def test_the_readme_says_what_the_table_says(cls: type) -> None:
+    assert markdown_table(cls) in README.read_text(encoding="utf-8")
+
+
+def test_defaults_make_the_default_object() -> None:
+    defaults = {spec.name: spec.default for spec in parameter_specs(EstimatorParameters)}
+    assert from_values(EstimatorParameters, defaults) == EstimatorParameters()
+
+
+def test_every_setting_of_the_estimator_is_a_parameter() -> None:
+    names = {spec.name for spec in parameter_specs(EstimatorParameters)}
+    assert {field.name for field in fields(EstimatorSettings)} <= names
+
+
+def spec_of(cls: type, name: str) -> ParameterSpec:
+    (spec,) = [spec for spec in parameter_specs(cls) if spec.name == name]
+    return spec
+
+
+def test_whole_numbers_will_do_for_real_ones_but_not_the_other_way_round() -> None:
+    rate = spec_of(PlayerParameters, "rate").checked(4)
+    assert (rate, type(rate)) == (4.0, float)
+    with pytest.raises(ParameterError, match=r"wait_for_subscribers = 4\.0 must be a whole number"):
+        spec_of(PlayerParameters, "wait_for_subscribers").checked(4.0)
+    with pytest.raises(ParameterError, match="rate = True must be a number"):
+        spec_of(PlayerParameters, "rate").checked(True)
+
+
+def test_lists_come_as_lists_or_tuples() -> None:
+    topics = spec_of(PlayerParameters, "topics")
+    assert topics.checked(["a", "b"]) == topics.checked(("a", "b")) == ("a", "b")
+    with pytest.raises(ParameterError, match="topics = 'a' must be a list of texts"):
+        topics.checked("a")
