@@ -28,7 +28,7 @@ from swarm_loc_estimator.calibration.windows import steps_of, true_motion, windo
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import MotionResponse, OdometryModel, Robot, Swarm
 
-EVALUATIONS = 40
+EVALUATIONS = 60
 """How often the estimator runs over the recording to fit the noise."""
 
 _LEAST_WINDOWS = 50
