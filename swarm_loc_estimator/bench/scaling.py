@@ -2,9 +2,9 @@
 
 The swarm is a grid with about three neighbours in view of each robot (`swarm_loc_drivers.sim.grid`):
 odometry at 20 Hz, cameras at 7.5 Hz, 150-300 ms late. Everybody gives all poses ten times a second and uses
-new measurements five times a second, as the live node does with a large swarm. Measured is CPU time of this process per simulated second, without reading messages; the optimum is gtsam's batch
-solution of all data that have arrived by the same moment.
-At the end a hundred robots are played into the live graph over DDS in real time.
+new measurements five times a second, as the live node does with a large swarm. Measured is CPU time of this
+process per simulated second, without reading messages; the optimum is gtsam's batch solution of all data that
+have arrived by the same moment. At the end a hundred robots are played into the live graph in real time.
 """
 
 from __future__ import annotations
