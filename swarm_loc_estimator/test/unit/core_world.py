@@ -139,6 +139,7 @@ class Plan:
         reach: How far cameras see [m].
         camera_hz: Pictures per second.
         standing: Robots that do not move.
+        carried: Robots that are put elsewhere, with their backs to where they looked, at half time.
     """
 
     robots: int = 3
@@ -155,6 +156,7 @@ class Plan:
     reach: float = 2.5
     camera_hz: float = 5.0
     standing: Sequence[int] = ()
+    carried: Sequence[int] = ()
 
 
 ODOMETRY = OdometryModel(wheel_separation=0.053, wheel_noise=2e-5)
@@ -222,6 +224,8 @@ def _drive(
         truth[k + 1] = _arc(
             truth[k], 0.5 * (true_right + true_left), (true_right - true_left) / ODOMETRY.wheel_separation
         )
+        if k == steps // 2:
+            truth[k + 1, list(plan.carried)] *= -1.0
     return truth, report
 
 
@@ -283,7 +287,7 @@ def _picture(
         if other != robot:
             ids += [face.id for face in swarm.robots[other].faces]
             frames += list(homogeneous(pose[0], pose[1], 0.0, pose[2]) @ _FACE_FRAMES)
-    relative = seen(poses[robot], MOUNT, np.array(frames))
+    relative = seen(poses[robot], MOUNT, np.array(frames).reshape(-1, 4, 4))
     place = relative[:, :3, 3]
     facing = np.einsum("mi,mi->m", relative[:, :3, 2], place) < -0.3 * np.linalg.norm(place, axis=1)
     ahead = (

@@ -1,0 +1,111 @@
+"""Errors are as large as the covariances say, and vanish where there is no noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from core_world import (
+    POSE,
+    POSE_TWO,
+    POSITION,
+    T0,
+    Plan,
+    World,
+    nees,
+    on_time,
+    play,
+    simulate,
+    ticks,
+)
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from swarm_loc_estimator.core import fusion
+from swarm_loc_estimator.core.estimator import SwarmEstimator
+from swarm_loc_estimator.core.settings import EstimatorSettings
+
+FloatArray = NDArray[np.float64]
+SEEDS = range(6)
+
+
+def errors(world: World, settings: EstimatorSettings, period_s: float) -> tuple[FloatArray, FloatArray]:
+    """Errors (T, N, 3) and covariances (T, N, 3, 3) of a run, every `period_s`."""
+    end_ns = int(world.stamp_ns[-1])
+    estimates = play(SwarmEstimator(world.swarm, settings), on_time(world), ticks(T0, end_ns, period_s))
+    error = np.array([estimate.poses - world.at(estimate.stamp_ns) for estimate in estimates])
+    error[..., 2] = np.arctan2(np.sin(error[..., 2]), np.cos(error[..., 2]))
+    return error, np.array([estimate.covariances for estimate in estimates])
+
+
+@pytest.mark.parametrize("robots", [1, 5])
+@pytest.mark.parametrize(
+    ("content", "flips"), [(POSE, 0.0), (POSITION, 0.0), (POSE_TWO, 0.2)], ids=["pose", "range", "two"]
+)
+def test_the_normalised_error_is_chi_square_distributed(content: int, flips: float, robots: int) -> None:
+    """Poses of one run are correlated over time: as many samples count as there are runs and robots."""
+    squared = []
+    for seed in SEEDS:
+        world = simulate(Plan(robots, 8.0, content=content, flips=flips, landmarks=6), 100 + seed)
+        error, covariance = errors(world, EstimatorSettings(), 1.0)
+        squared.append(nees(error, covariance)[2:].mean(axis=0))
+    samples = np.concatenate(squared)
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 3 * samples.size) / samples.size
+    assert low < samples.mean() < high
+
+
+@pytest.mark.parametrize("fusion_period_s", [0.0, 0.2])
+@pytest.mark.parametrize("content", [POSE, POSITION])
+def test_without_noise_the_error_vanishes(content: int, fusion_period_s: float) -> None:
+    world = simulate(Plan(2, 10.0, content=content, noise=0.0), 7)
+    wrong = [
+        replace(robot, start=(robot.start[0] + 0.03, robot.start[1] - 0.03, robot.start[2] + 0.05))
+        for robot in world.swarm.robots
+        if robot.start
+    ]
+    world = replace(world, swarm=replace(world.swarm, robots=tuple(wrong)))
+    settings = EstimatorSettings(fusion_period_s=fusion_period_s)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fusion, "_MANY", 3)
+        error, _ = errors(world, settings, 0.5)
+    assert np.abs(error[0]).max() > 0.02
+    assert np.abs(error[-1]).max() < 0.006
+
+
+def rmse(speed: float, settings: EstimatorSettings, seeds: range = SEEDS) -> float:
+    squared = []
+    for seed in seeds:
+        plan = Plan(2, 8.0, speed=speed, turn_rate=1.0, standing=(0, 1) if speed == 0.0 else ())
+        error, _ = errors(simulate(plan, seed), settings, 0.25)
+        squared.append(np.square(error[4:, :, :2]).sum(axis=-1))
+    return float(np.sqrt(np.mean(squared)))
+
+
+def test_the_closest_stored_state_is_as_good_for_robots_that_stand_and_worse_for_fast_ones() -> None:
+    """The configuration of the e-puck paper (V-B) against exact times."""
+    exact, closest = (
+        EstimatorSettings(fusion_period_s=0.0),
+        EstimatorSettings(fusion_period_s=0.0, state_period_s=0.4),
+    )
+    assert rmse(0.0, closest) == pytest.approx(rmse(0.0, exact), rel=0.02)
+    assert rmse(0.3, closest) > 1.5 * rmse(0.3, exact)
+
+
+def test_fusing_together_costs_little_accuracy() -> None:
+    together, exact = EstimatorSettings(fusion_period_s=0.2), EstimatorSettings(fusion_period_s=0.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fusion, "_MANY", 3)
+        assert rmse(0.1, together) < 1.1 * rmse(0.1, exact)
+
+
+def test_neighbours_help_where_landmarks_are_few() -> None:
+    plan = Plan(5, 12.0, landmarks=1)
+    with_all, without = [], []
+    for seed in SEEDS:
+        world = simulate(plan, seed)
+        error, _ = errors(world, EstimatorSettings(), 0.5)
+        with_all.append(np.square(error[8:, :, :2]).sum(axis=-1).mean())
+        for event in world.events:
+            event.detections["id"][event.detections["id"] < 1000] = 99
+        error, _ = errors(world, EstimatorSettings(), 0.5)
+        without.append(np.square(error[8:, :, :2]).sum(axis=-1).mean())
+    assert np.sqrt(np.mean(with_all)) < 0.8 * np.sqrt(np.mean(without))

@@ -1,0 +1,190 @@
+"""Robots start unknown, get lost, are found again, fall silent and leave, and do the others no harm."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from core_world import (
+    MOUNT,
+    POSE,
+    POSE_TWO,
+    POSITION,
+    SECOND,
+    T0,
+    Event,
+    Plan,
+    World,
+    detection,
+    marker_frame,
+    nees,
+    on_time,
+    play,
+    seen,
+    settled,
+    simulate,
+    ticks,
+)
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from swarm_loc_estimator.core.estimator import Status, SwarmEstimate, SwarmEstimator
+
+FloatArray = NDArray[np.float64]
+
+
+def errors(world: World, estimates: list[SwarmEstimate]) -> FloatArray:
+    """Distances (T, N) between estimates and truth [m]; NaN where not located."""
+    return np.array([np.hypot(*(e.poses - world.at(e.stamp_ns))[:, :2].T) for e in estimates])
+
+
+def run(world: World, seconds: float, keep: Callable[[Event], bool] = lambda _: True) -> list[SwarmEstimate]:
+    arrivals = [arrival for arrival in on_time(world) if keep(arrival[1])]
+    return play(SwarmEstimator(world.swarm), arrivals, ticks(T0, T0 + round(seconds * SECOND)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("content", [POSE, POSITION, POSE_TWO])
+def test_a_swarm_with_unknown_starts_finds_itself(content: int, seed: int) -> None:
+    world = simulate(Plan(2, 12.0, content=content, start_known=(False,), landmarks=5, flips=0.0), seed)
+    estimates = run(world, 12.0)
+    assert (estimates[0].status == Status.WAITING).all()
+    assert (estimates[-1].status == Status.TRACKED).all()
+    error = errors(world, estimates)
+    assert error[-1].max() < 0.05
+    for estimate in estimates:
+        located = estimate.status != Status.WAITING
+        difference = (estimate.poses - world.at(estimate.stamp_ns))[located]
+        assert (nees(difference, estimate.covariances[located]) < 35.0).all()
+    assert all(np.isnan(e.poses[e.status == Status.WAITING]).all() for e in estimates)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_robot_that_sees_no_landmark_is_located_through_another(seed: int) -> None:
+    world = simulate(Plan(2, 15.0, start_known=(True, False), landmarks=4), seed)
+    for event in world.events:
+        if event.robot == 1:
+            event.detections["id"][event.detections["id"] >= 1000] = 99
+    estimates = run(world, 15.0)
+    error = errors(world, estimates)
+    assert np.isfinite(error[-1, 1])
+    assert np.nanmax(error[:, 1]) < 0.3
+    assert estimates[-1].fix_age_s[1] == -1.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_mirrored_headings_do_not_mislead_a_robot_that_starts_unknown(seed: int) -> None:
+    world = simulate(Plan(2, 10.0, content=POSE_TWO, start_known=(False,), landmarks=4, flips=0.4), seed)
+    assert np.nanmax(errors(world, run(world, 10.0))) < 0.3
+
+
+def standing(content: int, marks: int, mirrored: float = 0.0) -> list[SwarmEstimate]:
+    """A robot that stands before landmarks and starts unknown."""
+    world = simulate(Plan(1, 0.1, noise=0.0, start_known=(False,), landmarks=max(1, marks)), 0)
+    base, arrivals = (0.1, 0.05, 0.3), []
+    for k in range(60):
+        stamp_ns = T0 + k * SECOND // 10
+        arrivals.append((stamp_ns, Event(0, stamp_ns, (0.0, 0.0, 0.0))))
+        for mark in world.swarm.landmarks[:marks]:
+            one, other = (
+                seen(base, MOUNT, marker_frame(mark.x, mark.y, mark.z, (mark.yaw or 0.0) + turn))
+                for turn in (mirrored, 0.0)
+            )
+            found = detection(mark.id, one, content)
+            found["alternative_orientation"] = Rotation.from_matrix(other[:3, :3]).as_quat()
+            arrivals.append((stamp_ns, Event(0, stamp_ns, None, found)))
+    return play(SwarmEstimator(world.swarm), arrivals, ticks(T0, T0 + 6 * SECOND))
+
+
+@pytest.mark.parametrize(
+    ("content", "marks", "mirrored"), [(POSITION, 1, 0.0), (POSE_TWO, 1, 0.6), (POSE_TWO, 1, -0.4)]
+)
+def test_what_fits_in_more_than_one_place_locates_nobody(content: int, marks: int, mirrored: float) -> None:
+    assert {e.status[0] for e in standing(content, marks, mirrored)} == {Status.WAITING}
+
+
+@pytest.mark.parametrize(
+    ("content", "marks", "mirrored"), [(POSITION, 2, 0.0), (POSE, 1, 0.0), (POSE_TWO, 2, 0.6)]
+)
+def test_what_fits_in_one_place_only_locates_the_robot(content: int, marks: int, mirrored: float) -> None:
+    last = standing(content, marks, mirrored)[-1]
+    assert last.status[0] == Status.TRACKED
+    np.testing.assert_allclose(last.poses[0], [0.1, 0.05, 0.3], atol=0.02)
+
+
+@pytest.mark.parametrize("content", [POSE, POSITION])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_robot_that_is_carried_away_is_found_again_and_harms_nobody(seed: int, content: int) -> None:
+    plan = Plan(3, 16.0, content=content, landmarks=6, carried=(0,))
+    world = simulate(plan, seed)
+    estimates = run(world, 16.0)
+    error = errors(world, estimates)
+    assert error[81, 0] > 0.15 or np.isnan(error[81, 0])
+    assert error[-1, 0] < 0.1
+    assert np.nanmax(error[:, 1:]) < 0.15
+    assert np.isfinite(error[:, 1:]).all()
+
+
+def test_a_filter_that_locks_good_measurements_out_notices() -> None:
+    world = simulate(Plan(1, 8.0), 0)
+    robot = world.swarm.robots[0]
+    x, y, theta = robot.start or (0.0, 0.0, 0.0)
+    wrong = replace(robot, start=(x + 1.0, y - 1.0, theta + 1.0))
+    world = replace(world, swarm=replace(world.swarm, robots=(wrong,)))
+    estimator = SwarmEstimator(world.swarm)
+    estimates = play(estimator, on_time(world), ticks(T0, T0 + 8 * SECOND))
+    assert estimator.drops["gated"] >= estimator.settings.lost_after
+    assert errors(world, estimates)[-1, 0] < 0.05
+
+
+def test_a_robot_silent_for_a_minute_comes_back() -> None:
+    world = simulate(Plan(2, 70.0, camera_hz=1.0), 2)
+    begin_ns, end_ns = T0 + 5 * SECOND, T0 + 65 * SECOND
+    estimator = SwarmEstimator(world.swarm)
+    arrivals = [(t, e) for t, e in on_time(world) if e.robot != 0 or not begin_ns < t < end_ns]
+    estimates = play(estimator, arrivals, ticks(T0, T0 + 70 * SECOND, 0.5))
+    status = np.array([estimate.status for estimate in estimates])
+    assert set(status[16:120, 0]) <= {Status.STALE, Status.WAITING}
+    assert (status[:, 1] == Status.TRACKED).all()
+    error = errors(world, estimates)
+    assert error[:, 1].max() < 0.15
+    assert error[-1, 0] < 0.1
+
+
+def test_a_robot_that_leaves_does_not_hold_the_others_up() -> None:
+    world = simulate(Plan(3, 10.0), 3)
+    stay = run(world, 10.0, lambda e: e.robot != 2 or e.stamp_ns < T0 + 3 * SECOND)
+    assert stay[-1].status[2] != Status.TRACKED
+    assert errors(world, stay)[-1, :2].max() < 0.05
+
+
+def test_an_operator_seats_and_forgets_a_robot() -> None:
+    world = simulate(Plan(1, 6.0, landmarks=0), 1)
+    estimator = SwarmEstimator(world.swarm)
+    play(estimator, on_time(world), ticks(T0, T0 + 3 * SECOND))
+    stamp_ns = T0 + 2 * SECOND
+    estimator.seat(0, stamp_ns, world.at(stamp_ns)[0], np.diag([1e-6, 1e-6, 1e-6]))
+    rest = [arrival for arrival in on_time(world) if arrival[0] > T0 + 3 * SECOND]
+    last = play(estimator, rest, ticks(T0 + 3 * SECOND, T0 + 4 * SECOND))[-1]
+    assert errors(world, [last])[0, 0] < 0.02
+    estimator.forget(0, T0 + 4 * SECOND)
+    assert estimator.tick(T0 + 4 * SECOND).status[0] == Status.WAITING
+    assert estimator.tick(T0 + 5 * SECOND).status[0] == Status.WAITING
+
+
+def test_fixes_from_outside_locate_and_hold_a_robot() -> None:
+    world = simulate(Plan(1, 6.0, landmarks=0, start_known=(False,)), 5)
+    estimator = SwarmEstimator(world.swarm)
+    rng = np.random.default_rng(0)
+    estimates = []
+    for stamp_ns, event in on_time(world):
+        event.give(estimator, stamp_ns)
+        pose = world.at(stamp_ns)[0] + 0.01 * rng.standard_normal(3)
+        pose[2] = math.nan if rng.uniform() < 0.5 else pose[2]
+        estimator.add_fix(0, stamp_ns, pose, 1e-4 * np.eye(3), stamp_ns)
+        estimates.append(estimator.tick(stamp_ns))
+    assert estimates[-1].fix_age_s[0] == 0.0
+    last = estimates[-1].poses[0] - world.at(estimates[-1].stamp_ns)[0]
+    assert nees(last, estimates[-1].covariances[0]) < 20.0
+    assert settled(estimator)["GATED"] < 5
