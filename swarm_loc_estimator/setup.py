@@ -28,6 +28,7 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
+            "calibrate = swarm_loc_estimator.cli.calibrate:main",
             "demo = swarm_loc_estimator.cli.demo:main",
             "estimator_node = swarm_loc_estimator.nodes.estimator_node:main",
             "graph = swarm_loc_estimator.cli.graph:main",
