@@ -27,6 +27,9 @@ from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
 from swarm_loc_estimator.replay import TICK_S, replay
 from swarm_loc_estimator.replay_result import ReplayResult
 
+_COVARIANCE = ("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
+_COLUMNS = ("stamp_ns", "robot", "x_m", "y_m", "theta_rad", *_COVARIANCE)
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
@@ -74,9 +77,7 @@ def write_poses(result: ReplayResult, path: Path) -> None:
     upper = np.triu_indices(3)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(
-            ["stamp_ns", "robot", "x_m", "y_m", "theta_rad", "xx", "xy", "xtheta", "yy", "ytheta", "thetatheta"]
-        )
+        writer.writerow(_COLUMNS)
         for stamp_ns, poses, covariances in zip(
             result.stamp_ns.tolist(), result.pose, result.covariance, strict=True
         ):

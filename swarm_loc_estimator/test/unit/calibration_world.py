@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -82,10 +83,10 @@ def record(world: World) -> tuple[Recording, Swarm]:
     return Recording("world", _rows(odometry), _rows(pictures), truth), swarm
 
 
-def _rows(messages: list[tuple[int, int, int, object]]) -> Rows:
-    messages = sorted(messages, key=lambda message: message[2])
-    columns = [np.array([m[k] for m in messages], dtype=np.int64) for k in range(3)]
-    return Rows(columns[0], columns[1], columns[2], tuple(m[3] for m in messages))
+def _rows(messages: Sequence[tuple[int, int, int, object]]) -> Rows:
+    ordered = sorted(messages, key=lambda message: message[2])
+    columns = [np.array([m[k] for m in ordered], dtype=np.int64) for k in range(3)]
+    return Rows(columns[0], columns[1], columns[2], tuple(m[3] for m in ordered))
 
 
 def _raw(rng: np.random.Generator, duration_s: float) -> Track:
