@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -79,7 +79,10 @@ def detection(marker_id: int, pose: FloatArray, content: int = POSE) -> NDArray[
 
 def joined(detections: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
     """All detections in one array of the same dtype, which numpy's own concatenation would not keep."""
-    return np.frombuffer(b"".join(one.tobytes() for one in detections), dtype=DETECTION_DTYPE).copy()
+    together: NDArray[np.void] = np.frombuffer(
+        b"".join(one.tobytes() for one in detections), dtype=DETECTION_DTYPE
+    ).copy()
+    return together
 
 
 @dataclass(frozen=True)
@@ -117,7 +120,8 @@ class World:
 
     def at(self, stamp_ns: int) -> FloatArray:
         """The true poses (N, 3) at an instant of the truth."""
-        return self.truth[int(np.searchsorted(self.stamp_ns, stamp_ns))]
+        poses: FloatArray = self.truth[int(np.searchsorted(self.stamp_ns, stamp_ns))]
+        return poses
 
 
 @dataclass(frozen=True)
@@ -328,15 +332,16 @@ def play(
     estimator: SwarmEstimator,
     events: Iterable[tuple[int, Event]],
     ticks_ns: Iterable[int],
+    resting_ns: Container[int] = (),
 ) -> list[SwarmEstimate]:
-    """Hand in events (arrival, event) in the order of their arrival, ticking in between; all estimates."""
+    """Hand in events (arrival, event) as they arrive, and tick, not fusing at some; return all estimates."""
     waiting = sorted(events, key=lambda pair: pair[0])
     estimates, k = [], 0
     for now_ns in ticks_ns:
         while k < len(waiting) and waiting[k][0] <= now_ns:
             waiting[k][1].give(estimator, waiting[k][0])
             k += 1
-        estimates.append(estimator.tick(now_ns))
+        estimates.append(estimator.tick(now_ns, fuse=now_ns not in resting_ns))
     return estimates
 
 

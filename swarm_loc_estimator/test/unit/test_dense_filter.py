@@ -11,7 +11,8 @@ FloatArray = NDArray[np.float64]
 
 def covariance(rng: np.random.Generator, size: int) -> FloatArray:
     factor = rng.standard_normal((size, size))
-    return factor @ factor.T + 0.1 * np.eye(size)
+    positive: FloatArray = factor @ factor.T + 0.1 * np.eye(size)
+    return positive
 
 
 def full(columns: NDArray[np.int64], jacobian: FloatArray, size: int) -> FloatArray:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ def tracks(*models: OdometryModel) -> OdometryTracks:
     return OdometryTracks([Robot(f"r{i}", odometry=model) for i, model in enumerate(models or (PLAIN,))])
 
 
-def arc(speed: float, turn_rate: float, seconds: FloatArray) -> FloatArray:
+def arc(speed: float, turn_rate: float, seconds: NDArray[np.floating[Any]]) -> FloatArray:
     """Poses (k, 3) on a circle, in closed form."""
     heading = turn_rate * seconds
     x = speed * seconds if turn_rate == 0.0 else speed / turn_rate * np.sin(heading)

@@ -72,8 +72,8 @@ def test_everything_works_on_any_leading_shape_as_on_single_poses() -> None:
     for function in (se2.compose, se2.between):
         np.testing.assert_array_equal(function(a, b)[index], function(a[index], b[index]))
         np.testing.assert_array_equal(function(a[0, 0], b)[index], function(a[0, 0], b[index]))
-    for function in (se2.inverse, se2.exp, se2.log, se2.adjoint, se2.error_to_pose_jacobian):
-        np.testing.assert_array_equal(function(a)[index], function(a[index]))
+    for of_one in (se2.inverse, se2.exp, se2.log, se2.adjoint, se2.error_to_pose_jacobian):
+        np.testing.assert_array_equal(of_one(a)[index], of_one(a[index]))
     assert se2.compose(np.zeros((0, 3)), np.zeros((0, 3))).shape == (0, 3)
 
 

@@ -70,7 +70,7 @@ def test_a_rendered_landmark_comes_back_as_the_measurement_in_the_plane(
     assert measured["kind"][0] == Kind.CARTESIAN
     assert (measured["observer"][0], measured["target"][0]) == (0, NOBODY)
     np.testing.assert_allclose(measured["sensor"][0], [mount.x, mount.y, mount.yaw])
-    np.testing.assert_allclose(measured["marker"][0], [MARK.x, MARK.y, MARK.yaw])
+    np.testing.assert_allclose(measured["marker"][0], [MARK.x, MARK.y, MARK.yaw or 0.0])
     position, _ = converted(detection(7, seen(base, mount, mark), POSITION), swarm(mount))
     distance, bearing = math.hypot(expected[0], expected[1]), math.atan2(expected[1], expected[0])
     np.testing.assert_allclose(position["value"][0, :2], [distance, bearing], atol=1e-12)
@@ -80,7 +80,7 @@ def test_a_rendered_landmark_comes_back_as_the_measurement_in_the_plane(
 def test_a_face_is_seen_on_the_robot_that_carries_it() -> None:
     measured, _ = converted(detection(FACE.id, marker_frame(0, 0, 1, 0)), swarm())
     assert (measured["observer"][0], measured["target"][0]) == (0, 1)
-    np.testing.assert_allclose(measured["marker"][0], [FACE.x, FACE.y, FACE.yaw])
+    np.testing.assert_allclose(measured["marker"][0], [FACE.x, FACE.y, FACE.yaw or 0.0])
 
 
 def test_a_marker_that_shows_no_heading_gives_range_and_bearing_even_from_a_pose() -> None:
