@@ -133,6 +133,9 @@ class LiveGraph:
 
     Attributes:
         recorder: What came out so far.
+
+    Raises:
+        LiveError: The estimator does not start.
     """
 
     recorder: Recorder
@@ -157,8 +160,7 @@ class LiveGraph:
             stack.callback(self._executor.shutdown)
             self._executor.add_node(self.recorder)
             stack.callback(self._stop)
-            for node in self._nodes.values():  # last, so that nothing is missed
-                self._start(node)
+            self._start_all()
             self._stack = stack.pop_all()
         return self
 
@@ -205,6 +207,18 @@ class LiveGraph:
             if time.monotonic() > since_s + patience_s:
                 raise LiveError(f"The graph did not {what} within {patience_s:.0f} s;{self._see}")
             self._executor.spin_once(timeout_sec=_WAKE_S)
+
+    def _start_all(self) -> None:
+        """Start the player last, when this process hears the estimator: no pose is missed."""
+        for name, node in self._nodes.items():
+            if name == PLAYER:
+                self.wait_for(
+                    lambda: self.recorder.count_publishers("swarm/poses") > 0,
+                    "announce its poses",
+                    _START_PATIENCE_S,
+                    needed=[ESTIMATOR],
+                )
+            self._start(node)
 
     @property
     def _see(self) -> str:

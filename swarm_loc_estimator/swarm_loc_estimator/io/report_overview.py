@@ -21,7 +21,7 @@ _STRIP_IN, _MARGIN_IN = 1.5, 1.0
 _TAIL_NS = 8_000_000_000
 _SIGMAS = 3.0
 _ENLARGED = 10.0
-_SEEN = 0.02
+_SEEN = 0.05
 """An ellipse smaller than this share of the map's width is drawn enlarged."""
 _MOST_NAMES = 12
 
@@ -43,7 +43,7 @@ def plot_overview(result: ReplayResult, path: Path) -> None:
     figure.suptitle(_title(result), x=0.01, ha="left", fontsize=13, color=INK, fontweight="bold")
     if result.errors:
         _draw_errors(axes[1], result)
-    figure.savefig(path, dpi=_DPI, metadata={"Software": None})
+    figure.savefig(path, dpi=_DPI, metadata={"Software": None}, pil_kwargs={"optimize": True})
 
 
 def _title(result: ReplayResult) -> str:
