@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse
+from PIL import Image
 
 from swarm_loc_estimator.core.metrics import pool, summarise
 from swarm_loc_estimator.core.se2 import FloatArray
@@ -24,6 +26,8 @@ _ENLARGED = 10.0
 _SEEN = 0.05
 """An ellipse smaller than this share of the map's width is drawn enlarged."""
 _MOST_NAMES = 12
+_COLOURS = 96
+"""A palette makes the file a third as large."""
 
 
 def plot_overview(result: ReplayResult, path: Path) -> None:
@@ -43,7 +47,9 @@ def plot_overview(result: ReplayResult, path: Path) -> None:
     figure.suptitle(_title(result), x=0.01, ha="left", fontsize=13, color=INK, fontweight="bold")
     if result.errors:
         _draw_errors(axes[1], result)
-    figure.savefig(path, dpi=_DPI, metadata={"Software": None}, pil_kwargs={"optimize": True})
+    drawn = io.BytesIO()
+    figure.savefig(drawn, dpi=_DPI, format="png")
+    Image.open(drawn).convert("RGB").quantize(_COLOURS).save(path, optimize=True)
 
 
 def _title(result: ReplayResult) -> str:
