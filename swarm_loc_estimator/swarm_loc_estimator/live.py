@@ -242,6 +242,7 @@ def play_live(
     *,
     log: Path,
     rate: float = 1.0,
+    parameter_file: Path | None = None,
     watch: Watch = lambda _recorder, _content: None,
 ) -> LiveRun:
     """Play a whole bag into a live graph and collect the poses that come out.
@@ -251,6 +252,7 @@ def play_live(
         swarm_file: Description of the swarm in it.
         log: File for the nodes' output.
         rate: Speed, 1 for real time.
+        parameter_file: ROS parameter file for the nodes.
         watch: Called about once per event while the bag plays, to show progress.
 
     Raises:
@@ -261,7 +263,8 @@ def play_live(
     """
     swarm = load_swarm(swarm_file)
     content = read_bag(bag, swarm)
-    options = GraphOptions(str(swarm_file), bag=str(bag), rate=rate)
+    parameters = None if parameter_file is None else str(parameter_file)
+    options = GraphOptions(str(swarm_file), bag=str(bag), rate=rate, parameter_file=parameters)
     with LiveGraph(options, log) as graph:
         recorder, estimator, player = graph.recorder, graph.process(ESTIMATOR), graph.process(PLAYER)
 
