@@ -47,8 +47,8 @@ class Agreement:
 
     @property
     def rms_m(self) -> float:
-        """Root mean square distance at all stamps [m]."""
-        return float(np.sqrt(np.nanmean(self.distance_m**2)))
+        """Root mean square distance of all robots that both had located [m]."""
+        return float(np.sqrt(np.mean(self.distance_m[np.isfinite(self.distance_m)] ** 2)))
 
     @property
     def settled_max_m(self) -> float:
@@ -68,9 +68,9 @@ def compare_with_replay(live: LiveRun, bag: Path, settings: EstimatorSettings | 
     replayed = replay(bag, live.result.swarm, settings, stamp_ns=live.result.stamp_ns)
     difference = live.result.pose - replayed.pose
     located = np.isfinite(live.result.pose).all(axis=2)
-    difference[located != np.isfinite(replayed.pose).all(axis=2)] = np.inf
-    turn = np.abs(np.where(np.isinf(difference[..., 2]), np.inf, se2.wrap_angle(difference[..., 2])))
-    distance = np.hypot(difference[..., 0], difference[..., 1])
+    one_only = located != np.isfinite(replayed.pose).all(axis=2)
+    turn = np.where(one_only, np.inf, np.abs(se2.wrap_angle(difference[..., 2])))
+    distance = np.where(one_only, np.inf, np.hypot(difference[..., 0], difference[..., 1]))
     return Agreement(replayed, distance, turn, _settled(live))
 
 
