@@ -12,7 +12,7 @@ from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
 
 _SECOND = 1_000_000_000
 _FIRST_LANDMARK = 10
-_LANDMARKS = 20  # more than are fused one by one where many may be fused together
+_LANDMARKS = 30  # three robots see more than are fused one by one where many may be fused together
 _FACING = (0.0, 1.0, 0.0, 0.0)  # x y z w: a marker that looks at the camera
 _AWAY = (0.0, 0.7, 0.0, 0.7)
 
