@@ -1,0 +1,155 @@
+"""Things that carry several markers: two or more of them, seen at once, fix one pose for all.
+
+One face seen head-on cannot be told from its mirror image, two faces together can. The answer is given face
+by face: each with the common pose, and with its covariance times the number of faces. So whoever takes the
+faces for independent gets the common pose with its true covariance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.swarm import CameraMount, Face, Robot
+from swarm_loc_vision.core.pose import Poses, Upright, body_pose, square
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_MOST_CHI2 = 25.0
+"""Per degree of freedom; where faces fit worse, they do not sit as described, and each stays on its own."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a marker sits on a body.
+
+    Attributes:
+        rotation: (3, 3) from the marker's frame to the body's.
+        position: (3,) in the body's frame [m].
+    """
+
+    rotation: FloatArray
+    position: FloatArray
+
+
+Body = Mapping[int, Placement]
+"""Marker id -> where it sits."""
+
+
+def robot_body(robot: Robot) -> Body:
+    """The faces of a robot that show a heading, in base_link."""
+    return {face.id: _placement(face, face.yaw) for face in robot.faces if face.yaw is not None}
+
+
+def _placement(face: Face, yaw: float) -> Placement:
+    """A face stands upright and looks along its yaw."""
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    rotation = np.array([[-sin, 0.0, cos], [cos, 0.0, sin], [0.0, 1.0, 0.0]])
+    return Placement(rotation, np.array([face.x, face.y, face.z]))
+
+
+def up_of(mount: CameraMount) -> FloatArray:
+    """(3,) up in the optical frame of a camera on a level robot."""
+    cos = math.cos(mount.pitch)
+    return np.array([-math.sin(mount.roll) * cos, -math.cos(mount.roll) * cos, -math.sin(mount.pitch)])
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Markers in a picture, one row each.
+
+    Attributes:
+        id: (N,).
+        corners: (N, 4, 2) [ideal px].
+        covariance: (N, 8, 8) of the corners [px^2].
+        lengths: (N,) sides [m].
+        poses: Of each on its own; those of bodies are replaced.
+    """
+
+    id: IntArray
+    corners: FloatArray
+    covariance: FloatArray
+    lengths: FloatArray
+    poses: Poses
+
+
+def solve_bodies(
+    seen: Seen, bodies: Iterable[Body], intrinsics: FloatArray, upright: Upright | None, layout_sigma: float
+) -> None:
+    """Replace the poses of markers that sit on one body by what they say together.
+
+    Args:
+        seen: The markers; changed.
+        bodies: What carries several.
+        intrinsics: (4,) fx, fy, cx, cy [px].
+        upright: Given when the bodies are known to stand upright.
+        layout_sigma: How exactly markers sit on bodies, each way [m].
+    """
+    solved = np.isfinite(seen.poses.chi2[:, 0])
+    for body in bodies:
+        rows = [int(i) for i in np.flatnonzero(solved) if int(seen.id[i]) in body]
+        distinct = {int(seen.id[i]) for i in rows}
+        if len(rows) < 2 or len(distinct) < len(rows):
+            continue
+        _solve(seen, rows, [body[int(seen.id[i])] for i in rows], intrinsics, upright, layout_sigma)
+
+
+def _solve(
+    seen: Seen,
+    rows: Sequence[int],
+    places: Sequence[Placement],
+    intrinsics: FloatArray,
+    upright: Upright | None,
+    layout_sigma: float,
+) -> None:
+    """One body, seen in some rows."""
+    points = np.stack(
+        [square(seen.lengths[i]) @ at.rotation.T + at.position for i, at in zip(rows, places, strict=True)]
+    )
+    shifts = [_shift_covariance(layout_sigma, seen.poses.position[i, 0], intrinsics) for i in rows]
+    covariance = seen.covariance[rows] + np.stack(shifts)
+    starts = _starts(seen, rows, places)
+    found = body_pose(points, seen.corners[rows], covariance, intrinsics, starts, upright)
+    freedom = 8.0 * len(rows) - 6.0
+    if not found.chi2[0, 0] < _MOST_CHI2 * freedom:
+        return
+    surplus = max(1.0, found.chi2[0, 0] / freedom)
+    for i, at in zip(rows, places, strict=True):
+        for s in range(2):
+            rotation, position = found.rotation[0, s], found.position[0, s]
+            lever = rotation @ at.position
+            seen.poses.rotation[i, s] = rotation @ at.rotation
+            seen.poses.position[i, s] = position + lever
+            seen.poses.covariance[i, s] = len(rows) * surplus * _moved(found.covariance[0, s], lever)
+            seen.poses.chi2[i, s] = found.chi2[0, s] / surplus
+
+
+def _starts(seen: Seen, rows: Sequence[int], places: Sequence[Placement]) -> tuple[FloatArray, FloatArray]:
+    """The poses of the body by each solution of each marker alone."""
+    rotations, positions = [], []
+    for i, at in zip(rows, places, strict=True):
+        for s in range(2):
+            if np.isfinite(seen.poses.chi2[i, s]):
+                rotation = seen.poses.rotation[i, s] @ at.rotation.T
+                rotations.append(rotation)
+                positions.append(seen.poses.position[i, s] - rotation @ at.position)
+    return np.stack(rotations), np.stack(positions)
+
+
+def _shift_covariance(sigma: float, position: FloatArray, intrinsics: FloatArray) -> FloatArray:
+    """(8, 8) of four corners that are shifted together [px^2]."""
+    u, v = (sigma * intrinsics[:2] / position[2]) ** 2
+    return np.asarray(np.kron(np.ones((4, 4)), np.diag([u, v])), np.float64)
+
+
+def _moved(covariance: FloatArray, lever: FloatArray) -> FloatArray:
+    """The covariance (6, 6) of a pose a lever (3,) away, given in the camera frame."""
+    x, y, z = lever
+    move = np.eye(6)
+    move[:3, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]  # d(position) = dt + omega x lever
+    return np.asarray(move @ covariance @ move.T)

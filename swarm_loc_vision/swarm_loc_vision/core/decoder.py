@@ -1,0 +1,231 @@
+"""From the brightness of cells to an id: the nearest word over all ids and rotations, and by how much.
+
+Blur mixes neighbouring cells, so cells are sharpened first. A cell near the threshold says little: a word may
+differ there at little cost, while a difference in a clear cell costs a whole bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.compiled import compiled
+from swarm_loc_vision.core.families import BITS, CELLS, Family, rotated
+from swarm_loc_vision.core.sampling import GRID
+
+FloatArray = NDArray[np.float64]
+Words = NDArray[np.uint64]
+
+FALSE_READINGS = 1e-5
+"""Of random squares, so many may be read as a marker in use."""
+_SHARPENING = 0.2
+"""How much of the difference to its four neighbours is added to a cell, each."""
+_MOST_DARK_ERRORS = 3.0
+"""Cells of the 28 of the border's inner ring that may look light."""
+_MOST_SLOPE = 0.5
+"""Over the contrast: by how much the border's darkness may differ from side to side."""
+_FAR = 1e9
+_WEIGHED = 4
+"""Words that differ in so many bits more than the nearest one may still be nearer when bits are weighed."""
+
+
+class Readings(NamedTuple):
+    """What candidates say, one row each.
+
+    Attributes:
+        word: Index of the nearest word, -1: no marker in use.
+        quarters: Counter-clockwise quarter turns that the marker is turned by in the picture.
+        errors: Weighed bits by which the candidate differs from it.
+        margin: Weighed bits that could still flip before another reading would be nearer.
+        contrast: Light minus dark cells [counts].
+    """
+
+    word: NDArray[np.int64]
+    quarters: NDArray[np.int64]
+    errors: FloatArray
+    margin: FloatArray
+    contrast: FloatArray
+
+
+class Dictionary:
+    """Words in use of families with the same border.
+
+    Args:
+        family_ids: For each family the ids in use.
+
+    Attributes:
+        codes: (N,) the family's code of each word.
+        ids: (N,) its id in it.
+        correctable: Bits that may differ while random squares are read as a marker at `FALSE_READINGS`.
+    """
+
+    def __init__(self, family_ids: Sequence[tuple[Family, NDArray[np.int64]]]) -> None:
+        self.codes = np.concatenate([np.full(len(ids), family.code) for family, ids in family_ids])
+        self.ids = np.concatenate([ids for _, ids in family_ids])
+        words = np.concatenate([family.words[ids] for family, ids in family_ids])
+        self._words = np.concatenate([rotated(words, quarters) for quarters in range(4)])
+        self.correctable = correctable_bits(len(words))
+
+    def read(self, cells: FloatArray, least_contrast: float) -> Readings:
+        """Read candidates.
+
+        Args:
+            cells: (N, GRID, GRID) of `sampling.read_cells`.
+            least_contrast: Between light and dark cells [counts].
+        """
+        count = len(cells)
+        readings = Readings(
+            np.full(count, -1), np.zeros(count, np.int64), np.zeros(count), np.zeros(count), np.zeros(count)
+        )
+        _read(cells, self._words, least_contrast, float(self.correctable), *readings)
+        return readings
+
+
+def correctable_bits(words: int) -> int:
+    """Most bits that may differ so that a random square is still read at most at a rate of FALSE_READINGS."""
+    near, bits = 1, 0
+    while bits < BITS // 4:
+        near += math.comb(BITS, bits + 1)
+        if 4.0 * words * near / 2.0**BITS > FALSE_READINGS:
+            break
+        bits += 1
+    return bits
+
+
+@compiled
+def _read(
+    cells: FloatArray,
+    words: Words,
+    least_contrast: float,
+    correctable: float,
+    word: NDArray[np.int64],
+    quarters: NDArray[np.int64],
+    errors: FloatArray,
+    margin: FloatArray,
+    contrast: FloatArray,
+) -> None:
+    """Fill `Readings`."""
+    clear = np.empty(BITS)
+    bits = np.empty(len(words), np.uint8)
+    for n in range(len(cells)):
+        contrast[n] = _clear_cells(cells[n], clear)
+        if contrast[n] < least_contrast:
+            continue
+        seen = np.uint64(0)
+        for bit in range(BITS):
+            seen = (seen << np.uint64(1)) | np.uint64(clear[bit] > 0.0)
+        best, distance, runner_up = nearest(words, seen, clear, bits)
+        if distance > correctable or runner_up <= distance:
+            continue
+        quarters[n], word[n] = divmod(best, len(words) // 4)
+        errors[n], margin[n] = distance, 0.5 * (runner_up - distance)
+
+
+@compiled
+def _clear_cells(cells: FloatArray, clear: FloatArray) -> float:
+    """From brightness to -1 (dark) ... 1 (light), in `clear`; the contrast, 0 where there is no dark border.
+
+    Dark is a plane through the border's inner ring, which takes in light that falls off; light is the mean
+    of the lighter cells.
+    """
+    sharp = np.empty((GRID - 2, GRID - 2))
+    for row in range(GRID - 2):
+        for column in range(GRID - 2):
+            here = cells[row + 1, column + 1]
+            around = (
+                cells[row, column + 1]
+                + cells[row + 2, column + 1]
+                + cells[row + 1, column]
+                + cells[row + 1, column + 2]
+            )
+            sharp[row, column] = here + _SHARPENING * (4.0 * here - around)
+    middle = 0.5 * (GRID - 3)
+    mean, by_x, by_y, square, n = 0.0, 0.0, 0.0, 0.0, 0
+    for row in range(GRID - 2):
+        for column in range(GRID - 2):
+            if 0 < row < GRID - 3 and 0 < column < GRID - 3:
+                continue
+            mean += sharp[row, column]
+            by_x += (column - middle) * sharp[row, column]
+            by_y += (row - middle) * sharp[row, column]
+            square += (column - middle) ** 2
+            n += 1
+    mean, by_x, by_y = mean / n, by_x / square, by_y / square
+    lightest = 0.0
+    for row in range(GRID - 2):
+        for column in range(GRID - 2):
+            sharp[row, column] -= mean + by_x * (column - middle) + by_y * (row - middle)
+            if 0 < row < GRID - 3 and 0 < column < GRID - 3:
+                lightest = max(lightest, sharp[row, column])
+    total, light = 0.0, 0
+    for row in range(1, GRID - 3):
+        for column in range(1, GRID - 3):
+            if sharp[row, column] > 0.5 * lightest:
+                total += sharp[row, column]
+                light += 1
+    if light == 0:
+        return 0.0
+    high = total / light
+    if (abs(by_x) + abs(by_y)) * (GRID - 3) > _MOST_SLOPE * high:
+        return 0.0
+    wrong = 0.0
+    for row in range(GRID - 2):
+        for column in range(GRID - 2):
+            value = min(max(2.0 * sharp[row, column] / high - 1.0, -1.0), 1.0)
+            if 0 < row < GRID - 3 and 0 < column < GRID - 3:
+                clear[(row - 1) * CELLS + column - 1] = value
+            elif value > 0.0:
+                wrong += value
+    return high if wrong <= _MOST_DARK_ERRORS else 0.0
+
+
+@compiled
+def nearest(
+    words: Words, seen: np.uint64, clear: FloatArray, bits: NDArray[np.uint8]
+) -> tuple[int, float, float]:
+    """The nearest word to what was seen.
+
+    Args:
+        words: (N,) all that there are.
+        seen: The candidate's bits.
+        clear: (BITS,) how clear each is, -1 to 1.
+        bits: (N,) filled with the number of bits that differ.
+
+    Returns:
+        Index of the nearest word, its weighed distance, and that of the second nearest.
+    """
+    fewest = np.uint8(BITS)
+    for i in range(len(words)):
+        bits[i] = _bits_set(words[i] ^ seen)
+        fewest = min(fewest, bits[i])
+    best, distance, runner_up = -1, _FAR, _FAR
+    for i in range(len(words)):
+        if bits[i] > fewest + _WEIGHED:
+            continue
+        different = words[i] ^ seen
+        cost = 0.0
+        for bit in range(BITS):
+            if (different >> np.uint64(BITS - 1 - bit)) & np.uint64(1):
+                cost += abs(clear[bit])
+        if cost < distance:
+            best, distance, runner_up = i, cost, distance
+        elif cost < runner_up:
+            runner_up = cost
+    return best, distance, runner_up
+
+
+@compiled
+def _bits_set(x: np.uint64) -> np.uint8:
+    """Number of ones, by shifts and sums, which the compiler turns into vectors."""
+    x -= (x >> np.uint64(1)) & np.uint64(0x5555555555555555)
+    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    x += x >> np.uint64(8)
+    x += x >> np.uint64(16)
+    x += x >> np.uint64(32)
+    count: np.uint8 = np.uint8(x & np.uint64(0x7F))
+    return count

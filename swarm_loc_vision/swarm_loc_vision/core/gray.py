@@ -1,0 +1,101 @@
+"""Pictures as cameras send them, made gray."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Gray = NDArray[np.uint8]
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+class ImageError(ValueError):
+    """A picture that cannot be used; the message is one sentence.
+
+    Attributes:
+        reason: In one word, for counting.
+    """
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+@dataclass(frozen=True)
+class _Encoding:
+    """How pixels lie in memory, and how they become gray."""
+
+    channels: int
+    to_gray: Callable[[Pixels], Pixels]
+    bytes_per_channel: int = 1
+
+
+def _converted(code: int) -> Callable[[Pixels], Pixels]:
+    """By a conversion of OpenCV."""
+
+    def convert(pixels: Pixels) -> Pixels:
+        return np.asarray(cv2.cvtColor(pixels, code), np.uint8)
+
+    return convert
+
+
+_PLAIN = _Encoding(1, lambda pixels: pixels[..., 0])
+_WIDE = _Encoding(1, lambda pixels: (pixels[..., 0] >> 8).astype(np.uint8), 2)
+_ENCODINGS = {
+    "mono8": _PLAIN,
+    "8UC1": _PLAIN,
+    "mono16": _WIDE,
+    "16UC1": _WIDE,
+    "rgb8": _Encoding(3, _converted(cv2.COLOR_RGB2GRAY)),
+    "bgr8": _Encoding(3, _converted(cv2.COLOR_BGR2GRAY)),
+    "8UC3": _Encoding(3, _converted(cv2.COLOR_BGR2GRAY)),
+    "rgba8": _Encoding(4, _converted(cv2.COLOR_RGBA2GRAY)),
+    "bgra8": _Encoding(4, _converted(cv2.COLOR_BGRA2GRAY)),
+    "bayer_rggb8": _Encoding(1, _converted(cv2.COLOR_BayerBG2GRAY)),
+    "bayer_bggr8": _Encoding(1, _converted(cv2.COLOR_BayerRG2GRAY)),
+    "bayer_gbrg8": _Encoding(1, _converted(cv2.COLOR_BayerGR2GRAY)),
+    "bayer_grbg8": _Encoding(1, _converted(cv2.COLOR_BayerGB2GRAY)),
+    "yuv422": _Encoding(2, lambda pixels: pixels[..., 1]),
+    "uyvy": _Encoding(2, lambda pixels: pixels[..., 1]),
+    "yuv422_yuy2": _Encoding(2, lambda pixels: pixels[..., 0]),
+    "yuyv": _Encoding(2, lambda pixels: pixels[..., 0]),
+}
+"""By the names of sensor_msgs/image_encodings."""
+
+
+def gray_image(
+    encoding: str, width: int, height: int, step: int, data: object, *, is_bigendian: bool = False
+) -> Gray:
+    """A picture (height, width) of brightness.
+
+    Args:
+        encoding: Of sensor_msgs/Image.
+        width: Of the picture [px].
+        height: Likewise.
+        step: Bytes from row to row.
+        data: The bytes.
+        is_bigendian: Byte order of 16-bit pixels.
+
+    Raises:
+        ImageError: Unknown encoding (`encoding`), or the bytes are not those of such a picture (`size`).
+    """
+    known = _ENCODINGS.get(encoding)
+    if known is None:
+        raise ImageError("encoding", f"the encoding '{encoding}' is not one of {', '.join(_ENCODINGS)}.")
+    raw = np.frombuffer(data, np.uint8)  # type: ignore[call-overload] # whatever has a buffer
+    row = width * known.channels * known.bytes_per_channel
+    if width < 1 or height < 1 or step < row or raw.size < step * (height - 1) + row:
+        raise ImageError(
+            "size",
+            f"{raw.size} bytes, {step} a row, are no picture of {width} x {height} pixels in '{encoding}'.",
+        )
+    rows = np.lib.stride_tricks.as_strided(raw, (height, row), (step, 1))
+    pixels: Pixels = np.ascontiguousarray(rows)
+    if known.bytes_per_channel == 2:
+        pixels = pixels.view(">u2" if is_bigendian else "<u2")
+    gray = np.ascontiguousarray(known.to_gray(pixels.reshape(height, width, known.channels)), np.uint8)
+    return gray if gray.flags.writeable else gray.copy()  # read-only ones would be compiled for once more

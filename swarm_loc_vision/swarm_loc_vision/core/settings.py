@@ -1,0 +1,26 @@
+"""What a detector can be told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from swarm_loc_estimator.core.swarm import number
+
+
+@dataclass(frozen=True)
+class DetectorSettings:
+    """Numbers of the detector, with units and ranges.
+
+    Candidates: `least_side_px`, `least_contrast`. Poses: the rest.
+    """
+
+    marker_length: float = number(0.05, "m", 0.001, 10.0, "side of a marker, black border included")
+    least_side_px: float = number(8.0, "px", 6.0, 1000.0, "smaller markers are not looked for")
+    least_contrast: float = number(4.0, "1", 1.0, 100.0, "by how much ink is darker than paper [counts]")
+    tilt_sigma: float = number(
+        0.0, "rad", 0.0, 1.0, "how upright markers stand towards a level camera's mount; 0: any way up"
+    )
+    layout_sigma: float = number(0.0005, "m", 0.0, 0.1, "how exactly faces sit on a robot")
+    ambiguity: float = number(
+        16.0, "1", 0.0, 1e4, "the mirrored pose is told when it fits worse by no more than this chi square"
+    )

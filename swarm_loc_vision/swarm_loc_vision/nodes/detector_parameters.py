@@ -1,0 +1,102 @@
+"""What a user may set about `marker_detector_node`, and the detector that follows from it. No ROS here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.swarm import CameraMount, Robot, Swarm
+from swarm_loc_estimator.io.swarm_file import load_swarm
+from swarm_loc_estimator.nodes.parameter_table import ParameterError, text, texts
+from swarm_loc_vision.core.bodies import robot_body, up_of
+from swarm_loc_vision.core.camera import Camera
+from swarm_loc_vision.core.detector import MarkerDetector
+from swarm_loc_vision.core.families import Family, family_named
+from swarm_loc_vision.core.selection import SelectionError, parse_ids, parse_lengths
+from swarm_loc_vision.core.settings import DetectorSettings
+
+IntArray = NDArray[np.int64]
+CreateDetector = Callable[[Camera], MarkerDetector]
+
+
+@dataclass(frozen=True)
+class DetectorParameters:
+    """Parameters of `marker_detector_node`; those of the detector itself are its settings."""
+
+    family: str = text(
+        "artoolkit_bch_thin",
+        "kind of marker: artoolkit_bch_thin, artoolkit_bch_thick, aruco_mip_36h12 or apriltag_36h11",
+        required=True,
+    )
+    ids: tuple[str, ...] = texts("ids in use, such as 5 or 0-31; empty: those of swarm_file, or else all")
+    lengths: tuple[str, ...] = texts("sides that differ from marker_length, such as 100-119:0.08 [m]")
+    swarm_file: str = text("", "path of the swarm description: ids in use, faces of robots; empty: none")
+    robot: str = text("", "whose camera it is in swarm_file: its mount says where up is; empty: a level one")
+    settings: DetectorSettings = field(
+        default_factory=DetectorSettings, metadata={"numbers_of": DetectorSettings}
+    )
+
+
+def detector_maker(wishes: DetectorParameters) -> CreateDetector:
+    """What makes the detector once the camera is known.
+
+    Raises:
+        ParameterError: A parameter cannot be used.
+        SwarmFileError: The swarm description cannot be used.
+    """
+    try:
+        family = family_named(wishes.family)
+    except ValueError as error:
+        raise ParameterError(f"parameter family = '{wishes.family}': {error}") from error
+    swarm = load_swarm(Path(wishes.swarm_file)) if wishes.swarm_file else Swarm()
+    robot = _robot(wishes, swarm)
+    ids = _ids(wishes, swarm, family)
+    lengths = _selected("lengths", wishes.lengths, parse_lengths, len(family.words))
+    up = up_of((robot.camera if robot else None) or CameraMount())
+    bodies = [robot_body(other) for other in swarm.robots if other is not robot]
+
+    def create(camera: Camera) -> MarkerDetector:
+        return MarkerDetector(wishes.settings, [(family, ids)], camera, lengths=lengths, up=up, bodies=bodies)
+
+    return create
+
+
+def _robot(wishes: DetectorParameters, swarm: Swarm) -> Robot | None:
+    """Whose camera it is."""
+    if not wishes.robot:
+        return None
+    if not wishes.swarm_file:
+        raise ParameterError(f"parameter robot = '{wishes.robot}' needs the parameter swarm_file, too.")
+    if wishes.robot not in swarm.index_of:
+        known = ", ".join(swarm.index_of)
+        raise ParameterError(f"parameter robot = '{wishes.robot}' must be a robot of the swarm: {known}.")
+    return swarm.robots[swarm.index_of[wishes.robot]]
+
+
+def _ids(wishes: DetectorParameters, swarm: Swarm, family: Family) -> IntArray | None:
+    """The ids in use; None: all."""
+    count = len(family.words)
+    if wishes.ids:
+        ids: IntArray = _selected("ids", wishes.ids, parse_ids, count)
+        return ids
+    if not swarm.owner_of:
+        return None
+    unknown = [marker_id for marker_id in swarm.owner_of if marker_id >= count]
+    if unknown:
+        raise ParameterError(
+            f"{wishes.swarm_file} has marker id {unknown[0]}, but {family.name} has only 0 to {count - 1}."
+        )
+    return np.array(sorted(swarm.owner_of), np.int64)
+
+
+def _selected(name: str, values: tuple[str, ...], parse: Callable[..., Any], count: int) -> Any:
+    """A list of texts, parsed."""
+    try:
+        return parse(values, count)
+    except SelectionError as error:
+        raise ParameterError(f"parameter {name}: {error}") from error

@@ -1,0 +1,183 @@
+"""The marker detector node over DDS: pictures in, detections out, and one counted drop for each bad one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from node_world import Ros, overrides
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo, Image
+from vision_bench.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
+
+from swarm_loc_estimator.nodes.parameter_table import ParameterError
+from swarm_loc_msgs.msg import MarkerDetection, MarkerDetectionArray
+from swarm_loc_vision.core.families import family_named
+from swarm_loc_vision.nodes.marker_detector_node import MarkerDetectorNode
+
+FAMILY = "aruco_mip_36h12"
+PICTURE, TRUTHS = random_scene(np.random.default_rng(4), family_named(FAMILY), 8, Look())
+FRAME = "epuck1/camera_optical_frame"
+
+
+def image(number: int, encoding: str = "mono8", channels: int = 1) -> Image:
+    """The scene; its stamp is its number."""
+    message = Image(height=HEIGHT, width=WIDTH, encoding=encoding, step=channels * WIDTH)
+    message.header.frame_id = FRAME
+    message.header.stamp.sec = number
+    message.data = np.repeat(PICTURE[..., None], channels, axis=2).tobytes()
+    return message
+
+
+def camera_info(**changes: Any) -> CameraInfo:
+    """The scene's camera."""
+    message = CameraInfo(height=HEIGHT, width=WIDTH, distortion_model="plumb_bob", d=[0.0] * 5)
+    message.k = CAMERA.ravel()
+    for name, value in changes.items():
+        setattr(message, name, value)
+    return message
+
+
+class Camera:
+    """A camera's driver, heard by a node, and what the node says."""
+
+    def __init__(self, ros: Ros, **parameters: Any) -> None:
+        self._ros = ros
+        node = MarkerDetectorNode(parameter_overrides=overrides(family=FAMILY, **parameters))
+        ros.add(node)
+        tester = ros.tester
+        self._image = tester.create_publisher(Image, "image_raw", qos_profile_sensor_data)
+        self._info = tester.create_publisher(CameraInfo, "camera_info", qos_profile_sensor_data)
+        self.detections: list[MarkerDetectionArray] = ros.listen(MarkerDetectionArray, "detections")
+        self._diagnostics: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
+        ros.until(lambda: self._image.get_subscription_count() and self._info.get_subscription_count())
+        ros.until(lambda: tester.count_publishers("detections") and tester.count_publishers("/diagnostics"))
+
+    def calibrate(self, message: CameraInfo, words: str) -> None:
+        """Publish a calibration until the node tells of it in its diagnostics."""
+
+        def told() -> bool:
+            self._info.publish(message)
+            return words in self.status().message
+
+        self._ros.until(told)
+
+    def status(self) -> DiagnosticStatus:
+        """The newest diagnostics."""
+        return self._diagnostics[-1].status[0] if self._diagnostics else DiagnosticStatus()
+
+    def values(self) -> dict[str, str]:
+        """Its figures."""
+        return {pair.key: pair.value for pair in self.status().values}
+
+    def see(self, message: Image) -> MarkerDetectionArray:
+        """Publish a picture until its detections come; large best-effort messages may get lost."""
+        stamp = message.header.stamp.sec
+        self._publish_until(message, lambda: any(d.header.stamp.sec == stamp for d in self.detections))
+        return next(d for d in self.detections if d.header.stamp.sec == stamp)
+
+    def see_dropped(self, message: Image, reason: str) -> None:
+        """Publish a picture until it is counted as dropped."""
+        self._publish_until(message, lambda: f"dropped: {reason}" in self.values())
+
+    def _publish_until(self, message: Image, condition: Any) -> None:
+        def happened() -> bool:
+            if not condition():
+                self._image.publish(message)
+                return False
+            return True
+
+        self._ros.until(happened)
+
+
+@pytest.fixture
+def ros() -> Iterator[Ros]:
+    ros = Ros()
+    yield ros
+    ros.close()
+
+
+def test_pictures_become_detections_with_their_stamp_and_frame(ros: Ros) -> None:
+    camera = Camera(ros)
+    camera.calibrate(camera_info(), "image_raw")
+    for number, (encoding, channels) in enumerate((("mono8", 1), ("rgb8", 3)), start=1):
+        array = camera.see(image(number, encoding, channels))
+        assert array.header.frame_id == FRAME
+        found = {detection.id: detection for detection in array.detections}
+        assert set(found) == {truth.marker_id for truth in TRUTHS}
+        for truth in TRUTHS:
+            detection = found[truth.marker_id]
+            assert np.reshape(detection.corners_px, (4, 2)) == pytest.approx(truth.corners, abs=0.5)
+            assert detection.family == MarkerDetection.FAMILY_ARUCO_MIP_36H12
+            assert detection.content in (MarkerDetection.CONTENT_POSE, MarkerDetection.CONTENT_POSE_TWO)
+            covariance = np.reshape(detection.pose.covariance, (6, 6))
+            assert np.linalg.eigvalsh(covariance)[0] > 0.0
+            depth = detection.pose.pose.position.z * truth.length / 0.05
+            assert depth == pytest.approx(truth.position[2], rel=0.05)
+    ros.until(lambda: camera.status().message == "detecting")
+    assert camera.status().level == DiagnosticStatus.OK
+
+
+def test_without_calibration_there_are_no_detections(ros: Ros) -> None:
+    camera = Camera(ros)
+    camera.see_dropped(image(1), "no_calibration")
+    camera.calibrate(
+        camera_info(k=np.zeros(9)), "the camera is not calibrated: its focal lengths are 0 and 0 px"
+    )
+    assert camera.status().level == DiagnosticStatus.WARN
+    assert not camera.detections
+    camera.calibrate(camera_info(), "detecting")
+    assert camera.see(image(2)).detections
+
+
+def test_bad_pictures_are_dropped_and_counted(ros: Ros) -> None:
+    camera = Camera(ros)
+    camera.calibrate(camera_info(), "image_raw")
+    wrong_encoding, small, short = image(1), image(2), image(3)
+    wrong_encoding.encoding = "jpeg"
+    small.height //= 2
+    short.data = short.data[:-1]
+    camera.see_dropped(wrong_encoding, "encoding")
+    camera.see_dropped(small, "size")
+    dropped = int(camera.values()["dropped: size"])
+    camera._publish_until(short, lambda: int(camera.values()["dropped: size"]) > dropped)
+    assert not camera.detections
+    assert camera.see(image(4)).detections  # and nothing else has stopped
+
+
+def test_ids_can_be_restricted(ros: Ros) -> None:
+    used = sorted(truth.marker_id for truth in TRUTHS)[:2]
+    camera = Camera(ros, ids=[str(marker_id) for marker_id in used])
+    camera.calibrate(camera_info(), "image_raw")
+    assert sorted(detection.id for detection in camera.see(image(1)).detections) == used
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"family": "qr"}, "there is no marker family 'qr'"),
+        ({"family": FAMILY, "ids": ["250"]}, "parameter ids: '250' must ascend within 0-249"),
+        ({"family": FAMILY, "lengths": ["1:0"]}, "parameter lengths: '1:0' must give a length"),
+        ({"family": FAMILY, "robot": "epuck1"}, "needs the parameter swarm_file"),
+        ({"family": FAMILY, "marker_length": -1.0}, "marker_length = -1.0 must lie in"),
+    ],
+)
+def test_wrong_parameters_stop_at_start(ros: Ros, parameters: dict[str, Any], words: str) -> None:
+    with pytest.raises(ParameterError, match=words):
+        ros.add(MarkerDetectorNode(parameter_overrides=overrides(**parameters)))
+
+
+def test_a_swarm_that_does_not_fit_stops_at_start(ros: Ros, tmp_path: Path) -> None:
+    path = tmp_path / "swarm.yaml"
+    path.write_text("fileversion: 1\nrobots: {a: {}}\nlandmarks: {300: {x: 1.0, y: 0.0}}\n", encoding="utf-8")
+    for parameters, words in (
+        ({}, "marker id 300, but"),
+        ({"robot": "b"}, "must be a robot of the swarm: a"),
+    ):
+        wishes = overrides(family=FAMILY, swarm_file=str(path), **parameters)
+        with pytest.raises(ParameterError, match=words):
+            ros.add(MarkerDetectorNode(parameter_overrides=wishes))

@@ -1,0 +1,74 @@
+"""Cameras: the same projection as OpenCV's, and its inverse; what is not calibrated is refused."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from swarm_loc_vision.core.camera import Camera, CameraError
+
+PLUMB_BOB = (-0.28, 0.09, 1e-3, -5e-4, -0.01)
+RATIONAL = (0.3, -0.1, 1e-3, 5e-4, 0.02, 0.6, -0.05, 0.01)
+EQUIDISTANT = (-0.02, 0.01, -0.003, 0.0005)
+
+
+def camera(distortion: tuple[float, ...] = (), model: str = "plumb_bob") -> Camera:
+    return Camera(1280, 960, 1000.0, 990.0, 640.0, 470.0, distortion, model)
+
+
+def directions() -> NDArray[np.float64]:
+    u, v = np.meshgrid(np.linspace(-0.55, 0.55, 9), np.linspace(-0.4, 0.4, 7))
+    return np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)
+
+
+def ideal_pixels(one: Camera) -> NDArray[np.float64]:
+    return np.asarray((directions() @ one.matrix.T)[:, :2])
+
+
+@pytest.mark.parametrize(
+    ("distortion", "model"),
+    [
+        ((), "plumb_bob"),
+        (PLUMB_BOB, "plumb_bob"),
+        (RATIONAL, "rational_polynomial"),
+        (EQUIDISTANT, "equidistant"),
+    ],
+)
+def test_raw_pixels_are_opencvs(distortion: tuple[float, ...], model: str) -> None:
+    one = camera(distortion, model)
+    if model == "equidistant":
+        expected = cv2.fisheye.projectPoints(
+            directions()[:, None], np.zeros(3), np.zeros(3), one.matrix, np.array(distortion)
+        )[0]
+    else:
+        expected = cv2.projectPoints(
+            directions(), np.zeros(3), np.zeros(3), one.matrix, np.array(distortion or (0.0,) * 4)
+        )[0]
+    raw = one.to_raw(ideal_pixels(one))
+    assert raw == pytest.approx(expected.reshape(-1, 2), abs=1e-6)
+    assert one.to_ideal(raw) == pytest.approx(ideal_pixels(one), abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"fx": 0.0}, "not calibrated: its focal lengths are 0 and 990 px"),
+        ({"cx": float("nan")}, "not finite"),
+        ({"width": 0}, "0 x 960 pixels"),
+        ({"model": "magic"}, "'magic' is not one of plumb_bob, rational_polynomial, equidistant"),
+        ({"distortion": (0.1, 0.2)}, "has 2 coefficients, but must have 0 or 4 or 5"),
+    ],
+)
+def test_what_cannot_be_a_camera_is_refused(changes: dict[str, object], words: str) -> None:
+    numbers: dict[str, object] = {
+        "width": 1280,
+        "height": 960,
+        "fx": 1000.0,
+        "fy": 990.0,
+        "cx": 640.0,
+        "cy": 470.0,
+    }
+    with pytest.raises(CameraError, match=words):
+        Camera(**{**numbers, **changes})  # type: ignore[arg-type]

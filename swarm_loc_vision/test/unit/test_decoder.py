@@ -1,0 +1,100 @@
+"""Ids from cells: every id in every rotation, and no id from anything else."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from swarm_loc_vision.core.decoder import FALSE_READINGS, Dictionary, correctable_bits
+from swarm_loc_vision.core.families import BITS, Family, family_named
+from swarm_loc_vision.core.sampling import GRID
+
+INK, PAPER = 40.0, 200.0
+BCH = family_named("artoolkit_bch_thin")
+ALL_BCH = Dictionary([(BCH, np.arange(4096))])
+
+
+def cells_of(patterns: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Brightness of cells (N, GRID, GRID) of patterns (N, 6, 6)."""
+    cells = np.full((len(patterns), GRID, GRID), PAPER)
+    cells[:, 1:-1, 1:-1] = INK
+    cells[:, 2:-2, 2:-2] = np.where(patterns, PAPER, INK)
+    return cells
+
+
+def patterns_of(family: Family, ids: NDArray[np.int64]) -> NDArray[np.uint8]:
+    border = family.border
+    return np.stack([family.pattern(int(i))[border:-border, border:-border] for i in ids])
+
+
+@pytest.mark.parametrize("quarters", range(4))
+def test_all_bch_ids_are_read_in_every_rotation(quarters: int) -> None:
+    ids = np.arange(4096)
+    readings = ALL_BCH.read(cells_of(np.rot90(patterns_of(BCH, ids), quarters, (1, 2))), 10.0)
+    assert (ALL_BCH.ids[readings.word] == ids).all()
+    assert (readings.quarters == quarters).all()
+    assert (readings.errors == 0.0).all()
+    assert 0.5 < readings.margin.min() <= 1.0  # two ids come as close as two bits when turned
+
+
+def test_uneven_light_and_noise_do_not_matter() -> None:
+    rng = np.random.default_rng(0)
+    ids = rng.integers(0, 4096, 300)
+    cells = cells_of(patterns_of(BCH, ids))
+    row, column = np.mgrid[:GRID, :GRID] / GRID
+    lit = cells * 0.4 * (1.0 + row + 0.5 * column) + rng.normal(0.0, 4.0, cells.shape)
+    readings = ALL_BCH.read(lit, 10.0)
+    assert (ALL_BCH.ids[readings.word] == ids).all()
+
+
+@given(st.integers(0, 249), st.sets(st.integers(0, BITS - 1), max_size=8))
+def test_flipped_bits_are_corrected_as_far_as_is_safe(marker_id: int, flipped: set[int]) -> None:
+    family = family_named("aruco_mip_36h12")
+    dictionary = Dictionary([(family, np.arange(20))])
+    marker_id %= 20
+    pattern = patterns_of(family, np.array([marker_id]))
+    pattern.reshape(-1)[sorted(flipped)] ^= 1
+    readings = dictionary.read(cells_of(pattern), 10.0)
+    if len(flipped) <= dictionary.correctable:
+        assert dictionary.ids[readings.word[0]] == marker_id
+        assert 0.5 * len(flipped) <= readings.errors[0] <= len(flipped)
+        assert readings.margin[0] > 0.25 * (12 - 2 * len(flipped))
+    else:
+        assert readings.word[0] == -1 or readings.errors[0] <= dictionary.correctable
+
+
+def test_fewer_ids_in_use_let_more_bits_be_corrected() -> None:
+    assert [correctable_bits(n) for n in (1, 20, 250, 4096)] == sorted(
+        (correctable_bits(n) for n in (1, 20, 250, 4096)), reverse=True
+    )
+    for words in (1, 20, 250, 4096):
+        near = sum(math.comb(BITS, k) for k in range(correctable_bits(words) + 1))
+        assert 4 * words * near / 2**BITS <= FALSE_READINGS
+
+
+@pytest.mark.parametrize(("name", "count"), [("artoolkit_bch_thin", 4096), ("aruco_mip_36h12", 250)])
+def test_random_squares_are_not_read(name: str, count: int) -> None:
+    rng = np.random.default_rng(1)
+    dictionary = Dictionary([(family_named(name), np.arange(count))])
+    patterns = rng.integers(0, 2, (20_000, 6, 6)).astype(np.uint8)
+    readings = dictionary.read(cells_of(patterns), 10.0)
+    assert (readings.word >= 0).sum() <= 2  # 0.2 are expected
+
+
+def test_other_ids_than_those_in_use_are_not_read() -> None:
+    dictionary = Dictionary([(BCH, np.array([5, 9]))])
+    readings = dictionary.read(cells_of(patterns_of(BCH, np.array([5, 6, 9, 4000]))), 10.0)
+    assert [dictionary.ids[w] if w >= 0 else None for w in readings.word] == [5, None, 9, None]
+
+
+def test_no_contrast_or_a_light_border_is_no_marker() -> None:
+    cells = cells_of(patterns_of(BCH, np.array([7, 7])))
+    cells[0] = 100.0 + 0.02 * cells[0]
+    cells[1, 1, 1:-1] = PAPER
+    readings = ALL_BCH.read(cells, 10.0)
+    assert (readings.word == -1).all()

@@ -1,0 +1,160 @@
+"""The whole detector on rendered pictures and, where they are at hand, on photographs."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from vision_bench.peers import own_detector
+from vision_bench.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, random_scene
+
+from swarm_loc_estimator.core.sightings import CONTENT_POSE, CONTENT_POSE_TWO
+from swarm_loc_vision.core.camera import Camera
+from swarm_loc_vision.core.detector import Detections, MarkerDetector
+from swarm_loc_vision.core.families import Family, family_named, packed
+from swarm_loc_vision.core.rows import detection_rows
+from swarm_loc_vision.core.settings import DetectorSettings
+
+PHOTOS = Path(__file__).resolve().parents[4] / "shared" / "data" / "photos"
+Gray = NDArray[np.uint8]
+
+
+def match(detections: Detections, truths: list[Truth]) -> list[tuple[int, Truth]]:
+    """Rows of detections and the markers that they are of."""
+    pairs = []
+    for truth in truths:
+        for row in np.flatnonzero(detections.id == truth.marker_id):
+            if np.abs(detections.corners[row] - truth.corners).max() < 3.0:
+                pairs.append((int(row), truth))
+                break
+    return pairs
+
+
+@pytest.mark.parametrize(
+    "name", ["artoolkit_bch_thin", "artoolkit_bch_thick", "aruco_mip_36h12", "apriltag_36h11"]
+)
+def test_markers_of_all_families_are_found_where_they_are(name: str) -> None:
+    family = family_named(name)
+    picture, truths = random_scene(np.random.default_rng(5), family, 15, Look())
+    detections = own_detector(family).detect(picture)
+    truths = [truth for truth in truths if truth.side_px > 3.0 * family.side and truth.incidence < 1.0]
+    pairs = match(detections, truths)
+    assert len(pairs) == len(truths) >= 6
+    errors = [detections.corners[row] - truth.corners for row, truth in pairs]
+    assert math.sqrt(np.mean(np.sum(np.square(errors), axis=2))) < 0.06
+    assert (detections.family == family.code).all()
+
+
+def test_corners_and_poses_are_as_sure_as_they_say() -> None:
+    family, nees = family_named("aruco_mip_36h12"), []
+    for seed in range(6):
+        picture, truths = random_scene(np.random.default_rng(seed), family, 15, Look())
+        detector = own_detector(family)
+        detector._lengths = {truth.marker_id: truth.length for truth in truths}
+        detections = detector.detect(picture)
+        poses = detections.poses
+        assert poses is not None
+        for row, truth in match(detections, truths):
+            if truth.side_px < 24.0 or detector._lengths[truth.marker_id] != truth.length:
+                continue
+            turn = Rotation.from_matrix(poses.rotation[row, 0] @ truth.rotation.T).as_rotvec()
+            error = np.concatenate([poses.position[row, 0] - truth.position, turn])
+            nees.append(error @ np.linalg.solve(poses.covariance[row, 0], error))
+            assert np.linalg.eigvalsh(poses.covariance[row, 0])[0] > 0.0
+    assert len(nees) > 50
+    assert 0.8 < np.median(nees) < 9.0  # 5.35 were the corners' noise all that there is, and white
+
+
+def test_a_distorting_lens_does_not_matter() -> None:
+    family = family_named("aruco_mip_36h12")
+    ideal, truths = random_scene(np.random.default_rng(3), family, 12, Look(noise=0.5))
+    camera = Camera.from_matrix((WIDTH, HEIGHT), CAMERA, (-0.25, 0.08, 5e-4, -5e-4, 0.0))
+    v, u = np.mgrid[:HEIGHT, :WIDTH].astype(float)
+    source = camera.to_ideal(np.stack([u, v], axis=2)).astype(np.float32)
+    raw = np.asarray(cv2.remap(ideal, source[..., 0], source[..., 1], cv2.INTER_CUBIC), np.uint8)
+    lengths = {truth.marker_id: truth.length for truth in truths}
+    detections = MarkerDetector(DetectorSettings(), [(family, None)], camera, lengths=lengths).detect(raw)
+    assert detections.poses is not None
+    checked = 0
+    for truth in truths:
+        rows = np.flatnonzero(detections.id == truth.marker_id)
+        if truth.side_px < 30.0 or len(rows) != 1:
+            continue
+        assert camera.to_ideal(detections.corners[rows[0]]) == pytest.approx(truth.corners, abs=0.3)
+        assert detections.poses.position[rows[0], 0] == pytest.approx(truth.position, rel=0.01, abs=0.003)
+        checked += 1
+    assert checked >= 6
+
+
+def test_only_ids_in_use_are_found() -> None:
+    family = family_named("artoolkit_bch_thin")
+    picture, truths = random_scene(np.random.default_rng(8), family, 12, Look())
+    used = np.array([truths[0].marker_id, truths[1].marker_id])
+    detections = MarkerDetector(DetectorSettings(), [(family, used)]).detect(picture)
+    assert set(detections.id.tolist()) <= set(used.tolist())
+    assert detections.poses is None
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (7, 5), (33, 41), (960, 1277)])
+def test_empty_pictures_of_any_size_show_nothing(shape: tuple[int, int]) -> None:
+    detector = own_detector(family_named("artoolkit_bch_thin"))
+    noise = np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8)
+    for picture in (np.zeros(shape, np.uint8), np.full(shape, 255, np.uint8), noise):
+        detections = detector.detect(picture)
+        assert len(detections) == 0
+        assert len(detection_rows(detections, 16.0)) == 0
+
+
+def test_rows_hold_what_was_found() -> None:
+    family = family_named("aruco_mip_36h12")
+    picture, _ = random_scene(np.random.default_rng(2), family, 15, Look())
+    detections = own_detector(family).detect(picture)
+    for ambiguity, contents in ((0.0, {CONTENT_POSE}), (1e9, {CONTENT_POSE_TWO})):
+        rows = detection_rows(detections, ambiguity)
+        assert set(rows["content"].tolist()) == contents
+        assert (rows["id"] == detections.id).all()
+        assert np.linalg.norm(rows["orientation"], axis=1) == pytest.approx(np.ones(len(rows)))
+        two = rows["content"] == CONTENT_POSE_TWO
+        assert (rows["alternative_ratio"][two] >= 1.0).all()
+        assert np.isnan(rows["alternative_ratio"][~two]).all()
+
+
+def photo_family(dictionary: str) -> Family:
+    """The family of a photograph; those of OpenCV's tutorials are not among ours."""
+    if dictionary == "DICT_APRILTAG_36h11":
+        return family_named("apriltag_36h11")
+    source = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_250)
+    cells = np.stack([source.generateImageMarker(i, 8)[1:-1, 1:-1] for i in range(250)]) // 255
+    return Family(dictionary, 255, 1, packed(cells.astype(np.uint8)))
+
+
+@pytest.mark.skipif(not PHOTOS.exists(), reason="the photographs are not at hand")
+@pytest.mark.parametrize(
+    ("file", "most_missing"),
+    [
+        ("opencv/singlemarkersoriginal.jpg", 0),
+        ("opencv/choriginal.jpg", 0),
+        ("opencv/chocclusion_original.jpg", 0),
+        ("apriltag/33369213973_9d9bb4cc96_c.jpg", 0),
+        ("apriltag/34085369442_304b6bafd9_c.jpg", 0),
+        ("apriltag/34139872896_defdb2f8d9_c.jpg", 1),
+    ],
+)
+def test_photographs(file: str, most_missing: int) -> None:
+    manifest = json.loads((PHOTOS / "manifest.json").read_text(encoding="utf-8"))
+    (entry,) = [entry for entry in manifest if entry["file"] == file]
+    picture = np.asarray(cv2.imread(str(PHOTOS / file), cv2.IMREAD_GRAYSCALE), np.uint8)
+    detections = MarkerDetector(DetectorSettings(), [(photo_family(entry["dict"]), None)]).detect(picture)
+    missing = Counter(entry["ids"]) - Counter(detections.id.tolist())
+    assert sum(missing.values()) <= most_missing
+    assert set(detections.id.tolist()) <= set(entry["ids"])
+    for marker_id, corners in entry.get("corners", {}).items():
+        (row,) = np.flatnonzero(detections.id == int(marker_id))
+        assert detections.corners[row].ravel() == pytest.approx(np.ravel(corners), abs=1.6)

@@ -1,0 +1,79 @@
+"""The words of the families, and their pictures."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from swarm_loc_vision.core.draw import draw_marker
+from swarm_loc_vision.core.families import families, family_named, packed, rotated
+
+BCH = family_named("artoolkit_bch_thin")
+
+
+def distances(word: np.uint64, words: np.ndarray[tuple[int], np.dtype[np.uint64]]) -> list[int]:
+    return [int(other).bit_count() for other in words ^ word]
+
+
+def test_bch_words_are_nine_bits_apart_in_one_orientation() -> None:
+    # the code is linear but for a mask, so the distances to one word are those to any
+    for marker_id in (0, 100, 4095):
+        apart = distances(BCH.words[marker_id], BCH.words)
+        assert sorted(apart)[:2] == [0, 9]
+
+
+def test_bch_ids_come_close_when_turned() -> None:
+    turned = np.concatenate([rotated(BCH.words, quarters) for quarters in (1, 2, 3)])
+    closest = [min(distances(word, turned)) for word in BCH.words[3000:3100]]
+    assert min(closest) == 2
+    pair = np.concatenate([rotated(BCH.words[1550:1551], quarters) for quarters in (1, 2, 3)])
+    assert min(distances(BCH.words[3080], pair)) <= 4  # who takes the first id that is near reads 1550
+
+
+def test_bch_words_hold_their_id_above_the_mask() -> None:
+    ids = ((BCH.words ^ np.uint64(0x8F80B8750)) >> np.uint64(24)).astype(int)
+    assert (ids == np.arange(4096)).all()
+
+
+def test_turning_four_quarters_changes_nothing() -> None:
+    words = BCH.words[:50]
+    assert (rotated(rotated(words, 1), 3) == words).all()
+    assert (rotated(rotated(words, 2), 2) == words).all()
+    assert (
+        rotated(words, 1)
+        == packed(np.rot90(np.stack([BCH.pattern(i)[1:-1, 1:-1] for i in range(50)]), 1, (1, 2)))
+    ).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "dictionary", "first_corner"),
+    [
+        ("aruco_mip_36h12", cv2.aruco.DICT_ARUCO_MIP_36h12, 0),
+        ("apriltag_36h11", cv2.aruco.DICT_APRILTAG_36h11, 2),  # OpenCV turns these by half a turn
+    ],
+)
+def test_opencv_reads_what_is_drawn(name: str, dictionary: int, first_corner: int) -> None:
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(dictionary))
+    for marker_id in (0, 7, 101, 249):
+        corners, ids, _ = detector.detectMarkers(draw_marker(family_named(name), marker_id, 8, 2))
+        assert np.ravel(ids).tolist() == [marker_id]
+        assert np.ravel(corners[0])[2 * first_corner : 2 * first_corner + 2] == pytest.approx([16, 16], abs=1)
+
+
+def test_sizes_of_pictures_and_borders() -> None:
+    thin, thick = family_named("artoolkit_bch_thin"), family_named("artoolkit_bch_thick")
+    assert draw_marker(thin, 0, 5, 1).shape == (50, 50)
+    assert draw_marker(thick, 0, 5, 0).shape == (60, 60)
+    picture = draw_marker(thick, 3, 1, 1)
+    assert (picture[0] == 255).all()
+    assert (picture[1:4, 1:-1] == 0).all()
+    assert thin.side - 6 == 0.125 * 2 * thin.side
+    assert thick.side - 6 == 0.25 * 2 * thick.side
+
+
+def test_unknown_names_and_ids_are_one_sentence() -> None:
+    with pytest.raises(ValueError, match="there is no marker family 'qr', only artoolkit_bch_thin"):
+        family_named("qr")
+    with pytest.raises(ValueError, match="aruco_mip_36h12 has ids 0 to 249, not 250"):
+        families()["aruco_mip_36h12"].pattern(250)

@@ -1,0 +1,136 @@
+"""Poses from corners: exact, consistent with their covariance, and honest about the mirrored solution."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from vision_bench.scenes import facing, project
+
+from swarm_loc_vision.core.pose import Poses, Upright, _equations, marker_poses, square
+
+FloatArray = NDArray[np.float64]
+INTRINSICS = np.array([1000.0, 1000.0, 639.5, 479.5])
+LENGTH, SIGMA_PX = 0.05, 0.05
+UP = np.array([0.0, -1.0, 0.0])
+
+
+def random_markers(count: int, seed: int, least_incidence: float = 0.0) -> tuple[FloatArray, FloatArray]:
+    """Rotations (N, 3, 3) and positions (N, 3) before the camera."""
+    rng = np.random.default_rng(seed)
+    position = rng.uniform(0.4, 1.2, (count, 1)) * np.column_stack(
+        [rng.uniform(-0.5, 0.5, (count, 2)), np.ones(count)]
+    )
+    azimuth, roll = rng.uniform(-3.0, 3.0, (2, count))
+    incidence = rng.uniform(least_incidence, 1.1, count)
+    rotation = [facing(a, i, r, at) for a, i, r, at in zip(azimuth, incidence, roll, position, strict=True)]
+    return np.stack(rotation), position
+
+
+def upright_markers(count: int, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Likewise, with their y axes up in the camera frame."""
+    rng = np.random.default_rng(seed)
+    yaw = rng.uniform(-1.0, 1.0, count)
+    out = np.column_stack([np.sin(yaw), np.zeros(count), -np.cos(yaw)])
+    right = np.cross(UP, out)
+    position = np.column_stack(
+        [rng.uniform(-0.3, 0.3, count), rng.uniform(-0.05, 0.05, count), rng.uniform(0.5, 1.5, count)]
+    )
+    return np.stack([right, np.tile(UP, (count, 1)), out], axis=2), position
+
+
+def corners_of(rotation: FloatArray, position: FloatArray, noise_px: float = 0.0) -> FloatArray:
+    exact = np.stack([project(r, p, square(LENGTH)) for r, p in zip(rotation, position, strict=True)])
+    return np.asarray(exact + noise_px * np.random.default_rng(9).normal(size=exact.shape))
+
+
+def solve(corners: FloatArray, upright: Upright | None = None) -> Poses:
+    count = len(corners)
+    covariance = np.tile(SIGMA_PX**2 * np.eye(8), (count, 1, 1))
+    return marker_poses(corners, covariance, np.full(count, LENGTH), INTRINSICS, upright)
+
+
+def turn_errors(found: FloatArray, true: FloatArray) -> FloatArray:
+    return np.asarray(Rotation.from_matrix(found @ true.transpose(0, 2, 1)).as_rotvec())
+
+
+def test_exact_corners_give_the_exact_pose() -> None:
+    rotation, position = random_markers(200, 0)
+    poses = solve(corners_of(rotation, position))
+    assert poses.position[:, 0] == pytest.approx(position, abs=1e-7)
+    assert np.abs(turn_errors(poses.rotation[:, 0], rotation)).max() < 1e-5
+    assert np.linalg.det(poses.rotation[:, 1]) == pytest.approx(np.ones(200))
+
+
+def test_an_axis_aligned_rectangle_has_a_pose() -> None:
+    corners = np.array([[[600.0, 400.0], [680.0, 400.0], [680.0, 480.0], [600.0, 480.0]]])
+    poses = solve(corners)
+    assert np.isfinite(poses.chi2[0, 0])
+    assert poses.position[0, 0, 2] == pytest.approx(1000.0 * LENGTH / 80.0, rel=1e-3)
+
+
+def test_errors_are_as_large_as_the_covariance_says() -> None:
+    rotation, position = random_markers(600, 1, least_incidence=0.5)
+    poses = solve(corners_of(rotation, position, SIGMA_PX))
+    error = np.hstack([poses.position[:, 0] - position, turn_errors(poses.rotation[:, 0], rotation)])
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(poses.covariance[:, 0]), error)
+    assert np.median(nees) == pytest.approx(5.35, rel=0.15)  # of chi square with 6 degrees of freedom
+    assert poses.chi2[:, 0].mean() == pytest.approx(2.0, rel=0.2)
+
+
+def test_the_other_solution_is_there_where_the_plane_is_ambiguous() -> None:
+    rotation, position = random_markers(400, 2)
+    poses = solve(corners_of(rotation, position, 6 * SIGMA_PX))
+    angle = np.linalg.norm(turn_errors(poses.rotation[:, 0], rotation), axis=1)
+    other = np.linalg.norm(turn_errors(poses.rotation[:, 1], rotation), axis=1)
+    flipped = other < 0.5 * angle
+    assert flipped.sum() > 5
+    close = poses.chi2[:, 1] - poses.chi2[:, 0] < 36.0 * 16.0  # the noise is six times what is told
+    assert close[flipped].all()
+    assert (poses.chi2[:, 0] <= poses.chi2[:, 1]).all()
+
+
+def test_knowing_that_markers_stand_upright_makes_them_surer() -> None:
+    rotation, position = upright_markers(400, 3)
+    corners = corners_of(rotation, position, 4 * SIGMA_PX)
+    tilts, turns = [], []
+    for upright in (None, Upright(UP, math.radians(0.2))):
+        poses = solve(corners, upright)
+        error = turn_errors(poses.rotation[:, 0], rotation)
+        tilts.append(math.sqrt(np.mean(error[:, [0, 2]] ** 2)))
+        turns.append(math.sqrt(np.mean(error[:, 1] ** 2)))
+    assert tilts[1] < 0.2 * tilts[0]
+    assert turns[1] <= turns[0]
+
+
+def test_the_gradient_is_that_of_the_cost() -> None:
+    rotation, position = random_markers(1, 4, least_incidence=0.4)
+    points, pixels = square(LENGTH), corners_of(rotation, position, 1.0)[0]
+    covariance = SIGMA_PX**2 * (np.eye(8) + 0.3 * np.ones((8, 8)))
+    weights = np.asarray(np.linalg.inv(covariance)[None], np.float64)
+    axis, normal, slope = np.array([0.0, 1.0, 0.0]), np.empty((6, 6)), np.empty(6)
+
+    def cost(step: FloatArray) -> float:
+        turned = Rotation.from_rotvec(step[3:]).as_matrix() @ rotation[0]
+        return float(
+            _equations(
+                points,
+                pixels,
+                weights,
+                INTRINSICS,
+                axis,
+                UP,
+                50.0,
+                turned,
+                position[0] + step[:3],
+                normal,
+                slope,
+            )
+        )
+
+    numeric = [(cost(1e-6 * unit) - cost(-1e-6 * unit)) / 2e-6 for unit in np.eye(6)]
+    cost(np.zeros(6))
+    assert -2.0 * slope == pytest.approx(numeric, rel=1e-4, abs=1e-2)
