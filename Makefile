@@ -5,7 +5,6 @@
 
 PYTHON ?= python3
 PACKAGES := swarm_loc_estimator swarm_loc_vision swarm_loc_drivers
-TESTED := $(PACKAGES) workspace
 # Only the plug-ins named here: what else is installed on a machine must not change how tests run.
 PYTEST := ./run -- env PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 pytest \
     -p xdist.plugin -p pytest_timeout -p _hypothesis_pytestplugin --numprocesses 2
@@ -20,9 +19,9 @@ test: lint unit node
 lint:
 	./run -- ruff check
 	./run -- ruff format --check
-	./run -- mypy conftest.py setup_workspace.py workspace
+	./run -- mypy conftest.py setup_workspace.py
 	@set -e; for package in $(PACKAGES); do \
-	    for part in $$package launch test bench; do \
+	    for part in $$package launch test bench workspace; do \
 	        if [ -n "$$(find $$package/$$part -name '*.py' 2>/dev/null)" ]; then \
 	            echo "./run -- mypy $$package/$$part"; ./run -- mypy $$package/$$part; \
 	        fi; \
@@ -30,17 +29,17 @@ lint:
 	done
 
 unit: setup
-	@$(PYTEST) $(wildcard $(TESTED:=/test/unit)) $(ARGS)
+	@$(PYTEST) $(wildcard $(PACKAGES:=/test/unit)) $(ARGS)
 
 node: setup
-	@$(PYTEST) $(wildcard $(TESTED:=/test/node)) $(ARGS)
+	@$(PYTEST) $(wildcard $(PACKAGES:=/test/node)) $(ARGS)
 
 setup:
 	@$(PYTHON) setup_workspace.py
 
 bench-%:
 	@$(PYTHON) setup_workspace.py --bench
-	@PYTHONPATH=swarm_loc_estimator ./run -- python -m bench.$* $(ARGS)
+	@PYTHONPATH=swarm_loc_estimator:swarm_loc_vision/bench ./run -- python -m bench.$* $(ARGS)
 
 clean:
 	rm -rf .venv .workspace out .mypy_cache .pytest_cache .ruff_cache .hypothesis

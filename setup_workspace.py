@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import argparse
 import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent / "swarm_loc_estimator"))
 
 from workspace import build, host, install
 from workspace.layout import WorkspaceError

@@ -3,6 +3,9 @@
     make bench-mrclam
     make bench-mrclam ARGS="FOLDER --fit 1"
 
+FOLDER holds MRCLAM_Dataset<k> folders, or is one; robots and ground truth may be missing. Parameters are
+fitted on set 1, which is looked for in ../shared/data/mrclam where FOLDER does not have it.
+
 Online poses at 10 Hz against ground truth, started at the true pose. "plain" has only its noise fitted,
 "calibrated" everything. The smoother is the offline limit with the same models and noise. In `blind_robots`
 two robots see landmarks and all see robots; the errors are those of the others, pooled over all choices.
@@ -16,16 +19,16 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench._common import OUT, Cell, new_plot, save_plot, table, write_figures
+from bench._common import OUT, new_plot, save_plot, table, write_figures
 from bench.mrclam_sets import (
     NoSetsError,
     find_sets,
@@ -38,6 +41,7 @@ from bench.mrclam_sets import (
     without_sightings,
 )
 from swarm_loc_estimator.calibration.fit import Options, calibrate
+from swarm_loc_estimator.calibration.in_order import run_in_order
 from swarm_loc_estimator.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.calibration.rerun import rerun
 from swarm_loc_estimator.core.metrics import Errors, pool
@@ -46,11 +50,14 @@ from swarm_loc_estimator.io.mrclam import MrclamError
 from swarm_loc_estimator.io.swarm_file import load_swarm
 from swarm_loc_estimator.io.swarm_writer import save_swarm
 from swarm_loc_estimator.replay import replay
-from swarm_loc_estimator.replay_result import ReplayResult
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 DEFAULT_FOLDER = OUT.parent.parent / "shared" / "data" / "mrclam"
 MODELS = ("plain", "calibrated")
-COLUMNS = ("odometry", "landmarks", "landmarks_robots", "smoother", "blind_robots")
+COLUMNS = ("odometry", "landmarks", "landmarks_robots", "unknown_start", "smoother", "blind_robots")
+_ALL = "landmarks_robots"
 FIGURES = ("position_rmse_m", "heading_rmse_deg", "nees")
 WORK = OUT / "mrclam"
 TICK_S, BLIND_TICK_S = 0.1, 0.5
@@ -62,6 +69,8 @@ PUBLISHED = (
 )
 """Mean position error over the first 600 s of set 2 [m]: CoLo toolbox (see README)."""
 _REPLAYS = 3
+_SHARE_PRINTED = 0.1
+_CASES_LABELLED = 4
 _PROCESSES = 2
 
 
@@ -134,8 +143,15 @@ def prepare(number: int, folder: Path) -> tuple[int, tuple[str, ...]]:
 def fit(number: int, model: str) -> tuple[str, str]:
     """Fit a model to a set and keep it as a file; returns what came out in a line."""
     recording, swarm = load(bag_of(number))
-    options = Options(plain=model == "plain")
-    done = calibrate(recording, swarm, options, lambda _share, _what: None)
+    printed = 0.0
+
+    def progress(share: float, what: str) -> None:
+        nonlocal printed
+        if share >= printed:
+            print(f"fit {model}, {share:.0%}: {what}", flush=True)
+            printed = share + _SHARE_PRINTED
+
+    done = calibrate(recording, swarm, Options(plain=model == "plain"), progress)
     save_swarm(done.swarm, WORK / f"{model}.yaml", f"{model}: fitted to set {number}")
     numbers = ", ".join(f"{name} {value:.3g}" for name, value in done.noise.items())
     return model, f"{model} fitted to set {number}: {numbers}"
@@ -146,57 +162,47 @@ def run(job: Job) -> tuple[Job, Sums | None]:
     recording, own = load(bag_of(job.number))
     swarm = transferred(load_swarm(WORK / f"{job.model}.yaml"), own)
     if job.column == "smoother":
-        return job, _smoothed(recording, swarm)
+        return job, _smoothed(job, recording, swarm)
     if job.column == "unknown_start":
-        return job, sums_of(rerun(recording, unknown_start(swarm), TICK_S))
+        return job, sums_of(rerun(recording, unknown_start(swarm), TICK_S).errors)
     if job.seeing is not None:
         masked = with_two_seeing(recording, swarm, job.seeing)
-        blind = [r.name for index, r in enumerate(swarm.robots) if index not in job.seeing]
-        return job, sums_of(rerun(masked, swarm, BLIND_TICK_S), blind)
+        seeing = {swarm.robots[index].name for index in job.seeing}
+        errors = rerun(masked, swarm, BLIND_TICK_S).errors
+        return job, sums_of({name: one for name, one in errors.items() if name not in seeing})
     masks: dict[str, Callable[[], Recording]] = {
         "odometry": lambda: without_sightings(recording),
         "landmarks": lambda: without_robots(recording, swarm),
         "landmarks_robots": lambda: recording,
     }
-    return job, sums_of(rerun(masks[job.column](), swarm, TICK_S))
+    return job, sums_of(rerun(masks[job.column](), swarm, TICK_S).errors)
 
 
-def sums_of(result: ReplayResult, names: Sequence[str] | None = None) -> Sums | None:
-    """Errors of all robots, or of those named, pooled."""
-    errors = pool([one for name, one in result.errors.items() if names is None or name in names])
-    if not errors.stamp_ns.size:
+def sums_of(errors: Mapping[str, Errors]) -> Sums | None:
+    """Errors of robots, by name, pooled; None without any."""
+    pooled = pool([*errors.values()])
+    if not pooled.stamp_ns.size:
         return None
+    early = pooled.stamp_ns <= pooled.stamp_ns.min() + PUBLISHED_S * 1e9
     return Sums(
-        errors.stamp_ns.size,
-        float(np.sum(errors.position**2)),
-        float(np.sum(errors.error[:, 2] ** 2)),
-        float(np.nansum(errors.nees)),
-        int(np.sum(~np.isnan(errors.nees))),
-        _early(result, errors),
+        pooled.stamp_ns.size,
+        float(np.sum(pooled.position**2)),
+        float(np.sum(pooled.error[:, 2] ** 2)),
+        float(np.nansum(pooled.nees)),
+        int(np.sum(~np.isnan(pooled.nees))),
+        float(pooled.position[early].mean()),
     )
 
 
-def _early(result: ReplayResult, errors: Errors) -> float:
-    """Mean position error as published: over the first 600 s."""
-    early = errors.stamp_ns <= result.stamp_ns[0] + PUBLISHED_S * 1e9
-    return float(errors.position[early].mean()) if early.any() else math.nan
+def _smoothed(job: Job, recording: Recording, swarm: Swarm) -> Sums | None:
+    """Errors of the offline limit; none where it cannot be found, and a line that says so."""
+    from bench.smoother import SmootherError, smooth  # noqa: PLC0415 # only benchmarks require gtsam
 
-
-def _smoothed(recording: Recording, swarm: Swarm) -> Sums | None:
-    """Errors of the offline limit."""
-    from bench.smoother import smooth  # noqa: PLC0415 # gtsam is a requirement of benchmarks, not of their tests
-
-    online = rerun(recording, swarm, TICK_S)
-    if not any(errors.stamp_ns.size for errors in online.errors.values()):
+    try:
+        return sums_of(smooth(recording, run_in_order(recording, swarm, TICK_S)))
+    except SmootherError as error:
+        print(f"set {job.number}, {job.model}: {error}", flush=True)
         return None
-    errors = smooth(recording, online)
-    return Sums(
-        errors.position.size,
-        float(np.sum(errors.position**2)),
-        float(np.sum(errors.heading**2)),
-        float(np.sum(errors.nees)),
-        errors.nees.size,
-    )
 
 
 def jobs_of(number: int, swarm: Swarm) -> list[Job]:
@@ -220,8 +226,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         sets = find_sets(options.folder)
-        fitted = chosen_to_fit(sets, options.fit)
-        figures, early = measure(sets, fitted)
+        figures, early = measure(sets, *chosen_to_fit(sets, options.fit))
     except (NoSetsError, MrclamError, CalibrationError) as error:
         print(error, file=sys.stderr)
         return 1
@@ -229,31 +234,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def chosen_to_fit(sets: dict[int, Path], wanted: int | None) -> int:
-    """The number of the set to fit to: the first unless one is wanted."""
-    if wanted is not None and wanted not in sets:
-        raise NoSetsError(f"--fit {wanted}: there is no such set, only {', '.join(map(str, sets))}.")
-    return min(sets) if wanted is None else wanted
+def chosen_to_fit(
+    sets: dict[int, Path], wanted: int | None, elsewhere: Path = DEFAULT_FOLDER
+) -> tuple[int, Path]:
+    """Number and folder of the set to fit to: the wanted one or set 1, here or elsewhere; else the first."""
+    others = find_sets(elsewhere) if elsewhere.is_dir() else {}
+    known = {**others, **sets}
+    number = 1 if wanted is None else wanted
+    if number in known:
+        return number, known[number]
+    if wanted is None:
+        return min(sets), sets[min(sets)]
+    raise NoSetsError(f"--fit {wanted}: there is no such set, only {', '.join(map(str, sorted(known)))}.")
 
 
-def measure(sets: dict[int, Path], fitted: int) -> tuple[dict[str, float], dict[tuple[int, str], float]]:
+def measure(
+    sets: dict[int, Path], fitted: int, fitted_folder: Path
+) -> tuple[dict[str, float], dict[tuple[int, str], float]]:
     """All figures by name, and the mean errors of the first 600 s by set and model."""
     totals: dict[tuple[int, str, str], Sums] = {}
-    early: dict[tuple[int, str], float] = {}
     with ProcessPoolExecutor(_PROCESSES, mp_context=get_context("spawn")) as workers:
-        for number, remarks in _done(workers, prepare, list(sets.items()), "import"):
+        imported = {fitted: fitted_folder, **sets}
+        for number, remarks in _done(workers, prepare, list(imported.items()), "import"):
             for remark in remarks:
                 print(f"set {number}: {remark}")
         for _, line in _done(workers, fit, [(fitted, model) for model in MODELS], "fit"):
             print(line)
         jobs = [job for k in sets for job in jobs_of(k, load_swarm(bag_of(k) / "swarm.yaml"))]
         for job, sums in _done(workers, run, [(job,) for job in jobs], "runs"):
-            if sums is None:
-                continue
-            key = (job.number, job.model, job.column)
-            totals[key] = totals[key] + sums if key in totals else sums
-            if job.column == "landmarks_robots" and math.isfinite(sums.early):
-                early[job.number, job.model] = sums.early
+            if sums is not None:
+                key = (job.number, job.model, job.column)
+                totals[key] = totals[key] + sums if key in totals else sums
+    early = {(k, model): sums.early for (k, model, column), sums in totals.items() if column == _ALL}
     figures = {
         f"set{number}.{model}.{column}.{name}": value
         for (number, model, column), sums in sorted(totals.items())
@@ -281,23 +293,24 @@ def _done(
 
 def report(figures: dict[str, float], early: dict[tuple[int, str], float], sets: dict[int, Path]) -> None:
     """Print the tables, draw the plot and write the figures."""
-    columns = ("odometry", "landmarks", "landmarks_robots", "unknown_start", "smoother", "blind_robots")
     rows = []
     for number, model in itertools.product(sets, MODELS):
-        cells = [_cell(figures, f"set{number}.{model}.{column}") for column in columns]
+        cells = [_cell(figures, f"set{number}.{model}.{column}") for column in COLUMNS]
         rows.append([f"set {number} {model}", *cells])
     print("\nposition RMSE [m] / heading RMSE [deg] / NEES (ideal 3)")
-    print(table(["", *columns], rows))
+    print(table(["", *COLUMNS], rows))
     print("\nmean position error [m] over the first 600 s, landmarks + robots")
-    means: list[list[Cell]] = [
-        [f"ours, set {k}, {model}", value] for (k, model), value in sorted(early.items())
-    ]
-    means += [[f"{name}, set 2", value] for name, value in PUBLISHED]
-    print(table(["", "m"], means))
+    print(table(["", "m"], [[*row] for row in beside_published(early)]))
     for number in sets:
         print(f"set {number}: replay {figures[f'set{number}.replay.speed_factor']:.0f} x real time")
-    draw(figures, sets)
+    print(f"plot: {draw(figures, early, sets)}")
     print(f"figures: {write_figures('mrclam', figures)}")
+
+
+def beside_published(early: dict[tuple[int, str], float]) -> list[tuple[str, float]]:
+    """Mean errors by name, ours and the published ones."""
+    ours = [(f"ours, set {k}, {model}", value) for (k, model), value in sorted(early.items())]
+    return ours + [(f"{name}, set 2", value) for name, value in PUBLISHED]
 
 
 def _cell(figures: dict[str, float], key: str) -> str:
@@ -308,26 +321,45 @@ def _cell(figures: dict[str, float], key: str) -> str:
     return "/".join("-" if v is None else f.format(v) for f, v in zip(formats, values, strict=True))
 
 
-def draw(figures: dict[str, float], sets: dict[int, Path]) -> None:
-    """Position errors and consistency, one plot per model."""
-    figure, axes = new_plot(2, width=5.6)
-    columns = ("landmarks", "landmarks_robots", "smoother", "blind_robots")
-    width = 0.8 / (len(sets) * len(MODELS))
-    for place, (number, model) in enumerate(itertools.product(sets, MODELS)):
-        shift = (place - 0.5 * (len(sets) * len(MODELS) - 1)) * width
-        for axis, name, scale in zip(axes, ("position_rmse_m", "nees"), (100.0, 1.0), strict=True):
-            found = [figures.get(f"set{number}.{model}.{column}.{name}", math.nan) for column in columns]
-            x = np.arange(len(columns)) + shift
-            bars = axis.bar(x, scale * np.array(found), width, label=f"set {number}, {model}")
-            axis.bar_label(bars, fmt="%.1f", fontsize=7)
-    names = ["landmarks", "landmarks\n+ robots", "smoother\n(offline)", "blind\nrobots"]
-    for axis, label in zip(axes, ("position RMSE [cm]", "NEES"), strict=True):
-        axis.set_xticks(range(len(columns)), names)
+def draw(figures: dict[str, float], early: dict[tuple[int, str], float], sets: dict[int, Path]) -> Path:
+    """Errors and consistency by column, and ours beside the published; returns the file."""
+    figure, axes = new_plot(4, width=5.8, height=4.4)
+    labels = ("position RMSE [m]", "heading RMSE [deg]", "NEES")
+    for axis, name, label in zip(axes, FIGURES, labels, strict=False):
+        _bars(axis, figures, list(itertools.product(sets, MODELS)), name)
         axis.set_ylabel(label)
-    axes[1].axhline(3.0, color="0.5", linestyle=":")
-    axes[1].text(len(columns) - 0.5, 3.05, "ideal", ha="right", color="0.4")
-    axes[0].legend()
-    print(f"plot: {save_plot(figure, 'mrclam')}")
+    for axis in axes[:2]:
+        axis.set_yscale("log")
+    axes[0].legend(fontsize=8)
+    axes[2].axhspan(2.0, 5.0, color="0.93", zorder=0)
+    axes[2].axhline(3.0, color="0.5", linestyle=":")
+    rows = beside_published(early)[::-1]
+    colours = ["0.6" if "CoLo" in name else "tab:blue" for name, _ in rows]
+    bars = axes[3].barh([name for name, _ in rows], [value for _, value in rows], color=colours)
+    axes[3].bar_label(bars, fmt="%.3f", fontsize=8)
+    axes[3].set_xlabel("mean position error, first 600 s [m]")
+    return save_plot(figure, "mrclam")
+
+
+def _bars(axis: Axes, figures: dict[str, float], cases: list[tuple[int, str]], name: str) -> None:
+    """A group of bars per column, one per set and model: pale where plain."""
+    width = 0.84 / len(cases)
+    numbers = sorted({number for number, _ in cases})
+    for place, (number, model) in enumerate(cases):
+        found = [(x, figures.get(f"set{number}.{model}.{column}.{name}")) for x, column in enumerate(COLUMNS)]
+        there = [(x + (place - 0.5 * (len(cases) - 1)) * width, v) for x, v in found if v is not None]
+        bars = axis.bar(
+            [x for x, _ in there],
+            [v for _, v in there],
+            width,
+            color=f"C{numbers.index(number)}",
+            alpha=0.45 if model == MODELS[0] else 1.0,
+            label=f"set {number}, {model}",
+        )
+        if len(cases) <= _CASES_LABELLED:
+            axis.bar_label(bars, fmt="{:.3g}", fontsize=6, rotation=90, padding=2)
+    axis.margins(y=0.12)
+    axis.set_xticks(range(len(COLUMNS)), [column.replace("_", "\n") for column in COLUMNS], fontsize=8)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -338,7 +370,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "folder", type=Path, nargs="?", default=DEFAULT_FOLDER, help="folder with MRCLAM_Dataset<k> folders"
     )
-    parser.add_argument("--fit", type=int, help="number of the set to fit to (default: the first)")
+    parser.add_argument("--fit", type=int, help="number of the set to fit to (default: 1)")
     return parser
 
 

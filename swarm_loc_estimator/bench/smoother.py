@@ -1,18 +1,20 @@
 """The offline limit: gtsam's batch solution of a recording with the estimator's own models and noise.
 
 A filter knows the past, a smoother also the future: no online estimate can be as good. Each robot has a pose
-at every stamp at which it sees or is seen, and at every whole half second, where the result is read.
+at every stamp at which it sees or is seen, and at every stamp at which the result is compared; and a bias of
+its turn rate, where its model has one, that steps a few times within its time constant.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_estimator.calibration.in_order import measurements_of, tracks_of
 from swarm_loc_estimator.calibration.recording import Recording
 from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.measurements import (
@@ -21,38 +23,33 @@ from swarm_loc_estimator.core.measurements import (
     innovation,
     predict_one,
 )
-from swarm_loc_estimator.core.metrics import DEFAULT_GAP_NS, Track, interpolate
+from swarm_loc_estimator.core.metrics import Errors, Track, compare
+from swarm_loc_estimator.core.motion import DRIFT, NOISE
 from swarm_loc_estimator.core.odometry import OdometryTracks
+from swarm_loc_estimator.core.parameters import TURN_BIAS
 from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.sightings import SightingConverter
-from swarm_loc_estimator.core.swarm import Swarm
+from swarm_loc_estimator.core.swarm import OdometryModel, Robot, Swarm
 from swarm_loc_estimator.replay_result import ReplayResult
-
-PERIOD_NS = 500_000_000
 
 _FLOOR = np.diag([1e-10, 1e-10, 1e-10])
 """A robot that stands gathers no noise; a factor needs some."""
+_UNKNOWN = np.array([30.0, 30.0, 10.0])
 _BEND = 3.0
 """From this many sigmas on a sighting counts less and less (Cauchy), where the filter has its gate."""
-_NEES_POSES = 150
+_NEES_POSES = 400
 """Marginal covariances are slow; the NEES is taken over about so many poses of each robot."""
+_MOST_ROUNDS = 25
+_SETTLED = 1e-4
+"""Share of the error by which the last round may still lessen it."""
+_SHORTEST_STEP = 1e-3
+_BIAS_STEP = 0.1
+"""A bias is constant for this share of its time constant."""
 
 IntArray = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class SmootherErrors:
-    """Errors of the batch solution where ground truth is known.
-
-    Attributes:
-        position: (m,) [m].
-        heading: (m,) [rad].
-        nees: (k,) of some of the poses.
-    """
-
-    position: FloatArray
-    heading: FloatArray
-    nees: FloatArray
+class SmootherError(RuntimeError):
+    """There is no solution; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -61,11 +58,13 @@ class _Nodes:
 
     Attributes:
         stamps_ns: Per robot, ascending.
+        compared: Per robot, which of them are compared with the truth.
         first: (N,) key of each robot's first pose.
         initial: (V, 3) where to begin.
     """
 
     stamps_ns: list[IntArray]
+    compared: list[IntArray]
     first: IntArray
     initial: FloatArray
 
@@ -78,48 +77,59 @@ class _Nodes:
         return keys
 
 
-def smooth(recording: Recording, online: ReplayResult) -> SmootherErrors:
-    """Solve a whole recording.
+def smooth(recording: Recording, online: ReplayResult) -> Mapping[str, Errors]:
+    """Solve a whole recording; returns the errors of robots with ground truth, by name.
 
     Args:
         recording: What was reported and seen, and the truth to compare with.
-        online: What the estimator made of it; its swarm has the models, its poses are where to begin.
+        online: What the estimator made of it; its swarm has the models, its poses are where to begin and
+            its stamps those of the comparison.
+
+    Raises:
+        SmootherError: The solution does not settle.
     """
     swarm = online.swarm
-    tracks, measured = _tracks(recording, swarm), _measurements(recording, swarm)
+    tracks, measured = tracks_of(recording, swarm), measurements_of(recording, swarm)
     estimates = [online.track(index) for index in range(len(swarm.robots))]
     measured = measured[_within(measured, estimates)]
     nodes = _nodes(tracks, estimates, measured)
-    graph = gtsam.NonlinearFactorGraph()
-    _add_motion(graph, swarm, tracks, nodes)
-    _add_sightings(graph, measured, nodes)
-    values = gtsam.Values()
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for key, pose in enumerate(nodes.initial.tolist()):
         values.insert(key, gtsam.Pose2(*pose))
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(1e-3)
-    parameters.setMaxIterations(25)
-    solution = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-    return _errors(recording, swarm, nodes, solution, gtsam.Marginals(graph, solution))
+    _add_motion(graph, values, swarm, tracks, nodes)
+    _add_sightings(graph, measured, nodes)
+    return _errors(recording, swarm, nodes, _solved(graph, values), graph)
 
 
-def _tracks(recording: Recording, swarm: Swarm) -> OdometryTracks:
-    """All odometry as the estimator reads it."""
-    tracks = OdometryTracks(swarm.robots)
-    rows = recording.odometry
-    tracks.extend(rows.robot, rows.stamp_ns, np.array(rows.data, dtype=float))
-    return tracks
+def _solved(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+    """The best values by Gauss-Newton from values near them.
+
+    gtsam's own optimizers let go of the interpreter's lock, which each factor written in Python then waits
+    for: they take a hundred times as long.
+    """
+    error = graph.error(values)
+    for _ in range(_MOST_ROUNDS):
+        step, share = graph.linearize(values).optimize(), 1.0
+        stepped = values.retract(step)
+        found = graph.error(stepped)
+        while found > error and share > _SHORTEST_STEP:
+            share *= 0.3
+            stepped = values.retract(_scaled(step, share))
+            found = graph.error(stepped)
+        if found > error:
+            return values
+        values, settled, error = stepped, error - found < _SETTLED * error, found
+        if settled:
+            return values
+    raise SmootherError(f"the batch solution has not settled after {_MOST_ROUNDS} rounds.")
 
 
-def _measurements(recording: Recording, swarm: Swarm) -> MeasurementArray:
-    """All sightings as the estimator reads them."""
-    rows = recording.detections
-    found: list[Any] = [*rows.data]
-    counts = [len(one) for one in found]
-    conversion = SightingConverter(swarm).convert(
-        np.repeat(rows.robot, counts), np.repeat(rows.stamp_ns, counts), np.concatenate(found)
-    )
-    return conversion.measurements
+def _scaled(step: gtsam.VectorValues, share: float) -> gtsam.VectorValues:
+    """A part of a step."""
+    scaled = gtsam.VectorValues()
+    for key in range(step.size()):
+        scaled.insert(key, share * step.at(key))
+    return scaled
 
 
 def _within(measured: MeasurementArray, estimates: list[Track]) -> NDArray[np.bool_]:
@@ -136,44 +146,76 @@ def _within(measured: MeasurementArray, estimates: list[Track]) -> NDArray[np.bo
 
 def _nodes(tracks: OdometryTracks, estimates: list[Track], measured: MeasurementArray) -> _Nodes:
     """A pose of each robot at every stamp that matters, at first by odometry from the last online one."""
-    stamps_ns, initial = [], []
+    stamps_ns, compared, initial = [], [], [np.zeros((0, 3))]
     for robot, track in enumerate(estimates):
-        if not track.stamp_ns.size:
-            stamps_ns.append(np.zeros(0, dtype=np.int64))
-            continue
-        first_ns, last_ns = int(track.stamp_ns[0]), int(track.stamp_ns[-1])
-        grid = np.arange(-(-first_ns // PERIOD_NS) * PERIOD_NS, last_ns + 1, PERIOD_NS)
         seen = [measured["stamp_ns"][measured[name] == robot] for name in ("observer", "target")]
-        stamps = np.unique(np.concatenate([[first_ns], grid, *seen]))
+        stamps = np.unique(np.concatenate([track.stamp_ns, *seen]))
+        stamps_ns.append(stamps)
+        compared.append(np.searchsorted(stamps, track.stamp_ns))
+        if not stamps.size:
+            continue
         before = np.searchsorted(track.stamp_ns, stamps, side="right") - 1
         who = np.full(stamps.size, robot)
         moved = se2.between(tracks.at(who, track.stamp_ns[before]).pose, tracks.at(who, stamps).pose)
-        stamps_ns.append(stamps)
         initial.append(se2.compose(track.pose[before], moved))
     sizes = np.array([stamps.size for stamps in stamps_ns])
-    return _Nodes(stamps_ns, np.cumsum(sizes) - sizes, np.concatenate(initial))
+    return _Nodes(stamps_ns, compared, np.cumsum(sizes) - sizes, np.concatenate(initial))
 
 
 def _add_motion(
-    graph: gtsam.NonlinearFactorGraph, swarm: Swarm, tracks: OdometryTracks, nodes: _Nodes
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    swarm: Swarm,
+    tracks: OdometryTracks,
+    nodes: _Nodes,
 ) -> None:
-    """Starts and odometry as factors."""
+    """Starts and odometry as factors, and the biases in which odometry errs."""
     for index, (robot, stamps) in enumerate(zip(swarm.robots, nodes.stamps_ns, strict=True)):
         if not stamps.size:
             continue
         first = int(nodes.first[index])
-        if robot.start is not None:  # the first online pose is a moment after the start
-            s = robot.start_sigma
-            noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([s.x + 0.01, s.y + 0.01, s.theta]))
-            graph.add(gtsam.PriorFactorPose2(first, gtsam.Pose2(*nodes.initial[first]), noise))
+        graph.add(gtsam.PriorFactorPose2(first, gtsam.Pose2(*nodes.initial[first]), _start_noise(robot)))
+        biases = _add_biases(graph, values, robot.odometry, stamps)
         sample = tracks.at(np.full(stamps.size, index), stamps)
         moved = se2.between(sample.pose[:-1], sample.pose[1:])
         to_body = se2.adjoint(se2.inverse(sample.pose[1:]))
-        gathered = to_body @ np.diff(sample.noise, axis=0) @ np.swapaxes(to_body, 1, 2) + _FLOOR
-        for step, (motion, covariance) in enumerate(zip(moved.tolist(), gathered, strict=True)):
-            model = gtsam.noiseModel.Gaussian.Covariance(covariance)
-            key = first + step
-            graph.add(gtsam.BetweenFactorPose2(key, key + 1, gtsam.Pose2(*motion), model))
+        gathered = np.diff(sample.gathered, axis=0)
+        covariance = to_body @ gathered[:, NOISE] @ np.swapaxes(to_body, 1, 2) + _FLOOR
+        drift = (to_body @ gathered[:, DRIFT])[:, :, TURN_BIAS]
+        for step, motion in enumerate(moved.tolist()):
+            model, key = gtsam.noiseModel.Gaussian.Covariance(covariance[step]), first + step
+            if biases.size:
+                drifting = _Drifting(gtsam.Pose2(*motion), drift[step])
+                graph.add(gtsam.CustomFactor(model, [key, key + 1, int(biases[step])], drifting))
+            else:
+                graph.add(gtsam.BetweenFactorPose2(key, key + 1, gtsam.Pose2(*motion), model))
+
+
+def _start_noise(robot: Robot) -> gtsam.noiseModel.Base:
+    """How sure the first online pose is: as the start is, a moment before; or not at all."""
+    if robot.start is None:
+        return gtsam.noiseModel.Diagonal.Sigmas(_UNKNOWN)
+    s = robot.start_sigma
+    return gtsam.noiseModel.Diagonal.Sigmas(np.array([s.x + 0.01, s.y + 0.01, s.theta]))
+
+
+def _add_biases(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, model: OdometryModel, stamps_ns: IntArray
+) -> IntArray:
+    """A Gauss-Markov chain of a robot's biases, if any; returns the key (m - 1,) of each step's."""
+    sigma, step_ns = model.turn_bias_sigma, _BIAS_STEP * model.turn_bias_time_s * 1e9
+    if not sigma:
+        return np.zeros(0, dtype=np.int64)
+    kept = np.exp(-_BIAS_STEP)
+    keys: IntArray = values.size() + ((stamps_ns[:-1] - stamps_ns[0]) // step_ns).astype(np.int64)
+    anew = gtsam.noiseModel.Isotropic.Sigma(1, sigma * np.sqrt(1.0 - kept**2))
+    for key in range(int(keys[0]), int(keys[-1]) + 1):
+        values.insert(key, np.zeros(1))
+        if key == keys[0]:
+            graph.add(gtsam.PriorFactorVector(key, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, sigma)))
+        else:
+            graph.add(gtsam.CustomFactor(anew, [key - 1, key], _Fading(kept)))
+    return keys
 
 
 def _add_sightings(graph: gtsam.NonlinearFactorGraph, measured: MeasurementArray, nodes: _Nodes) -> None:
@@ -181,14 +223,47 @@ def _add_sightings(graph: gtsam.NonlinearFactorGraph, measured: MeasurementArray
     columns = MeasurementColumns.of(measured)
     observers = nodes.keys(measured["observer"], measured["stamp_ns"]).tolist()
     targets = nodes.keys(measured["target"], measured["stamp_ns"]).tolist()
+    bend = gtsam.noiseModel.mEstimator.Cauchy.Create(_BEND)
     size = 2 + measured["has_heading"]
     for k in range(measured.size):
-        model = gtsam.noiseModel.Robust.Create(
-            gtsam.noiseModel.mEstimator.Cauchy.Create(_BEND),
-            gtsam.noiseModel.Gaussian.Covariance(measured["covariance"][k, : size[k], : size[k]]),
-        )
+        gaussian = gtsam.noiseModel.Gaussian.Covariance(measured["covariance"][k, : size[k], : size[k]])
+        model = gtsam.noiseModel.Robust.Create(bend, gaussian)
         keys = [observers[k]] if targets[k] < 0 else [observers[k], targets[k]]
         graph.add(gtsam.CustomFactor(model, keys, _Sighting(columns, k, int(size[k]))))
+
+
+class _Fading:
+    """A bias minus what the one before left."""
+
+    def __init__(self, kept: float) -> None:
+        self._kept = kept
+
+    def __call__(
+        self, factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        before, after = (values.atVector(key) for key in factor.keys())  # noqa: SIM118 # a method of gtsam
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = np.array([[-self._kept]]), np.eye(1)
+        return np.asarray(after - self._kept * before)
+
+
+class _Drifting:
+    """True minus reported motion of a step, the latter with a bias, as in gtsam's BetweenFactor."""
+
+    def __init__(self, moved: gtsam.Pose2, drift: FloatArray) -> None:
+        self._moved, self._drift = moved, drift
+
+    def __call__(
+        self, factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        begin, end, bias = factor.keys()
+        moved = values.atPose2(begin).between(values.atPose2(end))
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray(-moved.inverse().AdjointMap())
+            jacobians[1] = np.asfortranarray(np.eye(3))
+            jacobians[2] = np.asfortranarray(-self._drift[:, None])
+        apart = self._moved.localCoordinates(moved)
+        return np.asarray(apart - self._drift * values.atVector(bias)[0])
 
 
 class _Sighting:
@@ -202,38 +277,38 @@ class _Sighting:
     ) -> FloatArray:
         found = [values.atPose2(key) for key in factor.keys()]  # noqa: SIM118 # a method of gtsam
         poses = np.array([[pose.x(), pose.y(), pose.theta()] for pose in found])
-        value, jacobian, error = np.zeros(3), np.zeros((3, 3)), np.zeros(3)
-        predict_one(self._columns, self._k, poses[0], poses[-1], value, jacobian)
+        value, jacobian, error = np.zeros(3), np.zeros((3, 5)), np.zeros(3)
+        predict_one(self._columns, self._k, poses[0], poses[-1], np.zeros(2), value, jacobian)
         innovation(self._columns, self._k, self._columns.value[self._k], value, error)
         if jacobians is not None:
             signs = (-1.0, 1.0)
             for place, pose in enumerate(found):
-                by_own_frame = signs[place] * jacobian @ pose.AdjointMap()
+                by_own_frame = signs[place] * jacobian[:, :3] @ pose.AdjointMap()
                 jacobians[place] = np.asfortranarray(by_own_frame[: self._size])
         return -error[: self._size]
 
 
 def _errors(
-    recording: Recording, swarm: Swarm, nodes: _Nodes, solution: gtsam.Values, marginals: gtsam.Marginals
-) -> SmootherErrors:
-    """Errors at the whole half seconds, pooled over the robots."""
-    positions, headings, nees = [], [], []
+    recording: Recording,
+    swarm: Swarm,
+    nodes: _Nodes,
+    solution: gtsam.Values,
+    graph: gtsam.NonlinearFactorGraph,
+) -> dict[str, Errors]:
+    """Errors at the stamps of the online poses; normalised ones at some of them."""
+    marginals = gtsam.Marginals(graph, solution)
+    errors = {}
     for index, robot in enumerate(swarm.robots):
-        truth = recording.truth.get(robot.name)
-        stamps = nodes.stamps_ns[index]
-        rows = np.flatnonzero(stamps % PERIOD_NS == 0)
+        truth, rows = recording.truth.get(robot.name), nodes.compared[index]
         if truth is None or not rows.size:
-            continue
-        true, known = interpolate(truth, stamps[rows], DEFAULT_GAP_NS)
-        rows, true = rows[known], true[known]
-        if not rows.size:
             continue
         keys = (nodes.first[index] + rows).tolist()
         poses = np.array([[p.x(), p.y(), p.theta()] for p in (solution.atPose2(key) for key in keys)])
-        apart = se2.between(poses, true)
-        positions.append(np.hypot(apart[:, 0], apart[:, 1]))
-        headings.append(apart[:, 2])
-        for row in range(0, len(keys), max(1, len(keys) // _NEES_POSES)):
-            covariance = marginals.marginalCovariance(keys[row])
-            nees.append(float(apart[row] @ np.linalg.solve(covariance, apart[row])))
-    return SmootherErrors(np.concatenate(positions), np.concatenate(headings), np.array(nees))
+        covariance = np.full((rows.size, 3, 3), np.nan)
+        for row in range(0, rows.size, max(1, rows.size // _NEES_POSES)):
+            to_map = solution.atPose2(keys[row]).rotation().matrix()
+            turned = np.eye(3)
+            turned[:2, :2] = to_map
+            covariance[row] = turned @ marginals.marginalCovariance(keys[row]) @ turned.T
+        errors[robot.name] = compare(Track(nodes.stamps_ns[index][rows], poses), covariance, truth)
+    return errors

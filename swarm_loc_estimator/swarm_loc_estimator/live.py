@@ -29,17 +29,17 @@ from swarm_loc_estimator.graph import GraphOptions, NodeSpec, graph_nodes
 from swarm_loc_estimator.io.bags import BagReader
 from swarm_loc_estimator.io.ingest import input_topics
 from swarm_loc_estimator.io.swarm_file import load_swarm
+from swarm_loc_estimator.io.truth import TruthReader
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
 from swarm_loc_estimator.nodes.recorder import Recorder, read_poses
 from swarm_loc_estimator.processes import Child, node_command, start, stop
-from swarm_loc_estimator.replay import TruthReader
 from swarm_loc_estimator.replay_result import ReplayResult
 
 ESTIMATOR, PLAYER = "estimator", "player"
 _ALONE = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": ""}
 _WAKE_S = 0.05
-_START_PATIENCE_S = 180.0
-"""An estimator that must be compiled first takes a minute and more."""
+_START_PATIENCE_S = 600.0
+"""An estimator that must be compiled first takes a minute, and several where others are at work, too."""
 _SILENCE_PATIENCE_S = 30.0
 _END_PATIENCE_S = 10.0
 
@@ -60,7 +60,8 @@ class LiveRun:
         status: (T, N) of `SwarmPose.status`.
         received: Those that the estimator took in.
         estimator_core: CPU time of the estimator's process per second while the bag played.
-        age_s: (T,) time of reception minus stamp of poses, in the bag's time.
+        age_s: (A,) time of reception minus stamp of poses, in the bag's time, of those that came when it was
+            known here.
     """
 
     result: ReplayResult
@@ -110,18 +111,17 @@ def read_bag(bag: Path, swarm: Swarm) -> BagContent:
     Raises:
         BagError: Nothing in the bag can be read.
     """
-    truth, inputs = TruthReader(swarm), {topic.name for topic in input_topics(swarm)}
-    arrivals = []
+    truth, inputs = TruthReader(swarm), [topic.name for topic in input_topics(swarm)]
+    arrivals = [np.zeros(0, dtype=np.int64)]
     with BagReader(bag) as reader:
         begin_ns, end_ns = reader.time_range_ns
-        for topic, _, log_ns, data in reader.messages({*inputs, *truth.topics}):
-            if topic in inputs:
-                arrivals.append(log_ns)
-            else:
-                truth.add(topic, data)
+        for batch in reader.batches([*truth.topics, *inputs]):
+            is_truth = batch.topic < len(truth.topics)
+            truth.add(batch.chosen(is_truth))
+            arrivals.append(batch.log_ns[~is_truth])
         tracks = truth.tracks()
         remarks = (*reader.losses, *truth.remarks())
-    return BagContent(begin_ns, end_ns, np.array(arrivals, dtype=np.int64), tracks, remarks)
+    return BagContent(begin_ns, end_ns, np.concatenate(arrivals), tracks, remarks)
 
 
 class LiveGraph:
@@ -293,9 +293,15 @@ def play_live(
         data_s=(content.end_ns - content.begin_ns) * 1e-9,
         wall_s=played_s,
     )
-    age_s = (np.array(recorder.received_ns) - result.stamp_ns).astype(np.float64) * 1e-9
     status = np.array([one.status for one in poses])
+    age_s = _ages(np.array(recorder.received_ns, dtype=np.int64), result.stamp_ns)
     return LiveRun(result, content.arrival_ns, rate, status, recorder.inputs, core, age_s)
+
+
+def _ages(received_ns: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> FloatArray:
+    """Ages of poses at reception [s], where that time is known; before the first /clock it is zero."""
+    known = received_ns > 0
+    return (received_ns - stamp_ns)[known].astype(np.float64) * 1e-9
 
 
 def cpu_seconds(pid: int) -> float:
@@ -332,9 +338,16 @@ def _wait_for_the_rest(graph: LiveGraph, sent: int, end_ns: int) -> None:
         _END_PATIENCE_S,
         needed=[ESTIMATOR],
     )
-    told = recorder.diagnostics + 2
+    told: dict[int, int] = {}  # how many inputs by the n-th diagnostics
+
+    def has_all() -> bool:
+        """Whether everything has been taken in, or no more is."""
+        told[recorder.diagnostics] = recorder.inputs
+        before = told.get(recorder.diagnostics - 1)
+        return recorder.inputs in (sent, before)
+
     graph.wait_for(
-        lambda: recorder.inputs == sent or recorder.diagnostics >= told,
+        has_all,
         "publish diagnostics",
         _END_PATIENCE_S,
         needed=[ESTIMATOR],

@@ -25,6 +25,7 @@ AWAITED_SIGNALS = STOP_SIGNALS | {signal.SIGCHLD}
 _TIED_TO_PARENT = """
 import ctypes, os, signal, sys
 signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGCHLD})
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # shells start background jobs with it ignored
 PR_SET_PDEATHSIG = 1
 ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 os.execv(sys.argv[1], sys.argv[1:])

@@ -2,7 +2,7 @@
 
 Messages are handed to the estimator in the order in which they arrived (log time), and it ticks as it would
 have ticked then: what was late is late again. A bag therefore gives the same poses, byte for byte, every
-time.
+time. Memory does not grow with the bag: poses and ground truth are collected in a temporary file.
 """
 
 from __future__ import annotations
@@ -15,18 +15,20 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from swarm_loc_estimator.core.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.core.arrivals import Arrivals
+from swarm_loc_estimator.core.estimator import SwarmEstimator
 from swarm_loc_estimator.core.metrics import Track
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.swarm import Swarm
 from swarm_loc_estimator.io.bags import BagReader
-from swarm_loc_estimator.io.cdr import decode_pose_batch
 from swarm_loc_estimator.io.ingest import Ingest
+from swarm_loc_estimator.io.spool import Spool
+from swarm_loc_estimator.io.truth import TruthReader
 from swarm_loc_estimator.replay_result import ReplayResult
 
 TICK_S = 0.1
 """Default time between two outputs [s]."""
-_TRUTH_BATCH = 4096
+_TICKS_AT_ONCE = 256
 
 Progress = Callable[[float, str], None]
 
@@ -53,26 +55,24 @@ def replay(
     Raises:
         BagError: Nothing in the bag can be read.
     """
-    estimator = SwarmEstimator(swarm, settings)
-    ingest = Ingest(swarm, estimator)
-    truth = TruthReader(swarm)
+    estimator, ingest, truth = SwarmEstimator(swarm, settings), Ingest(swarm), TruthReader(swarm)
     period_ns = round(tick_s * 1e9)
-    schedule = _Periodic(period_ns) if stamp_ns is None else _Listed(stamp_ns)
-    recorder = _Recorder(estimator, schedule)
+    recorder = _Recorder(estimator, _Periodic(period_ns) if stamp_ns is None else _Listed(stamp_ns))
+    inputs = len(ingest.topics)
     began = time.perf_counter()
     with BagReader(bag) as reader:
         first_ns, last_ns = reader.time_range_ns
-        for topic, _, log_ns, data in reader.messages({*ingest.handle_of, *truth.topics}):
-            if topic in truth.topics:
-                truth.add(topic, data)
-                continue
-            if recorder.tick_until(log_ns) and progress is not None:
+        for batch in reader.batches([*ingest.handle_of, *truth.topics]):
+            is_input = batch.topic < inputs
+            for messages in ingest.read(batch.chosen(is_input)):
+                recorder.take(estimator.screen(messages), messages.begin_ns, messages.end_ns)
+            others = batch.chosen(~is_input)
+            truth.add(others._replace(topic=others.topic - inputs))
+            if progress is not None:
                 progress(reader.progress, "replaying")
-            ingest.receive(ingest.handle_of[topic], data, log_ns)
         recorder.tick_until(last_ns + period_ns if stamp_ns is None else int(stamp_ns.max(initial=0)))
-        tracks = truth.tracks()
         remarks = (*reader.losses, *_missing(ingest), *truth.remarks())
-    return recorder.result(bag.name, tracks, remarks, (last_ns - first_ns) * 1e-9, began)
+    return recorder.result(bag.name, truth.tracks(), remarks, (last_ns - first_ns) * 1e-9, began)
 
 
 class _Schedule(Protocol):
@@ -83,7 +83,7 @@ class _Schedule(Protocol):
 
 
 class _Periodic:
-    """At every whole multiple of a period, anew from where time has jumped back to."""
+    """At every whole multiple of a period."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
@@ -91,7 +91,7 @@ class _Periodic:
 
     def due(self, now_ns: int) -> Iterator[int]:
         """The instants until now that were not due before."""
-        if self._next_ns is None or now_ns < self._next_ns - 2 * self._period_ns:  # the start, or a jump back
+        if self._next_ns is None:
             self._next_ns = (now_ns // self._period_ns + 1) * self._period_ns
         while self._next_ns <= now_ns:
             yield self._next_ns
@@ -118,26 +118,39 @@ class _Recorder:
     def __init__(self, estimator: SwarmEstimator, schedule: _Schedule) -> None:
         self._estimator = estimator
         self._schedule = schedule
-        self._estimates: list[SwarmEstimate] = []
+        self._spool = Spool()
+        robots = len(estimator.swarm.robots)
+        self._stamp_ns = np.zeros(_TICKS_AT_ONCE, dtype=np.int64)
+        self._pose = np.zeros((_TICKS_AT_ONCE, robots, 3))
+        self._covariance = np.zeros((_TICKS_AT_ONCE, robots, 3, 3))
+        self._filled = 0
 
-    def tick_until(self, now_ns: int) -> bool:
-        """Do all ticks due by an instant, before what arrives then is handed in; return whether any were."""
-        before = len(self._estimates)
-        self._estimates += map(self._estimator.tick, self._schedule.due(now_ns))
-        return len(self._estimates) > before
+    def take(self, arrivals: Arrivals, begin_ns: int, end_ns: int) -> None:
+        """Hand in what arrived between two instants, and do all ticks that were due meanwhile."""
+        stamps_ns = [*self._schedule.due(begin_ns), *self._schedule.due(end_ns)]
+        parts = arrivals.until_each(np.array(stamps_ns, dtype=np.int64))
+        for now_ns in stamps_ns:
+            self._estimator.add(next(parts))
+            self._tick(now_ns)
+        self._estimator.add(next(parts))
+
+    def tick_until(self, now_ns: int) -> None:
+        """Do all ticks due by an instant."""
+        for due_ns in self._schedule.due(now_ns):
+            self._tick(due_ns)
 
     def result(
         self, title: str, truth: Mapping[str, Track], remarks: tuple[str, ...], data_s: float, began: float
     ) -> ReplayResult:
         """Everything together."""
+        self._flush()
         robots = len(self._estimator.swarm.robots)
-        estimates = self._estimates
         return ReplayResult(
             title=title,
             swarm=self._estimator.swarm,
-            stamp_ns=np.array([e.stamp_ns for e in estimates], dtype=np.int64),
-            pose=np.array([e.poses for e in estimates]).reshape(-1, robots, 3),
-            covariance=np.array([e.covariances for e in estimates]).reshape(-1, robots, 3, 3),
+            stamp_ns=self._spool.array("stamp_ns", np.int64),
+            pose=self._spool.array("pose", np.float64, robots, 3),
+            covariance=self._spool.array("covariance", np.float64, robots, 3, 3),
             truth=truth,
             counters={"measurements used": self._estimator.used, **self._estimator.drops},
             remarks=remarks,
@@ -145,53 +158,18 @@ class _Recorder:
             wall_s=time.perf_counter() - began,
         )
 
+    def _tick(self, now_ns: int) -> None:
+        estimate, k = self._estimator.tick(now_ns), self._filled
+        self._stamp_ns[k], self._pose[k], self._covariance[k] = now_ns, estimate.poses, estimate.covariances
+        self._filled += 1
+        if self._filled == _TICKS_AT_ONCE:
+            self._flush()
 
-class TruthReader:
-    """Collects ground truth; nothing of it reaches the estimator.
-
-    Args:
-        swarm: Whose.
-
-    Attributes:
-        topics: Topic -> robot name.
-    """
-
-    def __init__(self, swarm: Swarm) -> None:
-        self.topics = {f"{robot.name}/ground_truth": robot.name for robot in swarm.robots}
-        self._raw: dict[str, list[bytes]] = {name: [] for name in self.topics.values()}
-        self._rows: dict[str, list[Track]] = {name: [] for name in self.topics.values()}
-        self._malformed = 0
-
-    def add(self, topic: str, data: bytes) -> None:
-        """Take one message in."""
-        name = self.topics[topic]
-        self._raw[name].append(data)
-        if len(self._raw[name]) == _TRUTH_BATCH:
-            self._read(name)
-
-    def _read(self, name: str) -> None:
-        """Turn messages into numbers, many at once."""
-        batch = decode_pose_batch(self._raw[name])
-        self._raw[name].clear()
-        self._malformed += int(np.sum(~batch.valid))
-        usable = np.flatnonzero(batch.valid & np.isfinite(batch.pose).all(axis=1))
-        order = usable[np.argsort(batch.stamp_ns[usable], kind="stable")]
-        self._rows[name].append(Track(batch.stamp_ns[order], batch.pose[order]))
-
-    def tracks(self) -> dict[str, Track]:
-        """Per robot that has ground truth."""
-        tracks = {}
-        for name, parts in self._rows.items():
-            self._read(name)
-            stamps = np.concatenate([part.stamp_ns for part in parts])
-            order = np.argsort(stamps, kind="stable")
-            if len(order):
-                tracks[name] = Track(stamps[order], np.concatenate([part.pose for part in parts])[order])
-        return tracks
-
-    def remarks(self) -> tuple[str, ...]:
-        """What else must be said."""
-        return (f"{self._malformed} messages of ground truth are malformed.",) if self._malformed else ()
+    def _flush(self) -> None:
+        """Write what is kept to the spool."""
+        filled, self._filled = slice(self._filled), 0
+        for name in ("stamp_ns", "pose", "covariance"):
+            self._spool.append(name, getattr(self, f"_{name}")[filled])
 
 
 def _missing(ingest: Ingest) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from swarm_loc_estimator.calibration.offsets import fit_offsets
 from swarm_loc_estimator.calibration.recording import CalibrationError, Recording, started_at_truth
 from swarm_loc_estimator.calibration.rerun import rerun
 from swarm_loc_estimator.calibration.response import (
+    WINDOW_S,
     Drive,
     Lateness,
     explained,
@@ -28,7 +29,7 @@ from swarm_loc_estimator.calibration.windows import steps_of, true_motion, windo
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import MotionResponse, OdometryModel, Robot, Swarm
 
-EVALUATIONS = 60
+EVALUATIONS = 80
 """How often the estimator runs over the recording to fit the noise."""
 
 _LEAST_WINDOWS = 50
@@ -134,9 +135,9 @@ def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Pr
     folds = _folds(recording, swarm, whole, options)
     begin = _first_noise(whole, plain=options.plain)
 
-    def report(count: int, found: Score, _: dict[str, float]) -> None:
+    def report(count: int, found: Score) -> None:
         rmse_mm = 1e3 * found.position_rmse
-        share = 0.2 + 0.75 * count / options.evaluations
+        share = 0.2 + 0.75 * min(1.0, count / options.evaluations)
         progress(share, f"noise, run {count}: {rmse_mm:.1f} mm, NEES {found.nees:.2f}")
 
     noise = {**_FLOORS, **fit_noise(folds, begin, _FLOORS, options.evaluations, report)}
@@ -194,7 +195,7 @@ def _fit_drive(
             continue
         begin_ns, end_ns = int(track.stamp_ns[0]), int(track.stamp_ns[-1])
         drive = Drive(steps_of(track, swarm.robots[index].odometry), true_motion(truth, begin_ns, end_ns))
-        if windows(drive.motion, 5.0)[0].size >= _LEAST_WINDOWS:
+        if windows(drive.motion, WINDOW_S)[0].size >= _LEAST_WINDOWS:
             drives.append(drive)
     if not drives:
         return None
@@ -254,26 +255,27 @@ def _first_noise(models: Models, *, plain: bool) -> dict[str, float]:
         names = ("forward_sigma", "left_sigma", "heading_sigma")
         begin |= {n: _CORRELATION * max(1e-4, spread(error[~polar, k])) for k, n in enumerate(names)}
     if models.motion:
-        begin |= _first_motion_noise(models.motion)
+        begin |= _first_motion_noise(models.motion, plain=plain)
     else:
         model = OdometryModel()
         begin |= {"distance_noise": model.wheel_noise, "turn_noise": 0.01, "turn_drift": 1e-4}
     return begin
 
 
-def _first_motion_noise(motion: Sequence[DriveFit]) -> dict[str, float]:
-    """Each cause explains half of the mean squared errors of windows."""
+def _first_motion_noise(motion: Sequence[DriveFit], *, plain: bool) -> dict[str, float]:
+    """Each cause explains a part of the mean squared errors of windows."""
     path = turn = seconds = path2 = turn2 = 0.0
     for fit in motion:
         for drive in fit.drives:
-            first, last = windows(drive.motion, 5.0)
+            first, last = windows(drive.motion, WINDOW_S)
             path += float(np.sum(np.abs(drive.motion.path[last] - drive.motion.path[first])))
             turn += float(np.sum(np.abs(drive.motion.turn[last] - drive.motion.turn[first])))
-            seconds += 5.0 * first.size
+            seconds += WINDOW_S * first.size
         path2 += float(np.sum(fit.after[:, 0] ** 2))
         turn2 += float(np.sum(fit.after[:, 1] ** 2))
     path, turn, path2, turn2 = max(path, 1e-3), max(turn, 1e-3), max(path2, 1e-7), max(turn2, 1e-7)
-    return {
+    begin = {} if plain else {"turn_bias_sigma": np.sqrt(0.1 * turn2 / (seconds * WINDOW_S))}
+    return begin | {
         "distance_noise": 0.5 * path2 / path,
         "distance_turn_noise": 0.5 * path2 / turn,
         "lateral_noise": 0.05 * path2 / path,

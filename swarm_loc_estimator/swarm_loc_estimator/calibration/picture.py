@@ -16,9 +16,10 @@ from swarm_loc_estimator.calibration.response import spread_of
 from swarm_loc_estimator.calibration.robust import spread
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import MotionResponse
+from swarm_loc_estimator.io.report_style import INK, SOFT, TRUTH, colour_of, save, style
 
-_GREY, _COLOUR = "0.72", "tab:blue"
 _BINS = 60
+_COLUMNS = 3
 
 
 def text_of(done: Calibration) -> str:
@@ -45,9 +46,9 @@ def draw(done: Calibration, path: Path) -> Path:
     response = responses[0] if responses and len(responses[0].speeds) > 1 else None
     panels = _panels(done)
     count = len(panels) + 2 * (response is not None)
-    columns = min(4, max(1, count))
+    columns = min(_COLUMNS, max(1, count))
     rows = -(-count // columns)
-    figure = Figure(figsize=(3.8 * columns, 3.2 * rows), layout="constrained")
+    figure = Figure(figsize=(3.6 * columns, 2.9 * rows))
     axes: list[Any] = list(figure.subplots(rows, columns, squeeze=False).ravel())
     for axis, (label, before, after) in zip(axes, panels, strict=False):
         _histogram(axis, label, before, after)
@@ -56,7 +57,9 @@ def draw(done: Calibration, path: Path) -> Path:
             _shares(axis, response, name)
     for axis in axes[count:]:
         axis.set_visible(False)
-    figure.savefig(path, dpi=120)
+    if panels:
+        axes[0].legend(frameon=False, fontsize=9)
+    save(figure, path)
     return path
 
 
@@ -123,13 +126,13 @@ def _histogram(axis: Any, label: str, before: FloatArray, after: FloatArray) -> 
         1e-6, 4.0 * max(spread(before - np.median(before)), spread(after)) + abs(float(np.median(before)))
     )
     bins = np.linspace(-reach, reach, _BINS)
-    axis.hist(before, bins, color=_GREY, label="before")
-    axis.hist(after, bins, histtype="step", color=_COLOUR, linewidth=1.6, label="after")
-    axis.set_xlabel(f"error of {label}")
+    style(axis)
+    axis.hist(before, bins, color=TRUTH, alpha=0.6, label="before")
+    axis.hist(after, bins, histtype="step", color=colour_of(0), linewidth=1.6, label="after")
+    axis.set_title(f"error of {label}", loc="left", fontsize=10, color=INK)
     axis.set_yticks([])
     axis.locator_params(axis="x", nbins=5)
-    axis.spines[["top", "right", "left"]].set_visible(False)
-    axis.legend(frameon=False)
+    axis.spines["left"].set_visible(False)
 
 
 def _shares(axis: Any, response: MotionResponse, name: str) -> None:
@@ -140,4 +143,8 @@ def _shares(axis: Any, response: MotionResponse, name: str) -> None:
         axis.text(column, row, f"{share:.2f}", ha="center", va="center", fontsize=8)
     axis.set_xticks(range(len(response.turn_rates)), [f"{v:.2f}" for v in response.turn_rates])
     axis.set_yticks(range(len(response.speeds)), [f"{v:.3f}" for v in response.speeds])
-    axis.set(title=f"share of {name}", xlabel="turn rate [rad/s]", ylabel="speed [m/s]")
+    axis.tick_params(colors=SOFT, labelsize=8, length=0)
+    axis.spines[:].set_visible(False)
+    axis.set_title(f"true share of reported {name}", loc="left", fontsize=10, color=INK)
+    axis.set_xlabel("turn rate [rad/s]", color=SOFT, fontsize=9)
+    axis.set_ylabel("speed [m/s]", color=SOFT, fontsize=9)

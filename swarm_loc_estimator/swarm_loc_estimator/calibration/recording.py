@@ -6,24 +6,29 @@ enough for that.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from swarm_loc_estimator.core.arrivals import DetectionRows, Messages, OdometryRows
 from swarm_loc_estimator.core.metrics import Track, interpolate
 from swarm_loc_estimator.core.swarm import Robot, Swarm
 from swarm_loc_estimator.io.bags import BagReader
-from swarm_loc_estimator.io.cdr import decode_pose_batch
+from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
 from swarm_loc_estimator.io.ingest import Ingest
+from swarm_loc_estimator.io.truth import TruthReader
 
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 Progress = Callable[[float, str], None]
 
+_NONE = np.zeros(0, dtype=np.int64)
+_NO_ODOMETRY = OdometryRows(_NONE, _NONE, np.zeros((0, 3)), _NONE)
 START_GAP_NS = 500_000_000
 """A robot's true start is interpolated over no longer gap."""
 
@@ -53,6 +58,17 @@ class Rows:
         kept = np.flatnonzero(rows)
         data = tuple(self.data[row] for row in kept.tolist())
         return Rows(self.robot[kept], self.stamp_ns[kept], self.arrival_ns[kept], data)
+
+    @cached_property
+    def poses(self) -> npt.NDArray[np.float64]:
+        """Raw poses (M, 3) of odometry."""
+        return np.array(self.data, dtype=float).reshape(-1, 3)
+
+    @cached_property
+    def detections(self) -> npt.NDArray[np.void]:
+        """Detections of all messages one after the other (d,)."""
+        joined = b"".join(found.tobytes() for found in self.data)  # concatenating structured arrays is slow
+        return np.frombuffer(joined, dtype=DETECTION_DTYPE)
 
 
 @dataclass(frozen=True)
@@ -99,22 +115,25 @@ class Recording:
         )
         return replace(self, detections=replace(rows, data=data))
 
-    def messages(self) -> Iterator[tuple[int, bool, int, int, object]]:
-        """All messages in order of arrival: arrival [ns], whether odometry, robot, stamp [ns], data."""
-        odometry, detections = self.odometry, self.detections
-        arrival_ns = np.concatenate([odometry.arrival_ns, detections.arrival_ns])
-        robot = np.concatenate([odometry.robot, detections.robot]).tolist()
-        stamp_ns = np.concatenate([odometry.stamp_ns, detections.stamp_ns]).tolist()
-        data = (*odometry.data, *detections.data)
-        for row in np.argsort(arrival_ns, kind="stable").tolist():
-            yield int(arrival_ns[row]), row < len(odometry.data), robot[row], stamp_ns[row], data[row]
+    @cached_property
+    def messages(self) -> Messages:
+        """All of them in columns, in order of arrival."""
+        odometry, detections, (begin_ns, end_ns) = self.odometry, self.detections, self.range_ns
+        counts = [found.size for found in detections.data]
+        columns = (detections.robot, detections.stamp_ns, detections.arrival_ns)
+        robot, stamp_ns, arrival_ns = (np.repeat(column, counts) for column in columns)
+        return Messages(
+            OdometryRows(odometry.robot, odometry.stamp_ns, odometry.poses, odometry.arrival_ns),
+            DetectionRows(robot, stamp_ns, detections.detections, arrival_ns),
+            begin_ns,
+            end_ns,
+        )
 
     def track(self, robot: int) -> Track:
         """A robot's raw odometry in the order of its stamps, each stamp once."""
         rows = np.flatnonzero(self.odometry.robot == robot)
         stamp_ns, first = np.unique(self.odometry.stamp_ns[rows], return_index=True)
-        pose = np.array([self.odometry.data[row] for row in rows[first].tolist()], dtype=float).reshape(-1, 3)
-        return Track(stamp_ns, pose)
+        return Track(stamp_ns, self.odometry.poses[rows[first]])
 
 
 def read_recording(bag: Path, swarm: Swarm, progress: Progress | None = None) -> Recording:
@@ -128,21 +147,29 @@ def read_recording(bag: Path, swarm: Swarm, progress: Progress | None = None) ->
     Raises:
         BagError: Nothing in the bag can be read.
     """
-    collector = _Collector()
-    ingest = Ingest(swarm, collector)
-    truth_of = {f"{robot.name}/ground_truth": robot.name for robot in swarm.robots}
-    truth: dict[str, list[bytes]] = {topic: [] for topic in truth_of}
+    ingest, truth = Ingest(swarm), TruthReader(swarm)
+    inputs, parts = len(ingest.topics), list[Messages]()
     with BagReader(bag) as reader:
-        for count, (topic, _, log_ns, data) in enumerate(reader.messages({*ingest.handle_of, *truth_of})):
-            if topic in truth:
-                truth[topic].append(data)
-            else:
-                ingest.receive(ingest.handle_of[topic], data, log_ns)
-            if progress is not None and count % 5000 == 0:
+        for batch in reader.batches([*ingest.handle_of, *truth.topics]):
+            is_input = batch.topic < inputs
+            parts += ingest.read(batch.chosen(is_input))
+            others = batch.chosen(~is_input)
+            truth.add(others._replace(topic=others.topic - inputs))
+            if progress is not None:
                 progress(reader.progress, "reading")
         remarks = tuple(reader.losses)
-    tracks = {truth_of[topic]: _track(messages) for topic, messages in truth.items() if messages}
-    return Recording(bag.name, collector.rows(0), collector.rows(1), tracks, remarks)
+    odometry = OdometryRows.joined([_NO_ODOMETRY, *(part.odometry for part in parts)])
+    detections = [_per_message(part.detections) for part in parts]
+    tracks = {name: _each_stamp_once(track) for name, track in truth.tracks().items()}
+    return Recording(
+        bag.name,
+        Rows(
+            odometry.robot, odometry.stamp_ns, odometry.arrival_ns, tuple(map(tuple, odometry.pose.tolist()))
+        ),
+        _joined(detections),
+        tracks,
+        remarks,
+    )
 
 
 def start_of(recording: Recording, robot: Robot, track: Track) -> tuple[float, float, float] | None:
@@ -165,43 +192,26 @@ def started_at_truth(swarm: Swarm, recording: Recording) -> Swarm:
     return replace(swarm, robots=tuple(robots))
 
 
-def _track(messages: list[bytes]) -> Track:
-    """Ground truth in the order of its stamps."""
-    batch = decode_pose_batch(messages)
-    good = batch.valid & np.isfinite(batch.pose).all(axis=1)
-    stamp_ns, first = np.unique(batch.stamp_ns[good], return_index=True)
-    return Track(stamp_ns, batch.pose[good][first])
+def _each_stamp_once(track: Track) -> Track:
+    """The track with the first of the poses that share a stamp."""
+    stamp_ns, first = np.unique(track.stamp_ns, return_index=True)
+    return Track(stamp_ns, track.pose[first])
 
 
-class _Collector:
-    """Keeps what would go into an estimator."""
+def _per_message(rows: DetectionRows) -> Rows:
+    """Detections (d,) as messages (m,), each with all that a camera saw at once."""
+    columns = (rows.robot, rows.stamp_ns, rows.arrival_ns)
+    new = np.logical_or.reduce([column[1:] != column[:-1] for column in columns])
+    starts = np.flatnonzero(np.concatenate([np.ones(min(rows.robot.size, 1), dtype=bool), new]))
+    ends = [*starts[1:].tolist(), rows.robot.size]
+    data = tuple(rows.detection[a:b] for a, b in zip(starts.tolist(), ends, strict=True) if b > a)
+    robot, stamp_ns, arrival_ns = (column[starts] for column in columns)
+    return Rows(robot, stamp_ns, arrival_ns, data)
 
-    def __init__(self) -> None:
-        self._rows: tuple[list[tuple[int, int, int, object]], ...] = ([], [])
 
-    def add_odometry(
-        self, robot: int, stamp_ns: int, pose: tuple[float, float, float], now_ns: int, /
-    ) -> None:
-        """Keep a raw pose."""
-        self._rows[0].append((robot, stamp_ns, now_ns, pose))
-
-    def add_detections(
-        self, robot: int, stamp_ns: int, detections: npt.NDArray[np.void], now_ns: int, /
-    ) -> None:
-        """Keep what a camera saw."""
-        self._rows[1].append((robot, stamp_ns, now_ns, detections))
-
-    def drop(self, reason: str, count: int = 1, /) -> None:
-        """A message that cannot be read fits nothing."""
-
-    def rows(self, kind: int) -> Rows:
-        """What was kept of odometry (0) or detections (1)."""
-        robot, stamp_ns, arrival_ns, data = (
-            zip(*self._rows[kind], strict=True) if self._rows[kind] else ((),) * 4
-        )
-        return Rows(
-            np.array(robot, dtype=np.int64),
-            np.array(stamp_ns, dtype=np.int64),
-            np.array(arrival_ns, dtype=np.int64),
-            tuple(data),
-        )
+def _joined(parts: list[Rows]) -> Rows:
+    """All messages of parts, one after the other."""
+    names = ("robot", "stamp_ns", "arrival_ns")
+    columns = (np.concatenate([_NONE, *(getattr(part, name) for part in parts)]) for name in names)
+    robot, stamp_ns, arrival_ns = columns
+    return Rows(robot, stamp_ns, arrival_ns, tuple(message for part in parts for message in part.data))

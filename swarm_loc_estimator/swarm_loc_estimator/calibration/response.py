@@ -10,8 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from swarm_loc_estimator.calibration.recording import IntArray
 from swarm_loc_estimator.calibration.robust import ridge, spread
 from swarm_loc_estimator.calibration.windows import Steps, TrueMotion, gathered, windows
 from swarm_loc_estimator.core.se2 import FloatArray
@@ -20,9 +22,14 @@ from swarm_loc_estimator.core.swarm import MotionResponse
 LONGEST_DELAY_S = 0.5
 LONGEST_LAG_S = 1.0
 
-_WINDOW_S = 5.0
+WINDOW_S = 5.0
+"""Errors of motion are looked at over so long."""
+
 _SHORT_WINDOW_S = 0.5
-_NODES = 5
+_NODES = (0, 2, 5)
+"""So many points above 0 are tried for the table; none: one share everywhere."""
+_BLOCKS = 5
+_CLEAR_SIGMAS = 2.0
 _NEAR_ZERO = 0.05
 _CLEARLY = 0.85
 """Lateness is believed where it lessens the errors of short windows to this share."""
@@ -87,7 +94,7 @@ def fit_lateness(drives: Sequence[Drive]) -> Lateness:
     return Lateness(float(found.x[0]), float(found.x[1]) if found.x[1] > 2e-3 else 0.0)
 
 
-def nodes_of(values: FloatArray, duration_s: FloatArray, count: int = _NODES) -> FloatArray:
+def nodes_of(values: FloatArray, duration_s: FloatArray, count: int) -> FloatArray:
     """Grid points for reported values (n,): 0, and points evenly spaced over what was driven for long.
 
     Args:
@@ -108,20 +115,56 @@ def nodes_of(values: FloatArray, duration_s: FloatArray, count: int = _NODES) ->
 
 
 def fit_response(drives: Sequence[Drive], late: Lateness, *, table: bool) -> MotionResponse:
-    """The shares of speed and turn rate that are true, for robots of one type; one of each unless `table`."""
+    """The shares of speed and turn rate that are true, for robots of one type.
+
+    Several grids are tried on stretches of time that they were not fitted to; the smallest wins that does
+    about as well as the best: a table has to earn its numbers.
+
+    Args:
+        drives: Of all robots of the type.
+        late: Their delay and lag.
+        table: Whether there may be more than one share of each.
+    """
+    grids = [_grid(drives, count) for count in (_NODES if table else _NODES[:1])]
+    held_out = [_held_out_error(drives, late, *grid) for grid in grids]
+    best = held_out[int(np.argmin([np.mean(errors) for errors in held_out]))]
+    chosen = next(
+        grid
+        for grid, errors in zip(grids, held_out, strict=True)
+        if np.mean(errors - best) <= _CLEAR_SIGMAS * np.std(errors - best) / np.sqrt(_BLOCKS - 1)
+    )
+    tables = [_solved(_regression(drives, late, *chosen, column), *chosen).round(4) for column in range(2)]
+    return MotionResponse(
+        *(tuple(axis.tolist()) for axis in chosen),
+        *(tuple(tuple(row) for row in table.tolist()) for table in tables),
+    )
+
+
+def _grid(drives: Sequence[Drive], count: int) -> tuple[FloatArray, FloatArray]:
+    """Speeds and turn rates of a grid with so many points above 0; no points: one share everywhere."""
+    if not count:
+        return np.zeros(1), np.zeros(1)
     speed = np.concatenate([np.abs(drive.steps.speed) for drive in drives])
     turn_rate = np.concatenate([np.abs(drive.steps.turn_rate) for drive in drives])
     duration_s = np.concatenate([drive.steps.duration_s for drive in drives])
-    speeds = nodes_of(speed, duration_s)
-    turn_rates = nodes_of(turn_rate[speed > _MOVING], duration_s[speed > _MOVING])
-    if not table:
-        speeds = turn_rates = np.zeros(1)
-    tables = [_shares(drives, late, speeds, turn_rates, column) for column in range(2)]
-    return MotionResponse(
-        tuple(speeds.tolist()),
-        tuple(turn_rates.tolist()),
-        *(tuple(tuple(row) for row in table.tolist()) for table in tables),
-    )
+    driving = speed > _MOVING
+    return nodes_of(speed, duration_s, count), nodes_of(turn_rate[driving], duration_s[driving], count)
+
+
+def _held_out_error(
+    drives: Sequence[Drive], late: Lateness, speeds: FloatArray, turn_rates: FloatArray
+) -> FloatArray:
+    """Mean absolute errors (blocks,) of path and turn, relative to what was driven, block by block."""
+    total = np.zeros(_BLOCKS)
+    for column in range(2):
+        rows = _regression(drives, late, speeds, turn_rates, column)
+        for block in range(_BLOCKS):
+            held_out = (rows.block == block) & (rows.last_block == block)
+            fitted = (rows.block != block) & (rows.last_block != block)
+            shares = _solved(rows[fitted], speeds, turn_rates).ravel()
+            error = rows.wanted[held_out] - rows.basis[held_out] @ shares
+            total[block] += np.mean(np.abs(error)) / np.mean(np.abs(rows.wanted))
+    return total
 
 
 def hats(values: FloatArray, nodes: FloatArray) -> FloatArray:
@@ -129,11 +172,31 @@ def hats(values: FloatArray, nodes: FloatArray) -> FloatArray:
     return np.column_stack([np.interp(values, nodes, row) for row in np.eye(nodes.size)])
 
 
-def _shares(
+@dataclass(frozen=True)
+class _Regression:
+    """True motion of windows as a sum of shares.
+
+    Attributes:
+        basis: (m, V W) what each share contributes.
+        wanted: (m,) path [m] or turn [rad].
+        block: (m,) which stretch of time a window begins in.
+        last_block: (m,) and which it ends in.
+    """
+
+    basis: FloatArray
+    wanted: FloatArray
+    block: IntArray
+    last_block: IntArray
+
+    def __getitem__(self, rows: NDArray[np.bool_]) -> _Regression:
+        return _Regression(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+
+def _regression(
     drives: Sequence[Drive], late: Lateness, speeds: FloatArray, turn_rates: FloatArray, column: int
-) -> FloatArray:
-    """Shares (V, W) of the speed (column 0) or the turn rate (column 1)."""
-    bases, targets = [], []
+) -> _Regression:
+    """All windows, of the path (column 0) or the turn (column 1)."""
+    bases, targets, borders = [], [], []
     for drive in drives:
         steps, motion = drive.steps, drive.motion
         weight = (
@@ -143,14 +206,19 @@ def _shares(
         values = weight.reshape(reported.size, -1) * reported[:, None]
         integral = gathered(values, steps, motion, late.delay_s, late.lag_s)
         true = motion.turn if column else motion.path
-        first, last = windows(motion, _WINDOW_S)
+        first, last = windows(motion, WINDOW_S)
         bases.append(integral[last] - integral[first])
         targets.append(true[last] - true[first])
-    basis, wanted = np.concatenate(bases), np.concatenate(targets)
-    typical = np.mean(np.sum(basis, axis=1) ** 2)  # of a window: the prior does not depend on units
+        borders.append(np.column_stack([first, last]) * _BLOCKS // motion.time_s.size)
+    return _Regression(np.concatenate(bases), np.concatenate(targets), *np.concatenate(borders).T)
+
+
+def _solved(rows: _Regression, speeds: FloatArray, turn_rates: FloatArray) -> FloatArray:
+    """Shares (V, W)."""
+    typical = np.mean(np.sum(rows.basis, axis=1) ** 2)  # of a window: the prior does not depend on units
     penalty = _prior(speeds.size, turn_rates.size) * typical
-    shares = ridge(basis, wanted, penalty, np.ones(basis.shape[1]))
-    return np.asarray(np.clip(shares, 0.0, 10.0).round(4).reshape(speeds.size, turn_rates.size), dtype=float)
+    shares = ridge(rows.basis, rows.wanted, penalty, np.ones(rows.basis.shape[1]))
+    return np.asarray(np.clip(shares, 0.0, 10.0).reshape(speeds.size, turn_rates.size))
 
 
 def _prior(speeds: int, turn_rates: int) -> FloatArray:
@@ -182,7 +250,7 @@ def explained(drives: Sequence[Drive], late: Lateness, response: MotionResponse 
             for column, table in enumerate((response.speed_share, response.turn_share)):
                 reported[:, column] *= np.einsum("nv,vw,nw->n", speed, np.array(table), turn_rate)
         integral = gathered(reported, steps, motion, late.delay_s, late.lag_s)
-        first, last = windows(motion, _WINDOW_S)
+        first, last = windows(motion, WINDOW_S)
         true = np.column_stack([motion.path, motion.turn])
         errors.append((true[last] - true[first]) - (integral[last] - integral[first]))
     return np.concatenate(errors)

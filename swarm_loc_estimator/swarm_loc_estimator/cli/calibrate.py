@@ -17,7 +17,9 @@ from pathlib import Path
 from swarm_loc_estimator.calibration.fit import EVALUATIONS, Options, calibrate
 from swarm_loc_estimator.calibration.picture import draw, text_of
 from swarm_loc_estimator.calibration.recording import CalibrationError, read_recording
+from swarm_loc_estimator.cli.arguments import number_in
 from swarm_loc_estimator.cli.progress import ProgressLine
+from swarm_loc_estimator.cli.replay import swarm_beside
 from swarm_loc_estimator.io.bag_file import BagError
 from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
 from swarm_loc_estimator.io.swarm_writer import save_swarm
@@ -27,20 +29,15 @@ from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
-    folder = options.bag if options.bag.is_dir() else options.bag.parent
-    progress = ProgressLine()
+    chosen = Options(plain=options.plain, response=not options.no_response, evaluations=options.evaluations)
     try:
-        swarm = load_swarm(options.swarm or folder / "swarm.yaml")
-        recording = read_recording(options.bag, swarm, progress)
-        chosen = Options(
-            plain=options.plain, response=not options.no_response, evaluations=options.evaluations
-        )
-        done = calibrate(recording, swarm, chosen, progress)
+        swarm = load_swarm(options.swarm or swarm_beside(options.bag))
+        with ProgressLine() as progress:
+            recording = read_recording(options.bag, swarm, progress)
+            done = calibrate(recording, swarm, chosen, progress)
     except (BagError, SwarmFileError, CalibrationError, DefinitionsNotFoundError) as error:
-        progress.close()
         print(error, file=sys.stderr)
         return 1
-    progress.close()
     options.out.parent.mkdir(parents=True, exist_ok=True)
     save_swarm(done.swarm, options.out, f"Calibrated with {options.bag.name}.")
     print("\n".join([text_of(done), *recording.remarks]))
@@ -64,18 +61,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--evaluations",
-        type=_count,
+        type=number_in(1, 10_000),
         default=EVALUATIONS,
         help=f"runs of the estimator to fit the noise (default {EVALUATIONS})",
     )
     return parser
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if not 1 <= value <= 10_000:
-        raise argparse.ArgumentTypeError(f"{text} must lie in [1, 10000]")
-    return value
 
 
 if __name__ == "__main__":

@@ -4,7 +4,8 @@
     demo bags/eight_five_robots --rate 1 --out out/demo
 
 It prints the error table and ends with status 1 when the poses are not as good as they must be for this bag.
-The report (report.html, paths.png, errors.png, overview.png) and the nodes' output (nodes.log) are in --out.
+The report (report.txt, report.html, overview.png, paths.png, errors.png) and the nodes' output (nodes.log)
+are in --out.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from swarm_loc_estimator.cli.arguments import number_in
 from swarm_loc_estimator.cli.replay import swarm_beside
 from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.estimator import Status
@@ -25,7 +27,6 @@ from swarm_loc_estimator.core.metrics import interpolate, pool, summarise
 from swarm_loc_estimator.core.swarm import Swarm
 from swarm_loc_estimator.io.bag_file import BagError
 from swarm_loc_estimator.io.report import write_report
-from swarm_loc_estimator.io.report_overview import plot_overview
 from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
 from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
 from swarm_loc_estimator.live import BagContent, LiveError, LiveRun, play_live
@@ -65,11 +66,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     files = write_report(live.result, options.out)
-    overview = options.out / "overview.png"
-    plot_overview(live.result, overview)
     print(files.text.read_text(encoding="utf-8"))
     print("\n".join(live_facts(live, compared)))
-    print(f"\nReport:  {files.page}\nPicture: {overview}")
+    print(f"\nReport:  {files.page}\nPicture: {files.overview}")
     failures = failed_bars(live)
     for failure in failures:
         print(failure, file=sys.stderr)
@@ -79,13 +78,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def live_facts(live: LiveRun, compared: Agreement) -> list[str]:
     """How the live graph did, in words."""
     live_line = (
-        f"Live:    {live.received} of {live.sent} messages received, {len(live.age_s)} poses of all robots,"
-        f" {1e3 * float(np.percentile(live.age_s, 95)):.0f} ms old at most (95 %),"
+        f"Live:    {live.received} of {live.sent} messages received; {len(live.status)} poses of all robots,"
+        f" 95 % of them at most {1e3 * float(np.percentile(live.age_s, 95)):.0f} ms old;"
         f" {live.estimator_core:.2f} of a core"
     )
     replay_line = (
-        f"Replay:  at the same stamps {compared.equal_share:.0%} of the poses are the same to a micrometre"
-        f" (others miss what was on its way), difference {1e3 * compared.rms_m:.2f} mm (RMS)"
+        f"Replay:  the same bag offline gives poses {1e3 * compared.rms_m:.2f} mm from these (RMS);"
+        f" {compared.equal_share:.0%} are equal, the others lack what was just on its way"
     )
     return [live_line, replay_line]
 
@@ -174,16 +173,11 @@ def _parser() -> argparse.ArgumentParser:
         prog="demo", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("bag", nargs="?", type=Path, default=BAG, help=f"what to play (default: {BAG})")
-    parser.add_argument("--rate", type=_rate, default=RATE, help=f"speed of the bag (default: {RATE:g})")
+    parser.add_argument(
+        "--rate", type=number_in(0.1, 100.0), default=RATE, help=f"speed of the bag (default: {RATE:g})"
+    )
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for the report")
     return parser
-
-
-def _rate(text: str) -> float:
-    value = float(text)
-    if not 0.1 <= value <= 100.0:
-        raise argparse.ArgumentTypeError(f"{text} must lie in [0.1, 100]")
-    return value
 
 
 if __name__ == "__main__":

@@ -32,16 +32,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not 0 <= low_ms <= high_ms or seed < 0:
         parser.error(f"--delay-ms {low_ms} {high_ms} {seed}: 0 <= LO <= HI and 0 <= SEED are needed")
     began = time.monotonic()
-    progress = ProgressLine()
+    delay = Delay(low_ms * 1_000_000, high_ms * 1_000_000, seed)
     try:
-        progress(0.0, "reading")
-        dataset = read_dataset(options.folder)
-        done = convert(dataset, options.bag, Delay(low_ms * 1_000_000, high_ms * 1_000_000, seed), progress)
+        with ProgressLine() as progress:
+            progress(0.0, "reading")
+            dataset = read_dataset(options.folder)
+            done = convert(dataset, options.bag, delay, progress)
     except (MrclamError, BagError, DefinitionsNotFoundError) as error:
-        progress.close()
         print(error, file=sys.stderr)
         return 1
-    progress.close()
     for remark in done.remarks:
         print(remark)
     names = ", ".join(f"robot{robot.subject}" for robot in dataset.robots)

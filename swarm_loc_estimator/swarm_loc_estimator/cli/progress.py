@@ -6,12 +6,14 @@ import sys
 import time
 from typing import TextIO
 
+from typing_extensions import Self
+
 _REDRAW_S = 0.1
 _WIDTH = 30
 
 
 class ProgressLine:
-    """One line that is redrawn while a command works; silent where nobody watches.
+    """One line that is redrawn while a command works, and gone after; silent where nobody watches.
 
     Args:
         stream: Where it is drawn; only when that is a terminal.
@@ -32,8 +34,10 @@ class ProgressLine:
         self._stream.write(f"\r[{bar:<{_WIDTH}}] {share:4.0%} {what}\x1b[K")
         self._stream.flush()
 
-    def close(self) -> None:
-        """Clear the line."""
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         if self._shown:
             self._stream.write("\r\x1b[K")
             self._stream.flush()

@@ -4,7 +4,7 @@
     replay recording.mcap --swarm swarm.yaml --out out/recording --set horizon_s=1.0
 
 The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. The report
-(report.txt, report.html, paths.png, errors.png) and the poses (poses.csv) are written to --out.
+(report.txt, report.html, overview.png, paths.png, errors.png) and the poses (poses.csv) are written to --out.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from swarm_loc_estimator.cli.arguments import number_in
 from swarm_loc_estimator.cli.progress import ProgressLine
 from swarm_loc_estimator.core.settings import EstimatorSettings, SettingsError
 from swarm_loc_estimator.io.bag_file import BagError
@@ -34,21 +35,19 @@ _COLUMNS = ("stamp_ns", "robot", "x_m", "y_m", "theta_rad", *_COVARIANCE)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
-    progress = ProgressLine()
     try:
         settings = read_settings(options.set)
         swarm = load_swarm(options.swarm or swarm_beside(options.bag))
-        result = replay(options.bag, swarm, settings, tick_s=options.tick, progress=progress)
+        with ProgressLine() as progress:
+            result = replay(options.bag, swarm, settings, tick_s=options.tick, progress=progress)
+            progress(1.0, "writing the report")
+            files = write_report(result, options.out)
+            write_poses(result, options.out / "poses.csv")
     except (BagError, SwarmFileError, SettingsError, DefinitionsNotFoundError) as error:
-        progress.close()
         print(error, file=sys.stderr)
         return 1
-    progress(1.0, "writing the report")
-    files = write_report(result, options.out)
-    write_poses(result, options.out / "poses.csv")
-    progress.close()
     print(files.text.read_text(encoding="utf-8"))
-    print(f"Report: {files.page}")
+    print(f"Report:  {files.page}\nPicture: {files.overview}")
     return 0
 
 
@@ -94,16 +93,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("bag", type=Path, help="rosbag2 folder, .mcap or .db3 file")
     parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
     parser.add_argument("--out", type=Path, default=Path("out/replay"), help="folder for the report")
-    parser.add_argument("--tick", type=_positive, default=TICK_S, help="seconds between two outputs")
+    parser.add_argument(
+        "--tick", type=number_in(1e-3, 3600.0, "s"), default=TICK_S, help="seconds between outputs"
+    )
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="estimator setting")
     return parser
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 1e-3 <= value <= 3600.0:
-        raise argparse.ArgumentTypeError(f"{text} must lie in [0.001, 3600] s")
-    return value
 
 
 if __name__ == "__main__":

@@ -78,3 +78,10 @@ def moved_by_twist(
         a, b = math.sin(phi) / phi, (1.0 - math.cos(phi)) / phi
     ex, ey, etheta = composed(a * rho_x - b * rho_y, b * rho_x + a * rho_y, phi, x, y, theta)
     return ex, ey, wrap(etheta)
+
+
+@compiled
+def adjoint_of(transform: NDArray[np.float64]) -> tuple[tuple[float, ...], ...]:
+    """Ad(T) of a transform (3,), see `se2.adjoint`."""
+    cos, sin = math.cos(transform[2]), math.sin(transform[2])
+    return (cos, -sin, transform[1]), (sin, cos, -transform[0]), (0.0, 0.0, 1.0)

@@ -40,15 +40,6 @@ class DenseFilter:
         self.covariance[:, columns] = 0.0
         self.covariance[columns[:, None], columns[None, :]] = covariance
 
-    def predict(self, columns: IndexArray, noise: FloatArray) -> None:
-        """Add noise (b, k, k) to the diagonal blocks at columns (b, k), all distinct; eq. (9) with F = I."""
-        self.covariance[columns[:, :, None], columns[:, None, :]] += noise
-
-    def marginals(self, columns: IndexArray) -> FloatArray:
-        """The covariance blocks (b, k, k) at columns (b, k)."""
-        blocks: FloatArray = self.covariance[columns[:, :, None], columns[:, None, :]]
-        return blocks
-
     def update(
         self, columns: IndexArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
     ) -> FloatArray:
@@ -63,15 +54,35 @@ class DenseFilter:
             innovation: (m, r) measured minus predicted.
             noise: (m, r, r) covariance of the measurement.
         """
-        weighted = np.linalg.solve(noise, jacobian)  # R^-1 H, (m, r, c)
         information = _inverse(self.covariance)
-        added = np.swapaxes(jacobian, 1, 2) @ weighted
-        np.add.at(information, (columns[:, :, None], columns[:, None, :]), added)
-        gradient = np.zeros(self.covariance.shape[0])
-        np.add.at(gradient, columns, np.einsum("mrc,mr->mc", weighted, innovation))
+        gradient = np.zeros(information.shape[0])
+        _gather(information, gradient, columns, jacobian, innovation, noise)
         self.covariance = _inverse(information)
         correction: FloatArray = self.covariance @ gradient
         return correction
+
+
+@compiled
+def _gather(
+    information: FloatArray,
+    gradient: FloatArray,
+    columns: IndexArray,
+    jacobian: FloatArray,
+    innovation: FloatArray,
+    noise: FloatArray,
+) -> None:
+    """Add H^T R^-1 H to the information (n, n) and H^T R^-1 y to the gradient (n,)."""
+    weighted = np.empty((columns.shape[1], 3))
+    for k in range(columns.shape[0]):
+        factor = cholesky3(noise[k])
+        for a in range(columns.shape[1]):
+            solve3(factor, jacobian[k, :, a], weighted[a])  # R^-1 H
+        for a in range(columns.shape[1]):
+            w0, w1, w2 = weighted[a, 0], weighted[a, 1], weighted[a, 2]
+            gradient[columns[k, a]] += w0 * innovation[k, 0] + w1 * innovation[k, 1] + w2 * innovation[k, 2]
+            for b in range(columns.shape[1]):
+                h0, h1, h2 = jacobian[k, 0, b], jacobian[k, 1, b], jacobian[k, 2, b]
+                information[columns[k, a], columns[k, b]] += w0 * h0 + w1 * h1 + w2 * h2
 
 
 @compiled

@@ -8,12 +8,20 @@ from collections import Counter
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from swarm_loc_estimator.core.arrivals import (
+    NO_MEASUREMENTS,
+    Arrivals,
+    DetectionRows,
+    Messages,
+    OdometryRows,
+)
 from swarm_loc_estimator.core.compiled import compiled
 from swarm_loc_estimator.core.dense_filter import cholesky3
 from swarm_loc_estimator.core.fusion import Fusion, Verdict
 from swarm_loc_estimator.core.gate import gate_threshold
 from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE, NOBODY, Kind, MeasurementArray
 from swarm_loc_estimator.core.odometry import OdometryTracks
+from swarm_loc_estimator.core.parameters import ParameterTable
 from swarm_loc_estimator.core.readout import Status, SwarmEstimate, read_out
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.settings import EstimatorSettings
@@ -23,6 +31,8 @@ from swarm_loc_estimator.core.swarm import Swarm
 from swarm_loc_estimator.core.timeline import Timeline
 
 __all__ = ["Status", "SwarmEstimate", "SwarmEstimator"]
+
+IntArray = NDArray[np.int64]
 
 _FARTHEST_M = 1e6
 _LEAST_VARIANCE, _MOST_VARIANCE = 1e-14, 1e14
@@ -48,8 +58,10 @@ class SwarmEstimator:
         self._tracks = OdometryTracks(swarm.robots)
         self._converter = SightingConverter(swarm)
         self._fusion = Fusion(swarm, self.settings, self._tracks)
+        self._parameters = ParameterTable.of(swarm.robots)
+        self._reach_ns = self._tracks.reach_ns
         self._timeline = Timeline(
-            self.settings, self._fusion.step, SwarmState(len(swarm.robots)), self._tracks.reach_ns
+            self.settings, self._fusion.step, SwarmState(self._parameters), self._reach_ns
         )
         self._horizon_ns = round(self.settings.horizon_s * 1e9)
         self._future_ns = round(self.settings.future_tolerance_s * 1e9)
@@ -60,34 +72,32 @@ class SwarmEstimator:
 
     def _begin(self) -> None:
         self._now_ns: int | None = None
-        self._odometry: list[tuple[int, int, float, float, float]] = []
-        self._detections: list[tuple[int, int, NDArray[np.void]]] = []
+        self._odometry: list[OdometryRows] = []
 
     def reset(self) -> None:
         """Forget all data and begin anew with the configured starts; the counters go on."""
-        self.drop("reset", len(self._odometry) + sum(d.size for _, _, d in self._detections))
-        self.drop("reset", self._timeline.waiting)
+        self.drop("reset", sum(rows.robot.size for rows in self._odometry) + self._timeline.waiting)
         self._ingest_drops.update(self._timeline_drops())
         self._tracks.clear()
-        self._timeline.restart(SwarmState(len(self.swarm.robots)))
+        self._timeline.restart(SwarmState(self._parameters))
         self._begin()
 
-    def add_odometry(self, robot: int, stamp_ns: int, pose: tuple[float, float, float], now_ns: int) -> None:
-        """Take in one odometry message: the robot's pose (x [m], y [m], yaw [rad]) in its own odom frame."""
-        if self._in_time(stamp_ns, now_ns):
-            self._odometry.append((robot, stamp_ns, *pose))
+    def receive(self, messages: Messages) -> None:
+        """Take in messages; when they show that time has jumped back, begin anew with them."""
+        self._check_clock(messages.begin_ns)
+        self._check_clock(messages.end_ns)
+        self.add(self.screen(messages))
 
-    def add_detections(self, robot: int, stamp_ns: int, detections: NDArray[np.void], now_ns: int) -> None:
-        """Take in what a robot's camera saw in one picture.
+    def screen(self, messages: Messages) -> Arrivals:
+        """Turn messages into what can be used of them, and count the rest; nothing is taken in yet."""
+        self.drop("bad_message", messages.malformed)
+        return Arrivals(self._sound_odometry(messages.odometry), *self._measured(messages.detections))
 
-        Args:
-            robot: Index of the robot that carries the camera.
-            stamp_ns: Exposure time.
-            detections: (d,) structured, see `SightingConverter.convert`.
-            now_ns: Time of arrival.
-        """
-        if detections.size and self._in_time(stamp_ns, now_ns, detections.size):
-            self._detections.append((robot, stamp_ns, detections))
+    def add(self, arrivals: Arrivals) -> None:
+        """Take in what has arrived since the last tick, in order of arrival."""
+        if arrivals.odometry.robot.size:
+            self._odometry.append(arrivals.odometry)
+        self._timeline.add(arrivals.measurements)
 
     def add_fix(self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike, now_ns: int) -> None:
         """Take in an absolute fix: pose (3,) in `map`, heading NaN if not measured, and covariance (3, 3)."""
@@ -95,12 +105,14 @@ class SwarmEstimator:
         if np.isnan(fix["value"][0, 2]):
             fix["has_heading"], fix["value"][0, 2] = 0, 0.0
             fix["covariance"][0, 2, :] = fix["covariance"][0, :, 2] = [0.0, 0.0, 1.0]
-        if self._in_time(stamp_ns, now_ns):
-            self._add_measurements(fix)
+        self._check_clock(now_ns)
+        if self._in_time(fix["stamp_ns"], np.array([now_ns])).all():
+            self._timeline.add(fix[self._are_sound(fix)])
 
     def seat(self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike) -> None:
         """Set a robot to a pose (3,) in `map` with covariance (3, 3), whatever was believed."""
-        self._add_measurements(self._about(robot, stamp_ns, pose, covariance, Kind.SEAT))
+        seat = self._about(robot, stamp_ns, pose, covariance, Kind.SEAT)
+        self._timeline.add(seat[self._are_sound(seat)])
 
     def forget(self, robot: int, stamp_ns: int) -> None:
         """Take a robot out of the estimate; it waits for a fix."""
@@ -108,7 +120,8 @@ class SwarmEstimator:
 
     def drop(self, reason: str, count: int = 1) -> None:
         """Count data that could not even be handed in."""
-        self._ingest_drops[reason] += count
+        if count:
+            self._ingest_drops[reason] += count
 
     @property
     def drops(self) -> dict[str, int]:
@@ -129,10 +142,10 @@ class SwarmEstimator:
         """Use all that has arrived and give the poses at `now_ns`; measurements wait unless `fuse`."""
         newest_ns = self._check_clock(now_ns)
         oldest_ns = newest_ns - self._horizon_ns
-        self._tracks.trim(oldest_ns, oldest_ns - 2 * self._tracks.reach_ns)
-        self._use_odometry()
+        self._tracks.trim(oldest_ns, oldest_ns - 2 * self._reach_ns)
+        if self._odometry:
+            self._use_odometry()
         if fuse:
-            self._use_detections()
             self._timeline.advance(newest_ns)
         return self._estimate(now_ns)
 
@@ -144,55 +157,52 @@ class SwarmEstimator:
         self._now_ns = now_ns if self._now_ns is None else max(now_ns, self._now_ns)
         return self._now_ns
 
-    def _in_time(self, stamp_ns: int, now_ns: int, count: int = 1) -> bool:
-        self._check_clock(now_ns)
-        if stamp_ns > now_ns + self._future_ns:
-            self.drop("future_stamp", count)
-            return False
-        return True
+    def _in_time(self, stamps_ns: IntArray, arrivals_ns: IntArray) -> NDArray[np.bool_]:
+        """Whether stamps (k,) are not ahead of the clock at their arrivals (k,)."""
+        return self._all_but("future_stamp", stamps_ns > arrivals_ns + self._future_ns)
+
+    def _all_but(self, reason: str, bad: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Count the bad ones (k,) and mark the others."""
+        self.drop(reason, int(np.count_nonzero(bad)))
+        return ~bad
+
+    def _sound_odometry(self, rows: OdometryRows) -> OdometryRows:
+        """The rows with stamps and numbers to reckon with."""
+        if not rows.robot.size:
+            return rows
+        finite = np.isfinite(rows.pose).all(axis=1)
+        near = np.abs(rows.pose).max(axis=1) <= _FARTHEST_M
+        good = self._in_time(rows.stamp_ns, rows.arrival_ns)
+        good &= self._all_but("odometry_non_finite", good & ~finite)
+        good &= self._all_but("odometry_absurd", good & ~near)
+        return rows if good.all() else rows.chosen(good)
 
     def _use_odometry(self) -> None:
-        if not self._odometry:
-            return
-        robots = np.array([row[0] for row in self._odometry], dtype=np.int64)
-        stamps = np.array([row[1] for row in self._odometry], dtype=np.int64)
-        raw = np.array([row[2:] for row in self._odometry])
+        rows = OdometryRows.joined(self._odometry)
         self._odometry = []
-        finite = np.isfinite(raw).all(axis=1)
-        near = finite & (np.abs(np.where(finite[:, None], raw, 0.0)).max(axis=1) <= _FARTHEST_M)
-        self.drop("odometry_non_finite", int(np.sum(~finite)))
-        self.drop("odometry_absurd", int(np.sum(finite & ~near)))
-        change = self._tracks.extend(robots[near], stamps[near], raw[near])
+        change = self._tracks.extend(rows.robot, rows.stamp_ns, rows.pose)
         self.drop("odometry_duplicate", change.duplicates)
         self.drop("odometry_too_old", change.too_old)
         self.drop("odometry_jump", change.jumps)
         self._timeline.invalidate(change.changed_from_ns)
 
-    def _use_detections(self) -> None:
-        if not self._detections:
-            return
-        counts = [detections.size for _, _, detections in self._detections]
-        robots = np.repeat([robot for robot, _, _ in self._detections], counts)
-        stamps = np.repeat([stamp for _, stamp, _ in self._detections], counts)
-        joined = b"".join(
-            d.tobytes() for _, _, d in self._detections
-        )  # concatenating structured arrays is slow
-        detections = np.frombuffer(joined, dtype=self._detections[0][2].dtype)
-        conversion = self._converter.convert(robots, stamps, detections)
-        self._detections = []
+    def _measured(self, rows: DetectionRows) -> tuple[MeasurementArray, IntArray]:
+        """What the sound ones of the detections measure (m,), and when it arrived (m,)."""
+        if not rows.robot.size:
+            return NO_MEASUREMENTS, rows.arrival_ns
+        in_time = self._in_time(rows.stamp_ns, rows.arrival_ns)
+        rows = rows if in_time.all() else rows.chosen(in_time)
+        conversion = self._converter.convert(rows.robot, rows.stamp_ns, rows.detection)
         self._ingest_drops.update(conversion.dropped)
-        self._add_measurements(conversion.measurements)
+        sound = self._are_sound(conversion.measurements)
+        return conversion.measurements[sound], rows.arrival_ns[conversion.measured][sound]
 
-    def _add_measurements(self, measurements: MeasurementArray) -> None:
-        """Hand measurements on whose numbers are finite and whose noise is a covariance."""
+    def _are_sound(self, measurements: MeasurementArray) -> NDArray[np.bool_]:
+        """Whether the numbers of measurements (m,) are finite, and their noise is a covariance."""
         value = measurements["value"]
-        finite = np.isfinite(value).all(axis=1)
-        near = finite & (np.abs(np.nan_to_num(value)).max(axis=1) <= _FARTHEST_M)
-        sound = _is_covariance(measurements["covariance"])
-        self.drop("non_finite", int(np.sum(~finite)))
-        self.drop("absurd", int(np.sum(finite & ~near)))
-        self.drop("bad_covariance", int(np.sum(near & ~sound)))
-        self._timeline.add(measurements[near & sound])
+        finite = self._all_but("non_finite", ~np.isfinite(value).all(axis=1))
+        good = finite & self._all_but("absurd", finite & (np.abs(value).max(axis=1) > _FARTHEST_M))
+        return good & self._all_but("bad_covariance", good & ~_is_covariance(measurements["covariance"]))
 
     def _about(
         self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike, kind: Kind

@@ -69,7 +69,8 @@ class Fusion:
     def _enter_at_start(self, state: SwarmState, robot: int) -> None:
         start, covariance = self._starts[robot]
         transform = se2.compose(start, se2.inverse(self._tracks.arrays.begin_pose[robot]))
-        state.enter(robot, transform, se2.error_covariance(start, covariance), np.zeros((3, 3)))
+        begin_ns = int(self._tracks.arrays.begin_ns[robot])
+        state.enter(robot, transform, se2.error_covariance(start, covariance), np.zeros((2, 3, 3)), begin_ns)
 
     def _enter_those_measured(self, state: SwarmState, measurements: MeasurementArray) -> bool:
         """Let robots enter at their starts with the first measurement (m,) about them; whether any did.
@@ -167,7 +168,8 @@ class Fusion:
     ) -> tuple[NDArray[np.uint8], FloatArray]:
         """Judge measurements (m,) against one belief, use those that pass; return verdicts and their NIS."""
         m = measurements.size
-        columns, jacobian = np.empty((m, 6), dtype=np.int64), np.empty((m, 3, 6))
+        columns = np.empty((m, judgement.DEPENDS_ON), dtype=np.int64)
+        jacobian = np.empty((m, 3, judgement.DEPENDS_ON))
         difference, noise = np.empty((m, 3)), np.empty((m, 3, 3))
         passed, nis = np.empty(m, dtype=bool), np.empty(m)
         fields = MeasurementColumns.of(measurements)
@@ -195,5 +197,6 @@ class Fusion:
         track = self._tracks.at(order["target"], order["stamp_ns"])
         pose, covariance = order["value"][0], order["covariance"][0]
         transform = se2.compose(pose, se2.inverse(track.pose[0]))
-        state.enter(robot, transform, se2.error_covariance(pose, covariance), track.noise[0])
+        stamp_ns = int(order["stamp_ns"][0])
+        state.enter(robot, transform, se2.error_covariance(pose, covariance), track.gathered[0], stamp_ns)
         return Verdict.USED

@@ -10,8 +10,13 @@ from swarm_loc_estimator.core.dense_filter import IndexArray, update_one
 from swarm_loc_estimator.core.gate import position_distance, soften_heading, squared_distance
 from swarm_loc_estimator.core.measurements import MeasurementColumns, innovation, predict_one
 from swarm_loc_estimator.core.motion import TrackArrays, look_up
+from swarm_loc_estimator.core.parameters import CAMERA_SCALE, CAMERA_YAW, PARAMETERS
+from swarm_loc_estimator.core.prediction import advance
 from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.state import BeliefArrays, advance
+from swarm_loc_estimator.core.state import BeliefArrays
+
+DEPENDS_ON = 8
+"""Filter columns that a measurement depends on: both poses, observer first, yaw and scale of the camera."""
 
 OPEN, USED, GATED = 0, 1, 2
 """Verdicts that the inner loop gives, see `fusion.Verdict`."""
@@ -45,8 +50,8 @@ def fuse_in_order(
     Returns:
         The first measurement not dealt with, why (FINISHED, UNTIED, LOST), and the robot that was lost.
     """
-    pose, noise, raw = np.empty((2, 3)), np.empty((2, 3, 3)), np.empty(3)
-    columns, jacobian = np.empty(6, dtype=np.int64), np.empty((3, 6))
+    pose, gathered, raw = np.empty((2, 3)), np.empty((2, 3, 3)), np.empty(3)
+    columns, jacobian = np.empty(DEPENDS_ON, dtype=np.int64), np.empty((3, DEPENDS_ON))
     difference, r = np.empty(3), np.empty((3, 3))
     for k in range(begin, measurements.stamp_ns.size):
         sides = (measurements.observer[k], measurements.target[k])
@@ -55,8 +60,8 @@ def fuse_in_order(
                 return k, UNTIED, -1
         for i in range(2):
             if sides[i] >= 0:
-                look_up(tracks, sides[i], measurements.stamp_ns[k], pose[i], raw, noise[i])
-                advance(belief, sides[i], noise[i])
+                look_up(tracks, sides[i], measurements.stamp_ns[k], pose[i], raw, gathered)
+                advance(belief, sides[i], gathered, measurements.stamp_ns[k])
                 to_map(belief, sides[i], pose[i])
                 if is_unsure(belief, sides[i], pose[i], limits[0], limits[1]):
                     return k, LOST, sides[i]
@@ -90,27 +95,38 @@ def advance_all(
         unsure: (N,) written: robots involved that no longer know where they are.
     """
     robots = belief.tracked.size
-    noise, times = np.zeros((robots, 3, 3)), np.zeros(robots)
-    newest, raw, one = np.zeros((robots, 3)), np.empty(3), np.empty((3, 3))
+    gathered, times, stamps = np.zeros((robots, 2, 3, 3)), np.zeros(robots), np.zeros(robots)
+    raw, one = np.empty(3), np.empty((2, 3, 3))
     for k in range(measurements.stamp_ns.size):
         sides = (measurements.observer[k], measurements.target[k])
         for i in range(2):
             robot = sides[i]
             if robot >= 0:
                 look_up(tracks, robot, measurements.stamp_ns[k], pose[k, i], raw, one)
-                to_map(belief, robot, pose[k, i])
-                assign(newest[robot], pose[k, i])
                 times[robot] += 1.0
-                for a in range(3):
-                    for b in range(3):
-                        noise[robot, a, b] += one[a, b]
+                stamps[robot] += measurements.stamp_ns[k] - measurements.stamp_ns[0]
+                add_scaled(gathered[robot], one, 1.0)
     for robot in range(robots):
         if times[robot] > 0.0:
-            for a in range(3):
-                for b in range(3):
-                    one[a, b] = noise[robot, a, b] / times[robot]
-            advance(belief, robot, one)
-            unsure[robot] = is_unsure(belief, robot, newest[robot], limits[0], limits[1])
+            one.fill(0.0)
+            add_scaled(one, gathered[robot], 1.0 / times[robot])
+            advance(belief, robot, one, measurements.stamp_ns[0] + round(stamps[robot] / times[robot]))
+    for k in range(measurements.stamp_ns.size):
+        sides = (measurements.observer[k], measurements.target[k])
+        for i in range(2):
+            robot = sides[i]
+            if robot >= 0:
+                to_map(belief, robot, pose[k, i])
+                unsure[robot] = is_unsure(belief, robot, pose[k, i], limits[0], limits[1])
+
+
+@compiled
+def add_scaled(total: FloatArray, one: FloatArray, factor: float) -> None:
+    """Add `factor` times what a track has gathered (2, 3, 3)."""
+    for k in range(2):
+        for i in range(3):
+            for j in range(3):
+                total[k, i, j] += factor * one[k, i, j]
 
 
 @compiled
@@ -131,8 +147,8 @@ def judge_all(
         measurements: (m,).
         belief: Not changed.
         pose: (m, 2, 3) of observer and target in `map`.
-        columns: (m, 6) written: what each depends on.
-        jacobian: (m, 3, 6) written.
+        columns: (m, DEPENDS_ON) written: what each depends on.
+        jacobian: (m, 3, DEPENDS_ON) written.
         difference: (m, 3) written: the innovations.
         noise: (m, 3, 3) written: covariances of the measurements.
         passed: (m,) written: whether the gate lets it through.
@@ -159,24 +175,28 @@ def judge(
 
     Of a planar marker's two solutions the likelier counts. Arguments as of `judge_all`, for one.
     """
-    predicted, chain = np.empty(3), np.empty((3, 3))
-    predict_one(measurements, k, pose[0], pose[1], predicted, chain)
     observer, target = measurements.observer[k], measurements.target[k]
-    for j in range(3):
-        columns[j] = 3 * max(observer, 0) + j  # nobody's columns do not matter: their Jacobian is zero
-        columns[3 + j] = 3 * max(target, 0) + j
+    predicted, chain = np.empty(3), np.empty((3, 5))
+    camera, camera_columns = np.zeros(2), np.full(2, -1)
+    if observer >= 0:
+        camera[0] = belief.parameter[observer, CAMERA_YAW]
+        camera[1] = belief.parameter[observer, CAMERA_SCALE]
+        camera_columns[0] = belief.table.column[observer, CAMERA_YAW]
+        camera_columns[1] = belief.table.column[observer, CAMERA_SCALE]
+    predict_one(measurements, k, pose[0], pose[1], camera, predicted, chain)
+    for j in range(3):  # columns of nobody do not matter: their Jacobian is zero
+        columns[j], columns[3 + j] = 3 * max(observer, 0) + j, 3 * max(target, 0) + j
         for i in range(3):
             jacobian[i, j] = -chain[i, j] if observer >= 0 else 0.0
             jacobian[i, 3 + j] = chain[i, j] if target >= 0 else 0.0
+    for j in range(2):
+        columns[6 + j] = max(camera_columns[j], 0)
+        for i in range(3):
+            jacobian[i, 6 + j] = chain[i, 3 + j] if camera_columns[j] >= 0 else 0.0
     s = np.empty((3, 3))
     assign_matrix(noise, measurements.covariance[k])
     assign_matrix(s, noise)
-    for a in range(6):
-        for b in range(6):
-            p = belief.covariance[columns[a], columns[b]]
-            for i in range(3):
-                for j in range(3):
-                    s[i, j] += jacobian[i, a] * p * jacobian[j, b]
+    add_uncertainty(belief.covariance, observer, target, camera_columns, chain, s)
     innovation(measurements, k, measurements.value[k], predicted, difference)
     if measurements.has_alternative[k]:
         other = np.empty(3)
@@ -191,6 +211,50 @@ def judge(
             if i < 2:
                 s[2, i] = s[i, 2]
     return passed, squared_distance(difference, s)
+
+
+@compiled
+def add_uncertainty(
+    p: FloatArray, observer: int, target: int, camera: IndexArray, chain: FloatArray, s: FloatArray
+) -> None:
+    """Add H P H^T (3, 3), eq. (13) of the e-puck paper, where H is `chain` (3, 5) by xi_target - xi_observer.
+
+    The difference is taken first: a third of the work. The camera's parameters have columns (2,), or -1.
+    """
+    t, o = 3 * max(target, 0), 3 * max(observer, 0)
+    of_target, of_observer = 1.0 if target >= 0 else 0.0, 1.0 if observer >= 0 else 0.0
+    difference, half = np.empty((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            across = of_target * of_observer * (p[t + i, o + j] + p[o + i, t + j])
+            difference[i, j] = of_target * p[t + i, t + j] + of_observer * p[o + i, o + j] - across
+    _turned(chain, difference, half)
+    for i in range(3):
+        for j in range(3):
+            for a in range(3):
+                s[i, j] += half[i, a] * chain[j, a]
+    for k in range(2):
+        if camera[k] >= 0:
+            for a in range(3):
+                of_side = of_target * p[t + a, camera[k]] - of_observer * p[o + a, camera[k]]
+                difference[a, 0] = of_side
+            for i in range(3):
+                beside = chain[i, 0] * difference[0, 0] + chain[i, 1] * difference[1, 0]
+                beside += chain[i, 2] * difference[2, 0]
+                for other in range(2):  # its own variance, and its covariance with the other parameter
+                    if camera[other] >= 0:
+                        beside += 0.5 * chain[i, 3 + other] * p[camera[other], camera[k]]
+                for j in range(3):
+                    s[i, j] += beside * chain[j, 3 + k]
+                    s[j, i] += beside * chain[j, 3 + k]
+
+
+@compiled
+def _turned(chain: FloatArray, matrix: FloatArray, out: FloatArray) -> None:
+    """Write the product of the first three columns of `chain` and a matrix (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = chain[i, 0] * matrix[0, j] + chain[i, 1] * matrix[1, j] + chain[i, 2] * matrix[2, j]
 
 
 @compiled
@@ -213,11 +277,15 @@ def is_unsure(belief: BeliefArrays, robot: int, pose: FloatArray, position: floa
 
 @compiled
 def correct(belief: BeliefArrays, correction: FloatArray) -> None:
-    """Apply a filter's correction (3N,) to the transforms of the robots located."""
+    """Apply a filter's correction (n,) to transforms and parameters of the robots located."""
     for i in range(belief.tracked.size):
         if belief.tracked[i]:
             t, c = belief.transform[i], correction[3 * i : 3 * i + 3]
             t[0], t[1], t[2] = moved_by_twist(c[0], c[1], c[2], t[0], t[1], t[2])
+            for m in range(PARAMETERS):
+                column = belief.table.column[i, m]
+                if column >= 0:
+                    belief.parameter[i, m] += correction[column]
 
 
 @compiled

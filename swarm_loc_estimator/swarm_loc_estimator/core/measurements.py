@@ -9,7 +9,8 @@ signs: the chain is used, not the print). S is the sensor on the observer, M the
 landmark has no target robot (M is its pose in `map`), an absolute fix has no observer (S is the identity).
 
 With right-invariant errors X = exp(xi) X_hat the chain depends on xi_target - xi_observer only, so one
-Jacobian (3 x 3) serves both robots, with opposite signs.
+Jacobian (3 x 3) serves both robots, with opposite signs. Two more columns are for the sensor's own yaw and
+scale, see CAMERA_YAW and CAMERA_SCALE of core/parameters.py.
 """
 
 from __future__ import annotations
@@ -86,9 +87,12 @@ class MeasurementColumns(NamedTuple):
 
 
 def predict(
-    measurements: MeasurementArray, observer_pose: FloatArray, target_pose: FloatArray
+    measurements: MeasurementArray,
+    observer_pose: FloatArray,
+    target_pose: FloatArray,
+    camera: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Predicted values (m, 3) and their Jacobians (m, 3, 3) by xi_target - xi_observer.
+    """Predicted values (m, 3) and their Jacobians (m, 3, 5) by xi_target - xi_observer, camera yaw and scale.
 
     A heading that was not measured has a zero row.
 
@@ -96,11 +100,14 @@ def predict(
         measurements: (m,) of MEASUREMENT_DTYPE.
         observer_pose: (m, 3) in `map`; rows without an observer are ignored.
         target_pose: (m, 3); rows without a target are ignored.
+        camera: (m, 2) by how much the sensor is turned to the left besides [rad], and stretches distances;
+            zero if not given.
     """
-    value, jacobian = np.zeros((measurements.size, 3)), np.zeros((measurements.size, 3, 3))
+    value, jacobian = np.zeros((measurements.size, 3)), np.zeros((measurements.size, 3, 5))
+    errors = np.zeros((measurements.size, 2)) if camera is None else camera
     columns = MeasurementColumns.of(measurements)
     for k in range(measurements.size):
-        predict_one(columns, k, observer_pose[k], target_pose[k], value[k], jacobian[k])
+        predict_one(columns, k, observer_pose[k], target_pose[k], errors[k], value[k], jacobian[k])
     return value, jacobian
 
 
@@ -110,32 +117,39 @@ def predict_one(
     k: int,
     observer_pose: FloatArray,
     target_pose: FloatArray,
+    camera: FloatArray,
     value: FloatArray,
     jacobian: FloatArray,
 ) -> None:
-    """Write the predicted value (3,) of measurement k and its Jacobian (3, 3), see `predict`."""
+    """Write the predicted value (3,) of measurement k and its Jacobian (3, 5), see `predict`."""
     sensor, marker = measurements.sensor[k], measurements.marker[k]
-    sx, sy, stheta = sensor[0], sensor[1], sensor[2]
+    sx, sy, stheta = sensor[0], sensor[1], sensor[2] + camera[0]
     if measurements.observer[k] >= 0:
         sx, sy, stheta = composed(observer_pose[0], observer_pose[1], observer_pose[2], sx, sy, stheta)
     mx, my, mtheta = marker[0], marker[1], marker[2]
     if measurements.target[k] >= 0:
         mx, my, mtheta = composed(target_pose[0], target_pose[1], target_pose[2], mx, my, mtheta)
     cos, sin = math.cos(stheta), math.sin(stheta)
+    stretch = 1.0 + camera[1]
     x, y = cos * (mx - sx) + sin * (my - sy), -sin * (mx - sx) + cos * (my - sy)
-    value[0], value[1], value[2] = x, y, wrap(mtheta - stheta)
+    value[0], value[1], value[2] = stretch * x, stretch * y, wrap(mtheta - stheta)
     # moving the target by xi moves its marker by rho + phi * (-my, mx)
     jacobian[0, 0], jacobian[0, 1], jacobian[0, 2] = cos, sin, -cos * my + sin * mx
     jacobian[1, 0], jacobian[1, 1], jacobian[1, 2] = -sin, cos, sin * my + cos * mx
     jacobian[2, 0], jacobian[2, 1], jacobian[2, 2] = 0.0, 0.0, float(measurements.has_heading[k])
+    jacobian[0, 3], jacobian[1, 3], jacobian[2, 3] = y, -x, -jacobian[2, 2]
+    for j in range(4):
+        jacobian[0, j] *= stretch
+        jacobian[1, j] *= stretch
+    jacobian[0, 4], jacobian[1, 4], jacobian[2, 4] = x, y, 0.0
     if measurements.kind[k] == 1:  # Kind.POLAR
         distance = max(math.hypot(x, y), 1e-6)
         ux, uy = x / distance, y / distance
-        value[0], value[1] = distance, math.atan2(y, x)
-        for j in range(3):
+        value[0], value[1] = stretch * distance, math.atan2(y, x)
+        for j in range(5):
             forward, left = jacobian[0, j], jacobian[1, j]
             jacobian[0, j] = ux * forward + uy * left
-            jacobian[1, j] = (ux * left - uy * forward) / distance
+            jacobian[1, j] = (ux * left - uy * forward) / (stretch * distance)
 
 
 @compiled

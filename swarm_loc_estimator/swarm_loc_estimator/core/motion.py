@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.compiled import assign, assign_matrix, compiled, wrap
+from swarm_loc_estimator.core.parameters import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import OdometryModel
 
@@ -23,6 +24,9 @@ BEFORE_ALL_NS = np.iinfo(np.int64).min
 MODEL_DTYPE = np.dtype([(f.name, np.float64) for f in fields(OdometryModel)])
 """The numbers of an `OdometryModel` as a record."""
 
+NOISE, DRIFT = 0, 1
+"""What a track gathers along its way: a covariance, and by how much each parameter of the motion moves it."""
+
 
 class TrackArrays(NamedTuple):
     """The rows of all tracks and the models behind them, as compiled code reads them.
@@ -32,22 +36,25 @@ class TrackArrays(NamedTuple):
         stamp_ns: (N, capacity) instants, calibrated for delay.
         raw: (N, capacity, 3) poses as reported, headings unwrapped.
         pose: (N, capacity, 3) calibrated poses O, headings unwrapped.
-        noise: (N, capacity, 3, 3) gathered noise G in the track's frame.
+        gathered: (N, capacity, 2, 3, 3) in the track's frame: NOISE, the covariance G, and DRIFT, by how much
+            the pose moves per unit of each parameter of the motion (its columns, see core/parameters.py).
         rate: (N, capacity, 2) calibrated speed [m/s] and turn rate [rad/s] at the row, behind the lag.
+        delay_ns: (N,) delay of the stamps.
         model: (N,) records of the numbers of `OdometryModel`.
         response: (N, 2, V, W) shares of speed and of turn rate of `MotionResponse`.
         response_speed: (N, V) speeds of its grid, filled up with infinity.
         response_turn_rate: (N, W) turn rates likewise.
         begin_ns: (N,) instant of the very first row.
-        begin_pose: (N, 3) the pose there, where G is zero.
+        begin_pose: (N, 3) the pose there, where nothing is gathered yet.
     """
 
     filled: IntArray
     stamp_ns: IntArray
     raw: FloatArray
     pose: FloatArray
-    noise: FloatArray
+    gathered: FloatArray
     rate: FloatArray
+    delay_ns: IntArray
     model: NDArray[np.void]
     response: FloatArray
     response_speed: FloatArray
@@ -58,9 +65,9 @@ class TrackArrays(NamedTuple):
 
 @compiled
 def look_up(
-    tracks: TrackArrays, robot: int, stamp_ns: int, pose: FloatArray, raw: FloatArray, noise: FloatArray
+    tracks: TrackArrays, robot: int, stamp_ns: int, pose: FloatArray, raw: FloatArray, gathered: FloatArray
 ) -> float:
-    """Write the robot's pose O (3,), raw pose (3,) and noise G (3, 3) at an instant; return its silence [s].
+    """Write pose O (3,), raw pose (3,) and what is gathered (2, 3, 3) at an instant; return the silence [s].
 
     Within a step the motion is an arc of constant twist. Past the newest row the last twist goes on, less and
     less sure; after `timeout_s` the motion since that row counts as unknown. Before the first row the robot
@@ -68,26 +75,28 @@ def look_up(
     """
     count = tracks.filled[robot]
     if count == 0:
-        for i in range(3):
-            pose[i] = raw[i] = noise[i, 0] = noise[i, 1] = noise[i, 2] = 0.0
+        gathered.fill(0.0)
+        pose.fill(0.0)
+        raw.fill(0.0)
         return math.inf
     stamps, timeout_ns = tracks.stamp_ns[robot, :count], tracks.model[robot].timeout_s * 1e9
     row = max(0, np.searchsorted(stamps, stamp_ns, side="right") - 1)
     if row + 1 < count and stamps[row + 1] - stamps[row] <= timeout_ns:
         elapsed = max(0, stamp_ns - stamps[row])
-        _along_step(tracks, robot, row, elapsed / (stamps[row + 1] - stamps[row]), pose, raw, noise)
+        _along_step(tracks, robot, row, elapsed / (stamps[row + 1] - stamps[row]), pose, raw, gathered)
         return 0.0
     silence_ns = max(0, stamp_ns - stamps[row])
     if row > 0 and silence_ns <= timeout_ns and stamps[row] - stamps[row - 1] <= timeout_ns:
         fraction = 1.0 + silence_ns / (stamps[row] - stamps[row - 1])
-        _along_step(tracks, robot, row - 1, fraction, pose, raw, noise)
+        _along_step(tracks, robot, row - 1, fraction, pose, raw, gathered)
     else:
         assign(pose, tracks.pose[robot, row])
         assign(raw, tracks.raw[robot, row])
-        assign_matrix(noise, tracks.noise[robot, row])
+        assign_matrix(gathered[NOISE], tracks.gathered[robot, row, NOISE])
+        assign_matrix(gathered[DRIFT], tracks.gathered[robot, row, DRIFT])
     unknown = silence_ns > timeout_ns
     silence_s: float = silence_ns * 1e-9
-    _add_silence(tracks.model[robot], silence_s, unknown, tracks.pose[robot, row], noise)
+    _add_silence(tracks.model[robot], silence_s, unknown, tracks.pose[robot, row], gathered[NOISE])
     return silence_s
 
 
@@ -99,15 +108,16 @@ def _along_step(
     fraction: float,
     pose: FloatArray,
     raw: FloatArray,
-    noise: FloatArray,
+    gathered: FloatArray,
 ) -> None:
-    """Write pose, raw pose and noise at a fraction of the step from a row to the next, or beyond it."""
+    """Write what `look_up` does at a fraction of the step from a row to the next, or beyond it."""
     _interpolate(tracks.pose[robot, row], tracks.pose[robot, row + 1], fraction, pose)
     _interpolate(tracks.raw[robot, row], tracks.raw[robot, row + 1], fraction, raw)
-    before, after = tracks.noise[robot, row], tracks.noise[robot, row + 1]
-    for i in range(3):
-        for j in range(3):
-            noise[i, j] = before[i, j] + fraction * (after[i, j] - before[i, j])
+    before, after = tracks.gathered[robot, row], tracks.gathered[robot, row + 1]
+    for k in range(2):
+        for i in range(3):
+            for j in range(3):
+                gathered[k, i, j] = before[k, i, j] + fraction * (after[k, i, j] - before[k, i, j])
 
 
 @compiled
@@ -117,12 +127,12 @@ def look_up_all(
     stamps_ns: IntArray,
     pose: FloatArray,
     raw: FloatArray,
-    noise: FloatArray,
+    gathered: FloatArray,
     silence_s: FloatArray,
 ) -> None:
     """Look up m robots at m instants; see `look_up`."""
     for k in range(robots.size):
-        silence_s[k] = look_up(tracks, robots[k], stamps_ns[k], pose[k], raw[k], noise[k])
+        silence_s[k] = look_up(tracks, robots[k], stamps_ns[k], pose[k], raw[k], gathered[k])
 
 
 @compiled
@@ -138,20 +148,40 @@ def _interpolate(start: FloatArray, end: FloatArray, fraction: float, out: Float
 
 
 @compiled
-def are_newer(tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray, changed_from_ns: IntArray) -> bool:
-    """Whether rows continue the tracks in their order; writes (N,) after which instant each track changes."""
-    newest = np.empty(tracks.filled.size, dtype=np.int64)
+def continue_tracks(
+    tracks: TrackArrays,
+    oldest_ns: int,
+    robots: IntArray,
+    stamps_ns: IntArray,
+    raw: FloatArray,
+    changed_from_ns: IntArray,
+) -> int:
+    """Append rows (k,) in their order, if all are newer than what their tracks hold and not too old.
+
+    Stamps are as reported, not calibrated for delay. Writes (N,) after which instant each track changes.
+
+    Returns:
+        How many rows are jumps; -1, and nothing is changed, when some are not new, or there is no room.
+    """
+    newest, filled = np.empty(tracks.filled.size, dtype=np.int64), tracks.filled.copy()
     for robot in range(newest.size):
-        count = tracks.filled[robot]
-        newest[robot] = tracks.stamp_ns[robot, count - 1] if count else BEFORE_ALL_NS
+        newest[robot] = tracks.stamp_ns[robot, filled[robot] - 1] if filled[robot] else BEFORE_ALL_NS
+        changed_from_ns[robot] = UNCHANGED_NS
+    delayed = np.empty(robots.size, dtype=np.int64)
     for k in range(robots.size):
         robot = robots[k]
-        if stamps_ns[k] <= newest[robot]:
-            return False
+        delayed[k] = stamps_ns[k] + tracks.delay_ns[robot]
+        filled[robot] += 1
+        if (
+            stamps_ns[k] < oldest_ns
+            or delayed[k] <= newest[robot]
+            or filled[robot] > tracks.stamp_ns.shape[1]
+        ):
+            return -1
         if changed_from_ns[robot] == UNCHANGED_NS:
             changed_from_ns[robot] = newest[robot]
-        newest[robot] = stamps_ns[k]
-    return True
+        newest[robot] = delayed[k]
+    return integrate(tracks, robots, delayed, raw, np.ones(robots.size, dtype=np.bool_))[1]
 
 
 @compiled
@@ -170,7 +200,7 @@ def integrate(
         assign(tracks.raw[robot, row], raw[k])
         if row == 0:  # a track begins where its driver says
             assign(tracks.pose[robot, 0], raw[k])
-            assign_matrix(tracks.noise[robot, 0], np.zeros((3, 3)))
+            tracks.gathered[robot, 0].fill(0.0)
             assign(tracks.rate[robot, 0], np.zeros(2))
             assign(tracks.begin_pose[robot], raw[k])
             tracks.begin_ns[robot] = stamps_ns[k]
@@ -185,7 +215,7 @@ def integrate(
 
 @compiled
 def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
-    """Fill pose, noise and rate of a row from the row before; return whether no robot can drive so fast."""
+    """Fill a row from the row before and its raw pose; return whether no robot can drive so fast."""
     model = tracks.model[robot]
     before, after = tracks.raw[robot, row - 1], tracks.raw[robot, row]
     duration_s = (tracks.stamp_ns[robot, row] - tracks.stamp_ns[robot, row - 1]) * 1e-9
@@ -194,8 +224,10 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
     dx, dy = after[0] - before[0], after[1] - before[1]
     # half a robot's width of slack: stamps jitter
     jump = math.hypot(dx, dy) > model.max_speed * duration_s + 0.5 * model.wheel_separation
-    start, noise, rate = tracks.pose[robot, row - 1], tracks.noise[robot, row], tracks.rate[robot, row]
-    assign_matrix(noise, tracks.noise[robot, row - 1])
+    start, rate = tracks.pose[robot, row - 1], tracks.rate[robot, row]
+    noise, drift = tracks.gathered[robot, row, NOISE], tracks.gathered[robot, row, DRIFT]
+    assign_matrix(noise, tracks.gathered[robot, row - 1, NOISE])
+    assign_matrix(drift, tracks.gathered[robot, row - 1, DRIFT])
     if jump or duration_s > model.timeout_s:  # where it went is unknown
         assign(tracks.pose[robot, row], start)
         assign(rate, np.zeros(2))
@@ -216,6 +248,7 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
     changed = abs(rate[1] - before_rate[1])
     x, y = start[0] + 0.5 * step_x, start[1] + 0.5 * step_y
     _add_step_noise(model, distance, turn, changed, duration_s, x, y, middle, noise)
+    _add_step_drift(model, distance, turn, duration_s, x, y, middle, drift)
     return False
 
 
@@ -299,6 +332,30 @@ def _add_step_noise(
         heading += model.turn_drift * duration_s
     cross = 0.5 * wheel * (right - left) / separation
     _add_in_track_frame(x, y, theta, along, across, heading, cross, noise)
+
+
+@compiled
+def _add_step_drift(
+    model: OdometryModel,
+    distance: float,
+    turn: float,
+    duration_s: float,
+    x: float,
+    y: float,
+    theta: float,
+    drift: FloatArray,
+) -> None:
+    """Add by how much a step moves the pose per unit of each parameter: Ad(O) times its body direction."""
+    if distance == 0.0 and turn == 0.0:
+        return
+    drift[0, DISTANCE_SCALE] += math.cos(theta + model.course_offset) * distance
+    drift[1, DISTANCE_SCALE] += math.sin(theta + model.course_offset) * distance
+    # the axle turns, base_link ahead of it moves sideways besides
+    turned_x, turned_y = y - math.sin(theta) * model.axle_offset, -x + math.cos(theta) * model.axle_offset
+    for parameter, angle in ((TURN_BIAS, duration_s), (TURN_SCALE, turn)):
+        drift[0, parameter] += turned_x * angle
+        drift[1, parameter] += turned_y * angle
+        drift[2, parameter] += angle
 
 
 @compiled

@@ -22,7 +22,7 @@ from swarm_loc_estimator.core.motion import (
     UNCHANGED_NS,
     IntArray,
     TrackArrays,
-    are_newer,
+    continue_tracks,
     integrate,
     look_up_all,
 )
@@ -31,7 +31,8 @@ from swarm_loc_estimator.core.swarm import MotionResponse, Robot
 
 _IDEAL = MotionResponse(speeds=(0.0,), turn_rates=(0.0,), speed_share=((1.0,),), turn_share=((1.0,),))
 _FIRST_CAPACITY = 256
-_ROWS = ("stamp_ns", "raw", "pose", "noise", "rate")
+_TRIM_EVERY_NS = 1_000_000_000
+_ROWS = ("stamp_ns", "raw", "pose", "gathered", "rate")
 
 
 @dataclass(frozen=True)
@@ -41,13 +42,13 @@ class TrackSample:
     Attributes:
         pose: (m, 3) calibrated odometry pose O, heading not wrapped.
         raw: (m, 3) the pose that the driver reported, interpolated likewise.
-        noise: (m, 3, 3) gathered noise G in the track's frame.
+        gathered: (m, 2, 3, 3) noise G and drift D in the track's frame, see `TrackArrays`.
         silence_s: (m,) how long after the newest message of its robot the instant lies; 0 within the track.
     """
 
     pose: FloatArray
     raw: FloatArray
-    noise: FloatArray
+    gathered: FloatArray
     silence_s: FloatArray
 
 
@@ -87,6 +88,7 @@ class OdometryTracks:
     def clear(self) -> None:
         """Forget every row."""
         self._oldest_ns = BEFORE_ALL_NS
+        self._trimmed_ns = BEFORE_ALL_NS
         self.arrays = self._allocated(_FIRST_CAPACITY)
 
     @property
@@ -107,15 +109,17 @@ class OdometryTracks:
             stamps_ns: (k,) acquisition stamps.
             raw: (k, 3) finite poses as the driver reports them, in its own odom frame.
         """
+        changed_from = np.empty(self._robots, dtype=np.int64)
+        jumps = continue_tracks(self.arrays, self._oldest_ns, robots, stamps_ns, raw, changed_from)
+        if jumps >= 0:
+            return TrackChange(changed_from, 0, 0, jumps)
         stamps = stamps_ns + self._delay_ns[robots]
         fresh = stamps_ns >= self._oldest_ns
         robots, stamps, raw, new = robots[fresh], stamps[fresh], raw[fresh], fresh[fresh]
-        changed_from = np.full(self._robots, UNCHANGED_NS)
-        if not are_newer(self.arrays, robots, stamps, changed_from):
-            robots, stamps, raw, changed_from = self._take_back_later_rows(robots, stamps, raw)
-            order = np.lexsort((wrap_angle(raw[:, 2]), raw[:, 1], raw[:, 0], stamps, robots))
-            new = (np.arange(robots.size) < new.size)[order]  # not those taken back
-            robots, stamps, raw = robots[order], stamps[order], raw[order]
+        robots, stamps, raw, changed_from = self._take_back_later_rows(robots, stamps, raw)
+        order = np.lexsort((wrap_angle(raw[:, 2]), raw[:, 1], raw[:, 0], stamps, robots))
+        new = (np.arange(robots.size) < new.size)[order]  # not those taken back
+        robots, stamps, raw = robots[order], stamps[order], raw[order]
         while np.any(
             self.arrays.filled + np.bincount(robots, minlength=self._robots) > self.arrays.stamp_ns.shape[1]
         ):
@@ -131,13 +135,18 @@ class OdometryTracks:
             stamps_ns: (m,) instants.
         """
         m = robots.size
-        sample = TrackSample(np.zeros((m, 3)), np.zeros((m, 3)), np.zeros((m, 3, 3)), np.zeros(m))
-        look_up_all(self.arrays, robots, stamps_ns, sample.pose, sample.raw, sample.noise, sample.silence_s)
+        sample = TrackSample(np.zeros((m, 3)), np.zeros((m, 3)), np.zeros((m, 2, 3, 3)), np.zeros(m))
+        look_up_all(
+            self.arrays, robots, stamps_ns, sample.pose, sample.raw, sample.gathered, sample.silence_s
+        )
         return sample
 
     def trim(self, oldest_ns: int, kept_ns: int) -> None:
         """Refuse rows stamped before `oldest_ns`; let those go that no look-up from `kept_ns` on needs."""
         self._oldest_ns = oldest_ns
+        if kept_ns < self._trimmed_ns + _TRIM_EVERY_NS:
+            return
+        self._trimmed_ns = kept_ns
         capacity = self.arrays.stamp_ns.shape[1]
         for robot in np.flatnonzero(self.arrays.filled > capacity // 2):
             count = self.arrays.filled[robot]
@@ -154,8 +163,9 @@ class OdometryTracks:
             stamp_ns=np.zeros(shape, dtype=np.int64),
             raw=np.zeros((*shape, 3)),
             pose=np.zeros((*shape, 3)),
-            noise=np.zeros((*shape, 3, 3)),
+            gathered=np.zeros((*shape, 2, 3, 3)),
             rate=np.zeros((*shape, 2)),
+            delay_ns=self._delay_ns,
             model=self._model,
             response=self._response[0],
             response_speed=self._response[1],

@@ -8,10 +8,11 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.compiled import assign_matrix, compiled, composed, wrap
+from swarm_loc_estimator.core.compiled import compiled, composed, wrap
 from swarm_loc_estimator.core.motion import TrackArrays, look_up
+from swarm_loc_estimator.core.prediction import predicted
 from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.state import NEVER_NS, BeliefArrays, SwarmState, new_noise
+from swarm_loc_estimator.core.state import NEVER_NS, BeliefArrays, SwarmState
 
 
 class Status(IntEnum):
@@ -20,6 +21,9 @@ class Status(IntEnum):
     WAITING = 0  # not located
     TRACKED = 1
     STALE = 2  # located, but its odometry is silent
+
+
+_WAITING, _TRACKED, _STALE = int(Status.WAITING), int(Status.TRACKED), int(Status.STALE)
 
 
 @dataclass(frozen=True)
@@ -53,41 +57,42 @@ def read_out(state: SwarmState, tracks: TrackArrays, timeout_s: FloatArray, now_
         now_ns: The instant.
     """
     n = state.tracked.size
-    poses, covariances = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
-    map_to_odom, silence_s = np.full((n, 3), np.nan), np.zeros(n)
-    _read_all(state.arrays(), tracks, now_ns, poses, covariances, map_to_odom, silence_s)
-    located = np.where(silence_s > timeout_s, Status.STALE, Status.TRACKED)
-    status = np.where(state.tracked, located, Status.WAITING).astype(np.uint8)
-    never = state.last_fix_ns == NEVER_NS
-    age_s = np.where(never, -1.0, (now_ns - np.where(never, now_ns, state.last_fix_ns)) * 1e-9)
-    return SwarmEstimate(now_ns, poses, covariances, map_to_odom, status, age_s)
+    poses, covariances, map_to_odom = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3))
+    status, fix_age_s = np.empty(n, dtype=np.uint8), np.empty(n)
+    estimate = SwarmEstimate(now_ns, poses, covariances, map_to_odom, status, fix_age_s)
+    _read_all(state.arrays(), tracks, timeout_s, now_ns, poses, covariances, map_to_odom, status, fix_age_s)
+    return estimate
 
 
 @compiled
 def _read_all(
     belief: BeliefArrays,
     tracks: TrackArrays,
+    timeout_s: FloatArray,
     now_ns: int,
     poses: FloatArray,
     covariances: FloatArray,
     map_to_odom: FloatArray,
-    silence_s: FloatArray,
+    status: NDArray[np.uint8],
+    fix_age_s: FloatArray,
 ) -> None:
-    """Fill the arrays (N, ...) for the robots that are located."""
-    track, raw = np.empty(3), np.empty(3)
-    noise, added, error = np.empty((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
+    """Fill the arrays (N, ...) of an estimate."""
+    track, raw, t = np.empty(3), np.empty(3), np.empty(3)
+    gathered, error = np.empty((2, 3, 3)), np.empty((3, 3))
     for i in range(belief.tracked.size):
+        fixed_ns = belief.last_fix_ns[i]
+        fix_age_s[i] = -1.0 if fixed_ns == NEVER_NS else (now_ns - fixed_ns) * 1e-9
         if not belief.tracked[i]:
+            status[i] = _WAITING
+            poses[i].fill(np.nan)
+            covariances[i].fill(np.nan)
+            map_to_odom[i].fill(np.nan)
             continue
-        silence_s[i] = look_up(tracks, i, now_ns, track, raw, noise)
-        t = belief.transform[i]
+        silence_s = look_up(tracks, i, now_ns, track, raw, gathered)
+        status[i] = _STALE if silence_s > timeout_s[i] else _TRACKED
+        predicted(belief, i, gathered, now_ns, t, error)
         x, y, theta = composed(t[0], t[1], t[2], track[0], track[1], track[2])
         poses[i, 0], poses[i, 1], poses[i, 2] = x, y, wrap(theta)
-        assign_matrix(error, belief.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3])
-        if new_noise(belief, i, noise, added):
-            for a in range(3):
-                for b in range(3):
-                    error[a, b] += added[a, b]
         _pose_covariance(x, y, error, covariances[i])
         cos, sin = np.cos(theta - raw[2]), np.sin(theta - raw[2])
         map_to_odom[i, 0] = x - cos * raw[0] + sin * raw[1]

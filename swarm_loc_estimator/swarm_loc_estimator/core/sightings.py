@@ -50,10 +50,12 @@ class Conversion:
 
     Attributes:
         measurements: (m,) of MEASUREMENT_DTYPE.
+        measured: (d,) which detections they come from.
         dropped: Reason -> count, for `unknown_id`, `own_marker`, `no_camera`, `non_finite` and `absurd`.
     """
 
     measurements: MeasurementArray
+    measured: NDArray[np.bool_]
     dropped: dict[str, int]
 
 
@@ -138,7 +140,8 @@ class SightingConverter:
         )
         counts = np.bincount(fates, minlength=len(_FATES)).tolist()
         dropped = {_FATES[fate]: counts[fate] for fate in range(1, len(_FATES)) if counts[fate]}
-        return Conversion(measurements[fates == _MEASURED], dropped)
+        measured: NDArray[np.bool_] = fates == _MEASURED
+        return Conversion(measurements[measured], measured, dropped)
 
 
 @compiled

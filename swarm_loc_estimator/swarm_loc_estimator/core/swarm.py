@@ -78,7 +78,8 @@ class OdometryModel:
     The reported speed v and turn rate w of a step become distance_scale * v and turn_scale * w, further
     scaled by the robot's `MotionResponse` if it has one. They take effect `delay_s` after their stamp,
     through a first-order lag `lag_s`. base_link moves along `course_offset` and lies `axle_offset` ahead of
-    the wheels' axle.
+    the wheels' axle. Errors that last - a bias of the turn rate, scales that are not quite known - are
+    estimated along with the pose where their sigma is not zero.
     """
 
     wheel_separation: float = number(0.053, "m", 0.001, 10.0, "distance between the two wheels")
@@ -102,7 +103,19 @@ class OdometryModel:
     lateral_drift: float = number(0.0, "m^2/s", 0.0, 1.0, "variance across the path per second while moving")
     turn_drift: float = number(0.0, "rad^2/s", 0.0, 10.0, "variance of the turn per second while moving")
     distance_scale: float = number(1.0, "1", 0.1, 10.0, "true path per reported path")
+    distance_scale_sigma: float = number(
+        0.0, "1", 0.0, 1.0, "how unsure distance_scale is, relative; 0: exact, else it is estimated"
+    )
     turn_scale: float = number(1.0, "1", 0.1, 10.0, "true turn per reported turn")
+    turn_scale_sigma: float = number(
+        0.0, "1", 0.0, 1.0, "how unsure turn_scale is, relative; 0: exact, else it is estimated"
+    )
+    turn_bias_sigma: float = number(
+        0.0, "rad/s", 0.0, 10.0, "size of a turn rate besides while moving, estimated; 0: there is none"
+    )
+    turn_bias_time_s: float = number(
+        60.0, "s", 0.1, 1e6, "time constant with which that turn rate changes (Gauss-Markov)"
+    )
     course_offset: float = number(
         0.0, "rad", -math.pi, math.pi, "direction of motion against base_link's x axis"
     )
@@ -184,6 +197,9 @@ class SensorModel:
     bearing_sigma: float = number(
         0.05, "rad", 0.0, 10.0, "noise of the bearing, sightings without heading", above=True
     )
+    distance_scale_sigma: float = number(
+        0.0, "1", 0.0, 1.0, "how unsure the scale of all distances is; 0: exact, else it is estimated"
+    )
     range_log_scale: float = number(0.0, "1", -2.0, 2.0, "a of the range curve")
     range_skew: float = number(0.0, "1/rad", -10.0, 10.0, "c of the range curve")
     range_curve: float = number(
@@ -213,6 +229,9 @@ class CameraMount:
     y: float = number(0.0, "m", -10.0, 10.0, "left of base_link")
     z: float = number(0.0, "m", -10.0, 10.0, "above base_link")
     yaw: float = number(0.0, "rad", -TURN, TURN, "turned to the left")
+    yaw_sigma: float = number(
+        0.0, "rad", 0.0, 1.0, "how unsure yaw is; 0: exact, else it is estimated along with the pose"
+    )
     pitch: float = number(0.0, "rad", -TURN, TURN, "turned down")
     roll: float = number(0.0, "rad", -TURN, TURN, "turned about the optical axis")
 

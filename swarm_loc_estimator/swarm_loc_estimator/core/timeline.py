@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_estimator.core.compiled import compiled
 from swarm_loc_estimator.core.fusion import Verdict
-from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE, MeasurementArray
-from swarm_loc_estimator.core.motion import UNCHANGED_NS
+from swarm_loc_estimator.core.measurement_buffer import MeasurementBuffer
+from swarm_loc_estimator.core.measurements import MeasurementArray
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.state import SwarmState
@@ -24,6 +24,7 @@ from swarm_loc_estimator.core.state import SwarmState
 Step = Callable[[SwarmState, MeasurementArray, NDArray[np.uint8], FloatArray], None]
 
 _CHECKPOINTS = 40
+_FORGOTTEN_AT_ONCE = 4
 _BEFORE_ALL = np.iinfo(np.int64).min
 
 
@@ -62,12 +63,25 @@ class Timeline:
         self._checkpoints = [_Checkpoint(_BEFORE_ALL, state.copy())]
         self._new: list[MeasurementArray] = []
         self._redo_from_ns: int | None = None
-        self.measurements: MeasurementArray = np.zeros(0, dtype=MEASUREMENT_DTYPE)
-        self.verdicts: NDArray[np.uint8] = np.zeros(0, dtype=np.uint8)
-        self.nis: FloatArray = np.zeros(0)
+        self._buffer = MeasurementBuffer()
         self.settled: NDArray[np.int64] = np.zeros(len(Verdict), dtype=np.int64)
         self.duplicates = 0
         self.too_old = 0
+
+    @property
+    def measurements(self) -> MeasurementArray:
+        """Those within the horizon (m,), in order."""
+        return self._buffer.measurements
+
+    @property
+    def verdicts(self) -> NDArray[np.uint8]:
+        """(m,) what became of them, of `Verdict`."""
+        return self._buffer.verdicts
+
+    @property
+    def nis(self) -> FloatArray:
+        """(m,) their normalised innovations squared."""
+        return self._buffer.nis
 
     def add(self, measurements: MeasurementArray) -> None:
         """Take measurements (m,) in; they count from the next `advance` on."""
@@ -85,14 +99,10 @@ class Timeline:
         Args:
             changed_from_ns: (N,) per robot the instant after which its track changed.
         """
-        after = np.append(changed_from_ns, UNCHANGED_NS)  # NOBODY (-1) finds the last
-        stamps = self.measurements["stamp_ns"]
-        touched = stamps > np.minimum(
-            after[self.measurements["observer"]], after[self.measurements["target"]]
-        )
-        if touched.any():
-            first_ns = int(stamps[np.argmax(touched)])
-            self._redo_from_ns = first_ns if self._redo_from_ns is None else min(first_ns, self._redo_from_ns)
+        rows = self._buffer.measurements
+        first = _first_touched(self._buffer.stamp_ns, rows["observer"], rows["target"], changed_from_ns)
+        if first < len(self._buffer):
+            self._redo_from(int(self._buffer.stamp_ns[first]))
 
     def verdict_counts(self) -> NDArray[np.int64]:
         """How many measurements got each verdict since the start (len(Verdict),)."""
@@ -100,95 +110,86 @@ class Timeline:
 
     def advance(self, now_ns: int) -> None:
         """Compute all steps that new or changed data touch, and let go of what lies beyond the horizon."""
-        first_new = self._merge(now_ns - self._horizon_ns)
-        changed = [] if self._redo_from_ns is None else [self._key(self._redo_from_ns)]
-        self._redo_from_ns = None
-        self._compute_from(min([*changed, *first_new], default=None))
+        if self._new:
+            self._merge(now_ns - self._horizon_ns)
+        if self._redo_from_ns is not None:
+            self._compute_from(self._key(self._redo_from_ns))
+            self._redo_from_ns = None
         self._forget_before(self._key(now_ns - self._kept_ns))
 
     def _key(self, stamp_ns: int) -> int:
         """The step that a stamp belongs to, as the stamp at which the step begins."""
         return stamp_ns - stamp_ns % self._fusion_period_ns if self._fusion_period_ns else stamp_ns
 
-    def _keys(self, measurements: MeasurementArray) -> NDArray[np.int64]:
-        stamps: NDArray[np.int64] = measurements["stamp_ns"]
-        return stamps - stamps % self._fusion_period_ns if self._fusion_period_ns else stamps
+    def _count_until(self, key: int) -> int:
+        """How many measurements belong to steps up to `key`."""
+        if key == _BEFORE_ALL:
+            return 0
+        return int(self._buffer.stamp_ns.searchsorted(key + max(self._fusion_period_ns, 1)))
 
-    def _merge(self, oldest_ns: int) -> list[int]:
-        """Sort new measurements in; return the key of the first one, if any."""
-        if not self._new:
-            return []
-        new = np.concatenate(self._new)
+    def _redo_from(self, stamp_ns: int) -> None:
+        """Have the steps from that of a stamp on computed at the next `advance`."""
+        self._redo_from_ns = stamp_ns if self._redo_from_ns is None else min(stamp_ns, self._redo_from_ns)
+
+    def _merge(self, oldest_ns: int) -> None:
+        """Sort new measurements in."""
+        new = self._new[0] if len(self._new) == 1 else np.concatenate(self._new)
         self._new = []
         if self._state_period_ns:
-            period = self._state_period_ns
+            new, period = new.copy(), self._state_period_ns
             new["stamp_ns"] = (new["stamp_ns"] + period // 2) // period * period
-        in_time = new["stamp_ns"] >= oldest_ns
-        self.too_old += int(np.sum(~in_time))
-        new = new[in_time]
-        if not new.size:
-            return []
-        first_ns = int(new["stamp_ns"].min())
-        keep = int(np.searchsorted(self.measurements["stamp_ns"], first_ns))
-        tail = np.concatenate([self.measurements[keep:], new])
-        tail, duplicates = _in_order(tail)
-        self.duplicates += duplicates
-        self.measurements = np.concatenate([self.measurements[:keep], tail])
-        self.verdicts = np.concatenate([self.verdicts[:keep], np.zeros(tail.size, dtype=np.uint8)])
-        self.nis = np.concatenate([self.nis[:keep], np.full(tail.size, np.nan)])
-        return [self._key(first_ns)]
+        merged = self._buffer.merge(new, oldest_ns)
+        self.too_old += merged.too_old
+        self.duplicates += merged.duplicates
+        if merged.first_ns is not None:
+            self._redo_from(merged.first_ns)
 
-    def _compute_from(self, key: int | None) -> None:
+    def _compute_from(self, key: int) -> None:
         """Go back to before step `key`, if it is not ahead, and do all steps that are due."""
-        if key is None:
-            return
         if key <= self._head_key:
             while self._checkpoints[-1].key >= key:
                 self._checkpoints.pop()
             self._head_key = self._checkpoints[-1].key
             self.state = self._checkpoints[-1].state.copy()
-        keys = self._keys(self.measurements)
-        begin = int(np.searchsorted(keys, self._head_key, side="right"))
-        due = keys[begin:]
-        group = due // self._spacing_ns if not self._fusion_period_ns else due
-        starts = np.flatnonzero(np.diff(group, prepend=group[:1] - 1))
-        for low, high in zip(begin + starts, begin + np.append(starts[1:], due.size), strict=True):
-            rows = slice(int(low), int(high))
-            self._step(self.state, self.measurements[rows], self.verdicts[rows], self.nis[rows])
-            self._head_key = int(keys[high - 1])
+        buffer, begin = self._buffer, self._count_until(self._head_key)
+        while begin < len(buffer):
+            end = self._end_of_steps(begin)
+            rows = slice(begin, end)
+            self._step(self.state, buffer.measurements[rows], buffer.verdicts[rows], buffer.nis[rows])
+            self._head_key = self._key(int(buffer.stamp_ns[end - 1]))
             if self._head_key - max(self._checkpoints[-1].key, -(2**62)) >= self._spacing_ns:
                 self._checkpoints.append(_Checkpoint(self._head_key, self.state.copy()))
+            begin = end
+
+    def _end_of_steps(self, begin: int) -> int:
+        """Where those steps end that are computed together with the one at `begin`, up to a checkpoint."""
+        stamps_ns, length_ns = self._buffer.stamp_ns, self._fusion_period_ns or self._spacing_ns
+        next_ns = (int(stamps_ns[begin]) // length_ns + 1) * length_ns
+        return stamps_ns.size if stamps_ns[-1] < next_ns else int(stamps_ns.searchsorted(next_ns))
 
     def _forget_before(self, key: int) -> None:
         """Keep one checkpoint before step `key` and only the measurements after it."""
-        older = sum(checkpoint.key < key for checkpoint in self._checkpoints)
-        if older < 2:
+        older = 0
+        while older < len(self._checkpoints) and self._checkpoints[older].key < key:
+            older += 1
+        if older < _FORGOTTEN_AT_ONCE:
             return
         del self._checkpoints[: older - 1]
-        passed = int(np.searchsorted(self._keys(self.measurements), self._checkpoints[0].key, side="right"))
+        passed = self._count_until(self._checkpoints[0].key)
         self.settled += np.bincount(self.verdicts[:passed], minlength=len(Verdict))
-        self.measurements, self.verdicts = self.measurements[passed:], self.verdicts[passed:]
-        self.nis = self.nis[passed:]
+        self._buffer.drop_first(passed)
 
 
-def _in_order(measurements: MeasurementArray) -> tuple[MeasurementArray, int]:
-    """Measurements in the order of their stamps, each once, and how many were repetitions.
-
-    The order does not depend on that of arrival, not even among measurements that share a stamp.
-    """
-    keys = [measurements[name] for name in ("kind", "marker_id", "target", "observer", "stamp_ns")]
-    order = np.lexsort(keys)
-    if not _equal_to_the_one_before([key[order] for key in keys]).any():
-        return measurements[order], 0
-    numbers = [*measurements["value"].T, *measurements["alternative"].T]
-    numbers += [measurements["covariance"][:, i, i] for i in range(3)]
-    order = np.lexsort([*numbers, *keys])
-    again = _equal_to_the_one_before([key[order] for key in [*numbers, *keys]])
-    return measurements[order][~again], int(again.sum())
-
-
-def _equal_to_the_one_before(columns: list[NDArray[Any]]) -> NDArray[np.bool_]:
-    """Whether each row of the columns, each (m,), equals the row before it."""
-    equal = np.zeros(columns[0].size, dtype=bool)
-    equal[1:] = np.logical_and.reduce([column[1:] == column[:-1] for column in columns])
-    return equal
+@compiled
+def _first_touched(
+    stamps_ns: NDArray[np.int64],
+    observers: NDArray[np.int64],
+    targets: NDArray[np.int64],
+    changed_from_ns: NDArray[np.int64],
+) -> int:
+    """The first measurement (of m, by stamp) of a robot whose track (of N) changed before it; m when none."""
+    for k in range(np.searchsorted(stamps_ns, changed_from_ns.min(), side="right"), stamps_ns.size):
+        for robot in (observers[k], targets[k]):
+            if robot >= 0 and stamps_ns[k] > changed_from_ns[robot]:
+                return k
+    return stamps_ns.size

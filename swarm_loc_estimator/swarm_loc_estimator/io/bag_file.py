@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Iterator, Mapping
+
+    from swarm_loc_estimator.io.message_batch import MessageBatch
 
 RawMessage = tuple[str, str, int, bytes]
 """Topic, type, log time [ns], serialized message."""
@@ -20,6 +22,20 @@ class BagTopic(NamedTuple):
 
     name: str
     type: str
+
+
+class Losses(list[str]):
+    """What could not be read of a file, one sentence each, said once however often the file is read."""
+
+    def __init__(self, file: str) -> None:
+        super().__init__()
+        self._file = file
+
+    def say(self, sentence: str) -> None:
+        """Add a sentence about the file."""
+        sentence = f"{self._file}: {sentence}"
+        if sentence not in self:
+            self.append(sentence)
 
 
 class BagFile(Protocol):
@@ -38,15 +54,15 @@ class BagFile(Protocol):
         """First and last log time; (0, 0) without messages."""
 
     @property
-    def losses(self) -> list[str]:
-        """One sentence for each thing that could not be read; more may come while reading."""
+    def losses(self) -> Losses:
+        """What could not be read; more may come while reading."""
 
     @property
     def progress(self) -> float:
         """Share of the file that was read, 0 to 1."""
 
-    def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """All messages in order of log time; with `topics`, only of these."""
+    def batches(self, number_of: Mapping[BagTopic, int]) -> Iterator[MessageBatch]:
+        """The messages of some topics in order of log time, numbered as told."""
 
     def close(self) -> None:
         """Close the file."""

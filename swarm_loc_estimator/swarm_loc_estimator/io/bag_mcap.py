@@ -12,35 +12,39 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from bisect import bisect_left
 from dataclasses import dataclass
 from io import BytesIO
-from operator import itemgetter
-from typing import TYPE_CHECKING
+from itertools import zip_longest
+from typing import TYPE_CHECKING, Literal
 
 import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
+import numpy.typing as npt
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
 
-from swarm_loc_estimator.io.bag_file import BagError, BagTopic, RawMessage
+from swarm_loc_estimator.core.compiled import compiled
+from swarm_loc_estimator.io.bag_file import BagError, BagTopic, Losses
+from swarm_loc_estimator.io.message_batch import MessageBatch, merged
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")  # first and last time, size, checksum, length of the compression's name
 _LENGTH = struct.Struct("<Q")
-_MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
-_MESSAGE_HEAD = 22
+_RECORD_HEAD = 9  # opcode, length
+_MESSAGE_HEAD = 22  # channel, sequence, log time, publish time
+_IS_MESSAGE = int(Opcode.MESSAGE)
+_UNWANTED, _UNKNOWN = -1, -2
 _OPCODES = frozenset(int(opcode) for opcode in Opcode)
 _RUN_BYTES = 1 << 20
 _MAX_RECORD = 1 << 31
-_LOG_TIME = itemgetter(2)
 
 
 @dataclass
@@ -76,7 +80,7 @@ class McapFile:
         self._bytes_read = 0
         self._counted = 0
         self._unknown_channels = 0
-        self.losses: list[str] = []
+        self.losses = Losses(path.name)
         try:
             self._file = os.open(path, os.O_RDONLY)
         except OSError as error:
@@ -117,23 +121,17 @@ class McapFile:
             os.close(self._file)
         self._file = -1
 
-    def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """All messages in order of log time."""
+    def batches(self, number_of: Mapping[BagTopic, int]) -> Iterator[MessageBatch]:
+        """The messages of some topics in order of log time, numbered as told."""
         self._bytes_read = 0
         self._unknown_channels = 0
         chunks = sorted(self._chunks, key=lambda chunk: (chunk.first_ns, chunk.offset))
-        waiting: dict[int, list[RawMessage]] = {}
-        for index, chunk in enumerate(chunks):
-            waiting[chunk.offset] = sorted(self._load(chunk, topics), key=_LOG_TIME)
-            yield from _take_before(chunks[index + 1].first_ns if index + 1 < len(chunks) else None, waiting)
+        waiting: dict[int, MessageBatch] = {}
+        for chunk, following in zip_longest(chunks, chunks[1:]):
+            waiting[chunk.offset] = self._load(chunk, number_of).in_order_of_time()
+            yield _take_before(following, waiting)
         if self._unknown_channels:
-            self._say(f"{self._unknown_channels} messages of no known topic were skipped.")
-
-    def _say(self, sentence: str) -> None:
-        """Report a loss, once however often the file is read."""
-        sentence = f"{self._path.name}: {sentence}"
-        if sentence not in self.losses:
-            self.losses.append(sentence)
+            self.losses.say(f"{self._unknown_channels} messages of no known topic were skipped.")
 
     # Opening
 
@@ -146,7 +144,7 @@ class McapFile:
         if not self._whole or not self._statistics or len(self._channels) < self._statistics.channel_count:
             self._count()
         if not self._whole:
-            self._say(
+            self.losses.say(
                 f"it was cut off at byte {end} of {size}: the {self._counted} messages before that"
                 " were kept, what was written behind them is lost."
             )
@@ -224,77 +222,111 @@ class McapFile:
             else:
                 self._statistics = Statistics.read(stream)
         except (McapError, struct.error, UnicodeDecodeError, ValueError):
-            self._say("a damaged record that names a topic was skipped.")
+            self.losses.say("a damaged record that names a topic was skipped.")
 
     def _count(self) -> None:
         """Count by reading: without the end, only the chunks themselves know their topics and messages."""
         self._statistics = None
         for chunk in self._chunks:
             messages = self._load(chunk, None)
-            self._counted += len(messages)
-            if messages:
-                times = [message[2] for message in messages]
-                chunk.first_ns, chunk.last_ns = min(times), max(times)
+            self._counted += messages.size
+            if messages.size:
+                chunk.first_ns, chunk.last_ns = int(messages.log_ns.min()), int(messages.log_ns.max())
 
     # Reading
 
-    def _load(self, chunk: _Chunk, topics: Collection[str] | None) -> list[RawMessage]:
-        """The messages of a chunk in their stored order."""
+    def _load(self, chunk: _Chunk, number_of: Mapping[BagTopic, int] | None) -> MessageBatch:
+        """The messages of a chunk in their stored order; of all topics, unnumbered, when none are named."""
         self._bytes_read += chunk.stored
         stored = os.pread(self._file, chunk.stored, chunk.offset)
         try:
             data = _unpack(stored, chunk.compression)
         except (zstandard.ZstdError, RuntimeError, ValueError) as error:
-            self._say(f"the chunk at byte {chunk.offset} is damaged ({error}).")
-            return []
+            self.losses.say(f"the chunk at byte {chunk.offset} is damaged ({error}).")
+            return MessageBatch.of([])
         if chunk.whole and chunk.size and len(data) != chunk.size:
-            self._say(f"the chunk at byte {chunk.offset} holds {len(data)} of {chunk.size} bytes.")
+            self.losses.say(f"the chunk at byte {chunk.offset} holds {len(data)} of {chunk.size} bytes.")
         elif chunk.whole and chunk.checksum and zlib.crc32(data) != chunk.checksum:
-            self._say(f"the chunk at byte {chunk.offset} is damaged, its checksum is wrong.")
-            return []
-        messages, end = self._walk_chunk(data, topics)
+            self.losses.say(f"the chunk at byte {chunk.offset} is damaged, its checksum is wrong.")
+            return MessageBatch.of([])
+        messages, end = self._walk_chunk(data, number_of)
         if chunk.whole and end != len(data):
-            self._say(f"the chunk at byte {chunk.offset} is damaged behind its byte {end}.")
+            self.losses.say(f"the chunk at byte {chunk.offset} is damaged behind its byte {end}.")
         return messages
 
-    def _walk_chunk(self, data: bytes, topics: Collection[str] | None) -> tuple[list[RawMessage], int]:
+    def _walk_chunk(self, data: bytes, number_of: Mapping[BagTopic, int] | None) -> tuple[MessageBatch, int]:
         """The messages of unpacked records, and the offset behind the last whole one."""
-        messages: list[RawMessage] = []
-        wanted = self._wanted(topics)
-        append, head, unpack, size = messages.append, _MESSAGE.size, _MESSAGE.unpack_from, len(data)
-        is_message, record, least, offset = int(Opcode.MESSAGE), _RECORD.size, _MESSAGE_HEAD, 0
-        while offset + record <= size:
-            if data[offset] == is_message and offset + head <= size:
-                _, length, channel, _, log_ns, _ = unpack(data, offset)
-                end = offset + record + length
-                if end > size or length < least:
-                    return messages, offset
-                topic = wanted.get(channel)
-                if topic:
-                    append((topic[0], topic[1], log_ns, data[offset + head : end]))
-                elif topic is None:
-                    self._unknown_channels += 1
-            else:
-                opcode, length = _RECORD.unpack_from(data, offset)
-                end = offset + record + length
-                if end > size or opcode not in _OPCODES:
-                    return messages, offset
-                self._define_inside(opcode, data[offset + record : end])
-                wanted = self._wanted(topics)
+        content = np.frombuffer(data, dtype=np.uint8)
+        columns = np.empty((4, len(data) // (_RECORD_HEAD + _MESSAGE_HEAD) + 1), dtype=np.int64)
+        numbers, count, offset = self._numbers(number_of), 0, 0
+        while offset + _RECORD_HEAD <= len(data):
+            count, unknown, offset = _walk(content, offset, numbers, columns, count)
+            self._unknown_channels += unknown
+            if offset + _RECORD_HEAD > len(data):
+                break
+            opcode, length = _RECORD.unpack_from(data, offset)  # no whole message
+            end = offset + _RECORD_HEAD + length
+            if opcode == _IS_MESSAGE or end > len(data) or opcode not in _OPCODES:
+                break
+            if opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
+                self._define(opcode, data[offset + _RECORD_HEAD : end])
+                numbers = self._numbers(number_of)
             offset = end
-        return messages, offset
+        return MessageBatch(content, *columns[:, :count].copy()), offset
 
-    def _define_inside(self, opcode: int, content: bytes) -> None:
-        """A record of a chunk that is no message."""
-        if opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
-            self._define(opcode, content)
+    def _numbers(self, number_of: Mapping[BagTopic, int] | None) -> npt.NDArray[np.int64]:
+        """Channel -> number of its topic."""
+        numbers = np.full(1 << 16, _UNKNOWN)
+        for channel, topic in self._channels.items():
+            numbers[channel] = 0 if number_of is None else number_of.get(topic, _UNWANTED)
+        return numbers
 
-    def _wanted(self, topics: Collection[str] | None) -> dict[int, BagTopic | tuple[()]]:
-        """Channel -> topic; empty for those that are not asked for."""
-        return {
-            channel: topic if topics is None or topic.name in topics else ()
-            for channel, topic in self._channels.items()
-        }
+
+@compiled
+def _walk(
+    data: npt.NDArray[np.uint8],
+    offset: int,
+    numbers: npt.NDArray[np.int64],
+    columns: npt.NDArray[np.int64],
+    count: int,
+) -> tuple[int, int, int]:
+    """Note the messages from an offset on up to a record that is none, or is not whole.
+
+    Args:
+        data: Records.
+        offset: Where to begin.
+        numbers: Channel -> number of its topic, or _UNWANTED, or _UNKNOWN.
+        columns: (4, n) written: topic, log time, offset and length of each message.
+        count: How many stand there already.
+
+    Returns:
+        How many stand there now, how many messages were of unknown topics, and the offset reached.
+    """
+    unknown = 0
+    while offset + _RECORD_HEAD + _MESSAGE_HEAD <= data.size and data[offset] == _IS_MESSAGE:
+        length = _number(data, offset + 1, 8)
+        if length < _MESSAGE_HEAD or length > data.size - offset - _RECORD_HEAD:
+            break
+        topic = numbers[_number(data, offset + _RECORD_HEAD, 2)]
+        if topic >= 0:
+            columns[0, count] = topic
+            columns[1, count] = _number(data, offset + _RECORD_HEAD + 6, 8)
+            columns[2, count] = offset + _RECORD_HEAD + _MESSAGE_HEAD
+            columns[3, count] = length - _MESSAGE_HEAD
+            count += 1
+        elif topic == _UNKNOWN:
+            unknown += 1
+        offset += _RECORD_HEAD + length
+    return count, unknown, offset
+
+
+@compiled
+def _number(data: npt.NDArray[np.uint8], offset: int, size: int) -> int:
+    """A little-endian number; one beyond 63 bits is negative."""
+    number: int = np.int64(0)
+    for k in range(size):
+        number |= np.int64(data[offset + k]) << np.int64(8 * k)
+    return number
 
 
 def _unpack(stored: bytes, compression: str) -> bytes:
@@ -308,15 +340,16 @@ def _unpack(stored: bytes, compression: str) -> bytes:
     raise ValueError(f"its compression {compression!r} is not known")
 
 
-def _take_before(log_ns: int | None, waiting: dict[int, list[RawMessage]]) -> list[RawMessage]:
-    """Take the messages before a time out of the sorted ones of each chunk; equal times in recorded order."""
-    ready: list[RawMessage] = []
+def _take_before(following: _Chunk | None, waiting: dict[int, MessageBatch]) -> MessageBatch:
+    """Take what comes before the following chunk out of the loaded ones; equal times in recorded order."""
+    ready = []
     for offset in sorted(waiting):
-        messages = waiting[offset]
-        count = len(messages) if log_ns is None else bisect_left(messages, log_ns, key=_LOG_TIME)
-        ready += messages[:count]
-        del messages[:count]
-        if not messages:
-            del waiting[offset]
-    ready.sort(key=_LOG_TIME)
-    return ready
+        batch = waiting.pop(offset)
+        count = batch.size
+        if following is not None:
+            side: Literal["left", "right"] = "right" if offset < following.offset else "left"
+            count = int(np.searchsorted(batch.log_ns, following.first_ns, side=side))
+        ready.append(batch.chosen(slice(count)))
+        if count < batch.size:
+            waiting[offset] = batch.chosen(slice(count, None))
+    return merged(ready)

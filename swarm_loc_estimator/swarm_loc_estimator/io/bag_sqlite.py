@@ -13,14 +13,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
-from swarm_loc_estimator.io.bag_file import BagError, BagTopic, RawMessage
+from swarm_loc_estimator.io.bag_file import BagError, BagTopic, Losses
+from swarm_loc_estimator.io.message_batch import MessageBatch
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Iterator, Mapping
 
 _BATCH = 500
+_UNWANTED = -1
 _LARGEST_ID = 2**63 - 1
 _TIMED = "WHERE typeof(timestamp) = 'integer'"
+_MESSAGES = f"SELECT topic_id, timestamp, data FROM messages {_TIMED} ORDER BY timestamp, id"  # noqa: S608
 _TABLES = """
 CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT);
 CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);
@@ -39,7 +42,7 @@ class SqliteFile:
         self._path = path
         self._rescue: tempfile.TemporaryDirectory[str] | None = None
         self._done = 0
-        self.losses: list[str] = []
+        self.losses = Losses(path.name)
         self.message_count = 0
         self.time_range_ns = (0, 0)
         self._topics: dict[int, BagTopic] = {}
@@ -69,35 +72,30 @@ class SqliteFile:
         if self._rescue:
             self._rescue.cleanup()
 
-    def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """All messages in order of log time, equal ones in order of recording."""
+    def batches(self, number_of: Mapping[BagTopic, int]) -> Iterator[MessageBatch]:
+        """The messages of some topics in order of log time, equal ones in order of recording."""
         self._done = skipped = 0
-        known = self._topics
-        query = f"SELECT topic_id, timestamp, data FROM messages {_TIMED} ORDER BY timestamp, id"  # noqa: S608
-        cursor = self._connection.execute(query)
+        numbers = {topic_id: number_of.get(topic, _UNWANTED) for topic_id, topic in self._topics.items()}
+        cursor = self._connection.execute(_MESSAGES)
         while rows := cursor.fetchmany(_BATCH):
             self._done += len(rows)
-            for topic_id, log_ns, data in rows:
-                topic = known.get(topic_id)
-                if topic is None or type(data) is not bytes:
-                    skipped += 1
-                elif topics is None or topic.name in topics:
-                    yield topic.name, topic.type, log_ns, data
+            sound = [
+                (numbers[topic_id], data, log_ns)
+                for topic_id, log_ns, data in rows
+                if topic_id in numbers and type(data) is bytes
+            ]
+            skipped += len(rows) - len(sound)
+            yield MessageBatch.of([row for row in sound if row[0] != _UNWANTED])
         if skipped:
-            self._say(f"{skipped} messages without a known topic or data were skipped.")
-
-    def _say(self, sentence: str) -> None:
-        """Report a loss, once however often the file is read."""
-        sentence = f"{self._path.name}: {sentence}"
-        if sentence not in self.losses:
-            self.losses.append(sentence)
+            self.losses.say(f"{skipped} messages without a known topic or data were skipped.")
 
     def _open(self) -> None:
-        """Read topics, count and times; raises when a page of the database is damaged."""
+        """Read topics, count and times; raises when a page is damaged, or a column's name."""
         rows = self._connection.execute("SELECT id, name, type FROM topics ORDER BY id").fetchall()
         if self._connection.execute("PRAGMA integrity_check(1)").fetchone() != ("ok",):
             raise sqlite3.DatabaseError("database disk image is malformed")
         self._topics = {number: BagTopic(str(name).lstrip("/"), str(kind)) for number, name, kind in rows}
+        self._connection.execute(f"EXPLAIN {_MESSAGES}")
         query = f"SELECT count(*), min(timestamp), max(timestamp) FROM messages {_TIMED}"  # noqa: S608
         self.message_count, first, last = self._connection.execute(query).fetchone()
         self.time_range_ns = (first or 0, last or 0)
@@ -133,7 +131,7 @@ class SqliteFile:
         self._connection.close()
         self._connection = rescued
         self._open()
-        self._say(
+        self.losses.say(
             f"the database is damaged ({error}): {self.message_count} messages were kept, the rest is lost."
         )
 

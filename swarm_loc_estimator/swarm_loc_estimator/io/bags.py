@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-import heapq
 import itertools
 from contextlib import suppress
-from operator import itemgetter
 from typing import TYPE_CHECKING
 
 from typing_extensions import Self
 
 from swarm_loc_estimator.io.bag_file import BagError, BagFile, BagTopic, RawMessage
 from swarm_loc_estimator.io.bag_mcap import McapFile
+from swarm_loc_estimator.io.bag_qos import offered_qos
 from swarm_loc_estimator.io.bag_sqlite import SqliteFile
+from swarm_loc_estimator.io.message_batch import MessageBatch, merge_streams
 from swarm_loc_estimator.io.yaml_tree import YamlTreeError, read_tree
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection, Iterator, Mapping, Sequence
     from pathlib import Path
     from types import TracebackType
+
+    from rosbags.interfaces import Qos
 
 __all__ = ["BagError", "BagReader", "BagTopic", "RawMessage"]
 
@@ -33,12 +35,16 @@ class BagReader:
     Args:
         path: A rosbag2 folder, or an .mcap or .db3 file.
 
+    Attributes:
+        offered_qos: Topic -> what its publishers offered, as far as a folder's metadata know it.
+
     Raises:
         BagError: There is nothing to read.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        self.offered_qos: dict[str, list[Qos]] = {}
         self._files: list[BagFile] = []
         self._own_losses: list[str] = []
         paths = self._find()
@@ -83,13 +89,27 @@ class BagReader:
         Yields:
             (topic, type, log time [ns], serialized message).
         """
-        wanted = None if topics is None else frozenset(name.lstrip("/") for name in topics)
+        wanted = None if topics is None else {name.lstrip("/") for name in topics}
+        chosen = [topic for topic in self.topics if wanted is None or topic.name in wanted]
+        for batch in self._batches({topic: number for number, topic in enumerate(chosen)}):
+            for number, log_ns, data in batch.messages():
+                yield *chosen[number], log_ns, data
+
+    def batches(self, topics: Sequence[str]) -> Iterator[MessageBatch]:
+        """All messages of some topics in order of log time, many at once.
+
+        Args:
+            topics: Names; their place here is the topic's number in the batches.
+        """
+        number_of = {name.lstrip("/"): number for number, name in enumerate(topics)}
+        return self._batches({t: number_of[t.name] for t in self.topics if t.name in number_of})
+
+    def _batches(self, number_of: Mapping[BagTopic, int]) -> Iterator[MessageBatch]:
         ends = [file.time_range_ns for file in self._files]
+        streams = [file.batches(number_of) for file in self._files]
         if all(before[1] < after[0] for before, after in itertools.pairwise(ends)):
-            for file in self._files:
-                yield from file.messages(wanted)
-        else:
-            yield from heapq.merge(*(file.messages(wanted) for file in self._files), key=itemgetter(2))
+            return itertools.chain.from_iterable(streams)
+        return merge_streams(streams)
 
     def close(self) -> None:
         """Close all files; may be called twice."""
@@ -156,6 +176,7 @@ class BagReader:
             raise BagError(
                 f"'{self._path}' is compressed message by message; convert it first: ros2 bag convert."
             )
+        self.offered_qos = offered_qos(info)
         files = info.get("relative_file_paths")
         return [str(name) for name in files] if isinstance(files, list) else []
 

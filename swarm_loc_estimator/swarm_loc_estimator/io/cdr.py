@@ -9,15 +9,11 @@ from __future__ import annotations
 
 import math
 import struct
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 Array = npt.NDArray[np.float64]
 
@@ -67,21 +63,6 @@ class DetectionArrayMessage(NamedTuple):
     stamp_ns: int
     frame_id: str
     detections: npt.NDArray[np.void]
-
-
-@dataclass(frozen=True)
-class PoseBatch:
-    """Many stamped poses as columns.
-
-    Attributes:
-        stamp_ns: (N,) int64.
-        pose: (N, 3) x [m], y [m], yaw [rad].
-        valid: (N,) bool; False where the bytes were no stamped pose (its row is NaN, its stamp 0).
-    """
-
-    stamp_ns: npt.NDArray[np.int64]
-    pose: Array
-    valid: npt.NDArray[np.bool_]
 
 
 _DETECTION_FIELDS: tuple[tuple[str, str, tuple[int, ...]], ...] = (
@@ -136,7 +117,6 @@ class _Layout:
         self.twist = struct.Struct(order + "6d")
         self.double = np.dtype(order + "f8")
         self.detection = _detection_dtype(order)
-        self.stamp = np.dtype([("sec", order + "i4"), ("nanosec", order + "u4")])
 
 
 _LAYOUTS = {b"\x00\x00": _Layout(">"), b"\x00\x01": _Layout("<")}
@@ -277,61 +257,3 @@ def _detections(data: bytes, layout: _Layout, offset: int, count: int) -> npt.ND
     native = np.zeros(count, DETECTION_DTYPE)
     native[:] = detections
     return native
-
-
-def decode_pose_batch(messages: Sequence[bytes]) -> PoseBatch:
-    """Read many geometry_msgs/PoseStamped at once, about ten times faster than one by one.
-
-    Args:
-        messages: Serialized messages, best of one topic: those with the same frame are read in one pass.
-
-    Returns:
-        Columns in the order of `messages`; malformed ones are marked, never raised.
-    """
-    count = len(messages)
-    batch = PoseBatch(np.zeros(count, np.int64), np.full((count, 3), np.nan), np.zeros(count, np.bool_))
-    by_length: dict[int, list[int]] = {}
-    for index, length in enumerate(map(len, messages)):
-        by_length.setdefault(length, []).append(index)
-    for length, indices in by_length.items():
-        joined = b"".join([messages[index] for index in indices])
-        todo, rows = np.array(indices), np.frombuffer(joined, np.uint8).reshape(len(indices), length)
-        while todo.size:
-            alike = _decode_alike(todo, rows, batch)
-            todo, rows = todo[~alike], rows[~alike]
-    return batch
-
-
-def _decode_alike(
-    todo: npt.NDArray[np.intp], rows: npt.NDArray[np.uint8], batch: PoseBatch
-) -> npt.NDArray[np.bool_]:
-    """Read the messages that differ from the first one in numbers only; says which those are."""
-    model = rows[0].tobytes()
-    try:
-        decode_pose_stamped(model)
-    except CdrError:
-        first: npt.NDArray[np.bool_] = todo == todo[0]
-        return first
-    layout = _layout(model)
-    name = slice(ENCAPSULATION + 8, _header(model, layout)[2])
-    same_order = (rows[:, :2] == rows[0, :2]).all(axis=1)
-    alike: npt.NDArray[np.bool_] = (rows[:, name] == rows[0, name]).all(axis=1) & same_order
-    start = name.stop + -(name.stop - ENCAPSULATION) % 8
-    _fill(batch, todo[alike], rows[alike], layout, start)
-    return alike
-
-
-def _fill(
-    batch: PoseBatch, chosen: npt.NDArray[np.intp], rows: npt.NDArray[np.uint8], layout: _Layout, start: int
-) -> None:
-    """Write the numbers of like rows into the batch."""
-    stamp = np.ascontiguousarray(rows[:, ENCAPSULATION : ENCAPSULATION + 8]).view(layout.stamp)[:, 0]
-    numbers = np.ascontiguousarray(rows[:, start : start + 56]).view(layout.double)
-    valid = stamp["nanosec"] < _NANOSECONDS
-    batch.valid[chosen] = valid
-    stamp_ns = stamp["sec"].astype(np.int64) * _NANOSECONDS + stamp["nanosec"]
-    batch.stamp_ns[chosen] = np.where(valid, stamp_ns, 0)
-    qx, qy, qz, qw = numbers[:, 3:].T
-    sine, cosine = 2.0 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz
-    yaw = np.where((sine != 0.0) | (cosine != 0.0), np.arctan2(sine, cosine), np.nan)
-    batch.pose[chosen] = np.where(valid[:, None], np.column_stack([numbers[:, :2], yaw]), np.nan)

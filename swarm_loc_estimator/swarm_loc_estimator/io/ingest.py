@@ -1,26 +1,26 @@
-"""The way into the estimator, the same for a live node and for replay: raw messages by topic in, calls out.
+"""The way into the estimator, the same for a live node and for replay: raw messages in, columns out.
 
 A swarm has two inputs per robot, `<robot>/odom` and `<robot>/detections`. Bytes that are no message of the
-topic's type are counted as `bad_message` and go no further.
+topic's type are counted and go no further.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_estimator.core.arrivals import DetectionRows, IntArray, Messages, OdometryRows
+from swarm_loc_estimator.core.compiled import compiled
 from swarm_loc_estimator.core.swarm import Swarm
-from swarm_loc_estimator.io.cdr import CdrError
-from swarm_loc_estimator.io.streams import DetectionStream, OdometryStream, Pose2
+from swarm_loc_estimator.io.cdr import decode_odometry
+from swarm_loc_estimator.io.message_batch import MessageBatch
+from swarm_loc_estimator.io.streams import DetectionReader, PoseReader
 from swarm_loc_estimator.io.typestore import DETECTIONS, ODOMETRY
-
-Content = TypeVar("Content")
-Content_co = TypeVar("Content_co", covariant=True)
 
 
 class InputKind(Enum):
@@ -63,126 +63,146 @@ def input_topics(swarm: Swarm) -> tuple[InputTopic, ...]:
     )
 
 
-class EstimatorPort(Protocol):
-    """What the inputs need of `core.estimator.SwarmEstimator`."""
+_STATISTICS_DTYPE = np.dtype(
+    [
+        (name, np.int64)
+        for name in (
+            "received",
+            "malformed",
+            "last_stamp_ns",
+            "last_arrival_ns",
+            "late_sum_ns",
+            "late_max_ns",
+            "late_count",
+        )
+    ]
+)
 
-    def add_odometry(self, robot: int, stamp_ns: int, pose: Pose2, now_ns: int, /) -> None:
-        """Take in one odometry message."""
 
-    def add_detections(self, robot: int, stamp_ns: int, detections: NDArray[np.void], now_ns: int, /) -> None:
-        """Take in what a robot's camera saw in one picture."""
-
-    def drop(self, reason: str, count: int = 1, /) -> None:
-        """Count data that could not even be handed in."""
-
-
-@dataclass
 class InputStatistics:
     """What came in on one topic.
 
-    Attributes:
-        received: Messages so far, malformed ones included.
-        malformed: Those that were no message of the topic's type.
-        last_stamp_ns: Stamp of the newest well-formed one; None before the first.
-        last_arrival_ns: When it arrived.
-        late_sum_ns: Sum of arrival minus stamp since `restart`.
-        late_max_ns: Largest one since `restart`; None when nothing came.
-        late_count: How many since `restart`.
+    Args:
+        row: (1,) of _STATISTICS_DTYPE, where it is counted.
     """
 
-    received: int = 0
-    malformed: int = 0
-    last_stamp_ns: int | None = None
-    last_arrival_ns: int | None = None
-    late_sum_ns: int = 0
-    late_max_ns: int | None = None
-    late_count: int = 0
+    def __init__(self, row: NDArray[np.void]) -> None:
+        self._row = row
 
-    def note(self, stamp_ns: int, now_ns: int) -> None:
-        """Count a well-formed message."""
-        late_ns = now_ns - stamp_ns
-        self.received += 1
-        self.last_stamp_ns, self.last_arrival_ns = stamp_ns, now_ns
-        self.late_sum_ns += late_ns
-        self.late_count += 1
-        if self.late_max_ns is None or late_ns > self.late_max_ns:
-            self.late_max_ns = late_ns
+    @property
+    def received(self) -> int:
+        """Messages so far, malformed ones included."""
+        return int(self._row["received"][0])
+
+    @property
+    def malformed(self) -> int:
+        """Those that were no message of the topic's type."""
+        return int(self._row["malformed"][0])
+
+    @property
+    def last_stamp_ns(self) -> int | None:
+        """Stamp of the newest well-formed one; None before the first."""
+        return int(self._row["last_stamp_ns"][0]) if self.received > self.malformed else None
+
+    @property
+    def last_arrival_ns(self) -> int | None:
+        """When it arrived."""
+        return int(self._row["last_arrival_ns"][0]) if self.received > self.malformed else None
+
+    @property
+    def late_count(self) -> int:
+        """How many well-formed ones came since `restart`."""
+        return int(self._row["late_count"][0])
+
+    @property
+    def late_sum_ns(self) -> int:
+        """Sum of their arrivals minus their stamps."""
+        return int(self._row["late_sum_ns"][0])
+
+    @property
+    def late_max_ns(self) -> int | None:
+        """Largest one; None when nothing came."""
+        return int(self._row["late_max_ns"][0]) if self.late_count else None
 
     def restart(self) -> None:
         """Begin a new interval for the lateness."""
-        self.late_sum_ns, self.late_max_ns, self.late_count = 0, None, 0
-
-
-class _Stream(Protocol[Content_co]):
-    """Reads the messages of one topic."""
-
-    @property
-    def frame_id(self) -> str:
-        """Frame of the newest message."""
-
-    def read(self, data: bytes) -> tuple[int, Content_co]:
-        """Stamp [ns] and content."""
-
-
-class _Input(Generic[Content]):
-    """One topic: its reader, its statistics, and where the content goes."""
-
-    def __init__(
-        self, robot: int, stream: _Stream[Content], hand_on: Callable[[int, int, Content, int], None]
-    ) -> None:
-        self.stream = stream
-        self.statistics = InputStatistics()
-        self._robot = robot
-        self._hand_on = hand_on
-
-    def receive(self, data: bytes, now_ns: int) -> None:
-        """Read one message and hand it on; raises CdrError."""
-        stamp_ns, content = self.stream.read(data)
-        self.statistics.note(stamp_ns, now_ns)
-        self._hand_on(self._robot, stamp_ns, content, now_ns)
-
-
-def _input(topic: InputTopic, estimator: EstimatorPort) -> _Input[Pose2] | _Input[NDArray[np.void]]:
-    if topic.kind is InputKind.ODOMETRY:
-        return _Input(topic.robot, OdometryStream(), estimator.add_odometry)
-    return _Input(topic.robot, DetectionStream(), estimator.add_detections)
+        for name in ("late_sum_ns", "late_max_ns", "late_count"):
+            self._row[name] = 0
 
 
 class Ingest:
-    """Hands the messages of a swarm's topics to its estimator.
+    """Reads the messages of a swarm's topics.
 
     Args:
         swarm: Whose topics they are.
-        estimator: Where they go.
 
     Attributes:
-        topics: The inputs; their index here is the handle for `receive`.
-        handle_of: Topic name -> handle.
-        statistics: Per handle what came in.
+        topics: The inputs; their index here is the topic's number in a batch.
+        handle_of: Topic name -> that number.
+        statistics: Per topic what came in.
     """
 
-    def __init__(self, swarm: Swarm, estimator: EstimatorPort) -> None:
+    def __init__(self, swarm: Swarm) -> None:
         self.topics = input_topics(swarm)
         self.handle_of: Mapping[str, int] = {topic.name: handle for handle, topic in enumerate(self.topics)}
-        self._estimator = estimator
-        self._inputs = [_input(topic, estimator) for topic in self.topics]
-        self.statistics = [source.statistics for source in self._inputs]
+        self._robot = np.array([topic.robot for topic in self.topics], dtype=np.int64)
+        self._is_odometry = np.array([topic.kind is InputKind.ODOMETRY for topic in self.topics], dtype=bool)
+        self._poses = PoseReader(len(self.topics), decode_odometry, names=2)
+        self._detections = DetectionReader(len(self.topics))
+        self._counted = np.zeros(len(self.topics), dtype=_STATISTICS_DTYPE)
+        self.statistics = [InputStatistics(self._counted[k : k + 1]) for k in range(len(self.topics))]
 
-    def receive(self, handle: int, data: bytes, now_ns: int) -> None:
-        """Take in one message.
+    def read(self, batch: MessageBatch) -> Iterator[Messages]:
+        """Read messages, numbered as `topics`, in order of arrival.
 
-        Args:
-            handle: Which topic it came on, see `handle_of`.
-            data: The serialized message with its encapsulation header.
-            now_ns: When it arrived.
+        Yields:
+            One part for each stretch in which time does not go back.
         """
-        try:
-            self._inputs[handle].receive(data, now_ns)
-        except CdrError:
-            self.statistics[handle].received += 1
-            self.statistics[handle].malformed += 1
-            self._estimator.drop("bad_message")
+        back = np.flatnonzero(batch.log_ns[1:] < batch.log_ns[:-1]) + 1
+        for begin, end in itertools.pairwise([0, *back.tolist(), batch.size]):
+            if begin < end:
+                yield self._read_forwards(batch.chosen(slice(begin, end)))
 
     def frame_id(self, handle: int) -> str:
         """Frame of the newest message on a topic, "" before the first."""
-        return self._inputs[handle].stream.frame_id
+        reader = self._poses if self._is_odometry[handle] else self._detections
+        return reader.frame_ids[handle]
+
+    def _read_forwards(self, batch: MessageBatch) -> Messages:
+        is_odometry = self._is_odometry[batch.topic]
+        reports, pictures = batch.chosen(is_odometry), batch.chosen(~is_odometry)
+        poses, seen = self._poses.read(reports), self._detections.read(pictures)
+        for part, columns in ((reports, poses), (pictures, seen)):
+            _count(self._counted, part.topic, part.log_ns, columns.stamp_ns, columns.valid)
+        odometry = OdometryRows(self._robot[reports.topic], poses.stamp_ns, poses.pose, reports.log_ns)
+        per_detection = (self._robot[pictures.topic], seen.stamp_ns, pictures.log_ns)
+        robot, stamp_ns, arrival_ns = (np.repeat(column, seen.count) for column in per_detection)
+        return Messages(
+            odometry if poses.valid.all() else odometry.chosen(poses.valid),
+            DetectionRows(robot, stamp_ns, seen.detection, arrival_ns),
+            begin_ns=int(batch.log_ns[0]),
+            end_ns=int(batch.log_ns[-1]),
+            malformed=int(np.sum(~poses.valid)) + int(np.sum(~seen.valid)),
+        )
+
+
+@compiled
+def _count(
+    counted: NDArray[np.void],
+    topic: IntArray,
+    arrival_ns: IntArray,
+    stamp_ns: IntArray,
+    valid: NDArray[np.bool_],
+) -> None:
+    """Note messages (n,) in the statistics (t,) of their topics."""
+    for k in range(topic.size):
+        one = counted[topic[k]]
+        one.received += 1
+        if not valid[k]:
+            one.malformed += 1
+            continue
+        late_ns = arrival_ns[k] - stamp_ns[k]
+        one.last_stamp_ns, one.last_arrival_ns = stamp_ns[k], arrival_ns[k]
+        one.late_max_ns = max(one.late_max_ns, late_ns) if one.late_count else late_ns
+        one.late_sum_ns += late_ns
+        one.late_count += 1

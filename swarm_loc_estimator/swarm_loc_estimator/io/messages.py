@@ -19,7 +19,8 @@ from swarm_loc_estimator.io.typestore import DETECTION, DETECTIONS, ODOMETRY, PO
 Array = npt.NDArray[np.float64]
 
 _NANOSECONDS = 1_000_000_000
-_POSE_DOUBLES = 7
+POSE_DOUBLES = 7
+"""Numbers of a geometry_msgs/Pose: position and quaternion."""
 _ODOMETRY_DOUBLES = 7 + 36 + 6 + 36
 UNKNOWN_COVARIANCE = np.diag([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 """6x6; a negative first element says that the sender does not know (the convention of sensor_msgs)."""
@@ -56,7 +57,7 @@ def encode_odometry(
     template = _odometry_template(frame_id, child_frame_id)
     rows = _stamped_rows(template, stamp_ns)
     body = np.zeros((len(stamp_ns), _ODOMETRY_DOUBLES))
-    body[:, :7] = _pose_columns(pose)
+    body[:, :7] = position_and_quaternion(pose)
     body[:, 7:43] = covariance.reshape(36)
     body[:, [43, 44, 48]] = twist
     body[:, 49:] = twist_covariance.reshape(36)
@@ -67,7 +68,7 @@ def encode_odometry(
 def encode_pose_stamped(frame_id: str, stamp_ns: npt.NDArray[np.int64], pose: Array) -> list[bytes]:
     """Serialize geometry_msgs/PoseStamped; arguments as for `encode_odometry`."""
     rows = _stamped_rows(_pose_template(frame_id), stamp_ns)
-    rows[:, -8 * _POSE_DOUBLES :] = _pose_columns(pose).view(np.uint8)
+    rows[:, -8 * POSE_DOUBLES :] = position_and_quaternion(pose).view(np.uint8)
     return _split(rows)
 
 
@@ -100,12 +101,12 @@ def _stamped_rows(template: bytes, stamp_ns: npt.NDArray[np.int64]) -> npt.NDArr
     return rows
 
 
-def _pose_columns(pose: Array) -> Array:
-    """(N, 7) position and quaternion (x, y, z, w) of planar poses."""
-    columns = np.zeros((len(pose), _POSE_DOUBLES))
-    columns[:, :2] = pose[:, :2]
-    columns[:, 5] = np.sin(pose[:, 2] / 2.0)
-    columns[:, 6] = np.cos(pose[:, 2] / 2.0)
+def position_and_quaternion(poses: Array) -> Array:
+    """(N, 7) x, y, z [m] and quaternion x, y, z, w of planar poses (N, 3)."""
+    columns = np.zeros((len(poses), POSE_DOUBLES))
+    columns[:, :2] = poses[:, :2]
+    columns[:, 5] = np.sin(poses[:, 2] / 2.0)
+    columns[:, 6] = np.cos(poses[:, 2] / 2.0)
     return columns
 
 

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 ROBOT_TYPE = "create"
 WHEEL_SEPARATION = 0.258
 """Of an iRobot Create [m]."""
+TIMEOUT_S = 2.0
+"""Every two minutes or so the logs pause for just over a second; the robots drive on as commanded."""
 
 _FAMILY_OTHER = 255
 _CONTENT_POSITION = 1
@@ -171,7 +173,7 @@ def _robot(robot: RobotLog, barcode: int | None) -> Robot:
     return Robot(
         f"robot{robot.subject}",
         ROBOT_TYPE,
-        odometry=OdometryModel(wheel_separation=WHEEL_SEPARATION),
+        odometry=OdometryModel(wheel_separation=WHEEL_SEPARATION, timeout_s=TIMEOUT_S),
         camera=CameraMount(),
         faces=() if barcode is None else (Face("body", barcode),),
         start=_start(robot),

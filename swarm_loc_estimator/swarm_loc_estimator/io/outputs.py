@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.io.messages import planar_covariance
+from swarm_loc_estimator.io.messages import POSE_DOUBLES, planar_covariance, position_and_quaternion
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"
 _NANOSECONDS = 1_000_000_000
 _STAMP_SIZE = 8
-_POSE_DOUBLES = 7
 _XYYAW = (0, 1, 5)
 _PLANAR = [6 * row + column for row in _XYYAW for column in _XYYAW]
 
@@ -131,7 +130,7 @@ class PoseEncoder:
         writer = _Writer()
         self._stamp = writer.stamp()
         writer.text(frame_id)
-        self._start = writer.doubles(_POSE_DOUBLES + 36)
+        self._start = writer.doubles(POSE_DOUBLES + 36)
         self._message = writer.finish()
         self._plane = planar_covariance(0.0, 0.0, 0.0).reshape(36)
 
@@ -139,10 +138,10 @@ class PoseEncoder:
         """N messages for poses (N, 3) with covariances (N, 3, 3) of x, y, theta."""
         self._message[self._stamp : self._stamp + _STAMP_SIZE] = _stamp_bytes(stamp_ns)
         rows = np.tile(self._message, (len(poses), 1))
-        numbers = np.zeros((len(poses), _POSE_DOUBLES + 36))
-        numbers[:, :_POSE_DOUBLES] = _position_and_quaternion(poses)
-        numbers[:, _POSE_DOUBLES:] = self._plane
-        numbers[:, [_POSE_DOUBLES + place for place in _PLANAR]] = covariances.reshape(-1, 9)
+        numbers = np.zeros((len(poses), POSE_DOUBLES + 36))
+        numbers[:, :POSE_DOUBLES] = position_and_quaternion(poses)
+        numbers[:, POSE_DOUBLES:] = self._plane
+        numbers[:, [POSE_DOUBLES + place for place in _PLANAR]] = covariances.reshape(-1, 9)
         rows[:, self._start :] = _as_bytes(numbers)
         length, joined = rows.shape[1], rows.tobytes()
         return [joined[begin : begin + length] for begin in range(0, len(joined), length)]
@@ -169,7 +168,7 @@ class TransformsEncoder:
             self._lay_out(chosen)
         message = self._message
         message[self._stamps] = _stamp_bytes(stamp_ns)
-        message[self._numbers] = _as_bytes(_position_and_quaternion(transforms[chosen]))
+        message[self._numbers] = _as_bytes(position_and_quaternion(transforms[chosen]))
         return message.tobytes()
 
     def _lay_out(self, chosen: NDArray[np.bool_]) -> None:
@@ -180,15 +179,6 @@ class TransformsEncoder:
             stamps.append(writer.stamp())
             writer.text(self._frame_id)
             writer.text(self._children[index])
-            numbers.append(writer.doubles(_POSE_DOUBLES))
+            numbers.append(writer.doubles(POSE_DOUBLES))
         self._chosen, self._message = chosen.copy(), writer.finish()
-        self._stamps, self._numbers = _places(stamps, _STAMP_SIZE), _places(numbers, 8 * _POSE_DOUBLES)
-
-
-def _position_and_quaternion(poses: FloatArray) -> FloatArray:
-    """(n, 7) x, y, z and quaternion x, y, z, w of planar poses (n, 3)."""
-    columns = np.zeros((len(poses), _POSE_DOUBLES))
-    columns[:, :2] = poses[:, :2]
-    columns[:, 5] = np.sin(poses[:, 2] / 2.0)
-    columns[:, 6] = np.cos(poses[:, 2] / 2.0)
-    return columns
+        self._stamps, self._numbers = _places(stamps, _STAMP_SIZE), _places(numbers, 8 * POSE_DOUBLES)

@@ -19,8 +19,8 @@ _STYLE = """
 @media (prefers-color-scheme: dark) { :root { --ink: #e6edf3; --soft: #9aa7b2; --line: #30363d;
   --paper: #0d1117; --card: #161b22; --accent: #56b4e9; } }
 * { box-sizing: border-box; }
-body { margin: 0 auto; padding: 2rem 1.5rem 4rem; max-width: 1180px; background: var(--paper);
-  color: var(--ink); font: 15px/1.5 system-ui, sans-serif; }
+body { margin: 0 auto; padding: 2rem clamp(1rem, 4vw, 2.5rem) 4rem; max-width: 1120px;
+  background: var(--paper); color: var(--ink); font: 15px/1.5 system-ui, sans-serif; }
 h1 { font-size: 1.6rem; margin: 0 0 1rem; }
 h2 { font-size: 1.1rem; margin: 2.2rem 0 .7rem; }
 .facts { display: flex; flex-wrap: wrap; gap: .7rem; padding: 0; margin: 0; }
@@ -30,16 +30,18 @@ h2 { font-size: 1.1rem; margin: 2.2rem 0 .7rem; }
 .facts dd { margin: 0; font-weight: 600; }
 .facts .headline dd { color: var(--accent); font-size: 1.25rem; }
 .wide { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .3rem .7rem; text-align: right; white-space: nowrap;
+table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
+th, td { padding: .3rem .5rem; text-align: right; white-space: nowrap;
   border-bottom: 1px solid var(--line); }
-th { color: var(--soft); font-weight: 500; font-size: .85rem; }
-th:first-child, td:first-child { text-align: left; }
+th { color: var(--soft); font-weight: 500; font-size: .85rem; line-height: 1.25; }
+th:first-child, td:first-child { text-align: left; padding-left: 0; padding-right: 1rem;
+  position: sticky; left: 0; background: var(--paper); }
 th.group { text-align: center; color: var(--ink); }
 tr.pooled td { font-weight: 650; border-top: 2px solid var(--soft); }
-img { max-width: 100%; background: #fff; border: 1px solid var(--line); border-radius: 8px; }
+img { display: block; width: 100%; min-width: 42rem; background: #fff;
+  border: 1px solid var(--line); border-radius: 8px; }
 ul { padding-left: 1.2rem; }
-small { color: var(--soft); }
+small { display: block; color: var(--soft); }
 """
 
 
@@ -54,7 +56,6 @@ def html_report(result: ReplayResult, pictures: dict[str, Path]) -> str:
         f"<h1>{escape(result.title)}</h1>",
         _facts(result),
         _remarks(result),
-        "<h2>Errors against ground truth</h2>",
         _errors(result),
         *(_picture(heading, path) for heading, path in pictures.items()),
         _counters(result),
@@ -96,12 +97,13 @@ def _remarks(result: ReplayResult) -> str:
 
 def _errors(result: ReplayResult) -> str:
     """The error table."""
+    title = "<h2>Errors against ground truth</h2>"
     rows = summaries(result)
     if not rows:
-        return "<p>No ground truth to compare with.</p>"
+        return f"{title}<p>No ground truth to compare with.</p>"
     groups = "".join(f'<th class="group" colspan="{count}">{escape(name)}</th>' for name, count in GROUPS)
     titles = "".join(
-        f"<th>{escape(name)}{f' <small>[{escape(unit)}]</small>' if unit else ''}</th>"
+        f"<th>{escape(name)}{f'<small>[{escape(unit)}]</small>' if unit else ''}</th>"
         for name, unit in HEADER
     )
     body = "".join(
@@ -111,13 +113,14 @@ def _errors(result: ReplayResult) -> str:
         for name, row in rows
     )
     head = f"<thead><tr>{groups}</tr><tr>{titles}</tr></thead>"
-    return f'<div class="wide"><table>{head}<tbody>{body}</tbody></table></div>'
+    return f'{title}<div class="wide"><table>{head}<tbody>{body}</tbody></table></div>'
 
 
 def _picture(heading: str, path: Path) -> str:
     """A picture inside the page."""
     data = base64.b64encode(path.read_bytes()).decode("ascii")
-    return f'<h2>{escape(heading)}</h2><img alt="{escape(heading)}" src="data:image/png;base64,{data}">'
+    name = escape(heading)
+    return f'<h2>{name}</h2><div class="wide"><img alt="{name}" src="data:image/png;base64,{data}"></div>'
 
 
 def _counters(result: ReplayResult) -> str:

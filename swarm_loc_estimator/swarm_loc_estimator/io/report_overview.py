@@ -2,175 +2,201 @@
 
 from __future__ import annotations
 
-import io
 import math
-from pathlib import Path
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Ellipse
-from PIL import Image
+from matplotlib.lines import Line2D
+from matplotlib.patches import Ellipse
+from matplotlib.patheffects import withStroke
 
 from swarm_loc_estimator.core.metrics import pool, summarise
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.swarm import Landmark
-from swarm_loc_estimator.io.report_plots import INK, SOFT, TRUTH, colour_of, map_size, style
-from swarm_loc_estimator.replay_result import ReplayResult
+from swarm_loc_estimator.io.report_map import WorldMap, label_map, last_pose
+from swarm_loc_estimator.io.report_style import (
+    INK,
+    SOFT,
+    TRUTH,
+    broken,
+    colour_of,
+    length_text,
+    length_unit,
+    save,
+    seconds_since,
+    style,
+)
 
-_WIDTH_IN, _DPI = 9.0, 100
-_STRIP_IN, _MARGIN_IN = 1.5, 1.0
-_TAIL_NS = 8_000_000_000
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from matplotlib.axes import Axes
+
+    from swarm_loc_estimator.core.metrics import Errors, FloatArray
+    from swarm_loc_estimator.replay_result import ReplayResult
+
+_MAP_IN, _ERRORS_IN = 6.6, 4.4
+_ROOM_IN = 0.6
+"""Height that title, legend and axes take."""
+_TAIL_NS = 6_000_000_000
 _SIGMAS = 3.0
-_ENLARGED = 10.0
+_ENLARGED = 20.0
 _SEEN = 0.05
 """An ellipse smaller than this share of the map's width is drawn enlarged."""
 _MOST_NAMES = 12
-_COLOURS = 96
-"""A palette makes the file a third as large."""
+_STRETCHES = 120
+_NAME_PT = np.array([42.0, 22.0])
+"""How far beside and above a robot its name stands."""
 
 
 def plot_overview(result: ReplayResult, path: Path) -> None:
-    """Draw paths, landmarks and the robots at the end with their covariance; below, errors over time.
+    """Draw paths, landmarks and the robots at the end with their covariance; beside it, errors over time.
 
     Args:
-        result: What to draw; without ground truth there are no errors.
-        path: Picture to write, 900 pixels wide.
+        result: What to draw. The picture ends with the ground truth: what it shows last can be judged.
+            Without ground truth there are no errors.
+        path: Picture to write.
     """
-    width, height, limits = map_size(result)
-    map_in = (_WIDTH_IN - 0.8) * min(height / width, 1.2)
-    strip_in = _STRIP_IN if result.errors else 0.0
-    figure = Figure(figsize=(_WIDTH_IN, map_in + strip_in + _MARGIN_IN), layout="constrained")
-    rows = [map_in, strip_in] if result.errors else [map_in]
-    axes: list[Axes] = list(figure.subplots(len(rows), 1, height_ratios=rows, squeeze=False)[:, 0])
-    _draw_map(axes[0], result, limits)
-    figure.suptitle(_title(result), x=0.01, ha="left", fontsize=13, color=INK, fontweight="bold")
-    if result.errors:
-        _draw_errors(axes[1], result)
-    drawn = io.BytesIO()
-    figure.savefig(drawn, dpi=_DPI, format="png")
-    Image.open(drawn).convert("RGB").quantize(_COLOURS).save(path, optimize=True)
+    result = _until_truth_ends(result)
+    world = WorldMap(result)
+    judged = any(len(errors.stamp_ns) for errors in result.errors.values())
+    widths = [_MAP_IN, _ERRORS_IN] if judged else [_MAP_IN + _ERRORS_IN]
+    height = widths[0] * min(max(world.shape, 0.5), 1.1) + _ROOM_IN
+    figure = Figure(figsize=(_MAP_IN + _ERRORS_IN, height))
+    axes = figure.subplot_mosaic("mp;mh" if judged else "m", width_ratios=widths)
+    figure.suptitle(_title(result), x=0.012, ha="left", fontsize=15, color=INK, fontweight="bold")
+    enlarged = _draw_swarm(axes["m"], result, world)
+    _legend(figure, enlarged, judged=judged)
+    if judged:
+        metre, unit = length_unit(float(np.percentile(pool(list(result.errors.values())).position, 99.0)))
+        _draw_errors(axes["p"], f"position error [{unit}]", lambda one: metre * one.position, result)
+        _draw_errors(
+            axes["h"], "heading error [deg]", lambda one: np.degrees(np.abs(one.error[:, 2])), result
+        )
+        axes["h"].set_xlabel("time [s]", color=SOFT, fontsize=9)
+    save(figure, path)
+
+
+def _until_truth_ends(result: ReplayResult) -> ReplayResult:
+    """The result without poses that are later than all ground truth, where sensors may have stopped, too."""
+    ends = [int(track.stamp_ns[-1]) for track in result.truth.values() if len(track.stamp_ns)]
+    if not ends:
+        return result
+    kept = result.stamp_ns <= max(ends)
+    stamp_ns, pose, covariance = result.stamp_ns[kept], result.pose[kept], result.covariance[kept]
+    return replace(result, stamp_ns=stamp_ns, pose=pose, covariance=covariance)
 
 
 def _title(result: ReplayResult) -> str:
     """Who, and how well."""
-    robots = f"{len(result.swarm.robots)} robots, {len(result.swarm.landmarks)} landmarks"
+    robots = f"{_counted(result.swarm.robots, 'robot')}, {_counted(result.swarm.landmarks, 'landmark')}"
     if not result.errors:
         return robots
     row = summarise(pool(list(result.errors.values())))
-    error = f"{1e3 * row.position_rmse:.1f} mm, {math.degrees(row.heading_rmse):.1f}°"
-    return f"{robots}: RMS error {error}, NEES {row.nees:.1f} (ideal 3)"
+    position, heading = length_text(row.position_rmse), f"{math.degrees(row.heading_rmse):.1f}°"
+    return f"{robots}: RMS error {position} and {heading}, NEES {row.nees:.1f} (ideal 3)"
 
 
-def _draw_map(axis: Axes, result: ReplayResult, limits: tuple[float, float, float, float]) -> None:
-    """Landmarks below, then truth, paths and robots."""
-    style(axis)
-    axis.set_aspect("equal")
-    axis.set_xlim(limits[0], limits[1])
-    axis.set_ylim(limits[2], limits[3])
-    axis.set_xlabel("x in map [m]", color=SOFT, fontsize=9)
-    axis.set_ylabel("y in map [m]", color=SOFT, fontsize=9)
-    size = limits[1] - limits[0]
-    for mark in result.swarm.landmarks:
-        _draw_landmark(axis, mark, size)
-    for index, robot in enumerate(result.swarm.robots):
-        if robot.name in result.truth:
-            truth = result.truth[robot.name].pose
-            axis.plot(truth[:, 0], truth[:, 1], color=TRUTH, linewidth=4.0, alpha=0.35, zorder=1)
-        _draw_path(axis, result, index)
-    enlarged = _enlargement(result, size)
-    for index in range(len(result.swarm.robots)):
-        _draw_robot(axis, result, index, size, enlarged)
-    _legend(axis, result, enlarged)
+def _counted(things: tuple[object, ...], name: str) -> str:
+    """Things by number."""
+    return f"{len(things)} {name}{'' if len(things) == 1 else 's'}"
 
 
-def _draw_landmark(axis: Axes, mark: Landmark, size: float) -> None:
-    """A bar that faces where the marker faces; a dot where that is unknown."""
-    if mark.yaw is None:
-        axis.plot(mark.x, mark.y, "s", color=INK, markersize=4, zorder=4)
-        return
-    ahead = np.array([math.cos(mark.yaw), math.sin(mark.yaw)])
-    across = np.array([-ahead[1], ahead[0]])
-    place = np.array([mark.x, mark.y])
-    bar = np.stack([place - 0.012 * size * across, place + 0.012 * size * across])
-    nose = np.stack([place, place + 0.014 * size * ahead])
-    axis.plot(*bar.T, color=INK, linewidth=3.5, solid_capstyle="butt", zorder=4)
-    axis.plot(*nose.T, color=INK, linewidth=1.2, zorder=4)
+def _draw_swarm(axis: Axes, result: ReplayResult, world: WorldMap) -> float:
+    """Landmarks below, then truth, paths and robots; returns how much larger than life the ellipses are."""
+    world.draw_world(axis)
+    label_map(axis)
+    ends = [last_pose(result, index) for index in range(len(result.swarm.robots))]
+    enlarged = _enlargement([covariance for _, covariance in filter(None, ends)], world.width)
+    middle = np.mean([pose[:2] for pose, _ in filter(None, ends)] or [np.zeros(2)], axis=0)
+    for index, end in enumerate(ends):
+        world.draw_paths(axis, index, alpha=0.5)
+        _draw_tail(axis, result, index)
+        if end is None:
+            continue
+        pose, covariance = end
+        _draw_ellipse(axis, pose, covariance[:2, :2], enlarged, colour_of(index))
+        world.draw_robot(axis, index, pose)
+        if len(ends) <= _MOST_NAMES:
+            _draw_name(axis, result.swarm.robots[index].name, pose, middle, colour_of(index))
+    return enlarged
 
 
-def _draw_path(axis: Axes, result: ReplayResult, index: int) -> None:
-    """The whole path thin, its end bold."""
-    pose, colour = result.pose[:, index], colour_of(index)
-    axis.plot(pose[:, 0], pose[:, 1], color=colour, linewidth=0.8, alpha=0.55, zorder=2)
-    late = result.stamp_ns >= result.stamp_ns[-1] - _TAIL_NS
-    axis.plot(pose[late, 0], pose[late, 1], color=colour, linewidth=2.2, zorder=3)
+def _draw_tail(axis: Axes, result: ReplayResult, index: int) -> None:
+    """The last stretch of a path, bold."""
+    late = result.stamp_ns >= result.stamp_ns.max(initial=0) - _TAIL_NS
+    x, y, _ = result.pose[late, index].T
+    axis.plot(x, y, color=colour_of(index), linewidth=2.4, zorder=3)
 
 
-def _last(result: ReplayResult, index: int) -> tuple[FloatArray, FloatArray] | None:
-    """A robot's last pose (3,) with covariance (3, 3)."""
-    known = np.flatnonzero(np.isfinite(result.pose[:, index]).all(axis=1))
-    return (result.pose[known[-1], index], result.covariance[known[-1], index]) if len(known) else None
-
-
-def _enlargement(result: ReplayResult, size: float) -> float:
+def _enlargement(covariances: list[FloatArray], width: float) -> float:
     """How much larger than life ellipses must be drawn to be seen."""
-    ends = [last for index in range(len(result.swarm.robots)) if (last := _last(result, index)) is not None]
-    sigmas = [math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1])) for _, covariance in ends]
-    return 1.0 if not sigmas or 2.0 * _SIGMAS * max(sigmas) > _SEEN * size else _ENLARGED
+    sigmas = [math.sqrt(float(np.linalg.eigvalsh(one[:2, :2])[-1])) for one in covariances]
+    return 1.0 if not sigmas or 2.0 * _SIGMAS * max(sigmas) > _SEEN * width else _ENLARGED
 
 
-def _draw_robot(axis: Axes, result: ReplayResult, index: int, size: float, enlarged: float) -> None:
-    """A disc with a nose, its ellipse and its name."""
-    last = _last(result, index)
-    if last is None:
-        return
-    (x, y, theta), covariance = last
-    colour, radius = colour_of(index), 0.013 * size
-    variances, directions = np.linalg.eigh(covariance[:2, :2])
+def _draw_ellipse(axis: Axes, pose: FloatArray, covariance: FloatArray, enlarged: float, colour: str) -> None:
+    """Where a robot is believed to be, (2, 2) about its pose."""
+    variances, directions = np.linalg.eigh(covariance)
     minor, major = 2.0 * _SIGMAS * enlarged * np.sqrt(variances.clip(min=0.0))
     turn = math.degrees(math.atan2(directions[1, 1], directions[0, 1]))
-    shade = {"facecolor": colour, "edgecolor": colour, "linewidth": 1.0}
-    axis.add_patch(Ellipse((x, y), major, minor, angle=turn, alpha=0.28, zorder=5, **shade))
-    axis.add_patch(Circle((x, y), radius, facecolor=colour, edgecolor="white", linewidth=1.2, zorder=6))
-    nose = [x, x + 1.9 * radius * math.cos(theta)], [y, y + 1.9 * radius * math.sin(theta)]
-    axis.plot(*nose, color=INK, linewidth=2.0, zorder=7)
-    if len(result.swarm.robots) <= _MOST_NAMES:
-        axis.annotate(
-            result.swarm.robots[index].name,
-            (x, y),
-            (0, 20),
-            textcoords="offset points",
-            ha="center",
-            fontsize=10,
-            color=colour,
-            fontweight="bold",
-            zorder=8,
-        )
+    shape = Ellipse((float(pose[0]), float(pose[1])), major, minor, angle=turn, alpha=0.28, zorder=5)
+    shape.set_color(colour)
+    axis.add_patch(shape)
 
 
-def _legend(axis: Axes, result: ReplayResult, enlarged: float) -> None:
-    """What lines and shades mean."""
-    axis.plot([], [], color=INK, linewidth=3.5, label="landmark")
-    if result.truth:
-        axis.plot([], [], color=TRUTH, linewidth=4.0, alpha=0.5, label="truth")
-    axis.plot([], [], color=INK, linewidth=1.0, label="estimate, bold at the end")
-    larger = f", {enlarged:.0f} x enlarged" if enlarged != 1.0 else ""
-    axis.plot([], [], "o", color=SOFT, markersize=12, alpha=0.4, label=f"{_SIGMAS:.0f}-sigma ellipse{larger}")
-    axis.legend(
-        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, frameon=False, fontsize=9, borderpad=0.0
+def _draw_name(axis: Axes, name: str, pose: FloatArray, middle: FloatArray, colour: str) -> None:
+    """A robot's name beside its path, on the side away from the swarm's middle."""
+    side = np.array([-math.sin(pose[2]), math.cos(pose[2])])
+    away = math.copysign(1.0, float(side @ (pose[:2] - middle))) * side * _NAME_PT
+    text = axis.annotate(
+        name,
+        (float(pose[0]), float(pose[1])),
+        (float(away[0]), float(away[1])),
+        textcoords="offset points",
+        ha="center",
+        va="center",
+        fontsize=11,
+        color=colour,
+        fontweight="bold",
+        zorder=8,
     )
+    text.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
 
 
-def _draw_errors(axis: Axes, result: ReplayResult) -> None:
-    """Distance between estimate and truth of every robot."""
+def _legend(figure: Figure, enlarged: float, *, judged: bool) -> None:
+    """What lines and shades mean."""
+    larger = f", {enlarged:.0f} x enlarged" if enlarged != 1.0 else ""
+    meanings = [
+        Line2D([], [], color=INK, linewidth=3.5, label="landmark"),
+        Line2D([], [], color=INK, linewidth=1.0, label=f"estimate, its last {_TAIL_NS * 1e-9:.0f} s bold"),
+        Line2D([], [], color=SOFT, marker="o", linestyle="", markersize=11, alpha=0.4),
+    ]
+    meanings[-1].set_label(f"{_SIGMAS:.0f}-sigma ellipse{larger}")
+    if judged:
+        meanings.insert(1, Line2D([], [], color=TRUTH, linewidth=3.6, alpha=0.5, label="truth"))
+    figure.legend(handles=meanings, loc="outside lower left", ncols=4, frameon=False, fontsize=9)
+
+
+def _draw_errors(axis: Axes, title: str, of: Callable[[Errors], FloatArray], result: ReplayResult) -> None:
+    """An error over time: faint that of each robot, bold the RMS of the swarm."""
     style(axis)
-    begin_ns = result.stamp_ns[0]
+    begin_ns = int(result.stamp_ns[0])
     for name, errors in result.errors.items():
-        time_s = (errors.stamp_ns - begin_ns) * 1e-9
-        colour = colour_of(result.swarm.index_of[name])
-        axis.plot(time_s, 1e3 * errors.position, color=colour, linewidth=0.9, alpha=0.85)
-    every = np.concatenate([errors.position for errors in result.errors.values()])
-    axis.set_ylim(0.0, 1.5e3 * max(float(np.percentile(every, 99.0)), 1e-4))
-    axis.margins(x=0.0)
-    axis.set_xlabel("time [s]", color=SOFT, fontsize=9)
-    axis.set_ylabel("position\nerror [mm]", color=SOFT, fontsize=9)
+        line = np.column_stack([seconds_since(begin_ns, errors.stamp_ns), of(errors)])
+        colour, alpha = colour_of(result.swarm.index_of[name]), min(0.6, 6.0 / len(result.errors))
+        axis.plot(*broken(errors.stamp_ns, line).T, color=colour, linewidth=0.7, alpha=alpha)
+    every = pool(list(result.errors.values()))
+    axis.plot(*_rms(seconds_since(begin_ns, every.stamp_ns), of(every)), color=INK, linewidth=1.8)
+    axis.set_title(f"{title}, bold: RMS", loc="left", fontsize=10, color=INK)
+    axis.set(xmargin=0.0, ylim=(0.0, max(1.3 * float(np.percentile(of(every), 99.0)), 1e-3)))
+
+
+def _rms(time_s: FloatArray, off: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Root mean squares of even stretches of time, and their middles; NaN where there is nothing."""
+    edges = np.linspace(float(time_s.min()), np.nextafter(float(time_s.max()), math.inf), _STRETCHES + 1)
+    counts, _ = np.histogram(time_s, edges)
+    sums, _ = np.histogram(time_s, edges, weights=off**2)
+    with np.errstate(invalid="ignore"):
+        return (edges[:-1] + edges[1:]) / 2.0, np.sqrt(sums / counts)

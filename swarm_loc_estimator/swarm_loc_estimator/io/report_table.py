@@ -63,7 +63,7 @@ def facts(result: ReplayResult) -> list[tuple[str, str]]:
         ("duration of the data", f"{result.data_s:.1f} s"),
     ]
     if math.isfinite(result.speed_factor):
-        rows.append(("replayed in", f"{result.wall_s:.2f} s, {result.speed_factor:.0f} x real time"))
+        rows.append(("duration of the run", f"{result.wall_s:.2f} s, {result.speed_factor:.0f} x real time"))
     return rows
 
 

@@ -27,18 +27,20 @@ from swarm_loc_estimator.core.estimator import SwarmEstimate, SwarmEstimator
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.swarm import Swarm
 from swarm_loc_estimator.io.ingest import Ingest, InputKind
+from swarm_loc_estimator.io.message_batch import MessageBatch
 from swarm_loc_estimator.io.swarm_file import load_swarm
 from swarm_loc_estimator.nodes.declare import declare_parameters
 from swarm_loc_estimator.nodes.estimator_health import Health, Report, TickCost, load_report, merged
 from swarm_loc_estimator.nodes.estimator_outputs import EstimateOutputs
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
+from swarm_loc_estimator.nodes.fusion_pace import FusionPace
 from swarm_loc_estimator.nodes.running import run_node, spin
 from swarm_loc_estimator.nodes.seating import SeatRequestError, planar_seat
 from swarm_loc_estimator.nodes.warm_up import warm_up
 from swarm_loc_msgs.msg import MarkerDetectionArray
 from swarm_loc_msgs.srv import SetRobotPose
 
-INPUT_QOS = QoSProfile(depth=100)
+INPUT_QOS = QoSProfile(depth=1000)
 """Deep enough for a busy moment as long as the horizon; what is older would not be used anyway."""
 
 _MESSAGE_CLASSES = {InputKind.ODOMETRY: Odometry, InputKind.DETECTIONS: MarkerDetectionArray}
@@ -75,11 +77,11 @@ class EstimatorNode(Node):
         self.get_logger().info("compiling the estimator: a minute the first time on a machine")
         warm_up()
         self._estimator = create_estimator(self._swarm, self._wishes.settings)
-        self._ingest = Ingest(self._swarm, self._estimator)
+        self._ingest = Ingest(self._swarm)
         self._backlog: list[tuple[int, bytes, int]] = []
         self._estimate: SwarmEstimate | None = None
         self._jumps = 0
-        self._fuse_from_s = 0.0
+        self._pace = FusionPace(self._wishes.fusion_load, self._wishes.settings.horizon_s)
         self._cost = TickCost()
         self._health = Health(self._swarm, self._ingest, self._wishes.odom_frame, self._why_missing)
         self._outputs = EstimateOutputs(self, self._swarm, self._wishes)
@@ -113,7 +115,7 @@ class EstimatorNode(Node):
         return receive
 
     def _start_timers(self) -> None:
-        self.create_timer(self._wishes.tick_period_s, self._on_tick)
+        self._timer = self.create_timer(self._wishes.tick_period_s, self._on_tick)
         # by a clock that runs also while simulated time stands still
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_DIAGNOSTICS_PERIOD_S, self._on_diagnostics, clock=steady)
@@ -123,18 +125,25 @@ class EstimatorNode(Node):
         )
 
     def _on_tick(self) -> None:
+        if self._timer.time_until_next_call() > self._timer.timer_period_ns:
+            # Where several /clock messages were handled while a tick was due, the EventsExecutor calls once
+            # for each of them, and every call moves the timer on, in the end seconds ahead of time.
+            self._timer.reset()
+            return
         begin_s = time.perf_counter()
         now_ns = self.get_clock().now().nanoseconds
         if not now_ns:
             self._limit_backlog()
             return
-        for handle, data, arrival_ns in self._backlog:
-            self._ingest.receive(handle, data, arrival_ns or now_ns)
+        backlog = [(handle, data, arrival_ns or now_ns) for handle, data, arrival_ns in self._backlog]
         self._backlog.clear()
-        fuse = begin_s >= self._fuse_from_s
+        for messages in self._ingest.read(MessageBatch.of(backlog)):
+            self._estimator.receive(messages)
+        fuse = self._pace.is_due(begin_s, now_ns)  # large swarms: in between odometry leads on
+        begin_cpu_s = time.thread_time()
         self._estimate = self._estimator.tick(now_ns, fuse=fuse)
-        if fuse:  # large swarms fuse at fewer ticks; in between odometry leads on
-            self._fuse_from_s = begin_s + (time.perf_counter() - begin_s) / self._wishes.fusion_load
+        if fuse:
+            self._pace.note(begin_s, now_ns, time.thread_time() - begin_cpu_s)
         self._say_time_jumps()
         self._outputs.publish(self._estimate)
         self._cost.note(time.perf_counter() - begin_s)

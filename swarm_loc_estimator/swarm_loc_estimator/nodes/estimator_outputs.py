@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -50,7 +49,9 @@ class EstimateOutputs:
         )
         if self._tf is not None and located.any():
             self._tf.publish(self._tf_encoder.encode(e.stamp_ns, located, e.map_to_odom))
-        if self._robot_poses and located.any():
-            messages = self._pose_encoder.encode(e.stamp_ns, e.poses[located], e.covariances[located])
-            for robot, message in zip(np.flatnonzero(located), messages, strict=True):
+        # a large swarm's single topics cost most of all to publish, and are seldom heard
+        heard = [k for k, one in enumerate(self._robot_poses) if located[k] and one.get_subscription_count()]
+        if heard:
+            messages = self._pose_encoder.encode(e.stamp_ns, e.poses[heard], e.covariances[heard])
+            for robot, message in zip(heard, messages, strict=True):
                 self._robot_poses[robot].publish(message)

@@ -18,7 +18,7 @@ class EstimatorParameters:
         0.05, "s", 0.005, 1.0, "period of the node's clock in which data is used and poses are published"
     )
     fusion_load: float = number(
-        0.15, "1", 0.01, 1.0, "share of a core that fusing may take; a large swarm fuses at fewer ticks then"
+        0.1, "1", 0.01, 1.0, "share of a core that fusing may take; a large swarm fuses at fewer ticks then"
     )
     map_frame: str = text("map", "frame that all poses are in", required=True)
     odom_frame: str = text(

@@ -18,7 +18,6 @@ from rclpy.duration import Duration
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 
@@ -27,12 +26,9 @@ from swarm_loc_estimator.nodes.declare import declare_parameters
 from swarm_loc_estimator.nodes.pace import STEP_S, PlayedSoFar, play
 from swarm_loc_estimator.nodes.parameter_table import ParameterError
 from swarm_loc_estimator.nodes.player_parameters import PlayerParameters
+from swarm_loc_estimator.nodes.playing_qos import RELIABLE, playing_qos
 from swarm_loc_estimator.nodes.running import Stop, run_node
 
-_QOS = QoSProfile(depth=1000)
-"""Reliable, so that subscribers of either kind hear it."""
-_LATCHED_QOS = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-_LATCHED_TOPICS = frozenset({"tf_static", "robot_description", "map"})
 _CLOCK = "clock"
 _POLL_S = 0.05
 _SETTLED_S = 0.5
@@ -62,7 +58,7 @@ class PlayNode(Node):
         for topic in self._chosen_topics():
             self._add_publisher(topic)
         self._clock_publisher = (
-            self.create_publisher(ClockMessage, "/clock", _QOS) if self._wishes.clock else None
+            self.create_publisher(ClockMessage, "/clock", RELIABLE) if self._wishes.clock else None
         )
         self._own_executor = EventsExecutor()
         self._own_executor.add_node(self)
@@ -109,7 +105,7 @@ class PlayNode(Node):
         except (ImportError, AttributeError):
             self.get_logger().warning(f"{topic.name} is not played: there is no type {topic.type} here")
             return
-        qos = _LATCHED_QOS if topic.name in _LATCHED_TOPICS else _QOS
+        qos = playing_qos(topic.name, self._reader.offered_qos.get(topic.name, ()))
         self._publisher_of[topic.name] = self.create_publisher(message_class, topic.name, qos)
 
     def _play_once(self, stop: Stop) -> None:

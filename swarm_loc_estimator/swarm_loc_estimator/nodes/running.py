@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 import sys
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 
 from swarm_loc_estimator.io.bag_file import BagError
 from swarm_loc_estimator.io.swarm_file import SwarmFileError
@@ -90,6 +92,8 @@ def _start_ros() -> None:
     """Start rclpy by the arguments of the command line, without its signal handlers; see `Stop`."""
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    except rclpy_implementation.UnknownROSArgsError as error:
+        raise RosArgumentsError(f"ROS does not know the arguments {error}.") from error
     except rclpy_implementation.RCLError as error:
         raise RosArgumentsError(str(error).splitlines()[0]) from error
 
@@ -98,13 +102,15 @@ def spin(node: Node, stop: Stop) -> int:
     """Handle a node's events until it is asked to stop.
 
     The executor: the default ones build their wait set anew at every wake, which costs 18 us per subscription
-    and saturates a core at 50 robots. Of the EventsExecutor only `spin_once` with a timeout works in Jazzy;
-    its `spin()` is busy for ever and delivers nothing.
+    and saturates a core at 50 robots. The EventsExecutor's own `spin()` is busy for ever in Jazzy and
+    delivers nothing, and its `spin_once` comes back after every message; waiting for what never comes does
+    not.
     """
-    executor = EventsExecutor()
+    executor, never = EventsExecutor(), Future()
     executor.add_node(node)
+    gc.freeze()  # what is there now stays: the collector need not look at it again and again
     while not stop.requested:
-        executor.spin_once(timeout_sec=_WAKE_S)
+        executor.spin_until_future_complete(never, timeout_sec=_WAKE_S)
     executor.remove_node(node)
     executor.shutdown()
     return 0

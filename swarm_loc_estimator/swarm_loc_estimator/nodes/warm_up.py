@@ -9,6 +9,9 @@ from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.sightings import CONTENT_POSE_TWO, CONTENT_POSITION
 from swarm_loc_estimator.core.swarm import Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.io.ingest import Ingest
+from swarm_loc_estimator.io.message_batch import MessageBatch
+from swarm_loc_estimator.io.messages import encode_detections, encode_odometry
 
 _SECOND = 1_000_000_000
 _FIRST_LANDMARK = 10
@@ -28,15 +31,28 @@ def _run(settings: EstimatorSettings) -> None:
     robots.append(Robot("c", faces=(Face("front", 2, yaw=0.0),), start=(0.0, 0.0, 0.0)))
     places = range(_LANDMARKS)
     marks = tuple(Landmark(_FIRST_LANDMARK + k, x=1.0, y=0.2 * k, yaw=3.1) for k in places)
-    estimator = SwarmEstimator(Swarm(tuple(robots), marks), settings)
+    swarm = Swarm(tuple(robots), marks)
+    estimator, ingest = SwarmEstimator(swarm, settings), Ingest(swarm)
     for step in range(8):
         now_ns = 10 * _SECOND + step * _SECOND // 4
-        for robot in range(len(robots)):
-            estimator.add_odometry(robot, now_ns, (0.01 * step, 0.0, 0.001 * step), now_ns)
-            estimator.add_detections(robot, now_ns - _SECOND // 8, _sight(robot), now_ns)
+        backlog = []
+        for robot in robots:
+            x, yaw = 0.01 * step, 0.001 * step
+            backlog.append((ingest.handle_of[f"{robot.name}/odom"], _odometry(now_ns, x, yaw), now_ns))
+            seen = encode_detections("", now_ns - _SECOND // 8, _sight(robots.index(robot)))
+            backlog.append((ingest.handle_of[f"{robot.name}/detections"], seen, now_ns))
         # one measurement alone is compiled apart: its columns are contiguous
-        estimator.add_detections(0, now_ns - _SECOND // 16, _sight(0)[:1], now_ns)
+        one = encode_detections("", now_ns - _SECOND // 16, _sight(0)[:1])
+        backlog.append((ingest.handle_of["a/detections"], one, now_ns))
+        for messages in ingest.read(MessageBatch.of(backlog)):
+            estimator.receive(messages)
         estimator.tick(now_ns)
+
+
+def _odometry(stamp_ns: int, x: float, yaw: float) -> bytes:
+    """One message."""
+    pose, unknown = np.array([[x, 0.0, yaw]]), np.zeros((6, 6))
+    return encode_odometry("", "", np.array([stamp_ns]), pose, np.zeros((1, 3)), unknown, unknown)[0]
 
 
 def _sight(observer: int) -> np.ndarray[tuple[int], np.dtype[np.void]]:

@@ -16,6 +16,7 @@ import numpy as np
 import rclpy
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
+from rclpy.duration import Duration
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -201,6 +202,10 @@ class Robots:
         """Publish the clock."""
         self._clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
 
+    def wait_until_told(self) -> None:
+        """Return once the time has come to every reliable subscription, whether it was handled or not."""
+        assert self._clock.wait_for_all_acked(Duration(seconds=PATIENCE_S))
+
     def odometry(self, robot: str, data: bytes) -> None:
         """Publish serialized odometry."""
         self._odometry[robot].publish(data)
@@ -225,20 +230,26 @@ def stamp_ns(message: Any) -> int:
 
 
 class Program:
-    """An executable of the package as a process of its own, its output in one file.
+    """An executable as a process of its own, its output in one file.
 
     Args:
         name: Module below `nodes`.
         log: Where its output goes.
         parameters: ROS parameters.
         arguments: Further ROS arguments.
+        package: Whose executable.
     """
 
     def __init__(
-        self, name: str, log: Path, parameters: dict[str, object], arguments: Sequence[str] = ()
+        self,
+        name: str,
+        log: Path,
+        parameters: dict[str, object],
+        arguments: Sequence[str] = (),
+        package: str = "swarm_loc_estimator",
     ) -> None:
         self.log = log
-        command = [sys.executable, "-m", f"swarm_loc_estimator.nodes.{name}", "--ros-args", *arguments]
+        command = [sys.executable, "-m", f"{package}.nodes.{name}", "--ros-args", *arguments]
         for key, value in parameters.items():
             command += ["-p", f"{key}:={value}"]
         with log.open("wb") as out:

@@ -29,6 +29,7 @@ from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 from swarm_loc_estimator.core import se2
+from swarm_loc_estimator.core.arrivals import Messages
 from swarm_loc_estimator.core.estimator import SwarmEstimate
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 from swarm_loc_msgs.msg import SwarmPose
@@ -215,14 +216,12 @@ class StandIn:
         self.time_jumps = 0
         self.drops: dict[str, int] = {}
 
-    def add_odometry(self, robot: int, stamp: int, _pose: object, now_ns: int) -> None:
+    def receive(self, messages: Messages) -> None:
         """Remember whose and when."""
-        assert now_ns >= stamp
-        self.odometry.append((robot, stamp))
-
-    def add_detections(self, *_: object) -> None:
-        """Nobody sends any."""
-        raise AssertionError
+        assert messages.detections.robot.size == messages.malformed == 0
+        rows = messages.odometry
+        assert np.all(rows.arrival_ns >= rows.stamp_ns)
+        self.odometry += zip(rows.robot.tolist(), rows.stamp_ns.tolist(), strict=True)
 
     def tick(self, now_ns: int, *, fuse: bool) -> SwarmEstimate:
         """Always the same."""

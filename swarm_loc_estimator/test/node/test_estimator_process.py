@@ -36,6 +36,14 @@ def test_a_bad_parameter_ends_the_node_with_one_sentence(
     assert sentence in line
 
 
+def test_unknown_arguments_end_the_node_with_one_sentence(tmp_path: Path, swarm_file: Path) -> None:
+    arguments = ["surplus"]
+    with Program("estimator_node", tmp_path / "log", {"swarm_file": swarm_file}, arguments) as program:
+        assert program.end() == 1
+        (line,) = program.output.splitlines()
+    assert line == "estimator_node: ROS does not know the arguments ['surplus']."
+
+
 @pytest.mark.parametrize(
     ("values", "sentence"),
     [

@@ -51,11 +51,13 @@ def _fake_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
-    """Starts a graph of `fake` executables by their names; it does not outlive the test."""
+    """Starts a graph of `fake` executables by their names, with SIGINT `ignored`; it ends with the test."""
     with ExitStack() as stack:
 
-        def started(*names: str) -> subprocess.Popen[str]:
+        def started(*names: str, ignored: bool = False) -> subprocess.Popen[str]:
             command = [sys.executable, "-c", RUN_GRAPH, *names]
+            if ignored:
+                command = ["sh", "-c", 'trap "" INT; exec "$@"', "sh", *command]
             graph = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
             stack.callback(graph.kill)
             return graph
@@ -82,8 +84,11 @@ def test_a_required_node_that_ends_takes_the_others_along(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_every_node(stop: signal.Signals, start: Callable[..., subprocess.Popen[str]]) -> None:
-    graph = start("forever", "short", "forever")
+@pytest.mark.parametrize("ignored", [False, True], ids=["", "background"])
+def test_a_signal_ends_every_node(
+    stop: signal.Signals, ignored: bool, start: Callable[..., subprocess.Popen[str]]
+) -> None:
+    graph = start("forever", "short", "forever", ignored=ignored)
     _read_until(graph, "up", 2)
     graph.send_signal(stop)
     rest, _ = graph.communicate(timeout=60)

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from swarm_loc_estimator.core.arrivals import DetectionRows, Messages, OdometryRows
 from swarm_loc_estimator.core.estimator import SwarmEstimate, SwarmEstimator
 from swarm_loc_estimator.core.fusion import Verdict
+from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import (
     CameraMount,
     Face,
@@ -23,8 +25,6 @@ from swarm_loc_estimator.core.swarm import (
     Swarm,
 )
 from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
-
-FloatArray = NDArray[np.float64]
 
 SECOND = 10**9
 T0 = 1_000 * SECOND
@@ -96,10 +96,13 @@ class Event:
 
     def give(self, estimator: SwarmEstimator, now_ns: int) -> None:
         """Hand the message in."""
-        if self.pose is not None:
-            estimator.add_odometry(self.robot, self.stamp_ns, self.pose, now_ns)
-        else:
-            estimator.add_detections(self.robot, self.stamp_ns, self.detections, now_ns)
+        rows = 0 if self.pose is None else 1
+        poses = np.array([self.pose or ()], dtype=float).reshape(rows, 3)
+        robot, stamp_ns, arrival_ns = np.array([[self.robot], [self.stamp_ns], [now_ns]], dtype=np.int64)
+        odometry = OdometryRows(robot[:rows], stamp_ns[:rows], poses, arrival_ns[:rows])
+        each = np.zeros(self.detections.size, dtype=np.int64)
+        seen = DetectionRows(robot[each], stamp_ns[each], self.detections, arrival_ns[each])
+        estimator.receive(Messages(odometry, seen, now_ns, now_ns))
 
 
 @dataclass(frozen=True)
@@ -144,6 +147,8 @@ class Plan:
         camera_hz: Pictures per second.
         standing: Robots that do not move.
         carried: Robots that are put elsewhere, with their backs to where they looked, at half time.
+        lasting: Scale of the errors that last, of the motion and of the camera; 0: neither are there any,
+            nor are they estimated.
     """
 
     robots: int = 3
@@ -161,6 +166,7 @@ class Plan:
     camera_hz: float = 5.0
     standing: Sequence[int] = ()
     carried: Sequence[int] = ()
+    lasting: float = 0.0
 
 
 ODOMETRY = OdometryModel(wheel_separation=0.053, wheel_noise=2e-5)
@@ -169,6 +175,7 @@ SENSOR = SensorModel(
 )
 MOUNT = CameraMount(x=0.03, y=0.01, z=0.05, yaw=0.1, pitch=0.1)
 START_SIGMA = StartSigma(0.02, 0.02, 0.05)
+BIAS_SIGMA, BIAS_TIME_S, SCALE_SIGMA, YAW_SIGMA, STRETCH_SIGMA = 0.05, 4.0, 0.05, 0.05, 0.05
 _STEP_NS = 50_000_000
 _SIDES = {"front": 0.0, "left": math.pi / 2, "back": math.pi, "right": -math.pi / 2}
 _LEVEL = homogeneous(0, 0, 0, 0, MOUNT.pitch, MOUNT.roll)[:3, :3] @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
@@ -185,7 +192,8 @@ def simulate(plan: Plan, seed: int) -> World:
     start = np.column_stack(
         [rng.uniform(-0.5, 0.5, (plan.robots, 2)) * plan.arena, rng.uniform(-3.1, 3.1, plan.robots)]
     )
-    truth, odometry = _drive(rng, plan, start, steps)
+    lasting = _Lasting(plan, np.random.default_rng([seed, 1]), steps)
+    truth, odometry = _drive(rng, plan, start, steps, lasting)
     swarm = _describe(rng, plan, start)
     events = [
         Event(robot, int(stamps[k]), (float(x), float(y), float(theta)))
@@ -195,14 +203,29 @@ def simulate(plan: Plan, seed: int) -> World:
     for robot in range(plan.robots):
         every = round(SECOND / plan.camera_hz / _STEP_NS)
         for k in range(int(rng.integers(1, every + 1)), steps + 1, every):
-            detections = _picture(rng, plan, swarm, robot, truth[k])
+            mount = replace(MOUNT, yaw=MOUNT.yaw + float(lasting.yaw[robot]))
+            detections = _picture(rng, plan, swarm, robot, truth[k], mount, 1.0 + lasting.stretch[robot])
             if detections.size:
                 events.append(Event(robot, int(stamps[k]), None, detections))
     return World(swarm, stamps, truth, tuple(sorted(events, key=lambda e: e.stamp_ns)))
 
 
+class _Lasting:
+    """Errors that last: scales of path and turn, the camera's yaw and scale (N,), the turn's bias (T, N)."""
+
+    def __init__(self, plan: Plan, rng: np.random.Generator, steps: int) -> None:
+        drawn = plan.lasting * rng.standard_normal((4, plan.robots))
+        self.distance_scale, self.turn_scale = SCALE_SIGMA * drawn[0], SCALE_SIGMA * drawn[1]
+        self.yaw, self.stretch = YAW_SIGMA * drawn[2], STRETCH_SIGMA * drawn[3]
+        kept = math.exp(-_STEP_NS * 1e-9 / BIAS_TIME_S)
+        self.turn_bias = plan.lasting * BIAS_SIGMA * rng.standard_normal((steps, plan.robots))
+        for k in range(1, steps):
+            fresh = math.sqrt(1.0 - kept**2) * self.turn_bias[k]
+            self.turn_bias[k] = kept * self.turn_bias[k - 1] + fresh
+
+
 def _drive(
-    rng: np.random.Generator, plan: Plan, start: FloatArray, steps: int
+    rng: np.random.Generator, plan: Plan, start: FloatArray, steps: int, lasting: _Lasting
 ) -> tuple[FloatArray, FloatArray]:
     """True poses and reported odometry (T, N, 3); the report begins anywhere, the truth has the noise."""
     n, dt = plan.robots, _STEP_NS * 1e-9
@@ -225,9 +248,10 @@ def _drive(
         )
         report[k + 1] = _arc(report[k], path, turn)
         true_right, true_left = right + slip[0], left + slip[1]
-        truth[k + 1] = _arc(
-            truth[k], 0.5 * (true_right + true_left), (true_right - true_left) / ODOMETRY.wheel_separation
-        )
+        true_turn = (true_right - true_left) / ODOMETRY.wheel_separation
+        true_path = 0.5 * (true_right + true_left) * (1.0 + lasting.distance_scale)
+        true_turn += turn * lasting.turn_scale + np.where(speed > 0.0, lasting.turn_bias[k] * dt, 0.0)
+        truth[k + 1] = _arc(truth[k], true_path, true_turn)
         if k == steps // 2:
             truth[k + 1, list(plan.carried)] *= -1.0
     return truth, report
@@ -256,13 +280,20 @@ def _describe(rng: np.random.Generator, plan: Plan, start: FloatArray) -> Swarm:
     sigma = plan.noise * np.array([START_SIGMA.x, START_SIGMA.y, START_SIGMA.theta])
     believed = start + sigma * rng.standard_normal(start.shape)
     angles = 2.0 * np.pi * np.arange(plan.landmarks) / max(1, plan.landmarks)
+    odometry = replace(
+        ODOMETRY,
+        distance_scale_sigma=plan.lasting * SCALE_SIGMA,
+        turn_scale_sigma=plan.lasting * SCALE_SIGMA,
+        turn_bias_sigma=plan.lasting * BIAS_SIGMA,
+        turn_bias_time_s=BIAS_TIME_S,
+    )
     return Swarm(
         tuple(
             Robot(
                 name=f"robot_{i}",
-                odometry=ODOMETRY,
-                camera=MOUNT,
-                sensor=SENSOR,
+                odometry=odometry,
+                camera=replace(MOUNT, yaw_sigma=plan.lasting * YAW_SIGMA),
+                sensor=replace(SENSOR, distance_scale_sigma=plan.lasting * STRETCH_SIGMA),
                 faces=tuple(
                     Face(side, 10 * i + j, 0.03 * math.cos(yaw), 0.03 * math.sin(yaw), 0.04, yaw)
                     for j, (side, yaw) in enumerate(_SIDES.items())
@@ -282,21 +313,28 @@ def _describe(rng: np.random.Generator, plan: Plan, start: FloatArray) -> Swarm:
 
 
 def _picture(
-    rng: np.random.Generator, plan: Plan, swarm: Swarm, robot: int, poses: FloatArray
+    rng: np.random.Generator,
+    plan: Plan,
+    swarm: Swarm,
+    robot: int,
+    poses: FloatArray,
+    mount: CameraMount,
+    stretch: float,
 ) -> NDArray[np.void]:
-    """What the robot's camera sees (d,)."""
+    """What the robot's camera, mounted like this, sees (d,), at distances that it stretches."""
     ids = [mark.id for mark in swarm.landmarks]
     frames = [marker_frame(mark.x, mark.y, mark.z, mark.yaw or 0.0) for mark in swarm.landmarks]
     for other, pose in enumerate(poses):
         if other != robot:
             ids += [face.id for face in swarm.robots[other].faces]
             frames += list(homogeneous(pose[0], pose[1], 0.0, pose[2]) @ _FACE_FRAMES)
-    relative = seen(poses[robot], MOUNT, np.array(frames).reshape(-1, 4, 4))
+    relative = seen(poses[robot], mount, np.array(frames).reshape(-1, 4, 4))
     place = relative[:, :3, 3]
     facing = np.einsum("mi,mi->m", relative[:, :3, 2], place) < -0.3 * np.linalg.norm(place, axis=1)
     ahead = (
         (place[:, 2] > 0.05) & (place[:, 2] < plan.reach) & (np.abs(place[:, :2]).max(axis=1) < place[:, 2])
     )
+    relative[:, :3, 3] *= stretch
     found = [_sighting(rng, plan, ids[m], relative[m]) for m in np.flatnonzero(facing & ahead)]
     return joined(found)
 
@@ -361,18 +399,28 @@ def settled(estimator: SwarmEstimator) -> dict[str, int]:
     return {verdict.name: int(counts[verdict]) for verdict in Verdict}
 
 
-def without_start(swarm: Swarm, robots: Iterable[int]) -> Swarm:
-    """The swarm with some robots' starts unknown."""
-    chosen = set(robots)
-    return replace(
-        swarm, robots=tuple(replace(r, start=None) if i in chosen else r for i, r in enumerate(swarm.robots))
-    )
+def planar(pose: FloatArray) -> FloatArray:
+    """The homogeneous matrix (3, 3) of a pose (3,) in the plane."""
+    x, y, theta = pose
+    cos, sin = math.cos(theta), math.sin(theta)
+    return np.array([[cos, -sin, x], [sin, cos, y], [0.0, 0.0, 1.0]])
+
+
+def pose_of(matrix: FloatArray) -> FloatArray:
+    """The pose (3,) of a homogeneous matrix (3, 3)."""
+    return np.array([matrix[0, 2], matrix[1, 2], math.atan2(matrix[1, 0], matrix[0, 0])])
+
+
+def wrapped(error: FloatArray) -> FloatArray:
+    """Errors (..., 3) with their headings in [-pi, pi]."""
+    result: FloatArray = error.copy()
+    result[..., 2] = np.arctan2(np.sin(error[..., 2]), np.cos(error[..., 2]))
+    return result
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
     """Normalised squared errors (...) of errors (..., 3), headings wrapped."""
-    wrapped = error.copy()
-    wrapped[..., 2] = np.arctan2(np.sin(error[..., 2]), np.cos(error[..., 2]))
-    weighted = np.linalg.solve(covariance, wrapped[..., None])[..., 0]
-    squared: FloatArray = np.einsum("...i,...i->...", wrapped, weighted)
+    normal = wrapped(error)
+    weighted = np.linalg.solve(covariance, normal[..., None])[..., 0]
+    squared: FloatArray = np.einsum("...i,...i->...", normal, weighted)
     return squared

@@ -25,8 +25,9 @@ from core_world import (
     settled,
     simulate,
     ticks,
+    wrapped,
 )
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.core import fusion
@@ -58,8 +59,7 @@ def outcome(
 
 def assert_same(a: Outcome, b: Outcome) -> None:
     np.testing.assert_array_equal(a.estimate.status, b.estimate.status)
-    difference = a.estimate.poses - b.estimate.poses
-    difference[:, 2] = np.arctan2(np.sin(difference[:, 2]), np.cos(difference[:, 2]))
+    difference = wrapped(a.estimate.poses - b.estimate.poses)
     np.testing.assert_array_equal(np.isnan(a.estimate.poses), np.isnan(b.estimate.poses))
     np.testing.assert_allclose(np.nan_to_num(difference), 0.0, atol=1e-9)
     np.testing.assert_allclose(a.estimate.covariances, b.estimate.covariances, atol=1e-9)
@@ -78,6 +78,7 @@ def assert_same(a: Outcome, b: Outcome) -> None:
     outliers=st.sampled_from([0.0, 0.1, 0.6]),
     lost_after=st.sampled_from([2.0, 12.0]),
     late_s=st.sampled_from([0.3, 1.0, 1.9]),
+    lasting=st.sampled_from([0.0, 1.0]),
 )
 def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
     seed: int,
@@ -89,10 +90,11 @@ def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
     outliers: float,
     lost_after: float,
     late_s: float,
+    lasting: float,
 ) -> None:
     rng = np.random.default_rng(seed)
     plan = Plan(robots, 3.5, 0.2, content=content, start_known=start_known, outliers=outliers, flips=0.1)
-    world = simulate(plan, seed)
+    world = simulate(replace(plan, lasting=lasting), seed)
     chosen = EstimatorSettings(
         fusion_period_s=fusion_period_s, state_period_s=state_period_s, lost_after=lost_after
     )
@@ -228,7 +230,7 @@ def test_a_repeated_message_counts_once_and_two_sightings_of_a_marker_twice() ->
     rows = sum(event.pose is not None for event in events)
     assert estimator.drops == {"duplicate": len(events) - rows, "odometry_duplicate": rows}
     twice = joined([sighting(world, 0.8, 0.08, off=o).detections for o in (0.0, 0.01)])
-    estimator.add_detections(0, T0 + 8 * SECOND // 10, twice, T0 + SECOND)
+    Event(0, T0 + 8 * SECOND // 10, None, twice).give(estimator, T0 + SECOND)
     estimator.tick(T0 + SECOND)
     assert estimator.used == len(events) - rows + 2
 
@@ -276,3 +278,15 @@ def test_the_same_data_give_the_same_bytes() -> None:
     a, b = (outcome(world, on_time(world), ticks(T0, T0 + 3 * SECOND)).estimate for _ in range(2))
     assert a.poses.tobytes() == b.poses.tobytes()
     assert a.covariances.tobytes() == b.covariances.tobytes()
+
+
+@settings(max_examples=6, deadline=None)
+@given(seed=st.integers(0, 10**6), content=st.sampled_from([POSITION, POSE_TWO]))
+def test_robots_that_wait_long_are_located_at_the_same_instant(seed: int, content: int) -> None:
+    plan = Plan(2, 6.0, 0.04, content=content, start_known=(False,), landmarks=2, flips=0.4, camera_hz=6.67)
+    world = simulate(plan, seed)
+    rng = np.random.default_rng(seed)
+    arrivals = delayed(world.events, lambda _: rng.uniform(0.0, 1.9))
+    orderly = outcome(world, delayed(world.events, lambda _: 0.0), ticks(T0, T0 + 8 * SECOND, 0.25))
+    assert_same(orderly, outcome(world, arrivals, ticks(T0, T0 + 8 * SECOND, 0.11)))
+    assume(settled(orderly.estimator)["CLUE"] > 5)  # some worlds show them nothing

@@ -14,8 +14,9 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
-from swarm_loc_estimator.io.bag_writer import BagWriter
+from swarm_loc_estimator.io.bag_writer import RELIABLE, BagWriter
 from swarm_loc_estimator.io.bags import BagError, BagReader, BagTopic, RawMessage
+from swarm_loc_estimator.io.message_batch import MessageBatch, merge_streams
 from swarm_loc_estimator.io.typestore import DETECTIONS, ODOMETRY, typestore
 
 if TYPE_CHECKING:
@@ -92,6 +93,7 @@ def test_written_bag_is_read_back_and_by_the_library_too(tmp_path: Path) -> None
         assert list(bag.messages()) == expected(messages)
         assert bag.time_range_ns == (expected(messages)[0][2], expected(messages)[-1][2])
         assert bag.losses == []
+        assert bag.offered_qos == {name: [RELIABLE] for name in TOPICS}
     with Reader(tmp_path / "bag") as library:
         theirs = [(c.topic, c.msgtype, log_ns, data) for c, log_ns, data in library.messages()]
         assert theirs == [("/" + m[0], *m[1:]) for m in expected(messages)]
@@ -310,6 +312,14 @@ def test_files_of_something_else_are_refused(tmp_path: Path, suffix: str, conten
         BagReader(tmp_path / f"x{suffix}")
 
 
+def test_a_database_without_a_needed_column_has_no_messages_and_that_is_said(tmp_path: Path) -> None:
+    path = write_sqlite(tmp_path / "bag", some_messages(10))
+    path.write_bytes(path.read_bytes().replace(b"topic_id", b"topic_no"))
+    messages, losses = read(path)
+    assert messages == []
+    assert any("no such column: topic_id): 0 messages were kept" in loss for loss in losses)
+
+
 def peak_of_reading(path: Path) -> int:
     with BagReader(path) as bag:
         tracemalloc.start()
@@ -331,3 +341,18 @@ def test_memory_does_not_grow_with_the_bag(tmp_path: Path, storage: str) -> None
             path = write_sqlite(tmp_path / str(count), some_messages(count))
         peaks.append(peak_of_reading(path))
     assert peaks[1] < 2 * peaks[0] + 100_000
+
+
+@given(st.lists(st.lists(st.lists(st.integers(0, 30), max_size=5), max_size=4), max_size=4))
+def test_streams_of_batches_merge_in_order_of_time_and_of_streams(streams: list[list[list[int]]]) -> None:
+    rows = []
+    batches: list[list[MessageBatch]] = []
+    for number, stream in enumerate(streams):
+        times = iter(sorted(t for part in stream for t in part))
+        batches.append([])
+        for part in stream:
+            messages = [(number, bytes([number, t]), t) for t, _ in zip(times, part, strict=False)]
+            batches[-1].append(MessageBatch.of(messages))
+            rows += messages
+    merged = [row for batch in merge_streams([iter(s) for s in batches]) for row in batch.messages()]
+    assert merged == [(n, t, data) for n, data, t in sorted(rows, key=lambda row: row[2])]

@@ -84,3 +84,19 @@ def test_sums_add_up_to_pooled_figures() -> None:
     pooled = mrclam.Sums(1, 0.01, 0.0, 3.0, 1) + mrclam.Sums(3, 0.03, 0.0, 9.0, 3)
     assert pooled.figures == pytest.approx({"position_rmse_m": 0.1, "heading_rmse_deg": 0.0, "nees": 3.0})
     assert len(mrclam.jobs_of(1, SWARM)) == 2 * (5 + 3)
+
+
+def test_set_1_is_fitted_to_wherever_it_lies() -> None:
+    sets, elsewhere = {2: Path("b"), 7: Path("c")}, Path("nowhere")
+    assert mrclam.chosen_to_fit({1: Path("a"), **sets}, None, elsewhere) == (1, Path("a"))
+    assert mrclam.chosen_to_fit(sets, None, elsewhere) == (2, Path("b"))
+    assert mrclam.chosen_to_fit(sets, 7, elsewhere) == (7, Path("c"))
+    with pytest.raises(NoSetsError, match="--fit 5: there is no such set, only 2, 7"):
+        mrclam.chosen_to_fit(sets, 5, elsewhere)
+
+
+def test_set_1_of_another_folder_is_fitted_to_where_the_own_has_none(tmp_path: Path) -> None:
+    (tmp_path / "MRCLAM_Dataset1").mkdir()
+    (tmp_path / "MRCLAM_Dataset1" / "Robot1_Odometry.dat").touch()
+    assert mrclam.chosen_to_fit({7: Path("c")}, None, tmp_path) == (1, tmp_path / "MRCLAM_Dataset1")
+    assert mrclam.chosen_to_fit({1: Path("a")}, None, tmp_path) == (1, Path("a"))

@@ -9,11 +9,13 @@ import pytest
 from calibration_world import World, record, robot
 
 from swarm_loc_estimator.calibration.fit import Options, calibrate, fit_models
-from swarm_loc_estimator.calibration.noise import score, thinned
+from swarm_loc_estimator.calibration.in_order import run_in_order
+from swarm_loc_estimator.calibration.noise import Score, score, thinned
 from swarm_loc_estimator.calibration.recording import CalibrationError, started_at_truth
 from swarm_loc_estimator.calibration.rerun import rerun
-from swarm_loc_estimator.calibration.response import nodes_of
+from swarm_loc_estimator.calibration.response import Drive, Lateness, fit_response, nodes_of
 from swarm_loc_estimator.calibration.robust import population, ridge, softened
+from swarm_loc_estimator.calibration.windows import steps_of, true_motion
 from swarm_loc_estimator.core.swarm import CameraMount, MotionResponse, OdometryModel, Robot, SensorModel
 
 TRUE = Robot(
@@ -143,12 +145,12 @@ def test_with_too_little_there_is_one_sentence() -> None:
 def test_nodes_follow_what_was_driven() -> None:
     durations = np.ones(1000)
     values = np.linspace(0.1, 0.5, 1000)
-    nodes = nodes_of(values, durations)
+    nodes = nodes_of(values, durations, 5)
     assert nodes[0] == 0.0
     assert nodes[1] == pytest.approx(0.104, abs=0.002)
     assert nodes[-1] == pytest.approx(0.496, abs=0.002)
-    assert nodes_of(np.zeros(5), durations[:5]).tolist() == [0.0]
-    assert nodes_of(np.full(5, 0.3), durations[:5]).tolist() == [0.0, 0.3]
+    assert nodes_of(np.zeros(5), durations[:5], 5).tolist() == [0.0]
+    assert nodes_of(np.full(5, 0.3), durations[:5], 5).tolist() == [0.0, 0.3]
 
 
 def test_gross_errors_do_not_spoil_a_regression() -> None:
@@ -168,3 +170,36 @@ def test_a_type_is_no_tighter_a_prior_than_its_robots_agree() -> None:
     assert sigma[0] == pytest.approx(0.1)
     _, apart = population(np.array([[0.0], [2.0]]), np.full((2, 1), 0.01), np.ones(1))
     assert apart[0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("seed", [14, 15])
+def test_all_at_once_gives_the_poses_that_come_in_time(seed: int) -> None:
+    recording, swarm = record(World((robot(1, HONEST), robot(2, HONEST)), seed, duration_s=60.0))
+    swarm = started_at_truth(swarm, recording)
+    buffered, at_once = (run(recording, swarm, 0.52) for run in (rerun, run_in_order))
+    np.testing.assert_array_equal(buffered.stamp_ns, at_once.stamp_ns)
+    apart = np.abs(buffered.pose - at_once.pose)[:-3]  # odometry has ended
+    assert np.median(apart) < 1e-6  # but where the newest odometry is older than a change of speed
+    assert np.max(apart) < 0.05
+    assert score([at_once]).position_rmse == pytest.approx(score([buffered]).position_rmse, rel=0.2)
+
+
+@pytest.mark.parametrize("seed", [16, 17, 18])
+def test_a_table_has_to_earn_its_numbers(seed: int) -> None:
+    late = Lateness(0.0, 0.0)
+    for true, least, most in ((HONEST, 1, 1), (TRUE, 2, 6)):
+        slipping = replace(true, odometry=OdometryModel())
+        recording, swarm = record(World((robot(1, slipping),), seed, duration_s=150.0, turn_sigma=0.02))
+        track, truth = recording.track(0), recording.truth["robot1"]
+        motion = true_motion(truth, int(track.stamp_ns[0]), int(track.stamp_ns[-1]))
+        drive = Drive(steps_of(track, swarm.robots[0].odometry), motion)
+        assert least <= len(fit_response([drive], late, table=True).speeds) <= most
+
+
+def test_the_score_counts_error_consistency_and_poses_not_given() -> None:
+    fair = Score(0.02, 0.01, 2.5, 1.0)
+    assert replace(fair, position_rmse=0.021).cost > fair.cost
+    assert replace(fair, nees=5.0).cost == pytest.approx(replace(fair, nees=1.25).cost)
+    assert replace(fair, nees=5.0).cost > fair.cost
+    assert replace(fair, given=0.99).cost > fair.cost
+    assert Score(np.nan, np.nan, np.nan, 0.0).cost > 10.0

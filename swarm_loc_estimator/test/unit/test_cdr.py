@@ -104,12 +104,15 @@ def swap_simple(data: bytes, fields: list[tuple[int, int]]) -> bytes:
     return bytes(out)
 
 
-@given(
+odometry_fields = given(
     stamp=STAMPS,
     frames=st.tuples(NAMES, NAMES),
     pose=st.tuples(FINITE, FINITE, ANGLE),
     twist=st.tuples(FINITE, FINITE, FINITE),
 )
+
+
+@odometry_fields
 def test_odometry_agrees_with_the_serializer(
     stamp: int, frames: tuple[str, str], pose: tuple[float, float, float], twist: tuple[float, float, float]
 ) -> None:
@@ -202,33 +205,7 @@ def test_zero_quaternion_has_no_heading() -> None:
     assert math.isnan(cdr.decode_pose_stamped(bytes(raw)).pose[2])
 
 
-def test_batch_is_the_same_as_one_by_one() -> None:
-    rng = np.random.default_rng(1)
-    messages = [
-        encode(TYPES[POSE_STAMPED](header(k, frame), pose_object(*rng.uniform(-3, 3, 3))), POSE_STAMPED)
-        for k, frame in enumerate(["a", "a", "bb", "a", "", "c"])
-    ]
-    big = swap_simple(messages[1], [(4, 2), (0, 1), (8, 7)])
-    bad_stamp = messages[0][:8] + struct.pack("<I", 10**9) + messages[0][12:]
-    messages += [messages[0][:-1], b"", big, bad_stamp, messages[0][:-32] + bytes(32)]
-    batch = cdr.decode_pose_batch(messages)
-    assert batch.valid.tolist() == [True] * 6 + [False, False, True, False, True]
-    for k, raw in enumerate(messages):
-        if batch.valid[k]:
-            one = cdr.decode_pose_stamped(raw)
-            assert batch.stamp_ns[k] == one.stamp_ns
-            np.testing.assert_allclose(batch.pose[k], one.pose, rtol=0, atol=1e-15)
-        else:
-            assert np.isnan(batch.pose[k]).all()
-    assert len(cdr.decode_pose_batch([]).valid) == 0
-
-
-@given(
-    stamp=STAMPS,
-    frames=st.tuples(NAMES, NAMES),
-    pose=st.tuples(FINITE, FINITE, ANGLE),
-    twist=st.tuples(FINITE, FINITE, FINITE),
-)
+@odometry_fields
 def test_many_odometry_messages_are_what_the_serializer_writes(
     stamp: int, frames: tuple[str, str], pose: tuple[float, float, float], twist: tuple[float, float, float]
 ) -> None:

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from core_world import (
+    MOUNT,
+    ODOMETRY,
     POSE,
     POSE_TWO,
     POSITION,
@@ -16,15 +18,15 @@ from core_world import (
     play,
     simulate,
     ticks,
+    wrapped,
 )
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from swarm_loc_estimator.core import fusion
 from swarm_loc_estimator.core.estimator import SwarmEstimator
+from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.settings import EstimatorSettings
 
-FloatArray = NDArray[np.float64]
 SEEDS = range(6)
 
 
@@ -33,8 +35,7 @@ def errors(world: World, settings: EstimatorSettings, period_s: float) -> tuple[
     end_ns = int(world.stamp_ns[-1])
     estimates = play(SwarmEstimator(world.swarm, settings), on_time(world), ticks(T0, end_ns, period_s))
     error = np.array([estimate.poses - world.at(estimate.stamp_ns) for estimate in estimates])
-    error[..., 2] = np.arctan2(np.sin(error[..., 2]), np.cos(error[..., 2]))
-    return error, np.array([estimate.covariances for estimate in estimates])
+    return wrapped(error), np.array([estimate.covariances for estimate in estimates])
 
 
 @pytest.mark.parametrize("robots", [1, 5])
@@ -51,6 +52,29 @@ def test_the_normalised_error_is_chi_square_distributed(content: int, flips: flo
     samples = np.concatenate(squared)
     low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 3 * samples.size) / samples.size
     assert low < samples.mean() < high
+
+
+@pytest.mark.parametrize("many", [5, 1000])
+@pytest.mark.parametrize(("content", "robots"), [(POSE, 1), (POSITION, 3)])
+def test_errors_that_last_are_estimated_and_the_error_stays_chi_square_distributed(
+    content: int, robots: int, many: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fusion, "_MANY", many)
+    squared, estimating, trusting = [], [], []
+    for seed in SEEDS:
+        world = simulate(Plan(robots, 20.0, content=content, lasting=1.0, speed=0.15), 200 + seed)
+        error, covariance = errors(world, EstimatorSettings(), 1.0)
+        squared.append(nees(error, covariance)[5:].mean(axis=0))
+        estimating.append(np.square(error[5:, :, :2]).mean())
+        trusted = [replace(robot, odometry=ODOMETRY, camera=MOUNT) for robot in world.swarm.robots]
+        error, _ = errors(
+            replace(world, swarm=replace(world.swarm, robots=tuple(trusted))), EstimatorSettings(), 1.0
+        )
+        trusting.append(np.square(error[5:, :, :2]).mean())
+    samples = np.concatenate(squared)
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 3 * samples.size) / samples.size
+    assert low < samples.mean() < high
+    assert np.mean(estimating) < 0.7 * np.nanmean(trusting)  # not a number where it got lost
 
 
 @pytest.mark.parametrize("fusion_period_s", [0.0, 0.2])

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.core.estimator import Status, SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.core.estimator import Status, SwarmEstimate
 from swarm_loc_estimator.core.fusion import Verdict
 from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE
 from swarm_loc_estimator.core.swarm import OdometryModel, Robot, Swarm
 from swarm_loc_estimator.io.ingest import Ingest
+from swarm_loc_estimator.io.message_batch import MessageBatch
 from swarm_loc_estimator.io.messages import encode_odometry
 from swarm_loc_estimator.nodes.estimator_health import Health, Recent, TickCost, load_report
 
@@ -21,7 +22,7 @@ class World:
     """Health of a swarm of two, fed by hand."""
 
     def __init__(self) -> None:
-        self.ingest = Ingest(SWARM, SwarmEstimator(SWARM))
+        self.ingest = Ingest(SWARM)
         self.health = Health(SWARM, self.ingest, "odom", lambda name: f" (why {name[0]})")
 
     def odometry(self, robot: str, stamp_ns: int, now_ns: int, frame: str | None = None) -> None:
@@ -35,7 +36,7 @@ class World:
             np.eye(6),
             np.eye(6),
         )
-        self.ingest.receive(self.ingest.handle_of[f"{robot}/odom"], data, now_ns)
+        list(self.ingest.read(MessageBatch.of([(self.ingest.handle_of[f"{robot}/odom"], data, now_ns)])))
 
 
 def estimate(now_ns: int, *status: Status) -> SwarmEstimate:

@@ -29,9 +29,9 @@ from core_world import (
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.estimator import Status, SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.settings import EstimatorSettings
 
-FloatArray = NDArray[np.float64]
 END = T0 + 4 * SECOND
 
 
@@ -193,10 +193,10 @@ def test_precise_sightings_during_a_silence_keep_the_covariance_positive(turn_ra
         x = 0.3 * math.sin(heading) if turn_rate else 0.015 * k
         y = 0.3 - 0.3 * math.cos(heading) if turn_rate else 0.0
         if k < 20 or k > 38:
-            estimator.add_odometry(0, now_ns, (x, y, heading), now_ns)
+            Event(0, now_ns, (x, y, heading)).give(estimator, now_ns)
         one = detection(mark.id, seen((x, y, heading), MOUNT, frame))
         one["covariance"] = 1e-6 * np.eye(6)
-        estimator.add_detections(0, now_ns, one, now_ns)
+        Event(0, now_ns, None, one).give(estimator, now_ns)
         assert_sound(estimator.tick(now_ns))
 
 
@@ -256,8 +256,8 @@ def test_data_from_before_the_jump_are_from_the_future_after_it() -> None:
     run = world()
     estimator = SwarmEstimator(run.swarm)
     play(estimator, on_time(run), ticks(T0, END))
-    estimator.add_odometry(0, END, (0.0, 0.0, 0.0), T0)
-    estimator.add_detections(0, END, spoiled("position", 0.0), T0)
+    Event(0, END, (0.0, 0.0, 0.0)).give(estimator, T0)
+    Event(0, END, None, spoiled("position", 0.0)).give(estimator, T0)
     assert estimator.drops["future_stamp"] == 2
 
 

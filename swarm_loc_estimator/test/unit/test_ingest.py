@@ -1,21 +1,26 @@
-"""From raw messages to calls of the estimator; the fast reader agrees with the complete one."""
+"""From raw messages to columns; the fast readers agree with the complete ones."""
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.swarm import Robot, Swarm
-from swarm_loc_estimator.io.cdr import DETECTION_DTYPE, CdrError, decode_detections, decode_odometry
+from swarm_loc_estimator.io.cdr import (
+    DETECTION_DTYPE,
+    decode_detections,
+    decode_odometry,
+    decode_pose_stamped,
+)
 from swarm_loc_estimator.io.ingest import Ingest, InputKind
-from swarm_loc_estimator.io.messages import encode_detections, encode_odometry
-from swarm_loc_estimator.io.streams import DetectionStream, OdometryStream
-from swarm_loc_estimator.io.typestore import DETECTIONS, ODOMETRY, typestore
+from swarm_loc_estimator.io.message_batch import MessageBatch
+from swarm_loc_estimator.io.messages import encode_detections, encode_odometry, encode_pose_stamped
+from swarm_loc_estimator.io.streams import DetectionReader, PoseReader
+from swarm_loc_estimator.io.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED, typestore
 
 Pose = tuple[float, float, float]
 FRAMES = st.sampled_from(["", "a", "ab/odom", "robot17/odom", "r\u00f6/camera"])
@@ -43,103 +48,126 @@ def big_endian(data: bytes, message_type: str) -> bytes:
     return bytes(store.serialize_cdr(message, message_type, little_endian=False))
 
 
-@given(st.lists(st.tuples(FRAMES, FRAMES, st.integers(0, 2**62 // 10**9), st.booleans()), max_size=6))
-def test_odometry_reads_as_by_the_complete_reader(rows: list[tuple[str, str, int, bool]]) -> None:
-    stream = OdometryStream()
-    for frame, child, stamp_ns, swapped in rows:
+def batch_of(
+    messages: Sequence[bytes], topics: Sequence[int] = (), times: Sequence[int] = ()
+) -> MessageBatch:
+    n = len(messages)
+    return MessageBatch.of(list(zip(topics or [0] * n, messages, times or [0] * n, strict=True)))
+
+
+@settings(deadline=None)  # the first call compiles
+@given(
+    st.lists(st.tuples(st.integers(0, 2), FRAMES, FRAMES, st.integers(0, 2**62 // 10**9), st.booleans())),
+    st.booleans(),
+)
+def test_odometry_reads_as_by_the_complete_reader(
+    rows: list[tuple[int, str, str, int, bool]], at_once: bool
+) -> None:
+    reader, messages = PoseReader(3, decode_odometry, names=2), []
+    for _, frame, child, stamp_ns, swapped in rows:
         data = odometry(frame, stamp_ns, (1.5, -2.5, 3.0), child)
-        data = big_endian(data, ODOMETRY) if swapped else data
-        expected = decode_odometry(data)
-        assert stream.read(data) == (expected.stamp_ns, expected.pose)
-        assert stream.frame_id == frame
+        messages.append(big_endian(data, ODOMETRY) if swapped else data)
+    batch = batch_of(messages, [row[0] for row in rows])
+    slices = [slice(None)] if at_once else [slice(k, k + 1) for k in range(len(rows))]
+    parts = [reader.read(batch.chosen(rows)) for rows in slices]
+    stamps = [stamp for part in parts for stamp in part.stamp_ns.tolist()]
+    poses = [tuple(pose) for part in parts for pose in part.pose.tolist()]
+    expected = [decode_odometry(data) for data in messages]
+    assert stamps == [message.stamp_ns for message in expected]
+    assert poses == [message.pose for message in expected]
+    for topic, frame, *_ in rows:
+        newest = [row for row in rows if row[0] == topic][-1]
+        assert reader.frame_ids[topic] == newest[1], frame
 
 
-@given(st.lists(st.tuples(FRAMES, st.integers(0, 4), st.booleans()), max_size=6))
-def test_detections_read_as_by_the_complete_reader(rows: list[tuple[str, int, bool]]) -> None:
-    stream = DetectionStream()
-    for frame, count, swapped in rows:
-        data = detections(frame, 5, count)
-        data = big_endian(data, DETECTIONS) if swapped else data
-        expected = decode_detections(data)
-        stamp_ns, found = stream.read(data)
-        assert stamp_ns == expected.stamp_ns
-        assert found.dtype == DETECTION_DTYPE
-        for name in DETECTION_DTYPE.names or ():
-            assert np.array_equal(found[name], expected.detections[name])
+@settings(deadline=None)  # the first call compiles
+@given(st.lists(st.tuples(st.integers(0, 2), FRAMES, st.integers(0, 4), st.booleans()), max_size=8))
+def test_detections_read_as_by_the_complete_reader(rows: list[tuple[int, str, int, bool]]) -> None:
+    reader, messages = DetectionReader(3), []
+    for k, (_, frame, count, swapped) in enumerate(rows):
+        data = detections(frame, 5 + k, count)
+        messages.append(big_endian(data, DETECTIONS) if swapped else data)
+    columns = reader.read(batch_of(messages, [row[0] for row in rows]))
+    expected = [decode_detections(data) for data in messages]
+    assert columns.stamp_ns.tolist() == [message.stamp_ns for message in expected]
+    assert columns.count.tolist() == [message.detections.size for message in expected]
+    assert columns.detection.dtype == DETECTION_DTYPE
+    for name in DETECTION_DTYPE.names or ():
+        wanted = [message.detections[name] for message in expected]
+        found = columns.detection[name]
+        assert np.array_equal(found, np.concatenate(wanted) if wanted else found[:0])
 
 
-@pytest.mark.parametrize("good", [odometry("a/odom", 5, (0.0, 0.0, 0.0)), detections("a/camera", 5, 2)])
-def test_damaged_bytes_are_refused_before_and_after_a_good_message(good: bytes) -> None:
-    is_odometry = decodes(good)
-    stream = OdometryStream() if is_odometry else DetectionStream()
+@pytest.mark.parametrize("kind", ["odometry", "detections"])
+def test_damaged_bytes_are_refused_before_and_after_a_good_message(kind: str) -> None:
+    is_odometry = kind == "odometry"
+    good = odometry("a/odom", 5, (0.0, 0.0, 0.0)) if is_odometry else detections("a/camera", 5, 2)
+    reader = PoseReader(1, decode_odometry, names=2) if is_odometry else DetectionReader(1)
     bad_stamp = good[:8] + b"\xff\xff\xff\xff" + good[12:]
     broken = [b"", good[:3], good[:40], good[:-30], good + bytes(50), b"\x07" + good[1:], bad_stamp]
-    for _ in range(2):
-        for data in broken:
-            with pytest.raises(CdrError):
-                stream.read(data)
-        stream.read(good)
+    columns = reader.read(batch_of([*broken, good, *broken, good, good[:-1] + b"\x01"]))
+    bad = [False] * len(broken)
+    assert columns.valid.tolist() == [*bad, True, *bad, True, True]
 
 
-def decodes(data: bytes) -> bool:
-    """Whether these bytes are odometry."""
-    try:
-        decode_odometry(data)
-    except CdrError:
-        return False
-    return True
-
-
-class Recorder:
-    """Takes the place of the estimator."""
-
-    def __init__(self) -> None:
-        self.calls: list[tuple[object, ...]] = []
-        self.dropped: dict[str, int] = {}
-
-    def add_odometry(self, robot: int, stamp_ns: int, pose: Pose, now_ns: int) -> None:
-        """Keep the call."""
-        self.calls.append(("odometry", robot, stamp_ns, pose, now_ns))
-
-    def add_detections(self, robot: int, stamp_ns: int, found: NDArray[np.void], now_ns: int) -> None:
-        """Keep the call."""
-        self.calls.append(("detections", robot, stamp_ns, found["id"].tolist(), now_ns))
-
-    def drop(self, reason: str, count: int = 1) -> None:
-        """Count."""
-        self.dropped[reason] = self.dropped.get(reason, 0) + count
-
-
-def test_each_message_becomes_one_call_and_is_counted() -> None:
-    recorder = Recorder()
-    ingest = Ingest(Swarm((Robot("a"), Robot("b", camera=None))), recorder)
+def test_each_topic_is_read_and_counted_and_malformed_ones_go_no_further() -> None:
+    ingest = Ingest(Swarm((Robot("a"), Robot("b", camera=None))))
     assert [topic.name for topic in ingest.topics] == ["a/odom", "a/detections", "b/odom", "b/detections"]
     assert [topic.name for topic in ingest.topics if not topic.expected] == ["b/detections"]
 
     odom, seen = ingest.handle_of["b/odom"], ingest.handle_of["a/detections"]
-    ingest.receive(odom, odometry("b/odom", 10, (1.0, 2.0, 0.0)), 14)
-    ingest.receive(odom, odometry("b/odom", 20, (1.0, 2.0, 0.0)), 30)
-    ingest.receive(odom, b"nonsense", 40)
-    ingest.receive(seen, detections("a/camera", 15, 2), 50)
-
-    assert recorder.calls == [
-        ("odometry", 1, 10, (1.0, 2.0, 0.0), 14),
-        ("odometry", 1, 20, (1.0, 2.0, 0.0), 30),
-        ("detections", 0, 15, [7, 8], 50),
+    pose = (1.0, 2.0, 0.0)
+    messages = [
+        odometry("b/odom", 10, pose),
+        odometry("b/odom", 20, pose),
+        b"x",
+        detections("a/camera", 15, 2),
     ]
-    assert recorder.dropped == {"bad_message": 1}
+    (read,) = ingest.read(batch_of(messages, [odom, odom, odom, seen], [14, 30, 40, 50]))
+
+    assert [column.tolist() for column in read.odometry] == [[1, 1], [10, 20], [[*pose], [*pose]], [14, 30]]
+    assert read.detections.detection["id"].tolist() == [7, 8]
+    assert [read.detections.robot.tolist(), read.detections.stamp_ns.tolist()] == [[0, 0], [15, 15]]
+    assert read.detections.arrival_ns.tolist() == [50, 50]
+    assert (read.begin_ns, read.end_ns, read.malformed) == (14, 50, 1)
     statistics = ingest.statistics[odom]
     assert (statistics.received, statistics.malformed) == (3, 1)
     assert (statistics.last_stamp_ns, statistics.last_arrival_ns) == (20, 30)
     assert (statistics.late_sum_ns, statistics.late_max_ns, statistics.late_count) == (14, 10, 2)
+    statistics.restart()
+    assert (statistics.late_sum_ns, statistics.late_max_ns, statistics.late_count) == (0, None, 0)
     assert ingest.frame_id(odom) == "b/odom"
     assert ingest.topics[seen].kind is InputKind.DETECTIONS
+    assert ingest.statistics[0].last_arrival_ns is None
+
+
+def test_messages_are_parted_where_time_goes_back() -> None:
+    ingest = Ingest(Swarm((Robot("a"),)))
+    messages = [odometry("a/odom", k, (0.0, 0.0, 0.0)) for k in range(6)]
+    parts = list(ingest.read(batch_of(messages, times=[5, 5, 9, 3, 4, 1])))
+    assert [(part.begin_ns, part.end_ns) for part in parts] == [(5, 9), (3, 4), (1, 1)]
+    assert [part.odometry.stamp_ns.tolist() for part in parts] == [[0, 1, 2], [3, 4], [5]]
+    assert not list(ingest.read(MessageBatch.of([])))
 
 
 def test_a_quaternion_of_zeros_has_no_yaw() -> None:
     data = bytearray(odometry("a/odom", 5, (0.0, 0.0, 0.0)))
     start = len(data) - 8 * 85
     data[start + 24 : start + 56] = bytes(32)
-    stream = OdometryStream()
-    for _ in range(2):
-        assert math.isnan(stream.read(bytes(data))[1][2])
+    columns = PoseReader(1, decode_odometry, names=2).read(batch_of([bytes(data)] * 2))
+    assert columns.valid.all()
+    assert np.isnan(columns.pose[:, 2]).all()
+
+
+def test_ground_truth_reads_as_by_the_complete_reader() -> None:
+    poses = np.random.default_rng(1).uniform(-3, 3, (6, 3))
+    messages = [
+        encode_pose_stamped(frame, np.array([k]), poses[k : k + 1])[0]
+        for k, frame in enumerate(["a", "a", "bb", "a", "", "c"])
+    ]
+    messages += [big_endian(messages[1], POSE_STAMPED), messages[0][:-1], messages[0]]
+    columns = PoseReader(1, decode_pose_stamped, names=1).read(batch_of(messages))
+    assert columns.valid.tolist() == [True] * 7 + [False, True]
+    for k in np.flatnonzero(columns.valid).tolist():
+        one = decode_pose_stamped(messages[k])
+        assert (columns.stamp_ns[k], tuple(columns.pose[k])) == (one.stamp_ns, one.pose)

@@ -26,12 +26,10 @@ from core_world import (
     simulate,
     ticks,
 )
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.core.estimator import Status, SwarmEstimate, SwarmEstimator
-
-FloatArray = NDArray[np.float64]
+from swarm_loc_estimator.core.se2 import FloatArray
 
 
 def errors(world: World, estimates: list[SwarmEstimate]) -> FloatArray:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from core_world import planar, pose_of
 
 from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.measurements import (
@@ -17,14 +17,9 @@ from swarm_loc_estimator.core.measurements import (
     innovation,
     predict,
 )
+from swarm_loc_estimator.core.se2 import FloatArray
 
-FloatArray = NDArray[np.float64]
 WHO = {"landmark": (0, NOBODY), "robot": (0, 1), "fix": (NOBODY, 1)}
-
-
-def matrix(pose: FloatArray) -> FloatArray:
-    x, y, theta = pose
-    return np.array([[np.cos(theta), -np.sin(theta), x], [np.sin(theta), np.cos(theta), y], [0, 0, 1]])
 
 
 def measurement(
@@ -40,10 +35,9 @@ def chain(
     who: str, observer: FloatArray, target: FloatArray, sensor: FloatArray, marker: FloatArray
 ) -> FloatArray:
     """(X_observer S)^-1 (X_target M) by homogeneous matrices; eq. (3) for landmarks, (5) for robots."""
-    camera = matrix(sensor) if who == "fix" else matrix(observer) @ matrix(sensor)
-    mark = matrix(marker) if who == "landmark" else matrix(target) @ matrix(marker)
-    relative = np.linalg.inv(camera) @ mark
-    return np.array([relative[0, 2], relative[1, 2], math.atan2(relative[1, 0], relative[0, 0])])
+    camera = planar(sensor) if who == "fix" else planar(observer) @ planar(sensor)
+    mark = planar(marker) if who == "landmark" else planar(target) @ planar(marker)
+    return pose_of(np.linalg.inv(camera) @ mark)
 
 
 @dataclass
@@ -109,6 +103,27 @@ def test_jacobians_agree_with_finite_differences(who: str, kind: Kind, heading: 
             slope = values[0] - values[1]
             slope[1:] = [wrapped(slope[1]) if kind == Kind.POLAR else slope[1], wrapped(slope[2]) * heading]
             np.testing.assert_allclose(slope / (2 * step), sign * jacobian[:, j], atol=2e-8, rtol=1e-6)
+
+
+@pytest.mark.parametrize("heading", [0, 1])
+@pytest.mark.parametrize("kind", [Kind.CARTESIAN, Kind.POLAR])
+@pytest.mark.parametrize("who", ["landmark", "robot"])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_camera_may_be_turned_and_stretch_distances(
+    who: str, kind: Kind, heading: int, seed: int
+) -> None:
+    s, camera, step = scene(seed), np.array([0.2, 0.1]), 1e-6
+    one = measurement(who, kind, s.sensor, s.marker, heading).repeat(5)
+    errors = camera + step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [0, 0]])
+    value, jacobian = predict(one, s.observer[None].repeat(5, 0), s.target[None].repeat(5, 0), errors)
+    for column in range(2):
+        slope = value[2 * column] - value[2 * column + 1]
+        slope[1:] = [wrapped(slope[1]) if kind == Kind.POLAR else slope[1], wrapped(slope[2]) * heading]
+        np.testing.assert_allclose(slope / (2 * step), jacobian[4, :, 3 + column], atol=2e-8, rtol=1e-6)
+    s.sensor[2] += camera[0]
+    expected, _ = predicted(who, kind, s, heading)
+    expected[: 2 if kind == Kind.CARTESIAN else 1] *= 1.0 + camera[1]
+    np.testing.assert_allclose(value[4], expected, atol=1e-12)
 
 
 def test_a_marker_at_the_sensor_itself_has_finite_numbers() -> None:

@@ -6,13 +6,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from core_world import SECOND, T0
+from core_world import SECOND, T0, wrapped
 from numpy.typing import NDArray
 
+from swarm_loc_estimator.core import se2
+from swarm_loc_estimator.core.motion import DRIFT, NOISE
 from swarm_loc_estimator.core.odometry import OdometryTracks, TrackChange, TrackSample
+from swarm_loc_estimator.core.parameters import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
+from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import OdometryModel, Robot
 
-FloatArray = NDArray[np.float64]
 PLAIN = OdometryModel(wheel_separation=0.1, wheel_noise=1e-4)
 STEP_NS = SECOND // 20
 
@@ -55,7 +58,7 @@ def test_a_track_follows_closed_form_arcs_between_the_rows_too(speed: float, tur
 def test_headings_across_a_half_turn_are_followed() -> None:
     track, stamps = tracks(), stamps_until(8.0)
     raw = arc(0.1, 1.0, (stamps - T0) * 1e-9)
-    raw[:, 2] = np.arctan2(np.sin(raw[:, 2]), np.cos(raw[:, 2]))
+    raw = wrapped(raw)
     feed(track, stamps, raw)
     assert look(track, T0 + 8 * SECOND).pose[0, 2] == pytest.approx(8.0, abs=1e-9)
 
@@ -82,7 +85,7 @@ def test_gathered_noise_is_that_of_sampled_wheels(speed: float, turn_rate: float
     x = pose[:, 0] - (cos * raw[-1, 0] - sin * raw[-1, 1])
     y = pose[:, 1] - (sin * raw[-1, 0] + cos * raw[-1, 1])
     sampled = np.cov(np.stack([x, y, turned]))
-    gathered = look(track, int(stamps[-1])).noise[0]
+    gathered = look(track, int(stamps[-1])).gathered[0, NOISE]
     np.testing.assert_allclose(gathered, sampled, atol=0.05 * np.abs(gathered).max())
     np.testing.assert_allclose(np.diag(gathered), np.diag(sampled), rtol=0.08, atol=2e-6)
 
@@ -92,7 +95,7 @@ def test_noise_of_a_straight_drive_in_closed_form() -> None:
     feed(track, stamps, arc(0.3, 0.0, (stamps - T0) * 1e-9))
     k, d, length = PLAIN.wheel_noise, PLAIN.wheel_separation, 0.6
     heading = 2.0 * k * length / d**2
-    noise = look(track, int(stamps[-1])).noise[0]
+    noise = look(track, int(stamps[-1])).gathered[0, NOISE]
     assert noise[0, 0] == pytest.approx(0.5 * k * length)
     assert noise[2, 2] == pytest.approx(heading)
     assert noise[1, 2] == pytest.approx(-heading * length / 2, rel=1e-9)  # lever arm about the track's origin
@@ -107,7 +110,7 @@ def test_any_order_and_batching_of_rows_gives_the_same_track(seed: int) -> None:
     stamps = np.sort(rng.choice(np.arange(60), 50, replace=False)) * STEP_NS + T0
     raw = arc(0.1, 0.8, (stamps - T0) * 1e-9)
     raw[20] += 3.0  # no robot can drive so far
-    raw[:, 2] = np.arctan2(np.sin(raw[:, 2]), np.cos(raw[:, 2]))
+    raw = wrapped(raw)
     robots, rows = np.repeat([0, 1], 50), np.tile(raw, (2, 1))
     all_stamps = np.tile(stamps, 2)
     orderly.extend(robots, all_stamps, rows)
@@ -115,7 +118,7 @@ def test_any_order_and_batching_of_rows_gives_the_same_track(seed: int) -> None:
     for batch in np.array_split(conflicting, rng.integers(1, 30)):
         shuffled.extend(robots[batch], all_stamps[batch], rows[batch])
     who, when = np.repeat([0, 1], 80), np.tile(T0 + np.arange(80) * STEP_NS // 2 * 2 + 7_000_000, 2)
-    for name in ("pose", "raw", "noise", "silence_s"):
+    for name in ("pose", "raw", "gathered", "silence_s"):
         np.testing.assert_allclose(
             getattr(shuffled.at(who, when), name), getattr(orderly.at(who, when), name), atol=1e-12
         )
@@ -159,7 +162,7 @@ def test_what_noise_is_gathered_between_any_two_instants_is_a_covariance(
         )
     instants = T0 + np.arange(0, 3 * SECOND, 30_000_000)
     sample = track.at(np.zeros(instants.size, dtype=np.int64), instants)
-    least = np.linalg.eigvalsh(np.diff(sample.noise, axis=0)).min()
+    least = np.linalg.eigvalsh(np.diff(sample.gathered[:, NOISE], axis=0)).min()
     assert least > -1e-3 * PLAIN.wheel_noise  # the motion of a silent robot is not known better than a step's
 
 
@@ -171,8 +174,8 @@ def test_a_silent_robot_runs_on_for_its_timeout_and_then_may_be_anywhere() -> No
     assert soon.silence_s[0] == pytest.approx(0.05)
     assert late.silence_s[0] == pytest.approx(10.0)
     reach = PLAIN.max_speed * 10.0
-    np.testing.assert_allclose(np.diag(late.noise[0])[:2], reach**2 / 3, rtol=0.2)
-    assert late.noise[0, 2, 2] > 1.0
+    np.testing.assert_allclose(np.diag(late.gathered[0, NOISE])[:2], reach**2 / 3, rtol=0.2)
+    assert late.gathered[0, NOISE, 2, 2] > 1.0
 
 
 def test_a_row_after_a_silence_changes_nothing_more_than_a_timeout_before_it() -> None:
@@ -184,7 +187,7 @@ def test_a_row_after_a_silence_changes_nothing_more_than_a_timeout_before_it() -
     feed(track, np.array([T0 + 6 * SECOND]), np.array([[0.4, 0.2, 0.5]]))
     after = track.at(who, instants)
     np.testing.assert_array_equal(after.pose, before.pose)
-    np.testing.assert_array_equal(after.noise, before.noise)
+    np.testing.assert_array_equal(after.gathered, before.gathered)
 
 
 def test_a_jump_is_no_motion_but_makes_the_robot_unsure() -> None:
@@ -194,7 +197,7 @@ def test_a_jump_is_no_motion_but_makes_the_robot_unsure() -> None:
     assert feed(track, stamps, raw).jumps == 1
     assert look(track, int(stamps[-1])).pose[0, 0] == pytest.approx(0.1 - 0.005)
     assert look(track, int(stamps[-1])).raw[0, 0] == pytest.approx(4.1)
-    grown = look(track, int(stamps[10])).noise[0] - look(track, int(stamps[9])).noise[0]
+    grown = look(track, int(stamps[10])).gathered[0, NOISE] - look(track, int(stamps[9])).gathered[0, NOISE]
     assert math.sqrt(grown[0, 0]) > 0.02
     assert feed(track, stamps[[15]] + 1, raw[[15]]).jumps == 0  # one that comes late counts none again
 
@@ -211,7 +214,7 @@ def test_trimming_and_growing_keep_look_ups() -> None:
         trimmed.trim(now_ns - 2 * SECOND, now_ns - 4 * SECOND)
         when = now_ns - np.arange(0, 4 * SECOND, 230_000_000)
         who = np.zeros(when.size, dtype=np.int64)
-        for name in ("pose", "raw", "noise", "silence_s"):
+        for name in ("pose", "raw", "gathered", "silence_s"):
             np.testing.assert_array_equal(
                 getattr(trimmed.at(who, when), name), getattr(kept.at(who, when), name)
             )
@@ -237,3 +240,26 @@ def test_a_track_begins_with_its_earliest_row_even_when_that_comes_late() -> Non
     assert track.begun(0, T0)
     np.testing.assert_allclose(track.arrays.begin_pose[0], [0.004, 0.0, 0.0])
     np.testing.assert_allclose(look(track, T0 - SECOND).pose[0], [0.004, 0.0, 0.0])
+
+
+def test_gathered_drift_is_how_the_pose_moves_with_scales_and_bias() -> None:
+    """Against tracks of robots whose motion is calibrated differently, by finite differences."""
+    stamps, step = stamps_until(3.0), 1e-5
+    model = replace(PLAIN, course_offset=0.1, axle_offset=-0.03)
+    models = [
+        replace(model, **{name: 1.0 + way * step})
+        for name in ("distance_scale", "turn_scale")
+        for way in (1.0, -1.0)
+    ]
+    track, raw = tracks(model, *models, model, model), arc(0.2, 0.9, (stamps - T0) * 1e-9)
+    for robot, bias in enumerate([0.0, 0.0, 0.0, 0.0, 0.0, step, -step]):
+        # a bias is turned into the report, whose path does not change
+        rate = 0.9 + bias
+        feed(track, stamps, arc(0.2, rate, (stamps - T0) * 1e-9) if bias else raw, robot)
+    for seconds in (0.5, 1.77, 3.0):
+        at_ns = T0 + round(seconds * 1e9)
+        here = look(track, at_ns)
+        poses = [look(track, at_ns, robot).pose[0] for robot in range(1, 7)]
+        for k, parameter in enumerate((DISTANCE_SCALE, TURN_SCALE, TURN_BIAS)):
+            moved = se2.log(se2.compose(poses[2 * k], se2.inverse(poses[2 * k + 1]))) / (2 * step)
+            np.testing.assert_allclose(here.gathered[0, DRIFT, :, parameter], moved, atol=2e-4)

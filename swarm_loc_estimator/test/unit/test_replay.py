@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 
 from swarm_loc_estimator.core.metrics import pool, summarise
 from swarm_loc_estimator.io.bag_cut import copy_beginning
+from swarm_loc_estimator.io.bag_writer import BagWriter
+from swarm_loc_estimator.io.bags import BagReader
 from swarm_loc_estimator.io.swarm_file import load_swarm
 from swarm_loc_estimator.replay import replay
 
@@ -50,3 +53,27 @@ def test_a_bag_cut_in_the_middle_gives_the_poses_up_to_there(tmp_path: Path) -> 
     assert 0.3 < same / len(whole.stamp_ns) < 0.6
     np.testing.assert_array_equal(part.stamp_ns[:same], whole.stamp_ns[:same])
     np.testing.assert_array_equal(part.pose[:same], whole.pose[:same])
+
+
+def repeated(folder: Path, times: int) -> Path:
+    """The demo's messages several times over, each time later."""
+    with BagReader(DEMO) as reader, BagWriter(folder) as writer:
+        first_ns, last_ns = reader.time_range_ns
+        for topic in reader.topics:
+            writer.add_topic(topic.name, topic.type)
+        for k in range(times):
+            for name, _, log_ns, data in reader.messages():
+                writer.write(name, log_ns + k * (last_ns - first_ns), data)
+    return folder
+
+
+def test_memory_does_not_grow_with_the_bag(tmp_path: Path) -> None:
+    swarm, peaks = load_swarm(DEMO / "swarm.yaml"), []
+    bags = [repeated(tmp_path / f"{times}", times) for times in (1, 4)]
+    for one in (DEMO, *bags):  # the first run also pays for what is loaded once
+        tracemalloc.start()
+        result = replay(one, swarm)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert len(result.stamp_ns) > 2000
+    assert peaks[2] < 1.02 * peaks[1]

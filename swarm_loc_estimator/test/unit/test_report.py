@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+from dataclasses import replace
 from html.parser import HTMLParser
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ import pytest
 from swarm_loc_estimator.core.metrics import Track
 from swarm_loc_estimator.core.swarm import Landmark, Robot, Swarm
 from swarm_loc_estimator.io.report import write_report
+from swarm_loc_estimator.io.report_overview import plot_overview
 from swarm_loc_estimator.io.report_table import text_report
 from swarm_loc_estimator.replay_result import ReplayResult
 
@@ -30,7 +32,7 @@ def result_of(robots: int, ticks: int = 200, truths: int | None = None, title: s
     stamp_ns = np.arange(ticks, dtype=np.int64) * SECOND // 20
     true = np.zeros((ticks, robots, 3))
     true[:, :, 0] = np.arange(robots)
-    covariance = np.broadcast_to(0.01 * np.eye(3), (ticks, robots, 3, 3))
+    covariance = np.tile(0.01 * np.eye(3), (ticks, robots, 1, 1))
     pose = true + np.array([0.0, 0.3, 0.0])
     truth = {f"r{k}": Track(stamp_ns, true[:, k]) for k in range(robots if truths is None else truths)}
     return ReplayResult(
@@ -71,7 +73,7 @@ def png_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
-def test_table_has_the_figures(tmp_path: Path) -> None:
+def test_table_has_the_figures() -> None:
     text = text_report(result_of(2))
     rows = {line.split()[0]: line.split()[1:] for line in text.splitlines() if re.match(r"(r\d|all) ", line)}
     assert rows["r0"] == ["200", *["0.3000"] * 5, *["0.00"] * 5, "9.00"]
@@ -79,7 +81,6 @@ def test_table_has_the_figures(tmp_path: Path) -> None:
     assert "0.25 s, 40 x real time" in text
     assert re.search(r"too_old +14", text)
     assert "A remark." in text
-    assert (tmp_path / "x").exists() is False
 
 
 def test_robots_that_wait_and_robots_without_truth(tmp_path: Path) -> None:
@@ -99,7 +100,7 @@ def test_page_is_whole_and_needs_nothing_else(tmp_path: Path) -> None:
     html = files.page.read_text(encoding="utf-8")
     page.feed(html)
     assert page.open == []
-    assert len(page.sources) == 2
+    assert len(page.sources) == 3
     assert all(source.startswith("data:image/png;base64,") for source in page.sources)
     assert "http" not in re.sub(r"base64,[^\"]*", "", html)
     assert "&lt;b&gt;bag &amp; more" in html
@@ -111,15 +112,25 @@ def test_page_is_whole_and_needs_nothing_else(tmp_path: Path) -> None:
 def test_equal_results_give_equal_files(tmp_path: Path) -> None:
     for folder in ("one", "two"):
         write_report(result_of(1, ticks=20), tmp_path / folder)
-    for name in ("report.txt", "report.html", "paths.png", "errors.png"):
+    for name in ("report.txt", "report.html", "overview.png", "errors.png"):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+def test_the_overview_ends_with_the_truth(tmp_path: Path) -> None:
+    whole, longer = result_of(2, ticks=100), result_of(2, ticks=140)
+    longer.covariance[100:] *= 100.0
+    for name, result in (("whole", whole), ("longer", replace(longer, truth=whole.truth))):
+        plot_overview(result, tmp_path / name)
+    assert (tmp_path / "whole").read_bytes() == (tmp_path / "longer").read_bytes()
 
 
 @pytest.mark.parametrize("robots", [1, 4, 12])
 def test_pictures_of_few_and_many_robots(tmp_path: Path, robots: int) -> None:
+    write_report(result_of(2, ticks=20), tmp_path)
     files = write_report(result_of(robots, ticks=20), tmp_path)
+    assert (files.paths is not None) == (tmp_path / "paths.png").exists() == (robots == 4)
     assert files.errors is not None
-    for picture in (files.paths, files.errors):
+    for picture in filter(None, (files.overview, files.paths, files.errors)):
         width, height = png_size(picture)
         assert 300 < height < 4000
         assert 300 < width < 4000

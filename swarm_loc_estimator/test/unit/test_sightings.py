@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.core.measurements import NOBODY, Kind, MeasurementArray
+from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.sightings import SightingConverter
 from swarm_loc_estimator.core.swarm import CameraMount, Face, Landmark, Robot, SensorModel, Swarm
 from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
 
-FloatArray = NDArray[np.float64]
 LEVEL = CameraMount(x=0.04, z=0.05)
 MOUNTS = [
     LEVEL,

@@ -76,6 +76,7 @@ def _create(*, system_packages: bool) -> None:
     """Make an empty virtual environment in place of whatever is there."""
     host.check_python_parts()
     host.check_build_tools()
+    say("Setting up this clone, which takes some minutes once; interrupted, it goes on from there")
     if VENV.exists():
         say("  removing the old or unfinished .venv")
         shutil.rmtree(VENV)

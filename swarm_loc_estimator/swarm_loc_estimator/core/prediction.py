@@ -1,0 +1,225 @@
+"""Prediction of one robot along its odometry track: what its pose drifts by, and how unsure it becomes.
+
+A robot's pose is X = T O with the track O. Between two instants T gathers noise, and drifts with the
+parameters z of the robot's motion (`core/parameters.py`):
+
+    T <- exp(A z) T,    P <- F P F^T + Ad(T) (G2 - G1) Ad(T)^T,    A = Ad(T) (D2 - D1).
+
+The right-invariant error turns with the move, xi <- Ad(exp(A z)) xi + Ad(exp(A z / 2)) A dz, which is F. The
+turn rate's bias is a first-order Gauss-Markov process: it decays, and between the instants it was what it was
+on average.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.core.compiled import adjoint_of, assign, assign_matrix, compiled, moved_by_twist
+from swarm_loc_estimator.core.dense_filter import IndexArray, cholesky3
+from swarm_loc_estimator.core.motion import DRIFT, NOISE
+from swarm_loc_estimator.core.parameters import DRIVES, TURN_BIAS
+from swarm_loc_estimator.core.se2 import FloatArray
+
+if TYPE_CHECKING:
+    from swarm_loc_estimator.core.state import BeliefArrays
+
+
+class _Drift(NamedTuple):
+    """How a robot's parameters move its pose from where its belief stands to another instant.
+
+    Attributes:
+        twist: (3,) T is moved by exp(twist).
+        turn: (3, 3) the error of the pose there per error before.
+        drive: (3, DRIVES) the error of the pose there per error of each parameter before.
+        bias: (3,) share of the turn bias that is left; the variance that its mean over the time gained, in
+            units of its column of `drive`, squared; the covariance of that mean with the bias that is left.
+    """
+
+    twist: FloatArray
+    turn: FloatArray
+    drive: FloatArray
+    bias: FloatArray
+
+
+@compiled
+def advance(belief: BeliefArrays, robot: int, gathered: FloatArray, stamp_ns: int) -> None:
+    """Predict a robot, in place, to where its track has gathered (2, 3, 3) at an instant."""
+    added, first = np.empty((3, 3)), 3 * robot
+    if not new_noise(belief, robot, gathered[NOISE], added):
+        return
+    if has_drives(belief, robot):
+        drift = _new_drift(belief, robot, gathered[DRIFT], stamp_ns)
+        _move(drift.twist, belief.transform[robot])
+        _drive(belief, robot, drift)
+    for i in range(3):
+        for j in range(3):
+            belief.covariance[first + i, first + j] += added[i, j]
+    for k in range(2):
+        assign_matrix(belief.accounted[robot, k], gathered[k])
+    belief.accounted_ns[robot] = max(stamp_ns, belief.accounted_ns[robot])
+
+
+@compiled
+def predicted(
+    belief: BeliefArrays,
+    robot: int,
+    gathered: FloatArray,
+    stamp_ns: int,
+    transform: FloatArray,
+    covariance: FloatArray,
+) -> None:
+    """Write T (3,) and the covariance (3, 3) of its error where `advance` would take them; change nothing."""
+    added, first = np.empty((3, 3)), 3 * robot
+    assign(transform, belief.transform[robot])
+    assign_matrix(covariance, belief.covariance[first : first + 3, first : first + 3])
+    if not new_noise(belief, robot, gathered[NOISE], added):
+        return
+    if has_drives(belief, robot):
+        drift = _new_drift(belief, robot, gathered[DRIFT], stamp_ns)
+        _move(drift.twist, transform)
+        columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))
+        count = _own(belief, robot, drift, columns, weight)
+        _block(belief.covariance, columns, weight, count, drift, covariance)
+    for i in range(3):
+        for j in range(3):
+            covariance[i, j] += added[i, j]
+
+
+@compiled
+def new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, added: FloatArray) -> bool:
+    """Write Ad(T) (G - G_accounted) Ad(T)^T (3, 3) and return True; or leave it when that is no covariance.
+
+    The latter happens only when odometry comes so late that more was assumed of a silence beyond the horizon.
+    """
+    accounted = belief.accounted[robot, NOISE]
+    difference, work, rounding = np.empty((3, 3)), np.empty((3, 3)), 1e-12
+    for i in range(3):
+        rounding += 1e-9 * abs(noise[i, i] - accounted[i, i])
+    for i in range(3):
+        for j in range(3):
+            difference[i, j] = noise[i, j] - accounted[i, j]
+            work[i, j] = difference[i, j] + (rounding if i == j else 0.0)
+    factor = cholesky3(work)
+    if not math.isfinite(factor[0, 0] + factor[1, 1] + factor[2, 2]):
+        return False
+    adjoint = adjoint_of(belief.transform[robot])
+    for i in range(3):
+        for j in range(3):
+            work[i, j] = adjoint[i][0] * difference[0, j] + adjoint[i][1] * difference[1, j]
+            work[i, j] += adjoint[i][2] * difference[2, j]
+    for i in range(3):
+        for j in range(3):
+            added[i, j] = work[i, 0] * adjoint[j][0] + work[i, 1] * adjoint[j][1]
+            added[i, j] += work[i, 2] * adjoint[j][2]
+    return True
+
+
+@compiled
+def has_drives(belief: BeliefArrays, robot: int) -> bool:
+    """Whether any parameter of the robot's motion is estimated."""
+    estimated = False
+    for m in range(DRIVES):
+        estimated = estimated or belief.table.column[robot, m] >= 0
+    return estimated
+
+
+@compiled
+def _new_drift(belief: BeliefArrays, robot: int, drift: FloatArray, stamp_ns: int) -> _Drift:
+    """How the pose moves until its track has gathered `drift` (3, DRIVES) at an instant."""
+    out = _Drift(np.zeros(3), np.empty((3, 3)), np.zeros((3, DRIVES)), np.empty(3))
+    x = max(0, stamp_ns - belief.accounted_ns[robot]) * 1e-9 / belief.table.turn_bias_time_s[robot]
+    left, variance = math.exp(-x), belief.table.sigma[robot, TURN_BIAS] ** 2
+    reach = -math.expm1(-x)  # of the bias now, over the time, in units of its time constant
+    # of what arises meanwhile; a series where the closed form would be rounding
+    spread = 2.0 * x - 3.0 + 4.0 * left - left * left if x > 1e-2 else x**3 * (2.0 / 3.0 - 0.5 * x)
+    out.bias[0] = left
+    out.bias[1] = variance * spread / max(reach, 1e-12) ** 2
+    out.bias[2] = variance * (1.0 - left) ** 2 / max(reach, 1e-12)
+    adjoint, accounted = adjoint_of(belief.transform[robot]), belief.accounted[robot, DRIFT]
+    for m in range(DRIVES):
+        mean = reach / x if m == TURN_BIAS and x > 1e-9 else 1.0
+        for i in range(3):
+            for a in range(3):
+                out.drive[i, m] += adjoint[i][a] * (drift[a, m] - accounted[a, m]) * mean
+            out.twist[i] += out.drive[i, m] * belief.parameter[robot, m]
+    pose, column = np.zeros(3), np.empty(3)
+    _move(0.5 * out.twist, pose)
+    half = adjoint_of(pose)
+    for m in range(DRIVES):
+        for i in range(3):
+            column[i] = out.drive[i, m]
+        for i in range(3):
+            out.drive[i, m] = half[i][0] * column[0] + half[i][1] * column[1] + half[i][2] * column[2]
+    _move(0.5 * out.twist, pose)
+    whole = adjoint_of(pose)
+    for i in range(3):
+        for j in range(3):
+            out.turn[i, j] = whole[i][j]
+    return out
+
+
+@compiled
+def _own(belief: BeliefArrays, robot: int, drift: _Drift, columns: IndexArray, weight: FloatArray) -> int:
+    """Write which columns (3 + DRIVES,) the pose's error comes from, with what weight; return how many."""
+    count = 0
+    for m in range(3 + DRIVES):
+        column = 3 * robot + m if m < 3 else belief.table.column[robot, m - 3]
+        if column >= 0:
+            columns[count] = column
+            for i in range(3):
+                weight[i, count] = drift.turn[i, m] if m < 3 else drift.drive[i, m - 3]
+            count += 1
+    return count
+
+
+@compiled
+def _block(
+    p: FloatArray, columns: IndexArray, weight: FloatArray, count: int, drift: _Drift, out: FloatArray
+) -> None:
+    """Write the covariance (3, 3) of the pose's error after the drift."""
+    for i in range(3):
+        for j in range(i + 1):
+            total = drift.bias[1] * drift.drive[i, TURN_BIAS] * drift.drive[j, TURN_BIAS]
+            for a in range(count):
+                for b in range(count):
+                    total += weight[i, a] * p[columns[a], columns[b]] * weight[j, b]
+            out[i, j] = out[j, i] = total
+
+
+@compiled
+def _drive(belief: BeliefArrays, robot: int, drift: _Drift) -> None:
+    """Apply a drift to the covariance of the pose's error with everything, and let the bias decay."""
+    first, p, size = 3 * robot, belief.covariance, belief.covariance.shape[0]
+    columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))
+    rows, block = np.zeros((3, size)), np.empty((3, 3))
+    count = _own(belief, robot, drift, columns, weight)
+    _block(p, columns, weight, count, drift, block)
+    for i in range(3):
+        for a in range(count):
+            for j in range(size):
+                rows[i, j] += weight[i, a] * p[columns[a], j]
+    bias = belief.table.column[robot, TURN_BIAS]
+    if bias >= 0:
+        belief.parameter[robot, TURN_BIAS] *= drift.bias[0]
+        for j in range(size):
+            p[bias, j] *= drift.bias[0]
+            p[j, bias] *= drift.bias[0]
+        p[bias, bias] += belief.table.sigma[robot, TURN_BIAS] ** 2 * (1.0 - drift.bias[0] ** 2)
+        for i in range(3):
+            rows[i, bias] = drift.bias[0] * rows[i, bias] + drift.bias[2] * drift.drive[i, TURN_BIAS]
+    for i in range(3):
+        for j in range(size):
+            p[first + i, j] = p[j, first + i] = rows[i, j]
+    for i in range(3):
+        for j in range(3):
+            p[first + i, first + j] = block[i, j]
+
+
+@compiled
+def _move(twist: FloatArray, transform: FloatArray) -> None:
+    """Move a transform (3,), in place, by exp(twist)."""
+    x, y, theta = moved_by_twist(twist[0], twist[1], twist[2], transform[0], transform[1], transform[2])
+    transform[0], transform[1], transform[2] = x, y, theta

@@ -1,0 +1,37 @@
+"""At which ticks a large swarm's measurements are fused. No ROS here, and no clock but those handed in."""
+
+from __future__ import annotations
+
+_LONGEST_WAIT = 0.25
+"""Share of the horizon that data may wait to be fused; they have come late already."""
+
+
+class FusionPace:
+    """Lets fusing take its share of a core and no more, unless data would grow too old meanwhile.
+
+    Args:
+        load: Share of a core.
+        horizon_s: Data older than this are dropped [s].
+    """
+
+    def __init__(self, load: float, horizon_s: float) -> None:
+        self._load = load
+        self._longest_ns = round(_LONGEST_WAIT * horizon_s * 1e9)
+        self._rested_s = 0.0
+        self._fused_ns: int | None = None
+
+    def is_due(self, wall_s: float, now_ns: int) -> bool:
+        """Whether to fuse now.
+
+        Args:
+            wall_s: A steady clock, that of the core.
+            now_ns: The node's time, that of the data.
+        """
+        if wall_s >= self._rested_s or self._fused_ns is None:
+            return True
+        return not 0 <= now_ns - self._fused_ns < self._longest_ns
+
+    def note(self, wall_s: float, now_ns: int, cpu_s: float) -> None:
+        """Fusing began at these times and took so much of a core [s]."""
+        self._rested_s = wall_s + cpu_s / self._load
+        self._fused_ns = now_ns

@@ -1,0 +1,209 @@
+"""Locating a robot from clues alone: clues against transform chains, fixes against the truth behind them."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from core_world import SECOND, T0, nees, planar, pose_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from swarm_loc_estimator.core import fix, locate
+from swarm_loc_estimator.core.clues import CLUE_DTYPE, NO_CLUES, ClueArray, with_clue
+from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE, NOBODY, Kind, MeasurementArray
+from swarm_loc_estimator.core.odometry import OdometryTracks
+from swarm_loc_estimator.core.parameters import ParameterTable
+from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.state import SwarmState
+from swarm_loc_estimator.core.swarm import Robot
+
+SEEDS = st.integers(0, 10**6)
+SIGMA, TURN_SIGMA = 0.01, 0.05
+NO_NOISE = np.zeros((3, 3))
+LONG_NS = 3600 * SECOND
+
+
+def any_pose(rng: np.random.Generator) -> FloatArray:
+    return np.array([*rng.uniform(-2, 2, 2), rng.uniform(-3, 3)])
+
+
+def sighting(
+    rng: np.random.Generator, sees: bool, kind: Kind, yaw: float
+) -> tuple[MeasurementArray, FloatArray]:
+    """What robot 0, at a random place, sees of a robot 1 at the origin, or is seen as; and where it is."""
+    robot, sensor, marker = any_pose(rng), any_pose(rng), any_pose(rng)
+    turned = np.add(sensor, [0.0, 0.0, yaw])
+    observer, target = (planar(robot), np.eye(3)) if sees else (np.eye(3), planar(robot))
+    seen = pose_of(np.linalg.inv(observer @ planar(turned)) @ target @ planar(marker))
+    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
+    one["observer"], one["target"] = (0, 1) if sees else (1, 0)
+    one["kind"], one["sensor"], one["marker"], one["stamp_ns"], one["has_heading"] = (
+        kind,
+        sensor,
+        marker,
+        T0,
+        1,
+    )
+    one["value"] = (
+        seen if kind == Kind.CARTESIAN else [math.hypot(*seen[:2]), math.atan2(seen[1], seen[0]), seen[2]]
+    )
+    one["covariance"] = np.diag([4e-4, 1e-4, 1e-2])
+    return one, robot
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=SEEDS,
+    sees=st.booleans(),
+    kind=st.sampled_from([Kind.CARTESIAN, Kind.POLAR]),
+    yaw=st.floats(-0.2, 0.2),
+)
+def test_a_clue_lies_on_the_map_where_the_true_transform_puts_it(
+    seed: int, sees: bool, kind: Kind, yaw: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    one, robot = sighting(rng, sees, kind, yaw)
+    transform = any_pose(rng)
+    track = pose_of(np.linalg.inv(planar(transform)) @ planar(robot))
+    one["has_alternative"], one["alternative"] = 1, one["value"] + [0.0, 0.0, 0.7]
+    (clue,) = with_clue(NO_CLUES, one, yaw, 0, track, NO_NOISE, np.zeros(3), NO_NOISE, LONG_NS)
+    place = planar(transform) @ [clue["local_x"], clue["local_y"], 1.0]
+    np.testing.assert_allclose(place[:2], [clue["map_x"], clue["map_y"]], atol=1e-9)
+    off = np.array([clue["turn"], clue["other_turn"]]) - transform[2]
+    np.testing.assert_allclose(np.cos(off), [1.0, math.cos(0.7)], atol=1e-9)
+    assert (clue["marker_id"], clue["other"]) == (0, 1)
+
+
+@pytest.mark.parametrize("sees", [True, False])
+@pytest.mark.parametrize("kind", [Kind.CARTESIAN, Kind.POLAR])
+def test_a_clue_is_as_unsure_as_sampled_sightings_and_located_robots(kind: Kind, sees: bool) -> None:
+    rng = np.random.default_rng(int(kind) + 2 * sees)
+    one, robot = sighting(rng, sees, kind, 0.0)
+    spread = np.diag([1e-4, 2e-4, 3e-4])
+    samples, value = [], one["value"].copy()
+    for _ in range(4000):
+        one["value"] = value + rng.multivariate_normal(np.zeros(3), one["covariance"][0])
+        base = rng.multivariate_normal(np.zeros(3), spread)
+        (clue,) = with_clue(NO_CLUES, one, 0.0, 0, robot, NO_NOISE, base, spread, LONG_NS)
+        samples.append([clue[name] for name in ("local_x", "local_y", "map_x", "map_y")])
+    sampled = np.cov(np.array(samples).T)
+    local, there = (
+        np.array([[clue[f"{side}_xx"], clue[f"{side}_xy"]], [clue[f"{side}_xy"], clue[f"{side}_yy"]]])
+        for side in ("local", "map")
+    )
+    tolerance = 0.12 * np.abs(sampled).max()
+    np.testing.assert_allclose(local, sampled[:2, :2], atol=tolerance)
+    np.testing.assert_allclose(there, sampled[2:, 2:], atol=tolerance)
+
+
+def clues_of(
+    rng: np.random.Generator, transform: FloatArray, marks: FloatArray, headings: Sequence[float] = ()
+) -> ClueArray:
+    """Noisy clues (k,), 0.1 s apart, of marks (k, 2) in map; with headings off by so much where given."""
+    clues = np.zeros(len(marks), dtype=CLUE_DTYPE)
+    local = (np.linalg.inv(planar(transform)) @ np.column_stack([marks, np.ones(len(marks))]).T)[:2]
+    local += SIGMA * rng.standard_normal(local.shape)
+    clues["stamp_ns"] = T0 + np.arange(len(marks)) * SECOND // 10
+    clues["local_x"], clues["local_y"] = local
+    clues["map_x"], clues["map_y"] = marks.T
+    clues["local_xx"] = clues["local_yy"] = SIGMA**2
+    clues["turn"] = clues["other_turn"] = math.nan
+    clues["turn_variance"] = TURN_SIGMA**2
+    if headings:
+        clues["turn"] = transform[2] + headings + TURN_SIGMA * rng.standard_normal(len(marks))
+    return clues
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=SEEDS, count=st.integers(5, 20), wrong=st.floats(0.0, 0.35))
+def test_the_fix_is_the_truth_also_among_wrong_clues(seed: int, count: int, wrong: float) -> None:
+    rng = np.random.default_rng(seed)
+    transform = any_pose(rng)
+    angles = 2.0 * np.pi * (np.arange(count) * 0.381966) + rng.uniform(0, 6)
+    clues = clues_of(rng, transform, np.column_stack([np.cos(angles), np.sin(angles)]))
+    bad = rng.permutation(count)[: int(wrong * count)]
+    clues["map_x"][bad] += rng.choice([-1.0, 1.0], bad.size) * rng.uniform(0.5, 2.0, bad.size)
+    found = locate.locate(clues, NO_NOISE)
+    assert found is not None
+    assert np.abs(found.transform[:2] - transform[:2]).max() < 0.2
+    assert nees(error_of(found.transform, transform), found.covariance) < 45.0
+
+
+def error_of(transform: FloatArray, truth: FloatArray) -> FloatArray:
+    """The right-invariant error (3,), to first order."""
+    error: FloatArray = pose_of(planar(truth) @ np.linalg.inv(planar(transform)))
+    return error
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=SEEDS)
+def test_the_fix_moves_with_the_map(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    transform, moved = any_pose(rng), any_pose(rng)
+    marks = rng.uniform(-1, 1, (8, 2))
+    clues = clues_of(rng, transform, marks, headings=[0.0] * 8)
+    elsewhere = clues.copy()
+    elsewhere["map_x"], elsewhere["map_y"] = (planar(moved) @ np.column_stack([marks, np.ones(8)]).T)[:2]
+    elsewhere["turn"] += moved[2]
+    a, b = (locate.locate(some, NO_NOISE) for some in (clues, elsewhere))
+    assert a is not None
+    assert b is not None
+    np.testing.assert_allclose(planar(b.transform), planar(moved) @ planar(a.transform), atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_one_heading_against_two_of_one_marker_leaves_the_robot_waiting(seed: int) -> None:
+    """Two mirrored headings without their second solutions; the points say nothing, as they are all one."""
+    rng = np.random.default_rng(seed)
+    clues = clues_of(rng, any_pose(rng), np.tile([0.5, 0.3], (3, 1)), headings=[0.9, 0.0, 0.9])
+    assert locate.locate(clues, NO_NOISE) is None
+
+
+def many_clues(stamps_s: FloatArray, markers: Sequence[int], window_s: float) -> ClueArray:
+    """What is kept of sightings of all markers at each stamp."""
+    one, clues = np.zeros(1, dtype=MEASUREMENT_DTYPE), NO_CLUES
+    one["target"], one["covariance"] = NOBODY, np.eye(3)
+    for seconds in stamps_s:
+        for marker in markers:
+            one["stamp_ns"], one["marker_id"] = T0 + round(seconds * 1e9), marker
+            clues = with_clue(
+                clues, one, 0.0, 0, np.zeros(3), NO_NOISE, np.zeros(3), NO_NOISE, round(window_s * 1e9)
+            )
+    return clues
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=SEEDS, markers=st.integers(1, 6))
+def test_clues_kept_are_few_and_spread_over_time_and_markers(seed: int, markers: int) -> None:
+    steps = np.random.default_rng(seed).uniform(0.05, 0.2, 200)
+    stamps_s = np.cumsum(steps)
+    clues = many_clues(stamps_s, range(markers), 15.0)
+    age_s = (clues["stamp_ns"][-1] - clues["stamp_ns"]) * 1e-9
+    assert clues.size == 20
+    assert (np.diff(clues["stamp_ns"]) >= 0).all()
+    assert age_s.max() <= 15.0
+    for marker in range(markers):
+        of_marker = age_s[clues["marker_id"] == marker]
+        assert of_marker.min() < 0.25
+        assert of_marker.max() > 2.0  # of the last 20 sightings none would be
+    assert np.mean(age_s < 5.0) > 0.4  # a robot moved by hand meanwhile is soon outvoted
+
+
+def test_attempts_become_rarer_but_never_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracks, robots = OdometryTracks([Robot("a")]), [Robot("a")]
+    tracks.extend(np.zeros(2, dtype=np.int64), np.array([T0, T0 + 20 * SECOND]), np.zeros((2, 3)))
+    attempts: list[int] = []
+    monkeypatch.setattr(fix, "locate", lambda clues, _: attempts.append(int(clues["stamp_ns"][-1])))
+    state, book = SwarmState(ParameterTable.of(robots)), fix.ClueBook(tracks, 20.0)
+    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
+    one["target"], one["covariance"] = NOBODY, np.eye(3)
+    stamps = T0 + np.arange(0, 10 * SECOND, SECOND // 30)
+    for one["stamp_ns"][0] in stamps:
+        assert book.note(state, one)
+    assert attempts[0] == stamps[2]
+    gaps_s = np.diff(attempts) * 1e-9
+    assert gaps_s[:3].max() < 0.05
+    assert gaps_s.max() <= 0.3 + 1 / 30
+    assert len(attempts) < 10 / 0.3 + 25
+    assert stamps[-1] - attempts[-1] < SECOND // 3

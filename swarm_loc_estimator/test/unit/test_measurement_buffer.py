@@ -1,0 +1,66 @@
+"""Law: measurements lie in one order, each once, however they came in."""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.measurement_buffer import MeasurementBuffer
+from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE
+
+Row = tuple[int, int, int, float]
+ROW = st.tuples(
+    st.integers(-20, 20), st.integers(-1, 2), st.integers(0, 2), st.sampled_from([-1.0, 0.0, 1.5])
+)
+
+
+def measurements(rows: list[Row]) -> NDArray[np.void]:
+    many = np.zeros(len(rows), dtype=MEASUREMENT_DTYPE)
+    for one, (stamp_ns, observer, marker_id, value) in zip(many, rows, strict=True):
+        one["stamp_ns"], one["observer"], one["marker_id"], one["value"][1] = (
+            stamp_ns,
+            observer,
+            marker_id,
+            value,
+        )
+    return many
+
+
+@settings(deadline=None)  # the first call compiles
+@given(st.lists(st.lists(ROW, max_size=8), max_size=8), st.randoms())
+def test_any_order_gives_the_same_each_once(parts: list[list[Row]], order: random.Random) -> None:
+    rows = [row for part in parts for row in part]
+    buffer, other = MeasurementBuffer(), MeasurementBuffer()
+    known: set[Row] = set()
+    for part in parts:
+        merged = buffer.merge(measurements(part), -10)
+        new = {row for row in part if row[0] >= -10} - known
+        assert merged.too_old == sum(row[0] < -10 for row in part)
+        assert merged.duplicates == len(part) - merged.too_old - len(new)
+        assert merged.first_ns == min((row[0] for row in new), default=None)
+        known |= new
+    order.shuffle(rows)
+    for row in rows:
+        other.merge(measurements([row]), -10)
+    assert buffer.measurements.tobytes() == other.measurements.tobytes()
+    assert len(buffer) == len(known)
+    assert buffer.stamp_ns.tolist() == sorted(row[0] for row in known)
+    np.testing.assert_array_equal(buffer.measurements["stamp_ns"], buffer.stamp_ns)
+
+
+def test_what_was_computed_stays_with_what_lies_before_and_space_is_used_again() -> None:
+    buffer = MeasurementBuffer()
+    for lap in range(200):
+        buffer.merge(measurements([(100 * lap + k, 0, 0, 0.0) for k in range(100)]), -10)
+        buffer.nis[-100:] = lap
+        buffer.verdicts[-100:] = lap % 3
+        if lap >= 5:
+            buffer.drop_first(100)
+            assert buffer.nis.tolist() == [float(k) for k in range(lap - 4, lap + 1) for _ in range(100)]
+            assert buffer.verdicts.tolist() == [k % 3 for k in range(lap - 4, lap + 1) for _ in range(100)]
+    assert buffer.stamp_ns.tolist() == [*range(19500, 20000)]
+    assert buffer._stamp_ns.size < 5000

@@ -1,0 +1,123 @@
+"""Prediction with errors that last: against sampling, and in one step as in many."""
+
+import numpy as np
+import pytest
+from core_world import SECOND, T0
+
+from swarm_loc_estimator.core import se2
+from swarm_loc_estimator.core.odometry import OdometryTracks
+from swarm_loc_estimator.core.parameters import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE, ParameterTable
+from swarm_loc_estimator.core.prediction import advance
+from swarm_loc_estimator.core.state import SwarmState
+from swarm_loc_estimator.core.swarm import OdometryModel, Robot
+
+BIAS_SIGMA, DISTANCE_SIGMA, TURN_SIGMA, BIAS_TIME_S = 0.005, 0.01, 0.005, 20.0
+STEP_NS = SECOND // 20
+MODEL = OdometryModel(
+    wheel_noise=1e-9,
+    distance_scale_sigma=DISTANCE_SIGMA,
+    turn_scale_sigma=TURN_SIGMA,
+    turn_bias_sigma=BIAS_SIGMA,
+    turn_bias_time_s=BIAS_TIME_S,
+)
+PRIOR = 1e-4 * np.eye(3)
+
+
+def drive(speed: float, turn_rate: float, seconds: float) -> tuple[OdometryTracks, SwarmState]:
+    """Two robots that drive the same, the second without errors that last."""
+    robots = [Robot("a", odometry=MODEL), Robot("b", odometry=OdometryModel(wheel_noise=1e-9))]
+    tracks, state = OdometryTracks(robots), SwarmState(ParameterTable.of(robots))
+    stamps = T0 + STEP_NS * np.arange(round(seconds * 20) + 1, dtype=np.int64)
+    pose, raw = np.zeros(3), []
+    for _ in stamps:
+        raw.append(pose)
+        pose = se2.compose(pose, se2.exp(np.array([speed, 0.0, turn_rate]) * 0.05))
+    for robot in range(2):
+        tracks.extend(np.full(stamps.size, robot), stamps, np.array(raw))
+        state.enter(robot, np.array([0.3, -0.2, 1.0]), PRIOR, np.zeros((2, 3, 3)), T0)
+    return tracks, state
+
+
+def to(state: SwarmState, tracks: OdometryTracks, seconds: float, robot: int = 0) -> None:
+    stamp_ns = T0 + round(seconds * 1e9)
+    gathered = tracks.at(np.array([robot]), np.array([stamp_ns])).gathered[0]
+    advance(state.arrays(), robot, gathered, stamp_ns)
+
+
+@pytest.mark.parametrize(("speed", "turn_rate"), [(0.1, 0.0), (0.1, 0.4)])
+def test_one_long_prediction_is_many_short_ones(speed: float, turn_rate: float) -> None:
+    """Only the bias's decay along a bend tells them apart: it is taken as even over the time."""
+    tracks, many = drive(speed, turn_rate, 4.0)
+    many.parameter[0] = [0.02, 0.02, -0.01, 0.0, 0.0]
+    once = many.copy()
+    to(once, tracks, 4.0)
+    for seconds in np.linspace(0.1, 4.0, 40):
+        to(many, tracks, seconds)
+    np.testing.assert_allclose(once.transform, many.transform, atol=8e-3)
+    np.testing.assert_allclose(once.parameter, many.parameter, atol=1e-12)
+    p, q = once.filter.covariance, many.filter.covariance
+    scale = np.sqrt(np.outer(np.diag(q), np.diag(q)))
+    np.testing.assert_allclose(p / scale, q / scale, atol=0.08)
+    np.testing.assert_array_equal(p, p.T)
+    assert np.linalg.eigvalsh(p / scale).min() > 0.0
+
+
+def test_the_read_out_is_what_the_prediction_would_be() -> None:
+    tracks, state = drive(0.1, 0.3, 4.0)
+    state.parameter[0] = [0.02, 0.02, -0.01, 0.0, 0.0]
+    to(state, tracks, 1.0)
+    before = state.copy()
+    gathered = tracks.at(np.array([0]), np.array([T0 + 3 * SECOND])).gathered[0]
+    transform, covariance = state.at(0, gathered, T0 + 3 * SECOND)
+    np.testing.assert_array_equal(state.transform, before.transform)
+    np.testing.assert_array_equal(state.filter.covariance, before.filter.covariance)
+    to(state, tracks, 3.0)
+    np.testing.assert_allclose(transform, state.transform[0], atol=1e-12)
+    np.testing.assert_allclose(covariance, state.filter.covariance[:3, :3], atol=1e-12)
+
+
+def test_the_spread_is_that_of_sampled_motion() -> None:
+    """Heading and place of many robots whose scales and changing bias are drawn."""
+    speed, turn_rate, seconds, samples = 0.1, 0.3, 4.0, 4000
+    tracks, state = drive(speed, turn_rate, seconds)
+    rng, dt = np.random.default_rng(0), 0.05
+    true = se2.compose(np.array([0.3, -0.2, 1.0]), np.zeros((samples, 3)))
+    bias = BIAS_SIGMA * rng.standard_normal(samples)
+    along = speed * (1.0 + DISTANCE_SIGMA * rng.standard_normal(samples))
+    turning = turn_rate * (1.0 + TURN_SIGMA * rng.standard_normal(samples))
+    kept = np.exp(-dt / BIAS_TIME_S)
+    for _ in range(round(seconds / dt)):
+        twist = np.column_stack([along, np.zeros(samples), turning + bias]) * dt
+        true = se2.compose(true, se2.exp(twist))
+        bias = kept * bias + np.sqrt(1.0 - kept**2) * BIAS_SIGMA * rng.standard_normal(samples)
+    state.filter.place(np.arange(3), 1e-12 * np.eye(3))
+    to(state, tracks, seconds)
+    track = tracks.at(np.array([0]), np.array([T0 + round(seconds * 1e9)])).pose[0]
+    pose = se2.compose(state.transform[0], track)
+    spread = np.cov((true - pose).T)
+    scale = np.sqrt(np.outer(np.diag(spread), np.diag(spread)))
+    predicted = se2.pose_covariance(pose, state.filter.covariance[:3, :3])
+    np.testing.assert_allclose(predicted / scale, spread / scale, atol=0.08)
+
+
+def test_parameters_not_asked_for_have_no_columns() -> None:
+    tracks, state = drive(0.1, 0.3, 1.0)
+    assert state.filter.covariance.shape == (9, 9)
+    to(state, tracks, 1.0, robot=1)
+    assert not state.filter.covariance[3:6, 6:].any()
+    table = ParameterTable.of([Robot("b")])
+    assert table.filter_size == 3
+    assert (table.column == -1).all()
+
+
+def test_losing_a_robot_forgets_its_parameters() -> None:
+    tracks, state = drive(0.1, 0.3, 1.0)
+    state.parameter[0] = [0.02, 0.02, -0.01, 0.0, 0.0]
+    to(state, tracks, 1.0)
+    assert state.filter.covariance[:3, 6:].any()
+    state.lose(0)
+    assert not state.filter.covariance[:3, 6:].any()
+    assert not state.parameter[0].any()
+    sigma = np.sqrt(np.diag(state.filter.covariance)[6:])
+    np.testing.assert_allclose(sigma, [BIAS_SIGMA, DISTANCE_SIGMA, TURN_SIGMA])
+    assert (TURN_BIAS, DISTANCE_SCALE, TURN_SCALE) == (0, 1, 2)  # the order of sigma
