@@ -1,9 +1,12 @@
 """Simulate a swarm and write what its sensors say as a bag with its swarm.yaml.
 
     generate_bag eight bags/eight_five_robots --seed 3 --duration 54 --world w0
+    generate_bag pictures bags/eight_pictures --seed 1 --duration 9 --robots 2
     generate_bag grid /tmp/grid100 --robots 100 --duration 20
 
 The bag holds <robot>/odom, <robot>/detections and <robot>/ground_truth; `swarm.yaml` lies inside its folder.
+`pictures` writes, in place of detections, what the cameras see: <robot>/image_raw/compressed (JPEG) and
+<robot>/camera_info.
 The same arguments give the same bytes.
 """
 
@@ -17,14 +20,15 @@ from typing import TYPE_CHECKING
 from swarm_loc_drivers.sim.bag import write_bag
 from swarm_loc_drivers.sim.eight import EightSettings, simulate_eight
 from swarm_loc_drivers.sim.grid import GridSettings, simulate_grid
+from swarm_loc_drivers.sim.picture_bag import write_picture_bag
+from swarm_loc_drivers.sim.pictures import photograph_eight
+from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.io.bag_file import BagError
 from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from swarm_loc_drivers.sim.record import SimulatedRun
 
 _SHORTEST_S = 2.0
 
@@ -39,9 +43,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"--robots {options.robots} must be at least 1")
     if options.seed < 0:
         parser.error(f"--seed {options.seed} must be at least 0")
-    words = [f"{name}={value}" for name, value in vars(options).items() if name not in ("bag", "simulate")]
+    words = [f"{name}={value}" for name, value in vars(options).items() if name not in ("bag", "write")]
     try:
-        count = write_bag(options.simulate(options), options.bag, f"Simulated: {', '.join(words)}.")
+        count = options.write(options, f"Simulated: {', '.join(words)}.")
     except (BagError, DefinitionsNotFoundError) as error:
         print(error, file=sys.stderr)
         return 1
@@ -49,21 +53,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _eight(options: argparse.Namespace) -> SimulatedRun:
-    return simulate_eight(
-        EightSettings(
-            seed=options.seed,
-            duration_s=options.duration,
-            robots=options.robots,
-            speed=options.speed,
-            world=WORLDS[options.world],
-            start_known=not options.start_unknown,
-        )
+def _eight_settings(options: argparse.Namespace) -> EightSettings:
+    return EightSettings(
+        seed=options.seed,
+        duration_s=options.duration,
+        robots=options.robots,
+        speed=options.speed,
+        world=WORLDS[options.world],
+        start_known=not options.start_unknown,
     )
 
 
-def _grid(options: argparse.Namespace) -> SimulatedRun:
-    return simulate_grid(GridSettings(seed=options.seed, duration_s=options.duration, robots=options.robots))
+def _eight(options: argparse.Namespace, comment: str) -> int:
+    return write_bag(simulate_eight(_eight_settings(options)), options.bag, comment)
+
+
+def _pictures(options: argparse.Namespace, comment: str) -> int:
+    return write_picture_bag(photograph_eight(_eight_settings(options), CameraModel()), options.bag, comment)
+
+
+def _grid(options: argparse.Namespace, comment: str) -> int:
+    settings = GridSettings(seed=options.seed, duration_s=options.duration, robots=options.robots)
+    return write_bag(simulate_grid(settings), options.bag, comment)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -73,15 +84,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     swarms = parser.add_subparsers(dest="swarm", required=True, metavar="SWARM")
     eight = _swarm(swarms, "eight", "e-pucks driving the paper's eight among wall markers", 5, 54.0)
-    eight.set_defaults(simulate=_eight)
-    eight.add_argument(
-        "--world", choices=sorted(WORLDS), default="w0", help="imperfections; see sim/worlds.py"
-    )
-    eight.add_argument("--speed", type=float, default=0.06, help="[m/s]")
-    eight.add_argument("--start-unknown", action="store_true", help="swarm.yaml tells no start poses")
-    _swarm(swarms, "grid", "many robots, each about its cell of a grid", 100, 20.0).set_defaults(
-        simulate=_grid
-    )
+    eight.set_defaults(write=_eight)
+    pictures = _swarm(swarms, "pictures", "the same, with what their cameras see", 2, 9.0)
+    pictures.set_defaults(write=_pictures)
+    for one in (eight, pictures):
+        one.add_argument(
+            "--world", choices=sorted(WORLDS), default="w0", help="imperfections; see sim/worlds.py"
+        )
+        one.add_argument("--speed", type=float, default=0.06, help="[m/s]")
+        one.add_argument("--start-unknown", action="store_true", help="swarm.yaml tells no start poses")
+    _swarm(swarms, "grid", "many robots, each about its cell of a grid", 100, 20.0).set_defaults(write=_grid)
     return parser
 
 

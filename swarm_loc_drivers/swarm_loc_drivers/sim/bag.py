@@ -21,14 +21,17 @@ from swarm_loc_estimator.io.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED
 from .detections import as_detections
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
+
+    from swarm_loc_estimator.core.swarm import Swarm
 
     from .record import Records, SimulatedRun
 
 TRUTH_PERIOD_NS = 100_000_000
 
 
-class _Stream(NamedTuple):
+class Stream(NamedTuple):
     """The messages of one topic with their times of arrival."""
 
     topic: str
@@ -52,9 +55,18 @@ def write_bag(run: SimulatedRun, folder: Path, comment: str) -> int:
         BagError: The folder is there already, or cannot be created.
     """
     detections = as_detections(run)
-    streams: list[_Stream] = []
+    streams: list[Stream] = []
     for index in range(len(run.swarm.robots)):
-        streams += [_odometry(run, index), _detections(run, index, detections), _truth(run, index)]
+        streams += [
+            odometry_stream(run, index),
+            _detections(run, index, detections),
+            truth_stream(run, index),
+        ]
+    return write_streams(streams, run.swarm, folder, comment)
+
+
+def write_streams(streams: Sequence[Stream], swarm: Swarm, folder: Path, comment: str) -> int:
+    """Write topics in order of arrival, and `swarm.yaml`; arguments and errors as for `write_bag`."""
     arrival_ns = np.concatenate([stream.arrival_ns for stream in streams])
     owner = np.repeat(np.arange(len(streams)), [len(stream.data) for stream in streams])
     place = np.concatenate([np.arange(len(stream.data)) for stream in streams])
@@ -66,11 +78,11 @@ def write_bag(run: SimulatedRun, folder: Path, comment: str) -> int:
             owner[order].tolist(), arrival_ns[order].tolist(), place[order].tolist(), strict=True
         ):
             bag.write(streams[which].topic, at_ns, streams[which].data[one])
-    save_swarm(run.swarm, folder / "swarm.yaml", comment)
+    save_swarm(swarm, folder / "swarm.yaml", comment)
     return len(order)
 
 
-def _odometry(run: SimulatedRun, robot: int) -> _Stream:
+def odometry_stream(run: SimulatedRun, robot: int) -> Stream:
     """The robot's odometry; velocities are those of the step before each message."""
     name = run.swarm.robots[robot].name
     rows = run.odometry[run.odometry["robot"] == robot]
@@ -89,10 +101,10 @@ def _odometry(run: SimulatedRun, robot: int) -> _Stream:
         UNKNOWN_COVARIANCE,
         UNKNOWN_COVARIANCE,
     )
-    return _Stream(f"{name}/odom", ODOMETRY, rows["arrival_ns"], data)
+    return Stream(f"{name}/odom", ODOMETRY, rows["arrival_ns"], data)
 
 
-def _detections(run: SimulatedRun, robot: int, detections: Records) -> _Stream:
+def _detections(run: SimulatedRun, robot: int, detections: Records) -> Stream:
     """The robot's pictures, also those that show nothing: they tell that the camera is alive."""
     name = run.swarm.robots[robot].name
     frames = run.frames[run.frames["robot"] == robot]
@@ -101,11 +113,11 @@ def _detections(run: SimulatedRun, robot: int, detections: Records) -> _Stream:
         encode_detections(optical_frame, stamp_ns, detections[first : first + count])
         for _, stamp_ns, _, first, count in frames.tolist()
     ]
-    return _Stream(f"{name}/detections", DETECTIONS, frames["arrival_ns"], data)
+    return Stream(f"{name}/detections", DETECTIONS, frames["arrival_ns"], data)
 
 
-def _truth(run: SimulatedRun, robot: int) -> _Stream:
+def truth_stream(run: SimulatedRun, robot: int) -> Stream:
     """Where the robot really was, ten times a second."""
     stamp_ns = np.arange(run.start_ns, run.end_ns + 1, TRUTH_PERIOD_NS)
     data = encode_pose_stamped("map", stamp_ns, run.truth.at(robot, stamp_ns))
-    return _Stream(f"{run.swarm.robots[robot].name}/ground_truth", POSE_STAMPED, stamp_ns, data)
+    return Stream(f"{run.swarm.robots[robot].name}/ground_truth", POSE_STAMPED, stamp_ns, data)

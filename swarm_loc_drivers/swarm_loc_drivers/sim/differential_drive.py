@@ -62,6 +62,29 @@ def twist_of(wheels: FloatArray, separation: float) -> FloatArray:
     return np.stack([0.5 * (right + left), np.zeros_like(right), (right - left) / separation], axis=-1)
 
 
+def roll(
+    poses: FloatArray,
+    speed: FloatArray,
+    turn_rate: FloatArray,
+    model: Drive,
+    step_s: float,
+    noise: FloatArray,
+) -> FloatArray:
+    """Where robots at `poses` (N, 3) come in one step.
+
+    Args:
+        poses: In map.
+        speed: Commanded (N,) [m/s].
+        turn_rate: Commanded (N,) [rad/s].
+        model: How they err.
+        step_s: [s].
+        noise: (N, 2) of the right and left wheel, of variance `model.wheel_noise` [m^0.5].
+    """
+    rolled = wheel_paths(speed, (1.0 - model.turn_slip) * turn_rate, model.wheel_separation, step_s)
+    rolled += noise * np.sqrt(np.abs(rolled))
+    return se2.compose(poses, se2.exp(twist_of(rolled, model.wheel_separation)))
+
+
 def drive(
     rng: np.random.Generator,
     start: FloatArray,
@@ -79,9 +102,7 @@ def drive(
     for k in range(steps):
         speed, turn_rate = control(k, truth[k])
         commanded[k] = wheel_paths(speed, turn_rate, model.wheel_separation, step_s)
-        rolled = wheel_paths(speed, (1.0 - model.turn_slip) * turn_rate, model.wheel_separation, step_s)
-        rolled += noise[k] * np.sqrt(np.abs(rolled))
-        truth[k + 1] = se2.compose(truth[k], se2.exp(twist_of(rolled, model.wheel_separation)))
+        truth[k + 1] = roll(truth[k], speed, turn_rate, model, step_s, noise[k])
     return Driven(truth, integrate(twist_of(commanded, model.wheel_separation)))
 
 

@@ -25,11 +25,11 @@ from swarm_loc_estimator.core.swarm import (
     Swarm,
 )
 
-from .camera import View, exposures
+from .camera import Pictures, View, exposures
 from .differential_drive import Controller, Drive, drive, report_odometry
 from .lemniscate import Lemniscate
 from .markers import sight_markers
-from .record import SimulatedRun
+from .record import Records, SimulatedRun
 from .trajectories import Trajectories
 from .transport import ODOMETRY_LATENESS
 from .worlds import W0, World
@@ -81,6 +81,21 @@ class EightSettings:
 def simulate_eight(settings: EightSettings) -> SimulatedRun:
     """Drive the eight and record what the sensors say."""
     rng = np.random.default_rng(settings.seed)
+    swarm, truth, odometry = drive_eight(rng, settings)
+    pictures = take_pictures(rng, settings.robots, truth)
+    frames, sightings = sight_markers(rng, swarm, truth, pictures, VIEW, settings.world)
+    return SimulatedRun(swarm, truth, odometry, frames, sightings)
+
+
+def take_pictures(rng: np.random.Generator, robots: int, truth: Trajectories) -> Pictures:
+    """When the cameras look; not before pictures may be older than their stamps."""
+    return exposures(
+        rng, robots, CAMERA_RATE_HZ, int(truth.stamp_ns[0]) + 200_000_000, int(truth.stamp_ns[-1])
+    )
+
+
+def drive_eight(rng: np.random.Generator, settings: EightSettings) -> tuple[Swarm, Trajectories, Records]:
+    """Drive the eight: the swarm as described, where it went, and its odometry."""
     steps = round(settings.duration_s * 1e9 / STEP_NS)
     stamp_ns = START_NS + STEP_NS * np.arange(steps + 1, dtype=np.int64)
     path = Lemniscate(HALF_WIDTH)
@@ -92,16 +107,11 @@ def simulate_eight(settings: EightSettings) -> SimulatedRun:
     truth = Trajectories(stamp_ns, driven.truth)
     every = round(1e9 / settings.odometry_rate_hz / STEP_NS)
     odometry = report_odometry(rng, stamp_ns, driven.reported, every, ODOMETRY_LATENESS)
-    swarm = describe(settings, start)
-    pictures = exposures(
-        rng, settings.robots, CAMERA_RATE_HZ, int(stamp_ns[0]) + 200_000_000, int(stamp_ns[-1])
-    )
-    frames, sightings = sight_markers(rng, swarm, truth, pictures, VIEW, settings.world)
-    return SimulatedRun(swarm, truth, odometry, frames, sightings)
+    return describe(settings, start), truth, odometry
 
 
-def describe(settings: EightSettings, start: FloatArray) -> Swarm:
-    """The swarm as its owner would describe it; `start` is (N, 3) in map."""
+def describe(settings: EightSettings, start: FloatArray, first_face_id: int = 10) -> Swarm:
+    """The swarm as its owner would describe it; `start` is (N, 3) in map, each robot has ten ids."""
     odometry = OdometryModel(wheel_separation=WHEEL_SEPARATION, wheel_noise=settings.world.wheel_noise)
     robots = tuple(
         Robot(
@@ -110,7 +120,7 @@ def describe(settings: EightSettings, start: FloatArray) -> Swarm:
             odometry=odometry,
             camera=CAMERA,
             sensor=settings.world.described,
-            faces=faces(10 * (index + 1)),
+            faces=faces(first_face_id + 10 * index),
             start=rounded(pose) if settings.start_known else None,
             start_sigma=StartSigma(),
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.core import se2
 
 from .camera import Pictures, View, deliver, hidden
+from .hidden_geometry import HiddenGeometry, hidden_geometry
 from .record import SIGHTING_DTYPE, Records
 
 if TYPE_CHECKING:
@@ -24,27 +24,6 @@ FloatArray = NDArray[np.float64]
 
 ROBOT_RADIUS = 0.036
 GROSS_RANGE = 0.5
-
-
-@dataclass(frozen=True)
-class _HiddenGeometry:
-    """The world as it is, which its description only approximates.
-
-    Attributes:
-        mounts: (N, 3) camera poses in base_link.
-        scales: (N,) reported distance per true distance.
-        landmarks: (L, 3) in map.
-        faces: (K, 3) in their robot's base_link.
-        face_owner: (K,) robot index.
-        ids: (L + K,) marker ids.
-    """
-
-    mounts: FloatArray
-    scales: FloatArray
-    landmarks: FloatArray
-    faces: FloatArray
-    face_owner: NDArray[np.int64]
-    ids: NDArray[np.uint32]
 
 
 def sight_markers(
@@ -63,7 +42,7 @@ def sight_markers(
     Returns:
         Frames in order of arrival, of FRAME_DTYPE, and their sightings, of SIGHTING_DTYPE.
     """
-    geometry = _hide(rng, swarm, world)
+    geometry = hidden_geometry(rng, swarm, world)
     robot, stamp_ns = pictures
     early_ns = np.rint(rng.uniform(0.0, 1e9 * world.exposure_early_s, len(stamp_ns))).astype(np.int64)
     poses = truth.all_at(stamp_ns - early_ns)
@@ -78,30 +57,14 @@ def sight_markers(
     return deliver(rng, pictures, frame, sightings, end_ns=int(truth.stamp_ns[-1]), loss=world.frame_loss)
 
 
-def _hide(rng: np.random.Generator, swarm: Swarm, world: World) -> _HiddenGeometry:
-    """Draw the world that the description only approximates."""
-    mounts = np.array([[r.camera.x, r.camera.y, r.camera.yaw] for r in swarm.robots if r.camera is not None])
-    mounts[:, 2] += world.camera_yaw_sigma * rng.standard_normal(len(mounts))
-    scales = 1.0 + world.scale_sigma * rng.standard_normal(len(mounts))
-    landmarks = np.array([[m.x, m.y, m.yaw] for m in swarm.landmarks], dtype=float)
-    spread = np.array([world.map_position_sigma, world.map_position_sigma, world.map_heading_sigma])
-    landmarks += spread * rng.standard_normal(landmarks.shape)
-    all_faces = [(index, face) for index, robot in enumerate(swarm.robots) for face in robot.faces]
-    faces = np.array([[face.x, face.y, face.yaw] for _, face in all_faces], dtype=float)
-    faces[:, :2] += world.face_position_sigma * rng.standard_normal((len(faces), 2))
-    owner = np.array([index for index, _ in all_faces], dtype=np.int64)
-    ids = [mark.id for mark in swarm.landmarks] + [face.id for _, face in all_faces]
-    return _HiddenGeometry(mounts, scales, landmarks, faces, owner, np.array(ids, dtype=np.uint32))
-
-
-def _marker_poses(geometry: _HiddenGeometry, poses: FloatArray) -> FloatArray:
+def _marker_poses(geometry: HiddenGeometry, poses: FloatArray) -> FloatArray:
     """All markers (F, L + K, 3) in map, for robots at (F, N, 3)."""
     walls = np.broadcast_to(geometry.landmarks, (len(poses), *geometry.landmarks.shape))
     return np.concatenate([walls, se2.compose(poses[:, geometry.face_owner], geometry.faces)], axis=1)
 
 
 def _occluded(
-    geometry: _HiddenGeometry,
+    geometry: HiddenGeometry,
     robot: NDArray[np.int64],
     cameras: FloatArray,
     marks: FloatArray,

@@ -7,7 +7,7 @@ order of arrival. Ground truth stands apart and is for evaluation only.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -69,6 +69,14 @@ class SimulatedRun:
     def duration_s(self) -> float:
         """Simulated time [s]."""
         return (self.end_ns - self.start_ns) * 1e-9
+
+    def masked(self, kept: NDArray[np.bool_]) -> SimulatedRun:
+        """The run with some of its sightings (S,) only; frames stay, empty ones too."""
+        frames = self.frames.copy()
+        frame = np.repeat(np.arange(len(frames)), frames["count"])
+        frames["count"] = np.bincount(frame[kept], minlength=len(frames))
+        frames["first"] = np.cumsum(frames["count"]) - frames["count"]
+        return replace(self, frames=frames, sightings=self.sightings[kept])
 
     def arrivals(self) -> Iterator[tuple[str, int]]:
         """All data in order of arrival: ("odometry" or "frame", index into that array)."""

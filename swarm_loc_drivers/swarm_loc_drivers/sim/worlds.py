@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from swarm_loc_estimator.core.swarm import SensorModel
 
@@ -88,4 +88,7 @@ W2 = World(
 )
 """Small white noise and systematic errors that together look like the paper's experiment."""
 
-WORLDS = {"w0": W0, "w2": W2}
+W2_FAST = replace(W2, turn_slip=0.20)
+"""At 0.08 m/s the wheels slip more in the curves."""
+
+WORLDS = {"w0": W0, "w2": W2, "w2fast": W2_FAST}

@@ -1,0 +1,1 @@
+"""What a driver does between bytes and messages, without ROS."""

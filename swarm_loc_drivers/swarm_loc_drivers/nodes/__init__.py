@@ -1,0 +1,1 @@
+"""The drivers as ROS 2 nodes."""

@@ -1,0 +1,162 @@
+"""One simulated world of e-pucks as a ROS 2 node: robots that answer their drivers' bytes, cameras, /clock.
+
+    ./run swarm_loc_drivers epuck_world_node --ros-args -p swarm_file:=swarm.yaml -p first_port:=20000
+
+Drivers connect to tcp://localhost:20000, 20001, ... in the order of the swarm description, or with
+`link_folder` to serial ports named like the robots. The node publishes `/clock`, per robot `ground_truth`
+(for evaluation and steering) and, in the place of the camera board's own driver,
+`image_raw` and `camera_info` of the 1280x960 camera; pictures that nobody listens to are not drawn.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from array import array
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from numpy.typing import NDArray
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, Image
+
+from swarm_loc_drivers.nodes.world_parameters import WorldParameters, make_world
+from swarm_loc_drivers.protocols.epuck import EPUCK_MODELS
+from swarm_loc_drivers.sim.epuck_world import STEP_NS, Exposure, SimulatedEpuck
+from swarm_loc_drivers.sim.firmware.host import FirmwareHost
+from swarm_loc_drivers.sim.firmware.serial_firmware import SerialFirmware
+from swarm_loc_drivers.sim.firmware.wifi_firmware import WifiFirmware
+from swarm_loc_drivers.sim.render.lens import CameraModel
+from swarm_loc_estimator.io.messages import encode_pose_stamped
+from swarm_loc_estimator.nodes.declare import declare_parameters
+from swarm_loc_estimator.nodes.parameter_table import ParameterError
+from swarm_loc_estimator.nodes.running import Stop, run_node
+
+_CLOCK_QOS = QoSProfile(depth=10)
+_TRUTH_QOS = QoSProfile(depth=10)
+_STEP_S = STEP_NS * 1e-9
+_LONGEST_LAG_S = 0.1
+"""A world that cannot keep up goes on from now instead of hurrying after."""
+
+
+class EpuckWorldNode(Node):
+    """Steps the world, serves its robots' links, publishes what is to be seen of it.
+
+    Args:
+        node_arguments: Further arguments of `rclpy.node.Node`.
+
+    Raises:
+        ParameterError: A parameter cannot be used.
+        SwarmFileError: The swarm description cannot be used.
+    """
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("epuck_world", **node_arguments)
+        self._wishes = declare_parameters(self, WorldParameters)
+        swarm, self._world = make_world(self._wishes)
+        self._names = [robot.name for robot in swarm.robots]
+        self._host = FirmwareHost()
+        for robot, name in enumerate(self._names):
+            self.get_logger().info(f"{name} answers at {self._serve(robot)}")
+        self._clock_publisher = self.create_publisher(Clock, "/clock", _CLOCK_QOS)
+        self._truths = [
+            self._publisher(PoseStamped, name, "ground_truth", _TRUTH_QOS) for name in self._names
+        ]
+        self._images = [
+            self._publisher(Image, name, "image_raw", qos_profile_sensor_data) for name in self._names
+        ]
+        self._infos = [
+            self._publisher(CameraInfo, name, "camera_info", qos_profile_sensor_data) for name in self._names
+        ]
+        self._truth_steps = max(1, round(1.0 / (self._wishes.truth_rate * _STEP_S)))
+
+    def run(self, stop: Stop) -> int:
+        """Let time pass until asked to stop; the exit status."""
+        executor = EventsExecutor()
+        executor.add_node(self)
+        due_s = time.monotonic()
+        steps = 0
+        while not stop.requested:
+            self._publish(self._world.step(), with_truth=steps % self._truth_steps == 0)
+            steps += 1
+            due_s = max(due_s + _STEP_S / self._wishes.rate, time.monotonic() - _LONGEST_LAG_S)
+            self._host.poll(0.0)
+            while (left_s := due_s - time.monotonic()) > 0.0:
+                self._host.poll(left_s)
+            executor.spin_once(timeout_sec=0.0)
+        executor.shutdown()
+        return 0
+
+    def destroy_node(self) -> None:
+        """Switch the robots off, too."""
+        self._host.close()
+        super().destroy_node()
+
+    def _serve(self, robot: int) -> str:
+        """Put a robot on its link; the address for its driver."""
+        body, folder = SimulatedEpuck(self._world, robot), self._wishes.link_folder
+        try:
+            if folder:
+                link = Path(folder) / self._names[robot]
+                return str(self._host.serve_pty(SerialFirmware(body, EPUCK_MODELS[self._wishes.model]), link))
+            port = self._wishes.first_port + robot if self._wishes.first_port else 0
+            return f"tcp://localhost:{self._host.serve_tcp(WifiFirmware(body), port=port)}"
+        except OSError as error:
+            name, value = ("link_folder", folder) if folder else ("first_port", str(self._wishes.first_port))
+            raise ParameterError(
+                f"parameter {name} = {value} cannot be used for {self._names[robot]}: {error.strerror}."
+            ) from error
+
+    def _publisher(self, kind: type, robot: str, topic: str, qos: QoSProfile) -> Publisher:
+        return self.create_publisher(kind, f"{robot}/{topic}", qos)
+
+    def _publish(self, taken: list[Exposure], *, with_truth: bool) -> None:
+        """Tell the time, and then what belongs to it."""
+        now_ns = self._world.now_ns
+        self._clock_publisher.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+        if with_truth:
+            stamp_ns = np.array([now_ns], np.int64)
+            for publisher, pose in zip(self._truths, self._world.poses, strict=True):
+                publisher.publish(encode_pose_stamped("map", stamp_ns, pose[None])[0])
+        for exposure in taken:
+            if self._images[exposure.robot].get_subscription_count():
+                self._publish_picture(exposure)
+
+    def _publish_picture(self, exposure: Exposure) -> None:
+        message = image_message(self._world.picture(exposure))
+        message.header.stamp = Time(nanoseconds=exposure.stamp_ns).to_msg()
+        message.header.frame_id = f"{self._names[exposure.robot]}/camera_optical_frame"
+        info = camera_info_message(self._wishes.camera)
+        info.header = message.header
+        self._infos[exposure.robot].publish(info)
+        self._images[exposure.robot].publish(message)
+
+
+def image_message(picture: NDArray[np.uint8]) -> Image:
+    """A grey picture (height, width) as sensor_msgs/Image, without its header."""
+    height, width = picture.shape
+    message = Image(height=height, width=width, encoding="mono8", step=width)
+    message.data = array("B", picture.tobytes())  # a list would be checked byte by byte
+    return message
+
+
+def camera_info_message(model: CameraModel) -> CameraInfo:
+    """The calibration as sensor_msgs/CameraInfo, without its header."""
+    fields = model.camera_info()
+    return CameraInfo(**{**fields, "d": fields["d"].tolist()})
+
+
+def main() -> int:
+    """Run until SIGINT or SIGTERM; 1 when a parameter cannot be used."""
+    return run_node("epuck_world_node", EpuckWorldNode, EpuckWorldNode.run)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,89 @@
+"""What a user may set about `epuck_world_node`, and the world that follows from it. No ROS here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from swarm_loc_drivers.core.wheels import WheelGeometry
+from swarm_loc_drivers.protocols.epuck import EPUCK2, EPUCK_MODELS
+from swarm_loc_drivers.sim.eight import ARENA, CAMERA_RATE_HZ, START_NS
+from swarm_loc_drivers.sim.epuck_world import EpuckWorld, EpuckWorldSettings, WorldError
+from swarm_loc_drivers.sim.photographer import Stage
+from swarm_loc_drivers.sim.pictures import FACE_SIZE, FAMILY, LANDMARK_SIZE
+from swarm_loc_drivers.sim.render.lens import CameraModel
+from swarm_loc_drivers.sim.worlds import WORLDS
+from swarm_loc_estimator.core.swarm import OdometryModel, Swarm, number
+from swarm_loc_estimator.io.swarm_file import load_swarm
+from swarm_loc_estimator.nodes.parameter_table import ParameterError, text
+from swarm_loc_vision.core.families import family_named
+
+
+@dataclass(frozen=True)
+class WorldParameters:
+    """Parameters of `epuck_world_node`; the camera's are those of `CameraModel`."""
+
+    swarm_file: str = text("", "path of the swarm description; every robot needs a start", required=True)
+    world: str = text(
+        "w2", "which errors robots and cameras have: w0 or w2; see sim/worlds.py", required=True
+    )
+    seed: int = number(1, "1", 0, 2**31 - 1, "fixes the errors")
+    rate: float = number(
+        1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
+    )
+    link_folder: str = text(
+        "", "where each robot's serial port appears under its name; empty: robots on WiFi"
+    )
+    first_port: int = number(0, "1", 0, 65000, "TCP port of the first robot on WiFi, the others follow")
+    model: str = text(
+        "epuck2", "generation of the robots: epuck1 or epuck2; WiFi has only epuck2", required=True
+    )
+    wheel_diameter: float = number(0.041, "m", 0.001, 1.0, "diameter of the wheels")
+    wheel_separation: float = number(
+        OdometryModel().wheel_separation, "m", 0.001, 10.0, "distance between the two wheels"
+    )
+    arena_x: float = number(ARENA[0], "m", 0.1, 1000.0, "size of the arena along x, around the origin")
+    arena_y: float = number(ARENA[1], "m", 0.1, 1000.0, "likewise along y")
+    family: str = text(FAMILY, "kind of the markers", required=True)
+    landmark_length: float = number(
+        LANDMARK_SIZE, "m", 0.001, 10.0, "side of the landmarks, black border included"
+    )
+    face_length: float = number(FACE_SIZE, "m", 0.001, 10.0, "side of the robots' markers, likewise")
+    camera_rate: float = number(CAMERA_RATE_HZ, "1/s", 2.0, 60.0, "pictures of each camera")
+    truth_rate: float = number(20.0, "1/s", 0.1, 200.0, "published true poses of each robot")
+    camera: CameraModel = field(default_factory=CameraModel, metadata={"numbers_of": CameraModel})
+
+
+def make_world(wishes: WorldParameters) -> tuple[Swarm, EpuckWorld]:
+    """The swarm as described, and its world.
+
+    Raises:
+        ParameterError: A parameter cannot be used.
+        SwarmFileError: The swarm description cannot be used.
+    """
+    if wishes.world not in WORLDS:
+        raise ParameterError(f"parameter world = '{wishes.world}' must be one of {', '.join(WORLDS)}.")
+    if wishes.model not in EPUCK_MODELS:
+        raise ParameterError(f"parameter model = '{wishes.model}' must be one of {', '.join(EPUCK_MODELS)}.")
+    if not wishes.link_folder and EPUCK_MODELS[wishes.model] is not EPUCK2:
+        raise ParameterError(
+            f"parameter model = '{wishes.model}' needs the parameter link_folder: only epuck2 has WiFi."
+        )
+    swarm = load_swarm(Path(wishes.swarm_file))
+    try:
+        family = family_named(wishes.family)
+        stage = Stage((wishes.arena_x, wishes.arena_y), family, wishes.landmark_length, wishes.face_length)
+        settings = EpuckWorldSettings(
+            seed=wishes.seed,
+            world=WORLDS[wishes.world],
+            stage=stage,
+            camera=wishes.camera,
+            wheels=WheelGeometry(wishes.wheel_diameter, wishes.wheel_separation),
+            camera_rate_hz=wishes.camera_rate,
+            start_ns=START_NS,
+        )
+        return swarm, EpuckWorld(swarm, settings)
+    except WorldError as error:
+        raise ParameterError(f"parameter swarm_file = '{wishes.swarm_file}': {error}") from error
+    except ValueError as error:
+        raise ParameterError(f"parameter family = '{wishes.family}': {error}") from error

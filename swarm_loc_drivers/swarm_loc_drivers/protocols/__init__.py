@@ -1,0 +1,1 @@
+"""The bytes of the robots: encoding and decoding, no I/O."""

@@ -1,0 +1,228 @@
+"""One world of e-pucks, stepped in simulated time: motors turn wheels, wheels slip, cameras look.
+
+What happens is fixed by the seed and by when the robots are told what; pictures are drawn only when somebody
+wants to see them, and look the same whenever that is.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_drivers.core.wheels import WheelGeometry
+from swarm_loc_estimator.core.swarm import Swarm
+
+from .differential_drive import Drive, roll
+from .hidden_geometry import hidden_geometry
+from .photographer import Photographer, Stage
+from .proximity import proximity_values
+from .render.lens import CameraModel
+from .trajectories import Trajectories
+from .worlds import World
+
+FloatArray = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+STEP_NS = 5_000_000
+_REMEMBERED_NS = 700_000_000
+"""Pictures can be drawn as long after they were taken, less the longest error of their stamps."""
+_PHASES, _EXPOSURES, _SENSOR, _PROXIMITY = range(4)
+"""Streams of random numbers, each a function of the seed, the stream, and what it is for."""
+
+
+class WorldError(ValueError):
+    """A swarm that cannot be simulated; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class EpuckWorldSettings:
+    """How a world is.
+
+    Attributes:
+        seed: Fixes its systematic errors and its noise.
+        world: Which errors there are; those of sightings themselves (noise, flips) are up to the pictures.
+        stage: What is built around the robots.
+        camera: Of all robots, as calibrated.
+        wheels: Of all robots.
+        camera_rate_hz: [1/s].
+        start_ns: First moment.
+    """
+
+    seed: int
+    world: World
+    stage: Stage
+    camera: CameraModel
+    wheels: WheelGeometry
+    camera_rate_hz: float
+    start_ns: int
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """A picture that a camera has taken.
+
+    Attributes:
+        robot: Index of the robot.
+        number: Counts the robot's pictures.
+        stamp_ns: When its camera says it was taken.
+        middle_ns: When it was taken: the middle of the exposure.
+    """
+
+    robot: int
+    number: int
+    stamp_ns: int
+    middle_ns: int
+
+
+class EpuckWorld:
+    """The robots of a swarm in their arena.
+
+    Args:
+        swarm: As described; every robot needs a start pose and a camera, every marker a heading.
+        settings: How the world is.
+
+    Raises:
+        WorldError: The swarm cannot be simulated.
+    """
+
+    def __init__(self, swarm: Swarm, settings: EpuckWorldSettings) -> None:
+        _check(swarm)
+        self._settings = settings
+        self._drive = Drive(
+            settings.wheels.wheel_separation, settings.world.wheel_noise, settings.world.turn_slip
+        )
+        self._rng = np.random.default_rng(settings.seed)
+        truth = hidden_geometry(self._rng, swarm, settings.world)
+        self._photographer = Photographer(swarm, truth, settings.stage, settings.camera, settings.seed)
+        count = len(swarm.robots)
+        self.now_ns = settings.start_ns
+        self.poses: FloatArray = np.array([robot.start for robot in swarm.robots], dtype=float)
+        """(N, 3) where the robots truly are now, in map."""
+        self.rates: FloatArray = np.zeros((count, 2))
+        """(N, 2) of the left and the right wheel, as commanded [steps/s]."""
+        self.steps: FloatArray = np.zeros((count, 2))
+        """(N, 2) that the left and the right motor have done since the start."""
+        self._past = deque([(self.now_ns, self.poses)], maxlen=_REMEMBERED_NS // STEP_NS)
+        self._period_ns = round(1e9 / settings.camera_rate_hz)
+        phases = self._random(_PHASES).integers(0, self._period_ns, count)
+        first_ns = settings.start_ns + round(1e9 * settings.world.exposure_early_s) + self._half_exposure_ns
+        self._next = [self._exposure(robot, 0, first_ns + int(phases[robot])) for robot in range(count)]
+        self.newest: list[Exposure | None] = [None] * count
+        """The last picture that each camera has taken."""
+
+    def step(self) -> list[Exposure]:
+        """Go on by STEP_NS; the pictures that have been taken meanwhile, by stamp."""
+        step_s = STEP_NS * 1e-9
+        left, right = (self._settings.wheels.metres_per_step * self.rates).T
+        noise = np.sqrt(self._drive.wheel_noise) * self._rng.standard_normal(self.rates.shape)
+        turn_rate = (right - left) / self._drive.wheel_separation
+        self.poses = roll(self.poses, 0.5 * (left + right), turn_rate, self._drive, step_s, noise)
+        self.steps += self.rates * step_s
+        self.now_ns += STEP_NS
+        self._past.append((self.now_ns, self.poses))
+        taken = [self._take(robot) for robot in range(len(self._next)) if self._is_due(self._next[robot])]
+        return sorted(taken, key=lambda exposure: exposure.stamp_ns)
+
+    def picture(self, exposure: Exposure) -> Picture:
+        """Draw what a camera took (height, width).
+
+        Raises:
+            ValueError: It was taken too long ago.
+        """
+        track = Trajectories(
+            np.array([stamp_ns for stamp_ns, _ in self._past]), np.array([poses for _, poses in self._past])
+        )
+        rng = self._random(_SENSOR, exposure.robot, exposure.number)
+        return self._photographer.take(exposure.robot, exposure.middle_ns, track, rng)
+
+    def proximity(self, robot: int) -> NDArray[np.int64]:
+        """Raw values (8,) of a robot's proximity sensors now."""
+        rng = self._random(_PROXIMITY, robot, self.now_ns)
+        return proximity_values(self.poses, robot, self._settings.stage.arena, rng)
+
+    def _take(self, robot: int) -> Exposure:
+        """Note the picture that was due, and when the next one is."""
+        exposure = self._next[robot]
+        self.newest[robot] = exposure
+        self._next[robot] = self._exposure(robot, exposure.number + 1, exposure.stamp_ns + self._period_ns)
+        return exposure
+
+    def _exposure(self, robot: int, number: int, stamp_ns: int) -> Exposure:
+        """A picture to come; it is taken before its stamp as the world has it."""
+        early_s = self._settings.world.exposure_early_s * self._random(_EXPOSURES, robot, number).random()
+        return Exposure(robot, number, stamp_ns, stamp_ns - round(1e9 * early_s))
+
+    def _is_due(self, exposure: Exposure) -> bool:
+        """Whether its shutter has closed and its camera has stamped it."""
+        return self.now_ns >= max(exposure.stamp_ns, exposure.middle_ns + self._half_exposure_ns)
+
+    def _random(self, *what: int) -> np.random.Generator:
+        """Random numbers of their own for one purpose."""
+        return np.random.default_rng([self._settings.seed, *what])
+
+    @property
+    def _half_exposure_ns(self) -> int:
+        return round(0.5e9 * self._settings.camera.exposure_s)
+
+
+class SimulatedEpuck:
+    """One robot of a world as its firmware finds it; see `EpuckBody`.
+
+    Args:
+        world: Where it lives.
+        robot: Its index.
+    """
+
+    def __init__(self, world: EpuckWorld, robot: int) -> None:
+        self._world, self._robot = world, robot
+        self._drawn: tuple[int, Picture] | None = None
+
+    def set_wheel_speeds(self, left: float, right: float) -> None:
+        """Turn the wheels at these rates [steps/s] until the next call."""
+        self._world.rates[self._robot] = left, right
+
+    def wheel_steps(self) -> tuple[int, int]:
+        """Whole steps done since the start, left and right."""
+        left, right = self._world.steps[self._robot].tolist()
+        return int(left), int(right)
+
+    def proximity(self) -> NDArray[np.int64]:
+        """Raw values, ps0..ps7 clockwise from the front."""
+        return self._world.proximity(self._robot)
+
+    def image(self) -> tuple[Picture, int] | None:
+        """The newest picture (height, width) and its stamp [ns]; None before the first."""
+        newest = self._world.newest[self._robot]
+        if newest is None:
+            return None
+        if self._drawn is None or self._drawn[0] != newest.stamp_ns:
+            self._drawn = newest.stamp_ns, self._world.picture(newest)
+        return self._drawn[1], newest.stamp_ns
+
+    @property
+    def now_ns(self) -> int:
+        """The world's time [ns]."""
+        return self._world.now_ns
+
+
+def bodies(world: EpuckWorld, count: int) -> Sequence[SimulatedEpuck]:
+    """The robots of a world in the order of its swarm."""
+    return [SimulatedEpuck(world, robot) for robot in range(count)]
+
+
+def _check(swarm: Swarm) -> None:
+    """Raise what the robots or markers lack."""
+    for robot in swarm.robots:
+        if robot.start is None:
+            raise WorldError(
+                f"robot '{robot.name}' has no start pose, and a simulated robot has to be somewhere."
+            )
+        if robot.camera is None:
+            raise WorldError(f"robot '{robot.name}' has no camera, and a simulated e-puck has one.")
+    for marker_id, owner in swarm.owner_of.items():
+        if owner.marker.yaw is None:
+            raise WorldError(f"marker {marker_id} has no yaw, and a simulated marker looks somewhere.")

@@ -1,0 +1,106 @@
+"""Takes pictures of a described swarm as it truly is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.swarm import CameraMount, Swarm
+from swarm_loc_vision.core.families import Family
+
+from .hidden_geometry import HiddenGeometry
+from .render import scene as scenery
+from .render.lens import CameraModel
+from .render.raster import Patches
+from .render.renderer import Eye, Renderer, Scene
+from .trajectories import Trajectories
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What is built around the robots.
+
+    Attributes:
+        arena: Size along x and y, around map's origin [m].
+        family: Kind of the markers.
+        landmark_size: Side of a landmark's black square [m].
+        face_size: Side of a robot's marker [m].
+    """
+
+    arena: tuple[float, float]
+    family: Family
+    landmark_size: float
+    face_size: float
+
+
+class Photographer:
+    """The cameras of all robots; for use by one thread.
+
+    Args:
+        swarm: As described; every robot has a camera, and every marker shows a heading.
+        truth: Where cameras and markers truly are.
+        stage: What is around.
+        model: Of all cameras, as calibrated.
+        seed: Draws what the walls and the floor look like.
+    """
+
+    def __init__(
+        self, swarm: Swarm, truth: HiddenGeometry, stage: Stage, model: CameraModel, seed: int
+    ) -> None:
+        scene = _scene(swarm, truth, stage, np.random.default_rng(seed))
+        self._renderer = Renderer(scene, model)
+        self._half_ns = round(0.5e9 * model.exposure_s)
+        self._eyes = [
+            Eye(index, model, _true_mount(robot.camera, mount), focal_scale=1.0 / scale)
+            for index, (robot, mount, scale) in enumerate(
+                zip(swarm.robots, truth.mounts.tolist(), truth.scales.tolist(), strict=True)
+            )
+        ]
+
+    def take(
+        self, robot: int, middle_ns: int, track: Trajectories, rng: np.random.Generator
+    ) -> NDArray[np.uint8]:
+        """The picture (height, width) of a robot's camera, exposed around `middle_ns`.
+
+        Args:
+            robot: Its index.
+            middle_ns: Middle of the exposure.
+            track: True paths, from half an exposure before to half an exposure behind.
+            rng: Source of the sensor's noise.
+        """
+        eye, half_ns = self._eyes[robot], self._half_ns
+        begin, end = track.all_at(np.array([middle_ns - half_ns, middle_ns + half_ns]))
+        instants = self._renderer.instants(eye, begin, end)
+        shares = (2 * np.arange(instants) + 1 - instants) / instants
+        poses = track.all_at(middle_ns + np.rint(shares * half_ns).astype(np.int64))
+        return self._renderer.frame(eye, poses, rng)
+
+
+def _true_mount(camera: CameraMount | None, true: list[float]) -> CameraMount:
+    """A described mount with its true place and yaw."""
+    return replace(camera or CameraMount(), x=true[0], y=true[1], yaw=true[2])
+
+
+def _scene(swarm: Swarm, truth: HiddenGeometry, stage: Stage, rng: np.random.Generator) -> Scene:
+    """Arena, landmarks and robots."""
+
+    def board(pose: list[float], height: float, marker_id: int, size: float) -> Patches:
+        return scenery.marker(pose, height, stage.family.pattern(marker_id) != 0, size)
+
+    heights = [mark.z for mark in swarm.landmarks] + [
+        face.z for robot in swarm.robots for face in robot.faces
+    ]
+    places = [*truth.landmarks.tolist(), *truth.faces.tolist()]
+    marks = list(zip(places, heights, truth.ids.tolist(), strict=True))
+    count = len(swarm.landmarks)
+    boards = [board(pose, height, one, stage.landmark_size) for pose, height, one in marks[:count]]
+    faces = [board(pose, height, one, stage.face_size) for pose, height, one in marks[count:]]
+    robots = [
+        [scenery.body(), scenery.tower(), *(faces[k] for k in np.flatnonzero(truth.face_owner == robot))]
+        for robot in range(len(swarm.robots))
+    ]
+    return Scene(scenery.arena(stage.arena, rng), boards, robots)

@@ -1,0 +1,180 @@
+"""Pictures of an arena with robots, as their cameras take them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from swarm_loc_estimator.core import se2
+from swarm_loc_estimator.core.swarm import CameraMount
+
+from .lens import CameraModel
+from .raster import FX, REACH, Patches, draw, expose, fill, lay_over, project
+from .scene import ROOM
+
+FloatArray = NDArray[np.float64]
+Motion = tuple[FloatArray, FloatArray]
+"""Rotations (K, 3, 3) and shifts (K, 3) [m] from some frame to the optical one, at K instants."""
+
+STEP_PX = 1.0
+"""A picture is drawn at as many instants of its exposure as keep the motion between them below this."""
+MOST_INSTANTS = 256
+
+_OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+"""From x forward, y left, z up to x right, y down, z forward."""
+_CLOSEST = 0.03
+_NOISE_LENGTH = 1 << 20
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What cameras see.
+
+    Attributes:
+        backdrop: Behind everything, in map.
+        boards: What stands alone, in map.
+        robots: Of each robot its parts in its base_link, such that no part hides a later one.
+    """
+
+    backdrop: Patches
+    boards: Sequence[Patches]
+    robots: Sequence[Sequence[Patches]]
+
+
+@dataclass
+class Eye:
+    """One robot's camera as it truly is.
+
+    Attributes:
+        robot: Whose; its own body is not seen.
+        model: As calibrated.
+        mount: In base_link.
+        focal_scale: True focal length per calibrated one.
+        lens: Constants of `raster.project`.
+    """
+
+    robot: int
+    model: CameraModel
+    mount: CameraMount
+    focal_scale: float = 1.0
+    lens: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.lens = self.model.constants(self.focal_scale)
+        mount = self.mount
+        turned = Rotation.from_euler("ZYX", [mount.yaw, mount.pitch, mount.roll]).as_matrix()
+        self._turn: FloatArray = _OPTICAL @ turned.T
+        self._shift: FloatArray = -self._turn @ np.array([mount.x, mount.y, mount.z])
+
+    def view(self, poses: FloatArray) -> Motion:
+        """Where frames at planar `poses` (K, ..., 3) lie, given in this robot's base_link."""
+        cos, sin, zero = np.cos(poses[..., 2]), np.sin(poses[..., 2]), np.zeros(poses.shape[:-1])
+        rows = [[cos, -sin, zero], [sin, cos, zero], [zero, zero, zero + 1.0]]
+        turns = np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+        places = np.stack([poses[..., 0], poses[..., 1], zero], axis=-1)
+        return self._turn @ turns, places @ self._turn.T + self._shift
+
+
+class Renderer:
+    """Draws pictures of one scene; all cameras share its buffers, so use it from one thread.
+
+    Args:
+        scene: What is seen.
+        model: Of all cameras.
+    """
+
+    def __init__(self, scene: Scene, model: CameraModel) -> None:
+        self._scene, self._model = scene, model
+        self._board_centres = np.array([board.centre[0] for board in scene.boards]).reshape(-1, 3)
+        self._picture = np.zeros((model.height, model.width), np.float32)
+        self._changes = np.zeros((model.height, model.width + 2), np.float32)
+        self._covers = np.zeros_like(self._changes)
+        self._electrons = model.electrons()
+        self._noise = np.random.default_rng(0).standard_normal(_NOISE_LENGTH, dtype=np.float32)
+
+    def light(self, eye: Eye, poses: FloatArray) -> NDArray[np.float32]:
+        """The brightness of every pixel (height, width), without noise; overwritten by the next call.
+
+        What covers something else while it moves is averaged over the exposure before it is laid over what
+        it covers: exact but for the picture's blurred rims in front of other blurred rims.
+
+        Args:
+            eye: The camera.
+            poses: (K, N, 3) of all robots in map, at the middles of K equal parts of the exposure.
+        """
+        seen_from = poses[:, eye.robot]
+        of_map = eye.view(se2.inverse(seen_from))
+        of_robots = eye.view(se2.between(seen_from[:, None], poses))
+        draw(self._changes, self._covers, self._scene.backdrop, eye.lens, *of_map, _no_box())
+        fill(self._picture, self._changes, ROOM)
+        for part, motion in self._far_to_near(eye.robot, poses, of_map, of_robots):
+            box = _no_box()
+            draw(self._changes, self._covers, part, eye.lens, *motion, box)
+            lay_over(self._picture, self._changes, self._covers, box)
+        if self._model.focus_sigma_px > 0.0:
+            cv2.GaussianBlur(self._picture, (0, 0), self._model.focus_sigma_px, dst=self._picture)
+        return self._picture
+
+    def frame(self, eye: Eye, poses: FloatArray, rng: np.random.Generator) -> NDArray[np.uint8]:
+        """The picture (height, width) that the sensor reports; arguments as for `light`."""
+        light = self.light(eye, poses)
+        model = self._model
+        frame = np.empty(light.shape, np.uint8)
+        offset = rng.integers(0, _NOISE_LENGTH - model.width, model.height)
+        expose(light, frame, self._electrons, model.read_noise, model.gain, self._noise, offset)
+        return frame
+
+    def instants(self, eye: Eye, begin: FloatArray, end: FloatArray) -> int:
+        """At how many instants of an exposure `light` needs the poses.
+
+        Args:
+            eye: The camera.
+            begin: (N, 3) poses of all robots in map when the shutter opens.
+            end: Likewise when it closes.
+        """
+        poses = np.stack([begin, end])
+        seen_from = poses[:, eye.robot]
+        rotation, shift = eye.view(se2.inverse(seen_from))
+        boards = self._board_centres @ np.swapaxes(rotation, 1, 2) + shift[:, None]
+        robots = eye.view(se2.between(seen_from[:, None], poses))[1]
+        moved = float(eye.lens[FX] * np.abs(se2.wrap_angle(end[eye.robot, 2] - begin[eye.robot, 2])))
+        things = np.concatenate([boards, robots], axis=1)
+        in_view = (things[..., 2] > _CLOSEST) & (np.abs(things[..., 0]) < eye.lens[REACH] * things[..., 2])
+        for before, after in things[:, in_view.all(axis=0)].swapaxes(0, 1).tolist():
+            moved = max(moved, math.dist(_pixel(eye.lens, before), _pixel(eye.lens, after)))
+        return max(1, min(math.ceil(moved / STEP_PX), MOST_INSTANTS))
+
+    def _far_to_near(
+        self, own: int, poses: FloatArray, of_map: Motion, of_robots: Motion
+    ) -> Iterator[tuple[Patches, Motion]]:
+        """Everything in front of the backdrop with its motion, by distance at the exposure's middle."""
+        middle = poses[len(poses) // 2]
+        places = np.concatenate([self._board_centres[:, :2], middle[:, :2]])
+        boards = len(self._board_centres)
+        for thing in np.argsort(-np.linalg.norm(places - middle[own, :2], axis=1), kind="stable").tolist():
+            if thing < boards:
+                yield self._scene.boards[thing], of_map
+            elif thing - boards != own:
+                robot = thing - boards
+                motion = (
+                    np.ascontiguousarray(of_robots[0][:, robot]),
+                    np.ascontiguousarray(of_robots[1][:, robot]),
+                )
+                for part in self._scene.robots[robot]:
+                    yield part, motion
+
+
+def _pixel(lens: FloatArray, place: Sequence[float]) -> tuple[float, float]:
+    """Pixel of a place in the optical frame."""
+    return project(lens, place[0] / place[2], place[1] / place[2])
+
+
+def _no_box() -> FloatArray:
+    """The box of nothing: left, top, right, bottom."""
+    return np.array([math.inf, math.inf, -math.inf, -math.inf])

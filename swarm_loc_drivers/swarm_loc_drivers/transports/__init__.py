@@ -1,0 +1,1 @@
+"""Ways that bytes take: serial ports and TCP, with deadlines."""

@@ -1,0 +1,49 @@
+"""An emulated e-puck as a process: `epuck_process.py serial LINK MODEL` or `epuck_process.py wifi PORT`.
+
+It says where it answers, and for every line of its input how the robot is: pose, rates, steps.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+from epuck_body import DrivenBody
+
+from swarm_loc_drivers.protocols.epuck import EPUCK_MODELS
+from swarm_loc_drivers.sim.firmware.host import FirmwareHost
+from swarm_loc_drivers.sim.firmware.serial_firmware import SerialFirmware
+from swarm_loc_drivers.sim.firmware.wifi_firmware import WifiFirmware
+
+
+def main() -> None:
+    """Serve until the input ends."""
+    body = DrivenBody(time.monotonic_ns, steps=(32700, -32700))
+    with FirmwareHost() as host:
+        if sys.argv[1] == "serial":
+            print(
+                host.serve_pty(SerialFirmware(body, EPUCK_MODELS[sys.argv[3]]), Path(sys.argv[2])), flush=True
+            )
+        else:
+            print(host.serve_tcp(WifiFirmware(body), port=int(sys.argv[2])), flush=True)
+        os.set_blocking(sys.stdin.fileno(), False)
+        while (asked := _input()) != b"":
+            if asked is not None:
+                answer = {"pose": body.pose.tolist(), "rates": body.rates, "steps": body.wheel_steps()}
+                print(json.dumps(answer), flush=True)
+            host.poll(0.002)
+
+
+def _input() -> bytes | None:
+    """What was asked; None if nothing."""
+    try:
+        return os.read(sys.stdin.fileno(), 100)
+    except BlockingIOError:
+        return None
+
+
+if __name__ == "__main__":
+    main()

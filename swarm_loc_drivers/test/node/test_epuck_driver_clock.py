@@ -1,0 +1,159 @@
+"""The driver node in this process, on a clock that the test sets: simulated time, pictures."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+from epuck_bench import Emulator, Robots
+from epuck_body import GEOMETRY, DrivenBody
+from geometry_msgs.msg import Twist, Vector3
+from nav_msgs.msg import Odometry
+from node_world import SECOND, T0_NS, Ros, overrides, stamp_ns
+from rclpy.qos import qos_profile_sensor_data
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, Image
+
+from swarm_loc_drivers.nodes.epuck_driver_node import EpuckDriverNode
+from swarm_loc_drivers.protocols.epuck import EPUCK2
+
+STEP_NS = SECOND // 50
+CALIBRATION = """
+image_width: 160
+image_height: 120
+camera_name: epuck
+camera_matrix: {rows: 3, cols: 3, data: [180.0, 0, 80, 0, 181.0, 60, 0, 0, 1]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0.1, -0.2, 0, 0, 0]}
+"""
+
+
+class World:
+    """A robot and its clock; the firmware answers in a thread, by the same clock."""
+
+    def __init__(self, ros: Ros, robots: Robots) -> None:
+        self.now_ns = T0_NS
+        self._ros = ros
+        self.body = DrivenBody(lambda: self.now_ns, steps=(32700, -32700))
+        self.robots = robots
+        self._clock = ros.tester.create_publisher(Clock, "/clock", 10)
+        self._commands = ros.tester.create_publisher(Twist, "epuck1/cmd_vel", 10)
+        self.odometry: list[Odometry] = ros.listen(Odometry, "epuck1/odom")
+
+    def connect(self, node: EpuckDriverNode) -> None:
+        """Let the node take part."""
+        self._ros.add(node)
+        self._ros.until(self._clock.get_subscription_count)
+        self._ros.until(self._commands.get_subscription_count)
+        self.tell_time()
+        self._ros.until(lambda: node.get_clock().now().nanoseconds == self.now_ns)
+
+    def tell_time(self) -> None:
+        """Publish the clock."""
+        self._clock.publish(Clock(clock=Time(nanoseconds=self.now_ns).to_msg()))
+
+    def command(self, speed: float, turn_rate: float = 0.0) -> None:
+        """Publish a velocity."""
+        self._commands.publish(Twist(linear=Vector3(x=speed), angular=Vector3(z=turn_rate)))
+
+    def step(self) -> None:
+        """Let time go on, and wait for odometry of the new time."""
+        self.now_ns += STEP_NS
+        self.tell_time()
+        self._ros.until(lambda: self.odometry and stamp_ns(self.odometry[-1]) >= self.now_ns)
+
+
+@pytest.fixture
+def world(ros: Ros, tmp_path: Path) -> Iterator[World]:
+    with ExitStack() as stack:
+        yield World(ros, Robots(tmp_path, stack))
+
+
+def node_on(address: object, **values: object) -> EpuckDriverNode:
+    """A node on simulated time."""
+    settings = {"address": str(address), "use_sim_time": True, "reading_rate": 50.0, "cmd_vel_timeout_s": 0.1}
+    return EpuckDriverNode(namespace="/epuck1", parameter_overrides=overrides(**settings, **values))
+
+
+def serve(world: World, over: str) -> tuple[Emulator, object]:
+    """The robot, and its address."""
+    if over == "wifi":
+        return world.robots.wifi(body=world.body), world.robots.tcp_address
+    return world.robots.serial(EPUCK2, body=world.body), world.robots.serial_address
+
+
+@pytest.mark.parametrize("over", ["serial", "wifi"])
+def test_stamps_motion_and_timeout_follow_simulated_time(world: World, ros: Ros, over: str) -> None:
+    _, address = serve(world, over)
+    world.connect(node_on(address))
+    world.step()
+    world.command(0.1)
+    ros.until(lambda: any(world.body.rates))
+    rate = world.body.rates[0]
+    begin_ns = world.now_ns
+    while world.now_ns < begin_ns + SECOND // 10:
+        world.step()
+    ros.until(lambda: any(world.body.rates))  # the command is not yet older than the timeout
+    world.step()
+    world.step()
+    ros.until(lambda: not any(world.body.rates))
+    world.step()
+
+    stamps = np.array([stamp_ns(message) for message in world.odometry])
+    # the middle between question and answer, which time may have passed in between
+    assert ((stamps - T0_NS) % (STEP_NS // 2) == 0).all()
+    assert (np.diff(stamps) > 0).all()
+    driven = world.odometry[-1].pose.pose.position.x
+    assert driven == pytest.approx(world.body.pose[0], abs=2 * GEOMETRY.metres_per_step)
+    assert 0.1 * rate <= driven / GEOMETRY.metres_per_step <= 0.16 * rate
+
+
+def test_time_that_jumps_back_stops_the_robot_and_goes_on(world: World, ros: Ros) -> None:
+    _, address = serve(world, "serial")
+    world.connect(node_on(address))
+    world.step()
+    world.command(0.1)
+    ros.until(lambda: any(world.body.rates))
+    world.step()
+    before = world.odometry[-1]
+    world.now_ns = T0_NS - 100 * SECOND
+    world.body.rewind()
+    world.tell_time()
+    ros.until(lambda: not any(world.body.rates))
+    ros.until(lambda: stamp_ns(world.odometry[-1]) <= world.now_ns)
+    world.step()
+    assert world.odometry[-1].pose.pose.position.x == pytest.approx(before.pose.pose.position.x, abs=1e-3)
+
+
+def test_pictures_come_with_their_calibration(world: World, ros: Ros, tmp_path: Path) -> None:
+    images: list[Image] = []
+    infos: list[CameraInfo] = []
+    ros.tester.create_subscription(Image, "epuck1/image_raw", images.append, qos_profile_sensor_data)
+    ros.tester.create_subscription(CameraInfo, "epuck1/camera_info", infos.append, qos_profile_sensor_data)
+    path = tmp_path / "camera.yaml"
+    path.write_text(CALIBRATION, encoding="utf-8")
+    rows, columns = np.mgrid[:960, :1280]
+    frame = np.stack([rows // 8, columns // 8, 0 * rows], axis=-1).astype(np.uint8)
+    _, address = serve(world, "wifi")
+    world.connect(node_on(address, camera=True, camera_info_file=str(path)))
+    world.body.frame = (frame, world.now_ns)
+    end_s = time.monotonic() + 60.0
+    while not (images and infos):
+        world.step()
+        assert time.monotonic() < end_s
+
+    image, info = images[0], infos[0]
+    assert (image.width, image.height, image.step, image.encoding) == (160, 120, 480, "rgb8")
+    pixels = np.frombuffer(image.data, np.uint8).reshape(120, 160, 3)
+    expected = frame.reshape(120, 8, 160, 8, 3).mean(axis=(1, 3))
+    assert np.abs(pixels - expected).max() <= 8
+    assert image.header.frame_id == "epuck1/camera_optical_frame"
+    assert T0_NS <= stamp_ns(image) <= world.now_ns
+    assert info.header == image.header
+    assert (info.k[0], info.k[4], info.k[2], info.d[1]) == (180.0, 181.0, 80.0, -0.2)
+    assert info.p.tolist() == [180.0, 0, 80, 0, 0, 181.0, 60, 0, 0, 0, 1, 0]

@@ -1,0 +1,320 @@
+"""The driver node over DDS, with emulated robots in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from epuck_bench import SQUARE
+from epuck_body import GEOMETRY
+from geometry_msgs.msg import Twist, Vector3
+from nav_msgs.msg import Odometry
+from node_world import Program, Ros
+from numpy.typing import NDArray
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import Range
+from tf2_msgs.msg import TFMessage
+
+from swarm_loc_drivers.protocols.epuck import PROXIMITY_BEARINGS
+from swarm_loc_estimator.core import se2
+
+UNIT = Path(__file__).parents[1] / "unit"
+FloatArray = NDArray[np.float64]
+
+
+class Robot:
+    """An emulated robot."""
+
+    def __init__(self, *arguments: str) -> None:
+        path = os.pathsep.join([str(UNIT), os.environ.get("PYTHONPATH", "")])
+        self.process = subprocess.Popen(
+            [sys.executable, str(Path(__file__).with_name("epuck_process.py")), *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"PYTHONPATH": path},
+        )
+        self.place = self._line()
+
+    def _line(self) -> str:
+        assert self.process.stdout is not None
+        return self.process.stdout.readline().strip()
+
+    def truth(self) -> dict[str, Any]:
+        """How it is."""
+        assert self.process.stdin is not None
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+        truth: dict[str, Any] = json.loads(self._line())
+        return truth
+
+    def kill(self) -> None:
+        """Take its batteries out."""
+        with self.process:
+            self.process.kill()
+
+
+class Controller:
+    """What a person has on the desk: commands go out at every step, odometry comes in."""
+
+    def __init__(self, ros: Ros) -> None:
+        self.ros = ros
+        self.velocity = (0.0, 0.0)
+        self.odometry: list[Odometry] = ros.listen(Odometry, "epuck1/odom")
+        self.diagnostics: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
+        self._publisher = ros.tester.create_publisher(Twist, "epuck1/cmd_vel", 1)
+        self._timer = ros.tester.create_timer(0.03, self._say)
+
+    def _say(self) -> None:
+        speed, turn_rate = self.velocity
+        self._publisher.publish(Twist(linear=Vector3(x=speed), angular=Vector3(z=turn_rate)))
+
+    def fall_silent(self) -> None:
+        """No more commands."""
+        self._timer.cancel()
+
+    def drive(self, legs: list[tuple[float, float, float]]) -> None:
+        """Drive legs by odometry, then stand."""
+        self.ros.until(lambda: self.odometry)
+        for speed, turn_rate, amount in legs:
+            self.velocity = (speed, turn_rate)
+            self._until_gone(pose_of(self.odometry[-1]), amount, turning=bool(turn_rate))
+        self.velocity = (0.0, 0.0)
+        self.ros.until(lambda: not any(is_moving(message) for message in self.odometry[-3:]))
+
+    def _until_gone(self, start: FloatArray, amount: float, *, turning: bool) -> None:
+        def gone() -> float:
+            step = se2.between(start, pose_of(self.odometry[-1]))
+            return abs(float(step[2])) if turning else math.hypot(step[0], step[1])
+
+        self.ros.until(lambda: gone() >= amount)
+
+    def status(self) -> DiagnosticStatus | None:
+        """The newest of the driver."""
+        found = [s for message in self.diagnostics for s in message.status if s.name == "epuck1/epuck_driver"]
+        return found[-1] if found else None
+
+    def until_status(self, level: bytes) -> None:
+        """Wait for a level."""
+
+        def is_so() -> bool:
+            status = self.status()
+            return status is not None and status.level == level
+
+        self.ros.until(is_so)
+
+
+def is_moving(message: Odometry) -> bool:
+    twist = message.twist.twist
+    return bool(twist.linear.x or twist.angular.z)
+
+
+def pose_of(message: Odometry) -> FloatArray:
+    pose = message.pose.pose
+    return np.array(
+        [pose.position.x, pose.position.y, 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)]
+    )
+
+
+Start = Callable[..., Any]
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Iterator[Start]:
+    """Starts robots: on a serial port that always has one name, or behind TCP."""
+    with ExitStack() as stack:
+
+        def start(over: str, port: str = "0") -> Robot:
+            arguments = [str(tmp_path / "epuck"), "epuck1"] if over == "serial" else [port]
+            started = Robot(over, *arguments)
+            stack.callback(started.kill)
+            return started
+
+        yield start
+
+
+@pytest.fixture
+def driver(tmp_path: Path) -> Iterator[Start]:
+    """Starts drivers."""
+    with ExitStack() as stack:
+
+        def start(over: str, place: str, **parameters: object) -> Program:
+            chosen = (
+                {"address": place, "model": "epuck1"}
+                if over == "serial"
+                else {"address": f"tcp://127.0.0.1:{place}"}
+            )
+            program = Program(
+                "epuck_driver_node",
+                tmp_path / "log",
+                {**chosen, **parameters},
+                ("-r", "__ns:=/epuck1"),
+                package="swarm_loc_drivers",
+            )
+            return stack.enter_context(program)
+
+        yield start
+
+
+OVER = pytest.mark.parametrize("over", ["serial", "wifi"])
+
+
+@OVER
+def test_a_square(ros: Ros, robot: Start, driver: Start, over: str) -> None:
+    transforms: list[TFMessage] = ros.listen(TFMessage, "/tf")
+    ranges: list[Range] = []
+    for sensor in range(8):
+        ros.tester.create_subscription(
+            Range, f"epuck1/proximity/ps{sensor}", ranges.append, qos_profile_sensor_data
+        )
+    controller = Controller(ros)
+    emulated = robot(over)
+    driver(over, emulated.place)
+    controller.drive(SQUARE)
+
+    first, last = controller.odometry[0], controller.odometry[-1]
+    assert not pose_of(first).any()
+    assert (last.header.frame_id, last.child_frame_id) == ("epuck1/odom", "epuck1/base_link")
+    error = se2.between(emulated.truth()["pose"], pose_of(last))
+    step = GEOMETRY.metres_per_step
+    assert math.hypot(error[0], error[1]) <= 20 * step
+    assert abs(error[2]) <= 2.1 * step / GEOMETRY.wheel_separation
+
+    covariance = np.array(last.pose.covariance).reshape(6, 6)
+    assert np.linalg.eigvalsh(covariance)[0] > 0.0
+    assert covariance[5, 5] > 10 * np.array(first.pose.covariance)[35]
+    stamps = [
+        message.header.stamp.sec * 10**9 + message.header.stamp.nanosec for message in controller.odometry
+    ]
+    assert (np.diff(stamps) > 0).all()
+    assert abs(ros.tester.get_clock().now().nanoseconds - stamps[-1]) < 60 * 10**9
+
+    ros.until(
+        lambda: (
+            transforms and transforms[-1].transforms[0].header.stamp == controller.odometry[-1].header.stamp
+        )
+    )
+    (transform,) = transforms[-1].transforms
+    assert transform.child_frame_id == "epuck1/base_link"
+    assert transform.transform.translation.x == controller.odometry[-1].pose.pose.position.x
+
+    frames = {f"epuck1/ps{sensor}" for sensor in range(8)}
+    ros.until(lambda: {message.header.frame_id for message in ranges} == frames)
+    newest = {message.header.frame_id: message.range for message in ranges}
+    assert newest["epuck1/ps3"] == math.inf
+    assert 0.005 < newest["epuck1/ps7"] < newest["epuck1/ps0"] < 0.06
+
+    controller.until_status(DiagnosticStatus.OK)
+    status = controller.status()
+    assert status is not None
+    values = {pair.key: pair.value for pair in status.values}
+    assert values["connections"] == "1"
+    assert float(values["readings rate [1/s]"]) > 1.0
+    assert "implausible_counters" not in values
+
+
+def test_the_sensors_sit_where_they_look(ros: Ros, robot: Start, driver: Start) -> None:
+    static: list[TFMessage] = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    driver("wifi", robot("wifi").place)
+    ros.tester.create_subscription(TFMessage, "/tf_static", static.append, latched)
+    ros.until(lambda: static)
+    for transform, bearing in zip(static[0].transforms, PROXIMITY_BEARINGS, strict=True):
+        rotation, place = transform.transform.rotation, transform.transform.translation
+        assert 2.0 * math.atan2(rotation.z, rotation.w) == pytest.approx(bearing)
+        assert math.atan2(place.y, place.x) == pytest.approx(bearing)
+        assert transform.header.frame_id == "epuck1/base_link"
+
+
+@OVER
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_robot_stands_when_the_node_has_ended(
+    ros: Ros, robot: Start, driver: Start, over: str, number: signal.Signals
+) -> None:
+    controller, emulated = Controller(ros), robot(over)
+    program = driver(over, emulated.place)
+    controller.velocity = (0.06, 0.3)
+    ros.until(lambda: any(is_moving(message) for message in controller.odometry[-1:]))
+    assert any(emulated.truth()["rates"])
+    assert program.end(number) == 0
+    assert emulated.truth()["rates"] == [0.0, 0.0]
+    assert "Traceback" not in program.output
+
+
+@OVER
+def test_the_robot_stands_when_commands_stop(ros: Ros, robot: Start, driver: Start, over: str) -> None:
+    controller, emulated = Controller(ros), robot(over)
+    driver(over, emulated.place, cmd_vel_timeout_s=0.3)
+    controller.velocity = (0.06, 0.3)
+    ros.until(lambda: any(is_moving(message) for message in controller.odometry[-1:]))
+    controller.fall_silent()
+    ros.until(lambda: not any(emulated.truth()["rates"]))
+    ros.until(lambda: not is_moving(controller.odometry[-1]))
+
+
+@OVER
+def test_a_robot_that_dies_is_told_and_found_again(ros: Ros, robot: Start, driver: Start, over: str) -> None:
+    controller, emulated = Controller(ros), robot(over)
+    driver(over, emulated.place)
+    controller.drive(SQUARE[:1])
+    controller.until_status(DiagnosticStatus.OK)
+    emulated.kill()
+    controller.until_status(DiagnosticStatus.ERROR)
+    status = controller.status()
+    assert status is not None
+    assert emulated.place in status.message
+    count, end = len(controller.odometry), pose_of(controller.odometry[-1])
+
+    again = robot(over, emulated.place)
+    controller.until_status(DiagnosticStatus.OK)
+    ros.until(lambda: len(controller.odometry) > count)
+    assert pose_of(controller.odometry[count]) == pytest.approx(end, abs=1e-9)
+    controller.drive(SQUARE[:1])
+    driven = se2.between(end, pose_of(controller.odometry[-1]))
+    assert driven == pytest.approx(again.truth()["pose"], abs=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "sentence"),
+    [
+        (
+            {"address": "/dev/nothing", "reading_rate": 0.01},
+            "parameter reading_rate = 0.01 must lie in [0.1, 200] 1/s.",
+        ),
+        ({"address": "udp://robot"}, "parameter address = 'udp://robot' must be the path of a serial port"),
+        ({"address": "tcp://robot:99999"}, "parameter address = 'tcp://robot:99999' must be"),
+        (
+            {"address": "/dev/nothing", "model": "epuck3"},
+            "parameter model = 'epuck3' must be one of epuck1, epuck2.",
+        ),
+        ({"address": "tcp://robot", "model": "epuck1"}, "does not go with address = 'tcp://robot:1000'"),
+        ({"address": "/dev/nothing", "camera": "true"}, "parameter camera_info_file is not set"),
+        (
+            {"address": "/dev/nothing", "camera": "true", "image_width": 60, "image_height": 60},
+            "make pictures of 7200 bytes, but an epuck2 can send at most 4136.",
+        ),
+        (
+            {"address": "/dev/nothing", "camera": "true", "camera_info_file": "/nowhere.yaml"},
+            "parameter camera_info_file: /nowhere.yaml cannot be read",
+        ),
+    ],
+)
+def test_a_wrong_parameter_ends_the_node_with_one_sentence(
+    tmp_path: Path, parameters: dict[str, object], sentence: str
+) -> None:
+    with Program("epuck_driver_node", tmp_path / "log", parameters, package="swarm_loc_drivers") as program:
+        assert program.end() == 1
+        (line,) = program.output.splitlines()
+    assert line.startswith("epuck_driver_node: ")
+    assert sentence in line

@@ -1,0 +1,279 @@
+"""From velocities to wheels and from steps to poses."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+from epuck_body import GEOMETRY
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from swarm_loc_drivers.core.velocity_command import STANDING_CLOCK_S, VelocityCommand
+from swarm_loc_drivers.core.wheel_odometry import OdometryState, WheelOdometry
+from swarm_loc_drivers.protocols.epuck import EPUCK1, EPUCK2, as_counter
+from swarm_loc_estimator.core import se2
+from swarm_loc_estimator.core.odometry import OdometryTracks
+from swarm_loc_estimator.core.swarm import OdometryModel, Robot
+
+SECOND = 1_000_000_000
+NOISE = 2e-4
+RATE = st.floats(-1000.0, 1000.0)
+
+
+@given(speed=st.floats(-0.5, 0.5), turn_rate=st.floats(-20.0, 20.0))
+def test_beyond_the_limit_the_curve_stays(speed: float, turn_rate: float) -> None:
+    left, right = (EPUCK2.rate(c) for c in GEOMETRY.commands_for(speed, turn_rate, EPUCK2))
+    wanted_left = (speed - 0.5 * GEOMETRY.wheel_separation * turn_rate) / GEOMETRY.metres_per_step
+    wanted_right = (speed + 0.5 * GEOMETRY.wheel_separation * turn_rate) / GEOMETRY.metres_per_step
+    slower = min(1.0, EPUCK2.max_rate / max(abs(wanted_left), abs(wanted_right), 1e-9))
+
+    # near its limit the timer knows steps of 2.3 %
+    assert left == pytest.approx(slower * wanted_left, rel=0.012, abs=0.5)
+    assert right == pytest.approx(slower * wanted_right, rel=0.012, abs=0.5)
+
+
+class Watch:
+    """A clock and real time, both set by hand."""
+
+    def __init__(self) -> None:
+        self.now_ns = SECOND
+        self.steady_s = 0.0
+
+    def run(self, seconds: float) -> None:
+        """Let both go on."""
+        self.now_ns += round(seconds * SECOND)
+        self.steady_s += seconds
+
+
+def command_with(watch: Watch) -> tuple[VelocityCommand, Counter[str]]:
+    counts: Counter[str] = Counter()
+    command = VelocityCommand(GEOMETRY, EPUCK1, 0.5, lambda: watch.now_ns, counts, lambda: watch.steady_s)
+    return command, counts
+
+
+def test_a_velocity_counts_until_its_time_is_over() -> None:
+    watch = Watch()
+    command, counts = command_with(watch)
+    assert command.speeds() == (0, 0)
+    command.set(0.05, 0.0)
+    watch.run(0.5)
+    driving = command.speeds()
+    assert driving == GEOMETRY.commands_for(0.05, 0.0, EPUCK1)
+    assert min(driving) > 0
+    watch.run(0.01)
+    assert command.speeds() == (0, 0)
+    watch.run(-0.2)
+    assert command.speeds() == (0, 0)
+    assert counts == {"stale_cmd_vel": 1}
+
+
+def test_a_clock_that_stands_still_stops_the_robot() -> None:
+    watch = Watch()
+    command, _ = command_with(watch)
+    command.set(0.05, 0.0)
+    assert command.speeds() != (0, 0)
+    watch.steady_s += STANDING_CLOCK_S + 0.01
+    assert command.speeds() == (0, 0)
+
+
+def test_a_clock_that_jumps_back_stops_the_robot() -> None:
+    watch = Watch()
+    command, _ = command_with(watch)
+    command.set(0.05, 0.0)
+    watch.now_ns -= 1
+    assert command.speeds() == (0, 0)
+
+
+@pytest.mark.parametrize("velocity", [(math.nan, 0.0), (0.0, math.inf), (-math.inf, math.nan)])
+def test_what_is_not_finite_is_dropped(velocity: tuple[float, float]) -> None:
+    command, counts = command_with(Watch())
+    command.set(0.05, 0.0)
+    before = command.speeds()
+    command.set(*velocity)
+    assert command.speeds() == before
+    assert counts == {"bad_cmd_vel": 1}
+
+
+class Wheels:
+    """Counters that do what was commanded."""
+
+    def __init__(self, odometry: WheelOdometry, steps: tuple[int, int] = (0, 0)) -> None:
+        self.odometry = odometry
+        self.steps = np.array(steps, dtype=float)
+        self.now_ns = SECOND
+        self.rates = np.zeros(2)
+
+    def command(self, left: float, right: float) -> None:
+        """Change the rates."""
+        self.rates = np.array([left, right])
+        self.odometry.note_rates(self.now_ns, left, right)
+
+    def run(self, seconds: float) -> None:
+        """Turn."""
+        self.now_ns += round(seconds * SECOND)
+        self.steps += self.rates * seconds
+
+    def read(self) -> OdometryState | None:
+        """Report the counters."""
+        left, right = (as_counter(math.floor(s + 1e-6)) for s in self.steps)
+        return self.odometry.update(self.now_ns, left, right)
+
+
+@pytest.fixture
+def counts() -> Counter[str]:
+    return Counter()
+
+
+@pytest.fixture
+def odometry(counts: Counter[str]) -> WheelOdometry:
+    return WheelOdometry(GEOMETRY, NOISE, counts)
+
+
+def test_an_arc_is_an_arc_through_many_wraps_of_the_counters(
+    odometry: WheelOdometry, counts: Counter[str]
+) -> None:
+    wheels = Wheels(odometry, steps=(32000, -32700))
+    wheels.read()
+    wheels.command(1000.0, 800.0)
+    for _ in range(4000):
+        wheels.run(0.05)
+        state = wheels.read()
+    assert state is not None
+    paths = np.array([200e3, 160e3]) * GEOMETRY.metres_per_step
+    turn = (paths[1] - paths[0]) / GEOMETRY.wheel_separation
+    expected = se2.exp([paths.mean(), 0.0, turn])
+    assert state.pose[:2] == pytest.approx(expected[:2], abs=2e-3)
+    assert float(se2.wrap_angle(state.pose[2] - turn)) == pytest.approx(0.0, abs=1e-6)
+    assert not counts
+
+
+def test_through_a_long_gap_the_robot_is_believed_to_have_obeyed(
+    odometry: WheelOdometry, counts: Counter[str]
+) -> None:
+    wheels = Wheels(odometry)
+    wheels.read()
+    wheels.command(-800.0, -800.0)
+    wheels.run(0.1)
+    wheels.read()
+    wheels.run(300.0)
+    wheels.odometry.note_rates(wheels.now_ns, 0.0, 0.0)  # said on reconnecting, just before the reading
+    state = wheels.read()
+    assert state is not None
+    assert state.pose[0] == pytest.approx(-800.0 * 300.1 * GEOMETRY.metres_per_step, abs=1e-3)
+    assert not counts
+
+
+def test_one_corrupt_reading_is_left_out(odometry: WheelOdometry, counts: Counter[str]) -> None:
+    wheels = Wheels(odometry)
+    wheels.read()
+    wheels.command(400.0, 400.0)
+    wheels.run(0.1)
+    assert odometry.update(wheels.now_ns, 0x2828, 40) is None
+    wheels.run(0.1)
+    state = wheels.read()
+    assert state is not None
+    assert state.pose == pytest.approx([80 * GEOMETRY.metres_per_step, 0.0, 0.0], abs=1e-9)
+    assert counts == {"implausible_counters": 1}
+
+
+def test_a_robot_that_may_have_misunderstood_is_believed_by_its_counters(
+    odometry: WheelOdometry, counts: Counter[str]
+) -> None:
+    wheels = Wheels(odometry)
+    wheels.read()
+    wheels.command(20.0, 20.0)
+    wheels.rates = np.array([-700.0, 20.0])  # by a command that was twisted on the way
+    wheels.run(1.0)
+    odometry.doubt_rates(wheels.now_ns - SECOND, EPUCK1.max_rate)
+    state = wheels.read()
+    assert state is not None
+    turn = 720 * GEOMETRY.metres_per_step / GEOMETRY.wheel_separation
+    assert float(se2.wrap_angle(state.pose[2] - turn)) == pytest.approx(0.0, abs=1e-9)
+    assert not counts
+
+
+def test_a_command_that_takes_its_time_is_no_fault(odometry: WheelOdometry, counts: Counter[str]) -> None:
+    wheels = Wheels(odometry)
+    wheels.read()
+    wheels.command(600.0, 600.0)
+    wheels.run(1.0)
+    wheels.read()
+    odometry.note_rates(wheels.now_ns, 0.0, 0.0)  # under way for 0.2 s, while readings come
+    for _ in range(4):
+        wheels.run(0.05)
+        assert wheels.read() is not None
+    wheels.rates = np.zeros(2)
+    wheels.run(0.05)
+    assert wheels.read() is not None
+    assert not counts
+
+
+def test_a_robot_that_was_switched_off_is_counted_from_anew_and_less_sure(
+    odometry: WheelOdometry, counts: Counter[str]
+) -> None:
+    wheels = Wheels(odometry, steps=(20000, 20000))
+    wheels.read()
+    wheels.command(400.0, 400.0)
+    wheels.run(1.0)
+    sure = wheels.read()
+    wheels.run(0.5)
+    wheels.steps = np.zeros(2)
+    assert wheels.read() is None
+    wheels.run(0.5)
+    lost = wheels.read()
+    wheels.run(0.5)
+    after = wheels.read()
+    assert sure is not None
+    assert lost is not None
+    assert after is not None
+    assert lost.pose == pytest.approx(sure.pose)
+    assert math.sqrt(lost.covariance[0, 0]) > 0.5 * 400 * GEOMETRY.metres_per_step
+    assert after.pose[0] - lost.pose[0] == pytest.approx(200 * GEOMETRY.metres_per_step, abs=1e-9)
+    assert counts == {"implausible_counters": 1, "counter_restarts": 1}
+
+
+def test_time_that_stands_tells_nothing_and_time_that_jumps_back_begins_anew(odometry: WheelOdometry) -> None:
+    wheels = Wheels(odometry)
+    wheels.read()
+    assert wheels.read() is None
+    wheels.command(400.0, 400.0)
+    wheels.run(1.0)
+    before = wheels.read()
+    wheels.now_ns -= 5 * SECOND
+    again = wheels.read()
+    assert before is not None
+    assert again is not None
+    assert again.pose == pytest.approx(before.pose)
+
+
+@settings(deadline=None)  # the estimator is compiled at its first call
+@given(legs=st.lists(st.tuples(RATE, RATE, st.integers(1, 20)), min_size=1, max_size=12))
+def test_the_covariance_is_that_of_the_estimators_model(legs: list[tuple[float, float, int]]) -> None:
+    odometry = WheelOdometry(GEOMETRY, NOISE, Counter())
+    wheels = Wheels(odometry)
+    states = [wheels.read()]
+    for left, right, readings in legs:
+        wheels.command(left, right)
+        for _ in range(readings):
+            wheels.run(0.05)
+            states.append(wheels.read())
+    poses = np.array([state.pose for state in states if state is not None])
+    stamps = np.array([state.stamp_ns for state in states if state is not None])
+
+    model = OdometryModel(wheel_separation=GEOMETRY.wheel_separation, wheel_noise=NOISE, timeout_s=60.0)
+    tracks = OdometryTracks([Robot("one", odometry=model)])
+    tracks.extend(np.zeros(len(stamps), np.int64), stamps, poses)
+    gathered = tracks.at(np.zeros(1, np.int64), stamps[-1:]).gathered[0, 0]
+    jacobian = se2.error_to_pose_jacobian(poses[-1])
+    expected = jacobian @ gathered @ jacobian.T
+
+    last = states[-1]
+    assert last is not None
+    excess: NDArray[np.float64] = last.covariance - expected
+    # chords against arcs, and the cut-off fraction of a step on top
+    assert np.abs(excess).max() <= 0.02 * np.abs(expected).max() + 1e-5
+    assert np.linalg.eigvalsh(last.covariance)[0] > 0.0

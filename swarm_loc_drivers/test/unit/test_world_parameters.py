@@ -1,0 +1,73 @@
+"""A world's parameters: what follows from them, and what is refused in one sentence."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from swarm_loc_drivers.nodes.world_parameters import WorldParameters, make_world
+from swarm_loc_drivers.sim.eight import EightSettings, describe
+from swarm_loc_drivers.sim.render.lens import CameraModel
+from swarm_loc_drivers.sim.steering import EightSteering
+from swarm_loc_estimator.io.swarm_writer import save_swarm
+from swarm_loc_estimator.nodes.parameter_table import ParameterError, markdown_table, parameter_specs
+
+START = np.array([[0.1, 0.2, 0.3], [0.5, -0.2, 1.0]])
+
+
+@pytest.fixture
+def wishes(tmp_path: Path) -> WorldParameters:
+    save_swarm(describe(EightSettings(robots=2), START), tmp_path / "swarm.yaml")
+    return WorldParameters(
+        swarm_file=str(tmp_path / "swarm.yaml"), camera=CameraModel(width=64, height=48), world="w0"
+    )
+
+
+def test_the_readme_has_all_parameters() -> None:
+    readme = Path(__file__).parents[2] / "README.md"
+    assert markdown_table(WorldParameters) in readme.read_text(encoding="utf-8")
+
+
+def test_robots_begin_where_the_description_says(wishes: WorldParameters) -> None:
+    swarm, world = make_world(wishes)
+    assert [robot.name for robot in swarm.robots] == ["epuck1", "epuck2"]
+    np.testing.assert_allclose(world.poses, START)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"world": "w9"}, "parameter world = 'w9' must be one of w0, w2"),
+        ({"model": "khepera"}, "parameter model = 'khepera' must be one of"),
+        ({"model": "epuck1"}, "parameter model = 'epuck1' needs the parameter link_folder"),
+        ({"family": "round"}, "parameter family = 'round'"),
+    ],
+)
+def test_what_cannot_be_used_is_named(wishes: WorldParameters, change: dict[str, str], said: str) -> None:
+    with pytest.raises(ParameterError, match=said):
+        make_world(replace(wishes, **change))  # type: ignore[arg-type]
+
+
+def test_a_robot_without_a_start_is_named(wishes: WorldParameters) -> None:
+    save_swarm(describe(EightSettings(robots=2, start_known=False), START), Path(wishes.swarm_file))
+    with pytest.raises(ParameterError, match=r"parameter swarm_file = .* robot 'epuck1' has no start pose"):
+        make_world(wishes)
+
+
+def test_the_cameras_parameters_are_among_the_worlds() -> None:
+    names = {spec.name for spec in parameter_specs(WorldParameters)}
+    assert {"exposure_s", "width", "k1", "rate", "first_port"} <= names
+
+
+def test_steering_brings_a_robot_back_onto_the_eight() -> None:
+    steering = EightSteering(2, 0.06)
+    pose = np.array([0.63, -0.01, 1.3])
+    step_ns = 50_000_000
+    for step in range(400):
+        speed, turn_rate = steering.command(0, 10**12 + step * step_ns, pose)
+        heading = pose[2] + 0.5 * 0.05 * turn_rate
+        pose = pose + 0.05 * np.array([speed * np.cos(heading), speed * np.sin(heading), turn_rate])
+    r2 = float(pose[:2] @ pose[:2])
+    assert abs(r2**2 - 0.36 * (pose[0] ** 2 - pose[1] ** 2)) < 2e-3
+    assert speed == pytest.approx(0.06, rel=0.05)
