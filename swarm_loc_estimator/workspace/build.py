@@ -69,7 +69,7 @@ def compile_estimator() -> None:
     Raises:
         WorkspaceError: The estimator does not run.
     """
-    sources = (ROOT / "swarm_loc_estimator" / "swarm_loc_estimator" / "core").glob("*.py")
+    sources = (ROOT / "swarm_loc_estimator" / "swarm_loc_estimator" / "core").rglob("*.py")
     inputs = digest(sources, str(ROOT), install.identity())
     stamp = Stamp(STATE / "stamps" / "compiled")
     if stamp.read() == inputs:

@@ -22,7 +22,7 @@ Function = TypeVar("Function", bound=Callable[..., object])
 
 def _cache_folder() -> Path:
     """A folder of its own for every state of the sources: numba alone would miss a change in another file."""
-    sources = sorted(Path(__file__).parent.glob("*.py"))
+    sources = sorted(Path(__file__).parent.rglob("*.py"))
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
     root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(root) / "swarm_loc_estimator" / digest

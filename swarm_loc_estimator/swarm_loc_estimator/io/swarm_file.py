@@ -27,18 +27,15 @@ Numbers, units, ranges and defaults are those of the classes in `core.swarm`.
 
 from __future__ import annotations
 
-import difflib
-import math
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from swarm_loc_estimator.core.swarm import (
     CameraMount,
     Face,
     Landmark,
     MotionResponse,
-    NumberSpec,
     OdometryModel,
     Pose2,
     Robot,
@@ -48,7 +45,8 @@ from swarm_loc_estimator.core.swarm import (
     SwarmError,
     number_specs,
 )
-from swarm_loc_estimator.io.yaml_tree import Tree, YamlTreeError, read_tree, shown
+from swarm_loc_estimator.io.tree_checks import Numbers, TreeChecks, nearest
+from swarm_loc_estimator.io.yaml_tree import Tree, YamlTreeError, read_tree
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -69,8 +67,6 @@ _RESPONSE = ("speeds", "turn_rates", "speed_share", "turn_share")
 _MAX_ID = 2**32 - 1
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
-Numbers = dict[str, "float | None"]
-
 
 class SwarmFileError(ValueError):
     """A swarm description that cannot be used; the message is one sentence with file, key and value."""
@@ -89,7 +85,7 @@ def load_swarm(path: Path) -> Swarm:
         tree = read_tree(path)
     except YamlTreeError as error:
         raise SwarmFileError(str(error)) from error
-    return _Loader(path).swarm(tree)
+    return _Loader(path, SwarmFileError).swarm(tree)
 
 
 @dataclass
@@ -104,18 +100,15 @@ class _Layer:
     faces: dict[str, Numbers | None]
 
 
-class _Loader:
+class _Loader(TreeChecks):
     """Checks the tree of one file on the way to the dataclasses."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
 
     def swarm(self, tree: Tree) -> Swarm:
         """The whole file."""
-        sections = self._mapping(tree, "the file", _SECTIONS)
+        sections = self.mapping(tree, "the file", _SECTIONS)
         version = sections.get("fileversion")
         if version != FILE_VERSION or isinstance(version, bool):
-            raise self._error("fileversion", version, f"must be {FILE_VERSION}")
+            raise self.error("fileversion", version, f"must be {FILE_VERSION}")
         defaults = self._layer(sections.get("defaults", {}), "defaults", _LAYER)
         types = {
             name: self._layer(tree, f"types.{name}", _LAYER)
@@ -136,12 +129,10 @@ class _Loader:
     def _robot(self, name: str, tree: Tree, defaults: _Layer, types: Mapping[str, _Layer]) -> Robot:
         """One robot from its three layers."""
         key = f"robots.{name}"
-        mapping = self._mapping(tree, key, _ROBOT)
+        mapping = self.mapping(tree, key, _ROBOT)
         type_name = mapping.get("type", "")
         if type_name and (not isinstance(type_name, str) or type_name not in types):
-            raise self._error(
-                f"{key}.type", type_name, f"must be one of the types{_nearest(type_name, types)}"
-            )
+            raise self.error(f"{key}.type", type_name, f"must be one of the types{nearest(type_name, types)}")
         own = self._layer(mapping, key, _ROBOT)
         layers = [defaults, *([types[type_name]] if type_name else []), own]
         models = {
@@ -160,9 +151,9 @@ class _Loader:
 
     def _layer(self, tree: Tree, key: str, known: Iterable[str]) -> _Layer:
         """The settings that one layer says."""
-        mapping = self._mapping(tree, key, known)
+        mapping = self.mapping(tree, key, known)
         models = {
-            section: self._numbers(mapping[section], f"{key}.{section}", number_specs(cls))
+            section: self.numbers(mapping[section], f"{key}.{section}", number_specs(cls))
             for section, cls in _MODELS.items()
             if section in mapping
         }
@@ -171,12 +162,12 @@ class _Loader:
         specs = number_specs(Face)
         return _Layer(
             models,
-            None if camera is None else self._numbers(camera, f"{key}.camera", number_specs(CameraMount)),
+            None if camera is None else self.numbers(camera, f"{key}.camera", number_specs(CameraMount)),
             "camera" in mapping,
             self._response(mapping.get("response"), f"{key}.response"),
             "response" in mapping,
             {
-                name: None if face is None else self._numbers(face, f"{key}.faces.{name}", specs)
+                name: None if face is None else self.numbers(face, f"{key}.faces.{name}", specs)
                 for name, face in faces
             },
         )
@@ -185,15 +176,17 @@ class _Loader:
         """A table of shares, or that there is none; said as a whole by one layer."""
         if tree is None:
             return None
-        mapping = self._mapping(tree, key, _RESPONSE)
+        mapping = self.mapping(tree, key, _RESPONSE)
         for name in _RESPONSE:
             if name not in mapping:
                 raise SwarmFileError(f"{self._path}: {key} lacks {name}, a list of numbers.")
-        axes = {name: self._list(mapping[name], f"{key}.{name}") for name in ("speeds", "turn_rates")}
+        axes = {
+            name: self.list_of_numbers(mapping[name], f"{key}.{name}") for name in ("speeds", "turn_rates")
+        }
         tables = {
             name: tuple(
-                self._list(row, f"{key}.{name}[{index}]")
-                for index, row in enumerate(self._items(mapping[name], f"{key}.{name}"))
+                self.list_of_numbers(row, f"{key}.{name}[{index}]")
+                for index, row in enumerate(self.items(mapping[name], f"{key}.{name}"))
             )
             for name in ("speed_share", "turn_share")
         }
@@ -204,21 +197,6 @@ class _Loader:
         except SwarmError as error:
             raise SwarmFileError(f"{self._path}: {key.removesuffix('response')}{error}") from error
 
-    def _items(self, tree: Tree, key: str) -> list[Tree]:
-        """A list."""
-        if not isinstance(tree, list):
-            raise self._error(key, tree, "must be a list")
-        return tree
-
-    def _list(self, tree: Tree, key: str) -> tuple[float, ...]:
-        """A list of numbers."""
-        values = []
-        for index, value in enumerate(self._items(tree, key)):
-            if isinstance(value, bool) or not isinstance(value, int | float) or not -1e9 < value < 1e9:
-                raise self._error(f"{key}[{index}]", value, "must be a number")
-            values.append(float(value))
-        return tuple(values)
-
     def _faces(self, key: str, layers: Iterable[_Layer], ids_tree: Tree) -> tuple[Face, ...]:
         """The robot's markers: where they sit from the layers, which they are from its ids."""
         places: dict[str, Numbers] = {}
@@ -228,7 +206,7 @@ class _Loader:
                     places.pop(name, None)
                 else:
                     places[name] = {**places.get(name, {}), **numbers}
-        ids = self._mapping(ids_tree, f"{key}.ids", places)
+        ids = self.mapping(ids_tree, f"{key}.ids", places)
         missing = [name for name in places if name not in ids]
         if missing:
             raise SwarmFileError(
@@ -243,9 +221,9 @@ class _Loader:
     def _landmarks(self, tree: Tree) -> tuple[Landmark, ...]:
         """All landmarks, in the order of the file."""
         result = []
-        for number, place in self._mapping(tree, "landmarks").items():
+        for number, place in self.mapping(tree, "landmarks").items():
             key = f"landmarks.{number}"
-            numbers = self._numbers(place, key, number_specs(Landmark), required=("x", "y"))
+            numbers = self.numbers(place, key, number_specs(Landmark), required=("x", "y"))
             result.append(Landmark(self._marker_id(number, key), **numbers))  # type: ignore[arg-type]
         return tuple(result)
 
@@ -253,72 +231,26 @@ class _Loader:
         """A start pose, or that there is none."""
         if tree is None:
             return None
-        numbers = self._numbers(tree, key, _START, required=tuple(_START))
+        numbers = self.numbers(tree, key, _START, required=tuple(_START))
         return (float(numbers["x"] or 0.0), float(numbers["y"] or 0.0), float(numbers["theta"] or 0.0))
-
-    def _numbers(
-        self, tree: Tree, key: str, specs: Mapping[str, NumberSpec], required: tuple[str, ...] = ()
-    ) -> Numbers:
-        """A mapping of numbers, each in its range."""
-        mapping = self._mapping(tree, key, specs)
-        for name in required:
-            if name not in mapping:
-                raise SwarmFileError(
-                    f"{self._path}: {key} lacks {name}, a number in {specs[name].range_text}."
-                )
-        return {name: self._number(value, f"{key}.{name}", specs[name]) for name, value in mapping.items()}
-
-    def _number(self, value: Tree, key: str, spec: NumberSpec) -> float | None:
-        """One number in its range."""
-        if value is None and spec.optional:
-            return None
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self._error(key, value, f"must be a number in {spec.range_text}")
-        try:
-            number = float(value)
-        except OverflowError:  # a whole number of hundreds of digits
-            number = math.inf
-        if not spec.allows(number):
-            raise self._error(key, value, f"must lie in {spec.range_text}")
-        return number
 
     def _marker_id(self, value: Tree, key: str) -> int:
         """A marker id."""
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= _MAX_ID:
-            raise self._error(key, value, f"must be a marker id, a whole number in [0, {_MAX_ID}]")
+            raise self.error(key, value, f"must be a marker id, a whole number in [0, {_MAX_ID}]")
         return value
 
     def _named(self, tree: Tree, key: str) -> list[tuple[str, Tree]]:
         """A mapping from names that can stand in topics and frames."""
-        mapping = self._mapping(tree, key)
+        mapping = self.mapping(tree, key)
         for name in mapping:
             if not isinstance(name, str) or not _NAME.fullmatch(name):
-                raise self._error(
+                raise self.error(
                     f"a name in {key}",
                     name,
                     "must be letters, digits and underscores and start with a letter",
                 )
         return list(mapping.items())
-
-    def _mapping(self, tree: Tree, key: str, known: Iterable[str] | None = None) -> dict[Any, Tree]:
-        """A mapping; with `known`, only of these keys."""
-        if tree is None:
-            return {}
-        if not isinstance(tree, dict):
-            raise self._error(key, tree, "must be a mapping of keys to values")
-        if known is not None:
-            allowed = tuple(known)
-            for name in tree:
-                if name not in allowed:
-                    where = shown(name) if key == "the file" else shown(f"{key}.{name}")
-                    raise SwarmFileError(
-                        f"{self._path}: {where} is not a known key{_nearest(name, allowed)}."
-                    )
-        return tree
-
-    def _error(self, key: str, value: object, rule: str) -> SwarmFileError:
-        """The one sentence."""
-        return SwarmFileError(f"{self._path}: {key} is {shown(value)} but {rule}.")
 
 
 def _camera(layers: Iterable[_Layer]) -> CameraMount | None:
@@ -328,11 +260,3 @@ def _camera(layers: Iterable[_Layer]) -> CameraMount | None:
         if layer.says_camera:
             numbers = None if layer.camera is None else {**(numbers or {}), **layer.camera}
     return None if numbers is None else CameraMount(**numbers)  # type: ignore[arg-type]
-
-
-def _nearest(name: object, known: Iterable[str]) -> str:
-    """The known word most like it, for the end of a sentence."""
-    words = list(known)
-    if not words:
-        return "; none is known here"
-    return f"; the nearest one is '{difflib.get_close_matches(str(name), words, 1, 0.0)[0]}'"
