@@ -55,6 +55,11 @@ class NodeSpec:
     remappings: tuple[tuple[str, str], ...] = ()
     required: bool = True
 
+    @property
+    def full_name(self) -> str:
+        """Name with the namespace before it, unique in a graph."""
+        return f"{self.namespace}/{self.name}" if self.namespace else self.name
+
     def ros_arguments(self) -> list[str]:
         """The command-line arguments that make the executable this node."""
         arguments = ["--ros-args", "-r", f"__node:={self.name}"]

@@ -88,7 +88,7 @@ def run_graph(nodes: Sequence[NodeSpec], say: Callable[[str], None]) -> int:
     try:
         for node, command in zip(nodes, commands, strict=True):
             children.append(Child(node, start(command)))
-            say(f"{node.name}: started as process {children[-1].process.pid}")
+            say(f"{node.full_name}: started as process {children[-1].process.pid}")
         return _watch(children, say)
     finally:
         stop(children, say)
@@ -117,7 +117,7 @@ def _watch(children: Sequence[Child], say: Callable[[str], None]) -> int:
         for child in [c for c in running if c.process.poll() is not None]:
             running.remove(child)
             status = _shell_status(child.process.returncode)
-            say(f"{child.spec.name}: ended with status {status}")
+            say(f"{child.spec.full_name}: ended with status {status}")
             if child.spec.required or not running:
                 return status
         received = signal.sigwait(AWAITED_SIGNALS)
@@ -136,7 +136,7 @@ def stop(children: Sequence[Child], say: Callable[[str], None]) -> None:
         running = [child for child in children if child.process.poll() is None]
         for child in running:
             if stop_signal != signal.SIGINT:
-                say(f"{child.spec.name}: does not end, {stop_signal.name}")
+                say(f"{child.spec.full_name}: does not end, {stop_signal.name}")
             child.process.send_signal(stop_signal)
         _wait_for_all(running, patience_s)
 

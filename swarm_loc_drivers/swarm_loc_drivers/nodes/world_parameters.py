@@ -10,7 +10,7 @@ from swarm_loc_drivers.protocols.epuck import EPUCK2, EPUCK_MODELS
 from swarm_loc_drivers.sim.eight import ARENA, CAMERA_RATE_HZ, START_NS
 from swarm_loc_drivers.sim.epuck_world import EpuckWorld, EpuckWorldSettings, WorldError
 from swarm_loc_drivers.sim.photographer import Stage
-from swarm_loc_drivers.sim.pictures import FACE_SIZE, FAMILY, LANDMARK_SIZE
+from swarm_loc_drivers.sim.pictures import FAMILY
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.core.swarm import OdometryModel, Swarm, number
@@ -45,10 +45,6 @@ class WorldParameters:
     arena_x: float = number(ARENA[0], "m", 0.1, 1000.0, "size of the arena along x, around the origin")
     arena_y: float = number(ARENA[1], "m", 0.1, 1000.0, "likewise along y")
     family: str = text(FAMILY, "kind of the markers", required=True)
-    landmark_length: float = number(
-        LANDMARK_SIZE, "m", 0.001, 10.0, "side of the landmarks, black border included"
-    )
-    face_length: float = number(FACE_SIZE, "m", 0.001, 10.0, "side of the robots' markers, likewise")
     camera_rate: float = number(CAMERA_RATE_HZ, "1/s", 2.0, 60.0, "pictures of each camera")
     truth_rate: float = number(20.0, "1/s", 0.1, 200.0, "published true poses of each robot")
     camera: CameraModel = field(default_factory=CameraModel, metadata={"numbers_of": CameraModel})
@@ -71,8 +67,7 @@ def make_world(wishes: WorldParameters) -> tuple[Swarm, EpuckWorld]:
         )
     swarm = load_swarm(Path(wishes.swarm_file))
     try:
-        family = family_named(wishes.family)
-        stage = Stage((wishes.arena_x, wishes.arena_y), family, wishes.landmark_length, wishes.face_length)
+        stage = Stage((wishes.arena_x, wishes.arena_y), family_named(wishes.family))
         settings = EpuckWorldSettings(
             seed=wishes.seed,
             world=WORLDS[wishes.world],

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.swarm import CameraMount, Swarm
+from swarm_loc_estimator.core.swarm import CameraMount, Face, Landmark, Swarm
 from swarm_loc_vision.core.families import Family
 
 from .hidden_geometry import HiddenGeometry
@@ -27,14 +27,10 @@ class Stage:
     Attributes:
         arena: Size along x and y, around map's origin [m].
         family: Kind of the markers.
-        landmark_size: Side of a landmark's black square [m].
-        face_size: Side of a robot's marker [m].
     """
 
     arena: tuple[float, float]
     family: Family
-    landmark_size: float
-    face_size: float
 
 
 class Photographer:
@@ -88,17 +84,12 @@ def _true_mount(camera: CameraMount | None, true: list[float]) -> CameraMount:
 def _scene(swarm: Swarm, truth: HiddenGeometry, stage: Stage, rng: np.random.Generator) -> Scene:
     """Arena, landmarks and robots."""
 
-    def board(pose: list[float], height: float, marker_id: int, size: float) -> Patches:
-        return scenery.marker(pose, height, stage.family.pattern(marker_id) != 0, size)
+    def board(pose: list[float], mark: Face | Landmark) -> Patches:
+        return scenery.marker(pose, mark.z, stage.family.pattern(mark.id) != 0, mark.size)
 
-    heights = [mark.z for mark in swarm.landmarks] + [
-        face.z for robot in swarm.robots for face in robot.faces
-    ]
-    places = [*truth.landmarks.tolist(), *truth.faces.tolist()]
-    marks = list(zip(places, heights, truth.ids.tolist(), strict=True))
-    count = len(swarm.landmarks)
-    boards = [board(pose, height, one, stage.landmark_size) for pose, height, one in marks[:count]]
-    faces = [board(pose, height, one, stage.face_size) for pose, height, one in marks[count:]]
+    boards = [board(pose, mark) for pose, mark in zip(truth.landmarks.tolist(), swarm.landmarks, strict=True)]
+    all_faces = [face for robot in swarm.robots for face in robot.faces]
+    faces = [board(pose, face) for pose, face in zip(truth.faces.tolist(), all_faces, strict=True)]
     robots = [
         [scenery.body(), scenery.tower(), *(faces[k] for k in np.flatnonzero(truth.face_owner == robot))]
         for robot in range(len(swarm.robots))

@@ -18,7 +18,6 @@ from .record import SIGHTING_DTYPE, SimulatedRun
 from .render.lens import CameraModel
 
 FAMILY = "artoolkit_bch_thin"
-LANDMARK_SIZE, FACE_SIZE = 0.050, 0.036
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class PicturedRun:
 
     def pictures(self) -> Iterator[NDArray[np.uint8]]:
         """The pictures (height, width) in the order of `run.frames`, drawn one by one."""
-        stage = Stage(ARENA, family_named(FAMILY), LANDMARK_SIZE, FACE_SIZE)
+        stage = Stage(ARENA, family_named(FAMILY))
         seed = self.settings.seed
         photographer = Photographer(self.run.swarm, self.hidden, stage, self.camera, seed)
         for frame in self.run.frames:

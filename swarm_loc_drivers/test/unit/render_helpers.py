@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.sim.eight import ARENA, faces, wall_markers
-from swarm_loc_drivers.sim.pictures import FACE_SIZE, LANDMARK_SIZE
 from swarm_loc_drivers.sim.render import scene as scenery
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.raster import Patches
 from swarm_loc_drivers.sim.render.renderer import Eye, Scene
 
 FloatArray = NDArray[np.float64]
+
+LANDMARK_SIZE = wall_markers()[0].size
 
 
 def random_cells(seed: int) -> NDArray[np.bool_]:
@@ -29,15 +30,14 @@ def random_cells(seed: int) -> NDArray[np.bool_]:
 def small_arena(robots: int = 3) -> Scene:
     """The arena of the eight with markers of random cells."""
     boards = [
-        scenery.marker((m.x, m.y, m.yaw or 0.0), m.z, random_cells(m.id), LANDMARK_SIZE)
-        for m in wall_markers()
+        scenery.marker((m.x, m.y, m.yaw or 0.0), m.z, random_cells(m.id), m.size) for m in wall_markers()
     ]
     parts = [
         [
             scenery.body(),
             scenery.tower(),
             *(
-                scenery.marker((f.x, f.y, f.yaw or 0.0), f.z, random_cells(f.id), FACE_SIZE)
+                scenery.marker((f.x, f.y, f.yaw or 0.0), f.z, random_cells(f.id), f.size)
                 for f in faces(10 * (robot + 1))
             ),
         ]

@@ -31,7 +31,7 @@ START = np.array([[0.0, 0.0, 0.3], [0.3, 0.05, 2.0], [-0.4, 0.3, -1.0]])
 
 
 def world_of(world: World = IDEAL, seed: int = 1, start: FloatArray = START) -> EpuckWorld:
-    stage = Stage(ARENA, family_named("artoolkit_bch_thin"), landmark_size=0.05, face_size=0.036)
+    stage = Stage(ARENA, family_named("artoolkit_bch_thin"))
     swarm = describe(EightSettings(robots=len(start)), start)
     return EpuckWorld(swarm, EpuckWorldSettings(seed, world, stage, CAMERA, WHEELS, 7.5, 1_000_000_000_000))
 
@@ -121,7 +121,7 @@ def test_a_picture_shows_where_the_robot_was_when_it_was_taken() -> None:
 
 
 def _with_camera(camera: CameraModel, start: FloatArray) -> EpuckWorld:
-    stage = Stage(ARENA, family_named("artoolkit_bch_thin"), landmark_size=0.05, face_size=0.036)
+    stage = Stage(ARENA, family_named("artoolkit_bch_thin"))
     settings = EpuckWorldSettings(1, IDEAL, stage, camera, WHEELS, 7.5, 1_000_000_000_000)
     return EpuckWorld(describe(EightSettings(robots=len(start)), start), settings)
 
@@ -164,6 +164,6 @@ def test_a_swarm_that_cannot_be_simulated_is_refused_in_one_sentence(
 ) -> None:
     swarm = describe(EightSettings(robots=2), START[:2])
     lacking = Swarm((replace(swarm.robots[0], **change), swarm.robots[1]), swarm.landmarks)  # type: ignore[arg-type]
-    stage = Stage(ARENA, family_named("artoolkit_bch_thin"), 0.05, 0.036)
+    stage = Stage(ARENA, family_named("artoolkit_bch_thin"))
     with pytest.raises(WorldError, match=said):
         EpuckWorld(lacking, EpuckWorldSettings(1, W0, stage, CAMERA, WHEELS, 7.5, 0))

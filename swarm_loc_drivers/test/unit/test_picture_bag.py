@@ -11,11 +11,12 @@ from render_helpers import pixels_of
 from swarm_loc_drivers.cli.generate_bag import main
 from swarm_loc_drivers.sim.eight import CAMERA, EightSettings
 from swarm_loc_drivers.sim.picture_bag import CAMERA_INFO, COMPRESSED_IMAGE
-from swarm_loc_drivers.sim.pictures import FAMILY, LANDMARK_SIZE, photograph_eight
+from swarm_loc_drivers.sim.pictures import FAMILY, photograph_eight
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.renderer import Eye
 from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.swarm import Landmark
 from swarm_loc_estimator.io.bags import BagReader
 from swarm_loc_estimator.io.typestore import typestore
 from swarm_loc_vision.core.detector import MarkerDetector
@@ -89,7 +90,7 @@ def test_a_detector_finds_the_landmarks_where_they_are() -> None:
                     Eye(robot, camera, CAMERA),
                     camera,
                     pose,
-                    square_of((mark.x, mark.y, mark.yaw or 0.0), mark.z),
+                    square_of(mark),
                 )
                 errors += np.linalg.norm(corners - expected, axis=1).tolist()
     assert len(errors) > 4 * len(run.frames)
@@ -97,11 +98,11 @@ def test_a_detector_finds_the_landmarks_where_they_are() -> None:
     assert np.quantile(errors, 0.95) < 0.3
 
 
-def square_of(pose: tuple[float, float, float], height: float) -> FloatArray:
+def square_of(mark: Landmark) -> FloatArray:
     """Corners (4, 3) of a landmark, clockwise from the upper left of one who faces it."""
-    x, y, yaw = pose
+    yaw = mark.yaw or 0.0
     right = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
     up = np.array([0.0, 0.0, 1.0])
-    sides = 0.5 * LANDMARK_SIZE * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
-    corners: FloatArray = np.array([x, y, height]) + sides[:, :1] * right + sides[:, 1:] * up
+    sides = 0.5 * mark.size * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
+    corners: FloatArray = np.array([mark.x, mark.y, mark.z]) + sides[:, :1] * right + sides[:, 1:] * up
     return corners

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from render_helpers import RayCaster, camera_matrix, pixels_of, small_arena
+from render_helpers import LANDMARK_SIZE, RayCaster, camera_matrix, pixels_of, small_arena
 
 from swarm_loc_drivers.sim.eight import CAMERA
-from swarm_loc_drivers.sim.pictures import LANDMARK_SIZE
 from swarm_loc_drivers.sim.render import scene as scenery
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.raster import FloatArray, Image

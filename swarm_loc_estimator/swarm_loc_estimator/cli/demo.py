@@ -29,8 +29,9 @@ from swarm_loc_estimator.io.bag_file import BagError
 from swarm_loc_estimator.io.report import write_report
 from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
 from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
-from swarm_loc_estimator.live import BagContent, LiveError, LiveRun, play_live
+from swarm_loc_estimator.live import BagContent, LiveRun, play_live
 from swarm_loc_estimator.live_agreement import Agreement, compare_with_replay
+from swarm_loc_estimator.live_graph import LiveError
 from swarm_loc_estimator.nodes.recorder import Recorder, read_poses
 from swarm_loc_estimator.processes import GraphError
 

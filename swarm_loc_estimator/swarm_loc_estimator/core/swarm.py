@@ -247,6 +247,7 @@ class Face:
         y: [m], left.
         z: [m], up.
         yaw: Direction out of the face [rad]; None when the marker shows no heading.
+        size: Side of the marker, black border included [m].
     """
 
     name: str
@@ -255,6 +256,7 @@ class Face:
     y: float = number(0.0, "m", -10.0, 10.0, "left of base_link")
     z: float = number(0.0, "m", -10.0, 10.0, "above base_link")
     yaw: float | None = number(None, "rad", -TURN, TURN, "direction out of the face; null: shows no heading")
+    size: float = number(0.036, "m", 0.001, 10.0, "side of the marker, black border included")
 
 
 @dataclass(frozen=True)
@@ -267,6 +269,7 @@ class Landmark:
         y: [m].
         z: [m].
         yaw: Direction out of the marker's face [rad]; None when it shows no heading.
+        size: Side of the marker, black border included [m].
     """
 
     id: int
@@ -274,6 +277,7 @@ class Landmark:
     y: float = number(0.0, "m", -1e6, 1e6, "in map")
     z: float = number(0.0, "m", -1e4, 1e4, "in map")
     yaw: float | None = number(None, "rad", -TURN, TURN, "direction out of its face; null: shows no heading")
+    size: float = number(0.05, "m", 0.001, 10.0, "side of the marker, black border included")
 
 
 @dataclass(frozen=True)

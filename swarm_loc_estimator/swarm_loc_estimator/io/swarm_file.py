@@ -13,14 +13,14 @@ types:
       speed_share: [[1.0, 0.9, 0.9], [1.0, 0.8, 0.7]]
       turn_share: [[1.0, 0.9, 0.9], [1.0, 0.9, 0.9]]
     camera: {x: 0.035, z: 0.028}            # null: it has none
-    faces: {front: {x: 0.035, yaw: 0.0}}    # markers on the body; null takes one away
+    faces: {front: {x: 0.035, yaw: 0.0, size: 0.036}}   # markers on the body; null takes one away
 robots:
   epuck1:                 # the same keys; what is not said comes from its type
     type: epuck
     ids: {front: 12}      # which marker is on which face
     start: {x: 0.0, y: 0.0, theta: 0.0}     # null or left out: unknown
 landmarks:
-  100: {x: 1.2, y: -0.4, yaw: 3.14159}      # yaw null or left out: shows no heading
+  100: {x: 1.2, y: -0.4, yaw: 3.14159, size: 0.05}      # yaw null or left out: shows no heading
 ```
 Numbers, units, ranges and defaults are those of the classes in `core.swarm`.
 """

@@ -9,11 +9,12 @@ import pytest
 
 from swarm_loc_estimator.core.estimator import Status
 from swarm_loc_estimator.core.metrics import interpolate
-from swarm_loc_estimator.graph import GraphOptions
+from swarm_loc_estimator.graph import GraphOptions, graph_nodes
 from swarm_loc_estimator.io.bag_cut import copy_beginning
 from swarm_loc_estimator.io.swarm_file import load_swarm
-from swarm_loc_estimator.live import ESTIMATOR, PLAYER, LiveError, LiveGraph, play_live, read_bag
+from swarm_loc_estimator.live import ESTIMATOR, PLAYER, play_live, read_bag
 from swarm_loc_estimator.live_agreement import compare_with_replay
+from swarm_loc_estimator.live_graph import LiveError, LiveGraph
 from swarm_loc_estimator.nodes.recorder import read_poses
 
 DEMO = Path(__file__).parents[3] / "bags" / "eight_five_robots"
@@ -46,7 +47,7 @@ def test_poses_come_back_after_the_estimator_was_killed(bag: Path, tmp_path: Pat
     swarm = load_swarm(SWARM_FILE)
     content = read_bag(bag, swarm)
     options = GraphOptions(str(SWARM_FILE), bag=str(bag), rate=0.5)
-    with LiveGraph(options, tmp_path / "nodes.log") as graph:
+    with LiveGraph(graph_nodes(options), tmp_path / "nodes.log") as graph:
         recorder = graph.recorder
         graph.wait_for(lambda: len(recorder.raw) > 20, "publish poses", PATIENCE_S)
         before = len(recorder.raw)
@@ -66,7 +67,7 @@ def test_poses_come_back_after_the_estimator_was_killed(bag: Path, tmp_path: Pat
 
 def test_a_graph_that_fails_says_so(bag: Path, tmp_path: Path) -> None:
     options = GraphOptions(str(tmp_path / "missing.yaml"), bag=str(bag))
-    graph = LiveGraph(options, tmp_path / "nodes.log")
+    graph = LiveGraph(graph_nodes(options), tmp_path / "nodes.log")
     with pytest.raises(LiveError, match=r"Node estimator has ended, status 1;.*missing\.yaml"), graph:
         pytest.fail("the graph started without a swarm description")
     assert graph.process(ESTIMATOR).returncode == 1

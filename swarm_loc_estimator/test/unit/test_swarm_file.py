@@ -52,13 +52,13 @@ robots:
     sensor: {range_sigma: 0.3}
   two:
     type: epuck
-    faces: {back: null, front: {z: 0.1}}
+    faces: {back: null, front: {z: 0.1, size: 0.03}}
     ids: {front: 3}
     start_sigma: {theta: 0.5}
   three: {type: blind}
   four:
 landmarks:
-  100: {x: 1.5, y: 0.25, yaw: -1.0}
+  100: {x: 1.5, y: 0.25, yaw: -1.0, size: 0.08}
   101: {x: 0, y: 0}
 """
 RESPONSE = MotionResponse(
@@ -93,11 +93,14 @@ def test_layers_fall_from_defaults_to_type_to_robot(tmp_path: Path) -> None:
     assert one.camera == CameraMount(x=0.035, z=0.028)
     assert one.faces == (Face("front", 1, x=0.035, yaw=0.0), Face("back", 2, x=-0.035, yaw=3.1416))
     assert (one.start, two.start) == ((1.0, -2.5, 0.5), None)
-    assert two.faces == (Face("front", 3, x=0.035, z=0.1, yaw=0.0),)
+    assert two.faces == (Face("front", 3, x=0.035, z=0.1, yaw=0.0, size=0.03),)
     assert two.start_sigma == StartSigma(theta=0.5)
     assert three.camera is None
     assert (four.camera, four.type) == (CameraMount(x=0.01), "")
-    assert swarm.landmarks == (Landmark(100, 1.5, 0.25, yaw=-1.0), Landmark(101, 0.0, 0.0, yaw=None))
+    assert swarm.landmarks == (
+        Landmark(100, 1.5, 0.25, yaw=-1.0, size=0.08),
+        Landmark(101, 0.0, 0.0, yaw=None, size=0.05),
+    )
 
 
 SHARES = "speeds: [0, 0.1], turn_rates: [0.0], speed_share: [[1], [0.9]], turn_share: [[1], [0.8]]"
@@ -202,6 +205,7 @@ def test_owners_of_marker_ids(tmp_path: Path) -> None:
             "landmarks.abc is 'abc' but must be a marker id, a whole number in [0, 4294967295].",
         ),
         ("  101: {x: 0, y: 0}", "  100: {x: 0, y: 0}", "'landmarks.100' is given twice, again in line 29."),
+        ("size: 0.08", "size: 0.0", "landmarks.100.size is 0.0 but must lie in [0.001, 10] m."),
         ("  101: {x: 0, y: 0}", "  101: {x: 0}", "landmarks.101 lacks y, a number in [-1e+06, 1e+06] m."),
         (
             "y: -2.5, theta: 0.5",

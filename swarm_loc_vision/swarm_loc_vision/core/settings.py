@@ -14,7 +14,9 @@ class DetectorSettings:
     Candidates: `least_side_px`, `least_contrast`. Poses: the rest.
     """
 
-    marker_length: float = number(0.05, "m", 0.001, 10.0, "side of a marker, black border included")
+    marker_length: float = number(
+        0.05, "m", 0.001, 10.0, "side of a marker that has no other, black border included"
+    )
     least_side_px: float = number(8.0, "px", 6.0, 1000.0, "smaller markers are not looked for")
     least_contrast: float = number(4.0, "1", 1.0, 100.0, "by how much ink is darker than paper [counts]")
     tilt_sigma: float = number(

@@ -34,8 +34,12 @@ class DetectorParameters:
         required=True,
     )
     ids: tuple[str, ...] = texts("ids in use, such as 5 or 0-31; empty: those of swarm_file, or else all")
-    lengths: tuple[str, ...] = texts("sides that differ from marker_length, such as 100-119:0.08 [m]")
-    swarm_file: str = text("", "path of the swarm description: ids in use, faces of robots; empty: none")
+    lengths: tuple[str, ...] = texts(
+        "sides that differ from marker_length, such as 100-119:0.08 [m]; not with swarm_file, which has them"
+    )
+    swarm_file: str = text(
+        "", "path of the swarm description: ids in use, sizes, faces of robots; empty: none"
+    )
     robot: str = text("", "whose camera it is in swarm_file: its mount says where up is; empty: a level one")
     settings: DetectorSettings = field(
         default_factory=DetectorSettings, metadata={"numbers_of": DetectorSettings}
@@ -56,7 +60,7 @@ def detector_maker(wishes: DetectorParameters) -> CreateDetector:
     swarm = load_swarm(Path(wishes.swarm_file)) if wishes.swarm_file else Swarm()
     robot = _robot(wishes, swarm)
     ids = _ids(wishes, swarm, family)
-    lengths = _selected("lengths", wishes.lengths, parse_lengths, len(family.words))
+    lengths = _lengths(wishes, swarm, family)
     up = up_of((robot.camera if robot else None) or CameraMount())
     bodies = [robot_body(other) for other in swarm.robots if other is not robot]
 
@@ -92,6 +96,18 @@ def _ids(wishes: DetectorParameters, swarm: Swarm, family: Family) -> IntArray |
             f"{wishes.swarm_file} has marker id {unknown[0]}, but {family.name} has only 0 to {count - 1}."
         )
     return np.array(sorted(swarm.owner_of), np.int64)
+
+
+def _lengths(wishes: DetectorParameters, swarm: Swarm, family: Family) -> dict[int, float]:
+    """Sides by id: those of the swarm, or those that the parameter says."""
+    if wishes.lengths and wishes.swarm_file:
+        raise ParameterError(
+            "parameter lengths cannot be given along with swarm_file, which has the size of each marker."
+        )
+    if wishes.swarm_file:
+        return {marker_id: owner.marker.size for marker_id, owner in swarm.owner_of.items()}
+    lengths: dict[int, float] = _selected("lengths", wishes.lengths, parse_lengths, len(family.words))
+    return lengths
 
 
 def _selected(name: str, values: tuple[str, ...], parse: Callable[..., Any], count: int) -> Any:

@@ -176,6 +176,7 @@ def test_a_swarm_that_does_not_fit_stops_at_start(ros: Ros, tmp_path: Path) -> N
     path.write_text("fileversion: 1\nrobots: {a: {}}\nlandmarks: {300: {x: 1.0, y: 0.0}}\n", encoding="utf-8")
     for parameters, words in (
         ({}, "marker id 300, but"),
+        ({"ids": ["1"], "lengths": ["1:0.08"]}, "lengths cannot be given along with swarm_file"),
         ({"robot": "b"}, "must be a robot of the swarm: a"),
     ):
         wishes = overrides(family=FAMILY, swarm_file=str(path), **parameters)
