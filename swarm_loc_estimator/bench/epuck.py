@@ -7,8 +7,9 @@ W0 has the printed sigmas as white noise; a dense block of twenty shows what sig
 worth to those who never see a landmark. W2 has hidden systematic errors that together look like the paper's
 experiment: unknown yaw and scale of every camera, a badly surveyed map, late stamps, turns that slip. There
 "paper" is the paper's own filter (closest stored state, printed sigmas, no gate), and "selfcal" estimates
-yaw, scale and slip along with the poses. Errors are those of poses ten times a second as they come out,
-while sightings are still 150-300 ms late. At the end the marker detector sees the same pictures as others.
+yaw, scale, slip and the map along with the poses. Errors are those of poses ten times a second as they come
+out, while sightings are still 150-300 ms late. At the end the marker detector sees the same pictures as
+others.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from swarm_loc_drivers.sim.dense import DenseSettings, blind_robots, simulate_de
 from swarm_loc_drivers.sim.eight import EightSettings, simulate_eight
 from swarm_loc_drivers.sim.worlds import W0, W2, W2_FAST, World
 from swarm_loc_estimator.core.settings import EstimatorSettings
-from swarm_loc_estimator.core.swarm import Robot
+from swarm_loc_estimator.core.swarm import Robot, Swarm
 
 if TYPE_CHECKING:
     from swarm_loc_drivers.sim.record import SimulatedRun
@@ -49,7 +50,7 @@ PAPER = {
 }
 """Mean errors [cm], [deg] that the paper reports for its robots, one and five (section VI)."""
 
-Prepare = Callable[[Robot], Robot]
+Prepare = Callable[[Swarm], Swarm]
 
 
 @dataclass(frozen=True)
@@ -84,25 +85,31 @@ class Outcome:
     nees: float
 
 
-def as_described(robot: Robot) -> Robot:
-    """The robot as the world's description has it."""
-    return robot
+def as_described(swarm: Swarm) -> Swarm:
+    """The swarm as the world describes it."""
+    return swarm
 
 
-def papers_own(robot: Robot) -> Robot:
+def papers_own(swarm: Swarm) -> Swarm:
     """The paper's settings: printed sigmas, k_s = 2e-4 m for each wheel (errata, reading A), no gate."""
-    return replace(
-        robot,
-        odometry=replace(robot.odometry, wheel_noise=2e-4),
-        sensor=replace(robot.sensor, gate_probability=1.0),
+    robots = (
+        replace(
+            robot,
+            odometry=replace(robot.odometry, wheel_noise=2e-4),
+            sensor=replace(robot.sensor, gate_probability=1.0),
+        )
+        for robot in swarm.robots
     )
+    return replace(swarm, robots=tuple(robots))
 
 
-def self_calibrating(robot: Robot) -> Robot:
-    """What a careful user knows of such robots: sizes of the systematic errors, not their values.
+def self_calibrating(swarm: Swarm) -> Swarm:
+    """What a careful user knows of such robots and maps: sizes of the systematic errors, not their values."""
+    landmarks = (replace(mark, position_sigma=0.02, yaw_sigma=0.03) for mark in swarm.landmarks)
+    return Swarm(tuple(_self_calibrating(robot) for robot in swarm.robots), tuple(landmarks))
 
-    The sigmas of sightings contain the survey of the map, which is not estimated, and what lasts of it.
-    """
+
+def _self_calibrating(robot: Robot) -> Robot:
     camera = robot.camera
     return replace(
         robot,
@@ -110,9 +117,9 @@ def self_calibrating(robot: Robot) -> Robot:
         camera=camera and replace(camera, yaw_sigma=0.03),
         sensor=replace(
             robot.sensor,
-            forward_sigma=0.03,
-            left_sigma=0.03,
-            heading_sigma=0.2,
+            forward_sigma=0.01,
+            left_sigma=0.01,
+            heading_sigma=0.12,
             distance_scale_sigma=0.03,
             time_offset_s=-0.5 * W2.exposure_early_s,
         ),
@@ -155,8 +162,7 @@ def simulate(case: Case, seed: int) -> SimulatedRun:
             )
         )
     prepare = FILTERS[case.filter][0]
-    swarm = replace(run.swarm, robots=tuple(prepare(robot) for robot in run.swarm.robots))
-    run = replace(run, swarm=swarm)
+    run = replace(run, swarm=prepare(run.swarm))
     if case.relative:
         return run
     return run.masked(np.isin(run.sightings["marker_id"], [mark.id for mark in run.swarm.landmarks]))

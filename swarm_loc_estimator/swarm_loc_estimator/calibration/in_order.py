@@ -44,7 +44,10 @@ def run_in_order(recording: Recording, swarm: Swarm, tick_s: float) -> ReplayRes
     """Poses at every whole multiple of `tick_s`, each from all that was true by then."""
     began = time.perf_counter()
     tracks, measured = tracks_of(recording, swarm), measurements_of(recording, swarm)
-    fusion, state = Fusion(swarm, EstimatorSettings(), tracks), SwarmState(ParameterTable.of(swarm.robots))
+    fusion, state = (
+        Fusion(swarm, EstimatorSettings(), tracks),
+        SwarmState(ParameterTable.of(swarm.robots, swarm.landmarks)),
+    )
     timeout_s = np.array([robot.odometry.timeout_s for robot in swarm.robots])
     verdicts, nis = np.zeros(measured.size, dtype=np.uint8), np.empty(measured.size)
     stamps_ns, ends = _ticks(recording, measured["stamp_ns"], round(tick_s * 1e9))

@@ -46,7 +46,7 @@ _MOST_CLUES = 20
 def with_clue(
     clues: ClueArray,
     one: MeasurementArray,
-    camera_yaw: float,
+    camera: FloatArray,
     robot: int,
     track: FloatArray,
     noise: FloatArray,
@@ -59,17 +59,17 @@ def with_clue(
     Args:
         clues: In order of time; not changed.
         one: Between the robot and something located.
-        camera_yaw: By how much its sensor is turned to the left besides [rad].
+        camera: (2,) by how much its sensor is turned to the left besides [rad], and stretches distances.
         robot: Which of the two sides waits.
         track: (3,) pose of the robot on its track at the stamp.
         noise: (3, 3) noise that the track has gathered by then.
-        base: (3,) pose in `map` of the other side; zero for nobody.
+        base: (3,) pose in `map` of the other side; by what a landmark is moved from its survey.
         spread: (3, 3) covariance of its right-invariant error.
         window_ns: Age up to which clues are kept.
     """
     out = np.empty(_MOST_CLUES + 1, dtype=CLUE_DTYPE)
     count = _take_over(clues, one, window_ns, out)
-    _describe(one, camera_yaw, robot, track, noise, base, spread, out[count : count + 1])
+    _describe(one, camera, robot, track, noise, base, spread, out[count : count + 1])
     if count < _MOST_CLUES:
         return out[: count + 1]
     _thin_out(out)
@@ -135,7 +135,7 @@ def spread_at(spread: FloatArray, x: float, y: float) -> tuple[float, float, flo
 @compiled
 def _describe(
     measurements: MeasurementArray,
-    camera_yaw: float,
+    camera: FloatArray,
     robot: int,
     track: FloatArray,
     noise: FloatArray,
@@ -151,14 +151,16 @@ def _describe(
     lx, ly, ltheta = composed(track[0], track[1], track[2], on_track[0], on_track[1], on_track[2])
     mx, my, mtheta = composed(base[0], base[1], base[2], on_map[0], on_map[1], on_map[2])
     if sees:
-        ltheta += camera_yaw
+        ltheta += camera[0]
     else:
-        mtheta += camera_yaw
+        mtheta += camera[0]
     x, y, angle = value[0], value[1], ltheta if sees else mtheta
     xx, xy, yy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     if one.kind == 1:  # Kind.POLAR: along and across the line of sight
         x, y, angle = value[0], 0.0, angle + value[1]
         xy, yy = value[0] * xy, value[0] * value[0] * yy
+    size = 1.0 / (1.0 + camera[1])
+    x, y, xx, xy, yy = size * x, size * y, size * size * xx, size * size * xy, size * size * yy
     cos, sin = math.cos(angle), math.sin(angle)
     x, y = cos * x - sin * y, sin * x + cos * y
     xx, xy, yy = turned(xx, xy, yy, cos, sin)

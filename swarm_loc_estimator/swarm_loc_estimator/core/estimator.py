@@ -58,7 +58,7 @@ class SwarmEstimator:
         self._tracks = OdometryTracks(swarm.robots)
         self._converter = SightingConverter(swarm)
         self._fusion = Fusion(swarm, self.settings, self._tracks)
-        self._parameters = ParameterTable.of(swarm.robots)
+        self._parameters = ParameterTable.of(swarm.robots, swarm.landmarks)
         self._reach_ns = self._tracks.reach_ns
         self._timeline = Timeline(
             self.settings, self._fusion.step, SwarmState(self._parameters), self._reach_ns

@@ -17,7 +17,7 @@ from swarm_loc_estimator.core.locate import LEAST_CLUES, locate
 from swarm_loc_estimator.core.measurements import NOBODY, MeasurementArray
 from swarm_loc_estimator.core.motion import NOISE
 from swarm_loc_estimator.core.odometry import OdometryTracks
-from swarm_loc_estimator.core.parameters import CAMERA_YAW
+from swarm_loc_estimator.core.parameters import CAMERA_SCALE, CAMERA_YAW
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.state import SwarmState
 
@@ -55,9 +55,9 @@ class ClueBook:
         track = self._tracks.at(np.array([robot]), one["stamp_ns"])
         pose, gathered = track.pose[0], track.gathered[0]
         base, spread = self._located(state, other, one)
-        yaw = 0.0 if observer == NOBODY else float(state.parameter[observer, CAMERA_YAW])
+        camera = np.zeros(2) if observer == NOBODY else state.parameter[observer, [CAMERA_YAW, CAMERA_SCALE]]
         old = state.clues.get(robot, NO_CLUES)
-        clues = with_clue(old, one, yaw, robot, pose, gathered[NOISE], base, spread, self._window_ns)
+        clues = with_clue(old, one, camera, robot, pose, gathered[NOISE], base, spread, self._window_ns)
         state.clues[robot] = clues
         few = clues.size < LEAST_CLUES or clues["stamp_ns"][0] == now_ns
         if few or now_ns < state.next_attempt_ns[robot]:
@@ -71,7 +71,10 @@ class ClueBook:
         return True
 
     def _located(self, state: SwarmState, other: int, one: MeasurementArray) -> tuple[FloatArray, FloatArray]:
-        """Pose (3,) in map of the located side and the covariance (3, 3) of its error."""
+        """The located side as `with_clue` takes it: pose (3,) in map and covariance (3, 3) of its error."""
+        landmark = int(one["landmark"][0]) - 1
+        if landmark >= 0:
+            return state.landmark[landmark], state.landmark_covariance(landmark)
         if other == NOBODY:
             return np.zeros(3), np.zeros((3, 3))
         sample = self._tracks.at(np.array([other]), one["stamp_ns"])

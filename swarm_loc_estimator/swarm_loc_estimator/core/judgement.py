@@ -16,7 +16,7 @@ from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.state import BeliefArrays
 
 DEPENDS_ON = 8
-"""Filter columns that a measurement depends on: both poses, observer first, yaw and scale of the camera."""
+"""Filter columns that a measurement depends on: both bodies, observer first, yaw and scale of the camera."""
 
 OPEN, USED, GATED = 0, 1, 2
 """Verdicts that the inner loop gives, see `fusion.Verdict`."""
@@ -65,6 +65,8 @@ def fuse_in_order(
                 to_map(belief, sides[i], pose[i])
                 if is_unsure(belief, sides[i], pose[i], limits[0], limits[1]):
                     return k, LOST, sides[i]
+        if measurements.landmark[k] > 0:
+            assign(pose[1], belief.landmark[measurements.landmark[k] - 1])
         passed, nis[k] = judge(measurements, k, belief, pose, columns, jacobian, difference, r)
         verdicts[k] = USED if passed else GATED
         if passed:
@@ -91,7 +93,8 @@ def advance_all(
         tracks: Odometry.
         belief: Changed in place.
         limits: See `fuse_in_order`.
-        pose: (m, 2, 3) written: observers and targets in `map` at the stamps; nobody's is not written.
+        pose: (m, 2, 3) written: observers and targets in `map` at the stamps, or by what a landmark is moved;
+            nobody's is not written.
         unsure: (N,) written: robots involved that no longer know where they are.
     """
     robots = belief.tracked.size
@@ -118,6 +121,8 @@ def advance_all(
             if robot >= 0:
                 to_map(belief, robot, pose[k, i])
                 unsure[robot] = is_unsure(belief, robot, pose[k, i], limits[0], limits[1])
+        if measurements.landmark[k] > 0:
+            assign(pose[k, 1], belief.landmark[measurements.landmark[k] - 1])
 
 
 @compiled
@@ -146,7 +151,7 @@ def judge_all(
     Args:
         measurements: (m,).
         belief: Not changed.
-        pose: (m, 2, 3) of observer and target in `map`.
+        pose: (m, 2, 3) as `advance_all` writes it.
         columns: (m, DEPENDS_ON) written: what each depends on.
         jacobian: (m, 3, DEPENDS_ON) written.
         difference: (m, 3) written: the innovations.
@@ -175,7 +180,7 @@ def judge(
 
     Of a planar marker's two solutions the likelier counts. Arguments as of `judge_all`, for one.
     """
-    observer, target = measurements.observer[k], measurements.target[k]
+    observer, bodies = measurements.observer[k], _body_columns(measurements, k, belief)
     predicted, chain = np.empty(3), np.empty((3, 5))
     camera, camera_columns = np.zeros(2), np.full(2, -1)
     if observer >= 0:
@@ -185,10 +190,10 @@ def judge(
         camera_columns[1] = belief.table.column[observer, CAMERA_SCALE]
     predict_one(measurements, k, pose[0], pose[1], camera, predicted, chain)
     for j in range(3):  # columns of nobody do not matter: their Jacobian is zero
-        columns[j], columns[3 + j] = 3 * max(observer, 0) + j, 3 * max(target, 0) + j
+        columns[j], columns[3 + j] = max(bodies[0], 0) + j, max(bodies[1], 0) + j
         for i in range(3):
-            jacobian[i, j] = -chain[i, j] if observer >= 0 else 0.0
-            jacobian[i, 3 + j] = chain[i, j] if target >= 0 else 0.0
+            jacobian[i, j] = -chain[i, j] if bodies[0] >= 0 else 0.0
+            jacobian[i, 3 + j] = chain[i, j] if bodies[1] >= 0 else 0.0
     for j in range(2):
         columns[6 + j] = max(camera_columns[j], 0)
         for i in range(3):
@@ -196,7 +201,7 @@ def judge(
     s = np.empty((3, 3))
     assign_matrix(noise, measurements.covariance[k])
     assign_matrix(s, noise)
-    add_uncertainty(belief.covariance, observer, target, camera_columns, chain, s)
+    add_uncertainty(belief.covariance, bodies, camera_columns, chain, s)
     innovation(measurements, k, measurements.value[k], predicted, difference)
     if measurements.has_alternative[k]:
         other = np.empty(3)
@@ -214,15 +219,32 @@ def judge(
 
 
 @compiled
+def _body_columns(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> tuple[int, int]:
+    """The first of the three columns of the observer and of the target of measurement k; -1: has none."""
+    observer, target = measurements.observer[k], measurements.target[k]
+    first = 3 * target if target >= 0 else -1
+    if measurements.landmark[k] > 0:
+        first = belief.table.survey_column[measurements.landmark[k] - 1]
+    return (3 * observer if observer >= 0 else -1), first
+
+
+@compiled
 def add_uncertainty(
-    p: FloatArray, observer: int, target: int, camera: IndexArray, chain: FloatArray, s: FloatArray
+    p: FloatArray, bodies: tuple[int, int], camera: IndexArray, chain: FloatArray, s: FloatArray
 ) -> None:
     """Add H P H^T (3, 3), eq. (13) of the e-puck paper, where H is `chain` (3, 5) by xi_target - xi_observer.
 
-    The difference is taken first: a third of the work. The camera's parameters have columns (2,), or -1.
+    The difference is taken first: a third of the work.
+
+    Args:
+        p: (n, n) covariance.
+        bodies: First column of the observer and of the target, or -1.
+        camera: (2,) columns of its parameters, or -1.
+        chain: (3, 5).
+        s: (3, 3) added to.
     """
-    t, o = 3 * max(target, 0), 3 * max(observer, 0)
-    of_target, of_observer = 1.0 if target >= 0 else 0.0, 1.0 if observer >= 0 else 0.0
+    o, t = max(bodies[0], 0), max(bodies[1], 0)
+    of_observer, of_target = 1.0 if bodies[0] >= 0 else 0.0, 1.0 if bodies[1] >= 0 else 0.0
     difference, half = np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -277,7 +299,7 @@ def is_unsure(belief: BeliefArrays, robot: int, pose: FloatArray, position: floa
 
 @compiled
 def correct(belief: BeliefArrays, correction: FloatArray) -> None:
-    """Apply a filter's correction (n,) to transforms and parameters of the robots located."""
+    """Apply a filter's correction (n,) to transforms and parameters of robots located, and to landmarks."""
     for i in range(belief.tracked.size):
         if belief.tracked[i]:
             t, c = belief.transform[i], correction[3 * i : 3 * i + 3]
@@ -286,6 +308,10 @@ def correct(belief: BeliefArrays, correction: FloatArray) -> None:
                 column = belief.table.column[i, m]
                 if column >= 0:
                     belief.parameter[i, m] += correction[column]
+    for i in range(belief.table.survey_column.size):
+        first = belief.table.survey_column[i]
+        mark, c = belief.landmark[i], correction[first : first + 3]
+        mark[0], mark[1], mark[2] = moved_by_twist(c[0], c[1], c[2], mark[0], mark[1], mark[2])
 
 
 @compiled

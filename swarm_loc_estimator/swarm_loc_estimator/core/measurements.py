@@ -6,7 +6,8 @@ Every measurement observes the pose of a marker in a sensor's frame,
 
 the transform chains (3) and (5) of the e-puck paper in the plane (whose printed eq. (6) has three wrong
 signs: the chain is used, not the print). S is the sensor on the observer, M the marker on the target. A
-landmark has no target robot (M is its pose in `map`), an absolute fix has no observer (S is the identity).
+landmark has no target robot (M is its pose in `map`, moved by X_target when its place is estimated), an
+absolute fix has no observer (S is the identity).
 
 With right-invariant errors X = exp(xi) X_hat the chain depends on xi_target - xi_observer only, so one
 Jacobian (3 x 3) serves both robots, with opposite signs. Two more columns are for the sensor's own yaw and
@@ -44,6 +45,7 @@ MEASUREMENT_DTYPE = np.dtype(
         ("received_from", np.int64),  # robot whose message it came in; -1 for a message about the whole swarm
         ("observer", np.int64),  # robot index or NOBODY
         ("target", np.int64),  # robot index or NOBODY
+        ("landmark", np.int64),  # 1 + index among the landmarks whose place is estimated; 0: not one of them
         ("marker_id", np.int64),
         ("kind", np.int64),  # Kind
         ("has_heading", np.int64),  # 1 when value[2] was measured, else 0
@@ -70,6 +72,7 @@ class MeasurementColumns(NamedTuple):
     stamp_ns: NDArray[np.int64]
     observer: NDArray[np.int64]
     target: NDArray[np.int64]
+    landmark: NDArray[np.int64]
     kind: NDArray[np.int64]
     has_heading: NDArray[np.int64]
     has_alternative: NDArray[np.int64]
@@ -99,7 +102,7 @@ def predict(
     Args:
         measurements: (m,) of MEASUREMENT_DTYPE.
         observer_pose: (m, 3) in `map`; rows without an observer are ignored.
-        target_pose: (m, 3); rows without a target are ignored.
+        target_pose: (m, 3), or what moves a landmark from its surveyed place; rows with neither are ignored.
         camera: (m, 2) by how much the sensor is turned to the left besides [rad], and stretches distances;
             zero if not given.
     """
@@ -127,7 +130,7 @@ def predict_one(
     if measurements.observer[k] >= 0:
         sx, sy, stheta = composed(observer_pose[0], observer_pose[1], observer_pose[2], sx, sy, stheta)
     mx, my, mtheta = marker[0], marker[1], marker[2]
-    if measurements.target[k] >= 0:
+    if measurements.target[k] >= 0 or measurements.landmark[k] > 0:
         mx, my, mtheta = composed(target_pose[0], target_pose[1], target_pose[2], mx, my, mtheta)
     cos, sin = math.cos(stheta), math.sin(stheta)
     stretch = 1.0 + camera[1]

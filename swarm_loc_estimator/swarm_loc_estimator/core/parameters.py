@@ -1,8 +1,10 @@
-"""What is estimated of a robot besides its pose: errors that last, of its odometry and of its camera.
+"""What is estimated besides the robots' poses: errors that last, of odometry, of cameras and of the map.
 
-The first three act through the motion: the further a robot drives, the more they move its pose. The last
-two turn and stretch what its camera sees. Only those whose sigma is not zero are estimated; each has a
-column of the filter behind those of all poses.
+Of a robot's parameters the first three act through the motion: the further it drives, the more they move its
+pose. The last two turn and stretch what its camera sees. A landmark whose survey is not exact is a body that
+stands: like a robot's pose it has a right-invariant error, here of the identity, which moves the marker from
+where the survey has it. Only what has a sigma is estimated; its columns of the filter are behind those of
+all poses.
 """
 
 from __future__ import annotations
@@ -13,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.swarm import Robot
+from swarm_loc_estimator.core.se2 import FloatArray, error_covariance
+from swarm_loc_estimator.core.swarm import Landmark, Robot
 
 TURN_BIAS = 0
 """A turn rate besides the one reported, while moving [rad/s]; it changes slowly."""
@@ -31,23 +33,30 @@ DRIVES = 3
 """So many, the first, act through the motion."""
 PARAMETERS = 5
 
+_LEAST_SURVEY_SIGMA = 1e-4
+"""Of a landmark of which one of position and yaw is exact [m], [rad]: the filter inverts its covariance."""
+
 
 class ParameterTable(NamedTuple):
-    """Which parameters of which robot are estimated, as compiled code reads it.
+    """What is estimated of which robot and landmark, as compiled code reads it.
 
     Attributes:
         column: (N, PARAMETERS) column of the filter; -1: not estimated, its value stays 0.
         sigma: (N, PARAMETERS) standard deviation before any data.
         turn_bias_time_s: (N,) time constant of TURN_BIAS; the others do not change.
+        survey_column: (L,) of each landmark that is estimated the first of its three columns.
+        survey: (L, 3, 3) covariance of its right-invariant error before any data.
     """
 
     column: NDArray[np.int64]
     sigma: FloatArray
     turn_bias_time_s: FloatArray
+    survey_column: NDArray[np.int64]
+    survey: FloatArray
 
     @classmethod
-    def of(cls, robots: Sequence[Robot]) -> ParameterTable:
-        """What the robots' descriptions ask for."""
+    def of(cls, robots: Sequence[Robot], landmarks: Sequence[Landmark] = ()) -> ParameterTable:
+        """What the descriptions of robots and landmarks ask for."""
         sigma = np.zeros((len(robots), PARAMETERS))
         for i, robot in enumerate(robots):
             odometry = robot.odometry
@@ -61,9 +70,17 @@ class ParameterTable(NamedTuple):
         column = np.full(sigma.shape, -1)
         column[wanted] = 3 * len(robots) + np.arange(wanted.sum())
         times = np.array([robot.odometry.turn_bias_time_s for robot in robots], dtype=float)
-        return cls(column, sigma, times)
+        surveys = [_survey(mark) for mark in landmarks if mark.is_estimated]
+        survey_column = 3 * len(robots) + wanted.sum() + 3 * np.arange(len(surveys))
+        return cls(column, sigma, times, survey_column, np.array(surveys).reshape(-1, 3, 3))
 
     @property
     def filter_size(self) -> int:
-        """How many columns the filter has: three per pose and one per parameter estimated."""
-        return int(3 * self.column.shape[0] + np.sum(self.column >= 0))
+        """How many columns the filter has: three per pose, one per parameter and three per landmark."""
+        return int(3 * self.column.shape[0] + np.sum(self.column >= 0) + 3 * self.survey_column.size)
+
+
+def _survey(mark: Landmark) -> FloatArray:
+    """Covariance (3, 3) of the right-invariant error that a landmark's survey has."""
+    sigma = np.maximum([mark.position_sigma, mark.position_sigma, mark.yaw_sigma], _LEAST_SURVEY_SIGMA)
+    return error_covariance([mark.x, mark.y, mark.yaw or 0.0], np.diag(sigma**2))

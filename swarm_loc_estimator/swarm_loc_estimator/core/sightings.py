@@ -70,10 +70,11 @@ class _Cameras(NamedTuple):
 
 
 class _Markers(NamedTuple):
-    """All markers by ascending id (k,): whose they are, and M (k, 3), its heading NaN when it shows none."""
+    """All markers by ascending id (k,): whose, which landmark, and M (k, 3), heading NaN if it has none."""
 
     id: IntArray
     owner: IntArray
+    landmark: IntArray
     pose: FloatArray
 
 
@@ -111,9 +112,12 @@ class SightingConverter:
         )
         owners = sorted(swarm.owner_of.items())
         markers = [owner.marker for _, owner in owners]
+        estimated = [mark.id for mark in swarm.landmarks if mark.is_estimated]
+        number = {marker_id: k + 1 for k, marker_id in enumerate(estimated)}
         self._markers = _Markers(
             id=np.array([marker_id for marker_id, _ in owners], dtype=np.int64),
             owner=np.array([owner.robot_index for _, owner in owners], dtype=np.int64),
+            landmark=np.array([number.get(marker_id, 0) for marker_id, _ in owners], dtype=np.int64),
             pose=np.array([[m.x, m.y, np.nan if m.yaw is None else m.yaw] for m in markers]).reshape(-1, 3),
         )
 
@@ -164,7 +168,7 @@ def _convert_all(
         sensor, level, marker = cameras.sensor[robot], cameras.level[robot], markers.pose[place]
         marker_id[k] = markers.id[place]
         out.stamp_ns[k] += round(sensor.time_offset_s * 1e9)
-        out.target[k] = markers.owner[place]
+        out.target[k], out.landmark[k] = markers.owner[place], markers.landmark[place]
         assign(out.sensor[k], cameras.mount[robot])
         out.gate[k] = cameras.gate[robot]
         out.marker[k, 0], out.marker[k, 1] = marker[0], marker[1]

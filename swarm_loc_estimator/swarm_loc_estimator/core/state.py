@@ -22,6 +22,7 @@ class BeliefArrays(NamedTuple):
     transform: FloatArray
     covariance: FloatArray
     parameter: FloatArray
+    landmark: FloatArray
     table: ParameterTable
     accounted: FloatArray
     accounted_ns: NDArray[np.int64]
@@ -39,8 +40,9 @@ class SwarmState:
     Attributes:
         transform: (N, 3) T, from `map` to the frame of the robot's odometry track.
         parameter: (N, PARAMETERS) see `core/parameters.py`.
+        landmark: (L, 3) by what each landmark that is estimated is moved from its surveyed place, in `map`.
         filter: Covariance of the errors: robot i has columns 3i..3i+2 for its pose, right-invariant, and
-            those of the table for its parameters.
+            those of the table for its parameters; landmarks have those of the table.
         accounted: (N, 2, 3, 3) what the track had gathered where the belief stands.
         accounted_ns: (N,) the instant at which it stands.
         tracked: (N,) whether the robot is part of the estimate.
@@ -57,7 +59,10 @@ class SwarmState:
         self._table = table
         self.transform: FloatArray = np.zeros((robots, 3))
         self.parameter: FloatArray = np.zeros((robots, PARAMETERS))
+        self.landmark: FloatArray = np.zeros((table.survey_column.size, 3))
         self.filter = DenseFilter(table.filter_size)
+        for first, survey in zip(table.survey_column, table.survey, strict=True):
+            self.filter.place(first + np.arange(3), survey)
         self.accounted: FloatArray = np.zeros((robots, 2, 3, 3))
         self.accounted_ns: NDArray[np.int64] = np.zeros(robots, dtype=np.int64)
         self.tracked: NDArray[np.bool_] = np.zeros(robots, dtype=bool)
@@ -82,6 +87,7 @@ class SwarmState:
             self.transform,
             self.filter.covariance,
             self.parameter,
+            self.landmark,
             self._table,
             self.accounted,
             self.accounted_ns,
@@ -133,6 +139,12 @@ class SwarmState:
         predicted(self.arrays(), robot, gathered, stamp_ns, transform, covariance)
         return transform, covariance
 
+    def landmark_covariance(self, landmark: int) -> FloatArray:
+        """Covariance (3, 3) of the right-invariant error of a landmark that is estimated."""
+        own = slice(self._table.survey_column[landmark], self._table.survey_column[landmark] + 3)
+        covariance: FloatArray = self.filter.covariance[own, own]
+        return covariance
+
     def correct(self, correction: FloatArray) -> None:
         """Apply a filter's correction (n,) to transforms and parameters."""
         robots = self.transform.shape[0]
@@ -141,6 +153,8 @@ class SwarmState:
         self.transform[moved] = se2.compose(se2.exp(twist), self.transform[moved])
         estimated = (self._table.column >= 0) & self.tracked[:, None]
         self.parameter[estimated] += correction[self._table.column[estimated]]
+        columns = self._table.survey_column[:, None] + np.arange(3)
+        self.landmark = se2.compose(se2.exp(correction[columns]), self.landmark)
 
 
 def robot_columns(robots: NDArray[np.int64]) -> IndexArray:

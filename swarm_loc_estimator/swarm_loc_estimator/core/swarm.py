@@ -270,6 +270,8 @@ class Landmark:
         z: [m].
         yaw: Direction out of the marker's face [rad]; None when it shows no heading.
         size: Side of the marker, black border included [m].
+        position_sigma: How unsure x and y are, each [m].
+        yaw_sigma: How unsure yaw is [rad].
     """
 
     id: int
@@ -278,6 +280,15 @@ class Landmark:
     z: float = number(0.0, "m", -1e4, 1e4, "in map")
     yaw: float | None = number(None, "rad", -TURN, TURN, "direction out of its face; null: shows no heading")
     size: float = number(0.05, "m", 0.001, 10.0, "side of the marker, black border included")
+    position_sigma: float = number(
+        0.0, "m", 0.0, 100.0, "how unsure x and y are; 0: exact, else they are estimated along with the poses"
+    )
+    yaw_sigma: float = number(0.0, "rad", 0.0, 10.0, "how unsure yaw is; 0: exact, else it is estimated")
+
+    @property
+    def is_estimated(self) -> bool:
+        """Whether its place is not exact."""
+        return self.position_sigma > 0.0 or self.yaw_sigma > 0.0
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@
 fileversion: 1
 defaults:                 # any of odometry, response, camera, sensor, faces, start_sigma
   sensor: {range_sigma: 0.1}
+  landmark: {size: 0.06, position_sigma: 0.01, yaw_sigma: 0.02}   # of all; without sigmas their survey is exact
 types:
   epuck:                  # the same keys; what is not said comes from defaults
     odometry: {wheel_separation: 0.053}
@@ -56,6 +57,7 @@ FILE_VERSION = 1
 
 _SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks")
 _LAYER = ("odometry", "response", "camera", "sensor", "faces", "start_sigma")
+_DEFAULTS = (*_LAYER, "landmark")
 _ROBOT = ("type", *_LAYER, "ids", "start")
 _MODELS: dict[str, type] = {"odometry": OdometryModel, "sensor": SensorModel, "start_sigma": StartSigma}
 _START = {
@@ -63,6 +65,7 @@ _START = {
     "y": number_specs(Landmark)["y"],
     "theta": number_specs(CameraMount)["yaw"],
 }
+LANDMARK_DEFAULTS = {name: number_specs(Landmark)[name] for name in ("size", "position_sigma", "yaw_sigma")}
 _RESPONSE = ("speeds", "turn_rates", "speed_share", "turn_share")
 _MAX_ID = 2**32 - 1
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
@@ -109,7 +112,7 @@ class _Loader(TreeChecks):
         version = sections.get("fileversion")
         if version != FILE_VERSION or isinstance(version, bool):
             raise self.error("fileversion", version, f"must be {FILE_VERSION}")
-        defaults = self._layer(sections.get("defaults", {}), "defaults", _LAYER)
+        defaults = self._layer(sections.get("defaults", {}), "defaults", _DEFAULTS)
         types = {
             name: self._layer(tree, f"types.{name}", _LAYER)
             for name, tree in self._named(sections.get("types", {}), "types")
@@ -120,7 +123,7 @@ class _Loader(TreeChecks):
         )
         if not robots:
             raise SwarmFileError(f"{self._path}: robots is empty but must name at least one robot.")
-        landmarks = self._landmarks(sections.get("landmarks", {}))
+        landmarks = self._landmarks(sections.get("landmarks", {}), sections.get("defaults", {}))
         try:
             return Swarm(robots, landmarks)
         except SwarmError as error:
@@ -218,13 +221,15 @@ class _Loader(TreeChecks):
             for name, numbers in places.items()
         )
 
-    def _landmarks(self, tree: Tree) -> tuple[Landmark, ...]:
+    def _landmarks(self, tree: Tree, defaults: Tree) -> tuple[Landmark, ...]:
         """All landmarks, in the order of the file."""
+        shared_tree = self.mapping(defaults, "defaults").get("landmark", {})
+        shared = self.numbers(shared_tree, "defaults.landmark", LANDMARK_DEFAULTS)
         result = []
         for number, place in self.mapping(tree, "landmarks").items():
             key = f"landmarks.{number}"
             numbers = self.numbers(place, key, number_specs(Landmark), required=("x", "y"))
-            result.append(Landmark(self._marker_id(number, key), **numbers))  # type: ignore[arg-type]
+            result.append(Landmark(self._marker_id(number, key), **{**shared, **numbers}))  # type: ignore[arg-type]
         return tuple(result)
 
     def _start(self, tree: Tree, key: str) -> Pose2 | None:

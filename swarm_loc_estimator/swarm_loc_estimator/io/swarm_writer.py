@@ -20,9 +20,10 @@ from swarm_loc_estimator.core.swarm import (
     Swarm,
     number_specs,
 )
-from swarm_loc_estimator.io.swarm_file import FILE_VERSION
+from swarm_loc_estimator.io.swarm_file import FILE_VERSION, LANDMARK_DEFAULTS
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
 _MODELS: dict[str, type] = {
@@ -68,8 +69,25 @@ def _tree(swarm: Swarm) -> Mapping:
             types[robot.type] = _shared([other for other in swarm.robots if other.type == robot.type])
     robots = {robot.name: _robot(robot, types.get(robot.type, {})) for robot in swarm.robots}
     landmarks = {mark.id: _numbers(mark, keep=("x", "y")) for mark in swarm.landmarks}
-    tree = {"fileversion": FILE_VERSION, "types": types, "robots": robots, "landmarks": landmarks}
+    defaults = _taken_out(LANDMARK_DEFAULTS, list(landmarks.values()))
+    tree = {
+        "fileversion": FILE_VERSION,
+        "defaults": {"landmark": defaults} if defaults else {},
+        "types": types,
+        "robots": robots,
+        "landmarks": landmarks,
+    }
     return {key: value for key, value in tree.items() if value}
+
+
+def _taken_out(names: Iterable[str], entries: list[Mapping]) -> Mapping:
+    """Those of the named values that all entries share, taken out of them."""
+    shared = {name: entries[0][name] for name in names if entries and name in entries[0]}
+    shared = {name: value for name, value in shared.items() if all(e.get(name) == value for e in entries)}
+    for entry in entries:
+        for name in shared:
+            del entry[name]
+    return shared
 
 
 def _numbers(model: Any, keep: tuple[str, ...] = ()) -> Mapping:

@@ -149,6 +149,7 @@ class Plan:
         carried: Robots that are put elsewhere, with their backs to where they looked, at half time.
         lasting: Scale of the errors that last, of the motion and of the camera; 0: neither are there any,
             nor are they estimated.
+        survey: Scale of the errors of the landmarks' places, likewise.
     """
 
     robots: int = 3
@@ -167,6 +168,7 @@ class Plan:
     standing: Sequence[int] = ()
     carried: Sequence[int] = ()
     lasting: float = 0.0
+    survey: float = 0.0
 
 
 ODOMETRY = OdometryModel(wheel_separation=0.053, wheel_noise=2e-5)
@@ -176,6 +178,7 @@ SENSOR = SensorModel(
 MOUNT = CameraMount(x=0.03, y=0.01, z=0.05, yaw=0.1, pitch=0.1)
 START_SIGMA = StartSigma(0.02, 0.02, 0.05)
 BIAS_SIGMA, BIAS_TIME_S, SCALE_SIGMA, YAW_SIGMA, STRETCH_SIGMA = 0.05, 4.0, 0.05, 0.05, 0.05
+SURVEY_SIGMA, SURVEY_YAW_SIGMA = 0.05, 0.1
 _STEP_NS = 50_000_000
 _SIDES = {"front": 0.0, "left": math.pi / 2, "back": math.pi, "right": -math.pi / 2}
 _LEVEL = homogeneous(0, 0, 0, 0, MOUNT.pitch, MOUNT.roll)[:3, :3] @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
@@ -207,7 +210,24 @@ def simulate(plan: Plan, seed: int) -> World:
             detections = _picture(rng, plan, swarm, robot, truth[k], mount, 1.0 + lasting.stretch[robot])
             if detections.size:
                 events.append(Event(robot, int(stamps[k]), None, detections))
+    swarm = replace(swarm, landmarks=_surveyed(swarm.landmarks, plan, np.random.default_rng([seed, 2])))
     return World(swarm, stamps, truth, tuple(sorted(events, key=lambda e: e.stamp_ns)))
+
+
+def _surveyed(landmarks: Sequence[Landmark], plan: Plan, rng: np.random.Generator) -> tuple[Landmark, ...]:
+    """The landmarks where a survey with errors has them."""
+    sigma, yaw_sigma = plan.survey * SURVEY_SIGMA, plan.survey * SURVEY_YAW_SIGMA
+    return tuple(
+        replace(
+            mark,
+            x=mark.x + sigma * float(rng.standard_normal()),
+            y=mark.y + sigma * float(rng.standard_normal()),
+            yaw=(mark.yaw or 0.0) + yaw_sigma * float(rng.standard_normal()),
+            position_sigma=sigma,
+            yaw_sigma=yaw_sigma,
+        )
+        for mark in landmarks
+    )
 
 
 class _Lasting:

@@ -94,7 +94,7 @@ def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
 ) -> None:
     rng = np.random.default_rng(seed)
     plan = Plan(robots, 3.5, 0.2, content=content, start_known=start_known, outliers=outliers, flips=0.1)
-    world = simulate(replace(plan, lasting=lasting), seed)
+    world = simulate(replace(plan, lasting=lasting, survey=lasting), seed)
     chosen = EstimatorSettings(
         fusion_period_s=fusion_period_s, state_period_s=state_period_s, lost_after=lost_after
     )

@@ -77,6 +77,28 @@ def test_errors_that_last_are_estimated_and_the_error_stays_chi_square_distribut
     assert np.mean(estimating) < 0.7 * np.nanmean(trusting)  # not a number where it got lost
 
 
+@pytest.mark.parametrize("many", [5, 1000])
+@pytest.mark.parametrize("content", [POSE, POSITION])
+def test_landmarks_badly_surveyed_are_estimated_and_the_error_stays_chi_square_distributed(
+    content: int, many: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fusion, "_MANY", many)
+    squared, estimating, trusting = [], [], []
+    for seed in SEEDS:
+        world = simulate(Plan(1, 30.0, content=content, survey=1.0, speed=0.15), 300 + seed)
+        error, covariance = errors(world, EstimatorSettings(), 1.0)
+        squared.append(nees(error, covariance)[5:].mean(axis=0))
+        estimating.append(np.square(error[5:, :, :2]).mean())
+        trusted = tuple(replace(mark, position_sigma=0.0, yaw_sigma=0.0) for mark in world.swarm.landmarks)
+        world = replace(world, swarm=replace(world.swarm, landmarks=trusted))
+        error, _ = errors(world, EstimatorSettings(), 1.0)
+        trusting.append(np.square(error[5:, :, :2]).mean())
+    samples = np.concatenate(squared)
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 3 * samples.size) / samples.size
+    assert low < samples.mean() < high
+    assert np.mean(estimating) < 0.7 * np.nanmean(trusting)  # not a number where it got lost
+
+
 @pytest.mark.parametrize("fusion_period_s", [0.0, 0.2])
 @pytest.mark.parametrize("content", [POSE, POSITION])
 def test_without_noise_the_error_vanishes(content: int, fusion_period_s: float) -> None:

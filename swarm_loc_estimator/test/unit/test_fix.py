@@ -9,18 +9,19 @@ from core_world import SECOND, T0, nees, planar, pose_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core import fix, locate
+from swarm_loc_estimator.core import fix, locate, se2
 from swarm_loc_estimator.core.clues import CLUE_DTYPE, NO_CLUES, ClueArray, with_clue
 from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE, NOBODY, Kind, MeasurementArray
 from swarm_loc_estimator.core.odometry import OdometryTracks
 from swarm_loc_estimator.core.parameters import ParameterTable
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.state import SwarmState
-from swarm_loc_estimator.core.swarm import Robot
+from swarm_loc_estimator.core.swarm import Landmark, Robot
 
 SEEDS = st.integers(0, 10**6)
 SIGMA, TURN_SIGMA = 0.01, 0.05
 NO_NOISE = np.zeros((3, 3))
+EXACT = np.zeros(2)
 LONG_NS = 3600 * SECOND
 
 
@@ -29,13 +30,17 @@ def any_pose(rng: np.random.Generator) -> FloatArray:
 
 
 def sighting(
-    rng: np.random.Generator, sees: bool, kind: Kind, yaw: float
+    rng: np.random.Generator, sees: bool, kind: Kind, camera: FloatArray
 ) -> tuple[MeasurementArray, FloatArray]:
-    """What robot 0, at a random place, sees of a robot 1 at the origin, or is seen as; and where it is."""
+    """What robot 0, at a random place, sees of a robot 1 at the origin, or is seen as; and where it is.
+
+    The camera (2,) is turned and stretches distances.
+    """
     robot, sensor, marker = any_pose(rng), any_pose(rng), any_pose(rng)
-    turned = np.add(sensor, [0.0, 0.0, yaw])
+    turned = np.add(sensor, [0.0, 0.0, camera[0]])
     observer, target = (planar(robot), np.eye(3)) if sees else (np.eye(3), planar(robot))
     seen = pose_of(np.linalg.inv(observer @ planar(turned)) @ target @ planar(marker))
+    seen[:2] *= 1.0 + camera[1]
     one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
     one["observer"], one["target"] = (0, 1) if sees else (1, 0)
     one["kind"], one["sensor"], one["marker"], one["stamp_ns"], one["has_heading"] = (
@@ -58,16 +63,17 @@ def sighting(
     sees=st.booleans(),
     kind=st.sampled_from([Kind.CARTESIAN, Kind.POLAR]),
     yaw=st.floats(-0.2, 0.2),
+    stretch=st.floats(-0.2, 0.2),
 )
 def test_a_clue_lies_on_the_map_where_the_true_transform_puts_it(
-    seed: int, sees: bool, kind: Kind, yaw: float
+    seed: int, sees: bool, kind: Kind, yaw: float, stretch: float
 ) -> None:
-    rng = np.random.default_rng(seed)
-    one, robot = sighting(rng, sees, kind, yaw)
+    rng, camera = np.random.default_rng(seed), np.array([yaw, stretch])
+    one, robot = sighting(rng, sees, kind, camera)
     transform = any_pose(rng)
     track = pose_of(np.linalg.inv(planar(transform)) @ planar(robot))
     one["has_alternative"], one["alternative"] = 1, one["value"] + [0.0, 0.0, 0.7]
-    (clue,) = with_clue(NO_CLUES, one, yaw, 0, track, NO_NOISE, np.zeros(3), NO_NOISE, LONG_NS)
+    (clue,) = with_clue(NO_CLUES, one, camera, 0, track, NO_NOISE, np.zeros(3), NO_NOISE, LONG_NS)
     place = planar(transform) @ [clue["local_x"], clue["local_y"], 1.0]
     np.testing.assert_allclose(place[:2], [clue["map_x"], clue["map_y"]], atol=1e-9)
     off = np.array([clue["turn"], clue["other_turn"]]) - transform[2]
@@ -79,13 +85,14 @@ def test_a_clue_lies_on_the_map_where_the_true_transform_puts_it(
 @pytest.mark.parametrize("kind", [Kind.CARTESIAN, Kind.POLAR])
 def test_a_clue_is_as_unsure_as_sampled_sightings_and_located_robots(kind: Kind, sees: bool) -> None:
     rng = np.random.default_rng(int(kind) + 2 * sees)
-    one, robot = sighting(rng, sees, kind, 0.0)
+    camera = np.array([0.1, 0.3])
+    one, robot = sighting(rng, sees, kind, camera)
     spread = np.diag([1e-4, 2e-4, 3e-4])
     samples, value = [], one["value"].copy()
     for _ in range(4000):
         one["value"] = value + rng.multivariate_normal(np.zeros(3), one["covariance"][0])
         base = rng.multivariate_normal(np.zeros(3), spread)
-        (clue,) = with_clue(NO_CLUES, one, 0.0, 0, robot, NO_NOISE, base, spread, LONG_NS)
+        (clue,) = with_clue(NO_CLUES, one, camera, 0, robot, NO_NOISE, base, spread, LONG_NS)
         samples.append([clue[name] for name in ("local_x", "local_y", "map_x", "map_y")])
     sampled = np.cov(np.array(samples).T)
     local, there = (
@@ -168,7 +175,7 @@ def many_clues(stamps_s: FloatArray, markers: Sequence[int], window_s: float) ->
         for marker in markers:
             one["stamp_ns"], one["marker_id"] = T0 + round(seconds * 1e9), marker
             clues = with_clue(
-                clues, one, 0.0, 0, np.zeros(3), NO_NOISE, np.zeros(3), NO_NOISE, round(window_s * 1e9)
+                clues, one, EXACT, 0, np.zeros(3), NO_NOISE, np.zeros(3), NO_NOISE, round(window_s * 1e9)
             )
     return clues
 
@@ -207,3 +214,27 @@ def test_attempts_become_rarer_but_never_stop(monkeypatch: pytest.MonkeyPatch) -
     assert gaps_s.max() <= 0.3 + 1 / 30
     assert len(attempts) < 10 / 0.3 + 25
     assert stamps[-1] - attempts[-1] < SECOND // 3
+
+
+def test_a_landmark_that_is_estimated_is_where_the_belief_has_it() -> None:
+    """It is as unsure as that, and a robot located by it is no surer."""
+    mark = Landmark(1, 3.0, -2.0, 0.0, 0.4, position_sigma=0.05, yaw_sigma=0.1)
+    tracks, state = OdometryTracks([Robot("a")]), SwarmState(ParameterTable.of([Robot("a")], [mark]))
+    tracks.extend(np.zeros(2, dtype=np.int64), np.array([T0, T0 + SECOND]), np.zeros((2, 3)))
+    state.landmark[0] = moved = np.array([0.3, 0.1, 0.2])
+    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
+    one["target"], one["landmark"], one["marker"], one["has_heading"] = NOBODY, 1, [3.0, -2.0, 0.4], 1
+    one["covariance"] = np.diag([1e-6, 1e-6, 1e-4])
+    one["value"] = [1.0, 0.0, 0.0]
+    book = fix.ClueBook(tracks, 20.0)
+    for one["stamp_ns"][0] in T0 + np.arange(20) * (SECOND // 20):
+        book.note(state, one)
+    assert state.tracked[0]
+    place = pose_of(planar(moved) @ planar(np.array([3.0, -2.0, 0.4])) @ planar(np.array([-1.0, 0.0, 0.0])))
+    np.testing.assert_allclose(state.transform[0], place, atol=1e-3)
+    located, survey = (
+        np.diag(se2.pose_covariance(place, error))
+        for error in (state.filter.covariance[:3, :3], state.landmark_covariance(0))
+    )
+    assert (survey < located).all()
+    assert (located < 3.0 * survey).all()

@@ -19,7 +19,8 @@ from swarm_loc_estimator.core.measurements import (
 )
 from swarm_loc_estimator.core.se2 import FloatArray
 
-WHO = {"landmark": (0, NOBODY), "robot": (0, 1), "fix": (NOBODY, 1)}
+WHO = {"landmark": (0, NOBODY), "surveyed": (0, NOBODY), "robot": (0, 1), "fix": (NOBODY, 1)}
+"""Observer and target; the place of the landmark "surveyed" is estimated."""
 
 
 def measurement(
@@ -27,6 +28,7 @@ def measurement(
 ) -> MeasurementArray:
     one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
     one["observer"], one["target"] = WHO[who]
+    one["landmark"] = 1 if who == "surveyed" else 0
     one["kind"], one["has_heading"], one["sensor"], one["marker"] = kind, heading, sensor, marker
     return one
 
@@ -91,7 +93,7 @@ def test_jacobians_agree_with_finite_differences(who: str, kind: Kind, heading: 
     _, jacobian = predicted(who, kind, s, heading)
     step = 1e-6
     for side, sign in (("observer", -1.0), ("target", 1.0)):
-        if WHO[who][side == "target"] == NOBODY:
+        if WHO[who][side == "target"] == NOBODY and (who, side) != ("surveyed", "target"):
             continue
         for j in range(3):
             values = []
@@ -107,7 +109,7 @@ def test_jacobians_agree_with_finite_differences(who: str, kind: Kind, heading: 
 
 @pytest.mark.parametrize("heading", [0, 1])
 @pytest.mark.parametrize("kind", [Kind.CARTESIAN, Kind.POLAR])
-@pytest.mark.parametrize("who", ["landmark", "robot"])
+@pytest.mark.parametrize("who", ["landmark", "surveyed", "robot"])
 @pytest.mark.parametrize("seed", range(4))
 def test_the_camera_may_be_turned_and_stretch_distances(
     who: str, kind: Kind, heading: int, seed: int

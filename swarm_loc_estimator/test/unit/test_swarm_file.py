@@ -35,6 +35,7 @@ fileversion: 1
 defaults:
   sensor: {range_sigma: 0.2, gate_probability: 1}
   camera: {x: 0.01}
+  landmark: {position_sigma: 0.02}
 types:
   epuck:
     odometry: {wheel_separation: 0.053, wheel_noise: 2e-5}
@@ -59,7 +60,7 @@ robots:
   four:
 landmarks:
   100: {x: 1.5, y: 0.25, yaw: -1.0, size: 0.08}
-  101: {x: 0, y: 0}
+  101: {x: 0, y: 0, position_sigma: 0}
 """
 RESPONSE = MotionResponse(
     (0.0, 0.1), (0.0, 0.5, 1.0), ((1.0, 0.9, 0.9), (1.0, 0.8, 0.7)), ((1.0, 0.9, 0.8),) * 2
@@ -98,8 +99,8 @@ def test_layers_fall_from_defaults_to_type_to_robot(tmp_path: Path) -> None:
     assert three.camera is None
     assert (four.camera, four.type) == (CameraMount(x=0.01), "")
     assert swarm.landmarks == (
-        Landmark(100, 1.5, 0.25, yaw=-1.0, size=0.08),
-        Landmark(101, 0.0, 0.0, yaw=None, size=0.05),
+        Landmark(100, 1.5, 0.25, yaw=-1.0, size=0.08, position_sigma=0.02),
+        Landmark(101, 0.0, 0.0, yaw=None, size=0.05, position_sigma=0.0),
     )
 
 
@@ -204,9 +205,19 @@ def test_owners_of_marker_ids(tmp_path: Path) -> None:
             "  abc:",
             "landmarks.abc is 'abc' but must be a marker id, a whole number in [0, 4294967295].",
         ),
-        ("  101: {x: 0, y: 0}", "  100: {x: 0, y: 0}", "'landmarks.100' is given twice, again in line 29."),
+        ("  101: {x: 0, y: 0", "  100: {x: 0, y: 0", "'landmarks.100' is given twice, again in line 30."),
+        (
+            "{position_sigma: 0.02}",
+            "{x: 0.02}",
+            "'defaults.landmark.x' is not a known key; the nearest one is 'yaw_sigma'.",
+        ),
+        (
+            "{position_sigma: 0.02}",
+            "{yaw_sigma: -1}",
+            "defaults.landmark.yaw_sigma is -1 but must lie in [0, 10] rad.",
+        ),
         ("size: 0.08", "size: 0.0", "landmarks.100.size is 0.0 but must lie in [0.001, 10] m."),
-        ("  101: {x: 0, y: 0}", "  101: {x: 0}", "landmarks.101 lacks y, a number in [-1e+06, 1e+06] m."),
+        ("  101: {x: 0, y: 0", "  101: {x: 0", "landmarks.101 lacks y, a number in [-1e+06, 1e+06] m."),
         (
             "y: -2.5, theta: 0.5",
             "y: -2.5",
