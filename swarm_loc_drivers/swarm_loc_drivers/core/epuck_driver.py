@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,19 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.core.epuck_serial_session import SerialCamera, SerialSession
-from swarm_loc_drivers.core.epuck_session import Photo, Session, SessionError
+from swarm_loc_drivers.core.epuck_session import Photo, Session
 from swarm_loc_drivers.core.epuck_wifi_session import WifiSession
+from swarm_loc_drivers.core.link_keeper import LinkKeeper, SessionError
+from swarm_loc_drivers.core.odometry_state import OdometryState
 from swarm_loc_drivers.core.velocity_command import VelocityCommand
-from swarm_loc_drivers.core.wheel_odometry import OdometryState, WheelOdometry
+from swarm_loc_drivers.core.wheel_odometry import WheelOdometry
 from swarm_loc_drivers.core.wheels import WheelGeometry
 from swarm_loc_drivers.protocols.epuck import EpuckModel
 from swarm_loc_drivers.transports.link import Address, Link, LinkError
 from swarm_loc_drivers.transports.serial_link import SerialLink
 from swarm_loc_drivers.transports.tcp_link import TcpLink
-
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
-_LAST_ATTEMPTS_S = 3.0
-"""A robot that may be running when its link is down is sought for so long before the driver gives up."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +76,6 @@ class EpuckDriver:
 
     Attributes:
         counts: What happened how often, for people.
-        trouble: Why there is no connection; "" while there is one.
     """
 
     def __init__(self, settings: EpuckSettings, listeners: Listeners, clock: Callable[[], int]) -> None:
@@ -87,19 +83,19 @@ class EpuckDriver:
         self._listeners = listeners
         self._clock = clock
         self.counts: Counter[str] = Counter()
-        self.trouble = f"connecting to {settings.address}"
-        self.command = VelocityCommand(
-            settings.geometry, settings.model, settings.command_timeout_s, clock, self.counts
-        )
+        self.command = VelocityCommand(settings.command_timeout_s, clock, self.counts)
         self._odometry = WheelOdometry(settings.geometry, settings.wheel_noise, self.counts)
         self._tick = threading.Event()
-        self._stopping = threading.Event()
-        self._may_run = False
-        self._thread = threading.Thread(target=self._run, name=f"driver of {settings.address}")
+        self._keeper = LinkKeeper(str(settings.address), self._converse, self.counts)
+
+    @property
+    def trouble(self) -> str:
+        """Why there is no connection; "" while there is one."""
+        return self._keeper.trouble
 
     def start(self) -> None:
         """Begin."""
-        self._thread.start()
+        self._keeper.start()
 
     def tick(self) -> None:
         """It is time to ask the robot, where it has to be asked."""
@@ -107,54 +103,25 @@ class EpuckDriver:
 
     def set_velocity(self, speed: float, turn_rate: float) -> None:
         """Drive forward [m/s] and turn to the left [rad/s] from now on."""
-        self.command.set(speed, turn_rate)
+        self.command.set((speed, 0.0, turn_rate))
         self._tick.set()
 
     def stop(self) -> None:
         """Stop the robot and end."""
-        self._stopping.set()
+        self._keeper.stopping.set()
         self._tick.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        """Connect, converse, and again when the link breaks."""
-        pause_s = _FIRST_PAUSE_S
-        give_up_s: float | None = None
-        while True:
-            connections = self.counts["connections"]
-            try:
-                self._converse()
-            except (LinkError, SessionError) as error:
-                self.trouble = str(error)
-                self.counts["link_failures"] += 1
-            else:
-                return
-            if self._stopping.is_set():
-                give_up_s = give_up_s or time.monotonic() + _LAST_ATTEMPTS_S
-                if not self._may_run or time.monotonic() > give_up_s:
-                    return
-            connected = self.counts["connections"] > connections
-            pause_s = _FIRST_PAUSE_S if connected or give_up_s else min(2.0 * pause_s, _LONGEST_PAUSE_S)
-            self._pause(pause_s)
-
-    def _pause(self, pause_s: float) -> None:
-        """Wait; when the end is near no longer than that."""
-        if self._stopping.is_set():
-            time.sleep(_FIRST_PAUSE_S)
-        else:
-            self._stopping.wait(pause_s)
+        self._keeper.stop()
 
     def _converse(self) -> None:
         """One connection, from its begin to the end of the driver."""
         link = self._open()
         try:
             session = self._session(link)
-            self._may_run = True
+            self._keeper.may_run = True
             session.begin()
-            self.counts["connections"] += 1
-            self.trouble = ""
+            self._keeper.note_connection()
             try:
-                while not self._stopping.is_set():
+                while not self._keeper.stopping.is_set():
                     self._exchange(session)
             except (LinkError, SessionError):
                 raise
@@ -162,7 +129,7 @@ class EpuckDriver:
                 session.end()
                 raise
             session.end()
-            self._may_run = False
+            self._keeper.may_run = False
         finally:
             link.close()
 
@@ -182,7 +149,8 @@ class EpuckDriver:
 
     def _speeds(self) -> tuple[int, int]:
         """What the wheels are told now."""
-        left, right = self.command.speeds()
+        speed, _, turn_rate = self.command.velocity()
+        left, right = self._settings.geometry.commands_for(speed, turn_rate, self._settings.model)
         rate = self._settings.model.rate
         self._odometry.note_rates(self._clock(), rate(left), rate(right))
         return left, right

@@ -9,11 +9,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-
-class SessionError(Exception):
-    """The robot answers, but not as it must; the link is opened anew."""
-
-
 Speeds = Callable[[], tuple[int, int]]
 """Tells what the wheels are to do, left and right [steps/s]; called when it is about to be sent."""
 

@@ -8,7 +8,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from swarm_loc_drivers.core.epuck_session import Photo, Reading, SessionError, Speeds
+from swarm_loc_drivers.core.epuck_session import Photo, Reading, Speeds
+from swarm_loc_drivers.core.link_keeper import SessionError
 from swarm_loc_drivers.protocols import epuck_wifi as protocol
 from swarm_loc_drivers.protocols.rgb565 import decode_rgb565
 from swarm_loc_drivers.transports.link import Link

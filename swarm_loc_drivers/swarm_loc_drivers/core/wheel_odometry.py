@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swarm_loc_drivers.core.odometry_state import FloatArray, OdometryState, carried_on
 from swarm_loc_drivers.core.wheels import WheelGeometry
 from swarm_loc_drivers.protocols.epuck import unwrapped_difference
 
-FloatArray = NDArray[np.float64]
 Rates = tuple[float, float]
 
 _TIMING_SLACK_S = 0.15
@@ -29,25 +27,7 @@ _SHORTEST_NS = 4_000_000
 _ROUNDING_STEPS = 2
 _STEP_VARIANCE = 1.0 / 12.0
 """Of a counter that has cut off the fraction of a step."""
-
-
-@dataclass(frozen=True)
-class OdometryState:
-    """Odometry at an instant.
-
-    Attributes:
-        stamp_ns: Acquisition [ns].
-        pose: (3,) x [m], y [m], theta [rad] of base_link in odom.
-        covariance: (3, 3) of the pose.
-        twist: (2,) speed [m/s] and turn rate [rad/s] since the reading before.
-        twist_covariance: (2, 2).
-    """
-
-    stamp_ns: int
-    pose: FloatArray
-    covariance: FloatArray
-    twist: FloatArray
-    twist_covariance: FloatArray
+_FORWARD_TURN = np.ix_((0, 2), (0, 2))
 
 
 class _Told(NamedTuple):
@@ -158,14 +138,9 @@ class WheelOdometry:
         forward = np.array([math.cos(theta + half), math.sin(theta + half)])
         dx, dy = (chord * forward).tolist()
         self._pose = (x + dx, y + dy, (theta + turn + math.pi) % (2.0 * math.pi) - math.pi)
-        self._carry_on(dx, dy)
+        self._covariance = carried_on(self._covariance, dx, dy)
         effect = np.array([[forward[0], -0.5 * dy], [forward[1], 0.5 * dx], [0.0, 1.0]])
         self._covariance += effect @ self._twist_noise(abs(left), abs(right), self._wheel_noise) @ effect.T
-
-    def _carry_on(self, dx: float, dy: float) -> None:
-        """An error of the heading leads aside on the way."""
-        transition = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
-        self._covariance = transition @ self._covariance @ transition.T
 
     def _twist_noise(self, left: float, right: float, scale: float) -> FloatArray:
         """Covariance (2, 2) of path and turn when the wheels' paths have the variances scale * left, right.
@@ -188,11 +163,10 @@ class WheelOdometry:
         cut_off = _STEP_VARIANCE * self._geometry.metres_per_step**2
         (along, _), (_, turned) = self._twist_noise(1.0, 1.0, cut_off).tolist()
         covariance = self._covariance + np.diag([along, along, turned])
-        twist, twist_noise = np.zeros(2), np.eye(2)
+        twist, twist_noise = np.zeros(3), np.zeros((3, 3))
         if elapsed_s > 0.0:
-            twist = (
-                np.array([0.5 * (left + right), (right - left) / self._geometry.wheel_separation]) / elapsed_s
-            )
+            turned_rad = (right - left) / self._geometry.wheel_separation
+            twist = np.array([0.5 * (left + right), 0.0, turned_rad]) / elapsed_s
             noise = self._twist_noise(abs(left), abs(right), self._wheel_noise)
-            twist_noise = (noise + self._twist_noise(2.0, 2.0, cut_off)) / elapsed_s**2
+            twist_noise[_FORWARD_TURN] = (noise + self._twist_noise(2.0, 2.0, cut_off)) / elapsed_s**2
         return OdometryState(stamp_ns, np.array(self._pose), covariance, twist, twist_noise)

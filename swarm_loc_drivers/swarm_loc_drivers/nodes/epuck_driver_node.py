@@ -9,17 +9,11 @@ It takes `cmd_vel` and publishes `odom`, `proximity/ps0` to `ps7`, `image_raw`, 
 from __future__ import annotations
 
 import sys
-import time
-from collections import Counter
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Twist
-from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, Image, Range
@@ -27,18 +21,15 @@ from tf2_msgs.msg import TFMessage
 
 from swarm_loc_drivers.core.epuck_driver import EpuckDriver, Listeners
 from swarm_loc_drivers.core.epuck_session import Photo
-from swarm_loc_drivers.core.wheel_odometry import OdometryState
 from swarm_loc_drivers.nodes import epuck_messages
+from swarm_loc_drivers.nodes.driver_diagnostics import DriverDiagnostics
 from swarm_loc_drivers.nodes.epuck_parameters import EpuckParameters, camera_calibration, epuck_settings
+from swarm_loc_drivers.nodes.odometry_output import OdometryOutput, transform_publisher
 from swarm_loc_estimator.nodes.declare import declare_parameters
 from swarm_loc_estimator.nodes.running import run_node, spin
 
 _COMMAND_QOS = QoSProfile(depth=1)
-_ODOMETRY_QOS = QoSProfile(depth=10)
-_TF_QOS = QoSProfile(depth=100)
 _TF_STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-_DIAGNOSTICS_PERIOD_S = 1.0
-_THROTTLE_S = 10.0
 
 
 class EpuckDriverNode(Node):
@@ -57,25 +48,22 @@ class EpuckDriverNode(Node):
         settings = epuck_settings(wishes)
         robot = self.get_namespace().strip("/")
         self._prefix = f"{robot}/" if robot else ""
-        self._odom_frame = f"{self._prefix}{wishes.odom_frame}"
         self._base_frame = f"{self._prefix}{wishes.base_frame}"
         self._camera_frame = f"{self._prefix}camera_optical_frame"
-        self._address = str(settings.address)
         self._calibration = camera_calibration(wishes, settings.camera) if settings.camera else None
-        listeners = Listeners(self._publish_odometry, self._publish_proximity, self._publish_photo)
+        transforms = transform_publisher(self) if wishes.publish_tf else None
+        odom_frame = f"{self._prefix}{wishes.odom_frame}"
+        odometry = OdometryOutput(self, "odom", odom_frame, self._base_frame, transforms)
+        listeners = Listeners(odometry.publish, self._publish_proximity, self._publish_photo)
         self._driver = EpuckDriver(settings, listeners, self._now_ns)
-        self._reported: Counter[str] = Counter()
-        self._reported_s = time.monotonic()
-        self._told_trouble = self._driver.trouble
-        self._advertise(wishes)
+        self._advertise()
+        name, address = f"{self._prefix}{self.get_name()}", str(settings.address)
+        self._diagnostics = DriverDiagnostics(self, self._driver, name, address, ("readings", "pictures"))
         self.create_subscription(Twist, "cmd_vel", self._on_cmd_vel, _COMMAND_QOS)
         self.create_timer(1.0 / wishes.reading_rate, self._driver.tick)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)  # runs also while simulated time stands still
-        self.create_timer(_DIAGNOSTICS_PERIOD_S, self._on_diagnostics, clock=steady)
         self._driver.start()
 
-    def _advertise(self, wishes: EpuckParameters) -> None:
-        self._odometry = self.create_publisher(Odometry, "odom", _ODOMETRY_QOS)
+    def _advertise(self) -> None:
         # one topic each: eight at once on one would overrun the few places of a sensor-data queue
         self._proximity = [
             self.create_publisher(Range, f"proximity/{name}", qos_profile_sensor_data)
@@ -84,12 +72,10 @@ class EpuckDriverNode(Node):
         if self._calibration is not None:
             self._image = self.create_publisher(Image, "image_raw", qos_profile_sensor_data)
             self._camera_info = self.create_publisher(CameraInfo, "camera_info", qos_profile_sensor_data)
-        # tf2's listeners know these absolute names, whatever the namespace
-        self._tf = self.create_publisher(TFMessage, "/tf", _TF_QOS) if wishes.publish_tf else None
+        # tf2's listeners know this absolute name, whatever the namespace
         self._tf_static = self.create_publisher(TFMessage, "/tf_static", _TF_STATIC_QOS)
         sensors = epuck_messages.proximity_transforms(self._now_ns(), self._base_frame, self._prefix)
         self._tf_static.publish(TFMessage(transforms=sensors))
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
 
     def destroy_node(self) -> None:
         """Stop the robot first."""
@@ -101,12 +87,6 @@ class EpuckDriverNode(Node):
 
     def _on_cmd_vel(self, message: Twist) -> None:
         self._driver.set_velocity(message.linear.x, message.angular.z)
-
-    def _publish_odometry(self, state: OdometryState) -> None:
-        message = epuck_messages.odometry_message(state, self._odom_frame, self._base_frame)
-        self._odometry.publish(message)
-        if self._tf is not None:
-            self._tf.publish(TFMessage(transforms=[epuck_messages.odometry_transform(message)]))
 
     def _publish_proximity(self, stamp_ns: int, raw: NDArray[np.int64]) -> None:
         if any(publisher.get_subscription_count() for publisher in self._proximity):
@@ -120,31 +100,6 @@ class EpuckDriverNode(Node):
         image = epuck_messages.image_message(photo, self._camera_frame)
         self._image.publish(image)
         self._camera_info.publish(epuck_messages.camera_info_message(image, self._calibration))
-
-    def _on_diagnostics(self) -> None:
-        trouble, counts = self._driver.trouble, Counter(self._driver.counts)
-        if trouble != self._told_trouble:
-            self._told_trouble = trouble
-            if trouble:
-                self.get_logger().warning(trouble, throttle_duration_sec=_THROTTLE_S)
-            else:
-                self.get_logger().info(f"connected to {self._address}")
-        now_s = time.monotonic()
-        elapsed_s, self._reported_s = now_s - self._reported_s, now_s
-        values = {name: str(count) for name, count in sorted(counts.items())}
-        for name in ("readings", "pictures"):
-            values[f"{name} rate [1/s]"] = f"{(counts[name] - self._reported[name]) / elapsed_s:.4g}"
-        self._reported = counts
-        status = DiagnosticStatus(
-            level=DiagnosticStatus.ERROR if trouble else DiagnosticStatus.OK,
-            name=f"{self._prefix}{self.get_name()}",
-            message=trouble or "connected",
-            hardware_id=self._address,
-            values=[KeyValue(key=key, value=value) for key, value in values.items()],
-        )
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
 
 
 def main() -> int:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from swarm_loc_drivers.core.epuck_driver import EpuckDriver, EpuckSettings, Listeners
 from swarm_loc_drivers.core.epuck_serial_session import SerialCamera
 from swarm_loc_drivers.core.epuck_session import Photo
-from swarm_loc_drivers.core.wheel_odometry import OdometryState
+from swarm_loc_drivers.core.odometry_state import OdometryState
 from swarm_loc_drivers.protocols.epuck import EPUCK2, EpuckModel
 from swarm_loc_drivers.sim.firmware.host import FirmwareHost
 from swarm_loc_drivers.sim.firmware.serial_firmware import SerialFirmware

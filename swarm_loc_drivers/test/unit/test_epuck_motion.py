@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.core.velocity_command import STANDING_CLOCK_S, VelocityCommand
-from swarm_loc_drivers.core.wheel_odometry import OdometryState, WheelOdometry
+from swarm_loc_drivers.core.odometry_state import OdometryState
+from swarm_loc_drivers.core.velocity_command import STANDING_CLOCK_S, STILL, Velocity, VelocityCommand
+from swarm_loc_drivers.core.wheel_odometry import WheelOdometry
 from swarm_loc_drivers.protocols.epuck import EPUCK1, EPUCK2, as_counter
 from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.odometry import OdometryTracks
@@ -22,6 +23,7 @@ from swarm_loc_estimator.core.swarm import OdometryModel, Robot
 SECOND = 1_000_000_000
 NOISE = 2e-4
 RATE = st.floats(-1000.0, 1000.0)
+AHEAD = (0.05, 0.0, 0.0)
 
 
 @given(speed=st.floats(-0.5, 0.5), turn_rate=st.floats(-20.0, 20.0))
@@ -51,50 +53,47 @@ class Watch:
 
 def command_with(watch: Watch) -> tuple[VelocityCommand, Counter[str]]:
     counts: Counter[str] = Counter()
-    command = VelocityCommand(GEOMETRY, EPUCK1, 0.5, lambda: watch.now_ns, counts, lambda: watch.steady_s)
+    command = VelocityCommand(0.5, lambda: watch.now_ns, counts, lambda: watch.steady_s)
     return command, counts
 
 
 def test_a_velocity_counts_until_its_time_is_over() -> None:
     watch = Watch()
     command, counts = command_with(watch)
-    assert command.speeds() == (0, 0)
-    command.set(0.05, 0.0)
+    assert command.velocity() == STILL
+    command.set(AHEAD)
     watch.run(0.5)
-    driving = command.speeds()
-    assert driving == GEOMETRY.commands_for(0.05, 0.0, EPUCK1)
-    assert min(driving) > 0
+    assert command.velocity() == AHEAD
     watch.run(0.01)
-    assert command.speeds() == (0, 0)
+    assert command.velocity() == STILL
     watch.run(-0.2)
-    assert command.speeds() == (0, 0)
+    assert command.velocity() == STILL
     assert counts == {"stale_cmd_vel": 1}
 
 
 def test_a_clock_that_stands_still_stops_the_robot() -> None:
     watch = Watch()
     command, _ = command_with(watch)
-    command.set(0.05, 0.0)
-    assert command.speeds() != (0, 0)
+    command.set(AHEAD)
+    assert command.velocity() == AHEAD
     watch.steady_s += STANDING_CLOCK_S + 0.01
-    assert command.speeds() == (0, 0)
+    assert command.velocity() == STILL
 
 
 def test_a_clock_that_jumps_back_stops_the_robot() -> None:
     watch = Watch()
     command, _ = command_with(watch)
-    command.set(0.05, 0.0)
+    command.set(AHEAD)
     watch.now_ns -= 1
-    assert command.speeds() == (0, 0)
+    assert command.velocity() == STILL
 
 
-@pytest.mark.parametrize("velocity", [(math.nan, 0.0), (0.0, math.inf), (-math.inf, math.nan)])
-def test_what_is_not_finite_is_dropped(velocity: tuple[float, float]) -> None:
+@pytest.mark.parametrize("velocity", [(math.nan, 0.0, 0.0), (0.0, 0.0, math.inf), (0.0, -math.inf, math.nan)])
+def test_what_is_not_finite_is_dropped(velocity: Velocity) -> None:
     command, counts = command_with(Watch())
-    command.set(0.05, 0.0)
-    before = command.speeds()
-    command.set(*velocity)
-    assert command.speeds() == before
+    command.set(AHEAD)
+    command.set(velocity)
+    assert command.velocity() == AHEAD
     assert counts == {"bad_cmd_vel": 1}
 
 
