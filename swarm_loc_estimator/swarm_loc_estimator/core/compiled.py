@@ -85,3 +85,16 @@ def adjoint_of(transform: NDArray[np.float64]) -> tuple[tuple[float, ...], ...]:
     """Ad(T) of a transform (3,), see `se2.adjoint`."""
     cos, sin = math.cos(transform[2]), math.sin(transform[2])
     return (cos, -sin, transform[1]), (sin, cos, -transform[0]), (0.0, 0.0, 1.0)
+
+
+@compiled
+def carry(transform: NDArray[np.float64], matrix: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    """Write Ad(T) M Ad(T)^T (3, 3), of a transform (3,) and the covariance M (3, 3) of an error behind it."""
+    adjoint = adjoint_of(transform)
+    for i in range(3):
+        a, b, c = adjoint[i]
+        x = a * matrix[0, 0] + b * matrix[1, 0] + c * matrix[2, 0]
+        y = a * matrix[0, 1] + b * matrix[1, 1] + c * matrix[2, 1]
+        z = a * matrix[0, 2] + b * matrix[1, 2] + c * matrix[2, 2]
+        for j in range(3):
+            out[i, j] = x * adjoint[j][0] + y * adjoint[j][1] + z * adjoint[j][2]

@@ -175,9 +175,10 @@ class Fusion:
         fields = MeasurementColumns.of(measurements)
         judgement.judge_all(fields, state.arrays(), poses, columns, jacobian, difference, noise, passed, nis)
         if passed.any():
-            state.correct(
-                state.filter.update(columns[passed], jacobian[passed], difference[passed], noise[passed])
+            correction = state.filter.update(
+                columns[passed], jacobian[passed], difference[passed], noise[passed]
             )
+            judgement.correct(state.arrays(), correction)
         for robot in np.flatnonzero(judgement.count_all(fields, state.arrays(), passed, self._limits[2])):
             state.lose(int(robot))
         return np.where(passed, Verdict.USED, Verdict.GATED).astype(np.uint8), nis

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from swarm_loc_estimator.core.clues import Clue, ClueArray, spread_at, turned
-from swarm_loc_estimator.core.compiled import adjoint_of, assign, compiled, moved_by_twist, wrap
+from swarm_loc_estimator.core.compiled import assign, carry, compiled, moved_by_twist, wrap
 from swarm_loc_estimator.core.dense_filter import cholesky3, solve3
 from swarm_loc_estimator.core.se2 import FloatArray
 
@@ -271,7 +271,7 @@ def _widen(
         Standard deviations of the clues' middle on the map [m], the greater of the two, and of the heading.
     """
     x, y, total = 0.0, 0.0, 0.0
-    shared, drift = np.zeros((3, 3)), np.zeros((3, 3))
+    shared, drift, carried = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
     for k in range(clues.size):
         x += clues[k].map_x / clues.size
         y += clues[k].map_y / clues.size
@@ -282,12 +282,9 @@ def _widen(
             for j in range(3):
                 shared[i, j] += share * clues[k].shared[i, j]
                 drift[i, j] += share * (track_noise[i, j] - clues[k].track_noise[i, j])
-    adjoint = adjoint_of(transform)
+    carry(transform, drift, carried)
     for i in range(3):
         for j in range(3):
-            covariance[i, j] += shared[i, j]
-            for a in range(3):
-                for b in range(3):
-                    covariance[i, j] += adjoint[i][a] * drift[a, b] * adjoint[j][b]
+            covariance[i, j] += shared[i, j] + carried[i, j]
     xx, _, yy = spread_at(covariance, x, y)
     return math.sqrt(max(xx, yy)), math.sqrt(covariance[2, 2])

@@ -17,7 +17,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from swarm_loc_estimator.core.compiled import adjoint_of, assign, assign_matrix, compiled, moved_by_twist
+from swarm_loc_estimator.core.compiled import (
+    adjoint_of,
+    assign,
+    assign_matrix,
+    carry,
+    compiled,
+    moved_by_twist,
+)
 from swarm_loc_estimator.core.dense_filter import IndexArray, cholesky3
 from swarm_loc_estimator.core.motion import DRIFT, NOISE
 from swarm_loc_estimator.core.parameters import DRIVES, TURN_BIAS
@@ -34,14 +41,17 @@ class _Drift(NamedTuple):
         twist: (3,) T is moved by exp(twist).
         turn: (3, 3) the error of the pose there per error before.
         drive: (3, DRIVES) the error of the pose there per error of each parameter before.
-        bias: (3,) share of the turn bias that is left; the variance that its mean over the time gained, in
-            units of its column of `drive`, squared; the covariance of that mean with the bias that is left.
+        left: Share of the turn bias that is left.
+        gained: Variance that its mean over the time gained, in units of its column of `drive`, squared.
+        shared: Covariance that the mean gained with the bias there, in those units.
     """
 
     twist: FloatArray
     turn: FloatArray
     drive: FloatArray
-    bias: FloatArray
+    left: float
+    gained: float
+    shared: float
 
 
 @compiled
@@ -105,15 +115,7 @@ def new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, added: FloatA
     factor = cholesky3(work)
     if not math.isfinite(factor[0, 0] + factor[1, 1] + factor[2, 2]):
         return False
-    adjoint = adjoint_of(belief.transform[robot])
-    for i in range(3):
-        for j in range(3):
-            work[i, j] = adjoint[i][0] * difference[0, j] + adjoint[i][1] * difference[1, j]
-            work[i, j] += adjoint[i][2] * difference[2, j]
-    for i in range(3):
-        for j in range(3):
-            added[i, j] = work[i, 0] * adjoint[j][0] + work[i, 1] * adjoint[j][1]
-            added[i, j] += work[i, 2] * adjoint[j][2]
+    carry(belief.transform[robot], difference, added)
     return True
 
 
@@ -129,15 +131,15 @@ def has_drives(belief: BeliefArrays, robot: int) -> bool:
 @compiled
 def _new_drift(belief: BeliefArrays, robot: int, drift: FloatArray, stamp_ns: int) -> _Drift:
     """How the pose moves until its track has gathered `drift` (3, DRIVES) at an instant."""
-    out = _Drift(np.zeros(3), np.empty((3, 3)), np.zeros((3, DRIVES)), np.empty(3))
     x = max(0, stamp_ns - belief.accounted_ns[robot]) * 1e-9 / belief.table.turn_bias_time_s[robot]
     left, variance = math.exp(-x), belief.table.sigma[robot, TURN_BIAS] ** 2
     reach = -math.expm1(-x)  # of the bias now, over the time, in units of its time constant
     # of what arises meanwhile; a series where the closed form would be rounding
     spread = 2.0 * x - 3.0 + 4.0 * left - left * left if x > 1e-2 else x**3 * (2.0 / 3.0 - 0.5 * x)
-    out.bias[0] = left
-    out.bias[1] = variance * spread / max(reach, 1e-12) ** 2
-    out.bias[2] = variance * (1.0 - left) ** 2 / max(reach, 1e-12)
+    gained, shared = spread / max(reach, 1e-12) ** 2, (1.0 - left) ** 2 / max(reach, 1e-12)
+    out = _Drift(
+        np.zeros(3), np.empty((3, 3)), np.zeros((3, DRIVES)), left, variance * gained, variance * shared
+    )
     adjoint, accounted = adjoint_of(belief.transform[robot]), belief.accounted[robot, DRIFT]
     for m in range(DRIVES):
         mean = reach / x if m == TURN_BIAS and x > 1e-9 else 1.0
@@ -182,7 +184,7 @@ def _block(
     """Write the covariance (3, 3) of the pose's error after the drift."""
     for i in range(3):
         for j in range(i + 1):
-            total = drift.bias[1] * drift.drive[i, TURN_BIAS] * drift.drive[j, TURN_BIAS]
+            total = drift.gained * drift.drive[i, TURN_BIAS] * drift.drive[j, TURN_BIAS]
             for a in range(count):
                 for b in range(count):
                     total += weight[i, a] * p[columns[a], columns[b]] * weight[j, b]
@@ -203,13 +205,13 @@ def _drive(belief: BeliefArrays, robot: int, drift: _Drift) -> None:
                 rows[i, j] += weight[i, a] * p[columns[a], j]
     bias = belief.table.column[robot, TURN_BIAS]
     if bias >= 0:
-        belief.parameter[robot, TURN_BIAS] *= drift.bias[0]
+        belief.parameter[robot, TURN_BIAS] *= drift.left
         for j in range(size):
-            p[bias, j] *= drift.bias[0]
-            p[j, bias] *= drift.bias[0]
-        p[bias, bias] += belief.table.sigma[robot, TURN_BIAS] ** 2 * (1.0 - drift.bias[0] ** 2)
+            p[bias, j] *= drift.left
+            p[j, bias] *= drift.left
+        p[bias, bias] += belief.table.sigma[robot, TURN_BIAS] ** 2 * (1.0 - drift.left**2)
         for i in range(3):
-            rows[i, bias] = drift.bias[0] * rows[i, bias] + drift.bias[2] * drift.drive[i, TURN_BIAS]
+            rows[i, bias] = drift.left * rows[i, bias] + drift.shared * drift.drive[i, TURN_BIAS]
     for i in range(3):
         for j in range(size):
             p[first + i, j] = p[j, first + i] = rows[i, j]

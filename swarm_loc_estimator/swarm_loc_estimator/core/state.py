@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.dense_filter import DenseFilter, IndexArray
 from swarm_loc_estimator.core.parameters import PARAMETERS, ParameterTable
 from swarm_loc_estimator.core.prediction import predicted
@@ -144,17 +143,6 @@ class SwarmState:
         own = slice(self._table.survey_column[landmark], self._table.survey_column[landmark] + 3)
         covariance: FloatArray = self.filter.covariance[own, own]
         return covariance
-
-    def correct(self, correction: FloatArray) -> None:
-        """Apply a filter's correction (n,) to transforms and parameters."""
-        robots = self.transform.shape[0]
-        moved = np.flatnonzero(self.tracked)
-        twist = correction[: 3 * robots].reshape(-1, 3)[moved]
-        self.transform[moved] = se2.compose(se2.exp(twist), self.transform[moved])
-        estimated = (self._table.column >= 0) & self.tracked[:, None]
-        self.parameter[estimated] += correction[self._table.column[estimated]]
-        columns = self._table.survey_column[:, None] + np.arange(3)
-        self.landmark = se2.compose(se2.exp(correction[columns]), self.landmark)
 
 
 def robot_columns(robots: NDArray[np.int64]) -> IndexArray:
