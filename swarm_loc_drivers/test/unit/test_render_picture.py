@@ -6,7 +6,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from render_helpers import LANDMARK_SIZE, RayCaster, camera_matrix, pixels_of, small_arena
 
@@ -21,6 +21,9 @@ SHARP = CameraModel(width=640, height=480, focus_sigma_px=0.0)
 FISHY = CameraModel(width=640, height=480, focus_sigma_px=0.0, k1=-0.25, k2=0.06, p1=1e-3, p2=-5e-4)
 SOFT = CameraModel(width=640, height=480, focus_sigma_px=0.6)
 SHEET = LANDMARK_SIZE * 10 / 8
+BEND_PX = (
+    0.0014  # the renderer draws chords of at most 4 px, which leave FISHY's strongest bend by 0.00132 px
+)
 
 places = st.tuples(
     st.floats(0.15, 1.0),  # ahead [m]
@@ -58,16 +61,27 @@ def square(pose: tuple[float, float, float], height: float, side: float, pieces:
     return points
 
 
-def line_areas(polygon: FloatArray, lines: int) -> FloatArray:
-    """How much of each row a polygon (n, 2) fills (lines,) [px], by the integral of u dv along its sides."""
+def in_lines(polygon: FloatArray, lines: int) -> tuple[FloatArray, FloatArray]:
+    """What a polygon (n, 2) of short sides fills of each row, and how much of its outline lies there.
+
+    Returns:
+        Areas (lines,) by the integral of u dv along its sides, and lengths (lines,), where a side counts as
+        a whole in every row that it comes as near as BEND_PX to [px].
+    """
     a, b = polygon, np.roll(polygon, -1, axis=0)
-    row = np.arange(lines)[:, None]
-    begin, end = np.clip(a[:, 1], row - 0.5, row + 0.5), np.clip(b[:, 1], row - 0.5, row + 0.5)
-    level = a[:, 1] == b[:, 1]
-    share = (0.5 * (begin + end) - a[:, 1]) / np.where(level, 1.0, b[:, 1] - a[:, 1])
-    middle = a[:, 0] + share * (b[:, 0] - a[:, 0])
-    areas: FloatArray = np.abs(np.where(level, 0.0, middle * (end - begin)).sum(axis=1))
-    return areas
+    low, high = (f(a[:, 1], b[:, 1])[:, None] for f in (np.minimum, np.maximum))
+    row = np.round(low).astype(int) - 1 + np.arange(4 + int((high - low).max()))
+    level = low == high
+    begin, end = (np.clip(side[:, 1:], row - 0.5, row + 0.5) for side in (a, b))
+    share = (0.5 * (begin + end) - a[:, 1:]) / np.where(level, 1.0, b[:, 1:] - a[:, 1:])
+    middle = a[:, :1] + share * (b - a)[:, :1]
+    near = (low <= row + 0.5 + BEND_PX) & (high >= row - 0.5 - BEND_PX)
+    length = near * np.linalg.norm(b - a, axis=1, keepdims=True)
+    area: FloatArray = np.where(level, 0.0, middle * (end - begin))
+    areas, lengths = np.zeros((2, lines + 4))  # with room for rows that no side comes into
+    np.add.at(areas, row, area)
+    np.add.at(lengths, row, length)
+    return np.abs(areas[:lines]), lengths[:lines]
 
 
 def seen_at(place: tuple[float, float, float, float], mount: CameraMount) -> tuple[FloatArray, float]:
@@ -79,16 +93,20 @@ def seen_at(place: tuple[float, float, float, float], mount: CameraMount) -> tup
     return np.array([point[0], point[1], towards + turned]), float(point[2])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(place=places, mount=mounts, model=st.sampled_from([SHARP, FISHY]))
+@example(  # both sides' long upright edges bend within one column
+    place=(0.25, 0.25, 0.0, 0.0), mount=CameraMount(x=0.0, y=0.0, z=0.125), model=FISHY
+)
 def test_a_marker_fills_each_row_and_column_as_its_projection_does(
     place: tuple[float, float, float, float], mount: CameraMount, model: CameraModel
 ) -> None:
+    """Up to rounding, and to what the chords by which the renderer draws bent edges are off along them."""
     pose, height = seen_at(place, mount)
     x, y, yaw = pose.tolist()
     eye = Eye(0, model, mount)
     sheet, ink = (
-        pixels_of(eye, model, np.zeros(3), square((x, y, yaw), height, side, pieces=100))
+        pixels_of(eye, model, np.zeros(3), square((x, y, yaw), height, side, pieces=1000))
         for side in (SHEET, LANDMARK_SIZE)
     )
     assume(sheet.min() > 1.0 and (sheet.max(axis=0) < [638.0, 478.0]).all())
@@ -98,12 +116,14 @@ def test_a_marker_fills_each_row_and_column_as_its_projection_does(
     above = light.astype(float) - scenery.ROOM
     for axis, lines in ((1, 480), (0, 640)):
         order = slice(None, None, 1 if axis else -1)  # u as v and v as u
-        filled = (scenery.WHITE - scenery.ROOM) * line_areas(sheet[:, order], lines)
-        filled += (scenery.BLACK - scenery.WHITE) * line_areas(ink[:, order], lines)
-        np.testing.assert_allclose(above.sum(axis=axis), filled, atol=0.03)
+        (white, white_edge), (black, black_edge) = (in_lines(side[:, order], lines) for side in (sheet, ink))
+        filled = (scenery.WHITE - scenery.ROOM) * white + (scenery.BLACK - scenery.WHITE) * black
+        edge = (scenery.WHITE - scenery.ROOM) * white_edge + (scenery.WHITE - scenery.BLACK) * black_edge
+        wrong = np.abs(above.sum(axis=axis) - filled)
+        assert (wrong <= 1e-4 + (BEND_PX * edge if model is FISHY else 0.0)).all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(place=places, mount=mounts, model=st.sampled_from([SHARP, SOFT]))
 def test_lines_through_a_markers_edges_meet_in_its_corners(
     place: tuple[float, float, float, float], mount: CameraMount, model: CameraModel
@@ -161,7 +181,7 @@ def _edge(light: Image, start: FloatArray, end: FloatArray) -> FloatArray:
     return np.array([1.0, -slope, -offset]) if upright else np.array([-slope, 1.0, -offset])
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     seed=st.integers(0, 2**32 - 1),
     model=st.sampled_from([SHARP, FISHY]),
