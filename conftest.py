@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# Each run draws examples of its own; where CI is set all draw the same, so that only a change can break a
+# test there. How long an example takes says nothing: the machine may be busy, the first call may compile.
+settings.register_profile(
+    "workspace", derandomize="CI" in os.environ, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("workspace")
 
 
 @pytest.fixture(autouse=True)

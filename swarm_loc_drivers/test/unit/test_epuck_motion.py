@@ -8,7 +8,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from epuck_body import GEOMETRY
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -249,7 +249,6 @@ def test_time_that_stands_tells_nothing_and_time_that_jumps_back_begins_anew(odo
     assert again.pose == pytest.approx(before.pose)
 
 
-@settings(deadline=None)  # the estimator is compiled at its first call
 @given(legs=st.lists(st.tuples(RATE, RATE, st.integers(1, 20)), min_size=1, max_size=12))
 def test_the_covariance_is_that_of_the_estimators_model(legs: list[tuple[float, float, int]]) -> None:
     odometry = WheelOdometry(GEOMETRY, NOISE, Counter())

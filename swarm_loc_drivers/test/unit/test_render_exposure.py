@@ -66,7 +66,7 @@ def test_an_edge_is_blurred_as_far_as_it_moves_and_stays_where_it_is_on_average(
     assert spread - still == pytest.approx(faster * drawn, rel=0.02, abs=0.01)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(turn=st.floats(-0.02, 0.02), ahead=st.floats(-0.02, 0.02), seed=st.integers(0, 100))
 def test_more_instants_than_asked_for_change_nothing_that_matters(
     turn: float, ahead: float, seed: int

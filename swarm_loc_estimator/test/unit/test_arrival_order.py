@@ -67,7 +67,7 @@ def assert_same(a: Outcome, b: Outcome) -> None:
     assert settled(a.estimator) == settled(b.estimator)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     seed=st.integers(0, 10**6),
     robots=st.integers(1, 4),
@@ -280,7 +280,7 @@ def test_the_same_data_give_the_same_bytes() -> None:
     assert a.covariances.tobytes() == b.covariances.tobytes()
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(seed=st.integers(0, 10**6), content=st.sampled_from([POSITION, POSE_TWO]))
 def test_robots_that_wait_long_are_located_at_the_same_instant(seed: int, content: int) -> None:
     plan = Plan(2, 6.0, 0.04, content=content, start_known=(False,), landmarks=2, flips=0.4, camera_hz=6.67)

@@ -208,7 +208,7 @@ def test_damaged_chunk_is_lost_alone_and_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(
     places=st.lists(
         st.tuples(st.floats(0, 1, exclude_max=True), st.binary(min_size=1, max_size=40)),

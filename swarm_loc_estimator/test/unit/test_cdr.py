@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.io import cdr
@@ -134,7 +134,6 @@ def test_pose_agrees_with_the_serializer(stamp: int, frame: str, pose: tuple[flo
         assert message.pose == pytest.approx(pose, abs=1e-12)
 
 
-@settings(suppress_health_check=[HealthCheck.too_slow])
 @given(stamp=STAMPS, frame=NAMES, count=st.integers(0, 5))
 def test_detections_agree_with_the_serializer(stamp: int, frame: str, count: int) -> None:
     objects = [detection_object(k) for k in range(count)]
@@ -232,7 +231,6 @@ def test_many_poses_are_what_the_serializer_writes(
     assert data == encode(message, POSE_STAMPED)
 
 
-@settings(suppress_health_check=[HealthCheck.too_slow])
 @given(frame=NAMES, count=st.integers(0, 4))
 def test_detections_are_what_the_serializer_writes(frame: str, count: int) -> None:
     data = detections_bytes(count, frame)

@@ -57,7 +57,7 @@ def sighting(
     return one, robot
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     seed=SEEDS,
     sees=st.booleans(),
@@ -122,7 +122,7 @@ def clues_of(
     return clues
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=SEEDS, count=st.integers(5, 20), wrong=st.floats(0.0, 0.35))
 def test_the_fix_is_the_truth_also_among_wrong_clues(seed: int, count: int, wrong: float) -> None:
     rng = np.random.default_rng(seed)
@@ -143,7 +143,7 @@ def error_of(transform: FloatArray, truth: FloatArray) -> FloatArray:
     return error
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=SEEDS)
 def test_the_fix_moves_with_the_map(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -180,7 +180,7 @@ def many_clues(stamps_s: FloatArray, markers: Sequence[int], window_s: float) ->
     return clues
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=SEEDS, markers=st.integers(1, 6))
 def test_clues_kept_are_few_and_spread_over_time_and_markers(seed: int, markers: int) -> None:
     steps = np.random.default_rng(seed).uniform(0.05, 0.2, 200)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.core.swarm import Robot, Swarm
@@ -55,7 +55,6 @@ def batch_of(
     return MessageBatch.of(list(zip(topics or [0] * n, messages, times or [0] * n, strict=True)))
 
 
-@settings(deadline=None)  # the first call compiles
 @given(
     st.lists(st.tuples(st.integers(0, 2), FRAMES, FRAMES, st.integers(0, 2**62 // 10**9), st.booleans())),
     st.booleans(),
@@ -80,7 +79,6 @@ def test_odometry_reads_as_by_the_complete_reader(
         assert reader.frame_ids[topic] == newest[1], frame
 
 
-@settings(deadline=None)  # the first call compiles
 @given(st.lists(st.tuples(st.integers(0, 2), FRAMES, st.integers(0, 4), st.booleans()), max_size=8))
 def test_detections_read_as_by_the_complete_reader(rows: list[tuple[int, str, int, bool]]) -> None:
     reader, messages = DetectionReader(3), []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -30,7 +30,6 @@ def measurements(rows: list[Row]) -> NDArray[np.void]:
     return many
 
 
-@settings(deadline=None)  # the first call compiles
 @given(st.lists(st.lists(ROW, max_size=8), max_size=8), st.randoms())
 def test_any_order_gives_the_same_each_once(parts: list[list[Row]], order: random.Random) -> None:
     rows = [row for part in parts for row in part]
