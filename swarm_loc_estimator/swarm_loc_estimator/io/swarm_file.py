@@ -4,7 +4,7 @@
 fileversion: 1
 defaults:                 # any of odometry, response, camera, sensor, faces, start_sigma
   sensor: {range_sigma: 0.1}
-  landmark: {size: 0.06, position_sigma: 0.01, yaw_sigma: 0.02}   # of all; without sigmas their survey is exact
+  landmark: {size: 0.06, position_sigma: 0.01, yaw_sigma: 0.02}  # without sigmas: surveyed exactly
 types:
   epuck:                  # the same keys; what is not said comes from defaults
     odometry: {wheel_separation: 0.053}
