@@ -3,11 +3,12 @@
 A robot's pose is X = T O with the track O. Between two instants T gathers noise, and drifts with the
 parameters z of the robot's motion (`core/parameters.py`):
 
-    T <- exp(A z) T,    P <- F P F^T + Ad(T) (G2 - G1) Ad(T)^T,    A = Ad(T) (D2 - D1).
+    T <- T exp((D2 - D1) z) = exp(A z) T,    P <- F P F^T + Ad(T) (G2 - G1) Ad(T)^T,    A = Ad(T) (D2 - D1).
 
-The right-invariant error turns with the move, xi <- Ad(exp(A z)) xi + Ad(exp(A z / 2)) A dz, which is F. The
-turn rate's bias is a first-order Gauss-Markov process: it decays, and between the instants it was what it was
-on average.
+The right-invariant error does not change by the move itself, whatever z is, but by the error of z:
+xi <- xi + Ad(exp(A z / 2)) A dz, which is F. So what moves all robots and landmarks alike is never taken for
+observed. The turn rate's bias is a first-order Gauss-Markov process: it decays, and between the instants it
+was what it was on average.
 """
 
 from __future__ import annotations
@@ -39,7 +40,6 @@ class _Drift(NamedTuple):
 
     Attributes:
         twist: (3,) T is moved by exp(twist).
-        turn: (3, 3) the error of the pose there per error before.
         drive: (3, DRIVES) the error of the pose there per error of each parameter before.
         left: Share of the turn bias that is left.
         gained: Variance that its mean over the time gained, in units of its column of `drive`, squared.
@@ -47,7 +47,6 @@ class _Drift(NamedTuple):
     """
 
     twist: FloatArray
-    turn: FloatArray
     drive: FloatArray
     left: float
     gained: float
@@ -137,9 +136,7 @@ def _new_drift(belief: BeliefArrays, robot: int, drift: FloatArray, stamp_ns: in
     # of what arises meanwhile; a series where the closed form would be rounding
     spread = 2.0 * x - 3.0 + 4.0 * left - left * left if x > 1e-2 else x**3 * (2.0 / 3.0 - 0.5 * x)
     gained, shared = spread / max(reach, 1e-12) ** 2, (1.0 - left) ** 2 / max(reach, 1e-12)
-    out = _Drift(
-        np.zeros(3), np.empty((3, 3)), np.zeros((3, DRIVES)), left, variance * gained, variance * shared
-    )
+    out = _Drift(np.zeros(3), np.zeros((3, DRIVES)), left, variance * gained, variance * shared)
     adjoint, accounted = adjoint_of(belief.transform[robot]), belief.accounted[robot, DRIFT]
     for m in range(DRIVES):
         mean = reach / x if m == TURN_BIAS and x > 1e-9 else 1.0
@@ -155,11 +152,6 @@ def _new_drift(belief: BeliefArrays, robot: int, drift: FloatArray, stamp_ns: in
             column[i] = out.drive[i, m]
         for i in range(3):
             out.drive[i, m] = half[i][0] * column[0] + half[i][1] * column[1] + half[i][2] * column[2]
-    _move(0.5 * out.twist, pose)
-    whole = adjoint_of(pose)
-    for i in range(3):
-        for j in range(3):
-            out.turn[i, j] = whole[i][j]
     return out
 
 
@@ -172,7 +164,7 @@ def _own(belief: BeliefArrays, robot: int, drift: _Drift, columns: IndexArray, w
         if column >= 0:
             columns[count] = column
             for i in range(3):
-                weight[i, count] = drift.turn[i, m] if m < 3 else drift.drive[i, m - 3]
+                weight[i, count] = drift.drive[i, m - 3] if m >= 3 else (1.0 if i == m else 0.0)
             count += 1
     return count
 

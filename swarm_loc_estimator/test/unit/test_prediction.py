@@ -62,6 +62,23 @@ def test_one_long_prediction_is_many_short_ones(speed: float, turn_rate: float) 
     assert np.linalg.eigvalsh(p / scale).min() > 0.0
 
 
+def test_an_error_of_the_pose_is_not_changed_by_how_the_odometry_errs() -> None:
+    """Right-invariant, it moves the whole path alike; else what moves everything would seem observed."""
+    tracks, state = drive(0.1, 0.4, 4.0)
+    state.parameter[0] = [0.1, 0.2, -0.2, 0.0, 0.0]
+    state.filter.place(np.arange(6, 9), 1e-18 * np.eye(3))
+    state.filter.place(np.arange(3), np.diag([1.0, 2.0, 3.0]))
+    other, error = state.copy(), np.array([0.3, -0.5, 0.7])
+    other.transform[0] = se2.compose(se2.exp(error), state.transform[0])
+    for seconds in np.linspace(0.1, 4.0, 40):
+        to(state, tracks, seconds)
+        to(other, tracks, seconds)
+    np.testing.assert_allclose(
+        other.transform[0], se2.compose(se2.exp(error), state.transform[0]), atol=1e-12
+    )
+    np.testing.assert_allclose(state.filter.covariance[:3, :3], np.diag([1.0, 2.0, 3.0]), atol=1e-3)
+
+
 def test_the_read_out_is_what_the_prediction_would_be() -> None:
     tracks, state = drive(0.1, 0.3, 4.0)
     state.parameter[0] = [0.02, 0.02, -0.01, 0.0, 0.0]
