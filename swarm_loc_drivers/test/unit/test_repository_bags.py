@@ -1,14 +1,21 @@
 """The simulated bags of the repository are what their own first line says that they were made by."""
 
 import re
+from collections.abc import Iterator
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from swarm_loc_drivers.cli.generate_bag import main
+from swarm_loc_estimator.io.bags import BagReader
+from swarm_loc_estimator.io.typestore import typestore
 
 BAGS = Path(__file__).parents[3] / "bags"
 SIMULATED = ["eight_five_robots", "eight_five_robots_w2", "eight_one_robot_fast", "eight_one_robot_slow"]
+ROUNDING = 1e-9  # numpy's sines differ by their last bits where a processor has wider registers
 
 
 @pytest.mark.parametrize("name", SIMULATED)
@@ -19,5 +26,28 @@ def test_a_bag_comes_out_of_its_generator_again(name: str, tmp_path: Path) -> No
     assert unknown == "False"
     options = [word for key, value in said.items() for word in (f"--{key}", value)]
     assert main([swarm, str(tmp_path / name), *options]) == 0
-    again, kept = ((folder / name / f"{name}.mcap").read_bytes() for folder in (tmp_path, BAGS))
-    assert again == kept
+    moved: list[Any] = []
+    stayed: list[Any] = []
+    with BagReader(tmp_path / name) as again, BagReader(BAGS / name) as kept:
+        for one, other in zip(again.messages(), kept.messages(), strict=True):
+            assert one[:3] == other[:3]
+            if one != other:
+                moved += leaves(typestore().deserialize_cdr(one[3], one[1]))
+                stayed += leaves(typestore().deserialize_cdr(other[3], other[1]))
+    assert [x for x in moved if not isinstance(x, float)] == [x for x in stayed if not isinstance(x, float)]
+    numbers, others = (np.array([x for x in part if isinstance(x, float)]) for part in (moved, stayed))
+    np.testing.assert_allclose(numbers, others, rtol=0.0, atol=ROUNDING)
+
+
+def leaves(part: Any) -> Iterator[Any]:
+    """The texts and numbers of a message."""
+    if isinstance(part, np.ndarray):
+        yield from part.ravel().tolist()
+    elif isinstance(part, list):
+        for one in part:
+            yield from leaves(one)
+    elif is_dataclass(part):
+        for one in vars(part).values():
+            yield from leaves(one)
+    else:
+        yield part
