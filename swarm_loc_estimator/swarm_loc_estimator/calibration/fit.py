@@ -26,8 +26,9 @@ from swarm_loc_estimator.calibration.response import (
 )
 from swarm_loc_estimator.calibration.robust import spread
 from swarm_loc_estimator.calibration.windows import steps_of, true_motion, windows
+from swarm_loc_estimator.core.motion_response import MotionResponse
 from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.swarm import MotionResponse, OdometryModel, Robot, Swarm
+from swarm_loc_estimator.core.swarm import OdometryModel, Robot, Swarm
 
 EVALUATIONS = 80
 """How often the estimator runs over the recording to fit the noise."""

@@ -14,8 +14,8 @@ from swarm_loc_estimator.calibration.fit import Calibration
 from swarm_loc_estimator.calibration.noise import Score
 from swarm_loc_estimator.calibration.response import spread_of
 from swarm_loc_estimator.calibration.robust import spread
+from swarm_loc_estimator.core.motion_response import MotionResponse
 from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.swarm import MotionResponse
 from swarm_loc_estimator.io.report_style import INK, SOFT, TRUTH, colour_of, save, style
 
 _BINS = 60

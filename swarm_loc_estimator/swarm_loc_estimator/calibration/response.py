@@ -16,8 +16,8 @@ from scipy.optimize import minimize
 from swarm_loc_estimator.calibration.recording import IntArray
 from swarm_loc_estimator.calibration.robust import ridge, spread
 from swarm_loc_estimator.calibration.windows import Steps, TrueMotion, gathered, windows
+from swarm_loc_estimator.core.motion_response import MotionResponse
 from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.swarm import MotionResponse
 
 LONGEST_DELAY_S = 0.5
 LONGEST_LAG_S = 1.0

@@ -10,13 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.compiled import assign, assign_matrix, compiled, wrap
-from swarm_loc_estimator.core.parameters import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
+from swarm_loc_estimator.core.motion_noise import add_silence, add_step_drift, add_step_noise
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import OdometryModel
 
 IntArray = NDArray[np.int64]
-
-_FARTHEST_M = 1e3
 
 UNCHANGED_NS = np.iinfo(np.int64).max
 BEFORE_ALL_NS = np.iinfo(np.int64).min
@@ -38,7 +36,8 @@ class TrackArrays(NamedTuple):
         pose: (N, capacity, 3) calibrated poses O, headings unwrapped.
         gathered: (N, capacity, 2, 3, 3) in the track's frame: NOISE, the covariance G, and DRIFT, by how much
             the pose moves per unit of each parameter of the motion (its columns, see core/parameters.py).
-        rate: (N, capacity, 2) calibrated speed [m/s] and turn rate [rad/s] at the row, behind the lag.
+        rate: (N, capacity, 3) calibrated velocity forward and left [m/s] and turn rate [rad/s] at the row,
+            behind the lag.
         delay_ns: (N,) delay of the stamps.
         model: (N,) records of the numbers of `OdometryModel`.
         response: (N, 2, V, W) shares of speed and of turn rate of `MotionResponse`.
@@ -46,6 +45,7 @@ class TrackArrays(NamedTuple):
         response_turn_rate: (N, W) turn rates likewise.
         begin_ns: (N,) instant of the very first row.
         begin_pose: (N, 3) the pose there, where nothing is gathered yet.
+        stands: (N,) whether the robot has no odometry and never moves from where its track begins.
     """
 
     filled: IntArray
@@ -61,6 +61,7 @@ class TrackArrays(NamedTuple):
     response_turn_rate: FloatArray
     begin_ns: IntArray
     begin_pose: FloatArray
+    stands: NDArray[np.bool_]
 
 
 @compiled
@@ -78,7 +79,7 @@ def look_up(
         gathered.fill(0.0)
         pose.fill(0.0)
         raw.fill(0.0)
-        return math.inf
+        return 0.0 if tracks.stands[robot] else math.inf
     stamps, timeout_ns = tracks.stamp_ns[robot, :count], tracks.model[robot].timeout_s * 1e9
     row = max(0, np.searchsorted(stamps, stamp_ns, side="right") - 1)
     if row + 1 < count and stamps[row + 1] - stamps[row] <= timeout_ns:
@@ -96,7 +97,8 @@ def look_up(
         assign_matrix(gathered[DRIFT], tracks.gathered[robot, row, DRIFT])
     unknown = silence_ns > timeout_ns
     silence_s: float = silence_ns * 1e-9
-    _add_silence(tracks.model[robot], silence_s, unknown, tracks.pose[robot, row], gathered[NOISE])
+    rate = tracks.rate[robot, row]
+    add_silence(tracks.model[robot], silence_s, unknown, tracks.pose[robot, row], rate, gathered[NOISE])
     return silence_s
 
 
@@ -201,7 +203,7 @@ def integrate(
         if row == 0:  # a track begins where its driver says
             assign(tracks.pose[robot, 0], raw[k])
             tracks.gathered[robot, 0].fill(0.0)
-            assign(tracks.rate[robot, 0], np.zeros(2))
+            assign(tracks.rate[robot, 0], np.zeros(3))
             assign(tracks.begin_pose[robot], raw[k])
             tracks.begin_ns[robot] = stamps_ns[k]
         else:
@@ -230,25 +232,29 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
     assign_matrix(drift, tracks.gathered[robot, row - 1, DRIFT])
     if jump or duration_s > model.timeout_s:  # where it went is unknown
         assign(tracks.pose[robot, row], start)
-        assign(rate, np.zeros(2))
-        _add_silence(model, duration_s, True, start, noise)
+        assign(rate, np.zeros(3))
+        add_silence(model, duration_s, True, start, rate, noise)
         return bool(jump)
-    distance = math.cos(middle) * dx + math.sin(middle) * dy
-    lateral = -math.sin(middle) * dx + math.cos(middle) * dy
+    reported = (
+        math.cos(middle) * dx + math.sin(middle) * dy,
+        math.cos(middle) * dy - math.sin(middle) * dx,
+        turn,
+    )
     before_rate = tracks.rate[robot, row - 1]
-    distance, turn = _true_motion(tracks, robot, distance, turn, duration_s, before_rate, rate)
-    forward = math.cos(model.course_offset) * distance
-    lateral += math.sin(model.course_offset) * distance + model.axle_offset * turn
+    forward, left, turn = _true_motion(tracks, robot, reported, duration_s, before_rate, rate)
+    # the way of the axle, then that of base_link ahead of it
+    cos, sin = math.cos(model.course_offset), math.sin(model.course_offset)
+    way_x, way_y = cos * forward - sin * left, sin * forward + cos * left + model.axle_offset * turn
     middle = start[2] + 0.5 * turn
     cos, sin = math.cos(middle), math.sin(middle)
-    step_x, step_y = cos * forward - sin * lateral, sin * forward + cos * lateral
+    step_x, step_y = cos * way_x - sin * way_y, sin * way_x + cos * way_y
     tracks.pose[robot, row, 0] = start[0] + step_x
     tracks.pose[robot, row, 1] = start[1] + step_y
     tracks.pose[robot, row, 2] = start[2] + turn
-    changed = abs(rate[1] - before_rate[1])
+    changed = abs(rate[2] - before_rate[2])
     x, y = start[0] + 0.5 * step_x, start[1] + 0.5 * step_y
-    _add_step_noise(model, distance, turn, changed, duration_s, x, y, middle, noise)
-    _add_step_drift(model, distance, turn, duration_s, x, y, middle, drift)
+    add_step_noise(model, forward, left, turn, changed, duration_s, x, y, middle, noise)
+    add_step_drift(model, forward, left, turn, duration_s, x, y, middle, drift)
     return False
 
 
@@ -256,26 +262,31 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
 def _true_motion(
     tracks: TrackArrays,
     robot: int,
-    distance: float,
-    turn: float,
+    reported: tuple[float, float, float],
     duration_s: float,
     before_rate: FloatArray,
     rate: FloatArray,
-) -> tuple[float, float]:
-    """Calibrated path and turn of a reported step; writes speed and turn rate (2,) at its end."""
+) -> tuple[float, float, float]:
+    """Calibrated way forward and left and turn of a reported step; writes their rates (3,) at its end."""
     model = tracks.model[robot]
-    speed, turn_rate = distance / duration_s, turn / duration_s
-    speed_share, turn_share = _response(tracks, robot, abs(speed), abs(turn_rate))
-    speed *= model.distance_scale * speed_share
-    turn_rate *= model.turn_scale * turn_share
+    speed = math.hypot(reported[0], reported[1]) / duration_s
+    speed_share, turn_share = _response(tracks, robot, speed, abs(reported[2]) / duration_s)
+    scale, turn_scale = model.distance_scale * speed_share, model.turn_scale * turn_share
+    true_rate = (
+        scale * reported[0] / duration_s,
+        scale * reported[1] / duration_s,
+        turn_scale * reported[2] / duration_s,
+    )
     remaining, mean = 0.0, 0.0  # of what is left to follow: at the end, and on average over the step
     if model.lag_s > 0.0:
         remaining = math.exp(-duration_s / model.lag_s)
         mean = (1.0 - remaining) * model.lag_s / duration_s
-    behind_speed, behind_turn_rate = before_rate[0] - speed, before_rate[1] - turn_rate
-    rate[0] = speed + remaining * behind_speed
-    rate[1] = turn_rate + remaining * behind_turn_rate
-    return (speed + mean * behind_speed) * duration_s, (turn_rate + mean * behind_turn_rate) * duration_s
+    moved = np.empty(3)
+    for k in range(3):
+        behind = before_rate[k] - true_rate[k]
+        rate[k] = true_rate[k] + remaining * behind
+        moved[k] = (true_rate[k] + mean * behind) * duration_s
+    return moved[0], moved[1], moved[2]
 
 
 @compiled
@@ -300,100 +311,3 @@ def _bracket(axis: FloatArray, value: float) -> tuple[int, float]:
     if i + 1 == axis.size or math.isinf(axis[i + 1]):
         return i, 0.0
     return i, min(1.0, max(0.0, (value - axis[i]) / (axis[i + 1] - axis[i])))
-
-
-@compiled
-def _add_step_noise(
-    model: OdometryModel,
-    distance: float,
-    turn: float,
-    turn_rate_change: float,
-    duration_s: float,
-    x: float,
-    y: float,
-    theta: float,
-    noise: FloatArray,
-) -> None:
-    """Add a step's noise in the track's frame.
-
-    Wheels: covar(ds_r, ds_l) = diag(k |ds_r|, k |ds_l|) (Siegwart and Nourbakhsh), the U Q U^T of the e-puck
-    paper's eq. (9), whose Q is not printed.
-    """
-    separation, wheel = model.wheel_separation, model.wheel_noise
-    right, left = abs(distance + 0.5 * separation * turn), abs(distance - 0.5 * separation * turn)
-    along = 0.25 * wheel * (right + left) + model.distance_noise * abs(distance)
-    along += model.distance_turn_noise * abs(turn)
-    across = model.lateral_noise * abs(distance)
-    heading = wheel * (right + left) / separation**2 + model.turn_noise * abs(turn)
-    heading += model.turn_change_noise * turn_rate_change
-    if right + left > 0.0:
-        along += model.distance_drift * duration_s
-        across += model.lateral_drift * duration_s
-        heading += model.turn_drift * duration_s
-    cross = 0.5 * wheel * (right - left) / separation
-    _add_in_track_frame(x, y, theta, along, across, heading, cross, noise)
-
-
-@compiled
-def _add_step_drift(
-    model: OdometryModel,
-    distance: float,
-    turn: float,
-    duration_s: float,
-    x: float,
-    y: float,
-    theta: float,
-    drift: FloatArray,
-) -> None:
-    """Add by how much a step moves the pose per unit of each parameter: Ad(O) times its body direction."""
-    if distance == 0.0 and turn == 0.0:
-        return
-    drift[0, DISTANCE_SCALE] += math.cos(theta + model.course_offset) * distance
-    drift[1, DISTANCE_SCALE] += math.sin(theta + model.course_offset) * distance
-    # the axle turns, base_link ahead of it moves sideways besides
-    turned_x, turned_y = y - math.sin(theta) * model.axle_offset, -x + math.cos(theta) * model.axle_offset
-    for parameter, angle in ((TURN_BIAS, duration_s), (TURN_SCALE, turn)):
-        drift[0, parameter] += turned_x * angle
-        drift[1, parameter] += turned_y * angle
-        drift[2, parameter] += angle
-
-
-@compiled
-def _add_silence(
-    model: OdometryModel, silence_s: float, unknown: bool, pose: FloatArray, noise: FloatArray
-) -> None:
-    """Add the noise of a robot that has been silent since it was at `pose` (3,) on its track.
-
-    At first its speed and turn rate walk at random; once its motion is unknown it may have driven anywhere.
-    Both act about the last pose known: so the noise never shrinks with time.
-    """
-    # bounded: beside much larger numbers the noise of the steps after it would be lost to rounding
-    reach = min(model.max_speed * silence_s, _FARTHEST_M) ** 2 / 3.0
-    turned = min(model.max_turn_rate * silence_s, math.pi) ** 2 / 3.0  # pi: any heading
-    along, across, heading = reach, reach, turned
-    if not unknown:
-        walked = silence_s**3 / 3.0
-        along, across = min(along, model.speed_change**2 * walked), 0.0
-        heading = min(heading, model.turn_rate_change**2 * walked)
-    _add_in_track_frame(pose[0], pose[1], pose[2], along, across, heading, 0.0, noise)
-
-
-@compiled
-def _add_in_track_frame(
-    x: float,
-    y: float,
-    theta: float,
-    along: float,
-    across: float,
-    heading: float,
-    cross: float,
-    noise: FloatArray,
-) -> None:
-    """Add Ad(pose) Q Ad(pose)^T for body variances along, across, heading and cov(along, heading)."""
-    cos, sin = math.cos(theta), math.sin(theta)
-    forward, left, turning = (cos, sin, 0.0), (-sin, cos, 0.0), (y, -x, 1.0)
-    for i in range(3):
-        for j in range(3):
-            noise[i, j] += along * forward[i] * forward[j] + across * left[i] * left[j]
-            noise[i, j] += heading * turning[i] * turning[j]
-            noise[i, j] += cross * (forward[i] * turning[j] + turning[i] * forward[j])

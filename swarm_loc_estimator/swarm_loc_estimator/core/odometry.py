@@ -26,8 +26,9 @@ from swarm_loc_estimator.core.motion import (
     integrate,
     look_up_all,
 )
+from swarm_loc_estimator.core.motion_response import MotionResponse
 from swarm_loc_estimator.core.se2 import FloatArray, wrap_angle
-from swarm_loc_estimator.core.swarm import MotionResponse, Robot
+from swarm_loc_estimator.core.swarm import Robot
 
 _IDEAL = MotionResponse(speeds=(0.0,), turn_rates=(0.0,), speed_share=((1.0,),), turn_share=((1.0,),))
 _FIRST_CAPACITY = 256
@@ -82,6 +83,7 @@ class OdometryTracks:
         self._response = _stacked([robot.response or _IDEAL for robot in robots])
         names = MODEL_DTYPE.names or ()
         self._model = np.array([tuple(getattr(m, name) for name in names) for m in models], dtype=MODEL_DTYPE)
+        self._stands = np.array([robot.stands for robot in robots], dtype=bool)
         self._delay_ns = np.array([round(m.delay_s * 1e9) for m in models], dtype=np.int64)
         self.clear()
 
@@ -98,8 +100,9 @@ class OdometryTracks:
         return int(np.max(timeout_ns - np.minimum(0, self._delay_ns), initial=0))
 
     def begun(self, robot: int, stamp_ns: int) -> bool:
-        """Whether the robot's odometry has begun by an instant."""
-        return bool(self.arrays.filled[robot] and self.arrays.begin_ns[robot] <= stamp_ns)
+        """Whether the robot's odometry has begun by an instant; one without has always stood there."""
+        begun = self.arrays.filled[robot] and self.arrays.begin_ns[robot] <= stamp_ns
+        return bool(begun or self._stands[robot])
 
     def extend(self, robots: IntArray, stamps_ns: IntArray, raw: FloatArray) -> TrackChange:
         """Add rows, whatever their order and age.
@@ -164,7 +167,7 @@ class OdometryTracks:
             raw=np.zeros((*shape, 3)),
             pose=np.zeros((*shape, 3)),
             gathered=np.zeros((*shape, 2, 3, 3)),
-            rate=np.zeros((*shape, 2)),
+            rate=np.zeros((*shape, 3)),
             delay_ns=self._delay_ns,
             model=self._model,
             response=self._response[0],
@@ -172,6 +175,7 @@ class OdometryTracks:
             response_turn_rate=self._response[2],
             begin_ns=np.zeros(self._robots, dtype=np.int64),
             begin_pose=np.zeros((self._robots, 3)),
+            stands=self._stands,
         )
 
     def _grow(self) -> None:

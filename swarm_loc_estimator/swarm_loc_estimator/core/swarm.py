@@ -7,14 +7,16 @@ table; a new parameter is one line in one of these classes.
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from swarm_loc_estimator.core.motion_response import MotionResponse
+    from swarm_loc_estimator.core.robot_ir import RobotIr
 
 Pose2 = tuple[float, float, float]
 """x [m], y [m], heading [rad]."""
@@ -131,44 +133,6 @@ class OdometryModel:
     turn_rate_change: float = number(
         2.0, "rad/s/s^0.5", 0.0, 1000.0, "random walk of the turn rate past the newest message"
     )
-
-
-@dataclass(frozen=True)
-class MotionResponse:
-    """How much of the reported speed and turn rate is true, for odometry that is a command or that slips.
-
-    Between the points of the grid the shares are interpolated, beyond it they are those of its border.
-
-    Attributes:
-        speeds: (V,) reported speeds [m/s], ascending, from 0 on.
-        turn_rates: (W,) reported turn rates [rad/s], ascending, from 0 on; their sign does not matter.
-        speed_share: (V, W) true speed per reported speed.
-        turn_share: (V, W) true turn rate per reported turn rate.
-
-    Raises:
-        SwarmError: Sizes do not fit, an axis does not ascend, or a share is not in [0, 10].
-    """
-
-    speeds: tuple[float, ...]
-    turn_rates: tuple[float, ...]
-    speed_share: tuple[tuple[float, ...], ...]
-    turn_share: tuple[tuple[float, ...], ...]
-
-    def __post_init__(self) -> None:
-        for name in ("speeds", "turn_rates"):
-            axis = getattr(self, name)
-            ascends = all(low < high for low, high in itertools.pairwise(axis))
-            if not axis or not all(0.0 <= v <= 1e3 for v in axis) or not ascends:
-                raise SwarmError(f"response.{name} is {list(axis)} but must ascend within [0, 1000].")
-        for name in ("speed_share", "turn_share"):
-            table = getattr(self, name)
-            if len(table) != len(self.speeds) or any(len(row) != len(self.turn_rates) for row in table):
-                raise SwarmError(
-                    f"response.{name} must have {len(self.speeds)} rows, one per speed,"
-                    f" of {len(self.turn_rates)} numbers, one per turn rate."
-                )
-            if not all(0.0 <= v <= 10.0 for row in table for v in row):
-                raise SwarmError(f"response.{name} must hold numbers in [0, 10] only.")
 
 
 @dataclass(frozen=True)
@@ -314,6 +278,8 @@ class Robot:
         faces: Markers on its body.
         start: Pose in map at the first datum; None: unknown, it waits for a fix.
         start_sigma: How sure the start is.
+        stands: Whether it has no odometry and does not move.
+        ir: Its infrared board; None when it has none.
     """
 
     name: str
@@ -325,6 +291,8 @@ class Robot:
     faces: tuple[Face, ...] = ()
     start: Pose2 | None = None
     start_sigma: StartSigma = StartSigma()
+    stands: bool = False
+    ir: RobotIr | None = None
 
 
 @dataclass(frozen=True)
@@ -351,26 +319,21 @@ class Swarm:
     """All robots and landmarks.
 
     Raises:
-        SwarmError: A robot name or marker id appears twice.
+        SwarmError: A robot name, a marker id or the id of an infrared board appears twice.
     """
 
     robots: tuple[Robot, ...] = ()
     landmarks: tuple[Landmark, ...] = ()
 
     def __post_init__(self) -> None:
-        names: set[str] = set()
-        for robot in self.robots:
-            if robot.name in names:
-                raise SwarmError(f"robot name '{robot.name}' is given to two robots; names must be unique.")
-            names.add(robot.name)
-        owners: dict[int, str] = {}
-        for marker_id, owner in self._named_ids():
-            if marker_id in owners:
-                raise SwarmError(
-                    f"marker id {marker_id} belongs to both {owners[marker_id]} and {owner};"
-                    " ids must be unique."
-                )
-            owners[marker_id] = owner
+        if twice := _given_twice((robot.name, "") for robot in self.robots):
+            raise SwarmError(f"robot name '{twice[0]}' is given to two robots; names must be unique.")
+        if twice := _given_twice(self._named_ids()):
+            marker_id, one, other = twice
+            raise SwarmError(f"marker id {marker_id} belongs to both {one} and {other}; ids must be unique.")
+        if twice := _given_twice((r.ir.id, f"robot '{r.name}'") for r in self.robots if r.ir is not None):
+            board, one, other = twice
+            raise SwarmError(f"ir.id {board} belongs to both {one} and {other}; ids must be unique.")
 
     def _named_ids(self) -> Iterator[tuple[int, str]]:
         """Every marker id with its owner in words."""
@@ -395,3 +358,13 @@ class Swarm:
         }
         owners.update({mark.id: MarkerOwner(-1, index, mark) for index, mark in enumerate(self.landmarks)})
         return owners
+
+
+def _given_twice(owners: Iterable[tuple[object, str]]) -> tuple[object, str, str] | None:
+    """The first key that has two owners, with both."""
+    owner_of: dict[object, str] = {}
+    for key, owner in owners:
+        if key in owner_of:
+            return key, owner_of[key], owner
+        owner_of[key] = owner
+    return None

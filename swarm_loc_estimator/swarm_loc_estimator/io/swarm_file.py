@@ -2,7 +2,7 @@
 
 ```yaml
 fileversion: 1
-defaults:                 # any of odometry, response, camera, sensor, faces, start_sigma
+defaults:                 # any of odometry, response, camera, sensor, ir, faces, start_sigma
   sensor: {range_sigma: 0.1}
   landmark: {size: 0.06, position_sigma: 0.01, yaw_sigma: 0.02}  # without sigmas: surveyed exactly
 types:
@@ -15,28 +15,39 @@ types:
       turn_share: [[1.0, 0.9, 0.9], [1.0, 0.9, 0.9]]
     camera: {x: 0.035, z: 0.028}            # null: it has none
     faces: {front: {x: 0.035, yaw: 0.0, size: 0.036}}   # markers on the body; null takes one away
+  droplet:
+    odometry: null                          # null: it has none, and stands where it is
+    camera: null
+    ir:                                     # its infrared board; null: it has none
+      platform: droplet                     # a packaged one, or the path of a file, from here
+      estimator: likelihood                 # or closed_form
 robots:
   epuck1:                 # the same keys; what is not said comes from its type
     type: epuck
     ids: {front: 12}      # which marker is on which face
     start: {x: 0.0, y: 0.0, theta: 0.0}     # null or left out: unknown
+  droplet1:
+    type: droplet
+    ir:
+      id: 0x6B6F          # by which exchanges name it
+      gains: {sensor: [1, 1, 1, 1, 1, 1], emitter: [1, 1, 1, 1, 1, 1]}   # null or left out: never calibrated
 landmarks:
   100: {x: 1.2, y: -0.4, yaw: 3.14159, size: 0.05}      # yaw null or left out: shows no heading
 ```
-Numbers, units, ranges and defaults are those of the classes in `core.swarm`.
+Numbers, units, ranges and defaults are those of the classes in `core.swarm` and `core.robot_ir`.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from swarm_loc_estimator.core.motion_response import MotionResponse
 from swarm_loc_estimator.core.swarm import (
     CameraMount,
     Face,
     Landmark,
-    MotionResponse,
     OdometryModel,
     Pose2,
     Robot,
@@ -46,20 +57,27 @@ from swarm_loc_estimator.core.swarm import (
     SwarmError,
     number_specs,
 )
+from swarm_loc_estimator.io.ir_section import IrSection, Values
 from swarm_loc_estimator.io.tree_checks import Numbers, TreeChecks, nearest
 from swarm_loc_estimator.io.yaml_tree import Tree, YamlTreeError, read_tree
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Collection, Iterable, Mapping
     from pathlib import Path
 
 FILE_VERSION = 1
 
 _SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks")
-_LAYER = ("odometry", "response", "camera", "sensor", "faces", "start_sigma")
+_LAYER = ("odometry", "response", "camera", "sensor", "ir", "faces", "start_sigma")
 _DEFAULTS = (*_LAYER, "landmark")
 _ROBOT = ("type", *_LAYER, "ids", "start")
-_MODELS: dict[str, type] = {"odometry": OdometryModel, "sensor": SensorModel, "start_sigma": StartSigma}
+_MODELS: dict[str, type] = {
+    "odometry": OdometryModel,
+    "camera": CameraMount,
+    "sensor": SensorModel,
+    "start_sigma": StartSigma,
+}
+_MAY_BE_NONE = ("odometry", "camera")
 _START = {
     "x": number_specs(Landmark)["x"],
     "y": number_specs(Landmark)["y"],
@@ -93,11 +111,16 @@ def load_swarm(path: Path) -> Swarm:
 
 @dataclass
 class _Layer:
-    """What one of defaults, type and robot says; what it leaves out is missing here."""
+    """What one of defaults, type and robot says; what it leaves out is missing here.
 
-    models: dict[str, Numbers]
-    camera: Numbers | None
-    says_camera: bool
+    Attributes:
+        sections: Key -> values by name; None: there is no such thing.
+        response: Share of the motion that is true.
+        says_response: Whether the layer says so.
+        faces: Name -> place; None: taken away.
+    """
+
+    sections: dict[str, Values | None]
     response: MotionResponse | None
     says_response: bool
     faces: dict[str, Numbers | None]
@@ -105,6 +128,10 @@ class _Layer:
 
 class _Loader(TreeChecks):
     """Checks the tree of one file on the way to the dataclasses."""
+
+    def __init__(self, path: Path, error: type[ValueError]) -> None:
+        super().__init__(path, error)
+        self._ir = IrSection(self, path.parent)
 
     def swarm(self, tree: Tree) -> Swarm:
         """The whole file."""
@@ -138,35 +165,38 @@ class _Loader(TreeChecks):
             raise self.error(f"{key}.type", type_name, f"must be one of the types{nearest(type_name, types)}")
         own = self._layer(mapping, key, _ROBOT)
         layers = [defaults, *([types[type_name]] if type_name else []), own]
-        models = {
-            section: cls(**{k: v for layer in layers for k, v in layer.models.get(section, {}).items()})
+        sections = {section: _said(layers, section) for section in (*_MODELS, "ir")}
+        models: dict[str, Any] = {
+            section: None if (values := sections[section]) is None else cls(**values)
             for section, cls in _MODELS.items()
         }
         return Robot(
             name=name,
             type=type_name or "",
             response=next((layer.response for layer in reversed(layers) if layer.says_response), None),
-            camera=_camera(layers),
             faces=self._faces(key, layers, mapping.get("ids", {})),
             start=self._start(mapping.get("start"), f"{key}.start"),
-            **models,
+            stands=models["odometry"] is None,
+            ir=self._ir.board(sections["ir"], f"{key}.ir"),
+            **{**models, "odometry": models["odometry"] or OdometryModel()},
         )
 
-    def _layer(self, tree: Tree, key: str, known: Iterable[str]) -> _Layer:
+    def _layer(self, tree: Tree, key: str, known: Collection[str]) -> _Layer:
         """The settings that one layer says."""
         mapping = self.mapping(tree, key, known)
-        models = {
-            section: self.numbers(mapping[section], f"{key}.{section}", number_specs(cls))
+        sections: dict[str, Values | None] = {
+            section: None
+            if mapping[section] is None and section in _MAY_BE_NONE
+            else self.numbers(mapping[section], f"{key}.{section}", number_specs(cls))
             for section, cls in _MODELS.items()
             if section in mapping
         }
-        camera = mapping.get("camera")
+        if "ir" in mapping:
+            sections["ir"] = self._ir.layer(mapping["ir"], f"{key}.ir", of_robot="ids" in known)
         faces = self._named(mapping.get("faces", {}), f"{key}.faces")
         specs = number_specs(Face)
         return _Layer(
-            models,
-            None if camera is None else self.numbers(camera, f"{key}.camera", number_specs(CameraMount)),
-            "camera" in mapping,
+            sections,
             self._response(mapping.get("response"), f"{key}.response"),
             "response" in mapping,
             {
@@ -258,10 +288,11 @@ class _Loader(TreeChecks):
         return list(mapping.items())
 
 
-def _camera(layers: Iterable[_Layer]) -> CameraMount | None:
-    """The camera's mount; the last layer that says null takes it away, numbers behind that bring it back."""
-    numbers: Numbers | None = {}
+def _said(layers: Iterable[_Layer], section: str) -> Values | None:
+    """The values of a section; the last layer that says null takes all away, those behind bring it back."""
+    values: Values | None = {}
     for layer in layers:
-        if layer.says_camera:
-            numbers = None if layer.camera is None else {**(numbers or {}), **layer.camera}
-    return None if numbers is None else CameraMount(**numbers)  # type: ignore[arg-type]
+        if section in layer.sections:
+            said = layer.sections[section]
+            values = None if said is None else {**(values or {}), **said}
+    return values

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from swarm_loc_estimator.core.motion_response import MotionResponse
 from swarm_loc_estimator.core.swarm import (
     CameraMount,
     Face,
     Landmark,
-    MotionResponse,
     OdometryModel,
     Robot,
     SensorModel,
@@ -20,6 +20,7 @@ from swarm_loc_estimator.core.swarm import (
     Swarm,
     number_specs,
 )
+from swarm_loc_estimator.io.ir_section import ir_tree
 from swarm_loc_estimator.io.swarm_file import FILE_VERSION, LANDMARK_DEFAULTS
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def save_swarm(swarm: Swarm, path: Path, comment: str = "") -> None:
         comment: Lines that say where the numbers come from.
     """
     text = "".join(f"# {line}\n" for line in [*comment.splitlines(), *_units()])
-    text += yaml.safe_dump(_tree(swarm), sort_keys=False, default_flow_style=None, width=100)
+    text += yaml.safe_dump(_tree(swarm, path.parent), sort_keys=False, default_flow_style=None, width=100)
     temporary = path.with_name(path.name + ".part")
     temporary.write_text(text, encoding="utf-8")
     temporary.replace(path)
@@ -61,13 +62,14 @@ def _units() -> list[str]:
     return lines
 
 
-def _tree(swarm: Swarm) -> Mapping:
-    """The file's content."""
+def _tree(swarm: Swarm, folder: Path) -> Mapping:
+    """The content of a file in a folder."""
     types: Mapping = {}
     for robot in swarm.robots:
         if robot.type and robot.type not in types:
-            types[robot.type] = _shared([other for other in swarm.robots if other.type == robot.type])
-    robots = {robot.name: _robot(robot, types.get(robot.type, {})) for robot in swarm.robots}
+            alike = [_layer(other, folder) for other in swarm.robots if other.type == robot.type]
+            types[robot.type] = _shared(alike)
+    robots = {robot.name: _robot(robot, types.get(robot.type, {}), folder) for robot in swarm.robots}
     landmarks = {mark.id: _numbers(mark, keep=("x", "y")) for mark in swarm.landmarks}
     defaults = _taken_out(LANDMARK_DEFAULTS, list(landmarks.values()))
     tree = {
@@ -97,13 +99,16 @@ def _numbers(model: Any, keep: tuple[str, ...] = ()) -> Mapping:
     return {name: values[name] for name in defaults if values[name] != defaults[name] or name in keep}
 
 
-def _layer(robot: Robot) -> Mapping:
+def _layer(robot: Robot, folder: Path) -> Mapping:
     """Everything about a robot that a type can say, as far as it differs from the defaults."""
     layer: Mapping = {
         section: _numbers(getattr(robot, section)) for section in _MODELS if section != "camera"
     }
     layer["response"] = {} if robot.response is None else _lists(robot.response)
     layer["camera"] = None if robot.camera is None else _numbers(robot.camera)
+    if robot.stands:
+        layer["odometry"] = None
+    layer["ir"] = {} if robot.ir is None else ir_tree(robot.ir, folder)
     layer["faces"] = {face.name: _numbers(face) for face in robot.faces}
     return layer
 
@@ -118,12 +123,11 @@ def _listed(value: Any) -> Any:
     return [_listed(item) for item in value] if isinstance(value, tuple) else value
 
 
-def _shared(robots: list[Robot]) -> Mapping:
+def _shared(layers: list[Mapping]) -> Mapping:
     """What all robots of a type have in common; cameras and faces as a whole, the rest number by number."""
-    layers = [_layer(robot) for robot in robots]
     shared: Mapping = {}
     for section, first in layers[0].items():
-        if section in _WHOLE:
+        if section in _WHOLE or any(layer[section] is None for layer in layers):
             if all(layer[section] == first for layer in layers):
                 shared[section] = first
         else:
@@ -135,10 +139,10 @@ def _shared(robots: list[Robot]) -> Mapping:
     return {section: value for section, value in shared.items() if value != {}}
 
 
-def _robot(robot: Robot, shared: Mapping) -> Mapping:
+def _robot(robot: Robot, shared: Mapping, folder: Path) -> Mapping:
     """A robot without what its type says."""
     entry: Mapping = {"type": robot.type} if robot.type else {}
-    for section, value in _layer(robot).items():
+    for section, value in _layer(robot, folder).items():
         rest = value
         if section in shared:
             same = value == shared[section]
@@ -146,6 +150,8 @@ def _robot(robot: Robot, shared: Mapping) -> Mapping:
             rest = {} if same or whole else {k: v for k, v in value.items() if k not in shared[section]}
         if rest != {}:
             entry[section] = rest
+    if robot.ir is not None:
+        entry["ir"] = {"id": robot.ir.id, **entry.get("ir", {})}
     if robot.faces:
         entry["ids"] = {face.name: face.id for face in robot.faces}
     if robot.start is not None:

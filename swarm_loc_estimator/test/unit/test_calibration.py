@@ -16,7 +16,8 @@ from swarm_loc_estimator.calibration.rerun import rerun
 from swarm_loc_estimator.calibration.response import Drive, Lateness, fit_response, nodes_of
 from swarm_loc_estimator.calibration.robust import population, ridge, softened
 from swarm_loc_estimator.calibration.windows import steps_of, true_motion
-from swarm_loc_estimator.core.swarm import CameraMount, MotionResponse, OdometryModel, Robot, SensorModel
+from swarm_loc_estimator.core.motion_response import MotionResponse
+from swarm_loc_estimator.core.swarm import CameraMount, OdometryModel, Robot, SensorModel
 
 TRUE = Robot(
     "true",

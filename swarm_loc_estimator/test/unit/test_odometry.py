@@ -90,6 +90,67 @@ def test_gathered_noise_is_that_of_sampled_wheels(speed: float, turn_rate: float
     np.testing.assert_allclose(np.diag(gathered), np.diag(sampled), rtol=0.08, atol=2e-6)
 
 
+@pytest.mark.parametrize("heading", [0.0, 0.7])
+@pytest.mark.parametrize("course", [0.0, math.pi / 3, math.pi / 2, -2.0, math.pi])
+def test_gathered_noise_is_that_of_sampled_steps_in_any_direction(course: float, heading: float) -> None:
+    """A robot that walks without turning: noise along and across its way and in heading."""
+    model = replace(PLAIN, distance_noise=4e-4, lateral_noise=1e-4, distance_drift=2e-5, lateral_drift=1e-5)
+    track, stamps, step = tracks(model), stamps_until(1.0), 0.01
+    way = step * np.arange(stamps.size)[:, None] * [math.cos(heading + course), math.sin(heading + course)]
+    feed(track, stamps, np.column_stack([way, np.full(stamps.size, heading)]))
+    rng, samples, dt = np.random.default_rng(1), 20_000, 0.05
+    pose = np.tile([0.0, 0.0, heading], (samples, 1))
+    wheel, width = model.wheel_noise, model.wheel_separation
+    for _ in range(stamps.size - 1):
+        along = step + math.sqrt((0.5 * wheel + model.distance_noise) * step + model.distance_drift * dt) * (
+            rng.standard_normal(samples)
+        )
+        across = math.sqrt(model.lateral_noise * step + model.lateral_drift * dt) * rng.standard_normal(
+            samples
+        )
+        turn = math.sqrt(2.0 * wheel * step) / width * rng.standard_normal(samples)
+        middle = pose[:, 2] + 0.5 * turn + course
+        cos, sin = np.cos(middle), np.sin(middle)
+        pose += np.column_stack([cos * along - sin * across, sin * along + cos * across, turn])
+    turned = pose[:, 2] - heading
+    cos, sin = np.cos(turned), np.sin(turned)
+    x = pose[:, 0] - (cos * way[-1, 0] - sin * way[-1, 1])
+    y = pose[:, 1] - (sin * way[-1, 0] + cos * way[-1, 1])
+    sampled = np.cov(np.stack([x, y, turned]))
+    gathered = look(track, int(stamps[-1])).gathered[0, NOISE]
+    np.testing.assert_allclose(gathered[:2, :2], sampled[:2, :2], atol=0.05 * np.abs(sampled[:2, :2]).max())
+    np.testing.assert_allclose(gathered, sampled, atol=0.05 * np.abs(sampled).max())
+
+
+@pytest.mark.parametrize("course", [0.0, math.pi / 3, -math.pi / 2])
+def test_a_step_sideways_is_calibrated_like_one_ahead(course: float) -> None:
+    model = replace(PLAIN, distance_scale=0.8, course_offset=0.1, lag_s=0.3)
+    ahead, aside = tracks(model), tracks(model)
+    stamps, path = stamps_until(2.0), 0.02 * np.arange(41)
+    feed(ahead, stamps, np.column_stack([path, 0.0 * path, 0.0 * path]))
+    feed(aside, stamps, np.column_stack([path * math.cos(course), path * math.sin(course), 0.0 * path]))
+    when = int(stamps[-1]) + STEP_NS // 2  # past the newest message
+    one, other = look(ahead, when), look(aside, when)
+    cos, sin = math.cos(course), math.sin(course)
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(other.pose[0], turn @ one.pose[0], atol=1e-12)
+    noise = turn @ one.gathered[0, NOISE] @ turn.T
+    np.testing.assert_allclose(other.gathered[0, NOISE], noise, atol=1e-12)
+    np.testing.assert_allclose(
+        other.gathered[0, DRIFT, :, 1], turn @ one.gathered[0, DRIFT, :, 1], atol=1e-12
+    )
+
+
+def test_a_robot_without_odometry_stands_for_ever() -> None:
+    track = OdometryTracks([Robot("still", stands=True), Robot("silent")])
+    assert track.begun(0, T0)
+    assert not track.begun(1, T0)
+    sample = track.at(np.array([0, 1]), np.array([T0, T0]))
+    assert not sample.pose[0].any()
+    assert not sample.gathered[0].any()
+    assert sample.silence_s.tolist() == [0.0, math.inf]
+
+
 def test_noise_of_a_straight_drive_in_closed_form() -> None:
     track, stamps = tracks(), stamps_until(2.0)
     feed(track, stamps, arc(0.3, 0.0, (stamps - T0) * 1e-9))

@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 import string
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from swarm_loc_estimator.core.ir.platform import IrGains
+from swarm_loc_estimator.core.motion_response import MotionResponse
+from swarm_loc_estimator.core.robot_ir import IrMethod, RobotIr
 from swarm_loc_estimator.core.swarm import (
     CameraMount,
     Face,
     Landmark,
-    MotionResponse,
     OdometryModel,
     Robot,
     SensorModel,
@@ -24,11 +27,9 @@ from swarm_loc_estimator.core.swarm import (
     SwarmError,
     number_specs,
 )
+from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
 from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
 from swarm_loc_estimator.io.swarm_writer import save_swarm
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 EXAMPLE = """\
 fileversion: 1
@@ -65,6 +66,7 @@ landmarks:
 RESPONSE = MotionResponse(
     (0.0, 0.1), (0.0, 0.5, 1.0), ((1.0, 0.9, 0.9), (1.0, 0.8, 0.7)), ((1.0, 0.9, 0.8),) * 2
 )
+DROPLET = load_ir_platform("droplet")
 RELAXED = settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 
 
@@ -290,22 +292,36 @@ def build(cls: type) -> st.SearchStrategy[Any]:
     return numbers(cls).map(lambda values: cls(**values))
 
 
+def boards(board_id: int) -> st.SearchStrategy[RobotIr]:
+    gain = st.tuples(*[st.floats(0.05, 20.0)] * 6)
+    return st.builds(
+        RobotIr,
+        st.just(board_id),
+        st.just(DROPLET),
+        st.just("droplet"),
+        st.sampled_from(IrMethod),
+        st.none() | st.builds(IrGains, gain, gain, st.floats(0.0, 1.0)),
+        st.sampled_from([0.9999, 0.9]),
+    )
+
+
 @st.composite
 def swarms(draw: st.DrawFn) -> Swarm:
     ids = iter(draw(st.lists(st.integers(0, 2**32 - 1), unique=True, min_size=40, max_size=40)))
     names = draw(
         st.lists(st.text(string.ascii_letters, min_size=1, max_size=6), unique=True, min_size=1, max_size=4)
     )
-    robots = []
+    robots: list[Robot] = []
     pool = {cls: [cls(), draw(build(cls))] for cls in (OdometryModel, CameraMount, SensorModel, StartSigma)}
     face_numbers = draw(st.lists(numbers(Face), max_size=3))
     for name in names:
         faces = tuple(Face(f"f{k}", next(ids), **values) for k, values in enumerate(face_numbers))
+        stands = draw(st.booleans())
         robots.append(
             Robot(
                 name,
                 draw(st.sampled_from(["", "typ", "other"])),
-                odometry=draw(st.sampled_from(pool[OdometryModel])),
+                odometry=OdometryModel() if stands else draw(st.sampled_from(pool[OdometryModel])),
                 response=draw(st.sampled_from([None, RESPONSE])),
                 camera=draw(st.sampled_from([*pool[CameraMount], None])),
                 sensor=draw(st.sampled_from(pool[SensorModel])),
@@ -314,6 +330,8 @@ def swarms(draw: st.DrawFn) -> Swarm:
                     st.none() | st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6), st.floats(-6.28, 6.28))
                 ),
                 start_sigma=draw(st.sampled_from(pool[StartSigma])),
+                stands=stands,
+                ir=draw(st.none() | boards(len(robots) + 1)),
             )
         )
     landmarks = tuple(
