@@ -10,7 +10,7 @@ import numpy as np
 
 from swarm_loc_drivers.sim.detections import as_detections
 from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.arrivals import DetectionRows, Messages, OdometryRows
+from swarm_loc_estimator.core.arrivals import DetectionRows, Messages, OdometryRows, chosen
 from swarm_loc_estimator.core.estimator import SwarmEstimator
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def messages_between(run: SimulatedRun, tick_ns: NDArray[np.int64]) -> list[Mess
     for now_ns in tick_ns.tolist():
         ends = [int(np.searchsorted(p.arrival_ns, now_ns, side="right")) for p in (odometry, seen)]
         first, second = (slice(a, b) for a, b in zip(begin, ends, strict=True))
-        parts.append(Messages(odometry.chosen(first), seen.chosen(second), now_ns, now_ns))
+        parts.append(Messages(now_ns, now_ns, chosen(odometry, first), chosen(seen, second)))
         begin = ends
     return parts
 

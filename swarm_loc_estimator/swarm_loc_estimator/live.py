@@ -15,7 +15,7 @@ from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import Swarm
 from swarm_loc_estimator.graph import GraphOptions, graph_nodes
 from swarm_loc_estimator.io.bags import BagReader
-from swarm_loc_estimator.io.ingest import input_topics
+from swarm_loc_estimator.io.inputs import input_topics
 from swarm_loc_estimator.io.swarm_file import load_swarm
 from swarm_loc_estimator.io.truth import TruthReader
 from swarm_loc_estimator.live_graph import START_PATIENCE_S, LiveError, LiveGraph, cpu_seconds

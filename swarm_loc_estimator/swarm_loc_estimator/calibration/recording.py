@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from swarm_loc_estimator.core.arrivals import DetectionRows, Messages, OdometryRows
+from swarm_loc_estimator.core.arrivals import NO_ODOMETRY, DetectionRows, Messages, OdometryRows, joined
 from swarm_loc_estimator.core.metrics import Track, interpolate
 from swarm_loc_estimator.core.swarm import Robot, Swarm
 from swarm_loc_estimator.io.bags import BagReader
@@ -28,7 +28,6 @@ BoolArray = npt.NDArray[np.bool_]
 Progress = Callable[[float, str], None]
 
 _NONE = np.zeros(0, dtype=np.int64)
-_NO_ODOMETRY = OdometryRows(_NONE, _NONE, np.zeros((0, 3)), _NONE)
 START_GAP_NS = 500_000_000
 """A robot's true start is interpolated over no longer gap."""
 
@@ -123,10 +122,10 @@ class Recording:
         columns = (detections.robot, detections.stamp_ns, detections.arrival_ns)
         robot, stamp_ns, arrival_ns = (np.repeat(column, counts) for column in columns)
         return Messages(
-            OdometryRows(odometry.robot, odometry.stamp_ns, odometry.poses, odometry.arrival_ns),
-            DetectionRows(robot, stamp_ns, detections.detections, arrival_ns),
             begin_ns,
             end_ns,
+            OdometryRows(odometry.robot, odometry.stamp_ns, odometry.poses, odometry.arrival_ns),
+            DetectionRows(robot, stamp_ns, detections.detections, arrival_ns),
         )
 
     def track(self, robot: int) -> Track:
@@ -158,7 +157,7 @@ def read_recording(bag: Path, swarm: Swarm, progress: Progress | None = None) ->
             if progress is not None:
                 progress(reader.progress, "reading")
         remarks = tuple(reader.losses)
-    odometry = OdometryRows.joined([_NO_ODOMETRY, *(part.odometry for part in parts)])
+    odometry = joined([NO_ODOMETRY, *(part.odometry for part in parts)])
     detections = [_per_message(part.detections) for part in parts]
     tracks = {name: _each_stamp_once(track) for name, track in truth.tracks().items()}
     return Recording(

@@ -98,6 +98,20 @@ class MeasurementBuffer:
         self._end += count
         return Merged(first_ns if count else None, new.size - count - too_old, too_old)
 
+    def remove(self, gone: MeasurementArray) -> int | None:
+        """Take measurements (k,) out; return the stamp of the first that was there, None when none was."""
+        words = np.ascontiguousarray(gone).view(np.int64).reshape(-1, _WORDS)
+        first_ns = None
+        for one in words[np.argsort(words[:, 0], kind="stable")]:
+            place = _lower_bound(self._words, self._stamp_ns, self._begin, self._end, one)
+            if place == self._end or _compared(self._words[place], one) != 0:
+                continue
+            first_ns = int(one[0]) if first_ns is None else first_ns
+            for column in (self._words, self._stamp_ns, self._verdicts, self._nis):
+                column[place : self._end - 1] = column[place + 1 : self._end].copy()
+            self._end -= 1
+        return first_ns
+
     def drop_first(self, count: int) -> None:
         """Forget the oldest ones."""
         self._begin += count

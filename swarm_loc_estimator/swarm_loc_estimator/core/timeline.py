@@ -62,6 +62,7 @@ class Timeline:
         self._head_key = _BEFORE_ALL
         self._checkpoints = [_Checkpoint(_BEFORE_ALL, state.copy())]
         self._new: list[MeasurementArray] = []
+        self._withdrawn: list[MeasurementArray] = []
         self._redo_from_ns: int | None = None
         self._buffer = MeasurementBuffer()
         self.settled: NDArray[np.int64] = np.zeros(len(Verdict), dtype=np.int64)
@@ -88,6 +89,11 @@ class Timeline:
         if measurements.size:
             self._new.append(measurements)
 
+    def withdraw(self, measurements: MeasurementArray) -> None:
+        """Take back measurements (m,) that were added, as if they had never come."""
+        if measurements.size:
+            self._withdrawn.append(measurements)
+
     @property
     def waiting(self) -> int:
         """How many measurements wait for the next `advance`."""
@@ -112,6 +118,8 @@ class Timeline:
         """Compute all steps that new or changed data touch, and let go of what lies beyond the horizon."""
         if self._new:
             self._merge(now_ns - self._horizon_ns)
+        if self._withdrawn:
+            self._remove(now_ns - self._horizon_ns)
         if self._redo_from_ns is not None:
             self._compute_from(self._key(self._redo_from_ns))
             self._redo_from_ns = None
@@ -133,16 +141,27 @@ class Timeline:
 
     def _merge(self, oldest_ns: int) -> None:
         """Sort new measurements in."""
-        new = self._new[0] if len(self._new) == 1 else np.concatenate(self._new)
-        self._new = []
-        if self._state_period_ns:
-            new, period = new.copy(), self._state_period_ns
-            new["stamp_ns"] = (new["stamp_ns"] + period // 2) // period * period
+        new, self._new = self._at_their_states(self._new), []
         merged = self._buffer.merge(new, oldest_ns)
         self.too_old += merged.too_old
         self.duplicates += merged.duplicates
         if merged.first_ns is not None:
             self._redo_from(merged.first_ns)
+
+    def _remove(self, oldest_ns: int) -> None:
+        """Take withdrawn measurements out, unless what replaces them has just been refused as too old."""
+        gone, self._withdrawn = self._at_their_states(self._withdrawn), []
+        first_ns = self._buffer.remove(gone[gone["stamp_ns"] >= oldest_ns])
+        if first_ns is not None:
+            self._redo_from(first_ns)
+
+    def _at_their_states(self, parts: list[MeasurementArray]) -> MeasurementArray:
+        """All measurements (m,) of some parts, at the closest stored states where these are wanted."""
+        rows, period = parts[0] if len(parts) == 1 else np.concatenate(parts), self._state_period_ns
+        if period:
+            rows = rows.copy()
+            rows["stamp_ns"] = (rows["stamp_ns"] + period // 2) // period * period
+        return rows
 
     def _compute_from(self, key: int) -> None:
         """Go back to before step `key`, if it is not ahead, and do all steps that are due."""

@@ -65,6 +65,35 @@ class DetectionArrayMessage(NamedTuple):
     detections: npt.NDArray[np.void]
 
 
+class FixMessage(NamedTuple):
+    """What the estimator reads of geometry_msgs/PoseWithCovarianceStamped.
+
+    Attributes:
+        stamp_ns: When the robot was there.
+        frame_id: Frame of the pose.
+        pose: (x [m], y [m], yaw [rad]); yaw is NaN when the quaternion is zero.
+        covariance: 3x3, of x, y, yaw, as published.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    pose: tuple[float, float, float]
+    covariance: Array
+
+
+class BrightnessMessage(NamedTuple):
+    """swarm_loc_msgs/BrightnessMatrix, see there; `readings` (k,) need not have the promised size."""
+
+    stamp_ns: int
+    frame_id: str
+    receiver: int
+    transmitter: int
+    n: int
+    readings: npt.NDArray[np.int32]
+    power: int
+    saturation: int
+
+
 _DETECTION_FIELDS: tuple[tuple[str, str, tuple[int, ...]], ...] = (
     ("id", "u4", ()),
     ("family", "u1", ()),
@@ -113,6 +142,9 @@ class _Layout:
     def __init__(self, order: str) -> None:
         self.header = struct.Struct(order + "iII")
         self.count = struct.Struct(order + "I")
+        self.pair = struct.Struct(order + "IIB")
+        self.reading = np.dtype(order + "i4")
+        self.power = struct.Struct(order + "B3xi")
         self.pose = struct.Struct(order + "7d")
         self.twist = struct.Struct(order + "6d")
         self.double = np.dtype(order + "f8")
@@ -181,6 +213,12 @@ def _pose2(x: float, y: float, qx: float, qy: float, qz: float, qw: float) -> tu
     return x, y, math.atan2(sine, cosine) if sine or cosine else math.nan
 
 
+def _planar_covariance(data: bytes, layout: _Layout, offset: int) -> Array:
+    """3x3 over x, y, yaw of the 6x6 at an offset."""
+    whole = np.frombuffer(data, layout.double, 36, offset)
+    return whole.take(_COVARIANCE_XYYAW).astype(np.float64, copy=False)
+
+
 def decode_odometry(data: bytes) -> OdometryMessage:
     """Read a nav_msgs/Odometry.
 
@@ -197,11 +235,7 @@ def decode_odometry(data: bytes) -> OdometryMessage:
     _check_end(data, offset + 8 * _ODOMETRY_DOUBLES)
     x, y, _, qx, qy, qz, qw = layout.pose.unpack_from(data, offset)
     vx, vy, _, _, _, rate = layout.twist.unpack_from(data, offset + 8 * 43)
-    covariance = (
-        np.frombuffer(data, layout.double, 36, offset + 56)
-        .take(_COVARIANCE_XYYAW)
-        .astype(np.float64, copy=False)
-    )
+    covariance = _planar_covariance(data, layout, offset + 56)
     return OdometryMessage(
         stamp_ns, frame_id, child_frame_id, _pose2(x, y, qx, qy, qz, qw), (vx, vy, rate), covariance
     )
@@ -219,6 +253,42 @@ def decode_pose_stamped(data: bytes) -> PoseMessage:
     _check_end(data, offset + 56)
     x, y, _, qx, qy, qz, qw = layout.pose.unpack_from(data, offset)
     return PoseMessage(stamp_ns, frame_id, _pose2(x, y, qx, qy, qz, qw))
+
+
+def decode_fix(data: bytes) -> FixMessage:
+    """Read a geometry_msgs/PoseWithCovarianceStamped.
+
+    Raises:
+        CdrError: The bytes are not one whole message.
+    """
+    layout = _layout(data)
+    stamp_ns, frame_id, offset = _header(data, layout)
+    offset += -(offset - ENCAPSULATION) % 8
+    _check_end(data, offset + 8 * (7 + 36))
+    x, y, _, qx, qy, qz, qw = layout.pose.unpack_from(data, offset)
+    covariance = _planar_covariance(data, layout, offset + 56)
+    return FixMessage(stamp_ns, frame_id, _pose2(x, y, qx, qy, qz, qw), covariance)
+
+
+def decode_brightness(data: bytes) -> BrightnessMessage:
+    """Read a swarm_loc_msgs/BrightnessMatrix.
+
+    Raises:
+        CdrError: The bytes are not one whole message.
+    """
+    layout = _layout(data)
+    stamp_ns, frame_id, offset = _header(data, layout)
+    offset += -offset % 4
+    if offset + 16 > len(data):
+        raise CdrError(f"cut off after {len(data)} bytes.")
+    receiver, transmitter, n = layout.pair.unpack_from(data, offset)
+    (count,) = layout.count.unpack_from(data, offset + 12)
+    offset += 16
+    end = offset + 4 * count
+    _check_end(data, end + 8)
+    readings = np.frombuffer(data, layout.reading, count, offset).astype(np.int32)
+    power, saturation = layout.power.unpack_from(data, end)
+    return BrightnessMessage(stamp_ns, frame_id, receiver, transmitter, n, readings, power, saturation)
 
 
 def decode_detections(data: bytes) -> DetectionArrayMessage:

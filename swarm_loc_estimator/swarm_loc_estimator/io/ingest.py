@@ -1,67 +1,25 @@
 """The way into the estimator, the same for a live node and for replay: raw messages in, columns out.
 
-A swarm has two inputs per robot, `<robot>/odom` and `<robot>/detections`. Bytes that are no message of the
-topic's type are counted and go no further.
+What the inputs of a swarm are stands in `inputs.py`, how each kind is read in `channels.py`. Bytes that are
+no message of the topic's type are counted and go no further.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from enum import Enum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.arrivals import DetectionRows, IntArray, Messages, OdometryRows
+from swarm_loc_estimator.core.arrivals import IntArray, Messages
 from swarm_loc_estimator.core.compiled import compiled
 from swarm_loc_estimator.core.swarm import Swarm
-from swarm_loc_estimator.io.cdr import decode_odometry
+from swarm_loc_estimator.io.channels import CHANNELS
+from swarm_loc_estimator.io.inputs import InputKind, input_topics
 from swarm_loc_estimator.io.message_batch import MessageBatch
-from swarm_loc_estimator.io.streams import DetectionReader, PoseReader
-from swarm_loc_estimator.io.typestore import DETECTIONS, ODOMETRY
-
-
-class InputKind(Enum):
-    """What a topic carries; the value is its name below the robot's."""
-
-    ODOMETRY = "odom"
-    DETECTIONS = "detections"
-
-    @property
-    def message_type(self) -> str:
-        """Type of its messages, such as nav_msgs/msg/Odometry."""
-        return ODOMETRY if self is InputKind.ODOMETRY else DETECTIONS
-
-
-@dataclass(frozen=True)
-class InputTopic:
-    """One input.
-
-    Attributes:
-        name: Relative topic name, `<robot>/odom` or `<robot>/detections`.
-        kind: What it carries.
-        robot: Index into `Swarm.robots`.
-        expected: Whether something is wrong when nothing comes; a robot without camera detects nothing.
-    """
-
-    name: str
-    kind: InputKind
-    robot: int
-    expected: bool = True
-
-
-def input_topics(swarm: Swarm) -> tuple[InputTopic, ...]:
-    """All inputs of a swarm, robot by robot."""
-    return tuple(
-        InputTopic(
-            f"{robot.name}/{kind.value}", kind, index, kind is InputKind.ODOMETRY or robot.camera is not None
-        )
-        for index, robot in enumerate(swarm.robots)
-        for kind in InputKind
-    )
-
 
 _STATISTICS_DTYPE = np.dtype(
     [
@@ -135,6 +93,7 @@ class Ingest:
 
     Args:
         swarm: Whose topics they are.
+        map_frame: Name of the frame `map` in messages.
 
     Attributes:
         topics: The inputs; their index here is the topic's number in a batch.
@@ -142,13 +101,13 @@ class Ingest:
         statistics: Per topic what came in.
     """
 
-    def __init__(self, swarm: Swarm) -> None:
+    def __init__(self, swarm: Swarm, map_frame: str = "map") -> None:
         self.topics = input_topics(swarm)
         self.handle_of: Mapping[str, int] = {topic.name: handle for handle, topic in enumerate(self.topics)}
         self._robot = np.array([topic.robot for topic in self.topics], dtype=np.int64)
-        self._is_odometry = np.array([topic.kind is InputKind.ODOMETRY for topic in self.topics], dtype=bool)
-        self._poses = PoseReader(len(self.topics), decode_odometry, names=2)
-        self._detections = DetectionReader(len(self.topics))
+        place = {kind: number for number, kind in enumerate(InputKind)}
+        self._kind = np.array([place[topic.kind] for topic in self.topics], dtype=np.int64)
+        self._channels = {kind: CHANNELS[kind](len(self.topics), map_frame) for kind in InputKind}
         self._counted = np.zeros(len(self.topics), dtype=_STATISTICS_DTYPE)
         self.statistics = [InputStatistics(self._counted[k : k + 1]) for k in range(len(self.topics))]
 
@@ -165,25 +124,22 @@ class Ingest:
 
     def frame_id(self, handle: int) -> str:
         """Frame of the newest message on a topic, "" before the first."""
-        reader = self._poses if self._is_odometry[handle] else self._detections
-        return reader.frame_ids[handle]
+        return self._channels[self.topics[handle].kind].frame_id(handle)
 
     def _read_forwards(self, batch: MessageBatch) -> Messages:
-        is_odometry = self._is_odometry[batch.topic]
-        reports, pictures = batch.chosen(is_odometry), batch.chosen(~is_odometry)
-        poses, seen = self._poses.read(reports), self._detections.read(pictures)
-        for part, columns in ((reports, poses), (pictures, seen)):
-            _count(self._counted, part.topic, part.log_ns, columns.stamp_ns, columns.valid)
-        odometry = OdometryRows(self._robot[reports.topic], poses.stamp_ns, poses.pose, reports.log_ns)
-        per_detection = (self._robot[pictures.topic], seen.stamp_ns, pictures.log_ns)
-        robot, stamp_ns, arrival_ns = (np.repeat(column, seen.count) for column in per_detection)
-        return Messages(
-            odometry if poses.valid.all() else odometry.chosen(poses.valid),
-            DetectionRows(robot, stamp_ns, seen.detection, arrival_ns),
-            begin_ns=int(batch.log_ns[0]),
-            end_ns=int(batch.log_ns[-1]),
-            malformed=int(np.sum(~poses.valid)) + int(np.sum(~seen.valid)),
-        )
+        kinds = self._kind[batch.topic]
+        present = np.bincount(kinds, minlength=len(InputKind))
+        rows: dict[str, Any] = {}
+        dropped: Counter[str] = Counter()
+        for number, (kind, channel) in enumerate(self._channels.items()):
+            if not present[number]:
+                continue
+            part = batch if present[number] == batch.size else batch.chosen(kinds == number)
+            read = channel.read(part, self._robot[part.topic])
+            _count(self._counted, part.topic, part.log_ns, read.stamp_ns, read.valid)
+            rows[kind.name.lower()] = read.rows
+            dropped.update(read.dropped, bad_message=int(np.sum(~read.valid)))
+        return Messages(int(batch.log_ns[0]), int(batch.log_ns[-1]), dropped=+dropped, **rows)
 
 
 @compiled

@@ -14,13 +14,24 @@ import numpy as np
 import numpy.typing as npt
 
 from swarm_loc_estimator.io.cdr import DETECTION_DTYPE, DETECTION_GAP, DETECTION_PADDING, ENCAPSULATION
-from swarm_loc_estimator.io.typestore import DETECTION, DETECTIONS, ODOMETRY, POSE_STAMPED, encode, typestore
+from swarm_loc_estimator.io.typestore import (
+    BRIGHTNESS,
+    DETECTION,
+    DETECTIONS,
+    ODOMETRY,
+    POSE_STAMPED,
+    POSE_WITH_COVARIANCE,
+    encode,
+    typestore,
+)
 
 Array = npt.NDArray[np.float64]
 
 _NANOSECONDS = 1_000_000_000
 POSE_DOUBLES = 7
 """Numbers of a geometry_msgs/Pose: position and quaternion."""
+_PLANE = (0, 1, 5)
+"""Rows of x, y and yaw in a 6x6 covariance."""
 _ODOMETRY_DOUBLES = 7 + 36 + 6 + 36
 UNKNOWN_COVARIANCE = np.diag([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 """6x6; a negative first element says that the sender does not know (the convention of sensor_msgs)."""
@@ -86,6 +97,52 @@ def encode_detections(frame_id: str, stamp_ns: int, detections: npt.NDArray[np.v
     return row.tobytes()
 
 
+def encode_fix(frame_id: str, stamp_ns: int, pose: npt.ArrayLike, covariance: npt.ArrayLike) -> bytes:
+    """Serialize one geometry_msgs/PoseWithCovarianceStamped of the plane.
+
+    Args:
+        frame_id: Frame of the pose, `map`.
+        stamp_ns: When the robot was there.
+        pose: (3,) x [m], y [m], yaw [rad].
+        covariance: (3, 3) of it.
+    """
+    types, whole = typestore().types, planar_covariance(0.0, 0.0, 0.0)
+    whole[np.ix_(_PLANE, _PLANE)] = covariance
+    place = _pose(position_and_quaternion(np.asarray(pose, dtype=float)[None])[0])
+    body = types["geometry_msgs/msg/PoseWithCovariance"](place, whole.reshape(36))
+    return encode(types[POSE_WITH_COVARIANCE](_header(frame_id, stamp_ns), body), POSE_WITH_COVARIANCE)
+
+
+def encode_brightness(
+    frame_id: str,
+    stamp_ns: int,
+    pair: tuple[int, int],
+    readings: npt.NDArray[Any],
+    power: int = 0,
+    saturation: int = 0,
+) -> bytes:
+    """Serialize one swarm_loc_msgs/BrightnessMatrix.
+
+    Args:
+        frame_id: base_link of the receiver.
+        stamp_ns: Middle of the exchange.
+        pair: Ids of receiver and transmitter.
+        readings: (n, n) [count], [sensor, emitter].
+        power: Index of the power mode.
+        saturation: The reading from which on a sensor tells no more [count]; 0: not known.
+    """
+    message = typestore().types[BRIGHTNESS](
+        header=_header(frame_id, stamp_ns),
+        receiver=pair[0],
+        transmitter=pair[1],
+        n=len(readings),
+        readings=readings.reshape(-1).astype(np.int32),
+        power=power,
+        saturation=saturation,
+    )
+    return encode(message, BRIGHTNESS)
+
+
 def _detections_start(frame_id: str) -> int:
     """Offset of the first detection: behind stamp, frame and count, the latter aligned to 4."""
     end = ENCAPSULATION + 12 + len(frame_id.encode()) + 1
@@ -116,17 +173,19 @@ def _split(rows: npt.NDArray[np.uint8]) -> list[bytes]:
     return [joined[begin : begin + length] for begin in range(0, len(joined), length)]
 
 
-def _header(frame_id: str) -> Any:
-    """A std_msgs/Header at time zero."""
+def _header(frame_id: str, stamp_ns: int = 0) -> Any:
+    """A std_msgs/Header."""
     types = typestore().types
-    return types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), frame_id)
+    stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, _NANOSECONDS))
+    return types["std_msgs/msg/Header"](stamp, frame_id)
 
 
-def _pose() -> Any:
-    """A geometry_msgs/Pose at the origin."""
+def _pose(numbers: npt.ArrayLike = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)) -> Any:
+    """A geometry_msgs/Pose of position and quaternion (7,)."""
     types = typestore().types
-    point = types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0)
-    return types["geometry_msgs/msg/Pose"](point, types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0))
+    x, y, z, *quaternion = np.asarray(numbers, dtype=float).tolist()
+    point = types["geometry_msgs/msg/Point"](x, y, z)
+    return types["geometry_msgs/msg/Pose"](point, types["geometry_msgs/msg/Quaternion"](*quaternion))
 
 
 @lru_cache(maxsize=1024)

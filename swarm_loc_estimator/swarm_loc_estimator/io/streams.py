@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,10 @@ from swarm_loc_estimator.io.cdr import (
     DETECTION_DTYPE,
     DETECTION_GAP,
     ENCAPSULATION,
+    BrightnessMessage,
     CdrError,
     DetectionArrayMessage,
+    FixMessage,
     OdometryMessage,
     PoseMessage,
     decode_detections,
@@ -32,6 +34,8 @@ from swarm_loc_estimator.io.message_batch import MessageBatch
 IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
 BytesArray = NDArray[np.uint8]
+
+Message = TypeVar("Message", BrightnessMessage, FixMessage)
 
 _LITTLE_ENDIAN = b"\x00\x01"
 _NANOSECONDS = 1_000_000_000
@@ -197,6 +201,51 @@ class DetectionReader:
             end = _behind_string(data, _NAMES)
             self._models = _with_model(self._models, topic, data, end, end + -end % 4 + 4)
         return message
+
+
+@dataclass(frozen=True)
+class MessageColumns(Generic[Message]):
+    """Messages (n,) read whole.
+
+    Attributes:
+        stamp_ns: (n,).
+        valid: (n,) whether the bytes were a whole message of the type.
+        messages: The valid ones.
+    """
+
+    stamp_ns: IntArray
+    valid: NDArray[np.bool_]
+    messages: list[Message]
+
+
+class EachReader(Generic[Message]):
+    """Reads messages one by one, which is enough for what comes some hundred times a second.
+
+    Args:
+        topics: How many there are.
+        decode: The complete reader of one message.
+
+    Attributes:
+        frame_ids: Per topic the frame of the newest message, "" before the first.
+    """
+
+    def __init__(self, topics: int, decode: Callable[[bytes], Message]) -> None:
+        self.frame_ids = [""] * topics
+        self._decode: Callable[[bytes], Message] = decode
+
+    def read(self, batch: MessageBatch) -> MessageColumns[Message]:
+        """Read messages whose topics are numbered from 0 to `topics`."""
+        stamp_ns, valid = np.zeros(batch.size, dtype=np.int64), np.ones(batch.size, dtype=bool)
+        messages: list[Message] = []
+        for k, (topic, _, data) in enumerate(batch.messages()):
+            try:
+                message = self._decode(data)
+            except CdrError:
+                valid[k] = False
+                continue
+            stamp_ns[k], self.frame_ids[topic] = message.stamp_ns, message.frame_id
+            messages.append(message)
+        return MessageColumns(stamp_ns, valid, messages)
 
 
 def _behind_string(data: bytes, offset: int) -> int:

@@ -16,8 +16,10 @@ MESSAGE_PACKAGE = "swarm_loc_msgs"
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
+POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 DETECTIONS = f"{MESSAGE_PACKAGE}/msg/MarkerDetectionArray"
 DETECTION = f"{MESSAGE_PACKAGE}/msg/MarkerDetection"
+BRIGHTNESS = f"{MESSAGE_PACKAGE}/msg/BrightnessMatrix"
 
 
 class DefinitionsNotFoundError(RuntimeError):

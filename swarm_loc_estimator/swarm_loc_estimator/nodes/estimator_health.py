@@ -14,7 +14,8 @@ from swarm_loc_estimator.core.fusion import Verdict
 from swarm_loc_estimator.core.measurements import MeasurementArray
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import Robot, Swarm
-from swarm_loc_estimator.io.ingest import Ingest, InputKind, InputTopic
+from swarm_loc_estimator.io.ingest import Ingest
+from swarm_loc_estimator.io.inputs import InputKind, InputTopic
 
 _SHOWN_NAMES = 8
 _FULL_LOAD = 0.95
@@ -171,7 +172,7 @@ class Health:
 
     def _input_values(self, handle: int, topic: InputTopic, now_ns: int, elapsed_s: float) -> dict[str, str]:
         """Figures of an input over the interval; begins its next one."""
-        statistics, name = self._ingest.statistics[handle], topic.kind.value
+        statistics, name = self._ingest.statistics[handle], topic.kind.topic
         arrived = statistics.received - self._received[handle]
         self._received[handle] = statistics.received
         arrival_ns, count = statistics.last_arrival_ns, statistics.late_count

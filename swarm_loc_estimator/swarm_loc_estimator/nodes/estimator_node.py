@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -26,7 +27,8 @@ from std_srvs.srv import Trigger
 from swarm_loc_estimator.core.estimator import SwarmEstimate, SwarmEstimator
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.swarm import Swarm
-from swarm_loc_estimator.io.ingest import Ingest, InputKind
+from swarm_loc_estimator.io.ingest import Ingest
+from swarm_loc_estimator.io.inputs import InputKind
 from swarm_loc_estimator.io.message_batch import MessageBatch
 from swarm_loc_estimator.io.swarm_file import load_swarm
 from swarm_loc_estimator.nodes.declare import declare_parameters
@@ -37,13 +39,18 @@ from swarm_loc_estimator.nodes.fusion_pace import FusionPace
 from swarm_loc_estimator.nodes.running import run_node, spin
 from swarm_loc_estimator.nodes.seating import SeatRequestError, planar_seat
 from swarm_loc_estimator.nodes.warm_up import warm_up
-from swarm_loc_msgs.msg import MarkerDetectionArray
+from swarm_loc_msgs.msg import BrightnessMatrix, MarkerDetectionArray
 from swarm_loc_msgs.srv import SetRobotPose
 
 INPUT_QOS = QoSProfile(depth=1000)
 """Deep enough for a busy moment as long as the horizon; what is older would not be used anyway."""
 
-_MESSAGE_CLASSES = {InputKind.ODOMETRY: Odometry, InputKind.DETECTIONS: MarkerDetectionArray}
+_MESSAGE_CLASSES = {
+    InputKind.ODOMETRY: Odometry,
+    InputKind.DETECTIONS: MarkerDetectionArray,
+    InputKind.BRIGHTNESS: BrightnessMatrix,
+    InputKind.FIXES: PoseWithCovarianceStamped,
+}
 NO_CLOCK = "use_sim_time is true but no /clock has come"
 _DIAGNOSTICS_PERIOD_S = 1.0
 _THROTTLE_S = 30.0
@@ -77,7 +84,7 @@ class EstimatorNode(Node):
         self.get_logger().info("compiling the estimator: a minute the first time on a machine")
         warm_up()
         self._estimator = create_estimator(self._swarm, self._wishes.settings)
-        self._ingest = Ingest(self._swarm)
+        self._ingest = Ingest(self._swarm, self._wishes.map_frame)
         self._backlog: list[tuple[int, bytes, int]] = []
         self._estimate: SwarmEstimate | None = None
         self._jumps = 0

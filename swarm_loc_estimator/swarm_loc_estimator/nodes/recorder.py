@@ -13,13 +13,13 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
 from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.io.ingest import InputKind
+from swarm_loc_estimator.io.inputs import InputKind
 from swarm_loc_msgs.msg import SwarmPoses
 
 _DEEP = QoSProfile(depth=1000)
 _ESTIMATOR = "estimator"
 _DROPPED = "dropped: "
-_RECEIVED = tuple(f"{kind.value} received" for kind in InputKind)
+_RECEIVED = tuple(f"{kind.topic} received" for kind in InputKind)
 
 
 class Poses(NamedTuple):

@@ -218,7 +218,8 @@ class StandIn:
 
     def receive(self, messages: Messages) -> None:
         """Remember whose and when."""
-        assert messages.detections.robot.size == messages.malformed == 0
+        assert not messages.detections.robot.size
+        assert not messages.dropped
         rows = messages.odometry
         assert np.all(rows.arrival_ns >= rows.stamp_ns)
         self.odometry += zip(rows.robot.tolist(), rows.stamp_ns.tolist(), strict=True)

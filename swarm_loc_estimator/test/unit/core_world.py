@@ -102,7 +102,7 @@ class Event:
         odometry = OdometryRows(robot[:rows], stamp_ns[:rows], poses, arrival_ns[:rows])
         each = np.zeros(self.detections.size, dtype=np.int64)
         seen = DetectionRows(robot[each], stamp_ns[each], self.detections, arrival_ns[each])
-        estimator.receive(Messages(odometry, seen, now_ns, now_ns))
+        estimator.receive(Messages(now_ns, now_ns, odometry, seen))
 
 
 @dataclass(frozen=True)

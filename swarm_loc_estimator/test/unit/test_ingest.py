@@ -16,7 +16,8 @@ from swarm_loc_estimator.io.cdr import (
     decode_odometry,
     decode_pose_stamped,
 )
-from swarm_loc_estimator.io.ingest import Ingest, InputKind
+from swarm_loc_estimator.io.ingest import Ingest
+from swarm_loc_estimator.io.inputs import InputKind
 from swarm_loc_estimator.io.message_batch import MessageBatch
 from swarm_loc_estimator.io.messages import encode_detections, encode_odometry, encode_pose_stamped
 from swarm_loc_estimator.io.streams import DetectionReader, PoseReader
@@ -110,8 +111,9 @@ def test_damaged_bytes_are_refused_before_and_after_a_good_message(kind: str) ->
 
 def test_each_topic_is_read_and_counted_and_malformed_ones_go_no_further() -> None:
     ingest = Ingest(Swarm((Robot("a"), Robot("b", camera=None))))
-    assert [topic.name for topic in ingest.topics] == ["a/odom", "a/detections", "b/odom", "b/detections"]
-    assert [topic.name for topic in ingest.topics if not topic.expected] == ["b/detections"]
+    kinds = ("odom", "detections", "brightness", "fix")
+    assert [topic.name for topic in ingest.topics] == [f"{name}/{kind}" for name in "ab" for kind in kinds]
+    assert [topic.name for topic in ingest.topics if topic.expected] == ["a/odom", "a/detections", "b/odom"]
 
     odom, seen = ingest.handle_of["b/odom"], ingest.handle_of["a/detections"]
     pose = (1.0, 2.0, 0.0)
@@ -127,7 +129,7 @@ def test_each_topic_is_read_and_counted_and_malformed_ones_go_no_further() -> No
     assert read.detections.detection["id"].tolist() == [7, 8]
     assert [read.detections.robot.tolist(), read.detections.stamp_ns.tolist()] == [[0, 0], [15, 15]]
     assert read.detections.arrival_ns.tolist() == [50, 50]
-    assert (read.begin_ns, read.end_ns, read.malformed) == (14, 50, 1)
+    assert (read.begin_ns, read.end_ns, read.dropped) == (14, 50, {"bad_message": 1})
     statistics = ingest.statistics[odom]
     assert (statistics.received, statistics.malformed) == (3, 1)
     assert (statistics.last_stamp_ns, statistics.last_arrival_ns) == (20, 30)
