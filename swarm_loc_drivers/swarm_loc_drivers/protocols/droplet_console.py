@@ -167,6 +167,12 @@ class StepLength(NamedTuple):
     per_kilostep: int
 
 
+class Title(NamedTuple):
+    """What stands above a table."""
+
+    text: str
+
+
 class NotRecognised(NamedTuple):
     """A command that the firmware does not know."""
 
@@ -197,7 +203,7 @@ class Unknown(NamedTuple):
 
 Event = (
     Echo | Identity | MoveStarted | Relayed | SendAborted | EmissionFailed | RangeBearing | Matrix
-    | SilentSensor | MotorTrims | StepLength | NotRecognised | Overflow | Complaint | Broken | Unknown
+    | SilentSensor | MotorTrims | StepLength | Title | NotRecognised | Overflow | Complaint | Broken | Unknown
 )  # fmt: skip
 
 
@@ -260,6 +266,7 @@ _LINES: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Event]], ...] = t
         (r"!!!\tGot \d+ consecutive nothings from sensor (\d)\.\t!!!", lambda m: SilentSensor(int(m[1]))),
         (rf"\tdir: ([0-7])\t{_NUMBER}\t{_NUMBER}\t{_NUMBER}\t", _motor_trims),
         (r"\t([0-7])\t(\d{1,5})", lambda m: StepLength(*_integers(m))),
+        (r"Motor Values|Dist \(mm\) per kilostep", lambda m: Title(m[0])),
         (r"\tCommand \( (.*) \) not recognized\.", lambda m: NotRecognised(m[1])),
         (r"ERROR: Serial input buffer capacity of \d+ characters exceeded\.", lambda _: Overflow()),
         (r"(?:!!!|error|ERROR|Error).*", lambda m: Complaint(m[0])),

@@ -37,6 +37,7 @@ from swarm_loc_drivers.protocols.droplet_console import (
     SendAborted,
     SilentSensor,
     StepLength,
+    Title,
     Unknown,
 )
 
@@ -83,6 +84,8 @@ PRINTED: list[tuple[str, Event]] = [
     ("\tCommand ( dance ) not recognized.\r\n", NotRecognised("dance")),
     ("ERROR: Serial input buffer capacity of 64 characters exceeded.\r\n", Overflow()),
     ("ERROR! Should NOT be.\r\n", Complaint("ERROR! Should NOT be.")),
+    ("Motor Values\r\n", Title("Motor Values")),
+    ("Dist (mm) per kilostep\r\n", Title("Dist (mm) per kilostep")),
     ("\tdir: 7\t-25\t0\t31\t\r\n", MotorTrims(7, (-25, 0, 31))),
     ("\t7\t65535\r\n", StepLength(7, 65535)),
     ("hello\r\n", Unknown("hello")),

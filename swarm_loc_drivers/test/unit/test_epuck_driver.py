@@ -132,6 +132,7 @@ class Lossy:
 
     def __init__(self, firmware: SerialFirmware, share: float, seed: int) -> None:
         self._firmware = firmware
+        self.stream = firmware.stream
         self._rng = np.random.default_rng(seed)
         self.share = share
         self.hurt = 0
@@ -267,6 +268,9 @@ def test_a_port_that_is_not_there_is_named_and_waited_for(robots: Robots) -> Non
 def test_a_port_where_nobody_speaks_the_language_is_told(robots: Robots) -> None:
     class Mute:
         def receive(self, _: bytes) -> bytes:
+            return b""
+
+        def stream(self) -> bytes:
             return b""
 
     robots.serial(EPUCK1, wrap=lambda _: Mute())

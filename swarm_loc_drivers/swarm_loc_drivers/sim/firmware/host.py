@@ -16,7 +16,6 @@ from typing import Protocol
 
 from typing_extensions import Self
 
-from swarm_loc_drivers.sim.firmware.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.firmware.wifi_firmware import WifiFirmware
 
 _CHUNK = 4096
@@ -39,10 +38,20 @@ class _Port(Protocol):
         """End it."""
 
 
+class ConsoleFirmware(Protocol):
+    """A firmware behind a serial port."""
+
+    def receive(self, data: bytes) -> bytes:
+        """Take bytes; what the robot answers."""
+
+    def stream(self) -> bytes:
+        """What the robot sends by itself."""
+
+
 class _PtyPort:
     """A pseudo-terminal; it stays open while clients come and go, as a robot's Bluetooth module does."""
 
-    def __init__(self, firmware: SerialFirmware, link: Path | None) -> None:
+    def __init__(self, firmware: ConsoleFirmware, link: Path | None) -> None:
         self._firmware = firmware
         self._link = link
         self._master, self._slave = pty.openpty()
@@ -57,11 +66,17 @@ class _PtyPort:
         return self._master
 
     def on_readable(self) -> None:
-        with contextlib.suppress(BlockingIOError):  # what the client does not take is lost, as on a wire
-            os.write(self._master, self._firmware.receive(os.read(self._master, _CHUNK)))
+        with contextlib.suppress(BlockingIOError):
+            self._send(self._firmware.receive(os.read(self._master, _CHUNK)))
 
     def on_cycle(self) -> None:
-        """The serial firmware only answers."""
+        self._send(self._firmware.stream())
+
+    def _send(self, data: bytes) -> None:
+        """What the client does not take is lost, as on a wire."""
+        if data:
+            with contextlib.suppress(BlockingIOError):
+                os.write(self._master, data)
 
     def close(self) -> None:
         if self._link is not None:
@@ -144,7 +159,7 @@ class FirmwareHost:
         self._selector = selectors.DefaultSelector()
         self._ports: list[_Port] = []
 
-    def serve_pty(self, firmware: SerialFirmware, link: Path | None = None) -> Path:
+    def serve_pty(self, firmware: ConsoleFirmware, link: Path | None = None) -> Path:
         """Put a firmware behind a pseudo-terminal.
 
         Args:

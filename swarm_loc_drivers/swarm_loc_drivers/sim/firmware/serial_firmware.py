@@ -46,6 +46,10 @@ class SerialFirmware:
             replies.append(reply)
         return b"".join(replies)
 
+    def stream(self) -> bytes:
+        """It only answers."""
+        return b""
+
     def _run(self) -> Generator[bytes, int, None]:
         """The firmware's main loop: yields what to send, gets the next byte."""
         byte = yield b""
