@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Protocol
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -36,11 +37,21 @@ class DriverDiagnostics:
         name: Of the status.
         address: Where the robot answers.
         rates: Counts of which the rate is told besides.
+        wrong: Counts of which the log tells, and what they mean.
     """
 
-    def __init__(self, node: Node, driver: Driver, name: str, address: str, rates: Sequence[str]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        driver: Driver,
+        name: str,
+        address: str,
+        rates: Sequence[str],
+        wrong: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
         self._node, self._driver = node, driver
         self._name, self._address, self._rates = name, address, tuple(rates)
+        self._wrong = wrong
         self._reported: Counter[str] = Counter()
         self._reported_s = time.monotonic()
         self._told_trouble = driver.trouble
@@ -51,6 +62,7 @@ class DriverDiagnostics:
     def _report(self) -> None:
         trouble, counts = self._driver.trouble, Counter(self._driver.counts)
         self._log(trouble)
+        self._warn(counts)
         now_s = time.monotonic()
         elapsed_s, self._reported_s = now_s - self._reported_s, now_s
         values = {name: str(count) for name, count in sorted(counts.items())}
@@ -77,3 +89,10 @@ class DriverDiagnostics:
             self._node.get_logger().warning(trouble, throttle_duration_sec=_THROTTLE_S)
         else:
             self._node.get_logger().info(f"connected to {self._address}")
+
+    def _warn(self, counts: Counter[str]) -> None:
+        """Say what went wrong since the last report, once in a while."""
+        news = [name for name in self._wrong if counts[name] > self._reported[name]]
+        if news:
+            words = "; ".join(f"{counts[name]} {name}: {self._wrong[name]}" for name in news)
+            self._node.get_logger().warning(f"so far {words}", throttle_duration_sec=_THROTTLE_S)

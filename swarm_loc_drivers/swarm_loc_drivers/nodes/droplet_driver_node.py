@@ -1,0 +1,129 @@
+"""The driver of a Droplet at a cable as a ROS 2 node; one per cable, in the robot's namespace.
+
+    ./run swarm_loc_drivers droplet_driver_node --ros-args -r __ns:=/droplet1 -p address:=/dev/ttyUSB0 \
+        -p partners:='["6B6F", "DF64"]'
+
+It follows `cmd_vel` and publishes `odom`, `brightness`, `/tf` and `/diagnostics`; for Droplets without cable
+it follows and publishes `cmd_vel`, `odom` and `/tf` besides. Service: `~/measure`. Parameters: see
+`droplet_parameters.py` and the package's README.
+"""
+
+from __future__ import annotations
+
+import sys
+from array import array
+from functools import partial
+from typing import Any
+
+from geometry_msgs.msg import Twist
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from swarm_loc_drivers.core.droplet_driver import OWN, DropletDriver, DropletListeners
+from swarm_loc_drivers.core.droplet_exchange import Brightness
+from swarm_loc_drivers.core.odometry_state import OdometryState
+from swarm_loc_drivers.nodes.driver_diagnostics import DriverDiagnostics
+from swarm_loc_drivers.nodes.droplet_parameters import DropletParameters, droplet_settings
+from swarm_loc_drivers.nodes.odometry_output import OdometryOutput, stamp_message, transform_publisher
+from swarm_loc_estimator.nodes.declare import declare_parameters
+from swarm_loc_estimator.nodes.running import run_node, spin
+from swarm_loc_msgs.msg import BrightnessMatrix
+
+_COMMAND_QOS = QoSProfile(depth=1)
+_BRIGHTNESS_QOS = QoSProfile(depth=50)
+_RATES = ("exchanges", "lines")
+_WRONG = {
+    "broken_matrices": "print-outs that were no whole matrix",
+    "equal_powers": "exchanges as bright at near as at far power; does the firmware obey set_ir?",
+    "firmware_errors": "lines in which the firmware complains",
+    "foreign_receiver": "matrices that another robot must have measured",
+    "self_heard": "matrices of a robot that heard itself",
+    "silent_sensors": "reports of a sensor that reads nothing",
+    "unknown_commands": "commands that the firmware does not know",
+    "unknown_ids": "matrices of robots that are not among the partners",
+}
+
+
+class DropletDriverNode(Node):
+    """Hands velocities to the driver and publishes what it reports.
+
+    Args:
+        node_arguments: Further arguments of `rclpy.node.Node`.
+
+    Raises:
+        ParameterError: A parameter cannot be used.
+    """
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("droplet_driver", **node_arguments)
+        self._wishes = declare_parameters(self, DropletParameters)
+        settings = droplet_settings(self._wishes)
+        robot = self.get_namespace().strip("/")
+        prefix = f"{robot}/" if robot else ""
+        self._base_frame = f"{prefix}{self._wishes.base_frame}"
+        self._transforms = transform_publisher(self) if self._wishes.publish_tf else None
+        self._brightness = self.create_publisher(BrightnessMatrix, "brightness", _BRIGHTNESS_QOS)
+        above = robot.rpartition("/")[0]
+        self._odometry = {OWN: self._odometry_output("odom", prefix)}
+        for name in settings.relayed:
+            path = f"{above}/{name}" if above else name
+            self._odometry[name] = self._odometry_output(f"/{path}/odom", f"{path}/")
+        listeners = DropletListeners(self._publish_odometry, self._publish_brightness)
+        self._driver = DropletDriver(settings, listeners, self._now_ns)
+        for name in self._odometry:
+            topic = f"/{above}/{name}/cmd_vel".replace("//", "/") if name else "cmd_vel"
+            self.create_subscription(Twist, topic, partial(self._on_cmd_vel, name), _COMMAND_QOS)
+        self.create_service(Trigger, "~/measure", self._on_measure)
+        name, address = f"{prefix}{self.get_name()}", settings.device
+        self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
+        self._driver.start()
+
+    def _odometry_output(self, topic: str, prefix: str) -> OdometryOutput:
+        odom_frame, base_frame = f"{prefix}{self._wishes.odom_frame}", f"{prefix}{self._wishes.base_frame}"
+        return OdometryOutput(self, topic, odom_frame, base_frame, self._transforms)
+
+    def destroy_node(self) -> None:
+        """Stop the robots first."""
+        self._driver.stop()
+        super().destroy_node()
+
+    def _now_ns(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
+
+    def _on_cmd_vel(self, name: str, message: Twist) -> None:
+        self._driver.set_velocity(name, (message.linear.x, message.linear.y, message.angular.z))
+
+    def _on_measure(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = bool(self._wishes.partners) and not self._wishes.turns
+        if response.success:
+            self._driver.request_exchanges()
+            response.message = f"{len(self._wishes.partners)} partners are asked to emit."
+        else:
+            response.message = "Nobody is asked: there are no partners, or Droplets take turns."
+        return response
+
+    def _publish_odometry(self, name: str, state: OdometryState) -> None:
+        self._odometry[name].publish(state)
+
+    def _publish_brightness(self, receiver: int, one: Brightness) -> None:
+        message = BrightnessMatrix(
+            header=Header(stamp=stamp_message(one.stamp_ns), frame_id=self._base_frame),
+            receiver=receiver,
+            transmitter=one.transmitter,
+            n=len(one.readings),
+            power=int(one.power),
+            saturation=self._wishes.saturation,
+        )
+        message.readings = array("i", one.readings.ravel().tolist())
+        self._brightness.publish(message)
+
+
+def main() -> int:
+    """Run until SIGINT or SIGTERM; 1 when a parameter cannot be used."""
+    return run_node("droplet_driver_node", DropletDriverNode, spin)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

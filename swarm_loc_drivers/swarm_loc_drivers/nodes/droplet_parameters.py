@@ -1,0 +1,133 @@
+"""What a user may set about `droplet_driver_node`."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from swarm_loc_drivers.core.commanded_motion import MotionNoise
+from swarm_loc_drivers.core.droplet_driver import DropletSettings
+from swarm_loc_drivers.core.droplet_exchange import AskSettings
+from swarm_loc_drivers.core.droplet_session import SessionSettings
+from swarm_loc_drivers.core.droplet_turns import SHORTEST_TURN_S, TurnSettings
+from swarm_loc_drivers.protocols.droplet import DROPLET_MODELS, ELEMENTS, FULL_POWER, DropletModel
+from swarm_loc_estimator.core.swarm import number
+from swarm_loc_estimator.nodes.parameter_table import ParameterError, flag, text, texts
+
+_ID = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})")
+_RELAYED = re.compile(r"([A-Za-z]\w*)=(.*)")
+
+
+@dataclass(frozen=True)
+class DropletParameters:
+    """Parameters of `droplet_driver_node`."""
+
+    address: str = text("", "the serial port of the Droplet at the cable", required=True)
+    model: str = text(
+        "droplet", "droplet, or audio_droplet, which moves only ahead, back and in turns", required=True
+    )
+    reply_timeout_s: float = number(0.3, "s", 0.01, 10.0, "how long an echo or an answer may take")
+    cmd_vel_timeout_s: float = number(0.5, "s", 0.02, 10.0, "without cmd_vel for so long the robot stops")
+    stride_s: float = number(
+        2.0, "s", 0.2, 60.0, "how far ahead a motion is commanded; so long it goes on if the driver dies"
+    )
+    odom_rate: float = number(5.0, "1/s", 0.1, 20.0, "published odometry")
+    walk_noise: float = number(
+        1e-3, "m", 0.0, 1.0, "variance along and across of a walk per metre [m^2/m], of what is believed"
+    )
+    veer_noise: float = number(0.1, "rad^2/m", 0.0, 100.0, "likewise of the heading per metre walked")
+    turn_noise: float = number(0.01, "rad", 0.0, 10.0, "likewise of the heading per radian turned")
+    partners: tuple[str, ...] = texts("ids of the Droplets to measure, in hexadecimal as they print them")
+    exchange_rate: float = number(
+        0.5, "1/s", 0.0, 2.0, "exchanges in which a partner is asked to emit; 0: only on request"
+    )
+    retries: int = number(5, "1", 0, 100, "how often a partner is asked anew when no matrix comes")
+    far_power: int = number(FULL_POWER, "1", 1, FULL_POWER, "of the emitters in far exchanges")
+    near_power: int = number(40, "1", 0, FULL_POWER - 1, "likewise in near ones; 0: only far ones")
+    saturation: int = number(
+        240, "count", 1, 4095, "a reading tells no more from here on: full scale less ambient light"
+    )
+    least_brightness: int = number(
+        5, "count", 0, 4095, "a far matrix of no brighter reading shows nobody and is asked for anew"
+    )
+    turns: int = number(
+        0,
+        "1",
+        0,
+        10_000,
+        "with a cable at every Droplet: how many take turns to emit; 0: partners are asked",
+    )
+    turn: int = number(0, "1", 0, 9_999, "which turn is this one's, counted from 0")
+    turn_s: float = number(1.0, "s", SHORTEST_TURN_S, 60.0, "how long a turn lasts")
+    relayed: tuple[str, ...] = texts(
+        "NAME=ID of Droplets without a cable, which are driven by infrared through this one"
+    )
+    relay_loss: float = number(0.1, "1", 0.0, 1.0, "share of the commands by infrared that are not heard")
+    odom_frame: str = text("odom", "the pose is in <robot>/odom_frame", required=True)
+    base_frame: str = text("base_link", "the pose is that of <robot>/base_frame", required=True)
+    publish_tf: bool = flag(True, "publish the transform from odom to base_link")
+
+
+def droplet_settings(wishes: DropletParameters) -> DropletSettings:
+    """What the parameters mean together.
+
+    Raises:
+        ParameterError: One cannot be used, or does not go with another.
+    """
+    if not wishes.address.startswith("/"):
+        raise ParameterError(
+            f"parameter address = '{wishes.address}' must be the path of a serial port, such as /dev/ttyUSB0."
+        )
+    return DropletSettings(
+        device=wishes.address,
+        session=SessionSettings(_model(wishes), ELEMENTS, wishes.reply_timeout_s, _exchanges(wishes)),
+        noise=MotionNoise(wishes.walk_noise, wishes.veer_noise, wishes.turn_noise),
+        stride_s=wishes.stride_s,
+        relayed=_relayed(wishes),
+        relay_loss=wishes.relay_loss,
+        command_timeout_s=wishes.cmd_vel_timeout_s,
+        odometry_period_s=1.0 / wishes.odom_rate,
+    )
+
+
+def _model(wishes: DropletParameters) -> DropletModel:
+    if wishes.model not in DROPLET_MODELS:
+        raise ParameterError(
+            f"parameter model = '{wishes.model}' must be one of {', '.join(DROPLET_MODELS)}."
+        )
+    return DROPLET_MODELS[wishes.model]
+
+
+def _exchanges(wishes: DropletParameters) -> AskSettings | TurnSettings:
+    """How brightness is measured."""
+    partners = tuple(_id("partners", one) for one in wishes.partners)
+    if wishes.near_power >= wishes.far_power:
+        raise ParameterError(
+            f"parameter near_power = {wishes.near_power} must be below far_power = {wishes.far_power}."
+        )
+    powers = (wishes.far_power, wishes.near_power) if wishes.near_power else (wishes.far_power,)
+    if not wishes.turns:
+        period_s = 1.0 / wishes.exchange_rate if wishes.exchange_rate else 0.0
+        return AskSettings(partners, period_s, wishes.retries, powers, wishes.least_brightness)
+    if wishes.turn >= wishes.turns:
+        raise ParameterError(f"parameter turn = {wishes.turn} must be below turns = {wishes.turns}.")
+    return TurnSettings(wishes.turn, wishes.turns, wishes.turn_s, powers, partners)
+
+
+def _relayed(wishes: DropletParameters) -> dict[str, int]:
+    """Names and ids of the robots without a cable."""
+    found = {}
+    for one in wishes.relayed:
+        match = _RELAYED.fullmatch(one)
+        if match is None:
+            raise ParameterError(f"parameter relayed has '{one}' but must have entries as droplet2=6B6F.")
+        found[match[1]] = _id("relayed", match[2])
+    return found
+
+
+def _id(parameter: str, value: str) -> int:
+    """A Droplet's id."""
+    match = _ID.fullmatch(value)
+    if match is None or not int(match[1], 16):
+        raise ParameterError(f"parameter {parameter} has the id '{value}' but ids lie in [1, FFFF].")
+    return int(match[1], 16)
