@@ -135,9 +135,10 @@ class CommandedMotion:
         dx, dy = (steps * part for part in self._turned(gait, self._pose[2]))
         self._covariance = carried_on(self._covariance, dx, dy)
         walk, _, heading = self._body_noise(gait, steps)
-        # an error of the heading that grows on the way leads aside by half of it
-        effect = np.array([-0.5 * dy, 0.5 * dx, 1.0])
-        self._covariance += np.diag([walk, walk, 0.0]) + heading * np.outer(effect, effect)
+        # an error of the heading that grows on the way leads aside by half of it, give or take
+        effect, spread = np.array([-0.5 * dy, 0.5 * dx, 1.0]), np.array([-dy, dx, 0.0])
+        self._covariance += np.diag([walk, walk, 0.0])
+        self._covariance += heading * (np.outer(effect, effect) + np.outer(spread, spread) / 12.0)
         theta = self._pose[2] + steps * gait.turn
         self._pose = np.array(
             [self._pose[0] + dx, self._pose[1] + dy, (theta + math.pi) % (2.0 * math.pi) - math.pi]

@@ -18,7 +18,11 @@ from numpy.typing import NDArray
 from swarm_loc_drivers.core.console_talk import MARGIN_NS, ConsoleTalk, Talk, relay
 from swarm_loc_drivers.protocols import droplet_console as protocol
 from swarm_loc_drivers.protocols.droplet_console import Matrix, Said, SendAborted
-from swarm_loc_drivers.protocols.droplet_infrared import EMITTED_AFTER_NS, PRINTED_AFTER_NS
+from swarm_loc_drivers.protocols.droplet_infrared import (
+    EMITTED_AFTER_NS,
+    PRINTED_AFTER_NS,
+    SET_POWER_DELAY_NS,
+)
 
 _BRIGHTER = 1.5
 """So much brighter in all is the far matrix of a pair than the near one, at any distance up to 30 cm."""
@@ -252,6 +256,7 @@ class Asking:
             if len(self._settings.powers) > 1:
                 line = protocol.set_power(self._settings.powers[power])
                 yield from relay(self._console, partner, line)
+                yield from self._console.pause(SET_POWER_DELAY_NS)
                 if self._aborted:
                     return None
             heard_ns = yield from relay(self._console, partner, protocol.EMIT)

@@ -15,6 +15,7 @@ from swarm_loc_drivers.protocols import droplet_console as protocol
 from swarm_loc_drivers.protocols.droplet import DIRECTIONS, DropletModel, Gait, gait
 from swarm_loc_drivers.protocols.droplet_console import Identity, MotorTrims, MoveStarted, Said, StepLength
 
+_TRIES = 3
 _IDLE_NS = 20_000_000
 """While nothing is said, look so often what is to be done."""
 
@@ -141,9 +142,11 @@ class DropletSession:
 
     def _answered(self, line: str, condition: Callable[[], bool]) -> Talk[None]:
         """Ask for something that the robot must be able to say."""
-        yield from self._console.enter(line)
-        if not (yield from self._console.until(condition)):
-            raise SessionError(f"the robot does not answer '{line}'")
+        for _ in range(_TRIES):
+            yield from self._console.enter(line)
+            if (yield from self._console.until(condition)):
+                return
+        raise SessionError(f"the robot does not answer '{line}'")
 
     def _interlude(self) -> Talk[bool]:
         """Do what cannot wait: tell the robots how to move; whether to go on."""

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from swarm_loc_drivers.core.console_talk import ConsoleTalk, Talk
+from swarm_loc_drivers.core.console_talk import MARGIN_NS, ConsoleTalk, Talk
 from swarm_loc_drivers.core.droplet_exchange import (
     Brightness,
     MatrixJudge,
@@ -22,7 +22,11 @@ from swarm_loc_drivers.core.droplet_exchange import (
 )
 from swarm_loc_drivers.protocols import droplet_console as protocol
 from swarm_loc_drivers.protocols.droplet_console import Matrix, Said
-from swarm_loc_drivers.protocols.droplet_infrared import EMITTED_AFTER_NS, PRINTED_AFTER_NS
+from swarm_loc_drivers.protocols.droplet_infrared import (
+    EMITTED_AFTER_NS,
+    PRINTED_AFTER_NS,
+    SET_POWER_DELAY_NS,
+)
 
 _LATEST = 0.5
 """Later in a half than this share of it no emission begins: it might end in the next one."""
@@ -147,6 +151,7 @@ class Turns:
         if power != self._power:
             self._power = None
             yield from self._console.enter(protocol.set_power(power))
+            yield from self._console.pause(SET_POWER_DELAY_NS + MARGIN_NS)
             self._power = power
         if (yield from self._interlude()):
             yield from self._console.enter(protocol.EMIT)

@@ -17,6 +17,8 @@ _HEADER = 7
 
 HANDLING_NS = 5 * _MS
 """From the last byte of a command until it is obeyed."""
+SET_POWER_DELAY_NS = 10 * _MS
+"""From the command to change the power until it has changed."""
 EMIT_DELAY_NS = 5 * _MS
 """From the command to emit until the call."""
 CALL_NS = (_HEADER + 1) * _BYTE_NS

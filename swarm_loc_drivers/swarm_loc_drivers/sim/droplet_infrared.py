@@ -18,6 +18,7 @@ from .droplet_light import DropletLight, distance_to_segments
 
 _REMEMBERED_NS = 1_000_000_000
 _BASELINE_PERIOD_NS = 5_407_000_000
+_DRIFT_NS = 100_000_000
 _RECEIVING, _TRANSMITTING, _TIMED, _BLOCKED = 1, 2, 4, 8
 
 
@@ -123,6 +124,7 @@ class DropletInfrared:
         self._exchanges: list[_Exchange] = []
         self._ambient = rng.uniform(0.0, settings.ambient, (len(ids), platform.n))
         self._baseline = np.rint(self._ambient).astype(np.int64)
+        self._drift_due_ns = now_ns
         self._baseline_due_ns = now_ns + rng.integers(0, _BASELINE_PERIOD_NS, len(ids))
         self.heard: list[list[Command | Measured]] = [[] for _ in ids]
         self.counts: Counter[str] = Counter()
@@ -160,11 +162,9 @@ class DropletInfrared:
 
     def step(self, now_ns: int, poses: FloatArray) -> None:
         """Let time pass."""
-        step_s = (now_ns - self._now_ns) * 1e-9
         self._now_ns = now_ns
-        walk = self._settings.ambient_walk * np.sqrt(step_s)
-        self._ambient = np.abs(self._ambient + walk * self._rng.standard_normal(self._ambient.shape))
-        self._refresh_baselines()
+        if now_ns >= self._drift_due_ns:
+            self._drift()
         for message in self._messages:
             if not message.done and message.end_ns <= now_ns:
                 message.done = True
@@ -251,8 +251,11 @@ class DropletInfrared:
         for robot, readings in zip(exchange.receivers.tolist(), exchange.readings, strict=True):
             self.heard[robot].append(Measured(emitter, readings, exchange.end_ns))
 
-    def _refresh_baselines(self) -> None:
-        """Robots measure the ambient light, now and then."""
+    def _drift(self) -> None:
+        """The ambient light changes; robots measure it now and then."""
+        self._drift_due_ns += _DRIFT_NS
+        walk = self._settings.ambient_walk * np.sqrt(_DRIFT_NS * 1e-9)
+        self._ambient = np.abs(self._ambient + walk * self._rng.standard_normal(self._ambient.shape))
         due = np.flatnonzero(self._baseline_due_ns <= self._now_ns)
         self._baseline_due_ns[due] += _BASELINE_PERIOD_NS
         free = due[[not self.status(robot) for robot in due.tolist()]] if len(due) else due

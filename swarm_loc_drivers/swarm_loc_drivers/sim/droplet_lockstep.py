@@ -15,9 +15,11 @@ from swarm_loc_drivers.core.droplet_mover import DropletMover
 from swarm_loc_drivers.core.droplet_session import DropletSession, SessionSettings
 from swarm_loc_drivers.core.odometry_state import OdometryState
 from swarm_loc_drivers.core.velocity_command import Velocity, VelocityCommand
+from swarm_loc_drivers.protocols.droplet_console import TERMINATOR
 
 from .droplet_world import DropletWorld, SimulatedDroplet
-from .firmware.droplet_firmware import DropletFirmware
+from .firmware.droplet_firmware import DropletFirmware, Print
+from .firmware.host import ConsoleFirmware
 
 _TIMEOUT_S = 1.0
 STRIDE_S = 2.0
@@ -48,7 +50,8 @@ class Cable:
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._world = world
-        self._firmware = DropletFirmware(SimulatedDroplet(world, robot))
+        self._body = SimulatedDroplet(world, robot)
+        self._firmware: ConsoleFirmware = DropletFirmware(self._body)
         self._command = VelocityCommand(
             _TIMEOUT_S, lambda: world.now_ns, self.counts, lambda: 1e-9 * world.now_ns
         )
@@ -59,6 +62,20 @@ class Cable:
     def set_velocity(self, velocity: Velocity) -> None:
         """Have the robot move so for a while."""
         self._command.set(velocity)
+
+    def print_with(self, print_matrix: Print) -> None:
+        """Have the robot begin anew with another program of its user, who prints matrices so."""
+        self._firmware = DropletFirmware(self._body, print_matrix)
+
+    def wire(self, between: Callable[[ConsoleFirmware], ConsoleFirmware]) -> ConsoleFirmware:
+        """Put something between firmware and session; what the firmware was before."""
+        firmware = self._firmware
+        self._firmware = between(firmware)
+        return firmware
+
+    def enter(self, line: str) -> None:
+        """Type a line at the console, past the session."""
+        self._firmware.receive(line.encode() + TERMINATOR)
 
     def odometry(self) -> OdometryState:
         """Where the robot is believed to be."""
@@ -76,17 +93,35 @@ class Cable:
                 return
 
 
-def run(world: DropletWorld, cables: Sequence[Cable], steps: int, control: Callable[[], None]) -> None:
+class Loose:
+    """A robot without a cable, which is reached by infrared only.
+
+    Args:
+        world: Where the robot lives.
+        robot: Its index.
+    """
+
+    def __init__(self, world: DropletWorld, robot: int) -> None:
+        self._firmware = DropletFirmware(SimulatedDroplet(world, robot))
+
+    def step(self) -> None:
+        """Let it work; nobody reads what it prints."""
+        self._firmware.stream()
+
+
+def run(
+    world: DropletWorld, robots: Sequence[Cable | Loose], steps: int, control: Callable[[], None]
+) -> None:
     """Let time pass.
 
     Args:
         world: The world.
-        cables: Of its robots.
+        robots: All of its robots.
         steps: How many steps of the world.
         control: Called after every step; sets velocities, keeps records.
     """
     for _ in range(steps):
         world.step()
-        for cable in cables:
-            cable.step()
+        for robot in robots:
+            robot.step()
         control()

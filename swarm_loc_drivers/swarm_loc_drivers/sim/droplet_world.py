@@ -119,7 +119,13 @@ class DropletWorld:
 
     def step(self) -> None:
         """Go on by STEP_NS."""
-        step_s = STEP_NS * 1e-9
+        if self._twists.any():
+            self._creep(STEP_NS * 1e-9)
+        self.now_ns += STEP_NS
+        self.infrared.step(self.now_ns, self.poses)
+
+    def _creep(self, step_s: float) -> None:
+        """Those move whose motors run."""
         path = step_s * np.hypot(self._twists[:, 0], self._twists[:, 1])
         walk = self._errors.walk_noise * path
         heading = self._errors.veer_noise * path
@@ -127,8 +133,6 @@ class DropletWorld:
         noise = np.sqrt(np.stack([walk, walk, heading], axis=-1))
         noise *= self._rng.standard_normal(noise.shape)
         self.poses = se2.compose(self.poses, se2.exp(self._twists * step_s + noise))
-        self.now_ns += STEP_NS
-        self.infrared.step(self.now_ns, self.poses)
 
     def move(self, robot: int, direction: int | None) -> None:
         """A robot's motors run."""

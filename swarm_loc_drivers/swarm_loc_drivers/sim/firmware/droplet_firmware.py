@@ -12,16 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.protocols.droplet import DIRECTIONS, FULL_POWER, gait
-from swarm_loc_drivers.protocols.droplet_infrared import EMIT_DELAY_NS, HANDLING_NS, PRINT_DELAY_NS
+from swarm_loc_drivers.protocols.droplet_infrared import (
+    EMIT_DELAY_NS,
+    HANDLING_NS,
+    PRINT_DELAY_NS,
+    SET_POWER_DELAY_NS,
+)
 from swarm_loc_drivers.sim.body import Command, DropletBody, Measured
 
 _BUFFER = 64
 _RECEIVE_QUEUE = 2
 """Characters that the serial port keeps while nobody fetches them."""
-_MS = 1_000_000
-_SET_POWER_DELAY_NS = 10 * _MS
 _BUSY_SENDING = 2
 _BUSY_EXCHANGING = 4
+_PROCESSING = 1 << 6
 _BACKSPACE, _ESCAPE = 8, 27
 
 Print = Callable[[int, int, NDArray[np.int64]], str]
@@ -67,6 +71,7 @@ class DropletFirmware:
         self._moving = False
         self._stops = 0
         self._power = FULL_POWER
+        self._unread = 0
         self._commands: dict[str, Callable[[list[str]], None]] = {
             "get_id": lambda _: self._say(f"My ID is: {body.robot_id:04X}"),
             "move_steps": self._move_steps,
@@ -100,6 +105,7 @@ class DropletFirmware:
             if isinstance(heard, Command):
                 self._at(heard.end_ns + HANDLING_NS, lambda line=heard.line: self._execute(line))  # type: ignore[misc]
             else:
+                self._unread += 1
                 self._at(heard.end_ns + PRINT_DELAY_NS, lambda measured=heard: self._report(measured))  # type: ignore[misc]
         self._run_tasks()
         return self._taken()
@@ -202,12 +208,12 @@ class DropletFirmware:
         def set_it() -> None:
             self._power = min(max(power, 0), FULL_POWER)
 
-        self._later(_SET_POWER_DELAY_NS, set_it)
+        self._later(SET_POWER_DELAY_NS, set_it)
 
     def _emit(self) -> None:
         status = self._body.infrared_status()
-        if status >= _BUSY_EXCHANGING:
-            self._say(f"RNB Broadcast failed [ {(1 << 6) | status:02X} ]")
+        if status >= _BUSY_EXCHANGING or self._unread:
+            self._say(f"RNB Broadcast failed [ {_PROCESSING | status:02X} ]")
         else:
             self._body.emit(self._power)
 
@@ -221,6 +227,7 @@ class DropletFirmware:
             self._body.send(line, target)
 
     def _report(self, measured: Measured) -> None:
+        self._unread -= 1
         self._output += self._print_matrix(measured.emitter, self._body.robot_id, measured.readings)
 
     def _print_settings(self) -> None:
@@ -238,5 +245,6 @@ class DropletFirmware:
         self._stop()
         self._tasks.clear()
         self._line.clear()
+        self._unread = 0
         self._power = FULL_POWER
         self._output += "\n"
