@@ -1,0 +1,66 @@
+"""What a user sets about a Droplet's driver."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from swarm_loc_drivers.core.droplet_exchange import AskSettings
+from swarm_loc_drivers.core.droplet_turns import TurnSettings
+from swarm_loc_drivers.nodes.droplet_parameters import DropletParameters, droplet_settings
+from swarm_loc_drivers.protocols.droplet import AUDIO_DROPLET
+from swarm_loc_estimator.nodes.parameter_table import ParameterError, markdown_table
+
+README = Path(__file__).parents[2] / "README.md"
+PLAIN = DropletParameters(address="/dev/ttyUSB0")
+
+
+def test_the_readme_says_what_the_table_says() -> None:
+    assert markdown_table(DropletParameters) in README.read_text(encoding="utf-8")
+
+
+def test_partners_are_asked_unless_turns_are_taken() -> None:
+    wishes = replace(PLAIN, model="audio_droplet", partners=("6B6F", "0x0029", "df64"), exchange_rate=0.5)
+    session = droplet_settings(wishes).session
+    assert session.model is AUDIO_DROPLET
+    assert isinstance(session.exchanges, AskSettings)
+    assert session.exchanges.partners == (0x6B6F, 0x29, 0xDF64)
+    assert session.exchanges.period_s == 2.0
+    assert session.exchanges.powers == (256, 40)
+    turns = droplet_settings(replace(wishes, turns=20, turn=19)).session.exchanges
+    assert isinstance(turns, TurnSettings)
+    assert (turns.turn, turns.turns, turns.known) == (19, 20, (0x6B6F, 0x29, 0xDF64))
+
+
+def test_without_a_rate_or_a_near_power() -> None:
+    exchanges = droplet_settings(replace(PLAIN, exchange_rate=0.0, near_power=0)).session.exchanges
+    assert isinstance(exchanges, AskSettings)
+    assert exchanges.period_s == 0.0
+    assert exchanges.powers == (256,)
+
+
+def test_robots_without_a_cable_have_names_and_ids() -> None:
+    settings = droplet_settings(replace(PLAIN, relayed=("droplet2=6B6F", "b=29")))
+    assert settings.relayed == {"droplet2": 0x6B6F, "b": 0x29}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"address": "tcp://robot"}, "parameter address = 'tcp://robot' must be the path of a serial port"),
+        ({"model": "dropling"}, "parameter model = 'dropling' must be one of droplet, audio_droplet."),
+        ({"partners": ("6B6F", "G")}, "parameter partners has the id 'G' but ids lie in [1, FFFF]."),
+        ({"partners": ("0",)}, "parameter partners has the id '0'"),
+        ({"relayed": ("6B6F",)}, "parameter relayed has '6B6F' but must have entries as droplet2=6B6F."),
+        ({"relayed": ("a=12345",)}, "parameter relayed has the id '12345'"),
+        ({"far_power": 30}, "parameter near_power = 40 must be below far_power = 30."),
+        ({"turns": 3, "turn": 3}, "parameter turn = 3 must be below turns = 3."),
+    ],
+)
+def test_what_cannot_be_is_told_in_one_sentence(wrong: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ParameterError) as caught:
+        droplet_settings(replace(PLAIN, **wrong))
+    assert sentence in str(caught.value)
