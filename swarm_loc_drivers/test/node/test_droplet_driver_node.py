@@ -1,0 +1,131 @@
+"""The Droplet's driver node over DDS, with emulated robots in a process of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from droplet_bench import IDS, TRIANGLE, FloatArray
+from geometry_msgs.msg import Twist, Vector3
+from nav_msgs.msg import Odometry
+from node_world import Program, Ros, stamp_ns
+from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
+
+from swarm_loc_estimator.core import se2
+from swarm_loc_estimator.core.ir.brightness import expected
+from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
+from swarm_loc_msgs.msg import BrightnessMatrix
+
+UNIT = Path(__file__).parents[1] / "unit"
+
+
+class Robots:
+    """Emulated robots."""
+
+    def __init__(self, link: Path) -> None:
+        path = os.pathsep.join([str(UNIT), os.environ.get("PYTHONPATH", "")])
+        self.process = subprocess.Popen(
+            [sys.executable, str(Path(__file__).with_name("droplet_process.py")), str(link)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"PYTHONPATH": path},
+        )
+        assert self._line() == str(link)
+
+    def _line(self) -> str:
+        assert self.process.stdout is not None
+        return self.process.stdout.readline().strip()
+
+    def poses(self) -> FloatArray:
+        """Where they are."""
+        assert self.process.stdin is not None
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+        return np.array(json.loads(self._line()))
+
+
+@pytest.fixture
+def robots(tmp_path: Path) -> Iterator[Robots]:
+    robots = Robots(tmp_path / "droplet")
+    yield robots
+    with robots.process:
+        robots.process.kill()
+
+
+def test_a_droplet_walks_measures_and_stands_at_the_end(ros: Ros, robots: Robots, tmp_path: Path) -> None:
+    odometry: list[Odometry] = ros.listen(Odometry, "droplet1/odom")
+    relayed: list[Odometry] = ros.listen(Odometry, "droplet3/odom")
+    matrices: list[BrightnessMatrix] = ros.listen(BrightnessMatrix, "droplet1/brightness")
+    transforms: list[TFMessage] = ros.listen(TFMessage, "/tf")
+    diagnostics: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
+    parameters = {
+        "address": tmp_path / "droplet",
+        "partners": json.dumps([f"{robot:04X}" for robot in IDS[1:]]),
+        "relayed": json.dumps([f"droplet3={IDS[2]:04X}"]),
+        "exchange_rate": 0.0,
+    }
+    arguments = ("-r", "__ns:=/droplet1")
+    log = tmp_path / "log"
+    with Program("droplet_driver_node", log, parameters, arguments, package="swarm_loc_drivers") as program:
+        ros.until(lambda: odometry and relayed)
+        measure = ros.tester.create_client(Trigger, "droplet1/droplet_driver/measure")
+        assert measure.wait_for_service(60.0)
+        measure.call_async(Trigger.Request())
+        ros.until(lambda: len(matrices) == 4)
+        publisher = ros.tester.create_publisher(Twist, "droplet1/cmd_vel", 1)
+        timer = ros.tester.create_timer(0.05, lambda: publisher.publish(Twist(linear=Vector3(x=-0.01))))
+        ros.until(lambda: odometry[-1].pose.pose.position.x < -0.004)
+        ros.until(lambda: transforms and diagnostics)
+        timer.cancel()
+        assert program.end(signal.SIGINT) == 0, program.output
+    first = robots.poses()
+    assert (robots.poses() == first).all()
+    moved = se2.between(TRIANGLE[0], first[0])
+    assert moved[0] == pytest.approx(odometry[-1].pose.pose.position.x, abs=4e-3)
+    assert (first[1:] == TRIANGLE[1:]).all()
+
+    platform = load_ir_platform("droplet")
+    for near, far in zip(matrices[::2], matrices[1::2], strict=True):
+        assert stamp_ns(near) == stamp_ns(far)
+        assert near.header.frame_id == "droplet1/base_link"
+        assert (near.power, far.power) == (BrightnessMatrix.POWER_NEAR, BrightnessMatrix.POWER_FAR)
+        for one in (near, far):
+            assert (one.receiver, one.n, one.saturation) == (IDS[0], 6, 240)
+            seen = se2.between(TRIANGLE[0], TRIANGLE[IDS.index(one.transmitter)])
+            pose = [np.hypot(seen[0], seen[1]), np.arctan2(seen[1], seen[0]), seen[2]]
+            exact = np.clip(expected(platform, pose)[0, one.power], 0.0, 255.0)
+            assert np.abs(np.reshape(one.readings, (6, 6)) - exact).max() < 0.51
+    assert {one.transmitter for one in matrices} == set(IDS[1:])
+    frames = {one.transforms[0].child_frame_id for one in transforms}
+    assert frames == {"droplet1/base_link", "droplet3/base_link"}
+    status = diagnostics[-1].status[0]
+    values = {pair.key: pair.value for pair in status.values}
+    assert (status.name, status.message) == ("droplet1/droplet_driver", "connected")
+    assert values["exchanges"] == "2"
+
+
+@pytest.mark.parametrize(
+    ("parameters", "sentence"),
+    [
+        ({}, "parameter address is not set"),
+        ({"address": "/dev/nothing", "turns": 2, "turn": 2}, "parameter turn = 2 must be below turns = 2."),
+    ],
+)
+def test_a_wrong_parameter_ends_the_node_with_one_sentence(
+    tmp_path: Path, parameters: dict[str, object], sentence: str
+) -> None:
+    with Program("droplet_driver_node", tmp_path / "log", parameters, package="swarm_loc_drivers") as program:
+        assert program.end() == 1
+        (line,) = program.output.splitlines()
+    assert line.startswith("droplet_driver_node: ")
+    assert sentence in line
