@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from swarm_loc_estimator.core.arrivals import Arrivals
 from swarm_loc_estimator.core.estimator import SwarmEstimator
+from swarm_loc_estimator.core.learned import learns
 from swarm_loc_estimator.core.metrics import Track
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.swarm import Swarm
@@ -151,6 +152,7 @@ class _Recorder:
             stamp_ns=self._spool.array("stamp_ns", np.int64),
             pose=self._spool.array("pose", np.float64, robots, 3),
             covariance=self._spool.array("covariance", np.float64, robots, 3, 3),
+            learned=self._estimator.learned() if learns(self._estimator.swarm) else None,
             truth=truth,
             counters={"measurements used": self._estimator.used, **self._estimator.drops},
             remarks=remarks,

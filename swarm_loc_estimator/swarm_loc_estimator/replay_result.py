@@ -32,6 +32,7 @@ class ReplayResult:
         remarks: What else must be said, one sentence each, such as what could not be read of the bag.
         data_s: Duration of the data [s].
         wall_s: Duration of the replay [s].
+        learned: The swarm as the run has taught that it is; None where there was nothing to learn.
     """
 
     title: str
@@ -44,6 +45,7 @@ class ReplayResult:
     remarks: tuple[str, ...] = ()
     data_s: float = 0.0
     wall_s: float = 0.0
+    learned: Swarm | None = None
 
     @property
     def speed_factor(self) -> float:

@@ -2,9 +2,12 @@
 
     replay bags/eight_five_robots
     replay recording.mcap --swarm swarm.yaml --out out/recording --set horizon_s=1.0
+    replay recording.mcap --swarm swarm.yaml --learned learned.yaml
 
 The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. The report
 (report.txt, report.html, overview.png, paths.png, errors.png) and the poses (poses.csv) are written to --out.
+--learned writes the description for the next run, with what the filter has learned of cameras, odometry and
+landmarks; it learns of what the description gives a sigma.
 """
 
 from __future__ import annotations
@@ -20,14 +23,20 @@ import numpy as np
 
 from swarm_loc_estimator.cli.arguments import number_in
 from swarm_loc_estimator.cli.progress import ProgressLine
+from swarm_loc_estimator.core.learned import learns
 from swarm_loc_estimator.core.settings import EstimatorSettings, SettingsError
 from swarm_loc_estimator.io.bag_file import BagError
 from swarm_loc_estimator.io.report import write_report
 from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
+from swarm_loc_estimator.io.swarm_writer import save_swarm
 from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
 from swarm_loc_estimator.replay import TICK_S, replay
 from swarm_loc_estimator.replay_result import ReplayResult
 
+_NOTHING_TO_LEARN = (
+    "--learned: the swarm description has no sigma of a camera, of odometry or of a landmark,"
+    " so there is nothing to learn; give for instance camera.yaw_sigma."
+)
 _COVARIANCE = ("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
 _COLUMNS = ("stamp_ns", "robot", "x_m", "y_m", "theta_rad", *_COVARIANCE)
 
@@ -39,10 +48,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         settings = read_settings(options.set)
         swarm = load_swarm(options.swarm or swarm_beside(options.bag))
         with ProgressLine() as progress:
+            if options.learned and not learns(swarm):
+                print(_NOTHING_TO_LEARN, file=sys.stderr)
+                return 1
             result = replay(options.bag, swarm, settings, tick_s=options.tick, progress=progress)
             progress(1.0, "writing the report")
             files = write_report(result, options.out)
             write_poses(result, options.out / "poses.csv")
+            if options.learned and result.learned:
+                save_swarm(result.learned, options.learned, f"Learned from {result.title}.")
     except (BagError, SwarmFileError, SettingsError, DefinitionsNotFoundError) as error:
         print(error, file=sys.stderr)
         return 1
@@ -93,6 +107,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("bag", type=Path, help="rosbag2 folder, .mcap or .db3 file")
     parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
     parser.add_argument("--out", type=Path, default=Path("out/replay"), help="folder for the report")
+    parser.add_argument("--learned", type=Path, metavar="FILE", help="where to write what was learned")
     parser.add_argument(
         "--tick", type=number_in(1e-3, 3600.0, "s"), default=TICK_S, help="seconds between outputs"
     )

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.core.arrivals import Arrivals, FixRows, Messages, OdometryRows, joined
 from swarm_loc_estimator.core.fusion import Fusion, Verdict
+from swarm_loc_estimator.core.learned import learned
 from swarm_loc_estimator.core.measurements import Kind, MeasurementArray
 from swarm_loc_estimator.core.odometry import OdometryTracks
 from swarm_loc_estimator.core.parameters import ParameterTable
@@ -118,6 +119,10 @@ class SwarmEstimator:
     def recent(self) -> tuple[MeasurementArray, NDArray[np.uint8], FloatArray]:
         """The measurements within the horizon, their verdicts and normalised innovations squared."""
         return self._timeline.measurements, self._timeline.verdicts, self._timeline.nis
+
+    def learned(self) -> Swarm:
+        """The swarm with cameras, odometry and landmarks as they are now estimated; see `core/learned.py`."""
+        return learned(self.swarm, self._timeline.state)
 
     def tick(self, now_ns: int, *, fuse: bool = True) -> SwarmEstimate:
         """Use all that has arrived and give the poses at `now_ns`; measurements wait unless `fuse`."""

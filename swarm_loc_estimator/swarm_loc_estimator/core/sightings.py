@@ -173,6 +173,7 @@ def _convert_all(
         out.gate[k] = cameras.gate[robot]
         out.marker[k, 0], out.marker[k, 1] = marker[0], marker[1]
         _levelled(level, detections.position[k], position)
+        _scale(position, 1.0 / sensor.distance_scale)
         if detections.content[k] == CONTENT_POSITION or math.isnan(marker[2]):
             out.kind[k] = _POLAR
             _calibrate(sensor, position, out.target[k], out.value[k], out.covariance[k])
@@ -183,6 +184,7 @@ def _convert_all(
         if detections.content[k] == CONTENT_POSE_TWO:
             out.has_alternative[k] = 1
             _levelled(level, detections.alternative_position[k], other_position)
+            _scale(other_position, 1.0 / sensor.distance_scale)
             out.alternative[k, 0], out.alternative[k, 1] = other_position[0], other_position[1]
             out.alternative[k, 2] = _face_heading(level, detections.alternative_orientation[k])
         _pose_noise(sensor, level, detections.covariance[k], out.covariance[k])
@@ -232,6 +234,13 @@ def _levelled(level: FloatArray, optical: FloatArray, out: FloatArray) -> None:
     """Write a vector (3,) of the optical frame in the level axes forward, left, up of the camera."""
     for i in range(3):
         out[i] = level[i, 0] * optical[0] + level[i, 1] * optical[1] + level[i, 2] * optical[2]
+
+
+@compiled
+def _scale(vector: FloatArray, factor: float) -> None:
+    """Multiply a vector (3,), in place."""
+    for i in range(3):
+        vector[i] *= factor
 
 
 @compiled

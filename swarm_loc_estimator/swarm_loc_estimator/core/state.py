@@ -138,6 +138,13 @@ class SwarmState:
         predicted(self.arrays(), robot, gathered, stamp_ns, transform, covariance)
         return transform, covariance
 
+    def parameter_sigma(self, robot: int) -> FloatArray:
+        """Standard deviations (PARAMETERS,) of a robot's parameters; zero of those not estimated."""
+        column = self._table.column[robot]
+        variance = np.where(column >= 0, np.diag(self.filter.covariance)[column], 0.0)
+        sigma: FloatArray = np.sqrt(variance)
+        return sigma
+
     def landmark_covariance(self, landmark: int) -> FloatArray:
         """Covariance (3, 3) of the right-invariant error of a landmark that is estimated."""
         own = slice(self._table.survey_column[landmark], self._table.survey_column[landmark] + 3)

@@ -139,7 +139,8 @@ class OdometryModel:
 class SensorModel:
     """How a robot's sightings err: noise, calibration and gate.
 
-    A sighting's logged range r [m] and bearing b [rad] (positive to the left) become
+    Whatever is seen is closer or farther by distance_scale. A sighting without heading has a range r [m] and
+    a bearing b [rad], positive to the left, which become
     distance = r * exp(range_log_scale + range_skew * b + range_curve * b^2) + range_offset, to a robot's
     marker with robot_range_offset more, and
     bearing = bearing_scale * b + bearing_curve * b^2 + bearing_offset, taken `time_offset_s` after the stamp.
@@ -161,8 +162,9 @@ class SensorModel:
     bearing_sigma: float = number(
         0.05, "rad", 0.0, 10.0, "noise of the bearing, sightings without heading", above=True
     )
+    distance_scale: float = number(1.0, "1", 0.1, 10.0, "distance as seen per true distance")
     distance_scale_sigma: float = number(
-        0.0, "1", 0.0, 1.0, "how unsure the scale of all distances is; 0: exact, else it is estimated"
+        0.0, "1", 0.0, 1.0, "how unsure distance_scale is, relative; 0: exact, else it is estimated"
     )
     range_log_scale: float = number(0.0, "1", -2.0, 2.0, "a of the range curve")
     range_skew: float = number(0.0, "1/rad", -10.0, 10.0, "c of the range curve")

@@ -6,7 +6,17 @@ import base64
 from html import escape
 from typing import TYPE_CHECKING
 
-from swarm_loc_estimator.io.report_table import GROUPS, HEADER, POOLED, cells, facts, summaries
+from swarm_loc_estimator.io.report_table import (
+    GROUPS,
+    HEADER,
+    LEARNED,
+    POOLED,
+    cells,
+    facts,
+    learned_landmarks,
+    learned_robots,
+    summaries,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -58,6 +68,7 @@ def html_report(result: ReplayResult, pictures: dict[str, Path]) -> str:
         _remarks(result),
         _errors(result),
         *(_picture(heading, path) for heading, path in pictures.items()),
+        _learned(result),
         _counters(result),
     ]
     head = (
@@ -114,6 +125,17 @@ def _errors(result: ReplayResult) -> str:
     )
     head = f"<thead><tr>{groups}</tr><tr>{titles}</tr></thead>"
     return f'{title}<div class="wide"><table>{head}<tbody>{body}</tbody></table></div>'
+
+
+def _learned(result: ReplayResult) -> str:
+    """What was learned of robots and landmarks."""
+    rows, sentence = learned_robots(result), learned_landmarks(result)
+    if not rows and not sentence:
+        return ""
+    head = "".join(f"<th>{escape(name)}</th>" for name in LEARNED)
+    body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in rows)
+    table = f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    return f"<h2>Learned, with one standard deviation</h2>{table if rows else ''}<p>{escape(sentence)}</p>"
 
 
 def _picture(heading: str, path: Path) -> str:

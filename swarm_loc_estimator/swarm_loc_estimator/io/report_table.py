@@ -54,6 +54,46 @@ def cells(name: str, row: ErrorSummary) -> list[str]:
     ]
 
 
+LEARNED = (
+    "robot",
+    "path, true per told",
+    "turn, true per told",
+    "camera yaw [deg]",
+    "distance, seen per true",
+)
+"""Column titles of what was learned of robots."""
+
+
+def learned_robots(result: ReplayResult) -> list[list[str]]:
+    """What was learned of each robot, one text per column of `LEARNED`; a dash where nothing was."""
+    rows = []
+    for robot in result.learned.robots if result.learned else ():
+        odometry, camera, sensor = robot.odometry, robot.camera, robot.sensor
+        figures = [
+            (odometry.distance_scale, odometry.distance_scale * odometry.distance_scale_sigma, 4),
+            (odometry.turn_scale, odometry.turn_scale * odometry.turn_scale_sigma, 4),
+            (math.degrees(camera.yaw), math.degrees(camera.yaw_sigma), 2) if camera else (0.0, 0.0, 2),
+            (sensor.distance_scale, sensor.distance_scale * sensor.distance_scale_sigma, 4),
+        ]
+        if any(sigma for _, sigma, _ in figures):
+            rows.append([robot.name, *(_estimated(*figure) for figure in figures)])
+    return rows
+
+
+def learned_landmarks(result: ReplayResult) -> str:
+    """What was learned of the landmarks in a sentence; "" where their survey is exact."""
+    before = {mark.id: mark for mark in result.swarm.landmarks}
+    after = [mark for mark in (result.learned or result.swarm).landmarks if mark.is_estimated]
+    if not result.learned or not after:
+        return ""
+    moved = [100.0 * math.hypot(mark.x - before[mark.id].x, mark.y - before[mark.id].y) for mark in after]
+    sigma = 100.0 * sum(mark.position_sigma for mark in after) / len(after)
+    return (
+        f"{len(after)} landmarks are {sum(moved) / len(moved):.1f} cm from where the survey has them"
+        f" (at most {max(moved):.1f} cm), sure to {sigma:.1f} cm."
+    )
+
+
 def facts(result: ReplayResult) -> list[tuple[str, str]]:
     """Duration, speed and size in words."""
     rows = [
@@ -76,6 +116,10 @@ def text_report(result: ReplayResult) -> str:
         lines += ["", *_table([cells(name, row) for name, row in rows])]
     else:
         lines += ["", "No ground truth to compare with."]
+    learned = learned_robots(result)
+    if learned:
+        lines += ["", "Learned, with one standard deviation", *_columns([list(LEARNED), *learned])]
+    lines += ["", learned_landmarks(result)] if learned_landmarks(result) else []
     if result.counters:
         lines += ["", "Counted", *_pairs([(name, str(count)) for name, count in result.counters.items()])]
     if result.remarks:
@@ -88,6 +132,17 @@ def _number(value: float, digits: int) -> str:
     if math.isnan(value):
         return "-"
     return f"{value:.{digits}f}"
+
+
+def _estimated(value: float, sigma: float, digits: int) -> str:
+    """A figure with its standard deviation, or a dash where it was not estimated."""
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}" if sigma else "-"
+
+
+def _columns(rows: list[list[str]]) -> list[str]:
+    """Aligned columns."""
+    widths = [max(len(text) for text in column) for column in zip(*rows, strict=True)]
+    return [_line(row, widths) for row in rows]
 
 
 def _pairs(rows: list[tuple[str, str]]) -> list[str]:

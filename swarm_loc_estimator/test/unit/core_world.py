@@ -195,7 +195,7 @@ def simulate(plan: Plan, seed: int) -> World:
     start = np.column_stack(
         [rng.uniform(-0.5, 0.5, (plan.robots, 2)) * plan.arena, rng.uniform(-3.1, 3.1, plan.robots)]
     )
-    lasting = _Lasting(plan, np.random.default_rng([seed, 1]), steps)
+    lasting = lasting_errors(plan, seed)
     truth, odometry = _drive(rng, plan, start, steps, lasting)
     swarm = _describe(rng, plan, start)
     events = [
@@ -228,6 +228,11 @@ def _surveyed(landmarks: Sequence[Landmark], plan: Plan, rng: np.random.Generato
         )
         for mark in landmarks
     )
+
+
+def lasting_errors(plan: Plan, seed: int) -> _Lasting:
+    """Those of a world's robots."""
+    return _Lasting(plan, np.random.default_rng([seed, 1]), round(plan.duration_s * SECOND / _STEP_NS))
 
 
 class _Lasting:

@@ -1,0 +1,150 @@
+"""What a run teaches of cameras, odometry and landmarks: near the truth, and good for the next run."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from core_world import (
+    MOUNT,
+    POSE,
+    SENSOR,
+    T0,
+    Plan,
+    World,
+    detection,
+    lasting_errors,
+    marker_frame,
+    on_time,
+    play,
+    seen,
+    simulate,
+    ticks,
+    wrapped,
+)
+
+from swarm_loc_estimator.cli.replay import main
+from swarm_loc_estimator.core.estimator import SwarmEstimator
+from swarm_loc_estimator.core.learned import learns
+from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.sightings import SightingConverter
+from swarm_loc_estimator.core.swarm import Landmark, Robot, Swarm
+from swarm_loc_estimator.io.bag_cut import copy_beginning
+from swarm_loc_estimator.io.report_table import LEARNED
+from swarm_loc_estimator.io.swarm_file import load_swarm
+
+BAG = Path(__file__).parents[3] / "bags" / "eight_five_robots_w2"
+PLAN = Plan(2, 40.0, speed=0.15, lasting=1.0, survey=1.0)
+
+
+def run(world: World) -> tuple[Swarm, FloatArray]:
+    """What a run teaches, and its errors (T, N, 3)."""
+    estimator = SwarmEstimator(world.swarm)
+    estimates = play(estimator, on_time(world), ticks(T0, int(world.stamp_ns[-1]), 1.0))
+    return estimator.learned(), wrapped(np.array([e.poses - world.at(e.stamp_ns) for e in estimates]))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_what_is_learned_is_near_the_truth_and_as_sure_as_it_says(seed: int) -> None:
+    world, true = simulate(PLAN, seed), lasting_errors(PLAN, seed)
+    taught, _ = run(world)
+    off, before = [], []
+    for i, (robot, described) in enumerate(zip(taught.robots, world.swarm.robots, strict=True)):
+        odometry, sensor = robot.odometry, robot.sensor
+        assert robot.camera is not None
+        assert described.camera is not None
+        off += [
+            (odometry.distance_scale / (1.0 + true.distance_scale[i]) - 1.0) / odometry.distance_scale_sigma,
+            (odometry.turn_scale / (1.0 + true.turn_scale[i]) - 1.0) / odometry.turn_scale_sigma,
+            (robot.camera.yaw - MOUNT.yaw - true.yaw[i]) / robot.camera.yaw_sigma,
+            (sensor.distance_scale / (1.0 + true.stretch[i]) - 1.0) / sensor.distance_scale_sigma,
+        ]
+        before.append(robot.camera.yaw_sigma / described.camera.yaw_sigma)
+    for mark, surveyed, place in zip(
+        taught.landmarks, world.swarm.landmarks, true_landmarks(world), strict=True
+    ):
+        off += ((np.array([mark.x, mark.y]) - place) / mark.position_sigma).tolist()
+        before.append(mark.position_sigma / surveyed.position_sigma)
+    assert np.abs(off).max() < 4.5
+    assert max(before) < 0.6
+
+
+def true_landmarks(world: World) -> FloatArray:
+    """Places (L, 2) of the landmarks."""
+    angles = 2.0 * np.pi * np.arange(PLAN.landmarks) / PLAN.landmarks
+    assert len(world.swarm.landmarks) == PLAN.landmarks
+    return PLAN.arena * np.column_stack([np.cos(angles), np.sin(angles)])
+
+
+def exact(swarm: Swarm) -> Swarm:
+    """The swarm as it is described, nothing of which is estimated but poses and what changes."""
+    robots = (
+        replace(
+            robot,
+            odometry=replace(robot.odometry, distance_scale_sigma=0.0, turn_scale_sigma=0.0),
+            camera=robot.camera and replace(robot.camera, yaw_sigma=0.0),
+            sensor=replace(robot.sensor, distance_scale_sigma=0.0),
+        )
+        for robot in swarm.robots
+    )
+    landmarks = (replace(mark, position_sigma=0.0, yaw_sigma=0.0) for mark in swarm.landmarks)
+    return Swarm(tuple(robots), tuple(landmarks))
+
+
+def test_what_was_learned_may_be_trusted_from_then_on() -> None:
+    before: list[float] = []
+    after: list[float] = []
+    for seed in range(3):
+        world = simulate(PLAN, 10 + seed)
+        taught, _ = run(world)
+        for swarm, squared in ((world.swarm, before), (taught, after)):
+            _, errors = run(replace(world, swarm=exact(swarm)))
+            squared.append(float(np.nanmean(np.square(errors[5:, :, :2]))))  # not a number where one got lost
+    assert np.mean(after) < 0.25 * np.mean(before)
+
+
+def test_a_distance_scale_is_taken_out_of_what_is_seen() -> None:
+    frame = seen([0.0, 0.0, 0.0], MOUNT, marker_frame(1.0, 0.3, 0.1, 3.0))
+    values = []
+    for scale in (1.0, 1.25):
+        far = frame.copy()
+        far[:3, 3] *= scale
+        robot = Robot("a", camera=MOUNT, sensor=replace(SENSOR, distance_scale=scale))
+        swarm = Swarm((robot,), (Landmark(7, 1.0, 0.3, 0.1, 3.0),))
+        one = detection(7, far, POSE)
+        values.append(
+            SightingConverter(swarm).convert(np.zeros(1, np.int64), np.array([T0]), one).measurements["value"]
+        )
+    np.testing.assert_allclose(values[1], values[0], atol=1e-12)
+
+
+def test_there_is_nothing_to_learn_where_nothing_has_a_sigma() -> None:
+    assert not learns(simulate(Plan(1, 1.0), 0).swarm)
+    assert learns(simulate(Plan(1, 1.0, lasting=1.0), 0).swarm)
+    assert learns(simulate(Plan(1, 1.0, survey=1.0), 0).swarm)
+
+
+def test_a_robot_that_was_not_located_keeps_its_description() -> None:
+    swarm = simulate(Plan(1, 1.0, lasting=1.0), 0).swarm
+    assert SwarmEstimator(swarm).learned() == swarm
+
+
+def test_the_replay_command_writes_what_it_learned_and_reports_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy_beginning(BAG, tmp_path / "bag", 15.0)
+    learned, command = tmp_path / "learned.yaml", [str(tmp_path / "bag"), "--out", str(tmp_path)]
+    assert main([*command, "--swarm", str(BAG / "self_calibrating.yaml"), "--learned", str(learned)]) == 0
+    before, after = load_swarm(BAG / "self_calibrating.yaml"), load_swarm(learned)
+    for old, new in zip(before.robots, after.robots, strict=True):
+        assert old.camera is not None
+        assert new.camera is not None
+        assert 0.0 < new.camera.yaw_sigma < 0.5 * old.camera.yaw_sigma
+    shown = capsys.readouterr().out
+    assert "Learned" in shown
+    assert "20 landmarks are " in shown
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert all(title in page for title in LEARNED)
+    assert "20 landmarks are " in page
+    assert main([*command, "--swarm", str(BAG / "swarm.yaml"), "--learned", str(learned)]) == 1
+    assert "nothing to learn" in capsys.readouterr().err
