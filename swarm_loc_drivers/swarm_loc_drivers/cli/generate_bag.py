@@ -3,10 +3,11 @@
     generate_bag eight bags/eight_five_robots --seed 3 --duration 54 --world w0
     generate_bag pictures bags/eight_pictures --seed 1 --duration 9 --robots 2
     generate_bag grid /tmp/grid100 --robots 100 --duration 20
+    generate_bag droplets bags/droplets_twenty --seed 1 --duration 90
 
 The bag holds <robot>/odom, <robot>/detections and <robot>/ground_truth; `swarm.yaml` lies inside its folder.
 `pictures` writes, in place of detections, what the cameras see: <robot>/image_raw/compressed (JPEG) and
-<robot>/camera_info.
+<robot>/camera_info. `droplets` writes <robot>/brightness and <robot>/fix in place of detections.
 The same arguments give the same bytes.
 """
 
@@ -18,6 +19,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from swarm_loc_drivers.sim.bag import write_bag
+from swarm_loc_drivers.sim.droplet_bag import write_droplet_bag
+from swarm_loc_drivers.sim.droplet_run import DropletRunSettings, simulate_droplets
+from swarm_loc_drivers.sim.droplet_world import DROPLET_WORLDS
 from swarm_loc_drivers.sim.eight import EightSettings, simulate_eight
 from swarm_loc_drivers.sim.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.picture_bag import write_picture_bag
@@ -77,6 +81,18 @@ def _grid(options: argparse.Namespace, comment: str) -> int:
     return write_bag(simulate_grid(settings), options.bag, comment)
 
 
+def _droplets(options: argparse.Namespace, comment: str) -> int:
+    settings = DropletRunSettings(
+        seed=options.seed,
+        duration_s=options.duration,
+        robots=options.robots,
+        world=options.world,
+        calibrated=options.calibrated,
+        start_known=options.start_known,
+    )
+    return write_droplet_bag(simulate_droplets(settings), options.bag, comment, options.seed)
+
+
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(
@@ -93,6 +109,18 @@ def _parser() -> argparse.ArgumentParser:
         )
         one.add_argument("--speed", type=float, default=0.06, help="[m/s]")
         one.add_argument("--start-unknown", action="store_true", help="swarm.yaml tells no start poses")
+    droplets = _swarm(
+        swarms, "droplets", "Droplets that see each other by infrared, two by a tracker", 20, 90.0
+    )
+    droplets.set_defaults(write=_droplets)
+    droplets.add_argument(
+        "--world",
+        choices=sorted(DROPLET_WORLDS),
+        default="d1",
+        help="imperfections; see sim/droplet_world.py",
+    )
+    droplets.add_argument("--calibrated", action="store_true", help="swarm.yaml tells the elements' gains")
+    droplets.add_argument("--start-known", action="store_true", help="swarm.yaml tells the start poses")
     _swarm(swarms, "grid", "many robots, each about its cell of a grid", 100, 20.0).set_defaults(write=_grid)
     return parser
 

@@ -33,9 +33,9 @@ class DropletParameters:
     )
     odom_rate: float = number(5.0, "1/s", 0.1, 20.0, "published odometry")
     walk_noise: float = number(
-        1e-3, "m", 0.0, 1.0, "variance along and across of a walk per metre [m^2/m], of what is believed"
+        5e-4, "m", 0.0, 1.0, "variance along and across of a walk per metre [m^2/m], of what is believed"
     )
-    veer_noise: float = number(0.1, "rad^2/m", 0.0, 100.0, "likewise of the heading per metre walked")
+    veer_noise: float = number(0.05, "rad^2/m", 0.0, 100.0, "likewise of the heading per metre walked")
     turn_noise: float = number(0.01, "rad", 0.0, 10.0, "likewise of the heading per radian turned")
     partners: tuple[str, ...] = texts("ids of the Droplets to measure, in hexadecimal as they print them")
     exchange_rate: float = number(

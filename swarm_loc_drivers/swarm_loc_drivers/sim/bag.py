@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from swarm_loc_estimator.core.swarm import Swarm
 
-    from .record import Records, SimulatedRun
+    from .record import LivedRun, Records, SimulatedRun
 
 TRUTH_PERIOD_NS = 100_000_000
 
@@ -82,7 +82,7 @@ def write_streams(streams: Sequence[Stream], swarm: Swarm, folder: Path, comment
     return len(order)
 
 
-def odometry_stream(run: SimulatedRun, robot: int) -> Stream:
+def odometry_stream(run: LivedRun, robot: int) -> Stream:
     """The robot's odometry; velocities are those of the step before each message."""
     name = run.swarm.robots[robot].name
     rows = run.odometry[run.odometry["robot"] == robot]
@@ -116,7 +116,7 @@ def _detections(run: SimulatedRun, robot: int, detections: Records) -> Stream:
     return Stream(f"{name}/detections", DETECTIONS, frames["arrival_ns"], data)
 
 
-def truth_stream(run: SimulatedRun, robot: int) -> Stream:
+def truth_stream(run: LivedRun, robot: int) -> Stream:
     """Where the robot really was, ten times a second."""
     stamp_ns = np.arange(run.start_ns, run.end_ns + 1, TRUTH_PERIOD_NS)
     data = encode_pose_stamped("map", stamp_ns, run.truth.at(robot, stamp_ns))

@@ -38,22 +38,18 @@ Records = NDArray[Any]
 
 
 @dataclass(frozen=True)
-class SimulatedRun:
-    """A simulated swarm from start to end.
+class LivedRun:
+    """What every simulated swarm has.
 
     Attributes:
         swarm: The description that a user would have; it does not know the hidden errors of the world.
         truth: Where the robots really were, in map.
         odometry: (M,) of ODOMETRY_DTYPE in order of arrival.
-        frames: (F,) of FRAME_DTYPE in order of arrival; lost pictures are not there.
-        sightings: (S,) of SIGHTING_DTYPE, grouped by frame.
     """
 
     swarm: Swarm
     truth: Trajectories
     odometry: Records
-    frames: Records
-    sightings: Records
 
     @property
     def start_ns(self) -> int:
@@ -69,6 +65,19 @@ class SimulatedRun:
     def duration_s(self) -> float:
         """Simulated time [s]."""
         return (self.end_ns - self.start_ns) * 1e-9
+
+
+@dataclass(frozen=True)
+class SimulatedRun(LivedRun):
+    """A simulated swarm with cameras from start to end.
+
+    Attributes:
+        frames: (F,) of FRAME_DTYPE in order of arrival; lost pictures are not there.
+        sightings: (S,) of SIGHTING_DTYPE, grouped by frame.
+    """
+
+    frames: Records
+    sightings: Records
 
     def masked(self, kept: NDArray[np.bool_]) -> SimulatedRun:
         """The run with some of its sightings (S,) only; frames stay, empty ones too."""

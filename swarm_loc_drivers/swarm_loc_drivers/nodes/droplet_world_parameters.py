@@ -1,0 +1,80 @@
+"""What a user may set about `droplet_world_node`, and the world that follows from it. No ROS here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from swarm_loc_drivers.sim.droplet_world import (
+    DROPLET_WORLDS,
+    DropletWorld,
+    DropletWorldError,
+    DropletWorldSettings,
+)
+from swarm_loc_drivers.sim.eight import START_NS
+from swarm_loc_estimator.core.robot_ir import RobotIr
+from swarm_loc_estimator.core.swarm import Pose2, Robot, Swarm, number
+from swarm_loc_estimator.io.swarm_file import load_swarm
+from swarm_loc_estimator.nodes.parameter_table import ParameterError, text, texts
+
+
+@dataclass(frozen=True)
+class DropletWorldParameters:
+    """Parameters of `droplet_world_node`."""
+
+    swarm_file: str = text(
+        "", "path of the swarm description; every robot needs a start and an infrared board", required=True
+    )
+    world: str = text("d1", "how the robots err: d0 or d1; see sim/droplet_world.py", required=True)
+    seed: int = number(1, "1", 0, 2**31 - 1, "fixes the errors")
+    rate: float = number(
+        1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
+    )
+    link_folder: str = text("", "where each robot's serial port appears under its name", required=True)
+    truth_rate: float = number(10.0, "1/s", 0.1, 200.0, "published true poses of each robot")
+    fixed: tuple[str, ...] = texts("robots that a tracker above the table sees, which publishes <robot>/fix")
+    fix_rate: float = number(1.0, "1/s", 0.01, 100.0, "fixes of each of these robots")
+    fix_sigma: float = number(0.003, "m", 1e-6, 1.0, "their noise along each axis, one standard deviation")
+    fix_heading_sigma: float = number(0.02, "rad", 1e-6, 1.0, "likewise of the heading")
+
+
+def make_droplet_world(wishes: DropletWorldParameters) -> tuple[Swarm, DropletWorld]:
+    """The swarm as described, and its world.
+
+    Raises:
+        ParameterError: A parameter cannot be used.
+        SwarmFileError: The swarm description cannot be used.
+    """
+    if wishes.world not in DROPLET_WORLDS:
+        raise ParameterError(
+            f"parameter world = '{wishes.world}' must be one of {', '.join(DROPLET_WORLDS)}."
+        )
+    swarm = load_swarm(Path(wishes.swarm_file))
+    for name in wishes.fixed:
+        if name not in swarm.index_of:
+            raise ParameterError(f"parameter fixed has '{name}', who is not in the swarm description.")
+    try:
+        boards, starts = zip(*(_needed(robot) for robot in swarm.robots), strict=True)
+        settings = DropletWorldSettings(
+            wishes.seed, DROPLET_WORLDS[wishes.world], boards[0].platform, START_NS
+        )
+        return swarm, DropletWorld([board.id for board in boards], np.array(starts), settings)
+    except DropletWorldError as error:
+        raise ParameterError(f"parameter swarm_file = '{wishes.swarm_file}': {error}") from error
+
+
+def _needed(robot: Robot) -> tuple[RobotIr, Pose2]:
+    """The board and the start of a robot.
+
+    Raises:
+        DropletWorldError: It has none.
+    """
+    if robot.start is None:
+        raise DropletWorldError(
+            f"robot '{robot.name}' has no start pose, and a simulated robot has to be somewhere."
+        )
+    if robot.ir is None:
+        raise DropletWorldError(f"robot '{robot.name}' has no infrared board, and a Droplet has one.")
+    return robot.ir, robot.start

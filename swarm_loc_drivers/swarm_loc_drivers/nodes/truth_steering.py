@@ -1,0 +1,52 @@
+"""Steers the robots of a swarm by their true poses: the way does not depend on how well they are located."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, Twist, Vector3
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.time import Time
+
+from swarm_loc_drivers.core.velocity_command import Velocity
+from swarm_loc_estimator.core.se2 import FloatArray
+
+Steer = Callable[[int, int, FloatArray], Velocity]
+"""Robot's index, stamp [ns], true pose (3,) in map -> what it should do."""
+_THROTTLE_S = 10.0
+
+
+class TruthSteering:
+    """Turns `<robot>/ground_truth` into `<robot>/cmd_vel`, from when the drivers of all robots listen.
+
+    Args:
+        node: Whose subscriptions.
+        names: Of the robots.
+        steer: Tells what to do.
+    """
+
+    def __init__(self, node: Node, names: Sequence[str], steer: Steer) -> None:
+        self._node, self._steer = node, steer
+        self._driving = False
+        qos = QoSProfile(depth=1)
+        self._commands = [node.create_publisher(Twist, f"{name}/cmd_vel", qos) for name in names]
+        for index, name in enumerate(names):
+            node.create_subscription(PoseStamped, f"{name}/ground_truth", partial(self._on_pose, index), qos)
+
+    def _on_pose(self, robot: int, message: PoseStamped) -> None:
+        self._driving = self._driving or all(one.get_subscription_count() for one in self._commands)
+        if not self._driving:
+            return
+        place, turn = message.pose.position, message.pose.orientation
+        pose = np.array([place.x, place.y, 2.0 * math.atan2(turn.z, turn.w)])
+        if not np.isfinite(pose).all():
+            self._node.get_logger().warning(
+                "dropped a pose that is not finite", throttle_duration_sec=_THROTTLE_S
+            )
+            return
+        forward, left, rate = self._steer(robot, Time.from_msg(message.header.stamp).nanoseconds, pose)
+        self._commands[robot].publish(Twist(linear=Vector3(x=forward, y=left), angular=Vector3(z=rate)))
