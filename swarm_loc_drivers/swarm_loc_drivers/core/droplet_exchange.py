@@ -187,6 +187,10 @@ class Asking:
             else:  # nobody here knows how bright it shone
                 self._counts["overheard"] += 1
 
+    def is_quiet(self, _now_ns: int) -> bool:
+        """Whether nobody emits now; when others ask is not known."""
+        return True
+
     def is_due(self, now_ns: int) -> bool:
         """Whether to ask somebody now."""
         if not self._partners or not now_ns:

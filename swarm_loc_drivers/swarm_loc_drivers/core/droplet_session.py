@@ -151,7 +151,9 @@ class DropletSession:
     def _interlude(self) -> Talk[bool]:
         """Do what cannot wait: tell the robots how to move; whether to go on."""
         for mover in self._movers:
-            if not self.ending and mover.is_due(self._console.now_ns, self._gaits):
+            now_ns = self._console.now_ns
+            waits = self.ending or not self._exchanging.is_quiet(now_ns)
+            if not waits and mover.is_due(now_ns, self._gaits):
                 yield from mover.tell(self._console, self._gaits)
         return not self.ending
 

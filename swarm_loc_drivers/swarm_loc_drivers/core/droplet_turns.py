@@ -30,6 +30,8 @@ from swarm_loc_drivers.protocols.droplet_infrared import (
 
 _LATEST = 0.5
 """Later in a half than this share of it no emission begins: it might end in the next one."""
+_LATE_START_NS = 60_000_000
+"""So much later than its half begins an emission usually begins."""
 _LATE_NS = 500_000_000
 """So long after its turn a matrix may be read."""
 SHORTEST_TURN_S = 4.0 * EMITTED_AFTER_NS * 1e-9
@@ -115,6 +117,10 @@ class Turns:
         if kept is not None:
             self._counts["half_exchanges"] += 1
             publish_pair([kept[1]], self._publish)
+
+    def is_quiet(self, now_ns: int) -> bool:
+        """Whether nobody emits now: else the robot is deaf, or prints what an echo would break."""
+        return now_ns % self._half_ns > EMITTED_AFTER_NS + _LATE_START_NS
 
     def is_due(self, now_ns: int) -> bool:
         """Whether to emit now, or to wait no longer for the second matrix of an exchange."""

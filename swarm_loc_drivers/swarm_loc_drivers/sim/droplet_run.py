@@ -1,7 +1,7 @@
 """A swarm of Droplets that take turns to emit, half of them wandering, recorded as their drivers publish it.
 
-Robots, consoles and conversations are those of the live graph (see `droplet_lockstep`). Two robots are seen by
-a tracker above the table, all others are to be located by infrared alone.
+Robots, consoles and conversations are those of the live graph (see `droplet_lockstep`). A tracker above the
+table sees two robots, all others are to be located by infrared alone.
 """
 
 from __future__ import annotations

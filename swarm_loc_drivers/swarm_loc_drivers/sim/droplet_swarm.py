@@ -107,7 +107,7 @@ class Wander:
 
     def __init__(self, homes: FloatArray, walking: FloatArray, seed: int) -> None:
         self._homes, self._walking, self._seed = homes, walking, seed
-        self._leg = np.zeros(len(homes), dtype=np.int64)
+        self._leg = np.full(len(homes), -1)
         self._since_ns = np.zeros(len(homes), dtype=np.int64)
 
     def command(self, robot: int, stamp_ns: int, pose: FloatArray) -> tuple[float, float, float]:
@@ -135,9 +135,9 @@ class Wander:
         """The velocity to the end of the leg; still when it is reached."""
         leg = int(self._leg[robot])
         rng = np.random.default_rng([self._seed, robot, leg // 2])
-        radius, angle, heading = rng.uniform((0.0, -math.pi, -math.pi), (_WANDER_RADIUS, math.pi, math.pi))
+        radius, angle, aside = rng.uniform((0.0, -math.pi, -1.0), (_WANDER_RADIUS, math.pi, 1.0))
         if leg % 2:
-            left = float(se2.wrap_angle(heading - pose[2]))
+            left = float(se2.wrap_angle(self._homes[robot, 2] + aside - pose[2]))
             return 0.0, 0.0, math.copysign(_FAST_TURN, left) if abs(left) > _TURNED else 0.0
         there = self._homes[robot, :2] + radius * np.array([math.cos(angle), math.sin(angle)])
         seen = se2.between(pose, [*there, 0.0])

@@ -1,0 +1,101 @@
+"""The whole chain of Droplets over DDS: steering, drivers, consoles, one world, its clock and its tracker."""
+
+from __future__ import annotations
+
+import signal
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from node_world import Program, Ros, stamp_ns
+from rosgraph_msgs.msg import Clock
+
+from swarm_loc_drivers.sim.droplet_swarm import DropletSwarmSettings, describe_droplets, starts
+from swarm_loc_estimator.core import se2
+from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
+from swarm_loc_estimator.io.swarm_writer import save_swarm
+from swarm_loc_msgs.msg import BrightnessMatrix
+
+ROBOTS = 3
+SETTINGS = DropletSwarmSettings(robots=ROBOTS, start_known=True)
+
+
+@pytest.fixture
+def swarm_file(tmp_path: Path) -> Path:
+    path = tmp_path / "swarm.yaml"
+    gains = (None,) * ROBOTS
+    swarm = describe_droplets(SETTINGS, starts(SETTINGS), load_ir_platform("droplet"), gains)
+    save_swarm(swarm, path)
+    return path
+
+
+def way_of(odometry: list[Odometry]) -> float:
+    place = odometry[-1].pose.pose.position
+    return float(np.hypot(place.x, place.y))
+
+
+def test_droplets_wander_and_measure_each_other(ros: Ros, swarm_file: Path, tmp_path: Path) -> None:
+    clock: list[Clock] = ros.listen(Clock, "/clock")
+    truth: list[PoseStamped] = ros.listen(PoseStamped, "droplet2/ground_truth")
+    odometry: list[Odometry] = ros.listen(Odometry, "droplet2/odom")
+    fixes: list[PoseWithCovarianceStamped] = ros.listen(PoseWithCovarianceStamped, "droplet3/fix")
+    matrices: list[BrightnessMatrix] = ros.listen(BrightnessMatrix, "droplet1/brightness")
+    with ExitStack() as running:
+
+        def start(name: str, log: str, parameters: dict[str, object], namespace: str = "") -> Program:
+            arguments = ["-r", f"__ns:=/{namespace}"] if namespace else []
+            program = Program(name, tmp_path / log, parameters, arguments, package="swarm_loc_drivers")
+            return running.enter_context(program)
+
+        swarm = {"swarm_file": swarm_file}
+        seen = {"fixed": '["droplet3"]', "fix_rate": 5.0}
+        world = start(
+            "droplet_world_node", "world.log", {**swarm, **seen, "link_folder": tmp_path, "rate": 2.0}
+        )
+        ros.until(lambda: clock)
+        for robot in range(ROBOTS):
+            name = f"droplet{robot + 1}"
+            taking = {"turns": ROBOTS, "turn": robot, "use_sim_time": "true"}
+            start("droplet_driver_node", f"{name}.log", {"address": tmp_path / name, **taking}, name)
+        start("droplet_steering_node", "steering.log", {**swarm, "use_sim_time": "true"})
+        ros.until(lambda: any(one.twist.twist.linear.x or one.twist.twist.linear.y for one in odometry))
+        ros.until(lambda: len({one.transmitter for one in matrices}) == 2 and len(fixes) > 5)
+        ros.until(
+            lambda: np.hypot(odometry[-1].pose.pose.position.x, odometry[-1].pose.pose.position.y) > 0.005
+        )
+        assert world.end(signal.SIGINT) == 0, world.output
+    times = np.array([one.clock.sec + 1e-9 * one.clock.nanosec for one in clock])
+    assert (np.diff(times) > 0).all()
+    first, last = truth[0].pose.position, truth[-1].pose.position
+    assert np.hypot(last.x - first.x, last.y - first.y) > 0.003
+    assert {one.receiver for one in matrices} == {0x1001}
+    assert {one.power for one in matrices} == {BrightnessMatrix.POWER_FAR, BrightnessMatrix.POWER_NEAR}
+    assert all(stamp_ns(one) > 0 for one in matrices)
+    there = starts(SETTINGS)[2]
+    for fix in fixes:
+        place, turn = fix.pose.pose.position, fix.pose.pose.orientation
+        pose = [place.x, place.y, 2.0 * np.arctan2(turn.z, turn.w)]
+        error = np.subtract(pose, there)
+        error[2] = se2.wrap_angle(error[2])
+        assert np.abs(error / (0.003, 0.003, 0.02)).max() < 6.0
+        assert fix.header.frame_id == "map"
+
+
+@pytest.mark.parametrize(
+    ("parameters", "sentence"),
+    [
+        ({"world": "d7"}, "parameter world = 'd7' must be one of d0, d1."),
+        ({"fixed": '["droplet9"]'}, "parameter fixed has 'droplet9', who is not in the swarm description."),
+        ({"link_folder": "/nowhere"}, "parameter link_folder = /nowhere cannot be used for droplet1"),
+    ],
+)
+def test_a_parameter_that_cannot_be_used_ends_it_with_one_sentence(
+    swarm_file: Path, tmp_path: Path, parameters: dict[str, object], sentence: str
+) -> None:
+    all_parameters = {"swarm_file": swarm_file, "link_folder": tmp_path, **parameters}
+    program = Program("droplet_world_node", tmp_path / "log", all_parameters, package="swarm_loc_drivers")
+    assert program.process.wait(60.0) == 1
+    assert sentence in program.output
