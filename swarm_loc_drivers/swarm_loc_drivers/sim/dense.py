@@ -11,14 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import exposures
-from .differential_drive import Drive, drive, report_odometry
-from .eight import CAMERA_RATE_HZ, START_NS, STEP_NS, VIEW, WHEEL_SEPARATION, EightSettings, describe, follow
+from .eight import STEP_NS, VIEW, EightSettings, drive_robots, follow, take_pictures
 from .lemniscate import Lemniscate
 from .markers import sight_markers
 from .record import SimulatedRun
-from .trajectories import Trajectories
-from .transport import ODOMETRY_LATENESS
 from .worlds import W0, World
 
 FloatArray = NDArray[np.float64]
@@ -27,7 +23,6 @@ PITCH = 0.13
 COLUMNS, ROWS = 5, 4
 HALF_WIDTH = 0.45
 SPEED = 0.06
-_ODOMETRY_EVERY = 10
 _FIRST_FACE_ID = 1000
 
 
@@ -56,25 +51,20 @@ def blind_robots() -> NDArray[np.int64]:
 def simulate_dense(settings: DenseSettings) -> SimulatedRun:
     """Let the robots turn about and record what their sensors say."""
     rng = np.random.default_rng(settings.seed)
-    steps = round(settings.duration_s * 1e9 / STEP_NS)
-    stamp_ns = START_NS + STEP_NS * np.arange(steps + 1, dtype=np.int64)
     index = np.arange(COLUMNS * ROWS)
     homes = PITCH * np.column_stack(
         [index % COLUMNS - 0.5 * (COLUMNS - 1), index // COLUMNS - 0.5 * (ROWS - 1)]
     )
     path, place = Lemniscate(HALF_WIDTH), np.column_stack([homes, np.zeros(index.size)])
     start = path.at(np.zeros(index.size))[0] + place
-    model = Drive(WHEEL_SEPARATION, settings.world.wheel_noise, settings.world.turn_slip)
     control = follow(path, np.zeros(index.size), SPEED, STEP_NS * 1e-9)
 
     def in_formation(step: int, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
         return control(step, pose - place)
 
-    driven = drive(rng, start, in_formation, model, step_s=STEP_NS * 1e-9, steps=steps)
-    truth = Trajectories(stamp_ns, driven.truth)
-    odometry = report_odometry(rng, stamp_ns, driven.reported, _ODOMETRY_EVERY, ODOMETRY_LATENESS)
-    swarm = describe(EightSettings(world=settings.world), start, _FIRST_FACE_ID)
-    pictures = exposures(rng, index.size, CAMERA_RATE_HZ, int(stamp_ns[0]) + 200_000_000, int(stamp_ns[-1]))
+    chosen = EightSettings(duration_s=settings.duration_s, world=settings.world)
+    swarm, truth, odometry = drive_robots(rng, chosen, start, in_formation, _FIRST_FACE_ID)
+    pictures = take_pictures(rng, index.size, truth)
     frames, sightings = sight_markers(rng, swarm, truth, pictures, VIEW, settings.world)
     run = SimulatedRun(swarm, truth, odometry, frames, sightings)
     observer = np.repeat(frames["robot"], frames["count"])

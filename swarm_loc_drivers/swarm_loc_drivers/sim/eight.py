@@ -49,7 +49,7 @@ CAMERA_RATE_HZ = 7.5
 START_NS = 1_000 * 10**9
 STEP_NS = 5_000_000
 
-_FIRST_LANDMARK_ID = 100
+_FIRST_FACE_ID, _FIRST_LANDMARK_ID = 10, 100
 _ACROSS_GAIN = 25.0
 _HEADING_GAIN = 10.0
 _CATCH_UP_GAIN = 0.5
@@ -95,22 +95,32 @@ def take_pictures(rng: np.random.Generator, robots: int, truth: Trajectories) ->
 
 
 def drive_eight(rng: np.random.Generator, settings: EightSettings) -> tuple[Swarm, Trajectories, Records]:
-    """Drive the eight: the swarm as described, where it went, and its odometry."""
-    steps = round(settings.duration_s * 1e9 / STEP_NS)
-    stamp_ns = START_NS + STEP_NS * np.arange(steps + 1, dtype=np.int64)
+    """Drive the eight; results as of `drive_robots`."""
     path = Lemniscate(HALF_WIDTH)
     offset = np.arange(settings.robots) * path.length / settings.robots
     start, _ = path.at(offset)
+    return drive_robots(rng, settings, start, follow(path, offset, settings.speed, STEP_NS * 1e-9))
+
+
+def drive_robots(
+    rng: np.random.Generator,
+    settings: EightSettings,
+    start: FloatArray,
+    control: Controller,
+    first_face_id: int = _FIRST_FACE_ID,
+) -> tuple[Swarm, Trajectories, Records]:
+    """Drive robots from `start` (N, 3): the swarm as described, where it went, and its odometry."""
+    steps = round(settings.duration_s * 1e9 / STEP_NS)
+    stamp_ns = START_NS + STEP_NS * np.arange(steps + 1, dtype=np.int64)
     model = Drive(WHEEL_SEPARATION, settings.world.wheel_noise, settings.world.turn_slip)
-    control = follow(path, offset, settings.speed, STEP_NS * 1e-9)
     driven = drive(rng, start, control, model, step_s=STEP_NS * 1e-9, steps=steps)
     truth = Trajectories(stamp_ns, driven.truth)
     every = round(1e9 / settings.odometry_rate_hz / STEP_NS)
     odometry = report_odometry(rng, stamp_ns, driven.reported, every, ODOMETRY_LATENESS)
-    return describe(settings, start), truth, odometry
+    return describe(settings, start, first_face_id), truth, odometry
 
 
-def describe(settings: EightSettings, start: FloatArray, first_face_id: int = 10) -> Swarm:
+def describe(settings: EightSettings, start: FloatArray, first_face_id: int = _FIRST_FACE_ID) -> Swarm:
     """The swarm as its owner would describe it; `start` is (N, 3) in map, each robot has ten ids."""
     odometry = OdometryModel(wheel_separation=WHEEL_SEPARATION, wheel_noise=settings.world.wheel_noise)
     robots = tuple(
