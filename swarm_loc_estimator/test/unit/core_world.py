@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from core_geometry import homogeneous, marker_frame, seen
+from core_messages import POSE, POSITION, SECOND, T0, Event, detection, joined
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from swarm_loc_estimator.core.arrivals import DetectionRows, Messages, OdometryRows
-from swarm_loc_estimator.core.estimator import SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.core.fusion import Verdict
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import (
     CameraMount,
@@ -24,85 +23,6 @@ from swarm_loc_estimator.core.swarm import (
     StartSigma,
     Swarm,
 )
-from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
-
-SECOND = 10**9
-T0 = 1_000 * SECOND
-POSITION, POSE, POSE_TWO = 1, 2, 3
-
-
-def homogeneous(
-    x: float, y: float, z: float, yaw: float, pitch: float = 0.0, roll: float = 0.0
-) -> FloatArray:
-    """The matrix (4, 4) of a frame at x, y, z turned by Rz(yaw) Ry(pitch) Rx(roll)."""
-    cy, sy, cp, sp, cr, sr = (f(a) for a in (yaw, pitch, roll) for f in (math.cos, math.sin))
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr, x],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr, y],
-            [-sp, cp * sr, cp * cr, z],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
-
-
-def marker_frame(x: float, y: float, z: float, yaw: float) -> FloatArray:
-    """The matrix (4, 4) of a marker: z out of its face towards yaw, y down."""
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    return np.array([[sin, 0.0, cos, x], [-cos, 0.0, sin, y], [0.0, -1.0, 0.0, z], [0.0, 0.0, 0.0, 1.0]])
-
-
-def optical_frame(mount: CameraMount) -> FloatArray:
-    """The matrix (4, 4) from base_link to the camera's optical frame: x right, y down, z forward."""
-    to_optical = np.eye(4)
-    to_optical[:3, :3] = np.column_stack([(0, -1, 0), (0, 0, -1), (1, 0, 0)])
-    return homogeneous(mount.x, mount.y, mount.z, mount.yaw, mount.pitch, mount.roll) @ to_optical
-
-
-def seen(base: ArrayLike, mount: CameraMount, marker_in_map: FloatArray) -> FloatArray:
-    """Markers (..., 4, 4) in the optical frame of a camera on a robot at `base` (3,)."""
-    x, y, theta = np.asarray(base, dtype=float)
-    camera = homogeneous(x, y, 0.0, theta) @ optical_frame(mount)
-    relative: FloatArray = np.linalg.inv(camera) @ marker_in_map
-    return relative
-
-
-def detection(marker_id: int, pose: FloatArray, content: int = POSE) -> NDArray[np.void]:
-    """A detection (1,) of a marker whose pose in the optical frame is (4, 4); its noise is the sensor's."""
-    one = np.zeros(1, dtype=DETECTION_DTYPE)
-    one["id"], one["content"], one["position"] = marker_id, content, pose[:3, 3]
-    one["orientation"] = Rotation.from_matrix(pose[:3, :3]).as_quat()
-    one["alternative_position"], one["alternative_orientation"] = one["position"], one["orientation"]
-    one["covariance"][0, 0, 0] = -1.0
-    return one
-
-
-def joined(detections: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
-    """All detections in one array of the same dtype, which numpy's own concatenation would not keep."""
-    together: NDArray[np.void] = np.frombuffer(
-        b"".join(one.tobytes() for one in detections), dtype=DETECTION_DTYPE
-    ).copy()
-    return together
-
-
-@dataclass(frozen=True)
-class Event:
-    """One message: odometry when `pose` is given, else detections."""
-
-    robot: int
-    stamp_ns: int
-    pose: tuple[float, float, float] | None = None
-    detections: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, dtype=DETECTION_DTYPE))
-
-    def give(self, estimator: SwarmEstimator, now_ns: int) -> None:
-        """Hand the message in."""
-        rows = 0 if self.pose is None else 1
-        poses = np.array([self.pose or ()], dtype=float).reshape(rows, 3)
-        robot, stamp_ns, arrival_ns = np.array([[self.robot], [self.stamp_ns], [now_ns]], dtype=np.int64)
-        odometry = OdometryRows(robot[:rows], stamp_ns[:rows], poses, arrival_ns[:rows])
-        each = np.zeros(self.detections.size, dtype=np.int64)
-        seen = DetectionRows(robot[each], stamp_ns[each], self.detections, arrival_ns[each])
-        estimator.receive(Messages(now_ns, now_ns, odometry, seen))
 
 
 @dataclass(frozen=True)
@@ -150,6 +70,7 @@ class Plan:
         lasting: Scale of the errors that last, of the motion and of the camera; 0: neither are there any,
             nor are they estimated.
         survey: Scale of the errors of the landmarks' places, likewise.
+        watching: Whether every robot begins with its camera on the landmark farthest from it.
     """
 
     robots: int = 3
@@ -169,6 +90,7 @@ class Plan:
     carried: Sequence[int] = ()
     lasting: float = 0.0
     survey: float = 0.0
+    watching: bool = False
 
 
 ODOMETRY = OdometryModel(wheel_separation=0.053, wheel_noise=2e-5)
@@ -195,6 +117,8 @@ def simulate(plan: Plan, seed: int) -> World:
     start = np.column_stack(
         [rng.uniform(-0.5, 0.5, (plan.robots, 2)) * plan.arena, rng.uniform(-3.1, 3.1, plan.robots)]
     )
+    if plan.watching:
+        start[:, 2] = _towards_the_farthest(start, plan)
     lasting = lasting_errors(plan, seed)
     truth, odometry = _drive(rng, plan, start, steps, lasting)
     swarm = _describe(rng, plan, start)
@@ -282,6 +206,22 @@ def _drive(
     return truth, report
 
 
+def _landmark_angles(plan: Plan) -> FloatArray:
+    """Where on their circle the landmarks stand (L,)."""
+    angles: FloatArray = 2.0 * np.pi * np.arange(plan.landmarks) / max(1, plan.landmarks)
+    return angles
+
+
+def _towards_the_farthest(start: FloatArray, plan: Plan) -> FloatArray:
+    """Headings (N,) with which the robots' cameras look at the landmark that is farthest from their start."""
+    angles = _landmark_angles(plan)
+    marks = plan.arena * np.column_stack([np.cos(angles), np.sin(angles)])
+    away = marks - start[:, None, :2]
+    farthest = away[np.arange(plan.robots), np.linalg.norm(away, axis=2).argmax(axis=1)]
+    headings: FloatArray = np.arctan2(farthest[:, 1], farthest[:, 0]) - MOUNT.yaw
+    return headings
+
+
 def _homing(pose: FloatArray, plan: Plan) -> FloatArray:
     """Turn rate (N,) of robots that have come too far out; NaN for others."""
     away = np.arctan2(-pose[:, 1], -pose[:, 0]) - pose[:, 2]
@@ -304,7 +244,6 @@ def _describe(rng: np.random.Generator, plan: Plan, start: FloatArray) -> Swarm:
     known = [plan.start_known[i % len(plan.start_known)] for i in range(plan.robots)]
     sigma = plan.noise * np.array([START_SIGMA.x, START_SIGMA.y, START_SIGMA.theta])
     believed = start + sigma * rng.standard_normal(start.shape)
-    angles = 2.0 * np.pi * np.arange(plan.landmarks) / max(1, plan.landmarks)
     odometry = replace(
         ODOMETRY,
         distance_scale_sigma=plan.lasting * SCALE_SIGMA,
@@ -332,7 +271,7 @@ def _describe(rng: np.random.Generator, plan: Plan, start: FloatArray) -> Swarm:
         ),
         tuple(
             Landmark(1000 + i, plan.arena * math.cos(a), plan.arena * math.sin(a), 0.1, a + math.pi)
-            for i, a in enumerate(angles)
+            for i, a in enumerate(_landmark_angles(plan).tolist())
         ),
     )
 
@@ -389,63 +328,3 @@ def _sighting(rng: np.random.Generator, plan: Plan, marker_id: int, relative: Fl
 def _about_z(angle: float) -> FloatArray:
     cos, sin = math.cos(angle), math.sin(angle)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-
-
-def play(
-    estimator: SwarmEstimator,
-    events: Iterable[tuple[int, Event]],
-    ticks_ns: Iterable[int],
-    resting_ns: Container[int] = (),
-) -> list[SwarmEstimate]:
-    """Hand in events (arrival, event) as they arrive, and tick, not fusing at some; return all estimates."""
-    waiting = sorted(events, key=lambda pair: pair[0])
-    estimates, k = [], 0
-    for now_ns in ticks_ns:
-        while k < len(waiting) and waiting[k][0] <= now_ns:
-            waiting[k][1].give(estimator, waiting[k][0])
-            k += 1
-        estimates.append(estimator.tick(now_ns, fuse=now_ns not in resting_ns))
-    return estimates
-
-
-def on_time(world: World) -> list[tuple[int, Event]]:
-    """The world's events, each arriving at its stamp."""
-    return [(event.stamp_ns, event) for event in world.events]
-
-
-def ticks(begin_ns: int, end_ns: int, period_s: float = 0.1) -> list[int]:
-    """Instants of ticks, the last one at `end_ns`."""
-    return [*range(begin_ns, end_ns, round(period_s * SECOND)), end_ns]
-
-
-def settled(estimator: SwarmEstimator) -> dict[str, int]:
-    """How many measurements ended with which verdict."""
-    counts = estimator._timeline.verdict_counts()
-    return {verdict.name: int(counts[verdict]) for verdict in Verdict}
-
-
-def planar(pose: FloatArray) -> FloatArray:
-    """The homogeneous matrix (3, 3) of a pose (3,) in the plane."""
-    x, y, theta = pose
-    cos, sin = math.cos(theta), math.sin(theta)
-    return np.array([[cos, -sin, x], [sin, cos, y], [0.0, 0.0, 1.0]])
-
-
-def pose_of(matrix: FloatArray) -> FloatArray:
-    """The pose (3,) of a homogeneous matrix (3, 3)."""
-    return np.array([matrix[0, 2], matrix[1, 2], math.atan2(matrix[1, 0], matrix[0, 0])])
-
-
-def wrapped(error: FloatArray) -> FloatArray:
-    """Errors (..., 3) with their headings in [-pi, pi]."""
-    result: FloatArray = error.copy()
-    result[..., 2] = np.arctan2(np.sin(error[..., 2]), np.cos(error[..., 2]))
-    return result
-
-
-def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Normalised squared errors (...) of errors (..., 3), headings wrapped."""
-    normal = wrapped(error)
-    weighted = np.linalg.solve(covariance, normal[..., None])[..., 0]
-    squared: FloatArray = np.einsum("...i,...i->...", normal, weighted)
-    return squared

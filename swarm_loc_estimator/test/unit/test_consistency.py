@@ -4,22 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from core_world import (
-    MOUNT,
-    ODOMETRY,
-    POSE,
-    POSE_TWO,
-    POSITION,
-    T0,
-    Plan,
-    World,
-    nees,
-    on_time,
-    play,
-    simulate,
-    ticks,
-    wrapped,
-)
+from core_geometry import nees, wrapped
+from core_messages import POSE, POSE_TWO, POSITION, T0
+from core_run import on_time, play, ticks
+from core_world import MOUNT, ODOMETRY, Plan, World, simulate
 from scipy.stats import chi2
 
 from swarm_loc_estimator.core import fusion

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from core_world import SECOND, T0, nees, planar, pose_of
+from core_geometry import nees, planar, pose_of
+from core_messages import SECOND, T0
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -6,26 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from core_world import (
-    MOUNT,
-    POSE,
-    POSE_TWO,
-    POSITION,
-    SECOND,
-    T0,
-    Event,
-    Plan,
-    World,
-    detection,
-    marker_frame,
-    nees,
-    on_time,
-    play,
-    seen,
-    settled,
-    simulate,
-    ticks,
-)
+from core_geometry import marker_frame, nees, seen
+from core_messages import POSE, POSE_TWO, POSITION, SECOND, T0, Event, detection
+from core_run import on_time, play, settled, ticks
+from core_world import MOUNT, Plan, World, simulate
 from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.core.estimator import Status, SwarmEstimate, SwarmEstimator

@@ -5,23 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from core_world import (
-    MOUNT,
-    POSE,
-    SENSOR,
-    T0,
-    Plan,
-    World,
-    detection,
-    lasting_errors,
-    marker_frame,
-    on_time,
-    play,
-    seen,
-    simulate,
-    ticks,
-    wrapped,
-)
+from core_geometry import marker_frame, seen, wrapped
+from core_messages import POSE, T0, detection
+from core_run import on_time, play, ticks
+from core_world import MOUNT, SENSOR, Plan, World, lasting_errors, simulate
 
 from swarm_loc_estimator.cli.replay import main
 from swarm_loc_estimator.core.estimator import SwarmEstimator

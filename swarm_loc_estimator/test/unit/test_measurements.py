@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from core_world import planar, pose_of
+from core_geometry import planar, pose_of
 
 from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.measurements import (

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from core_world import SECOND, T0, wrapped
+from core_geometry import wrapped
+from core_messages import SECOND, T0
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core import se2

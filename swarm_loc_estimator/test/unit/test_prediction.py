@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from core_world import SECOND, T0
+from core_messages import SECOND, T0
 
 from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.odometry import OdometryTracks

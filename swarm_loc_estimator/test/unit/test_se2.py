@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from core_world import planar, wrapped
+from core_geometry import planar, wrapped
 from scipy.linalg import expm
 
 from swarm_loc_estimator.core import se2

@@ -5,16 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from core_world import (
-    POSE_TWO,
-    POSITION,
-    T0,
-    detection,
-    homogeneous,
-    joined,
-    marker_frame,
-    seen,
-)
+from core_geometry import homogeneous, marker_frame, seen
+from core_messages import POSE_TWO, POSITION, T0, detection, joined
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 

@@ -1,0 +1,44 @@
+"""Runs of the core in tests: messages handed in as they arrive, ticks, and what became of it all."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterable
+
+from core_messages import SECOND, Event
+from core_world import World
+
+from swarm_loc_estimator.core.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.core.fusion import Verdict
+
+
+def play(
+    estimator: SwarmEstimator,
+    events: Iterable[tuple[int, Event]],
+    ticks_ns: Iterable[int],
+    resting_ns: Container[int] = (),
+) -> list[SwarmEstimate]:
+    """Hand in events (arrival, event) as they arrive, and tick, not fusing at some; return all estimates."""
+    waiting = sorted(events, key=lambda pair: pair[0])
+    estimates, k = [], 0
+    for now_ns in ticks_ns:
+        while k < len(waiting) and waiting[k][0] <= now_ns:
+            waiting[k][1].give(estimator, waiting[k][0])
+            k += 1
+        estimates.append(estimator.tick(now_ns, fuse=now_ns not in resting_ns))
+    return estimates
+
+
+def on_time(world: World) -> list[tuple[int, Event]]:
+    """The world's events, each arriving at its stamp."""
+    return [(event.stamp_ns, event) for event in world.events]
+
+
+def ticks(begin_ns: int, end_ns: int, period_s: float = 0.1) -> list[int]:
+    """Instants of ticks, the last one at `end_ns`."""
+    return [*range(begin_ns, end_ns, round(period_s * SECOND)), end_ns]
+
+
+def settled(estimator: SwarmEstimator) -> dict[str, int]:
+    """How many measurements ended with which verdict."""
+    counts = estimator._timeline.verdict_counts()
+    return {verdict.name: int(counts[verdict]) for verdict in Verdict}
