@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 END = 0
 RGB565_MODE = 1
-PROXIMITY_SENSORS = 8
 
 _SPEEDS = struct.Struct("<2h")
 _READINGS = struct.Struct("<2h8H")

@@ -24,16 +24,7 @@ _SECOND = 1_000_000_000
 def write_picture_bag(pictured: PicturedRun, folder: Path, comment: str) -> int:
     """Write `<robot>/image_raw/compressed`, `camera_info`, `odom` and `ground_truth` of all robots.
 
-    Args:
-        pictured: What to write; log times are times of arrival.
-        folder: The bag, created; must not exist.
-        comment: First lines of `swarm.yaml`, where the run comes from.
-
-    Returns:
-        Number of messages.
-
-    Raises:
-        BagError: The folder is there already, or cannot be created.
+    The folder, the comment, the result and the errors are those of `bag.write_bag`.
     """
     run = pictured.run
     frames = run.frames

@@ -29,7 +29,6 @@ from swarm_loc_drivers.protocols.rgb565 import decode_rgb565, encode_rgb565
 
 MODELS = pytest.mark.parametrize("model", [EPUCK1, EPUCK2], ids=lambda model: model.name)
 SPEED = st.integers(-1100, 1100)
-WORD = st.integers(-(2**15), 2**15 - 1)
 
 
 @pytest.mark.parametrize(

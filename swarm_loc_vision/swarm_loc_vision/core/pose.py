@@ -55,6 +55,28 @@ class Poses(NamedTuple):
     chi2: FloatArray
 
 
+class _Sight(NamedTuple):
+    """What is known of the pose of one marker, or of a body with M of them.
+
+    Attributes:
+        points: (4 M, 3) corners in the body's frame.
+        pixels: (4 M, 2) where they are seen.
+        weights: (M, 8, 8) of each four.
+        intrinsics: fx, fy, cx, cy.
+        axis: (3,) of the body, which points up.
+        up: (3,) in the camera frame.
+        tilt_weight: One over the tilt's variance; 0 when nothing is known.
+    """
+
+    points: FloatArray
+    pixels: FloatArray
+    weights: FloatArray
+    intrinsics: FloatArray
+    axis: FloatArray
+    up: FloatArray
+    tilt_weight: float
+
+
 def square(length: float) -> FloatArray:
     """(4, 3) corners of a marker in its own frame, clockwise from the upper left [m]."""
     half = 0.5 * length
@@ -111,22 +133,13 @@ def body_pose(
         N = 1; the second solution is the best one of another kind, if a start led to one.
     """
     weights = np.asarray(np.linalg.inv(covariance), np.float64)
-    axis = np.array([0.0, 0.0, 1.0])
+    axis, flat = np.array([0.0, 0.0, 1.0]), (points.reshape(-1, 3), pixels.reshape(-1, 2))
+    sight = _Sight(*flat, weights, intrinsics, axis, *_tilt(upright))
     rotations, positions = starts[0].copy(), starts[1].copy()
     covariances = np.zeros((len(rotations), 6, 6))
     chi2 = np.full(len(rotations), np.inf)
     for i in range(len(rotations)):
-        chi2[i] = _refine(
-            points.reshape(-1, 3),
-            pixels.reshape(-1, 2),
-            weights,
-            intrinsics,
-            axis,
-            *_tilt(upright),
-            rotations[i],
-            positions[i],
-            covariances[i],
-        )
+        chi2[i] = _refine(sight, rotations[i], positions[i], covariances[i])
     order = np.argsort(chi2, kind="stable")
     best = order[0]
     turned = np.einsum("ij,sij->s", rotations[best], rotations)  # 1 + 2 cos of the angle between
@@ -164,45 +177,18 @@ def _refine_markers(
     """Refine both starts of each marker; the last four arguments are `Poses`."""
     axis = np.array([0.0, 1.0, 0.0])
     for n in range(len(corners)):
+        sight = _Sight(points[n], corners[n], weights[n : n + 1], intrinsics, axis, up, tilt_weight)
         for s in range(2):
             if position[n, s, 2] > 0.0:
-                chi2[n, s] = _refine(
-                    points[n],
-                    corners[n],
-                    weights[n : n + 1],
-                    intrinsics,
-                    axis,
-                    up,
-                    tilt_weight,
-                    rotation[n, s],
-                    position[n, s],
-                    covariance[n, s],
-                )
+                chi2[n, s] = _refine(sight, rotation[n, s], position[n, s], covariance[n, s])
 
 
 @compiled
-def _refine(
-    points: FloatArray,
-    pixels: FloatArray,
-    weights: FloatArray,
-    intrinsics: FloatArray,
-    axis: FloatArray,
-    up: FloatArray,
-    tilt_weight: float,
-    rotation: FloatArray,
-    position: FloatArray,
-    covariance: FloatArray,
-) -> float:
+def _refine(sight: _Sight, rotation: FloatArray, position: FloatArray, covariance: FloatArray) -> float:
     """Weighted least squares on corners and tilt, Levenberg and Marquardt.
 
     Args:
-        points: (4 M, 3) corners in the body's frame.
-        pixels: (4 M, 2) where they are seen.
-        weights: (M, 8, 8) of each four.
-        intrinsics: fx, fy, cx, cy.
-        axis: (3,) of the body, which points up.
-        up: (3,) in the camera frame.
-        tilt_weight: One over the tilt's variance.
+        sight: What is known.
         rotation: (3, 3) start, and result.
         position: (3,) likewise.
         covariance: (6, 6) filled.
@@ -214,9 +200,7 @@ def _refine(
     slope, trial_slope, step = np.empty(6), np.empty(6), np.empty(6)
     trial_rotation, trial_position = np.empty((3, 3)), np.empty(3)
     factor = np.empty((6, 6))
-    cost = _equations(
-        points, pixels, weights, intrinsics, axis, up, tilt_weight, rotation, position, normal, slope
-    )
+    cost = _equations(sight, rotation, position, normal, slope)
     damping = 1e-4
     for _ in range(_ROUNDS):
         if not cost < _NOWHERE:
@@ -230,19 +214,7 @@ def _refine(
             if i < 3:
                 trial_position[i] = position[i] + step[i]
         _rotated(rotation, step, trial_rotation)
-        trial = _equations(
-            points,
-            pixels,
-            weights,
-            intrinsics,
-            axis,
-            up,
-            tilt_weight,
-            trial_rotation,
-            trial_position,
-            trial_normal,
-            trial_slope,
-        )
+        trial = _equations(sight, trial_rotation, trial_position, trial_normal, trial_slope)
         if trial <= cost:
             rotation[:], position[:] = trial_rotation, trial_position
             normal[:], slope[:] = trial_normal, trial_slope
@@ -265,24 +237,15 @@ def _refine(
 
 @compiled
 def _equations(
-    points: FloatArray,
-    pixels: FloatArray,
-    weights: FloatArray,
-    intrinsics: FloatArray,
-    axis: FloatArray,
-    up: FloatArray,
-    tilt_weight: float,
-    rotation: FloatArray,
-    position: FloatArray,
-    normal: FloatArray,
-    slope: FloatArray,
+    sight: _Sight, rotation: FloatArray, position: FloatArray, normal: FloatArray, slope: FloatArray
 ) -> float:
-    """Normal equations (6, 6) and (6,) at a pose, and its cost; the arguments are those of `_refine`."""
+    """Normal equations (6, 6) and (6,) at a pose, and its cost; infinite where a corner lies behind."""
     normal[:] = 0.0
     slope[:] = 0.0
     cost = 0.0
     jacobian, weighed = np.zeros((8, 6)), np.empty(6)
     rest = np.empty(8)
+    points, pixels, weights, intrinsics = sight.points, sight.pixels, sight.weights, sight.intrinsics
     fx, fy = intrinsics[0], intrinsics[1]
     for m in range(len(weights)):
         for k in range(4):
@@ -317,21 +280,15 @@ def _equations(
                 slope[c] += jacobian[i, c] * weighed_rest
                 for d in range(6):
                     normal[c, d] += jacobian[i, c] * weighed[d]
-    if tilt_weight > 0.0:
-        cost += _add_tilt(axis, up, tilt_weight, rotation, normal, slope)
+    if sight.tilt_weight > 0.0:
+        cost += _add_tilt(sight, rotation, normal, slope)
     return cost
 
 
 @compiled
-def _add_tilt(
-    axis: FloatArray,
-    up: FloatArray,
-    tilt_weight: float,
-    rotation: FloatArray,
-    normal: FloatArray,
-    slope: FloatArray,
-) -> float:
+def _add_tilt(sight: _Sight, rotation: FloatArray, normal: FloatArray, slope: FloatArray) -> float:
     """Add that a body's axis points up: their cross product is zero but for the tilt."""
+    axis, up, tilt_weight = sight.axis, sight.up, sight.tilt_weight
     top = np.empty(3)
     for i in range(3):
         top[i] = rotation[i, 0] * axis[0] + rotation[i, 1] * axis[1] + rotation[i, 2] * axis[2]

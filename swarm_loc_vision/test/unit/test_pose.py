@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from vision_bench.scenes import facing, project
 
-from swarm_loc_vision.core.pose import Poses, Upright, _equations, marker_poses, square
+from swarm_loc_vision.core.pose import Poses, Upright, _equations, _Sight, marker_poses, square
 
 FloatArray = NDArray[np.float64]
 INTRINSICS = np.array([1000.0, 1000.0, 639.5, 479.5])
@@ -111,25 +111,12 @@ def test_the_gradient_is_that_of_the_cost() -> None:
     points, pixels = square(LENGTH), corners_of(rotation, position, 1.0)[0]
     covariance = SIGMA_PX**2 * (np.eye(8) + 0.3 * np.ones((8, 8)))
     weights = np.asarray(np.linalg.inv(covariance)[None], np.float64)
-    axis, normal, slope = np.array([0.0, 1.0, 0.0]), np.empty((6, 6)), np.empty(6)
+    sight = _Sight(points, pixels, weights, INTRINSICS, np.array([0.0, 1.0, 0.0]), UP, 50.0)
+    normal, slope = np.empty((6, 6)), np.empty(6)
 
     def cost(step: FloatArray) -> float:
         turned = Rotation.from_rotvec(step[3:]).as_matrix() @ rotation[0]
-        return float(
-            _equations(
-                points,
-                pixels,
-                weights,
-                INTRINSICS,
-                axis,
-                UP,
-                50.0,
-                turned,
-                position[0] + step[:3],
-                normal,
-                slope,
-            )
-        )
+        return float(_equations(sight, turned, position[0] + step[:3], normal, slope))
 
     numeric = [(cost(1e-6 * unit) - cost(-1e-6 * unit)) / 2e-6 for unit in np.eye(6)]
     cost(np.zeros(6))
