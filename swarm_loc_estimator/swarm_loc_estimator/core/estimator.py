@@ -43,7 +43,7 @@ class SwarmEstimator:
         self._screening = Screening(swarm, round(self.settings.future_tolerance_s * 1e9))
         self._fusion = Fusion(swarm, self.settings, self._tracks)
         self._parameters = ParameterTable.of(swarm.robots, swarm.landmarks)
-        self._reach_ns = self._tracks.reach_ns
+        self._reach_ns = self._tracks.reach_ns + round(0.5e9 * self.settings.state_period_s)
         self._timeline = Timeline(
             self.settings, self._fusion.step, SwarmState(self._parameters), self._reach_ns
         )

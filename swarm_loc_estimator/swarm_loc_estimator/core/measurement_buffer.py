@@ -47,12 +47,10 @@ class Merged(NamedTuple):
     Attributes:
         first_ns: Stamp of the first measurement that was not there yet; None when there is none.
         duplicates: Repetitions.
-        too_old: Those older than the oldest accepted.
     """
 
     first_ns: int | None
     duplicates: int
-    too_old: int
 
 
 class MeasurementBuffer:
@@ -88,15 +86,13 @@ class MeasurementBuffer:
         """(m,) to be written."""
         return self._nis[self._begin : self._end]
 
-    def merge(self, new: MeasurementArray, oldest_ns: int) -> Merged:
-        """Sort measurements (k,) in that are not older than an instant."""
+    def merge(self, new: MeasurementArray) -> Merged:
+        """Sort measurements (k,) in."""
         self._make_room(new.size)
         words = np.ascontiguousarray(new).view(np.int64).reshape(-1, _WORDS)
-        count, too_old, first_ns = _merge(
-            self._words, self._stamp_ns, self._begin, self._end, words, oldest_ns
-        )
+        count, first_ns = _merge(self._words, self._stamp_ns, self._begin, self._end, words)
         self._end += count
-        return Merged(first_ns if count else None, new.size - count - too_old, too_old)
+        return Merged(first_ns if count else None, new.size - count)
 
     def remove(self, gone: MeasurementArray) -> int | None:
         """Take measurements (k,) out; return the stamp of the first that was there, None when none was."""
@@ -138,13 +134,11 @@ class MeasurementBuffer:
 
 
 @compiled
-def _merge(
-    rows: IntArray, stamps_ns: IntArray, begin: int, end: int, new: IntArray, oldest_ns: int
-) -> tuple[int, int, int]:
-    """Merge new rows that are not too old into rows[begin:end], which has room behind.
+def _merge(rows: IntArray, stamps_ns: IntArray, begin: int, end: int, new: IntArray) -> tuple[int, int]:
+    """Merge new rows into rows[begin:end], which has room behind.
 
     Returns:
-        How many it has more now, how many were too old, and the stamp of the first one it has more.
+        How many it has more now, and the stamp of the first one it has more.
     """
     order = np.argsort(new[:, 0], kind="mergesort")
     for k in range(1, order.size):  # those that share a stamp
@@ -153,12 +147,9 @@ def _merge(
             order[place] = order[place - 1]
             place -= 1
         order[place] = row
-    kept = too_old = 0
+    kept = 0
     for k in range(order.size):
         row = order[k]
-        if new[row, 0] < oldest_ns:
-            too_old += 1
-            continue
         if kept and _compared(new[row], new[order[kept - 1]]) == 0:
             continue
         place = _lower_bound(rows, stamps_ns, begin, end, new[row])
@@ -177,7 +168,7 @@ def _merge(
         _copy(rows[place], new[row])
         stamps_ns[place] = new[row, 0]
         place -= 1
-    return kept, too_old, new[order[0], 0] if kept else 0
+    return kept, new[order[0], 0] if kept else 0
 
 
 @compiled

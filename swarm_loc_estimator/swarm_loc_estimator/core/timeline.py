@@ -43,8 +43,8 @@ class Timeline:
         settings: Horizon, and how stamps are grouped into steps.
         step: Fuses the measurements of one step into a state, see `Fusion.step`.
         state: Where to begin.
-        reach_ns: How far before its stamp late odometry may change what measurements meant; those are kept
-            so much longer than the horizon.
+        reach_ns: How far before its stamp late odometry may change what measurements meant, and they may
+            count; they are kept so much longer than the horizon.
     """
 
     def __init__(self, settings: EstimatorSettings, step: Step, state: SwarmState, reach_ns: int) -> None:
@@ -141,23 +141,30 @@ class Timeline:
 
     def _merge(self, oldest_ns: int) -> None:
         """Sort new measurements in."""
-        new, self._new = self._at_their_states(self._new), []
-        merged = self._buffer.merge(new, oldest_ns)
-        self.too_old += merged.too_old
+        count, new = self.waiting, self._not_older(self._new, oldest_ns)
+        self._new = []
+        self.too_old += count - new.size
+        merged = self._buffer.merge(new)
         self.duplicates += merged.duplicates
         if merged.first_ns is not None:
             self._redo_from(merged.first_ns)
 
     def _remove(self, oldest_ns: int) -> None:
         """Take withdrawn measurements out, unless what replaces them has just been refused as too old."""
-        gone, self._withdrawn = self._at_their_states(self._withdrawn), []
-        first_ns = self._buffer.remove(gone[gone["stamp_ns"] >= oldest_ns])
+        gone, self._withdrawn = self._not_older(self._withdrawn, oldest_ns), []
+        first_ns = self._buffer.remove(gone)
         if first_ns is not None:
             self._redo_from(first_ns)
 
-    def _at_their_states(self, parts: list[MeasurementArray]) -> MeasurementArray:
-        """All measurements (m,) of some parts, at the closest stored states where these are wanted."""
+    def _not_older(self, parts: list[MeasurementArray], oldest_ns: int) -> MeasurementArray:
+        """Measurements (m,) of some parts whose own stamps are not older than an instant.
+
+        Where stored states are wanted, they come with the stamps of the closest ones.
+        """
         rows, period = parts[0] if len(parts) == 1 else np.concatenate(parts), self._state_period_ns
+        fresh = rows["stamp_ns"] >= oldest_ns
+        if not fresh.all():
+            rows = rows[fresh]
         if period:
             rows = rows.copy()
             rows["stamp_ns"] = (rows["stamp_ns"] + period // 2) // period * period

@@ -9,8 +9,8 @@ import pytest
 from core_geometry import marker_frame, seen, wrapped
 from core_messages import POSE, POSE_TWO, POSITION, SECOND, T0, Event, detection, joined
 from core_run import on_time, play, settled, ticks
-from core_world import MOUNT, Plan, World, simulate
-from hypothesis import given, settings
+from core_world import MOUNT, ODOMETRY, Plan, World, simulate
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.core import fusion
@@ -62,6 +62,18 @@ def assert_same(a: Outcome, b: Outcome) -> None:
     lost_after=st.sampled_from([2.0, 12.0]),
     late_s=st.sampled_from([0.3, 1.0, 1.9]),
     lasting=st.sampled_from([0.0, 1.0]),
+)
+@example(  # a sighting within the horizon, the state closest to it beyond
+    seed=163,
+    robots=4,
+    content=POSE,
+    start_known=(True,),
+    fusion_period_s=0.0,
+    state_period_s=0.13,
+    outliers=0.0,
+    lost_after=2.0,
+    late_s=1.9,
+    lasting=0.0,
 )
 def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
     seed: int,
@@ -163,6 +175,20 @@ def test_odometry_that_comes_at_the_edge_of_the_horizon_changes_what_lay_before_
     late = delayed(events, lambda e: 1.995 if e.pose and int(since_start(e) / step_s) % 3 == 1 else 0.0)
     at_ns = ticks(T0, T0 + 8 * SECOND, 0.005)
     assert_same(outcome(world, delayed(events, lambda _: 0.0), at_ns), outcome(world, late, at_ns))
+
+
+@pytest.mark.parametrize("state_period_s", [0.4, 1.0])
+def test_how_late_a_sighting_is_is_told_by_its_own_stamp(state_period_s: float) -> None:
+    """Also where it counts at a stored state that lies beyond the horizon."""
+    world = small()
+    brief = [replace(robot, odometry=replace(ODOMETRY, timeout_s=0.05)) for robot in world.swarm.robots]
+    world = replace(world, swarm=replace(world.swarm, robots=tuple(brief)))
+    settings = replace(EXACT, state_period_s=state_period_s)
+    events, at_ns = driving(world, 6.0), ticks(T0, T0 + 8 * SECOND, 0.005)
+    orderly = outcome(world, delayed(events, lambda _: 0.0), at_ns, settings)
+    late = outcome(world, delayed(events, lambda e: 0.0 if e.pose else 1.995), at_ns, settings)
+    assert_same(orderly, late)
+    assert not late.estimator.drops
 
 
 def test_odometry_after_a_long_silence_may_be_late() -> None:
