@@ -114,6 +114,10 @@ class DropletDriver:
         """Measure once with every partner."""
         self._requested.set()
 
+    def begin_to_stop(self) -> None:
+        """Have the robots stand and the driver end; `stop` waits for it."""
+        self._keeper.stopping.set()
+
     def stop(self) -> None:
         """Stop the robots and end."""
         self._keeper.stop()

@@ -35,7 +35,6 @@ _COMMAND_QOS = QoSProfile(depth=1)
 _BRIGHTNESS_QOS = QoSProfile(depth=50)
 _RATES = ("exchanges", "lines")
 _WRONG = {
-    "broken_matrices": "print-outs that were no whole matrix",
     "equal_powers": "exchanges as bright at near as at far power; does the firmware obey set_ir?",
     "firmware_errors": "lines in which the firmware complains",
     "foreign_receiver": "matrices that another robot must have measured",
@@ -83,6 +82,10 @@ class DropletDriverNode(Node):
     def _odometry_output(self, topic: str, prefix: str) -> OdometryOutput:
         odom_frame, base_frame = f"{prefix}{self._wishes.odom_frame}", f"{prefix}{self._wishes.base_frame}"
         return OdometryOutput(self, topic, odom_frame, base_frame, self._transforms)
+
+    def begin_to_stop(self) -> None:
+        """Have the robots stand; `destroy_node` waits until they do."""
+        self._driver.begin_to_stop()
 
     def destroy_node(self) -> None:
         """Stop the robots first."""

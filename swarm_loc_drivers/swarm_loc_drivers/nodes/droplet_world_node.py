@@ -31,6 +31,8 @@ from swarm_loc_estimator.nodes.parameter_table import ParameterError
 from swarm_loc_estimator.nodes.running import Stop, run_node
 
 _FIX_QOS = QoSProfile(depth=10)
+_CLOCK_STEPS = 2
+"""Droplets are slow; many drivers hear the clock."""
 
 
 class DropletWorldNode(Node):
@@ -52,7 +54,8 @@ class DropletWorldNode(Node):
         self._host = FirmwareHost()
         for robot, name in enumerate(names):
             self.get_logger().info(f"{name} answers at {self._serve(robot, name)}")
-        self._time = WorldTime(self, names, STEP_NS, self._wishes.rate, self._wishes.truth_rate)
+        rate, truth_rate = self._wishes.rate, self._wishes.truth_rate
+        self._time = WorldTime(self, names, STEP_NS, rate, truth_rate, _CLOCK_STEPS)
         self._tracker = Tracker(
             tuple(swarm.index_of[name] for name in self._wishes.fixed),
             self._wishes.fix_rate,

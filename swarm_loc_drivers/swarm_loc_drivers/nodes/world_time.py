@@ -33,10 +33,17 @@ class WorldTime:
         step_ns: Simulated time of a step.
         rate: Simulated seconds per second, as far as the machine keeps up.
         truth_rate: Published true poses of each robot [1/s].
+        clock_steps: The time is told every so many steps.
     """
 
     def __init__(
-        self, node: Node, names: Sequence[str], step_ns: int, rate: float, truth_rate: float
+        self,
+        node: Node,
+        names: Sequence[str],
+        step_ns: int,
+        rate: float,
+        truth_rate: float,
+        clock_steps: int = 1,
     ) -> None:
         self._node = node
         self._step_s = step_ns * 1e-9
@@ -45,12 +52,14 @@ class WorldTime:
         self._truths = [
             node.create_publisher(PoseStamped, f"{name}/ground_truth", _TRUTH_QOS) for name in names
         ]
+        self._clock_steps = clock_steps
         self._truth_steps = max(1, round(1.0 / (truth_rate * self._step_s)))
         self._steps = 0
 
     def tell(self, now_ns: int, poses: FloatArray) -> None:
         """A step was done: publish the time, and at times the true poses (N, 3)."""
-        self._clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+        if self._steps % self._clock_steps == 0:
+            self._clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
         if self._steps % self._truth_steps == 0:
             stamp_ns = np.array([now_ns], np.int64)
             for publisher, pose in zip(self._truths, poses, strict=True):

@@ -45,9 +45,8 @@ def test_droplets_wander_and_measure_each_other(ros: Ros, swarm_file: Path, tmp_
     matrices: list[BrightnessMatrix] = ros.listen(BrightnessMatrix, "droplet1/brightness")
     with ExitStack() as running:
 
-        def start(name: str, log: str, parameters: dict[str, object], namespace: str = "") -> Program:
-            arguments = ["-r", f"__ns:=/{namespace}"] if namespace else []
-            program = Program(name, tmp_path / log, parameters, arguments, package="swarm_loc_drivers")
+        def start(name: str, log: str, parameters: dict[str, object]) -> Program:
+            program = Program(name, tmp_path / log, parameters, package="swarm_loc_drivers")
             return running.enter_context(program)
 
         swarm = {"swarm_file": swarm_file}
@@ -56,10 +55,7 @@ def test_droplets_wander_and_measure_each_other(ros: Ros, swarm_file: Path, tmp_
             "droplet_world_node", "world.log", {**swarm, **seen, "link_folder": tmp_path, "rate": 2.0}
         )
         ros.until(lambda: clock)
-        for robot in range(ROBOTS):
-            name = f"droplet{robot + 1}"
-            taking = {"turns": ROBOTS, "turn": robot, "use_sim_time": "true"}
-            start("droplet_driver_node", f"{name}.log", {"address": tmp_path / name, **taking}, name)
+        start("droplet_table_node", "table.log", {**swarm, "link_folder": tmp_path, "use_sim_time": "true"})
         start("droplet_steering_node", "steering.log", {**swarm, "use_sim_time": "true"})
         ros.until(lambda: any(one.twist.twist.linear.x or one.twist.twist.linear.y for one in odometry))
         ros.until(lambda: len({one.transmitter for one in matrices}) == 2 and len(fixes) > 5)

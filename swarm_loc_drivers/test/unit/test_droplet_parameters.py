@@ -11,6 +11,7 @@ import pytest
 from swarm_loc_drivers.core.droplet_exchange import AskSettings
 from swarm_loc_drivers.core.droplet_turns import TurnSettings
 from swarm_loc_drivers.nodes.droplet_parameters import DropletParameters, droplet_settings
+from swarm_loc_drivers.nodes.droplet_world_parameters import DropletWorldParameters
 from swarm_loc_drivers.protocols.droplet import AUDIO_DROPLET
 from swarm_loc_estimator.nodes.parameter_table import ParameterError, markdown_table
 
@@ -18,8 +19,9 @@ README = Path(__file__).parents[2] / "README.md"
 PLAIN = DropletParameters(address="/dev/ttyUSB0")
 
 
-def test_the_readme_says_what_the_table_says() -> None:
-    assert markdown_table(DropletParameters) in README.read_text(encoding="utf-8")
+@pytest.mark.parametrize("parameters", [DropletParameters, DropletWorldParameters])
+def test_the_readme_says_what_the_table_says(parameters: type) -> None:
+    assert markdown_table(parameters) in README.read_text(encoding="utf-8")
 
 
 def test_partners_are_asked_unless_turns_are_taken() -> None:

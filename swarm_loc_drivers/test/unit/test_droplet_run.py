@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from swarm_loc_drivers.cli.generate_bag import main
-from swarm_loc_drivers.nodes.droplet_world_parameters import DropletWorldParameters
 from swarm_loc_drivers.sim.droplet_run import DropletRun, DropletRunSettings, simulate_droplets
 from swarm_loc_drivers.sim.droplet_swarm import PITCH, DropletSwarmSettings, starts
 from swarm_loc_estimator.core import se2
@@ -17,9 +16,7 @@ from swarm_loc_estimator.core.ir.platform import PairGains
 from swarm_loc_estimator.io.bags import BagReader
 from swarm_loc_estimator.io.cdr import decode_brightness, decode_fix
 from swarm_loc_estimator.io.swarm_file import load_swarm
-from swarm_loc_estimator.nodes.parameter_table import markdown_table
 
-README = Path(__file__).parents[2] / "README.md"
 SETTINGS = DropletRunSettings(seed=2, duration_s=20.0, robots=6, calibrated=True)
 
 
@@ -34,10 +31,6 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     options = ["--seed", "2", "--duration", "20", "--robots", "6", "--calibrated"]
     assert main(["droplets", str(path), *options]) == 0
     return path
-
-
-def test_the_readme_says_what_the_table_says() -> None:
-    assert markdown_table(DropletWorldParameters) in README.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("robots", [1, 2, 20])

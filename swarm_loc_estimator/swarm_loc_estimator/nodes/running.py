@@ -98,8 +98,8 @@ def _start_ros() -> None:
         raise RosArgumentsError(str(error).splitlines()[0]) from error
 
 
-def spin(node: Node, stop: Stop) -> int:
-    """Handle a node's events until it is asked to stop.
+def spin(node: Node, stop: Stop, *companions: Node) -> int:
+    """Handle the events of a node, and of others in its process, until it is asked to stop.
 
     The executor: the default ones build their wait set anew at every wake, which costs 18 us per subscription
     and saturates a core at 50 robots. The EventsExecutor's own `spin()` is busy for ever in Jazzy and
@@ -107,10 +107,13 @@ def spin(node: Node, stop: Stop) -> int:
     not.
     """
     executor, never = EventsExecutor(), Future()
-    executor.add_node(node)
+    nodes = (node, *companions)
+    for one in nodes:
+        executor.add_node(one)
     gc.freeze()  # what is there now stays: the collector need not look at it again and again
     while not stop.requested:
         executor.spin_until_future_complete(never, timeout_sec=_WAKE_S)
-    executor.remove_node(node)
+    for one in nodes:
+        executor.remove_node(one)
     executor.shutdown()
     return 0
