@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 _PERIOD_S = 1.0
-_THROTTLE_S = 10.0
+_THROTTLE_S, _WRONG_THROTTLE_S = 10.0, 60.0
 
 
 class Driver(Protocol):
@@ -95,4 +95,4 @@ class DriverDiagnostics:
         news = [name for name in self._wrong if counts[name] > self._reported[name]]
         if news:
             words = "; ".join(f"{counts[name]} {name}: {self._wrong[name]}" for name in news)
-            self._node.get_logger().warning(f"so far {words}", throttle_duration_sec=_THROTTLE_S)
+            self._node.get_logger().warning(f"so far {words}", throttle_duration_sec=_WRONG_THROTTLE_S)

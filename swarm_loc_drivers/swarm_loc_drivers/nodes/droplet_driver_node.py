@@ -35,6 +35,7 @@ _COMMAND_QOS = QoSProfile(depth=1)
 _BRIGHTNESS_QOS = QoSProfile(depth=50)
 _RATES = ("exchanges", "lines")
 _WRONG = {
+    "broken_matrices": "print-outs that were no whole matrix of numbers",
     "equal_powers": "exchanges as bright at near as at far power; does the firmware obey set_ir?",
     "firmware_errors": "lines in which the firmware complains",
     "foreign_receiver": "matrices that another robot must have measured",

@@ -15,6 +15,7 @@ from swarm_loc_estimator.core.swarm import number
 from swarm_loc_estimator.nodes.parameter_table import ParameterError, flag, text, texts
 
 _ID = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})")
+_TURN_S = 1.0
 _RELAYED = re.compile(r"([A-Za-z]\w*)=(.*)")
 
 
@@ -58,7 +59,7 @@ class DropletParameters:
         "with a cable at every Droplet: how many take turns to emit; 0: partners are asked",
     )
     turn: int = number(0, "1", 0, 9_999, "which turn is this one's, counted from 0")
-    turn_s: float = number(1.0, "s", SHORTEST_TURN_S, 60.0, "how long a turn lasts")
+    turn_s: float = number(_TURN_S, "s", SHORTEST_TURN_S, 60.0, "how long a turn lasts")
     relayed: tuple[str, ...] = texts(
         "NAME=ID of Droplets without a cable, which are driven by infrared through this one"
     )
@@ -66,6 +67,17 @@ class DropletParameters:
     odom_frame: str = text("odom", "the pose is in <robot>/odom_frame", required=True)
     base_frame: str = text("base_link", "the pose is that of <robot>/base_frame", required=True)
     publish_tf: bool = flag(True, "publish the transform from odom to base_link")
+
+
+@dataclass(frozen=True)
+class DropletTableParameters:
+    """Parameters of `droplet_table_node`."""
+
+    swarm_file: str = text("", "path of the swarm description: which robots there are", required=True)
+    link_folder: str = text("", "where each robot's serial port lies under its name", required=True)
+    part: int = number(0, "1", 0, 999, "of the table's parts, each in a process of its own, this one")
+    parts: int = number(1, "1", 1, 1000, "how many parts there are")
+    turn_s: float = number(_TURN_S, "s", SHORTEST_TURN_S, 60.0, "how long a turn lasts")
 
 
 def droplet_settings(wishes: DropletParameters) -> DropletSettings:

@@ -9,7 +9,6 @@ in the robot's namespace and at the port of `link_folder` that is named like it;
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,25 +16,11 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from swarm_loc_drivers.nodes.droplet_driver_node import DropletDriverNode
-from swarm_loc_drivers.nodes.droplet_parameters import DropletParameters
-from swarm_loc_estimator.core.swarm import number
+from swarm_loc_drivers.nodes.droplet_parameters import DropletTableParameters
 from swarm_loc_estimator.io.swarm_file import load_swarm
 from swarm_loc_estimator.nodes.declare import declare_parameters
-from swarm_loc_estimator.nodes.parameter_table import ParameterError, text
+from swarm_loc_estimator.nodes.parameter_table import ParameterError
 from swarm_loc_estimator.nodes.running import Stop, run_node, spin
-
-_DRIVER = DropletParameters()
-
-
-@dataclass(frozen=True)
-class DropletTableParameters:
-    """Parameters of `droplet_table_node`."""
-
-    swarm_file: str = text("", "path of the swarm description: which robots there are", required=True)
-    link_folder: str = text("", "where each robot's serial port lies under its name", required=True)
-    part: int = number(0, "1", 0, 999, "of the table's parts, each in a process of its own, this one")
-    parts: int = number(1, "1", 1, 1000, "how many parts there are")
-    turn_s: float = number(_DRIVER.turn_s, "s", 0.8, 60.0, "how long a turn lasts")
 
 
 class DropletTableNode(Node):

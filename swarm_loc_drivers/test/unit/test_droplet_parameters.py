@@ -10,7 +10,11 @@ import pytest
 
 from swarm_loc_drivers.core.droplet_exchange import AskSettings
 from swarm_loc_drivers.core.droplet_turns import TurnSettings
-from swarm_loc_drivers.nodes.droplet_parameters import DropletParameters, droplet_settings
+from swarm_loc_drivers.nodes.droplet_parameters import (
+    DropletParameters,
+    DropletTableParameters,
+    droplet_settings,
+)
 from swarm_loc_drivers.nodes.droplet_world_parameters import DropletWorldParameters
 from swarm_loc_drivers.protocols.droplet import AUDIO_DROPLET
 from swarm_loc_estimator.nodes.parameter_table import ParameterError, markdown_table
@@ -19,7 +23,7 @@ README = Path(__file__).parents[2] / "README.md"
 PLAIN = DropletParameters(address="/dev/ttyUSB0")
 
 
-@pytest.mark.parametrize("parameters", [DropletParameters, DropletWorldParameters])
+@pytest.mark.parametrize("parameters", [DropletParameters, DropletTableParameters, DropletWorldParameters])
 def test_the_readme_says_what_the_table_says(parameters: type) -> None:
     assert markdown_table(parameters) in README.read_text(encoding="utf-8")
 
