@@ -9,7 +9,10 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import sys
 from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import TypeVar, cast
 
@@ -19,21 +22,41 @@ from numpy.typing import NDArray
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
-
-def _cache_folder() -> Path:
-    """A folder of its own for every state of the sources: numba alone would miss a change in another file."""
-    sources = sorted(Path(__file__).parent.rglob("*.py"))
-    digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
-    root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(root) / "swarm_loc_estimator" / digest
+_CORE = Path(__file__).parent
 
 
-if "NUMBA_CACHE_DIR" not in os.environ:
-    numba.config.CACHE_DIR = str(_cache_folder())  # type: ignore[attr-defined]
+@cache
+def _cache_folder(folder: Path) -> Path:
+    """A cache for every state of a folder's sources and of the core's.
+
+    Numba alone would miss a change in another file than that of the function called.
+    """
+    sources = sorted({*_CORE.rglob("*.py"), *folder.glob("*.py")})
+    place = f"{folder} {numba.__version__} {sys.version}".encode()
+    parts = [place, *(source.read_bytes() for source in sources)]
+    root = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(root) / "swarm_loc_estimator" / hashlib.sha256(b"".join(parts)).hexdigest()[:16]
+
+
+def is_warm(folder: Path = _CORE) -> bool:
+    """Whether the compiled code of a folder's sources, as they are, has been called throughout before."""
+    return _mark(folder).exists()
+
+
+def note_warm(folder: Path = _CORE) -> None:
+    """Remember that the compiled code of a folder's sources has now been called throughout."""
+    with suppress(OSError):  # where nothing can be kept, the next start compiles again
+        _mark(folder).touch()
+
+
+def _mark(folder: Path) -> Path:
+    return _cache_folder(folder) / "warm"
 
 
 def compiled(function: Function) -> Function:
     """Compile a function on its first call; calls among compiled functions cost nothing."""
+    folder = _cache_folder(Path(function.__code__.co_filename).parent)
+    numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
     return cast("Function", numba.njit(cache=True, error_model="numpy")(function))
 
 

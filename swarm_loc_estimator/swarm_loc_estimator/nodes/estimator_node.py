@@ -24,6 +24,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
+from swarm_loc_estimator.core.compiled import is_warm
 from swarm_loc_estimator.core.estimator import SwarmEstimate, SwarmEstimator
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.swarm import Swarm
@@ -81,7 +82,8 @@ class EstimatorNode(Node):
         super().__init__("estimator", **node_arguments)
         self._wishes = declare_parameters(self, EstimatorParameters)
         self._swarm = load_swarm(Path(self._wishes.swarm_file))
-        self.get_logger().info("compiling the estimator: a minute the first time on a machine")
+        if not is_warm():
+            self.get_logger().info("compiling the estimator for this machine: about a minute")
         warm_up()
         self._estimator = create_estimator(self._swarm, self._wishes.settings)
         self._ingest = Ingest(self._swarm, self._wishes.map_frame)

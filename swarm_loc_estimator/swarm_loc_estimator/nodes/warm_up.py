@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from swarm_loc_estimator.core.compiled import note_warm
 from swarm_loc_estimator.core.estimator import SwarmEstimator
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.sightings import CONTENT_POSE_TWO, CONTENT_POSITION
@@ -21,9 +22,10 @@ _AWAY = (0.0, 0.7, 0.0, 0.7)
 
 
 def warm_up() -> None:
-    """Run small estimators through all that they do: a minute the first time on a machine, then a second."""
+    """Run small estimators through all that they do: a minute unless `is_warm`, then a second."""
     for fusion_period_s in (0.0, 0.1):
         _run(EstimatorSettings(fusion_period_s=fusion_period_s))
+    note_warm()
 
 
 def _run(settings: EstimatorSettings) -> None:

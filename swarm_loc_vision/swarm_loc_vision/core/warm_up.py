@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
+from swarm_loc_estimator.core.compiled import note_warm
 from swarm_loc_vision.core.bodies import Placement
 from swarm_loc_vision.core.camera import Camera
 from swarm_loc_vision.core.detector import MarkerDetector
 from swarm_loc_vision.core.draw import draw_marker
 from swarm_loc_vision.core.families import family_named
 from swarm_loc_vision.core.settings import DetectorSettings
+
+CORE = Path(__file__).parent
 
 
 def warm_up() -> None:
@@ -23,3 +28,4 @@ def warm_up() -> None:
     up = np.array([0.0, -1.0, 0.0])
     settings = DetectorSettings(tilt_sigma=0.1)
     MarkerDetector(settings, [(family, np.array([1, 2]))], camera, up=up, bodies=[body]).detect(picture)
+    note_warm(CORE)

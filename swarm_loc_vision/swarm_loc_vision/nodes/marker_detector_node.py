@@ -22,6 +22,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, Image
 
+from swarm_loc_estimator.core.compiled import is_warm
 from swarm_loc_estimator.io.messages import encode_detections
 from swarm_loc_estimator.nodes.declare import declare_parameters
 from swarm_loc_estimator.nodes.running import run_node, spin
@@ -30,7 +31,7 @@ from swarm_loc_vision.core.camera import Camera, CameraError
 from swarm_loc_vision.core.detector import MarkerDetector
 from swarm_loc_vision.core.gray import ImageError, gray_image
 from swarm_loc_vision.core.rows import detection_rows
-from swarm_loc_vision.core.warm_up import warm_up
+from swarm_loc_vision.core.warm_up import CORE, warm_up
 from swarm_loc_vision.nodes.detector_parameters import DetectorParameters, detector_maker
 
 IMAGE_QOS = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -58,7 +59,8 @@ class MarkerDetectorNode(Node):
         super().__init__("marker_detector", **node_arguments)
         self._wishes = declare_parameters(self, DetectorParameters)
         self._create_detector = detector_maker(self._wishes)
-        self.get_logger().info("compiling the detector: half a minute the first time on a machine")
+        if not is_warm(CORE):
+            self.get_logger().info("compiling the detector for this machine: about half a minute")
         warm_up()
         self._camera: Camera | None = None
         self._camera_trouble = ""
