@@ -25,6 +25,10 @@ from swarm_loc_estimator.io.swarm_writer import save_swarm
 SECOND = 1_000_000_000
 SIZE = {"width": 320, "height": 240}
 SPEED = 0.06
+RATE = 0.5
+"""Simulated seconds per second: on a busy machine, too, commands come before the robots have gone far."""
+CATCHING_UP_NS = SECOND
+"""At first they are faster, the more so the later the first command came."""
 
 
 @pytest.fixture
@@ -70,7 +74,7 @@ def test_robots_drive_the_eight_by_their_bytes_and_their_cameras_look(
             program = Program(name, tmp_path / log, parameters, arguments, package="swarm_loc_drivers")
             return running.enter_context(program)
 
-        world = start("world_node", "world.log", {**swarm, **place, **SIZE, "rate": 2.0})
+        world = start("world_node", "world.log", {**swarm, **place, **SIZE, "rate": RATE})
         ros.until(lambda: clock)
         for robot in range(2):
             address = (
@@ -84,8 +88,10 @@ def test_robots_drive_the_eight_by_their_bytes_and_their_cameras_look(
             )
         start("steering_node", "steering.log", {**swarm, "speed": SPEED, **sim_time})
         ros.until(lambda: any(one.twist.twist.linear.x > 0.9 * SPEED for one in odometry))
+        moving_ns = stamp_ns(truth[-1])
+        ros.until(lambda: stamp_ns(truth[-1]) > moving_ns + CATCHING_UP_NS)
         begin = len(truth)
-        ros.until(lambda: stamp_ns(truth[-1]) > stamp_ns(truth[begin - 1]) + 6 * SECOND)
+        ros.until(lambda: stamp_ns(truth[-1]) > moving_ns + CATCHING_UP_NS + 3 * SECOND)
         assert world.end(signal.SIGINT) == 0, world.output
     times = [Time.from_msg(one.clock).nanoseconds for one in clock]
     assert (np.diff(times) > 0).all()

@@ -32,9 +32,9 @@ class DrivenBody:
         self.frame: tuple[NDArray[np.uint8], int] | None = None
 
     def _drive(self) -> None:
-        """Catch up with the clock."""
+        """Catch up with the clock; one that has jumped back takes no way."""
         now_ns = self._clock()
-        steps = self._rates * (now_ns - self._since_ns) * 1e-9
+        steps = self._rates * max(0, now_ns - self._since_ns) * 1e-9
         left, right = steps * GEOMETRY.metres_per_step
         twist = [0.5 * (left + right), 0.0, (right - left) / GEOMETRY.wheel_separation]
         self._pose = se2.compose(self._pose, se2.exp(twist))
@@ -76,7 +76,3 @@ class DrivenBody:
         """Where it is (3,)."""
         self._drive()
         return self._pose
-
-    def rewind(self) -> None:
-        """The clock has jumped; what was driven stays driven."""
-        self._since_ns = self._clock()
