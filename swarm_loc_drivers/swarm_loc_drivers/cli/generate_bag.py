@@ -3,7 +3,7 @@
     generate_bag eight bags/eight_five_robots --seed 3 --duration 54 --world w0
     generate_bag pictures bags/eight_pictures --seed 1 --duration 9 --robots 2
     generate_bag grid /tmp/grid100 --robots 100 --duration 20
-    generate_bag droplets bags/droplets_twenty --seed 1 --duration 90
+    generate_bag droplets bags/droplets_twenty --seed 1 --duration 60
 
 The bag holds <robot>/odom, <robot>/detections and <robot>/ground_truth; `swarm.yaml` lies inside its folder.
 `pictures` writes, in place of detections, what the cameras see: <robot>/image_raw/compressed (JPEG) and

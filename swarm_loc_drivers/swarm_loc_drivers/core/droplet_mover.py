@@ -30,6 +30,8 @@ def nearest_motion(wanted: Velocity, gaits: Gaits) -> int | None:
         forward, left, turn = (want - have for want, have in zip(wanted, velocity, strict=True))
         return math.hypot(forward, left, RADIUS_M * turn)
 
+    if wanted == STILL:
+        return _STAND
     return min([_STAND, *gaits], key=distance)
 
 

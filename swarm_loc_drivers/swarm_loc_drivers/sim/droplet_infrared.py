@@ -105,6 +105,7 @@ class DropletInfrared:
 
     Attributes:
         heard: Per robot what has come and was not fetched.
+        deaf_until_ns: Per robot the end of its last exchange [ns].
         counts: What happened how often.
     """
 
@@ -127,6 +128,7 @@ class DropletInfrared:
         self._drift_due_ns = now_ns
         self._baseline_due_ns = now_ns + rng.integers(0, _BASELINE_PERIOD_NS, len(ids))
         self.heard: list[list[Command | Measured]] = [[] for _ in ids]
+        self.deaf_until_ns = [0 for _ in ids]
         self.counts: Counter[str] = Counter()
 
     def send(self, sender: int, line: str, target: int, poses: FloatArray) -> None:
@@ -141,6 +143,7 @@ class DropletInfrared:
         end_ns = self._now_ns + timing.CALL_NS
         self._messages.append(_Message(emitter, self._now_ns, end_ns, self._in_reach(emitter, poses)))
         self._exchanges.append(_Exchange(emitter, self._now_ns, power))
+        self.deaf_until_ns[emitter] = self._exchanges[-1].end_ns
 
     def status(self, robot: int) -> int:
         """What keeps a robot's infrared busy, see `DropletBody.infrared_status`."""
@@ -152,13 +155,6 @@ class DropletInfrared:
         if any(robot == one.emitter or robot in one.receivers for one in self._exchanges):
             status |= _TIMED | _BLOCKED
         return status
-
-    def deaf_until_ns(self, robot: int) -> int:
-        """When a robot has time again [ns]; 0 if it has."""
-        return max(
-            (one.end_ns for one in self._exchanges if robot == one.emitter or robot in one.receivers),
-            default=0,
-        )
 
     def step(self, now_ns: int, poses: FloatArray) -> None:
         """Let time pass."""
@@ -227,6 +223,8 @@ class DropletInfrared:
         for exchange in self._exchanges:
             if exchange.emitter == call.sender and exchange.begin_ns == call.begin_ns:
                 exchange.receivers = receivers
+                for robot in receivers.tolist():
+                    self.deaf_until_ns[robot] = exchange.end_ns
                 exchange.readings = np.zeros((len(receivers), self._platform.n, self._platform.n), np.int64)
 
     def _measure(self, exchange: _Exchange, poses: FloatArray) -> None:

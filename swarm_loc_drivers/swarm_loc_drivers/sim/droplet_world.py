@@ -202,13 +202,15 @@ class SimulatedDroplet:
 
     def heard(self) -> Sequence[Command | Measured]:
         """What has come since the last call."""
-        heard = self._world.infrared.heard[self._robot]
-        self._world.infrared.heard[self._robot] = []
+        everybody = self._world.infrared.heard
+        heard = everybody[self._robot]
+        if heard:
+            everybody[self._robot] = []
         return heard
 
     def deaf_until_ns(self) -> int:
         """When the firmware has time again [ns]."""
-        return self._world.infrared.deaf_until_ns(self._robot)
+        return self._world.infrared.deaf_until_ns[self._robot]
 
     @property
     def now_ns(self) -> int:

@@ -98,17 +98,19 @@ class DropletFirmware:
         """What the robot sends by itself."""
         if self._is_deaf():
             return b""
-        queued, self._queue = bytes(self._queue), bytearray()
-        for byte in queued:
-            self._character(byte)
+        if self._queue:
+            queued, self._queue = bytes(self._queue), bytearray()
+            for byte in queued:
+                self._character(byte)
         for heard in self._body.heard():
             if isinstance(heard, Command):
                 self._at(heard.end_ns + HANDLING_NS, lambda line=heard.line: self._execute(line))  # type: ignore[misc]
             else:
                 self._unread += 1
                 self._at(heard.end_ns + PRINT_DELAY_NS, lambda measured=heard: self._report(measured))  # type: ignore[misc]
-        self._run_tasks()
-        return self._taken()
+        if self._tasks:
+            self._run_tasks()
+        return self._taken() if self._output else b""
 
     def _is_deaf(self) -> bool:
         return self._body.now_ns < self._body.deaf_until_ns()
@@ -128,9 +130,12 @@ class DropletFirmware:
 
     def _run_tasks(self) -> None:
         """Do what is due, the oldest first; tasks may make others."""
-        while not self._is_deaf() and any(due_ns <= self._body.now_ns for due_ns, _ in self._tasks):
-            due_ns, task = min(self._tasks, key=lambda one: one[0])
-            self._tasks.remove((due_ns, task))
+        while self._tasks and not self._is_deaf():
+            first = min(self._tasks, key=lambda one: one[0])
+            due_ns, task = first
+            if due_ns > self._body.now_ns:
+                return
+            self._tasks.remove(first)
             task()
 
     def _character(self, byte: int) -> None:
