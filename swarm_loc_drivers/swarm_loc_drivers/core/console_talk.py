@@ -26,6 +26,8 @@ Talk = Generator[int, None, Result]
 MARGIN_NS = 15_000_000
 """How much later than reckoned a robot may be ready: its clock runs by the millisecond."""
 _TRIES = 8
+_ERASED_AT_ONCE = 7
+"""Each character taken back is answered by three; more at once would be lost on the way."""
 
 _COUNTED = {
     protocol.Broken: "broken_matrices",
@@ -115,9 +117,17 @@ class ConsoleTalk:
         raise SessionError(f"the robot does not echo '{line}'")
 
     def forget_line(self) -> Talk[None]:
-        """Take back whatever was typed and not ended."""
-        self._output += protocol.LINE_AT_MOST * protocol.ERASE
+        """Take back whatever was typed and not ended, no faster than the robot can answer."""
+        for _ in range(0, protocol.LINE_AT_MOST, _ERASED_AT_ONCE):
+            if not (yield from self._erase(_ERASED_AT_ONCE)):
+                break
         yield from self.until(lambda: not self._parser.partial)
+
+    def _erase(self, count: int) -> Talk[bool]:
+        """Take back so many characters; whether the robot answers."""
+        answered = self._parser.backspaces + protocol.BACKSPACES_PER_ERASE * count
+        self._output += count * protocol.ERASE
+        return (yield from self.until(lambda: self._parser.backspaces >= answered))
 
 
 def relay(console: ConsoleTalk, target: int, line: str) -> Talk[int]:

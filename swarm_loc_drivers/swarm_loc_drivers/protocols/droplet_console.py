@@ -18,6 +18,7 @@ from swarm_loc_drivers.protocols.droplet import ELEMENTS, FULL_POWER
 TERMINATOR = b"\r"
 ERASE = b"\b"
 """Takes back the last character of the line; the console answers `\\b \\b` even where there is none."""
+BACKSPACES_PER_ERASE = 2
 
 LINE_AT_MOST = 63
 """The line buffer has 64 characters, and one of them ends the text."""
@@ -283,10 +284,12 @@ class ConsoleParser:
 
     Attributes:
         partial: The line that has not ended yet, as a terminal would show it.
+        backspaces: How many have come.
     """
 
     def __init__(self, elements: int = ELEMENTS) -> None:
         self.partial = ""
+        self.backspaces = 0
         self._stamp_ns = 0
         row = r"\{" + ",".join([_NUMBER] * elements) + r"\}"
         rows = r"\{" + ",".join([row] * elements) + r"\}"
@@ -307,6 +310,7 @@ class ConsoleParser:
                 self.partial = ""
             elif code == _BACKSPACE:
                 self.partial = self.partial[:-1]
+                self.backspaces += 1
             elif len(self.partial) < _LONGEST_LINE:
                 self._stamp_ns = self._stamp_ns if self.partial else stamp_ns
                 self.partial += chr(code)
