@@ -257,7 +257,7 @@ def _motor_trims(match: re.Match[str]) -> MotorTrims:
 _LINES: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Event]], ...] = tuple(
     (re.compile(pattern), make)
     for pattern, make in (
-        (rf"My ID is: {_HEX}", lambda m: Identity(int(m[1], 16))),
+        (r"My ID is: ([0-9A-F]{1,4})", lambda m: Identity(int(m[1], 16))),
         (r"walk direction (\d), num_steps (\d{1,5})", _move_started),
         (rf'Broadcasting command to {_HEX}: "(.*)", of length (\d{{1,2}})\.', _relayed),
         (r'Broadcasting command()?: "(.*)", of length (\d{1,2})\.', _relayed),

@@ -65,6 +65,7 @@ def of_2016(rows: Sequence[Sequence[int]]) -> str:
 PRINTED: list[tuple[str, Event]] = [
     ("get_id\r\n", Echo("get_id")),
     ("My ID is: DF64\r\n", Identity(0xDF64)),
+    ("My ID is: 29\r\n", Identity(0x29)),
     ("move_steps 0 50\r\n", Echo("move_steps 0 50")),
     ("walk 0 50\r\n", Echo("walk 0 50")),
     ("walk direction 0, num_steps 50\r\n", MoveStarted(0, 50)),
