@@ -60,6 +60,12 @@ def compiled(function: Function) -> Function:
     return cast("Function", numba.njit(cache=True, error_model="numpy")(function))
 
 
+def compiled_sums(function: Function) -> Function:
+    """The same for sums that may be taken in any order, which is several times faster for long ones."""
+    sums = numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+    return cast("Function", sums(function))
+
+
 @compiled
 def assign(target: NDArray[np.float64], source: NDArray[np.float64]) -> None:
     """Copy a vector; a slice assignment would cost seconds of compilation at every place it stands."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.stats import norm
 
-from swarm_loc_estimator.core.ir.platform import IrPlatform
+from swarm_loc_estimator.core.ir.brightness import expected, expected_with_slopes
+from swarm_loc_estimator.core.ir.platform import IrPlatform, PairGains
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
 
@@ -66,3 +68,44 @@ def random_poses(count: int, seed: int, low: float = 0.06, high: float = 0.28) -
     rng = np.random.default_rng(seed)
     angles = rng.uniform(-np.pi, np.pi, (count, 2))
     return np.column_stack([rng.uniform(low, high, count), angles])
+
+
+def readings_of(
+    platform: IrPlatform, poses: FloatArray, seed: int, gains: PairGains | None = None
+) -> FloatArray:
+    """Readings (k, modes, n, n) of poses with the platform's noise, cut at saturation."""
+    bright = expected(platform, poses, gains)
+    spread = np.hypot(platform.noise, platform.relative_noise * bright)
+    noise = spread * np.random.default_rng(seed).standard_normal(bright.shape)
+    return np.minimum(bright + noise, platform.saturation)
+
+
+def differing_gains(count: int, n: int, sigma: float, seed: int) -> PairGains:
+    """Gains of pairs whose elements all differ, with nothing left unknown."""
+    factors = np.exp(sigma * np.random.default_rng(seed).standard_normal((2, count, n)))
+    return PairGains(factors[0], factors[1], np.zeros((count, 4)))
+
+
+def cramer_rao(platform: IrPlatform, poses: FloatArray) -> FloatArray:
+    """(k, 3, 3) the least covariance of any unbiased estimate, of elements that are alike.
+
+    A reading beyond saturation tells only that it is, which leaves a share of its information.
+    """
+    bright, slopes = expected_with_slopes(platform, poses)
+    z = (platform.saturation - bright) / platform.noise
+    share = norm.cdf(z) - z * norm.pdf(z) + norm.pdf(z) ** 2 / np.maximum(norm.sf(z), 1e-300)
+    share = np.where(z > 8.0, 1.0, np.where(z < -8.0, 0.0, share)) / platform.noise**2
+    return np.asarray(np.linalg.inv(np.einsum("kmij,kmija,kmijb->kab", share, slopes, slopes)))
+
+
+def pose_errors(found: FloatArray, poses: FloatArray) -> FloatArray:
+    """(k, 3) with angles wrapped [m, rad, rad]."""
+    errors = found - poses
+    errors[:, 1:] = wrapped(errors[:, 1:])
+    return errors
+
+
+def nees(errors: FloatArray, covariances: FloatArray) -> FloatArray:
+    """(k,) normalised errors squared."""
+    solved = np.linalg.solve(covariances, errors[..., None])[..., 0]
+    return np.asarray(np.sum(errors * solved, axis=-1))

@@ -18,6 +18,7 @@ from swarm_loc_estimator.core.ir.curves import (
     TabulatedCurve,
     amplitude_at,
     curve_at,
+    distance_at,
 )
 from swarm_loc_estimator.core.ir.platform import IrGains, PairGains
 from swarm_loc_estimator.core.se2 import FloatArray
@@ -87,17 +88,18 @@ def test_the_inverse_amplitude_gives_the_distance_back(mode: int) -> None:
     distances = np.linspace(0.001, 0.6, 200)
     law = platform.model.amplitudes[mode]
     bright = np.array([amplitude_at(law, r)[0] for r in distances])
-    np.testing.assert_allclose(platform.amplitudes[mode].inverse(bright), distances, atol=1e-12)
-    assert platform.amplitudes[mode].inverse(np.array(-1.0)) == np.inf
+    back = [distance_at(law, one) for one in bright]
+    np.testing.assert_allclose(back, distances, atol=1e-12)
+    assert distance_at(law, -1.0) == np.inf
 
 
 def test_the_printed_inverse_is_rounded() -> None:
     """Eq. (22) has 118 for the root of 14000: up to 0.07 cm."""
     bright = np.linspace(10.0, 250.0, 50)
     printed = 0.01 * (118.0 / np.sqrt(bright + 1.0) + 3.0)
-    error = np.abs(droplet().amplitudes[0].inverse(bright) - printed)
-    assert 5e-4 < error.max() + 4.5e-4 < 1.5e-3
-    assert error.max() > 1e-4
+    law = droplet().model.amplitudes[0]
+    error = np.abs([distance_at(law, one) for one in bright] - printed)
+    assert 5e-4 < error.max() < 1.2e-3
 
 
 def test_a_table_passes_its_points_and_stays_between_them() -> None:
@@ -129,7 +131,7 @@ def test_curves_that_cannot_be_are_refused(pieces: tuple[PowerPiece, ...], words
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"angles": (0.0, 1.0)}, "angles has 2 elements but must have 3 to 64"),
+        ({"angles": (0.0, 1.0)}, "angles has 2 elements but must have 3 to 32"),
         ({"angles": (0.0, 1.0, 2.0 * math.pi)}, "no two elements may coincide"),
         ({"angles": (0.0, 1.0, math.nan)}, "must lie within"),
         ({"radius": 0.0}, r"radius is 0 but must lie in \(0, 10\] m"),

@@ -77,14 +77,17 @@ def predict_brightness(
             rx, ry = ex - rho * model.units[i, 0], ey - rho * model.units[i, 1]
             square = max(rx * rx + ry * ry, 1e-12)
             r = math.sqrt(square)
+            per_r = 1.0 / r
             along = math.atan2(ry, rx)
             seen, seen_slope = curve_at(model.sensor, along - model.angles[i])
             lit, lit_slope = curve_at(model.emitter, along + math.pi - model.angles[j] - heading)
             # how the distance and the direction from sensor to emitter change with the pose
-            dr_distance, da_distance = (rx * ux + ry * uy) / r, (rx * uy - ry * ux) / square
-            dr_bearing = distance * (ry * ux - rx * uy) / r
-            da_bearing = distance * (rx * ux + ry * uy) / square
-            dr_heading, da_heading = rho * (ry * jx - rx * jy) / r, rho * (rx * jx + ry * jy) / square
+            vx, vy = rx * per_r, ry * per_r
+            forward, aside = vx * ux + vy * uy, vx * uy - vy * ux
+            dr_distance, da_distance = forward, aside * per_r
+            dr_bearing, da_bearing = -distance * aside, distance * forward * per_r
+            forward, aside = vx * jx + vy * jy, vx * jy - vy * jx
+            dr_heading, da_heading = -rho * aside, rho * forward * per_r
             share = seen * lit
             turned = seen_slope * lit + seen * lit_slope  # by the direction
             for m in range(modes):

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from swarm_loc_estimator.core.compiled import compiled, wrap
+from swarm_loc_estimator.core.compiled import compiled
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import number, number_specs
 
@@ -51,11 +51,18 @@ class CurveTable(NamedTuple):
 
     Attributes:
         edges: (P + 1,) where the pieces meet [rad].
+        per_radian: (P,) how many cells of a piece one radian has.
         cubics: (P, cells, 4) coefficients by the share of the cell passed, constant first.
     """
 
     edges: FloatArray
+    per_radian: FloatArray
     cubics: FloatArray
+
+    @classmethod
+    def of(cls, edges: FloatArray, cubics: FloatArray) -> CurveTable:
+        """From where pieces meet, and their cubics."""
+        return cls(edges, cubics.shape[1] / np.diff(edges), cubics)
 
 
 @dataclass(frozen=True)
@@ -103,7 +110,7 @@ class PowerCurve:
             for begin, piece in self._spans()
         ]
         mirror = [cubics[::-1] @ _BACKWARDS for cubics in half[::-1]]
-        return CurveTable(np.concatenate([-edges[:0:-1], edges]), np.array([*mirror, *half]))
+        return CurveTable.of(np.concatenate([-edges[:0:-1], edges]), np.array([*mirror, *half]))
 
     def _spans(self) -> list[tuple[float, PowerPiece]]:
         """Where each piece begins, and the piece."""
@@ -143,7 +150,7 @@ class TabulatedCurve:
         at = np.linspace(-math.pi, math.pi, _TABLE_CELLS + 1)
         within = np.clip(at, self.angles[0], self.angles[-1])
         slopes = np.where(at == within, curve.derivative()(within), 0.0)
-        return CurveTable(at[[0, -1]], _cubics(curve(within), slopes, 2.0 * math.pi)[None])
+        return CurveTable.of(at[[0, -1]], _cubics(curve(within), slopes, 2.0 * math.pi)[None])
 
 
 AngleCurve = PowerCurve | TabulatedCurve
@@ -173,32 +180,18 @@ class Amplitude:
                 f"nearest is {self.nearest:g} m but must be beyond the pole at {-self.offset:g} m."
             )
 
-    def inverse(self, brightness: FloatArray) -> FloatArray:
-        """Distances [m] at which an aligned pair is so bright, eq. (22); infinite where it never is so dark.
-
-        The printed 118 is sqrt(14000) rounded.
-        """
-        top = self.scale / (self.nearest + self.offset) ** self.exponent + self.background
-        slope = -self.exponent * (top - self.background) / (self.nearest + self.offset)
-        above = np.asarray(brightness, dtype=float) - self.background
-        with np.errstate(divide="ignore", invalid="ignore"):
-            far = (self.scale / above) ** (1.0 / self.exponent) - self.offset
-        near = np.maximum(self.nearest + (np.asarray(brightness) - top) / slope, 0.0)
-        return np.where(above <= 0.0, np.inf, np.where(brightness > top, near, far))
-
 
 @compiled
 def curve_at(table: CurveTable, angle: float) -> tuple[float, float]:
     """The value and slope [1/rad] of a curve at an angle [rad] of any size."""
-    a = wrap(angle)
+    a = angle - 2.0 * math.pi * math.floor(angle * (0.5 / math.pi) + 0.5)
     edges = table.edges
     piece = 0
     while piece < edges.size - 2 and a >= edges[piece + 1]:
         piece += 1
-    cells = table.cubics.shape[1]
-    per_radian = cells / (edges[piece + 1] - edges[piece])
+    per_radian = table.per_radian[piece]
     place = (a - edges[piece]) * per_radian
-    cell = min(max(int(place), 0), cells - 1)
+    cell = min(max(int(place), 0), table.cubics.shape[1] - 1)
     t = place - cell
     c = table.cubics[piece, cell]
     return c[0] + t * (c[1] + t * (c[2] + t * c[3])), (c[1] + t * (2.0 * c[2] + 3.0 * t * c[3])) * per_radian
@@ -212,10 +205,26 @@ def amplitude_at(law: FloatArray, r: float) -> tuple[float, float]:
         law: (5,) the fields of `Amplitude` in their order.
         r: The distance.
     """
-    distance = max(r, law[4]) + law[1]
-    value = law[0] / (distance * distance) if law[2] == 2.0 else law[0] * distance ** (-law[2])
-    slope = -law[2] * value / distance
+    closeness = 1.0 / (max(r, law[4]) + law[1])
+    value = law[0] * (closeness * closeness if law[2] == 2.0 else closeness ** law[2])
+    slope = -law[2] * value * closeness
     return value + law[3] + slope * min(r - law[4], 0.0), slope
+
+
+@compiled
+def distance_at(law: FloatArray, brightness: float) -> float:
+    """The distance [m] at which an aligned pair is so bright [count], eq. (22); infinite where it never is.
+
+    The printed 118 is the root of 14000, rounded.
+    """
+    above = brightness - law[3]
+    if above <= 0.0:
+        return math.inf
+    top, slope = amplitude_at(law, law[4])
+    if brightness > top:
+        return float(max(law[4] + (brightness - top) / slope, 0.0))
+    ratio = law[0] / above
+    return float((math.sqrt(ratio) if law[2] == 2.0 else ratio ** (1.0 / law[2])) - law[1])
 
 
 def _powers(terms: tuple[tuple[float, float], ...], size: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -25,7 +25,7 @@ from swarm_loc_estimator.core.swarm import number, number_specs
 
 POWERS = ("far", "near")
 """Powers of the emitters in the order of BrightnessMatrix's POWER_* constants; only the first is a must."""
-MAX_ELEMENTS = 64
+MAX_ELEMENTS = 32
 _TOGETHER = 1e-3
 """Two elements closer than this are one [rad]."""
 
@@ -121,6 +121,13 @@ class IrPlatform:
             self.relative_noise,
         )
 
+    def unknown_gains(self, count: int) -> PairGains:
+        """Gains of pairs of robots that were never calibrated."""
+        sigma = np.zeros((count, 4))
+        sigma[:, ::2] = self.element_sigma
+        ones = np.ones((count, self.n))
+        return PairGains(ones, ones, sigma)
+
 
 @dataclass(frozen=True)
 class IrGains:
@@ -180,9 +187,3 @@ class PairGains(NamedTuple):
             np.array([t.emitter for _, t in pairs]),
             np.array([(r.sigma, r.common_sigma, t.sigma, t.common_sigma) for r, t in pairs]),
         )
-
-    @classmethod
-    def unknown(cls, platform: IrPlatform, count: int) -> PairGains:
-        """Of robots that were never calibrated."""
-        one = IrGains.unknown(platform)
-        return cls.of([one] * count, [one] * count)
