@@ -44,7 +44,10 @@ from swarm_loc_msgs.msg import BrightnessMatrix, MarkerDetectionArray
 from swarm_loc_msgs.srv import SetRobotPose
 
 INPUT_QOS = QoSProfile(depth=1000)
-"""Deep enough for a busy moment as long as the horizon; what is older would not be used anyway."""
+"""Deep enough for a busy moment as long as the horizon; what is older would not be used anyway.
+
+More cannot be counted: Fast DDS tells of no message that a newer one replaces in this queue.
+"""
 
 _MESSAGE_CLASSES = {
     InputKind.ODOMETRY: Odometry,
