@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
-_CORE = Path(__file__).parent
+_CORE = Path(__file__).resolve().parent
 
 
 @cache
@@ -55,8 +55,10 @@ def _mark(folder: Path) -> Path:
 
 def compiled(function: Function) -> Function:
     """Compile a function on its first call; calls among compiled functions cost nothing."""
-    folder = _cache_folder(Path(function.__code__.co_filename).parent)
-    numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
+    # one cache, whether a package is found by a link or not: numba has another one for every path
+    source = Path(function.__code__.co_filename).resolve()
+    function.__code__ = function.__code__.replace(co_filename=str(source))
+    numba.config.CACHE_DIR = str(_cache_folder(source.parent))  # type: ignore[attr-defined]
     return cast("Function", numba.njit(cache=True, error_model="numpy")(function))
 
 

@@ -14,7 +14,7 @@ from swarm_loc_vision.core.draw import draw_marker
 from swarm_loc_vision.core.families import family_named
 from swarm_loc_vision.core.settings import DetectorSettings
 
-CORE = Path(__file__).parent
+CORE = Path(__file__).resolve().parent
 
 
 def warm_up() -> None:
