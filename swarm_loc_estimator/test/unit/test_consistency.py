@@ -1,5 +1,6 @@
 """Errors are as large as the covariances say, and vanish where there is no noise."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from swarm_loc_estimator.core import fusion
 from swarm_loc_estimator.core.estimator import SwarmEstimator
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.settings import EstimatorSettings
+from swarm_loc_estimator.core.swarm import Swarm
 
 SEEDS = range(6)
 
@@ -24,6 +26,13 @@ def errors(world: World, settings: EstimatorSettings, period_s: float) -> tuple[
     estimates = play(SwarmEstimator(world.swarm, settings), on_time(world), ticks(T0, end_ns, period_s))
     error = np.array([estimate.poses - world.at(estimate.stamp_ns) for estimate in estimates])
     return wrapped(error), np.array([estimate.covariances for estimate in estimates])
+
+
+def assert_chi_square(squared: Sequence[FloatArray]) -> None:
+    """The mean of normalised errors, an array (N,) of each run, is what three degrees of freedom give."""
+    samples = np.concatenate(squared)
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 3 * samples.size) / samples.size
+    assert low < samples.mean() < high
 
 
 @pytest.mark.parametrize("robots", [1, 5])
@@ -37,9 +46,20 @@ def test_the_normalised_error_is_chi_square_distributed(content: int, flips: flo
         world = simulate(Plan(robots, 8.0, content=content, flips=flips, landmarks=6), 100 + seed)
         error, covariance = errors(world, EstimatorSettings(), 1.0)
         squared.append(nees(error, covariance)[2:].mean(axis=0))
-    samples = np.concatenate(squared)
-    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 3 * samples.size) / samples.size
-    assert low < samples.mean() < high
+    assert_chi_square(squared)
+
+
+def assert_estimated(worlds: Sequence[World], trusting: Callable[[World], Swarm]) -> None:
+    """What is wrong with worlds is estimated: errors are as the filter says, and less than of who trusts."""
+    squared, own, others = [], [], []
+    for world in worlds:
+        error, covariance = errors(world, EstimatorSettings(), 1.0)
+        squared.append(nees(error, covariance)[5:].mean(axis=0))
+        own.append(np.square(error[5:, :, :2]).mean())
+        error, _ = errors(replace(world, swarm=trusting(world)), EstimatorSettings(), 1.0)
+        others.append(np.square(error[5:, :, :2]).mean())
+    assert_chi_square(squared)
+    assert np.mean(own) < 0.7 * np.nanmean(others)  # not a number where it got lost
 
 
 @pytest.mark.parametrize("many", [5, 1000])
@@ -48,21 +68,13 @@ def test_errors_that_last_are_estimated_and_the_error_stays_chi_square_distribut
     content: int, robots: int, many: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fusion, "_MANY", many)
-    squared, estimating, trusting = [], [], []
-    for seed in SEEDS:
-        world = simulate(Plan(robots, 20.0, content=content, lasting=1.0, speed=0.15), 200 + seed)
-        error, covariance = errors(world, EstimatorSettings(), 1.0)
-        squared.append(nees(error, covariance)[5:].mean(axis=0))
-        estimating.append(np.square(error[5:, :, :2]).mean())
-        trusted = [replace(robot, odometry=ODOMETRY, camera=MOUNT) for robot in world.swarm.robots]
-        error, _ = errors(
-            replace(world, swarm=replace(world.swarm, robots=tuple(trusted))), EstimatorSettings(), 1.0
-        )
-        trusting.append(np.square(error[5:, :, :2]).mean())
-    samples = np.concatenate(squared)
-    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 3 * samples.size) / samples.size
-    assert low < samples.mean() < high
-    assert np.mean(estimating) < 0.7 * np.nanmean(trusting)  # not a number where it got lost
+    plan = Plan(robots, 20.0, content=content, lasting=1.0, speed=0.15)
+
+    def trusting(world: World) -> Swarm:
+        trusted = (replace(robot, odometry=ODOMETRY, camera=MOUNT) for robot in world.swarm.robots)
+        return replace(world.swarm, robots=tuple(trusted))
+
+    assert_estimated([simulate(plan, 200 + seed) for seed in SEEDS], trusting)
 
 
 @pytest.mark.parametrize("many", [5, 1000])
@@ -71,20 +83,13 @@ def test_landmarks_badly_surveyed_are_estimated_and_the_error_stays_chi_square_d
     content: int, many: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fusion, "_MANY", many)
-    squared, estimating, trusting = [], [], []
-    for seed in SEEDS:
-        world = simulate(Plan(1, 30.0, content=content, survey=1.0, speed=0.15), 300 + seed)
-        error, covariance = errors(world, EstimatorSettings(), 1.0)
-        squared.append(nees(error, covariance)[5:].mean(axis=0))
-        estimating.append(np.square(error[5:, :, :2]).mean())
-        trusted = tuple(replace(mark, position_sigma=0.0, yaw_sigma=0.0) for mark in world.swarm.landmarks)
-        world = replace(world, swarm=replace(world.swarm, landmarks=trusted))
-        error, _ = errors(world, EstimatorSettings(), 1.0)
-        trusting.append(np.square(error[5:, :, :2]).mean())
-    samples = np.concatenate(squared)
-    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 3 * samples.size) / samples.size
-    assert low < samples.mean() < high
-    assert np.mean(estimating) < 0.7 * np.nanmean(trusting)  # not a number where it got lost
+    plan = Plan(1, 30.0, content=content, survey=1.0, speed=0.15)
+
+    def trusting(world: World) -> Swarm:
+        trusted = (replace(mark, position_sigma=0.0, yaw_sigma=0.0) for mark in world.swarm.landmarks)
+        return replace(world.swarm, landmarks=tuple(trusted))
+
+    assert_estimated([simulate(plan, 300 + seed) for seed in SEEDS], trusting)
 
 
 @pytest.mark.parametrize("fusion_period_s", [0.0, 0.2])
