@@ -40,6 +40,14 @@ class DenseFilter:
         self.covariance[:, columns] = 0.0
         self.covariance[columns[:, None], columns[None, :]] = covariance
 
+    def relate(self, columns: IndexArray, others: IndexArray, mapping: FloatArray) -> None:
+        """Add the errors of other columns (m,), mapped by (k, m), to those of independent columns (k,)."""
+        common = mapping @ self.covariance[others]
+        added = common[:, others] @ mapping.T
+        self.covariance[columns, :] += common
+        self.covariance[:, columns] += common.T
+        self.covariance[np.ix_(columns, columns)] += 0.5 * (added + added.T)
+
     def update(
         self, columns: IndexArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
     ) -> FloatArray:

@@ -12,13 +12,13 @@ from __future__ import annotations
 import numpy as np
 
 from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.clues import NO_CLUES, with_clue
+from swarm_loc_estimator.core.clues import NO_CLUES, THE_MAP, OtherSide, refreshed, with_clue
 from swarm_loc_estimator.core.locate import LEAST_CLUES, locate
 from swarm_loc_estimator.core.measurements import NOBODY, MeasurementArray
 from swarm_loc_estimator.core.motion import NOISE
 from swarm_loc_estimator.core.odometry import OdometryTracks
 from swarm_loc_estimator.core.parameters import CAMERA_SCALE, CAMERA_YAW
-from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.prediction import advance
 from swarm_loc_estimator.core.state import SwarmState
 
 _LONGEST_PAUSE_NS = 300_000_000
@@ -54,29 +54,33 @@ class ClueBook:
             return False
         track = self._tracks.at(np.array([robot]), one["stamp_ns"])
         pose, gathered = track.pose[0], track.gathered[0]
-        base, spread = self._located(state, other, one)
         camera = np.zeros(2) if observer == NOBODY else state.parameter[observer, [CAMERA_YAW, CAMERA_SCALE]]
         old = state.clues.get(robot, NO_CLUES)
-        clues = with_clue(old, one, camera, robot, pose, gathered[NOISE], base, spread, self._window_ns)
+        seen = self._located(state, other, one)
+        clues = with_clue(old, one, camera, robot, pose, gathered[NOISE], seen, self._window_ns)
         state.clues[robot] = clues
         few = clues.size < LEAST_CLUES or clues["stamp_ns"][0] == now_ns
         if few or now_ns < state.next_attempt_ns[robot]:
             return True
-        fix = locate(clues, gathered[NOISE])
+        fix = locate(refreshed(clues, state.arrays()), gathered[NOISE])
         if fix is not None:
-            state.enter(robot, fix.transform, fix.covariance, gathered, now_ns)
+            state.enter(robot, fix.transform, fix.covariance, gathered, now_ns, fix.columns, fix.shares)
         else:
             waited_ns = now_ns - int(clues["stamp_ns"][0])
             state.next_attempt_ns[robot] = now_ns + min(_LONGEST_PAUSE_NS, waited_ns // _PAUSE_SHARE)
         return True
 
-    def _located(self, state: SwarmState, other: int, one: MeasurementArray) -> tuple[FloatArray, FloatArray]:
-        """The located side as `with_clue` takes it: pose (3,) in map and covariance (3, 3) of its error."""
+    def _located(self, state: SwarmState, other: int, one: MeasurementArray) -> OtherSide:
+        """The side of a measurement (1,) that is located, brought up to its stamp."""
         landmark = int(one["landmark"][0]) - 1
         if landmark >= 0:
-            return state.landmark[landmark], state.landmark_covariance(landmark)
+            moved = state.landmark[landmark].copy()
+            return OtherSide(NOBODY, state.landmark_column(landmark), moved, moved, np.zeros((3, 3)))
         if other == NOBODY:
-            return np.zeros(3), np.zeros((3, 3))
+            return THE_MAP
         sample = self._tracks.at(np.array([other]), one["stamp_ns"])
-        transform, spread = state.at(other, sample.gathered[0], int(one["stamp_ns"][0]))
-        return se2.compose(transform, sample.pose[0]), spread
+        gathered = sample.gathered[0]
+        # so that how it erred until now is shared by all that are located by it
+        advance(state.arrays(), other, gathered, int(one["stamp_ns"][0]))
+        transform = state.transform[other].copy()
+        return OtherSide(other, 3 * other, se2.compose(transform, sample.pose[0]), transform, gathered[NOISE])

@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from swarm_loc_estimator.core.clues import Clue, ClueArray, spread_at, turned
 from swarm_loc_estimator.core.compiled import assign, carry, compiled, moved_by_twist, wrap
 from swarm_loc_estimator.core.dense_filter import cholesky3, solve3
-from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.se2 import FloatArray, adjoint
 
 LEAST_CLUES = 3
 _AGREE = float(chi2.ppf(0.999, 2))
@@ -28,24 +28,36 @@ _APART_M, _APART_RAD = 0.1, 0.1
 _HEADING_SIGMA = 0.2
 _POSITION_SIGMA = 0.5
 _REFINEMENTS = 5
+_MARGIN = 1e-6  # so that what is its own is a covariance where next to nothing is
 _PRIOR = 1e-6  # so that what no clue shows is unsure instead of singular
 
 
 @dataclass(frozen=True)
 class Fix:
-    """Where a track lies: its transform (3,) and the covariance (3, 3) of the right-invariant error."""
+    """Where a track lies.
+
+    Attributes:
+        transform: (3,) of the track.
+        covariance: (3, 3) of the part of its right-invariant error that is its own.
+        columns: (s,) first filter columns of the errors of those it was located by.
+        shares: (s, 3, 3) how these enter its own.
+    """
 
     transform: FloatArray
     covariance: FloatArray
+    columns: NDArray[np.int64]
+    shares: FloatArray
 
 
 def locate(clues: ClueArray, track_noise: FloatArray) -> Fix | None:
     """The transform that a robot's clues (k,) agree on, or None while it is not unique and sure.
 
     Args:
-        clues: Of CLUE_DTYPE.
+        clues: Of CLUE_DTYPE, refreshed.
         track_noise: (3, 3) noise the track has gathered by now; what came since a clue makes it less sure.
     """
+    if clues.size < LEAST_CLUES:
+        return None
     hypotheses = _hypotheses(clues)
     clues = _drifted(clues, track_noise)
     agreeing, support = _vote(clues, hypotheses)
@@ -56,12 +68,14 @@ def locate(clues: ClueArray, track_noise: FloatArray) -> Fix | None:
     transform, covariance, weight = _refined(clues, hypotheses[best])
     if np.count_nonzero(weight) < enough:
         return None
-    position, heading = _widen(clues, track_noise, weight, transform, covariance)
+    position, heading = _unsureness(clues, track_noise, weight, transform, covariance)
     if not (position < _POSITION_SIGMA and heading < _HEADING_SIGMA):
         return None
     rivals = hypotheses[support >= _RIVAL_SHARE * support[best]]
     limits = (_APART_M + 3.0 * position, _APART_RAD + 3.0 * heading)
-    return None if _is_ambiguous(clues, transform, rivals, limits) else Fix(transform, covariance)
+    if _is_ambiguous(clues, transform, rivals, limits):
+        return None
+    return _parted(clues, track_noise, weight, transform, covariance)
 
 
 def _is_ambiguous(
@@ -255,23 +269,71 @@ def _refine(
         solve3(factor, gradient, covariance[i])
 
 
+def _parted(
+    clues: ClueArray,
+    track_noise: FloatArray,
+    weight: FloatArray,
+    transform: FloatArray,
+    covariance: FloatArray,
+) -> Fix:
+    """Part the error of a transform (3,) into its own and that of all those it was located by.
+
+    An error of another side moves all that is tied to it, so it enters by the share of the information that
+    its clues have. What else makes clues unsure is their own, and averages out but for the drift of the track
+    since, which counts at its mean by weight (k,).
+    """
+    used = weight > 0.0
+    clues, weight = clues[used], weight[used]
+    cos, sin = math.cos(transform[2]), math.sin(transform[2])
+    turn = np.array([[cos, -sin], [sin, cos]])
+    local = _matrices(clues, "local")
+    place = np.column_stack([clues["local_x"], clues["local_y"]]) @ turn.T + transform[:2]
+    tie, other_tie = _ties(place), _ties(np.column_stack([clues["map_x"], clues["map_y"]]))
+    tie[:, 2, 2] = [math.isfinite(_turn_off(clue, transform[2])) for clue in clues]
+    noise, common = np.zeros((2, clues.size, 3, 3))
+    noise[:, :2, :2] = turn @ local @ turn.T + _matrices(clues, "map")
+    noise[:, 2, 2] = clues["turn_variance"]
+    common[:, :2, :2] = (other_tie @ clues["shared"] @ np.swapaxes(other_tie, 1, 2))[:, :2, :2]
+    common[:, 2, 2] = clues["shared"][:, 2, 2]
+    weighted = np.linalg.solve(noise, tie)
+    information = np.swapaxes(tie, 1, 2) @ weighted
+    gain = np.linalg.inv(information.sum(axis=0) + _PRIOR * np.eye(3))
+    rest = (np.swapaxes(weighted, 1, 2) @ ((1.0 + _MARGIN) * noise - common) @ weighted).sum(axis=0)
+    drift = np.average(track_noise - clues["track_noise"], axis=0, weights=weight)
+    own = covariance @ rest @ gain + adjoint(transform) @ drift @ adjoint(transform).T
+    columns = np.unique(clues["column"][clues["column"] >= 0])
+    shares = np.array([gain @ information[clues["column"] == column].sum(axis=0) for column in columns])
+    return Fix(transform, 0.5 * (own + own.T), columns, shares.reshape(-1, 3, 3))
+
+
+def _ties(places: FloatArray) -> FloatArray:
+    """How right-invariant errors move points (k, 2), and turn what is there: (k, 3, 3)."""
+    ties = np.tile(np.eye(3), (len(places), 1, 1))
+    ties[:, 0, 2], ties[:, 1, 2] = -places[:, 1], places[:, 0]
+    return ties
+
+
+def _matrices(clues: ClueArray, side: str) -> FloatArray:
+    """Covariances (k, 2, 2) of the points of a side."""
+    xx, xy, yy = (clues[f"{side}_{name}"] for name in ("xx", "xy", "yy"))
+    return np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-1)
+
+
 @compiled
-def _widen(
+def _unsureness(
     clues: ClueArray,
     track_noise: FloatArray,
     weight: FloatArray,
     transform: FloatArray,
     covariance: FloatArray,
 ) -> tuple[float, float]:
-    """Add to a covariance (3, 3) what clues share and what does not average out; return how unsure it leaves.
+    """How unsure a fix leaves the clues' middle on the map [m], the greater of x and y, and the heading.
 
-    That is the error of a robot seen and the drift of the track since, at their means by weight (k,).
-
-    Returns:
-        Standard deviations of the clues' middle on the map [m], the greater of the two, and of the heading.
+    What does not average out counts at its mean by weight (k,): the errors of the other sides, as if all
+    erred alike, and the drift of the track since.
     """
     x, y, total = 0.0, 0.0, 0.0
-    shared, drift, carried = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
+    whole, drift, carried = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
     for k in range(clues.size):
         x += clues[k].map_x / clues.size
         y += clues[k].map_y / clues.size
@@ -280,11 +342,11 @@ def _widen(
         share = weight[k] / total
         for i in range(3):
             for j in range(3):
-                shared[i, j] += share * clues[k].shared[i, j]
+                whole[i, j] += share * clues[k].shared[i, j]
                 drift[i, j] += share * (track_noise[i, j] - clues[k].track_noise[i, j])
     carry(transform, drift, carried)
     for i in range(3):
         for j in range(3):
-            covariance[i, j] += shared[i, j] + carried[i, j]
-    xx, _, yy = spread_at(covariance, x, y)
-    return math.sqrt(max(xx, yy)), math.sqrt(covariance[2, 2])
+            whole[i, j] += covariance[i, j] + carried[i, j]
+    xx, _, yy = spread_at(whole, x, y)
+    return math.sqrt(max(xx, yy)), math.sqrt(whole[2, 2])

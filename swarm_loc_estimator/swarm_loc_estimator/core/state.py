@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.dense_filter import DenseFilter, IndexArray
 from swarm_loc_estimator.core.parameters import PARAMETERS, ParameterTable
-from swarm_loc_estimator.core.prediction import predicted
 from swarm_loc_estimator.core.se2 import FloatArray
 
 NEVER_NS = np.iinfo(np.int64).min
+
+_ALONE: IndexArray = np.zeros(0, dtype=np.int64)
+_NO_SHARES: FloatArray = np.zeros((0, 3, 3))
 
 
 class BeliefArrays(NamedTuple):
@@ -96,19 +98,33 @@ class SwarmState:
         )
 
     def enter(
-        self, robot: int, transform: FloatArray, covariance: FloatArray, gathered: FloatArray, stamp_ns: int
+        self,
+        robot: int,
+        transform: FloatArray,
+        covariance: FloatArray,
+        gathered: FloatArray,
+        stamp_ns: int,
+        columns: IndexArray = _ALONE,
+        shares: FloatArray = _NO_SHARES,
     ) -> None:
-        """Take the robot into the estimate, independent of all others, its parameters as before any data.
+        """Take the robot into the estimate, its parameters as before any data.
+
+        Its error is one of its own, and a share of those of what it was located by.
 
         Args:
             robot: Its index.
             transform: (3,) T.
-            covariance: (3, 3) of its right-invariant error.
+            covariance: (3, 3) of the part of its right-invariant error that is its own.
             gathered: (2, 3, 3) what its track has gathered at the instant of entering.
             stamp_ns: That instant.
+            columns: (s,) first filter columns of the others' errors.
+            shares: (s, 3, 3) how they enter its own.
         """
         self.transform[robot] = transform
         self._isolate(robot, covariance)
+        others = (columns[:, None] + np.arange(3)).reshape(-1)
+        mapping = shares.transpose(1, 0, 2).reshape(3, -1)
+        self.filter.relate(robot_columns(np.array([robot]))[0], others, mapping)
         self.accounted[robot] = gathered
         self.accounted_ns[robot] = stamp_ns
         self.tracked[robot] = True
@@ -132,12 +148,6 @@ class SwarmState:
         self.filter.place(self._table.column[robot, estimated], np.diag(sigma**2))
         self.parameter[robot] = 0.0
 
-    def at(self, robot: int, gathered: FloatArray, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
-        """T (3,) and the covariance (3, 3) of its error where the track has gathered (2, 3, 3)."""
-        transform, covariance = np.empty(3), np.empty((3, 3))
-        predicted(self.arrays(), robot, gathered, stamp_ns, transform, covariance)
-        return transform, covariance
-
     def parameter_sigma(self, robot: int) -> FloatArray:
         """Standard deviations (PARAMETERS,) of a robot's parameters; zero of those not estimated."""
         column = self._table.column[robot]
@@ -147,9 +157,13 @@ class SwarmState:
 
     def landmark_covariance(self, landmark: int) -> FloatArray:
         """Covariance (3, 3) of the right-invariant error of a landmark that is estimated."""
-        own = slice(self._table.survey_column[landmark], self._table.survey_column[landmark] + 3)
-        covariance: FloatArray = self.filter.covariance[own, own]
+        own = self.landmark_column(landmark) + np.arange(3)
+        covariance: FloatArray = self.filter.covariance[np.ix_(own, own)]
         return covariance
+
+    def landmark_column(self, landmark: int) -> int:
+        """First filter column of the error of a landmark that is estimated."""
+        return int(self._table.survey_column[landmark])
 
 
 def robot_columns(robots: NDArray[np.int64]) -> IndexArray:

@@ -11,12 +11,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.core import fix, locate, se2
-from swarm_loc_estimator.core.clues import CLUE_DTYPE, NO_CLUES, ClueArray, with_clue
+from swarm_loc_estimator.core.clues import (
+    CLUE_DTYPE,
+    NO_CLUES,
+    THE_MAP,
+    ClueArray,
+    OtherSide,
+    refreshed,
+    with_clue,
+)
 from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE, NOBODY, Kind, MeasurementArray
 from swarm_loc_estimator.core.odometry import OdometryTracks
 from swarm_loc_estimator.core.parameters import ParameterTable
 from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.state import SwarmState
+from swarm_loc_estimator.core.state import BeliefArrays, SwarmState
 from swarm_loc_estimator.core.swarm import Landmark, Robot
 
 SEEDS = st.integers(0, 10**6)
@@ -24,6 +32,8 @@ SIGMA, TURN_SIGMA = 0.01, 0.05
 NO_NOISE = np.zeros((3, 3))
 EXACT = np.zeros(2)
 LONG_NS = 3600 * SECOND
+ORIGIN = OtherSide(1, 3, np.zeros(3), np.zeros(3), NO_NOISE)
+"""Robot 1 at the origin."""
 
 
 def any_pose(rng: np.random.Generator) -> FloatArray:
@@ -74,12 +84,12 @@ def test_a_clue_lies_on_the_map_where_the_true_transform_puts_it(
     transform = any_pose(rng)
     track = pose_of(np.linalg.inv(planar(transform)) @ planar(robot))
     one["has_alternative"], one["alternative"] = 1, one["value"] + [0.0, 0.0, 0.7]
-    (clue,) = with_clue(NO_CLUES, one, camera, 0, track, NO_NOISE, np.zeros(3), NO_NOISE, LONG_NS)
+    (clue,) = with_clue(NO_CLUES, one, camera, 0, track, NO_NOISE, ORIGIN, LONG_NS)
     place = planar(transform) @ [clue["local_x"], clue["local_y"], 1.0]
     np.testing.assert_allclose(place[:2], [clue["map_x"], clue["map_y"]], atol=1e-9)
     off = np.array([clue["turn"], clue["other_turn"]]) - transform[2]
     np.testing.assert_allclose(np.cos(off), [1.0, math.cos(0.7)], atol=1e-9)
-    assert (clue["marker_id"], clue["other"]) == (0, 1)
+    assert (clue["marker_id"], clue["other"], clue["column"]) == (0, 1, 3)
 
 
 @pytest.mark.parametrize("sees", [True, False])
@@ -93,7 +103,10 @@ def test_a_clue_is_as_unsure_as_sampled_sightings_and_located_robots(kind: Kind,
     for _ in range(4000):
         one["value"] = value + rng.multivariate_normal(np.zeros(3), one["covariance"][0])
         base = rng.multivariate_normal(np.zeros(3), spread)
-        (clue,) = with_clue(NO_CLUES, one, camera, 0, robot, NO_NOISE, base, spread, LONG_NS)
+        other = OtherSide(1, 3, base, base, NO_NOISE)
+        (clue,) = refreshed(
+            with_clue(NO_CLUES, one, camera, 0, robot, NO_NOISE, other, LONG_NS), belief_of(base, spread)
+        )
         samples.append([clue[name] for name in ("local_x", "local_y", "map_x", "map_y")])
     sampled = np.cov(np.array(samples).T)
     local, there = (
@@ -103,6 +116,93 @@ def test_a_clue_is_as_unsure_as_sampled_sightings_and_located_robots(kind: Kind,
     tolerance = 0.12 * np.abs(sampled).max()
     np.testing.assert_allclose(local, sampled[:2, :2], atol=tolerance)
     np.testing.assert_allclose(there, sampled[2:, 2:], atol=tolerance)
+
+
+def belief_of(transform: FloatArray, spread: FloatArray) -> BeliefArrays:
+    """Of robots 0, which waits, and 1, which is believed to be at `transform` with an error like `spread`."""
+    state = SwarmState(ParameterTable.of([Robot("a"), Robot("b")]))
+    state.enter(1, transform, spread, np.zeros((2, 3, 3)), T0)
+    return state.arrays()
+
+
+def test_a_clue_moves_with_what_is_believed_of_the_robot_on_the_other_side() -> None:
+    """As if that had been known when it was noted; what its track has gathered since makes it less sure."""
+    rng = np.random.default_rng(3)
+    then, now, spread, drift = any_pose(rng), any_pose(rng), np.diag([1e-4, 2e-4, 3e-4]), 1e-4 * np.eye(3)
+    one, robot = sighting(rng, True, Kind.CARTESIAN, EXACT)
+    track = any_pose(rng)
+    clues = [
+        refreshed(
+            with_clue(
+                NO_CLUES,
+                one,
+                EXACT,
+                0,
+                robot,
+                NO_NOISE,
+                OtherSide(1, 3, se2.compose(transform, track), transform, noise),
+                LONG_NS,
+            ),
+            belief_of(now, spread),
+        )[0]
+        for transform, noise in ((then, NO_NOISE), (now, NO_NOISE), (then, drift))
+    ]
+    for name in ("local_x", "map_x", "map_y", "map_xx", "map_xy", "map_yy", "turn_variance"):
+        np.testing.assert_allclose(clues[0][name], clues[1][name], atol=1e-12)
+    assert math.cos(clues[0]["turn"] - clues[1]["turn"]) == pytest.approx(1.0)
+    assert clues[2]["turn_variance"] == pytest.approx(clues[0]["turn_variance"] + 1e-4)
+    assert clues[2]["map_xx"] > clues[0]["map_xx"] + 0.9e-4
+    np.testing.assert_array_equal(clues[2]["shared"], spread)
+
+
+def test_clues_of_a_robot_that_was_lost_do_not_count() -> None:
+    one, robot = sighting(np.random.default_rng(0), True, Kind.CARTESIAN, EXACT)
+    clues = with_clue(NO_CLUES, one, EXACT, 0, robot, NO_NOISE, ORIGIN, LONG_NS)
+    assert refreshed(clues, SwarmState(ParameterTable.of([Robot("a"), Robot("b")])).arrays()).size == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_enters_errs_as_those_do_that_it_was_located_by(seed: int) -> None:
+    """The joint covariance against sampling: two robots that err alike in part, a third that both see."""
+    rng = np.random.default_rng(seed)
+    robots = [Robot(name, stands=True) for name in "abc"]
+    true = np.array([[0.3, 0.1, 0.4], [-0.2, 0.4, -1.0], [0.1, -0.3, 2.0]])
+    half = 0.02 * rng.standard_normal((6, 6))
+    prior, noise = half @ half.T, np.diag([0.01, 0.01, 0.02]) ** 2
+    errors, believed, count = [], [], 300
+    for _ in range(count):
+        state, book = SwarmState(ParameterTable.of(robots)), fix.ClueBook(OdometryTracks(robots), 20.0)
+        drawn = rng.multivariate_normal(np.zeros(6), prior).reshape(2, 3)
+        for robot in range(2):
+            estimate = se2.compose(se2.exp(-drawn[robot]), true[robot])
+            state.enter(robot, estimate, np.eye(3), np.zeros((2, 3, 3)), T0)
+        state.filter.covariance[:6, :6] = prior
+        for k in range(6):
+            book.note(state, sight_of(rng, true, k % 2, noise, T0 + k * SECOND))
+        assert state.tracked[2]
+        errors.append(se2.log(se2.compose(true, se2.inverse(state.transform))).ravel())
+        believed.append(state.filter.covariance.copy())
+    claimed, sampled = np.mean(believed, axis=0), np.array(errors).T @ np.array(errors) / count
+    normal = [e @ np.linalg.solve(covariance, e) for e, covariance in zip(errors, believed, strict=True)]
+    assert 0.75 < np.mean(normal) / 9.0 < 1.15  # sampled to 0.03; what scatters by chance counts as unsure
+    scale = np.sqrt(np.diag(claimed))
+    np.testing.assert_allclose(sampled / np.outer(scale, scale), claimed / np.outer(scale, scale), atol=0.3)
+
+
+def sight_of(
+    rng: np.random.Generator, true: FloatArray, observer: int, noise: FloatArray, stamp_ns: int
+) -> MeasurementArray:
+    """What a robot at true[observer] measures of the third, by range, bearing and heading."""
+    x, y, heading = se2.between(true[observer], true[2]) + rng.multivariate_normal(np.zeros(3), noise)
+    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
+    one["stamp_ns"], one["observer"], one["target"] = stamp_ns, observer, 2
+    one["kind"], one["has_heading"] = Kind.POLAR, 1
+    distance, bearing = math.hypot(x, y), math.atan2(y, x)
+    one["value"] = [distance, bearing, heading]
+    cos, sin = math.cos(bearing), math.sin(bearing)
+    to_polar = np.array([[cos, sin, 0.0], [-sin / distance, cos / distance, 0.0], [0.0, 0.0, 1.0]])
+    one["covariance"] = to_polar @ noise @ to_polar.T
+    return one
 
 
 def clues_of(
@@ -175,9 +275,7 @@ def many_clues(stamps_s: FloatArray, markers: Sequence[int], window_s: float) ->
     for seconds in stamps_s:
         for marker in markers:
             one["stamp_ns"], one["marker_id"] = T0 + round(seconds * 1e9), marker
-            clues = with_clue(
-                clues, one, EXACT, 0, np.zeros(3), NO_NOISE, np.zeros(3), NO_NOISE, round(window_s * 1e9)
-            )
+            clues = with_clue(clues, one, EXACT, 0, np.zeros(3), NO_NOISE, THE_MAP, round(window_s * 1e9))
     return clues
 
 

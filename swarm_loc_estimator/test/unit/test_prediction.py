@@ -7,7 +7,7 @@ from core_messages import SECOND, T0
 from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.odometry import OdometryTracks
 from swarm_loc_estimator.core.parameters import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE, ParameterTable
-from swarm_loc_estimator.core.prediction import advance
+from swarm_loc_estimator.core.prediction import advance, predicted
 from swarm_loc_estimator.core.state import SwarmState
 from swarm_loc_estimator.core.swarm import OdometryModel, Robot
 
@@ -85,7 +85,8 @@ def test_the_read_out_is_what_the_prediction_would_be() -> None:
     to(state, tracks, 1.0)
     before = state.copy()
     gathered = tracks.at(np.array([0]), np.array([T0 + 3 * SECOND])).gathered[0]
-    transform, covariance = state.at(0, gathered, T0 + 3 * SECOND)
+    transform, covariance = np.empty(3), np.empty((3, 3))
+    predicted(state.arrays(), 0, gathered, T0 + 3 * SECOND, transform, covariance)
     np.testing.assert_array_equal(state.transform, before.transform)
     np.testing.assert_array_equal(state.filter.covariance, before.filter.covariance)
     to(state, tracks, 3.0)
