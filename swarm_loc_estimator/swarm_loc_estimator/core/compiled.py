@@ -55,17 +55,21 @@ def _mark(folder: Path) -> Path:
 
 def compiled(function: Function) -> Function:
     """Compile a function on its first call; calls among compiled functions cost nothing."""
-    # one cache, whether a package is found by a link or not: numba has another one for every path
-    source = Path(function.__code__.co_filename).resolve()
-    function.__code__ = function.__code__.replace(co_filename=str(source))
-    numba.config.CACHE_DIR = str(_cache_folder(source.parent))  # type: ignore[attr-defined]
-    return cast("Function", numba.njit(cache=True, error_model="numpy")(function))
+    return _compiled(function, fastmath=False)
 
 
 def compiled_sums(function: Function) -> Function:
     """The same for sums that may be taken in any order, which is several times faster for long ones."""
-    sums = numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
-    return cast("Function", sums(function))
+    return _compiled(function, fastmath={"reassoc", "contract"})
+
+
+def _compiled(function: Function, *, fastmath: bool | set[str]) -> Function:
+    """Compile a function, with a cache of its folder."""
+    # one cache, whether a package is found by a link or not: numba has another one for every path
+    source = Path(function.__code__.co_filename).resolve()
+    function.__code__ = function.__code__.replace(co_filename=str(source))
+    numba.config.CACHE_DIR = str(_cache_folder(source.parent))  # type: ignore[attr-defined]
+    return cast("Function", numba.njit(cache=True, error_model="numpy", fastmath=fastmath)(function))
 
 
 @compiled

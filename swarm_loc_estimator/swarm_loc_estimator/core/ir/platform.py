@@ -26,6 +26,7 @@ from swarm_loc_estimator.core.swarm import number, number_specs
 POWERS = ("far", "near")
 """Powers of the emitters in the order of BrightnessMatrix's POWER_* constants; only the first is a must."""
 MAX_ELEMENTS = 32
+GAIN_RANGE = (0.05, 20.0)
 _TOGETHER = 1e-3
 """Two elements closer than this are one [rad]."""
 
@@ -154,8 +155,10 @@ class IrGains:
             )
         for name in ("sensor", "emitter"):
             for value in getattr(self, name):
-                if not 0.05 <= value <= 20.0:
-                    raise IrPlatformError(f"gains.{name} has {value:g} but factors must lie in [0.05, 20].")
+                if not GAIN_RANGE[0] <= value <= GAIN_RANGE[1]:
+                    raise IrPlatformError(
+                        f"gains.{name} has {value:g} but factors must lie in {list(GAIN_RANGE)}."
+                    )
         check_numbers(self, "gains.")
 
     @classmethod

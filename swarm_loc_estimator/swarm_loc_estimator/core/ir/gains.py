@@ -1,0 +1,284 @@
+"""Gains of robots' sensors and emitters, from the brightness matrices that they recorded of each other.
+
+All gains and the relative pose of every exchange are sought together by Gauss-Newton, each pose eliminated
+from its own readings. Without known poses, what all gains of a robot have in common is told from range only
+by near robots, whose pattern depends on it; far ones with brighter elements just seem nearer. The result says
+how unsure it is. Known poses determine it, but for a factor between sensors and emitters, which cancels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.ir.brightness import expected_with_slopes
+from swarm_loc_estimator.core.ir.likelihood import MaximumLikelihood
+from swarm_loc_estimator.core.ir.platform import GAIN_RANGE, IrGains, IrPlatform, PairGains
+from swarm_loc_estimator.core.ir.solution import DARKEST, Outcome
+from swarm_loc_estimator.core.se2 import FloatArray
+
+Progress = Callable[[str], None]
+
+_ROUNDS = 8
+_STILL = 1e-3
+"""Rounds end when no log-gain moves by more."""
+_POSE_SIGMA = (0.0005, 0.005, 0.005)
+"""How well known poses are known: range [m], bearing, heading [rad]."""
+_SEARCH_SIGMA = 0.02
+"""How unsure gains are taken to be while poses are searched with them."""
+_MOST_ODDS = 0.05
+_MOST_MISFIT = 3.0
+"""Exchanges whose second-best pose is likelier, or that fit worse, are left out."""
+_CLEAR_OF_SATURATION = 3.0
+"""Readings expected nearer to saturation than this are left out [sigma]."""
+_WORST = 5.0
+"""Exchanges whose residuals' mean square is above the median by more than this factor are left out."""
+_LONGEST_STEP = 0.3
+_LEAST_SIGMA = 0.003
+"""Gains are never called surer than this."""
+
+
+class Exchanges(NamedTuple):
+    """What robots read of each other.
+
+    Attributes:
+        receiver: (k,) index of the robot that measured.
+        transmitter: (k,) index of the robot that lit its emitters.
+        readings: (k, modes, n, n) [count], [mode, sensor, emitter], NaN where not measured.
+        poses: (k, 3) of the transmitter seen from the receiver, range [m], bearing, heading [rad]; NaN where
+            not known.
+    """
+
+    receiver: NDArray[np.int64]
+    transmitter: NDArray[np.int64]
+    readings: FloatArray
+    poses: FloatArray
+
+
+@dataclass(frozen=True)
+class GainsFit:
+    """Gains of all robots, and how well they explain what was read.
+
+    Attributes:
+        gains: One per robot.
+        used: (k,) which exchanges were used.
+        before: (k, modes, n, n) residuals with all gains 1, in sigmas; NaN where a reading was not used.
+        after: Likewise with the gains.
+    """
+
+    gains: tuple[IrGains, ...]
+    used: NDArray[np.bool_]
+    before: FloatArray
+    after: FloatArray
+
+
+class GainsError(ValueError):
+    """Exchanges that tell nothing of gains; the message is one sentence."""
+
+
+def estimate_gains(
+    platform: IrPlatform, robots: int, exchanges: Exchanges, progress: Progress = lambda _: None
+) -> GainsFit:
+    """Estimate the gains of all robots.
+
+    Args:
+        platform: Of all robots; its `element_sigma` is by how much elements may differ.
+        robots: How many there are.
+        exchanges: What they read.
+        progress: Called with a word on what is being done.
+
+    Raises:
+        GainsError: Elements cannot differ, or no exchange can be used.
+    """
+    if platform.element_sigma == 0.0:
+        raise GainsError("element_sigma of the platform is 0, so that all gains are 1.")
+    estimator = MaximumLikelihood(platform)
+    logs = np.zeros((2, robots, platform.n))
+    poses, used = _poses(estimator, exchanges, _pairs(exchanges, logs, platform.element_sigma))
+    before = _residuals(platform, exchanges, logs, poses, used)
+    for number in range(_ROUNDS):
+        progress(f"gains, round {number + 1}")
+        logs, covariance, moved = _improved(platform, exchanges, logs, poses, used)
+        poses, used = _poses(estimator, exchanges, _pairs(exchanges, logs, _SEARCH_SIGMA))
+        used = _without_worst(_residuals(platform, exchanges, logs, poses, used), used)
+        if moved < _STILL:
+            break
+    after = _residuals(platform, exchanges, logs, poses, used)
+    return GainsFit(_as_gains(platform, exchanges, logs, covariance, used), used, before, after)
+
+
+def _pairs(exchanges: Exchanges, logs: FloatArray, sigma: float) -> PairGains:
+    """The gains of every exchange's pair, from log-gains (2, robots, n) of sensors and emitters."""
+    factors = np.exp(logs)
+    sigmas = np.tile([sigma, 0.0, sigma, 0.0], (len(exchanges.receiver), 1))
+    return PairGains(factors[0, exchanges.receiver], factors[1, exchanges.transmitter], sigmas)
+
+
+def _poses(
+    estimator: MaximumLikelihood, exchanges: Exchanges, pairs: PairGains
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """The pose (k, 3) of every exchange, and which of them can be relied on.
+
+    Raises:
+        GainsError: None of them.
+    """
+    solutions = estimator.solve(exchanges.readings, pairs)
+    known = _known(exchanges)
+    sure = (solutions.odds < _MOST_ODDS) & (solutions.misfits < _MOST_MISFIT)
+    used = np.asarray((solutions.outcomes == Outcome.FOUND) & (known | sure))
+    if not used.any():
+        raise GainsError(f"None of {len(used)} exchanges determines a pose.")
+    return np.where(known[:, None], exchanges.poses, solutions.poses), used
+
+
+def _known(exchanges: Exchanges) -> NDArray[np.bool_]:
+    """(k,) whether the pose is known."""
+    known: NDArray[np.bool_] = np.isfinite(exchanges.poses[:, 0])
+    return known
+
+
+def _residuals(
+    platform: IrPlatform,
+    exchanges: Exchanges,
+    logs: FloatArray,
+    poses: FloatArray,
+    used: NDArray[np.bool_],
+) -> FloatArray:
+    """(k, modes, n, n) what readings differ from expectation by [sigma]; NaN where not used."""
+    linear = _linearized(platform, exchanges, logs, poses, used)
+    residuals = np.full(exchanges.readings.shape, np.nan)
+    residuals[used] = np.where(linear.weight > 0.0, linear.residual * np.sqrt(linear.weight), np.nan)
+    return residuals
+
+
+def _without_worst(residuals: FloatArray, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which exchanges are used of those that were: not the few that fit far worse than most."""
+    kept: NDArray[np.bool_] = used.copy()
+    squares = np.nanmean(residuals[used] ** 2, axis=(1, 2, 3))
+    kept[used] = squares <= _WORST * max(float(np.median(squares)), 1.0)
+    return kept
+
+
+class _Linear(NamedTuple):
+    """Readings about expectation, for the u exchanges used.
+
+    Attributes:
+        weight: (u, modes, n, n) one over the variance, 0 where there is no reading to use.
+        residual: (u, modes, n, n) reading less expectation.
+        expected: (u, modes, n, n), which is the slope by a log-gain.
+        slopes: (u, modes, n, n, 3) by the pose.
+    """
+
+    weight: FloatArray
+    residual: FloatArray
+    expected: FloatArray
+    slopes: FloatArray
+
+
+def _linearized(
+    platform: IrPlatform,
+    exchanges: Exchanges,
+    logs: FloatArray,
+    poses: FloatArray,
+    used: NDArray[np.bool_],
+) -> _Linear:
+    """The readings of the exchanges used."""
+    pairs = PairGains(*(values[used] for values in _pairs(exchanges, logs, 0.0)))
+    expected, slopes = expected_with_slopes(platform, poses[used], pairs)
+    readings = exchanges.readings[used]
+    with np.errstate(invalid="ignore"):
+        spread = np.hypot(platform.noise, platform.relative_noise * readings)
+        clear = expected < platform.saturation - _CLEAR_OF_SATURATION * platform.noise
+        light = (readings > DARKEST * platform.noise) & (readings < platform.saturation)
+    usable = np.isfinite(readings) & clear & light
+    weight = np.where(usable, 1.0 / np.where(usable, spread, 1.0) ** 2, 0.0)
+    return _Linear(weight, np.where(usable, readings - expected, 0.0), expected, slopes)
+
+
+def _improved(
+    platform: IrPlatform,
+    exchanges: Exchanges,
+    logs: FloatArray,
+    poses: FloatArray,
+    used: NDArray[np.bool_],
+) -> tuple[FloatArray, FloatArray, float]:
+    """One step of Gauss-Newton: log-gains, their covariance, and the largest change."""
+    linear = _linearized(platform, exchanges, logs, poses, used)
+    information, pull = _without_pose(linear, _known(exchanges)[used])
+    _, robots, n = logs.shape
+    own = np.arange(n)
+    sensors = exchanges.receiver[used, None] * n + own
+    emitters = robots * n + exchanges.transmitter[used, None] * n + own
+    place = np.concatenate([sensors, emitters], axis=1)
+    prior = 1.0 / platform.element_sigma**2
+    matrix, vector = prior * np.eye(logs.size), -prior * logs.ravel()
+    np.add.at(matrix, (place[:, :, None], place[:, None, :]), information)
+    np.add.at(vector, place, pull)
+    covariance = np.asarray(np.linalg.inv(matrix))
+    step = np.clip(covariance @ vector, -_LONGEST_STEP, _LONGEST_STEP)
+    return logs + step.reshape(logs.shape), covariance, float(np.abs(step).max())
+
+
+def _without_pose(linear: _Linear, known: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    """The information (u, 2n, 2n) on log-gains of each exchange's sensors and emitters, and its pull (u, 2n).
+
+    The pose is eliminated, with what is known of it.
+    """
+    weight, expected, slopes = linear.weight, linear.expected, linear.slopes
+    square, mixed = weight * expected**2, (weight * expected)[..., None] * slopes
+    count, _, n, _ = weight.shape
+    gains = np.zeros((count, 2 * n, 2 * n))
+    both, own = square.sum(axis=1), np.arange(n)
+    gains[:, own, own], gains[:, n + own, n + own] = both.sum(axis=2), both.sum(axis=1)
+    gains[:, :n, n:], gains[:, n:, :n] = both, np.swapaxes(both, 1, 2)
+    to_pose = np.concatenate([mixed.sum(axis=(1, 3)), mixed.sum(axis=(1, 2))], axis=1)
+    pose = np.einsum("kmij,kmija,kmijb->kab", weight, slopes, slopes)
+    pose[known] += np.diag(1.0 / np.square(_POSE_SIGMA))
+    of_gains = weight * expected * linear.residual
+    pull = np.concatenate([of_gains.sum(axis=(1, 3)), of_gains.sum(axis=(1, 2))], axis=1)
+    of_pose = np.einsum("kmij,kmija->ka", weight * linear.residual, slopes)
+    back = np.linalg.solve(pose, np.swapaxes(to_pose, 1, 2))
+    return gains - to_pose @ back, pull - np.einsum("kap,ka->kp", back, of_pose)
+
+
+def _as_gains(
+    platform: IrPlatform,
+    exchanges: Exchanges,
+    logs: FloatArray,
+    covariance: FloatArray,
+    used: NDArray[np.bool_],
+) -> tuple[IrGains, ...]:
+    """Gains with how unsure they are, each by itself and all of a robot together.
+
+    The latter is what a receiver's sensors and a transmitter's emitters have in common, halved between them:
+    sensors that read more and emitters that shine less by the same factor are no different.
+    """
+    _, robots, n = logs.shape
+    blocks = covariance.reshape(2 * robots, n, 2 * robots, n)
+    means = blocks.mean(axis=(1, 3))
+    own = np.array([np.trace(blocks[k, :, k]) / n - means[k, k] for k in range(2 * robots)])
+    common: list[list[float]] = [[] for _ in range(2 * robots)]
+    pairs = np.unique(
+        np.stack([exchanges.receiver[used], robots + exchanges.transmitter[used]], axis=1), axis=0
+    )
+    for sensors, emitters in pairs.tolist():
+        both = means[sensors, sensors] + means[emitters, emitters] + 2.0 * means[sensors, emitters]
+        common[sensors].append(0.5 * float(both))
+        common[emitters].append(0.5 * float(both))
+    unseen = platform.element_sigma**2 / n
+    shared = np.array([np.mean(values) if values else unseen for values in common])
+    own, shared = (np.sqrt(np.mean(v.reshape(2, robots), axis=0)) for v in (own, shared))
+    factors = np.clip(np.exp(logs), *GAIN_RANGE)
+    return tuple(
+        IrGains(
+            tuple(factors[0, k].tolist()),
+            tuple(factors[1, k].tolist()),
+            max(float(own[k]), _LEAST_SIGMA),
+            float(shared[k]),
+        )
+        for k in range(robots)
+    )
