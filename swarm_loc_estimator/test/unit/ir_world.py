@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import norm
 
-from swarm_loc_estimator.core.ir.brightness import expected, expected_with_slopes
+from swarm_loc_estimator.core.ir.brightness import expected
 from swarm_loc_estimator.core.ir.platform import IrPlatform, PairGains
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
@@ -84,18 +83,6 @@ def differing_gains(count: int, n: int, sigma: float, seed: int) -> PairGains:
     """Gains of pairs whose elements all differ, with nothing left unknown."""
     factors = np.exp(sigma * np.random.default_rng(seed).standard_normal((2, count, n)))
     return PairGains(factors[0], factors[1], np.zeros((count, 4)))
-
-
-def cramer_rao(platform: IrPlatform, poses: FloatArray) -> FloatArray:
-    """(k, 3, 3) the least covariance of any unbiased estimate, of elements that are alike.
-
-    A reading beyond saturation tells only that it is, which leaves a share of its information.
-    """
-    bright, slopes = expected_with_slopes(platform, poses)
-    z = (platform.saturation - bright) / platform.noise
-    share = norm.cdf(z) - z * norm.pdf(z) + norm.pdf(z) ** 2 / np.maximum(norm.sf(z), 1e-300)
-    share = np.where(z > 8.0, 1.0, np.where(z < -8.0, 0.0, share)) / platform.noise**2
-    return np.asarray(np.linalg.inv(np.einsum("kmij,kmija,kmijb->kab", share, slopes, slopes)))
 
 
 def pose_errors(found: FloatArray, poses: FloatArray) -> FloatArray:
