@@ -241,6 +241,7 @@ def draw(
     lens: FloatArray,
     rotations: FloatArray,
     shifts: FloatArray,
+    weight: float,
     box: FloatArray,
 ) -> None:
     """Note the boundaries of patches as a camera sees them during its exposure.
@@ -252,10 +253,11 @@ def draw(
         lens: Constants of `project`.
         rotations: (K, 3, 3) from the patches' frame to the optical one, at K instants of the exposure.
         shifts: (K, 3) likewise [m].
+        weight: Share of the light that comes this way.
         box: (4,) left, top, right and bottom [px] of what was drawn, extended.
     """
     polygon, spare = np.empty((_CORNERS, 3)), np.empty((_CORNERS, 3))
-    reach, share = lens[REACH], 1.0 / len(rotations)
+    reach, share = lens[REACH], weight / len(rotations)
     for instant in range(len(rotations)):
         rotation, shift = rotations[instant], shifts[instant]
         for surface in range(len(patches.radius)):

@@ -15,7 +15,7 @@ from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.swarm import CameraMount
 
 from .lens import CameraModel
-from .raster import FX, REACH, Patches, draw, expose, fill, lay_over, project
+from .raster import CX, CY, FX, REACH, Patches, draw, expose, fill, lay_over, project
 from .scene import ROOM
 
 FloatArray = NDArray[np.float64]
@@ -29,6 +29,11 @@ MOST_INSTANTS = 256
 _OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """From x forward, y left, z up to x right, y down, z forward."""
 _CLOSEST = 0.03
+_ONE_WAY = ((0.0, 1.0),)
+_NARROW_WAYS = ((-0.5, 0.25), (0.0, 0.5), (0.5, 0.25))
+"""Shift to the right and down [px], and share of the light, for a blur that is narrow against pixels."""
+_NARROW_VARIANCE, _WIDE_VARIANCE = 0.125, 0.64
+"""Of these ways, and from which pixels are fine enough [px^2]."""
 _NOISE_LENGTH = 1 << 20
 
 
@@ -111,15 +116,41 @@ class Renderer:
         seen_from = poses[:, eye.robot]
         of_map = eye.view(se2.inverse(seen_from))
         of_robots = eye.view(se2.between(seen_from[:, None], poses))
-        draw(self._changes, self._covers, self._scene.backdrop, eye.lens, *of_map, _no_box())
+        self._draw(self._scene.backdrop, eye, of_map, _no_box())
         fill(self._picture, self._changes, ROOM)
         for part, motion in self._far_to_near(eye.robot, poses, of_map, of_robots):
             box = _no_box()
-            draw(self._changes, self._covers, part, eye.lens, *motion, box)
+            self._draw(part, eye, motion, box)
             lay_over(self._picture, self._changes, self._covers, box)
-        if self._model.focus_sigma_px > 0.0:
-            cv2.GaussianBlur(self._picture, (0, 0), self._model.focus_sigma_px, dst=self._picture)
+        self._defocus()
         return self._picture
+
+    def _draw(self, patches: Patches, eye: Eye, motion: Motion, box: FloatArray) -> None:
+        """Note the boundaries of patches; with a narrow blur by light that comes three ways."""
+        ways = _NARROW_WAYS if self._blur_is_narrow else _ONE_WAY
+        for shift_px, weight in ways:
+            lens = eye.lens.copy()
+            lens[[CX, CY]] += shift_px
+            draw(self._changes, self._covers, patches, lens, *motion, weight, box)
+
+    @property
+    def _blur_is_narrow(self) -> bool:
+        return _NARROW_VARIANCE < self._model.focus_sigma_px**2 < _WIDE_VARIANCE
+
+    def _defocus(self) -> None:
+        """Blur the picture as the optics do.
+
+        Light is blurred before it falls into pixels. A blur that is wide against them comes out the same when
+        pixels are blurred afterwards; with a narrow one edges would seem to lie up to 0.03 px aside, one way
+        or the other as they lie in the pixels. So part of it is there before, half a pixel apart.
+        """
+        sigma = self._model.focus_sigma_px
+        if self._blur_is_narrow:
+            side = 0.5 * (sigma**2 - _NARROW_VARIANCE)
+            kernel = np.array([side, 1.0 - 2.0 * side, side])
+            cv2.sepFilter2D(self._picture, -1, kernel, kernel, dst=self._picture)
+        elif sigma > 0.0:
+            cv2.GaussianBlur(self._picture, (0, 0), sigma, dst=self._picture)
 
     def frame(self, eye: Eye, poses: FloatArray, rng: np.random.Generator) -> NDArray[np.uint8]:
         """The picture (height, width) that the sensor reports; arguments as for `light`."""
