@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.compiled import compiled
-from swarm_loc_vision.core.detector import homographies
 from swarm_loc_vision.core.families import Family
+from swarm_loc_vision.core.homographies import homographies
 from swarm_loc_vision.core.pose import square
 
 FloatArray = NDArray[np.float64]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.compiled import compiled
-from swarm_loc_vision.core.families import BITS, CELLS, Family, rotated
+from swarm_loc_vision.core.families import BITS, CELLS, Family, rotated, unpacked
 from swarm_loc_vision.core.sampling import GRID
 
 FloatArray = NDArray[np.float64]
@@ -60,6 +60,7 @@ class Dictionary:
     Attributes:
         codes: (N,) the family's code of each word.
         ids: (N,) its id in it.
+        strips: (N, 4, cells) the row of cells behind the border along each side, clockwise; 1 is white.
         correctable: Bits that may differ while random squares are read as a marker at `FALSE_READINGS`.
     """
 
@@ -67,8 +68,12 @@ class Dictionary:
         self.codes = np.concatenate([np.full(len(ids), family.code) for family, ids in family_ids])
         self.ids = np.concatenate([ids for _, ids in family_ids])
         words = np.concatenate([family.words[ids] for family, ids in family_ids])
+        border = family_ids[0][0].border
         self._words = np.concatenate([rotated(words, quarters) for quarters in range(4)])
         self.correctable = correctable_bits(len(words))
+        cells = unpacked(words)
+        rows = np.stack([np.rot90(cells, k, axes=(1, 2))[:, 0] for k in range(4)], axis=1)
+        self.strips = np.pad(rows, ((0, 0), (0, 0), (border, border)))
 
     def read(self, cells: FloatArray, least_contrast: float) -> Readings:
         """Read candidates.

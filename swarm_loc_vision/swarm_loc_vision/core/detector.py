@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from swarm_loc_vision.core.bodies import Body, Seen, solve_bodies
 from swarm_loc_vision.core.camera import Camera
 from swarm_loc_vision.core.decoder import Dictionary
-from swarm_loc_vision.core.edges import refine
+from swarm_loc_vision.core.edges import refine, refine_read
 from swarm_loc_vision.core.families import Family
+from swarm_loc_vision.core.homographies import homographies
 from swarm_loc_vision.core.pose import Poses, Upright, marker_poses
 from swarm_loc_vision.core.quads import find_quads
 from swarm_loc_vision.core.sampling import GRID, LENS_SIZE, read_cells
@@ -23,8 +24,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Gray = NDArray[np.uint8]
 
-_ROUGH_PX, _FINE_PX = 3.0, 1.0
-"""Distances of the profiles across the sides of candidates, and of markers."""
+_ROUGH_PX = 3.0
+"""Distance of the profiles across the sides of candidates."""
 _LEAST_EDGE = 2.0
 """Contrast of a candidate's sides over `least_contrast`, which counts from the mean and not from dark."""
 _SAME = 0.3
@@ -126,19 +127,22 @@ class MarkerDetector:
         read_cells(gray, self._lens, homographies(corners), side, cells)
         readings = dictionary.read(cells, _LEAST_EDGE * least_contrast)
         good = readings.word >= 0
-        fine = refine(gray, self._lens, corners[good], side, _FINE_PX)
         word, quarters = readings.word[good], readings.quarters[good]
         own = (np.arange(4) - quarters[:, None]) % 4  # the marker's own first corner first
-        pairs = (2 * own[:, :, None] + np.arange(2)).reshape(-1, 8)
-        rows = np.arange(len(word))
+        fine = refine_read(
+            gray,
+            self._lens,
+            np.take_along_axis(corners[good], own[..., None], axis=1),
+            dictionary.strips[word],
+        )
         markers = _Markers(
             dictionary.codes[word],
             dictionary.ids[word],
             readings.margin[good],
             readings.errors[good],
             readings.contrast[good],
-            fine.corners[rows[:, None], own],
-            fine.covariance[rows[:, None, None], pairs[:, :, None], pairs[:, None, :]],
+            fine.corners,
+            fine.covariance,
         )
         return markers.chosen(fine.contrast > 0.0)
 
@@ -172,24 +176,3 @@ def _best(markers: _Markers) -> _Markers:
         if not near[i, kept].any():
             kept.append(int(i))
     return markers.chosen(np.array(sorted(kept), np.int64))
-
-
-def homographies(quads: FloatArray) -> FloatArray:
-    """(N, 3, 3) from the unit square, clockwise from its upper left (0, 0), to quadrangles (N, 4, 2)."""
-    first, second, third, fourth = np.moveaxis(quads, 1, 0)
-    uneven = first - second + third - fourth
-    a, b = second - third, fourth - third
-    determinant = _cross(a, b)
-    g, h = _cross(uneven, b) / determinant, _cross(a, uneven) / determinant
-    result = np.empty((len(quads), 3, 3))
-    result[:, :2, 0] = second - first + g[:, None] * second
-    result[:, :2, 1] = fourth - first + h[:, None] * fourth
-    result[:, :2, 2] = first
-    result[:, 2, 0], result[:, 2, 1], result[:, 2, 2] = g, h, 1.0
-    return result
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(N,) cross products of plane vectors (N, 2)."""
-    product: FloatArray = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
-    return product

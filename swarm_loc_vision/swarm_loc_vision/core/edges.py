@@ -12,7 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.compiled import compiled
+from swarm_loc_vision.core.families import CELLS
 from swarm_loc_vision.core.sampling import MOST_PROFILES, profile_crossings
+from swarm_loc_vision.core.side_pixels import side_pixels
+from swarm_loc_vision.core.sides import fit_sides
 
 FloatArray = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -42,7 +45,7 @@ class Corners(NamedTuple):
     contrast: FloatArray
 
 
-def refine(image: Gray, lens: FloatArray, quads: FloatArray, cells: int, spacing: float = 1.5) -> Corners:
+def refine(image: Gray, lens: FloatArray, quads: FloatArray, cells: int, spacing: float = 1.0) -> Corners:
     """Move quadrangles onto their edges.
 
     Args:
@@ -56,49 +59,66 @@ def refine(image: Gray, lens: FloatArray, quads: FloatArray, cells: int, spacing
     covariance = np.zeros((len(quads), 8, 8))
     contrast = np.ones(len(quads))
     crossings = np.empty((len(quads), 4, MOST_PROFILES, 3))
-    reaches = _sides(corners) / cells
+    lengths = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2)
+    reaches = _narrower(lengths) / cells
     profile_crossings(image, lens, corners, reaches, spacing, crossings)
-    _fit(crossings, reaches, corners, covariance, contrast)
+    ends, of_ends = np.empty((len(quads), 8)), np.empty((len(quads), 8, 8))
+    _fit(crossings, reaches, lengths, ends, of_ends, contrast)
+    _intersect(corners, ends, of_ends, covariance, contrast)
     return Corners(corners, covariance, contrast)
 
 
-def _sides(quads: FloatArray) -> FloatArray:
-    """(N,) the shorter of two mean opposite sides [px]."""
-    lengths = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2)
-    shorter: FloatArray = 0.5 * np.minimum(lengths[:, 0] + lengths[:, 2], lengths[:, 1] + lengths[:, 3])
-    return shorter
+def refine_read(image: Gray, lens: FloatArray, quads: FloatArray, strips: NDArray[np.uint8]) -> Corners:
+    """Move the corners of markers that have been read onto their edges, as exactly as the pixels tell.
+
+    Args:
+        image: (height, width).
+        lens: See `camera.Camera`.
+        quads: (N, 4, 2) clockwise from each marker's own upper left, nearly right [ideal px].
+        strips: (N, 4, cells) the row of cells behind the border along each side; 1 is white.
+    """
+    cells = strips.shape[2]
+    corners, covariance = quads.copy(), np.zeros((len(quads), 8, 8))
+    ends, of_ends, contrast = np.zeros((len(quads), 8)), np.zeros((len(quads), 8, 8)), np.empty(len(quads))
+    border = (cells - CELLS) // 2
+    pixels = side_pixels(image, lens, quads, cells, border)
+    fit_sides(pixels, strips, border, ends, of_ends, contrast)
+    _intersect(corners, ends, of_ends, covariance, contrast)
+    lost = np.flatnonzero(contrast == 0.0)
+    if len(lost):
+        again = refine(image, lens, quads[lost], cells)
+        corners[lost], covariance[lost], contrast[lost] = again
+    return Corners(corners, covariance, contrast)
+
+
+def _narrower(lengths: FloatArray) -> FloatArray:
+    """(N,) the shorter of two mean opposite sides, of lengths (N, 4) [px]."""
+    narrower: FloatArray = 0.5 * np.minimum(lengths[:, 0] + lengths[:, 2], lengths[:, 1] + lengths[:, 3])
+    return narrower
 
 
 @compiled
 def _fit(
     crossings: FloatArray,
     widths: FloatArray,
-    corners: FloatArray,
+    lengths: FloatArray,
+    ends: FloatArray,
     covariance: FloatArray,
     contrast: FloatArray,
 ) -> None:
-    """Fit lines and intersect them; a quadrangle with a side that cannot be fitted keeps its corners."""
-    lines = np.empty((4, 5))  # offset and slope of each side's crossings, and their covariance
-    moved = np.empty((4, 2))
-    jacobian = np.empty((8, 8))
-    for n in range(len(corners)):
+    """Fit a line to the crossings of each side; the last three as of `sides.fit_sides`."""
+    line = np.empty(5)
+    for n in range(len(crossings)):
         least_variance = _LEAST_SIGMA_PX**2 + (_NEIGHBOUR_PX3 / widths[n] ** 2) ** 2
-        weakest = 1e9
+        contrast[n] = 1e9
+        covariance[n] = 0.0
         for k in range(4):
-            weakest = min(weakest, _fit_line(crossings[n, k], least_variance, lines[k]))
-        if weakest <= 0.0 or not _intersect(corners[n], lines, moved, jacobian):
-            contrast[n] = 0.0
-            continue
-        contrast[n] = weakest
-        corners[n] = moved
-        for i in range(8):
-            for j in range(8):
-                total = 0.0
-                for k in range(4):
-                    a, b = jacobian[i, 2 * k], jacobian[i, 2 * k + 1]
-                    c, d = jacobian[j, 2 * k], jacobian[j, 2 * k + 1]
-                    total += a * c * lines[k, 2] + (a * d + b * c) * lines[k, 3] + b * d * lines[k, 4]
-                covariance[n, i, j] = total
+            contrast[n] = min(contrast[n], _fit_line(crossings[n, k], least_variance, line))
+            length, i, j = lengths[n, k], 2 * k, 2 * k + 1
+            ends[n, i], ends[n, j] = line[0], line[0] + length * line[1]
+            covariance[n, i, i] = line[2]
+            covariance[n, i, j] = covariance[n, j, i] = line[2] + length * line[3]
+            covariance[n, j, j] = line[2] + length * (2.0 * line[3] + length * line[4])
 
 
 @compiled
@@ -150,29 +170,51 @@ def _fit_line(crossings: FloatArray, least_variance: float, line: FloatArray) ->
 
 
 @compiled
-def _intersect(corners: FloatArray, lines: FloatArray, moved: FloatArray, jacobian: FloatArray) -> bool:
-    """Where lines given relative to the sides of a quadrangle meet.
+def _intersect(
+    corners: FloatArray, ends: FloatArray, of_ends: FloatArray, covariance: FloatArray, contrast: FloatArray
+) -> None:
+    """Where the lines along the sides of quadrangles meet.
+
+    Args:
+        corners: (N, 4, 2) the quadrangles; moved.
+        ends: (N, 8) how far outside each side its line lies at its begin and its end [px].
+        of_ends: (N, 8, 8) their covariance [px^2].
+        covariance: (N, 8, 8) of the corners, filled.
+        contrast: (N,) set to 0 where lines do not meet; such corners stay.
+    """
+    moved = np.empty((4, 2))
+    jacobian = np.empty((8, 8))
+    for n in range(len(corners)):
+        if contrast[n] > 0.0 and _meet(corners[n], ends[n], moved, jacobian):
+            corners[n] = moved
+            covariance[n] = jacobian @ of_ends[n] @ jacobian.T
+        else:
+            contrast[n] = 0.0
+
+
+@compiled
+def _meet(corners: FloatArray, ends: FloatArray, moved: FloatArray, jacobian: FloatArray) -> bool:
+    """Where the lines along the sides of one quadrangle meet.
 
     Args:
         corners: (4, 2) the quadrangle.
-        lines: (4, 5) of `_fit_line`.
+        ends: (8,) how far outside each side its line lies at its begin and its end.
         moved: (4, 2) filled with the new corners.
-        jacobian: (8, 8) filled with their derivatives by offset and slope of each line.
+        jacobian: (8, 8) filled with their derivatives by `ends`.
     """
-    normal = np.empty((4, 2))
-    direction = np.empty((4, 2))
-    rest = np.empty(4)
+    normal, direction = np.empty((4, 2)), np.empty((4, 2))
+    rest, lengths = np.empty(4), np.empty(4)
     for k in range(4):
         du = corners[(k + 1) % 4, 0] - corners[k, 0]
         dv = corners[(k + 1) % 4, 1] - corners[k, 1]
-        length = math.hypot(du, dv)
-        du, dv = du / length, dv / length
+        lengths[k] = math.hypot(du, dv)
+        du, dv = du / lengths[k], dv / lengths[k]
         direction[k, 0], direction[k, 1] = du, dv
         # a point p of the line has out - slope * along = offset, where along = (p - c) . (du, dv)
         # and out = (p - c) . (dv, -du); so normal . p = rest
-        slope = lines[k, 1]
+        slope = (ends[2 * k + 1] - ends[2 * k]) / lengths[k]
         normal[k, 0], normal[k, 1] = dv - slope * du, -du - slope * dv
-        rest[k] = lines[k, 0] + normal[k, 0] * corners[k, 0] + normal[k, 1] * corners[k, 1]
+        rest[k] = ends[2 * k] + normal[k, 0] * corners[k, 0] + normal[k, 1] * corners[k, 1]
     jacobian[:] = 0.0
     for k in range(4):
         a = (k + 3) % 4
@@ -182,15 +224,12 @@ def _intersect(corners: FloatArray, lines: FloatArray, moved: FloatArray, jacobi
         u = (rest[a] * normal[k, 1] - rest[k] * normal[a, 1]) / determinant
         v = (normal[a, 0] * rest[k] - normal[k, 0] * rest[a]) / determinant
         moved[k, 0], moved[k, 1] = u, v
-        # a line moved out by 1 shifts the corner along the other line; its slope moves it out by `along`
-        along = (u - corners[a, 0]) * direction[a, 0] + (v - corners[a, 1]) * direction[a, 1]
-        jacobian[2 * k, 2 * a] = normal[k, 1] / determinant
-        jacobian[2 * k + 1, 2 * a] = -normal[k, 0] / determinant
-        jacobian[2 * k, 2 * a + 1] = along * jacobian[2 * k, 2 * a]
-        jacobian[2 * k + 1, 2 * a + 1] = along * jacobian[2 * k + 1, 2 * a]
-        along = (u - corners[k, 0]) * direction[k, 0] + (v - corners[k, 1]) * direction[k, 1]
-        jacobian[2 * k, 2 * k] = -normal[a, 1] / determinant
-        jacobian[2 * k + 1, 2 * k] = normal[a, 0] / determinant
-        jacobian[2 * k, 2 * k + 1] = along * jacobian[2 * k, 2 * k]
-        jacobian[2 * k + 1, 2 * k + 1] = along * jacobian[2 * k + 1, 2 * k]
+        # a line moved out by 1 shifts the corner along the other line; its ends share in that
+        for line, other, sign in ((a, k, 1.0), (k, a, -1.0)):
+            along = (u - corners[line, 0]) * direction[line, 0] + (v - corners[line, 1]) * direction[line, 1]
+            share = along / lengths[line]
+            for axis in range(2):
+                by_line = sign * (normal[other, 1] if axis == 0 else -normal[other, 0]) / determinant
+                jacobian[2 * k + axis, 2 * line] = (1.0 - share) * by_line
+                jacobian[2 * k + axis, 2 * line + 1] = share * by_line
     return True

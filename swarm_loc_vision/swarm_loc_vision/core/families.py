@@ -53,9 +53,7 @@ class Family:
         """
         if not 0 <= marker_id < len(self.words):
             raise ValueError(f"{self.name} has ids 0 to {len(self.words) - 1}, not {marker_id}.")
-        shifts = np.arange(BITS - 1, -1, -1, dtype=np.uint64)
-        cells = (self.words[marker_id] >> shifts) & np.uint64(1)
-        return np.pad(cells.astype(np.uint8).reshape(CELLS, CELLS), self.border)
+        return np.pad(unpacked(self.words[marker_id : marker_id + 1])[0], self.border)
 
 
 def packed(cells: NDArray[np.uint8]) -> NDArray[np.uint64]:
@@ -66,11 +64,16 @@ def packed(cells: NDArray[np.uint8]) -> NDArray[np.uint64]:
     return words
 
 
+def unpacked(words: NDArray[np.uint64]) -> NDArray[np.uint8]:
+    """Cells (N, 6, 6), 1 white, of words (N,)."""
+    shifts = np.arange(BITS - 1, -1, -1, dtype=np.uint64)
+    cells: NDArray[np.uint8] = ((words[:, None] >> shifts) & np.uint64(1)).astype(np.uint8)
+    return cells.reshape(-1, CELLS, CELLS)
+
+
 def rotated(words: NDArray[np.uint64], quarters: int) -> NDArray[np.uint64]:
     """The words (N,) of markers turned counter-clockwise by quarter turns, as they then look."""
-    shifts = np.arange(BITS - 1, -1, -1, dtype=np.uint64)
-    cells = ((words[:, None] >> shifts) & np.uint64(1)).astype(np.uint8).reshape(-1, CELLS, CELLS)
-    return packed(np.rot90(cells, quarters, axes=(1, 2)))
+    return packed(np.rot90(unpacked(words), quarters, axes=(1, 2)))
 
 
 def _opencv_words(dictionary: int, *, quarters: int) -> NDArray[np.uint64]:

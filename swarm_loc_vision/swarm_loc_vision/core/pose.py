@@ -25,6 +25,9 @@ _ROUNDS = 12
 _STILL = 1e-6
 """A step whose weighed square is smaller ends the search."""
 _NOWHERE = 1e12
+_TRUST = 6.0
+"""The corners' covariance counts like so many degrees of freedom; where corners fit worse than it says, as on
+a marker that is partly covered, the pose is as much less sure. A marker alone has two of its own."""
 
 
 class Upright(NamedTuple):
@@ -105,6 +108,10 @@ def marker_poses(
     poses = Poses(rotation, position, np.zeros((len(corners), 2, 6, 6)), np.full((len(corners), 2), np.inf))
     weights = np.asarray(np.linalg.inv(covariance), np.float64)
     _refine_markers(points, corners, weights, intrinsics, *_tilt(upright), *poses)
+    surplus = np.maximum(1.0, (_TRUST + poses.chi2.min(axis=1)) / (_TRUST + 2.0))
+    solved = np.isfinite(surplus)
+    poses.covariance[solved] *= surplus[solved, None, None, None]
+    poses.chi2[solved] /= surplus[solved, None]
     worse = poses.chi2[:, 0] > poses.chi2[:, 1]
     for column in poses:
         column[worse] = column[worse, ::-1]

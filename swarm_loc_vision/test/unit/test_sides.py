@@ -1,0 +1,152 @@
+"""Sides fitted to pixels: no bias wherever edges lie in the pixels, and as sure as they say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from swarm_loc_vision.core.camera import Camera
+from swarm_loc_vision.core.decoder import Dictionary
+from swarm_loc_vision.core.edges import Corners, refine_read
+from swarm_loc_vision.core.families import family_named
+from swarm_loc_vision.core.sampling import LENS_SIZE
+from swarm_loc_vision.core.side_pixels import INNER, side_pixels
+
+FloatArray = NDArray[np.float64]
+FAMILY = family_named("artoolkit_bch_thin")
+INK, PAPER = 30.0, 200.0
+SIZE_PX = 96
+STRAIGHT = np.zeros(LENS_SIZE)
+
+
+def strips(marker_id: int) -> NDArray[np.uint8]:
+    return Dictionary([(FAMILY, np.array([marker_id]))]).strips
+
+
+def shares(begin: float, cell: float, blur: float, motion: float, cover: float = 0.0) -> FloatArray:
+    """(SIZE_PX, 10) of each pixel's light that comes from each cell of a row and its margin: exact means."""
+    edges = begin + cell * np.arange(-1, 10)
+    edges[[0, -1]] = -1e3, 1e3  # the margin has no end
+    edges[1] += cover * cell
+    pixels = np.arange(SIZE_PX)[:, None]
+
+    def integral(x: FloatArray) -> FloatArray:
+        z = x / blur
+        return np.asarray(blur * (z * norm.cdf(z) + norm.pdf(z)))
+
+    moved = motion * (np.arange(32) - 15.5) / 32.0
+    below = np.mean(
+        [integral(pixels + 0.5 - edges - m) - integral(pixels - 0.5 - edges - m) for m in moved], 0
+    )
+    return np.asarray(below[:, :-1] - below[:, 1:])
+
+
+def picture(
+    at: tuple[float, float],
+    cell: float,
+    blur: float = 0.5,
+    motion: float = 0.0,
+    noise: float = 0.0,
+    seed: int = 0,
+    cover: float = 0.0,
+) -> NDArray[np.uint8]:
+    """An upright marker (id `seed`) on endless paper, moving to the right, a share of a cell covered left."""
+    cells = np.pad(FAMILY.pattern(seed), 1, constant_values=1) * (PAPER - INK) + INK
+    light = shares(at[1], cell, blur, 0.0) @ cells @ shares(at[0], cell, blur, motion, cover).T
+    light += noise * np.random.default_rng(seed).standard_normal(light.shape)
+    return np.asarray(np.clip(np.rint(light), 0, 255), np.uint8)
+
+
+def corners_of(at: tuple[float, float], cell: float) -> FloatArray:
+    side = cell * FAMILY.side
+    return np.array(at) + side * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+
+
+def fitted(image: NDArray[np.uint8], near: FloatArray, marker_id: int) -> Corners:
+    return refine_read(image, STRAIGHT, near[None], strips(marker_id))
+
+
+@settings(max_examples=60)
+@given(
+    at=st.tuples(st.floats(20.0, 21.0), st.floats(20.0, 21.0)),
+    cell=st.floats(4.0, 7.0),
+    blur=st.floats(0.4, 0.9),
+    marker_id=st.integers(0, 4095),
+    shift=st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)),
+)
+def test_edges_along_rows_and_columns_are_found_wherever_they_lie(
+    at: tuple[float, float], cell: float, blur: float, marker_id: int, shift: tuple[float, float]
+) -> None:
+    true = corners_of(at, cell)
+    found = fitted(picture(at, cell, blur, seed=marker_id), true + np.array(shift), marker_id)
+    assert found.corners[0] == pytest.approx(true, abs=0.02)
+
+
+@pytest.mark.parametrize(("cell", "motion"), [(2.6, 0.0), (6.0, 0.0), (6.0, 3.0), (6.0, 6.0)])
+def test_corners_are_as_sure_as_they_say(cell: float, motion: float) -> None:
+    rng = np.random.default_rng(1)
+    nees = []
+    for marker_id in range(100):
+        at = tuple(rng.uniform(20.0, 21.0, 2).tolist())
+        true = corners_of(at, cell)
+        near = true + rng.normal(0.0, 0.1, (4, 2))
+        found = fitted(picture(at, cell, 0.5, motion, noise=2.5, seed=marker_id), near, marker_id)
+        error = (found.corners[0] - true).ravel()
+        nees.append(error @ np.linalg.solve(found.covariance[0], error))
+    # 8 were the noise all that there is; what it leaves out is there for worse pictures than these
+    assert 1.0 < np.mean(nees) < 9.0
+    assert np.max(nees) < 40.0
+
+
+def test_motion_makes_the_sides_across_it_less_sure() -> None:
+    at = (20.3, 20.6)
+    still, moving = (
+        np.diag(fitted(picture(at, 6.0, motion=motion, noise=1.0), corners_of(at, 6.0), 0).covariance[0])
+        for motion in (0.0, 6.0)
+    )
+    assert (moving[::2] > 3.0 * still[::2]).all()
+    assert (moving[1::2] < 0.1 * moving[::2]).all()
+
+
+@pytest.mark.parametrize("cover", [0.1, 0.3, 0.6])
+def test_a_covered_side_is_less_sure(cover: float) -> None:
+    at, cell, marker_id = (20.3, 20.6), 6.0, 100
+    assert strips(marker_id)[0, 3].sum() >= 3
+    true = corners_of(at, cell)
+    free = fitted(picture(at, cell, noise=1.0, seed=marker_id), true, marker_id)
+    seen = true + cover * cell * np.array([[1.0, 0.0], [0.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
+    covered = fitted(picture(at, cell, noise=1.0, seed=marker_id, cover=cover), seen, marker_id)
+    left = [0, 3]
+    error = np.abs(covered.corners[0] - true)[left, 0]
+    sigma, usual = (np.sqrt(np.diag(found.covariance[0]))[[0, 6]] for found in (covered, free))
+    assert error.min() > 0.5 * cover * cell
+    assert (error < 4.0 * sigma).all()
+    assert (sigma > 10.0 * usual).all()
+
+
+def test_what_cannot_be_fitted_keeps_what_the_profiles_say() -> None:
+    image = np.full((SIZE_PX, SIZE_PX), 120, np.uint8)
+    found = fitted(image, corners_of((20.0, 20.0), 5.0), 0)
+    assert found.contrast[0] == 0.0
+
+
+@settings(max_examples=30)
+@given(k1=st.floats(-0.3, 0.3), place=st.tuples(st.floats(30.0, 900.0), st.floats(30.0, 600.0)))
+def test_the_lens_is_undone_at_every_pixel_next_to_a_side(k1: float, place: tuple[float, float]) -> None:
+    camera = Camera(1280, 960, 1000.0, 1000.0, 639.5, 479.5, (k1, 0.05, 1e-3, -1e-3, 0.0))
+    quad = camera.to_ideal(
+        np.array(place) + 60.0 * np.array([[0.0, 0.1], [1.0, 0.0], [0.9, 1.0], [0.1, 0.8]])
+    )
+    pixels = side_pixels(np.zeros((960, 1280), np.uint8), camera.lens, quad[None], 8, 1)
+    count = int(pixels.counts[0])
+    assert count > 500
+    frame = pixels.frames[0, pixels.side[0, :count] % INNER]
+    along, outside = pixels.along[0, :count, None], pixels.outside[0, :count, None]
+    normal = np.column_stack([frame[:, 3], -frame[:, 2]])
+    raw = camera.to_raw(frame[:, :2] + along * frame[:, 2:4] + outside * normal)
+    error = np.abs(raw - np.rint(raw)).max(axis=1)
+    assert error[np.abs(outside[:, 0]) < 3.0].max() < 0.02
