@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.core.arrivals import Arrivals, FixRows, Messages, OdometryRows, joined
+from swarm_loc_estimator.core.brightness_sightings import BrightnessConverter
 from swarm_loc_estimator.core.fusion import Fusion, Verdict
 from swarm_loc_estimator.core.learned import learned
 from swarm_loc_estimator.core.measurements import Kind, MeasurementArray
@@ -41,6 +42,7 @@ class SwarmEstimator:
         self._timeout_s = np.array([robot.odometry.timeout_s for robot in swarm.robots])
         self._tracks = OdometryTracks(swarm.robots)
         self._screening = Screening(swarm, round(self.settings.future_tolerance_s * 1e9))
+        self._brightness = BrightnessConverter(swarm)
         self._fusion = Fusion(swarm, self.settings, self._tracks)
         self._parameters = ParameterTable.of(swarm.robots, swarm.landmarks)
         self._reach_ns = self._tracks.reach_ns + round(0.5e9 * self.settings.state_period_s)
@@ -62,6 +64,7 @@ class SwarmEstimator:
         self._screening.drops.update(self._timeline_drops())
         self._tracks.clear()
         self._timeline.restart(SwarmState(self._parameters))
+        self._brightness.restart()
         self._begin()
 
     def receive(self, messages: Messages) -> None:
@@ -79,6 +82,10 @@ class SwarmEstimator:
         if arrivals.odometry.robot.size:
             self._odometry.append(arrivals.odometry)
         self._timeline.add(arrivals.measurements)
+        if arrivals.brightness.robot.size:
+            change = self._brightness.take(arrivals.brightness)
+            self._timeline.add(change.added)
+            self._timeline.withdraw(change.withdrawn)
 
     def add_fix(self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike, now_ns: int) -> None:
         """Take in an absolute fix: pose (3,) in `map`, heading NaN if not measured, and covariance (3, 3)."""
@@ -108,7 +115,7 @@ class SwarmEstimator:
     @property
     def drops(self) -> dict[str, int]:
         """Data not used, by reason, since construction."""
-        total = self._screening.drops + Counter(self._timeline_drops())
+        total = self._screening.drops + self._brightness.drops + Counter(self._timeline_drops())
         return {reason: count for reason, count in sorted(total.items()) if count}
 
     @property
@@ -133,6 +140,7 @@ class SwarmEstimator:
             self._use_odometry()
         if fuse:
             self._timeline.advance(newest_ns)
+            self._brightness.forget_before(oldest_ns)
         return self._estimate(now_ns)
 
     def _check_clock(self, now_ns: int) -> int:

@@ -144,7 +144,7 @@ def search(
             best, cost = 1 - best, now
             for p in range(size):
                 at[p] = room.trial[p]
-            if now < known[3] + 1.0 and _beside(known, at):
+            if known[3] < math.inf and now < known[3] + 1.0 and _beside(known, at):
                 return float(min(now, known[3]))
             damping, growth = damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 2.0
         else:

@@ -1,0 +1,216 @@
+"""From brightness matrices to relative measurements, one per exchange of two robots.
+
+The matrices of all powers of one exchange share their stamp. What has come of an exchange is used at once,
+and when more of it comes, the measurement made of less is replaced by one made of all. So nothing waits, the
+order of arrival does not matter, and of a matrix that is lost only what it would have told is missing.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.core.arrivals import NO_MEASUREMENTS, BrightnessRows
+from swarm_loc_estimator.core.gate import gate_threshold
+from swarm_loc_estimator.core.ir.closed_form import ClosedForm
+from swarm_loc_estimator.core.ir.likelihood import MaximumLikelihood
+from swarm_loc_estimator.core.ir.platform import IrPlatform, PairGains
+from swarm_loc_estimator.core.ir.solution import IrEstimator, IrSolutions, Outcome
+from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE, Kind, MeasurementArray
+from swarm_loc_estimator.core.robot_ir import IrMethod, RobotIr
+from swarm_loc_estimator.core.screening import FAULTS, faults_of
+from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.swarm import Swarm
+
+_METHODS: dict[IrMethod, Callable[[IrPlatform], IrEstimator]] = {
+    IrMethod.LIKELIHOOD: MaximumLikelihood,
+    IrMethod.CLOSED_FORM: ClosedForm,
+}
+
+_Key = tuple[int, int, int]
+"""Stamp, receiver and transmitter of an exchange; the latter two as robot indices."""
+
+
+class Change(NamedTuple):
+    """What new matrices change.
+
+    Attributes:
+        added: (m,) measurements to use from now on.
+        withdrawn: (w,) measurements given before that no longer hold.
+    """
+
+    added: MeasurementArray
+    withdrawn: MeasurementArray
+
+
+@dataclass
+class _Exchange:
+    """What has come of an exchange.
+
+    Attributes:
+        readings: Power -> (n, n) [count].
+        measurement: (1,) as it is used, (0,) when there is none.
+        fate: Why there is none.
+    """
+
+    readings: dict[int, FloatArray] = field(default_factory=dict)
+    measurement: MeasurementArray = field(default_factory=NO_MEASUREMENTS.copy)
+    fate: str = ""
+
+
+@lru_cache(maxsize=64)
+def _estimator(platform: IrPlatform, method: IrMethod) -> IrEstimator:
+    """The estimator of a kind for a board; what it prepares is worth keeping."""
+    return _METHODS[method](platform)
+
+
+class BrightnessConverter:
+    """Keeps the exchanges of the last while, and makes measurements of them.
+
+    Args:
+        swarm: Whose.
+    """
+
+    def __init__(self, swarm: Swarm) -> None:
+        self._ir: dict[int, RobotIr] = {k: r.ir for k, r in enumerate(swarm.robots) if r.ir is not None}
+        self._robot_of = {ir.id: robot for robot, ir in self._ir.items()}
+        self._gate = {robot: float(gate_threshold(ir.gate_probability)) for robot, ir in self._ir.items()}
+        self._dropped: Counter[str] = Counter()
+        self._exchanges: dict[_Key, _Exchange] = {}
+        for ir in self._ir.values():
+            _estimator(ir.platform, ir.estimator)  # now, and not when the first message is waiting
+
+    @property
+    def drops(self) -> Counter[str]:
+        """Matrices not used, by reason; what still comes of their exchanges may make them useful."""
+        return self._dropped + _fates(self._exchanges.values())
+
+    def forget_before(self, oldest_ns: int) -> None:
+        """Let go of the exchanges before an instant: nothing more comes of them."""
+        old = [key for key in self._exchanges if key[0] < oldest_ns]
+        self._dropped += _fates([self._exchanges.pop(key) for key in old])
+
+    def restart(self) -> None:
+        """Let go of all exchanges."""
+        self._dropped += _fates(self._exchanges.values())
+        self._exchanges.clear()
+
+    def take(self, rows: BrightnessRows) -> Change:
+        """Take matrices (b,) in."""
+        touched: dict[_Key, None] = {}
+        for k in range(rows.robot.size):
+            fault = self._fault(rows, k)
+            if fault:
+                self._dropped[fault] += 1
+            else:
+                touched[self._noted(rows, k)] = None
+        added, withdrawn = [NO_MEASUREMENTS], [NO_MEASUREMENTS]
+        for keys in self._alike(touched):
+            for exchange, measurement in self._solved(keys):
+                withdrawn.append(exchange.measurement)
+                added.append(measurement)
+                exchange.measurement = measurement
+        return Change(np.concatenate(added), np.concatenate(withdrawn))
+
+    def _fault(self, rows: BrightnessRows, k: int) -> str:
+        """Why matrix k cannot be used whatever else comes; "" if it can."""
+        receiver, transmitter = (self._robot_of.get(int(ids[k])) for ids in (rows.receiver, rows.transmitter))
+        ir = self._ir.get(int(rows.robot[k]))
+        if ir is None:
+            return "no_ir"
+        if receiver is None or transmitter is None:
+            return "ir_unknown_id"
+        if receiver != rows.robot[k]:
+            return "ir_wrong_receiver"
+        if transmitter == receiver:
+            return "ir_hears_itself"
+        if self._ir[transmitter].platform != ir.platform:
+            return "ir_other_board"
+        if rows.n[k] != ir.platform.n or rows.readings[k].size != ir.platform.n**2:
+            return "ir_wrong_size"
+        return "" if rows.power[k] < len(ir.platform.amplitudes) else "ir_unknown_power"
+
+    def _noted(self, rows: BrightnessRows, k: int) -> _Key:
+        """Keep matrix k with its exchange; of two for one power the same one counts in any order."""
+        robot = int(rows.robot[k])
+        platform, limit = self._ir[robot].platform, rows.saturation[k]
+        readings = rows.readings[k].reshape(platform.n, platform.n).astype(np.float64)
+        if limit > 0:  # a sensor that ends before the platform's does tells only that there was more
+            readings[(readings >= limit) & (readings < platform.saturation)] = np.nan
+        key = (int(rows.stamp_ns[k]), robot, self._robot_of[int(rows.transmitter[k])])
+        known, power = self._exchanges.setdefault(key, _Exchange()).readings, int(rows.power[k])
+        if power in known:
+            self._dropped["duplicate"] += 1
+            readings = min(readings, known[power], key=lambda matrix: matrix.tobytes())
+        known[power] = readings
+        return key
+
+    def _alike(self, keys: Iterable[_Key]) -> Iterable[list[_Key]]:
+        """Exchanges of one kind of board and estimator together."""
+        groups: dict[IrEstimator, list[_Key]] = {}
+        for key in keys:
+            ir = self._ir[key[1]]
+            groups.setdefault(_estimator(ir.platform, ir.estimator), []).append(key)
+        return groups.values()
+
+    def _solved(self, keys: list[_Key]) -> list[tuple[_Exchange, MeasurementArray]]:
+        """Exchanges of one kind whose measurement changes, with what it becomes, (1,) or (0,)."""
+        ir = self._ir[keys[0][1]]
+        exchanges = [self._exchanges[key] for key in keys]
+        shape = (len(keys), len(ir.platform.amplitudes), ir.platform.n, ir.platform.n)
+        readings: FloatArray = np.full(shape, np.nan)
+        for k, exchange in enumerate(exchanges):
+            for power, matrix in exchange.readings.items():
+                readings[k, power] = matrix
+        sides = [[self._ir[key[side]].believed_gains for key in keys] for side in (1, 2)]
+        solutions = _estimator(ir.platform, ir.estimator).solve(readings, PairGains.of(*sides))
+        measurements = self._measurements(keys, solutions)
+        faults = faults_of(measurements)
+        changed = []
+        for k, exchange in enumerate(exchanges):
+            exchange.fate = _reason(int(solutions.outcomes[k]), readings[k], ir.platform) or FAULTS[faults[k]]
+            measurement = NO_MEASUREMENTS if exchange.fate else measurements[k : k + 1]
+            if measurement.tobytes() != exchange.measurement.tobytes():
+                changed.append((exchange, measurement))
+        return changed
+
+    def _measurements(self, keys: list[_Key], solutions: IrSolutions) -> MeasurementArray:
+        """Measurements (k,) as the filter knows them: the transmitter's base_link in the receiver's.
+
+        That one robot hears another and is heard by it are two measurements: other sensors read the light of
+        other emitters, so neither noise nor gains have anything in common.
+        """
+        measurements = np.zeros(len(keys), dtype=MEASUREMENT_DTYPE)
+        stamps_ns, receivers, transmitters = np.array(keys, dtype=np.int64).T
+        measurements["stamp_ns"], measurements["target"] = stamps_ns, transmitters
+        measurements["received_from"] = measurements["observer"] = receivers
+        measurements["kind"], measurements["has_heading"] = Kind.POLAR, 1
+        measurements["gate"] = [self._gate[receiver] for receiver in receivers.tolist()]
+        measurements["value"], measurements["covariance"] = solutions.poses, solutions.covariances
+        ambiguous = np.isfinite(solutions.alternatives).all(axis=1)
+        measurements["has_alternative"] = ambiguous
+        measurements["alternative"][ambiguous] = solutions.alternatives[ambiguous]
+        return measurements
+
+
+def _fates(exchanges: Iterable[_Exchange]) -> Counter[str]:
+    """How many matrices of exchanges were not used, by reason."""
+    counts: Counter[str] = Counter()
+    for exchange in exchanges:
+        if exchange.fate:
+            counts[exchange.fate] += len(exchange.readings)
+    return counts
+
+
+def _reason(outcome: int, readings: FloatArray, platform: IrPlatform) -> str:
+    """Why readings (modes, n, n) gave no pose, "" if they did."""
+    if outcome == Outcome.FOUND:
+        return ""
+    if np.all(readings[np.isfinite(readings)] >= platform.saturation):
+        return "ir_saturated"
+    return f"ir_{Outcome(outcome).name.lower()}"
