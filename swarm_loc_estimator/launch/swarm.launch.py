@@ -1,11 +1,12 @@
 """Start the whole graph: ros2 launch swarm_loc_estimator swarm.launch.py swarm_file:=FILE [bag:=BAG]."""
 
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from swarm_loc_estimator.graph import GraphOptions, NodeSpec, graph_nodes
+from swarm_loc_estimator.graph import GraphOptions, graph_nodes
+from swarm_loc_estimator.launching import node_action
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -36,18 +37,3 @@ def start_nodes(context: LaunchContext) -> list[Node]:
         parameter_file=argument("params_file") or None,
     )
     return [node_action(spec) for spec in graph_nodes(options)]
-
-
-def node_action(spec: NodeSpec) -> Node:
-    """The launch action of one node."""
-    files = [] if spec.parameter_file is None else [spec.parameter_file]
-    return Node(
-        package=spec.package,
-        executable=spec.executable,
-        name=spec.name,
-        namespace=spec.namespace,
-        parameters=[*files, dict(spec.parameters)],
-        remappings=list(spec.remappings),
-        output="screen",
-        on_exit=[Shutdown(reason=f"{spec.name} ended")] if spec.required else [],
-    )

@@ -4,7 +4,8 @@
 
 It steers by `<robot>/ground_truth` (geometry_msgs/PoseStamped, motion capture or simulation), so that the way
 does not depend on how well the robots are located, and publishes `<robot>/cmd_vel` at the poses' rate. The
-eight begins when the drivers of all robots listen.
+eight begins when the drivers of all robots listen, and with `wait_for_poses` when all who locate them are
+there.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from swarm_loc_drivers.sim.steering import EightSteering
 from swarm_loc_estimator.core.swarm import number
 from swarm_loc_estimator.io.swarm_file import load_swarm
 from swarm_loc_estimator.nodes.declare import declare_parameters
-from swarm_loc_estimator.nodes.parameter_table import text
+from swarm_loc_estimator.nodes.parameter_table import flag, text
 from swarm_loc_estimator.nodes.running import run_node, spin
 
 
@@ -36,6 +37,9 @@ class SteeringParameters:
 
     swarm_file: str = text("", "path of the swarm description: which robots there are", required=True)
     speed: float = number(0.06, "m/s", 0.001, 0.12, "along the eight")
+    wait_for_poses: bool = flag(
+        False, "begin only when swarm/poses and the detections of all robots are announced"
+    )
 
 
 class EightSteeringNode(Node):
@@ -55,6 +59,8 @@ class EightSteeringNode(Node):
         robots = load_swarm(Path(wishes.swarm_file)).robots
         self._steering = EightSteering(len(robots), wishes.speed)
         self._driving = False
+        located = ["swarm/poses", *(f"{robot.name}/detections" for robot in robots)]
+        self._awaited = located if wishes.wait_for_poses else []
         self._commands = [
             self.create_publisher(Twist, f"{robot.name}/cmd_vel", QoSProfile(depth=1)) for robot in robots
         ]
@@ -64,7 +70,7 @@ class EightSteeringNode(Node):
             )
 
     def _on_pose(self, robot: int, message: PoseStamped) -> None:
-        self._driving = self._driving or all(one.get_subscription_count() for one in self._commands)
+        self._driving = self._driving or self._all_there()
         if not self._driving:
             return
         place, turn = message.pose.position, message.pose.orientation
@@ -76,6 +82,11 @@ class EightSteeringNode(Node):
         command = Twist()
         command.linear.x, command.angular.z = self._steering.command(robot, stamp_ns, pose)
         self._commands[robot].publish(command)
+
+    def _all_there(self) -> bool:
+        """Whether the eight can begin."""
+        drivers = all(one.get_subscription_count() for one in self._commands)
+        return drivers and all(self.count_publishers(topic) for topic in self._awaited)
 
 
 def main() -> int:

@@ -5,7 +5,8 @@
 Drivers connect to tcp://localhost:20000, 20001, ... in the order of the swarm description, or with
 `link_folder` to serial ports named like the robots. The node publishes `/clock`, per robot `ground_truth`
 (for evaluation and steering) and, in the place of the camera board's own driver,
-`image_raw` and `camera_info` of the 1280x960 camera; pictures that nobody listens to are not drawn.
+`image_raw` and `camera_info` of the 1280x960 camera; pictures that nobody listens to are not drawn. With
+`answer_within` time does not run away from those who read them.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import sys
 import time
 from array import array
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +24,12 @@ from numpy.typing import NDArray
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from rclpy.qos import QoSProfile
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 
+from swarm_loc_drivers.nodes.unanswered import Unanswered
 from swarm_loc_drivers.nodes.world_parameters import WorldParameters, make_world
 from swarm_loc_drivers.protocols.epuck import EPUCK_MODELS
 from swarm_loc_drivers.sim.epuck_world import STEP_NS, Exposure, SimulatedEpuck
@@ -38,10 +41,17 @@ from swarm_loc_estimator.io.messages import encode_pose_stamped
 from swarm_loc_estimator.nodes.declare import declare_parameters
 from swarm_loc_estimator.nodes.parameter_table import ParameterError
 from swarm_loc_estimator.nodes.running import Stop, run_node
+from swarm_loc_msgs.msg import MarkerDetectionArray
 
 _CLOCK_QOS = QoSProfile(depth=10)
 _TRUTH_QOS = QoSProfile(depth=10)
 _STEP_S = STEP_NS * 1e-9
+_CAMERA_QOS = QoSProfile(depth=5)
+"""Reliable: who wants so gets every picture, and who listens with best effort gets what comes."""
+_ANSWER_QOS = QoSProfile(depth=100)
+_ANSWER_WAKE_S = 0.002
+_ANSWER_PATIENCE_S = 10.0
+_THROTTLE_S = 30.0
 _LONGEST_LAG_S = 0.1
 """A world that cannot keep up goes on from now instead of hurrying after."""
 
@@ -69,12 +79,13 @@ class EpuckWorldNode(Node):
         self._truths = [
             self._publisher(PoseStamped, name, "ground_truth", _TRUTH_QOS) for name in self._names
         ]
-        self._images = [
-            self._publisher(Image, name, "image_raw", qos_profile_sensor_data) for name in self._names
-        ]
-        self._infos = [
-            self._publisher(CameraInfo, name, "camera_info", qos_profile_sensor_data) for name in self._names
-        ]
+        self._images = [self._publisher(Image, name, "image_raw", _CAMERA_QOS) for name in self._names]
+        self._infos = [self._publisher(CameraInfo, name, "camera_info", _CAMERA_QOS) for name in self._names]
+        self._unanswered = Unanswered(self._wishes.answer_within)
+        if self._wishes.answer_within > 0.0:
+            for robot, name in enumerate(self._names):
+                answered = partial(self._on_detections, robot)
+                self.create_subscription(MarkerDetectionArray, f"{name}/detections", answered, _ANSWER_QOS)
         self._truth_steps = max(1, round(1.0 / (self._wishes.truth_rate * _STEP_S)))
 
     def run(self, stop: Stop) -> int:
@@ -91,8 +102,22 @@ class EpuckWorldNode(Node):
             while (left_s := due_s - time.monotonic()) > 0.0:
                 self._host.poll(left_s)
             executor.spin_once(timeout_sec=0.0)
+            self._wait_for_answers(executor, stop)
         executor.shutdown()
         return 0
+
+    def _wait_for_answers(self, executor: EventsExecutor, stop: Stop) -> None:
+        """Let time stand still, but answer the drivers, while pictures have not become detections."""
+        since_s = time.monotonic()
+        while self._unanswered.is_late(self._world.now_ns) and not stop.requested:
+            self._host.poll(0.0)
+            executor.spin_once(timeout_sec=_ANSWER_WAKE_S)
+            if time.monotonic() > since_s + _ANSWER_PATIENCE_S:
+                name, since_s = self._names[self._unanswered.give_up()], time.monotonic()
+                self.get_logger().warning(
+                    f"a picture of {name} has not become {name}/detections; time goes on without",
+                    throttle_duration_sec=_THROTTLE_S,
+                )
 
     def destroy_node(self) -> None:
         """Switch the robots off, too."""
@@ -137,6 +162,10 @@ class EpuckWorldNode(Node):
         info.header = message.header
         self._infos[exposure.robot].publish(info)
         self._images[exposure.robot].publish(message)
+        self._unanswered.ask(exposure.robot, exposure.stamp_ns, self._world.now_ns)
+
+    def _on_detections(self, robot: int, message: MarkerDetectionArray) -> None:
+        self._unanswered.answer(robot, Time.from_msg(message.header.stamp).nanoseconds)
 
 
 def image_message(picture: NDArray[np.uint8]) -> Image:

@@ -31,6 +31,13 @@ class WorldParameters:
     rate: float = number(
         1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
     )
+    answer_within: float = number(
+        0.0,
+        "s",
+        0.0,
+        10.0,
+        "time stands still while a picture that is older has not become <robot>/detections; 0: never",
+    )
     link_folder: str = text(
         "", "where each robot's serial port appears under its name; empty: robots on WiFi"
     )

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, Image
 
 from swarm_loc_estimator.core.compiled import is_warm
@@ -72,7 +73,10 @@ class MarkerDetectorNode(Node):
         self._detections = self.create_publisher(MarkerDetectionArray, "detections", QoSProfile(depth=10))
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
         self.create_subscription(CameraInfo, "camera_info", self._on_camera_info, qos_profile_sensor_data)
-        self.create_subscription(Image, "image_raw", self._on_image, IMAGE_QOS)
+        reliability = QoSOverridingOptions([QoSPolicyKind.RELIABILITY])
+        self.create_subscription(
+            Image, "image_raw", self._on_image, IMAGE_QOS, qos_overriding_options=reliability
+        )
         # by a clock that runs also while simulated time stands still
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_DIAGNOSTICS_PERIOD_S, self._on_diagnostics, clock=steady)

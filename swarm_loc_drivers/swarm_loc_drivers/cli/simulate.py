@@ -1,0 +1,71 @@
+"""Start simulated e-pucks and all that locates them.
+
+    simulate bags/eight_five_robots/swarm.yaml --world w2 --seed 1
+
+One world with rendered cameras, robots that answer their drivers' bytes on serial ports, a driver and a
+marker detector for each robot, the steering along the eight, and the estimator; all on simulated time.
+`ros2 launch swarm_loc_drivers simulation.launch.py` starts the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from swarm_loc_drivers.sim.worlds import WORLDS
+from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_estimator.cli.arguments import number_in
+from swarm_loc_estimator.cli.graph import say
+from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
+from swarm_loc_estimator.processes import GraphError, run_graph
+
+
+def parse(arguments: Sequence[str], link_folder: str) -> SimulationOptions:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(
+        prog="simulate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    defaults = SimulationOptions("", "")
+    parser.add_argument("swarm_file", metavar="SWARM_FILE", help="the swarm description")
+    parser.add_argument(
+        "--world",
+        choices=sorted(WORLDS),
+        default=defaults.world,
+        help=f"which errors robots and cameras have (default: {defaults.world})",
+    )
+    parser.add_argument(
+        "--seed", type=number_in(0, 2**31 - 1), default=defaults.seed, help="fixes them (default: 1)"
+    )
+    parser.add_argument(
+        "--speed",
+        type=number_in(0.001, 0.12, "m/s"),
+        default=defaults.speed,
+        help=f"along the eight (default: {defaults.speed} m/s)",
+    )
+    parser.add_argument(
+        "--rate",
+        type=number_in(0.01, 100.0),
+        default=defaults.rate,
+        help="simulated seconds per second, as far as the machine keeps up (default: 1)",
+    )
+    parser.add_argument("--params-file", dest="parameter_file", help="ROS parameter file for all nodes")
+    return SimulationOptions(link_folder=link_folder, **vars(parser.parse_args(arguments)))
+
+
+def main() -> int:
+    """Run until a node ends or Ctrl-C."""
+    try:
+        with tempfile.TemporaryDirectory(prefix="epucks-") as links:
+            options = parse(sys.argv[1:], links)
+            robots = [robot.name for robot in load_swarm(Path(options.swarm_file)).robots]
+            return run_graph(simulation_nodes(options, robots), say)
+    except (GraphError, SwarmFileError) as error:
+        print(error, file=sys.stderr)
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

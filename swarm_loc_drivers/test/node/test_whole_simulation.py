@@ -1,0 +1,64 @@
+"""Everything at once over DDS: pictures, firmware, drivers, detectors and estimator give true poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped
+
+from swarm_loc_drivers.sim.eight import HALF_WIDTH, EightSettings, describe
+from swarm_loc_drivers.sim.lemniscate import Lemniscate
+from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_estimator.core.estimator import Status
+from swarm_loc_estimator.io.swarm_writer import save_swarm
+from swarm_loc_estimator.live_graph import LiveGraph
+from swarm_loc_estimator.nodes.recorder import read_poses
+from swarm_loc_msgs.msg import MarkerDetectionArray
+
+PATIENCE_S = 100.0
+PARAMETERS = "epuck_world: {ros__parameters: {width: 640, height: 480}}\n"
+
+
+@pytest.mark.timeout(300)  # the renderer may have to be compiled first
+def test_robots_are_located_by_what_their_cameras_see(tmp_path: Path) -> None:
+    eight = Lemniscate(HALF_WIDTH)
+    start, _ = eight.at(np.array([0.0, 0.5 * eight.length]))
+    swarm = describe(EightSettings(robots=2), start)
+    save_swarm(swarm, tmp_path / "swarm.yaml")
+    (tmp_path / "parameters.yaml").write_text(PARAMETERS, encoding="utf-8")
+    (tmp_path / "links").mkdir()
+    options = SimulationOptions(
+        str(tmp_path / "swarm.yaml"),
+        str(tmp_path / "links"),
+        world="w0",
+        parameter_file=str(tmp_path / "parameters.yaml"),
+    )
+    nodes = simulation_nodes(options, [robot.name for robot in swarm.robots])
+    truth: dict[int, np.ndarray[tuple[int], np.dtype[np.float64]]] = {}
+    seen: list[MarkerDetectionArray] = []
+
+    def on_truth(message: PoseStamped) -> None:
+        stamp, place = message.header.stamp, message.pose.position
+        truth[stamp.sec * 1_000_000_000 + stamp.nanosec] = np.array([place.x, place.y])
+
+    with LiveGraph(nodes, tmp_path / "nodes.log") as graph:
+        recorder = graph.recorder
+        recorder.create_subscription(PoseStamped, "epuck1/ground_truth", on_truth, 1000)
+        recorder.create_subscription(MarkerDetectionArray, "epuck1/detections", seen.append, 1000)
+
+        def has_driven() -> bool:
+            return bool(truth) and float(np.linalg.norm(list(truth.values())[-1] - start[0, :2])) > 0.1
+
+        graph.wait_for(has_driven, "drive", PATIENCE_S)
+    poses = [one for one in map(read_poses, recorder.raw) if min(truth) <= one.stamp_ns <= max(truth)][-20:]
+    assert len(poses) == 20
+    assert (poses[-1].status == Status.TRACKED).all()
+    stamps, places = np.array(list(truth)), np.array(list(truth.values()))
+    errors = [
+        np.hypot(*(one.pose[0, axis] - np.interp(one.stamp_ns, stamps, places[:, axis]) for axis in (0, 1)))
+        for one in poses
+    ]
+    assert np.median(errors) < 0.02
+    assert sum(len(array.detections) for array in seen) > len(seen)

@@ -1,0 +1,65 @@
+"""The list of a simulation's nodes, its command line, and how its world waits for those who see it."""
+
+from __future__ import annotations
+
+from swarm_loc_drivers.cli import simulate
+from swarm_loc_drivers.nodes.unanswered import Unanswered
+from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
+
+SECOND = 1_000_000_000
+
+
+def test_every_robot_has_a_driver_on_its_link_and_a_detector_for_its_camera() -> None:
+    options = SimulationOptions(
+        "swarm.yaml", "/links", world="w0", seed=3, rate=0.5, parameter_file="all.yaml"
+    )
+    nodes = {node.full_name: node for node in simulation_nodes(options, ["a", "b"])}
+
+    assert list(nodes) == [
+        *("estimator", "epuck_world", "eight_steering"),
+        *("a/epuck_driver", "a/marker_detector", "b/epuck_driver", "b/marker_detector"),
+    ]
+    assert nodes["b/epuck_driver"].parameters["address"] == "/links/b"
+    world = nodes["epuck_world"].parameters
+    assert (world["link_folder"], world["world"], world["seed"], world["rate"]) == ("/links", "w0", 3, 0.5)
+    detector = nodes["a/marker_detector"].parameters
+    assert (detector["robot"], detector["swarm_file"]) == ("a", "swarm.yaml")
+    for name, node in nodes.items():
+        assert node.parameters.get("use_sim_time", False) is (name != "epuck_world")  # which makes the time
+        assert node.parameter_file == "all.yaml"
+
+
+def test_the_command_line_becomes_options() -> None:
+    line = ["swarm.yaml", "--world", "w0", "--seed", "7", "--speed", "0.08", "--rate", "2"]
+    expected = SimulationOptions("swarm.yaml", "/links", world="w0", seed=7, speed=0.08, rate=2.0)
+    assert simulate.parse(line, "/links") == expected
+
+
+def test_a_world_waits_for_its_oldest_picture() -> None:
+    unanswered = Unanswered(0.15)
+    unanswered.ask(0, stamp_ns=10, now_ns=SECOND)
+    unanswered.ask(1, stamp_ns=20, now_ns=SECOND + 100_000_000)
+    assert not unanswered.is_late(SECOND + 149_000_000)
+    assert unanswered.is_late(SECOND + 150_000_000)
+    unanswered.answer(0, stamp_ns=10)
+    assert not unanswered.is_late(SECOND + 200_000_000)
+    assert unanswered.is_late(SECOND + 250_000_000)
+    assert unanswered.give_up() == 1
+    assert not unanswered.is_late(9 * SECOND)
+
+
+def test_an_answer_stands_for_all_older_pictures_of_its_robot() -> None:
+    unanswered = Unanswered(0.1)
+    for stamp_ns in (10, 20, 30):
+        unanswered.ask(0, stamp_ns, SECOND)
+    unanswered.answer(0, 20)
+    unanswered.answer(1, 30)
+    assert unanswered.is_late(2 * SECOND)
+    unanswered.answer(0, 30)
+    assert not unanswered.is_late(2 * SECOND)
+
+
+def test_a_world_that_does_not_wait_never_does() -> None:
+    unanswered = Unanswered(0.0)
+    unanswered.ask(0, 10, 0)
+    assert not unanswered.is_late(100 * SECOND)
