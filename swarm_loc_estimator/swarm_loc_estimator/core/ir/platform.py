@@ -155,9 +155,10 @@ class IrGains:
             )
         for name in ("sensor", "emitter"):
             for value in getattr(self, name):
-                if not GAIN_RANGE[0] <= value <= GAIN_RANGE[1]:
+                low, high = GAIN_RANGE
+                if not low <= value <= high:
                     raise IrPlatformError(
-                        f"gains.{name} has {value:g} but factors must lie in {list(GAIN_RANGE)}."
+                        f"gains.{name} has {value:g} but factors must lie in [{low:g}, {high:g}]."
                     )
         check_numbers(self, "gains.")
 
