@@ -73,7 +73,8 @@ def replay(
                 progress(reader.progress, "replaying")
         recorder.tick_until(last_ns + period_ns if stamp_ns is None else int(stamp_ns.max(initial=0)))
         remarks = (*reader.losses, *_missing(ingest), *truth.remarks())
-    return recorder.result(bag.name, truth.tracks(), remarks, (last_ns - first_ns) * 1e-9, began)
+    data_s = (last_ns - first_ns) * 1e-9
+    return recorder.result(bag.name, ingest.received(), truth.tracks(), remarks, data_s, began)
 
 
 class _Schedule(Protocol):
@@ -141,7 +142,13 @@ class _Recorder:
             self._tick(due_ns)
 
     def result(
-        self, title: str, truth: Mapping[str, Track], remarks: tuple[str, ...], data_s: float, began: float
+        self,
+        title: str,
+        received: Mapping[str, int],
+        truth: Mapping[str, Track],
+        remarks: tuple[str, ...],
+        data_s: float,
+        began: float,
     ) -> ReplayResult:
         """Everything together."""
         self._flush()
@@ -154,7 +161,11 @@ class _Recorder:
             covariance=self._spool.array("covariance", np.float64, robots, 3, 3),
             learned=self._estimator.learned() if learns(self._estimator.swarm) else None,
             truth=truth,
-            counters={"measurements used": self._estimator.used, **self._estimator.drops},
+            counters={
+                **{f"messages on {topic}": count for topic, count in received.items()},
+                **self._estimator.counters,
+                **self._estimator.drops,
+            },
             remarks=remarks,
             data_s=data_s,
             wall_s=time.perf_counter() - began,

@@ -35,7 +35,7 @@ def rerun(
         pose=np.array([e.poses for e in estimates]).reshape(-1, robots, 3),
         covariance=np.array([e.covariances for e in estimates]).reshape(-1, robots, 3, 3),
         truth=recording.truth,
-        counters={"measurements used": estimator.used, **estimator.drops},
+        counters={**estimator.counters, **estimator.drops},
         data_s=(last_ns - first_ns) * 1e-9,
         wall_s=time.perf_counter() - began,
     )

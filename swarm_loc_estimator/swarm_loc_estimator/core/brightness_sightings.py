@@ -81,6 +81,7 @@ class BrightnessConverter:
         self._robot_of = {ir.id: robot for robot, ir in self._ir.items()}
         self._gate = {robot: float(gate_threshold(ir.gate_probability)) for robot, ir in self._ir.items()}
         self._dropped: Counter[str] = Counter()
+        self._measured = 0
         self._exchanges: dict[_Key, _Exchange] = {}
         for ir in self._ir.values():
             _estimator(ir.platform, ir.estimator)  # now, and not when the first message is waiting
@@ -90,15 +91,18 @@ class BrightnessConverter:
         """Matrices not used, by reason; what still comes of their exchanges may make them useful."""
         return self._dropped + _fates(self._exchanges.values())
 
+    @property
+    def measured(self) -> int:
+        """Exchanges that gave a measurement."""
+        return self._measured + sum(exchange.measurement.size for exchange in self._exchanges.values())
+
     def forget_before(self, oldest_ns: int) -> None:
         """Let go of the exchanges before an instant: nothing more comes of them."""
-        old = [key for key in self._exchanges if key[0] < oldest_ns]
-        self._dropped += _fates([self._exchanges.pop(key) for key in old])
+        self._forget([key for key in self._exchanges if key[0] < oldest_ns])
 
     def restart(self) -> None:
         """Let go of all exchanges."""
-        self._dropped += _fates(self._exchanges.values())
-        self._exchanges.clear()
+        self._forget(list(self._exchanges))
 
     def take(self, rows: BrightnessRows) -> Change:
         """Take matrices (b,) in."""
@@ -116,6 +120,12 @@ class BrightnessConverter:
                 added.append(measurement)
                 exchange.measurement = measurement
         return Change(np.concatenate(added), np.concatenate(withdrawn))
+
+    def _forget(self, keys: Iterable[_Key]) -> None:
+        """Let go of exchanges."""
+        gone = [self._exchanges.pop(key) for key in keys]
+        self._dropped += _fates(gone)
+        self._measured += sum(exchange.measurement.size for exchange in gone)
 
     def _fault(self, rows: BrightnessRows, k: int) -> str:
         """Why matrix k cannot be used whatever else comes; "" if it can."""

@@ -123,6 +123,15 @@ class SwarmEstimator:
         """Measurements used since the last reset."""
         return int(self._timeline.verdict_counts()[Verdict.USED])
 
+    @property
+    def counters(self) -> dict[str, int]:
+        """What was used since the last reset, by name."""
+        exchanges = self._brightness.measured
+        return {
+            "measurements used": self.used,
+            **({"infrared exchanges measured": exchanges} if exchanges else {}),
+        }
+
     def recent(self) -> tuple[MeasurementArray, NDArray[np.uint8], FloatArray]:
         """The measurements within the horizon, their verdicts and normalised innovations squared."""
         return self._timeline.measurements, self._timeline.verdicts, self._timeline.nis

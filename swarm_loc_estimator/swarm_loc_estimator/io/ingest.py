@@ -99,10 +99,12 @@ class Ingest:
         topics: The inputs; their index here is the topic's number in a batch.
         handle_of: Topic name -> that number.
         statistics: Per topic what came in.
+        map_frame: Name of the frame `map`.
     """
 
     def __init__(self, swarm: Swarm, map_frame: str = "map") -> None:
         self.topics = input_topics(swarm)
+        self.map_frame = map_frame
         self.handle_of: Mapping[str, int] = {topic.name: handle for handle, topic in enumerate(self.topics)}
         self._robot = np.array([topic.robot for topic in self.topics], dtype=np.int64)
         place = {kind: number for number, kind in enumerate(InputKind)}
@@ -121,6 +123,12 @@ class Ingest:
         for begin, end in itertools.pairwise([0, *back.tolist(), batch.size]):
             if begin < end:
                 yield self._read_forwards(batch.chosen(slice(begin, end)))
+
+    def received(self) -> dict[str, int]:
+        """Messages so far by kind of topic, such as `<robot>/odom`; kinds of which none came are missing."""
+        kinds = np.bincount(self._kind, weights=self._counted["received"], minlength=len(InputKind))
+        counts = {f"<robot>/{kind.topic}": int(kinds[number]) for number, kind in enumerate(InputKind)}
+        return {topic: count for topic, count in counts.items() if count}
 
     def frame_id(self, handle: int) -> str:
         """Frame of the newest message on a topic, "" before the first."""

@@ -134,11 +134,12 @@ class Health:
         values: dict[str, str] = {}
         for handle, topic in self._inputs_of[index]:
             troubles += self._input_troubles(handle, topic, robot, now_ns)
-            values.update(self._input_values(handle, topic, now_ns, elapsed_s))
+            if topic.expected or self._ingest.statistics[handle].received:
+                values.update(self._input_values(handle, topic, now_ns, elapsed_s))
         status = Status(int(estimate.status[index]))
         if status is Status.WAITING and not troubles:
             lost = "lost, " if self._was_located[index] else ""
-            troubles.append(f"{lost}waiting for a sighting that locates it")
+            troubles.append(f"{lost}waiting for a sighting or a fix that locates it")
         values["status"] = status.name.lower()
         values["fix age [s]"] = _figure(estimate.fix_age_s[index])
         sigma = np.sqrt(np.diagonal(estimate.covariances[index]))
@@ -155,11 +156,13 @@ class Health:
             )
         if statistics.last_arrival_ns is None:
             return [f"no message on {topic.name} is a {topic.kind.message_type}"]
+        found = self._ingest.frame_id(handle)
+        if topic.kind is InputKind.FIXES and found != self._ingest.map_frame:
+            return [f"{topic.name} is in frame '{found}' but must be in '{self._ingest.map_frame}'"]
         if topic.kind is not InputKind.ODOMETRY:
             return []
         silent_s = (now_ns - statistics.last_arrival_ns) * 1e-9
         expected = f"{robot.name}/{self._odom_frame}"
-        found = self._ingest.frame_id(handle)
         silence = (
             [f"{topic.name} is silent for {silent_s:.1f} s"] if silent_s > robot.odometry.timeout_s else []
         )

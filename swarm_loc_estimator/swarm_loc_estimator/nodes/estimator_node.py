@@ -59,9 +59,20 @@ NO_CLOCK = "use_sim_time is true but no /clock has come"
 _DIAGNOSTICS_PERIOD_S = 1.0
 _THROTTLE_S = 30.0
 _ORDINARY_DROPS = frozenset(
-    {"duplicate", "gated", "odometry_duplicate", "odometry_too_old", "reset", "too_old", "untied"}
+    {
+        "duplicate",
+        "gated",
+        "ir_saturated",
+        "ir_too_weak",
+        "ir_undetermined",
+        "odometry_duplicate",
+        "odometry_too_old",
+        "reset",
+        "too_old",
+        "untied",
+    }
 )
-"""Late, double or outlying data is a matter of course."""
+"""Late, double or outlying data is a matter of course, and so is light of robots too far or too near."""
 _MOST_WITHOUT_CLOCK = 20_000
 _PATIENCE_S = 5.0
 """How long nothing may come before the log names what is missing."""
@@ -197,6 +208,7 @@ class EstimatorNode(Node):
         recent, drops = self._estimator.recent(), self._estimator.drops
         *robots, whole = self._health.reports(now_ns, self._estimate, recent, drops)
         whole.values["time jumps"] = str(self._estimator.time_jumps)
+        whole.values.update({name: str(count) for name, count in self._estimator.counters.items()})
         return [*robots, merged([whole, load], "estimator")]
 
     def _warn_of_drops(self) -> None:

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from swarm_loc_estimator.core.compiled import note_warm
 from swarm_loc_estimator.core.estimator import SwarmEstimator
+from swarm_loc_estimator.core.ir.brightness import expected
+from swarm_loc_estimator.core.robot_ir import IrMethod, RobotIr
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.sightings import CONTENT_POSE_TWO, CONTENT_POSITION
 from swarm_loc_estimator.core.swarm import Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
 from swarm_loc_estimator.io.ingest import Ingest
+from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
 from swarm_loc_estimator.io.message_batch import MessageBatch
-from swarm_loc_estimator.io.messages import encode_detections, encode_odometry
+from swarm_loc_estimator.io.messages import encode_brightness, encode_detections, encode_fix, encode_odometry
 
 _SECOND = 1_000_000_000
 _FIRST_LANDMARK = 10
 _LANDMARKS = 30  # three robots see more than are fused one by one where many may be fused together
+_DROPLET = load_ir_platform("droplet")
+_LIGHT = expected(_DROPLET, (0.1, 0.3, 1.0))[0]
 _FACING = (0.0, 1.0, 0.0, 0.0)  # x y z w: a marker that looks at the camera
 _AWAY = (0.0, 0.7, 0.0, 0.7)
 
@@ -31,6 +38,7 @@ def warm_up() -> None:
 def _run(settings: EstimatorSettings) -> None:
     robots = [Robot(name, faces=(Face("front", k, yaw=0.0),)) for k, name in enumerate("ab")]
     robots.append(Robot("c", faces=(Face("front", 2, yaw=0.0),), start=(0.0, 0.0, 0.0)))
+    robots = [replace(robot, ir=_board(k)) for k, robot in enumerate(robots)]
     places = range(_LANDMARKS)
     marks = tuple(Landmark(_FIRST_LANDMARK + k, x=1.0, y=0.2 * k, yaw=3.1) for k in places)
     swarm = Swarm(tuple(robots), marks)
@@ -46,9 +54,20 @@ def _run(settings: EstimatorSettings) -> None:
         # one measurement alone is compiled apart: its columns are contiguous
         one = encode_detections("", now_ns - _SECOND // 16, _sight(0)[:1])
         backlog.append((ingest.handle_of["a/detections"], one, now_ns))
+        fix = encode_fix("map", now_ns, (0.0, 0.0, 0.0), np.eye(3))
+        backlog.append((ingest.handle_of["a/fix"], fix, now_ns))
+        for number, robot in enumerate(robots[:2]):  # the powers of an exchange in different steps
+            for power, stamp_ns in enumerate((now_ns, now_ns - _SECOND // 4)):
+                light = encode_brightness("", stamp_ns, (1 + number, 3), _LIGHT[power], power)
+                backlog.append((ingest.handle_of[f"{robot.name}/brightness"], light, now_ns))
         for messages in ingest.read(MessageBatch.of(backlog)):
             estimator.receive(messages)
         estimator.tick(now_ns)
+
+
+def _board(number: int) -> RobotIr:
+    """One that reads by likelihood, the next by the closed form."""
+    return RobotIr(1 + number, _DROPLET, "droplet", list(IrMethod)[number % 2])
 
 
 def _odometry(stamp_ns: int, x: float, yaw: float) -> bytes:

@@ -215,6 +215,7 @@ class StandIn:
         self.odometry: list[tuple[int, int]] = []
         self.time_jumps = 0
         self.drops: dict[str, int] = {}
+        self.counters: dict[str, int] = {}
 
     def receive(self, messages: Messages) -> None:
         """Remember whose and when."""

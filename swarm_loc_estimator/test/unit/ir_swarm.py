@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -17,7 +18,11 @@ from swarm_loc_estimator.core.robot_ir import RobotIr
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.swarm import OdometryModel, Robot, StartSigma, Swarm
+from swarm_loc_estimator.io.bag_writer import BagWriter
+from swarm_loc_estimator.io.inputs import InputKind
 from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
+from swarm_loc_estimator.io.messages import encode_brightness, encode_fix, encode_odometry
+from swarm_loc_estimator.io.swarm_writer import save_swarm
 
 SECOND = 10**9
 T0 = 1_000 * SECOND
@@ -260,3 +265,30 @@ def play(
         begin = end
         estimates.append(estimator.tick(now_ns))
     return estimator, estimates
+
+
+def write_bag(run: Run, folder: Path, arrivals: Sequence[tuple[int, Event]]) -> Path:
+    """A bag of messages with their arrivals, its swarm description beside them."""
+    with BagWriter(folder) as writer:
+        for robot in run.swarm.robots:
+            for kind in (InputKind.ODOMETRY, InputKind.BRIGHTNESS, InputKind.FIXES):
+                writer.add_topic(f"{robot.name}/{kind.topic}", kind.message_type)
+        for log_ns, event in sorted(arrivals, key=lambda pair: pair[0]):
+            kind, data = encoded(event, run.swarm.robots[event.robot].name)
+            writer.write(f"{run.swarm.robots[event.robot].name}/{kind.topic}", log_ns, data)
+    save_swarm(run.swarm, folder / "swarm.yaml")
+    return folder
+
+
+def encoded(event: Event, name: str) -> tuple[InputKind, bytes]:
+    """The message of an event of a robot."""
+    if isinstance(event, Move):
+        unknown, frames = np.zeros((6, 6)), (f"{name}/odom", f"{name}/base_link")
+        stamp_ns, still = column([event.stamp_ns]), np.zeros((1, 3))
+        data = encode_odometry(*frames, stamp_ns, event.pose[None], still, unknown, unknown)
+        return InputKind.ODOMETRY, data[0]
+    if isinstance(event, Place):
+        return InputKind.FIXES, encode_fix("map", event.stamp_ns, event.pose, np.diag(FIX_SIGMA**2))
+    pair = (event.robot + 1, event.transmitter + 1)
+    frame = f"{name}/base_link"
+    return InputKind.BRIGHTNESS, encode_brightness(frame, event.stamp_ns, pair, event.readings, event.power)

@@ -93,11 +93,11 @@ def test_a_robot_is_told_apart_as_waiting_lost_silent_or_in_a_foreign_frame() ->
     world = World()
     world.odometry("b", 0, 0)
     _, b, whole = world.health.reports(0, estimate(0, Status.TRACKED, Status.WAITING), recent(), {"gated": 3})
-    assert (b.warning, b.message) == (True, "waiting for a sighting that locates it")
+    assert (b.warning, b.message) == (True, "waiting for a sighting or a fix that locates it")
     assert whole.values == {"dropped: gated": "3"}
     world.health.reports(0, estimate(0, Status.TRACKED, Status.TRACKED), recent(), {})
     _, b, _ = world.health.reports(0, estimate(0, Status.TRACKED, Status.WAITING), recent(), {})
-    assert b.message == "lost, waiting for a sighting that locates it"
+    assert b.message == "lost, waiting for a sighting or a fix that locates it"
     now_ns = 5 * SECOND
     _, b, _ = world.health.reports(now_ns, estimate(now_ns, Status.TRACKED, Status.STALE), recent(), {})
     assert b.message == "b/odom is silent for 5.0 s"
