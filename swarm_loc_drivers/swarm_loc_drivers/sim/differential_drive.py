@@ -50,6 +50,36 @@ class Driven:
     reported: FloatArray
 
 
+class LastingNoise:
+    """Unit noise that acts over a while instead of within one step.
+
+    White noise would shake a wheel anew at every step, however short: a camera that looks for 8 ms would see
+    the robot jump. Real wheels slip over millimetres, and a robot is heavy. So each draw is spread evenly
+    over the steps of `time_s`, of which every step takes the mean. Sums over longer times keep the variance
+    of sums of white noise but for a third of `time_s`, so that `wheel_noise` means what it says.
+
+    Args:
+        rng: Source.
+        shape: Of one step's noise.
+        step_s: [s].
+        time_s: How long a draw acts [s].
+    """
+
+    def __init__(
+        self, rng: np.random.Generator, shape: tuple[int, ...], step_s: float, time_s: float
+    ) -> None:
+        self._rng = rng
+        self._draws = rng.standard_normal((max(1, round(time_s / step_s)), *shape))
+        self._oldest = 0
+
+    def next(self) -> FloatArray:
+        """The noise of the next step."""
+        self._draws[self._oldest] = self._rng.standard_normal(self._draws.shape[1:])
+        self._oldest = (self._oldest + 1) % len(self._draws)
+        mean: FloatArray = self._draws.mean(axis=0)
+        return mean
+
+
 def wheel_paths(speed: FloatArray, turn_rate: FloatArray, separation: float, step_s: float) -> FloatArray:
     """Paths (..., 2) [m] of the right and left wheel in one step."""
     half_turn = 0.5 * separation * turn_rate

@@ -72,6 +72,19 @@ def test_counters_are_blind_to_slip_and_noise() -> None:
     assert np.std(turns) == pytest.approx(spread, rel=0.4)
 
 
+def test_slipping_wheels_do_not_shake_the_camera_within_an_exposure() -> None:
+    world = world_of(replace(W2, turn_slip=0.0))
+    world.rates[:] = 466.0
+    headings = [world.poses[:, 2]]
+    for _ in range(400):
+        world.step()
+        headings.append(world.poses[:, 2])
+    turns = np.diff(headings, axis=0)
+    jumps = np.diff(turns, axis=0)
+    # white noise would change the turn twice as much as it turns, in variance
+    assert 0.1 < np.var(jumps) / np.var(turns) < 0.4
+
+
 def test_every_camera_takes_pictures_at_its_rate_and_stamps_them_as_the_world_errs() -> None:
     for world, early_s in ((world_of(), 0.0), (world_of(W2), 0.133)):
         taken = run(world, 6.0)

@@ -8,6 +8,7 @@ import pytest
 from swarm_loc_drivers.sim.differential_drive import (
     Controller,
     Drive,
+    LastingNoise,
     drive,
     integrate,
     twist_of,
@@ -76,6 +77,26 @@ def test_wheel_noise_grows_with_the_path_of_each_wheel() -> None:
     covariance = np.cov(along, turned)[0, 1]
     expected = 0.5 * noise * (right - left) / SEPARATION
     assert covariance == pytest.approx(expected, abs=0.03 * math.sqrt(along.var() * turned.var()))
+
+
+def test_lasting_noise_has_the_variance_of_white_noise_over_longer_times() -> None:
+    wheels, lasting_steps = 20_000, 10
+    noise = LastingNoise(np.random.default_rng(3), (wheels,), step_s=0.005, time_s=0.05)
+    steps = np.array([noise.next() for _ in range(200)])
+    bound = 5.0 * math.sqrt(2.0 / wheels)  # of a sample variance, relative
+    for begin, count in ((0, 20), (0, 200), (100, 100)):
+        spread_over = (lasting_steps**2 - 1) / (3.0 * lasting_steps)  # steps' worth that both ends share out
+        variance = steps[begin : begin + count].sum(axis=0).var()
+        assert variance == pytest.approx(count - spread_over, rel=bound)
+    assert 0.98 < (200 - spread_over) / 200 < 1.0  # a second of simulated time
+    assert steps[0].var() == pytest.approx(1.0 / lasting_steps, rel=bound)
+
+
+def test_lasting_noise_hardly_changes_within_an_exposure() -> None:
+    noise = LastingNoise(np.random.default_rng(3), (20_000,), step_s=0.005, time_s=0.05)
+    before, after = noise.next(), noise.next()
+    correlation = np.corrcoef(before, after)[0, 1]
+    assert correlation == pytest.approx(0.9, abs=5.0 * (1.0 - 0.9**2) / math.sqrt(20_000))
 
 
 def test_slip_loses_its_share_of_a_turn_and_odometry_does_not_know() -> None:
