@@ -55,10 +55,10 @@ def _descriptor(spec: ParameterSpec) -> ParameterDescriptor:
     """What `ros2 param describe` tells."""
     kind = _TYPES[type(spec.default)].value
     descriptor = ParameterDescriptor(type=kind, description=spec.doc, read_only=True)
+    descriptor.additional_constraints = spec.range_text
     number = spec.number
     if number is None:
         return descriptor
-    descriptor.additional_constraints = number.range_text
     if isinstance(spec.default, int):
         descriptor.integer_range = [IntegerRange(from_value=int(number.low), to_value=int(number.high))]
     else:

@@ -6,7 +6,7 @@ field with the metadata `numbers_of` holds a dataclass of numbers, each of which
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
@@ -30,6 +30,7 @@ class ParameterSpec:
         doc: One line for people.
         number: Unit and range of a number; None for the other types.
         required: Whether an empty text is refused.
+        choices: The texts that there are; empty: any.
     """
 
     name: str
@@ -37,6 +38,12 @@ class ParameterSpec:
     doc: str
     number: NumberSpec | None = None
     required: bool = False
+    choices: tuple[str, ...] = ()
+
+    @property
+    def range_text(self) -> str:
+        """The values allowed, for people; empty: any."""
+        return self.number.range_text if self.number else ", ".join(self.choices)
 
     def checked(self, value: object) -> Value:
         """The value, with its type made exact; a whole number will do for a real one.
@@ -52,6 +59,8 @@ class ParameterSpec:
             raise ParameterError(f"parameter {self.name} = {value!r} must be {self._type_text}.")
         if self.number is not None and isinstance(value, int | float) and not self.number.allows(value):
             raise ParameterError(f"parameter {self.name} = {value} must lie in {self.number.range_text}.")
+        if self.choices and value not in self.choices:
+            raise ParameterError(f"parameter {self.name} = '{value}' must be one of {self.range_text}.")
         if self.required and value == "":
             raise ParameterError(f"parameter {self.name} is not set: {self.doc}.")
         checked: Value = value
@@ -67,6 +76,11 @@ class ParameterSpec:
 def text(default: str, doc: str, *, required: bool = False) -> Any:
     """A dataclass field that is a text; a required one may not be empty."""
     return field(default=default, metadata={"doc": doc, "required": required})
+
+
+def choice(default: str, choices: Sequence[str], doc: str) -> Any:
+    """A dataclass field that is one of some texts."""
+    return field(default=default, metadata={"doc": doc, "choices": tuple(choices)})
 
 
 def flag(default: bool, doc: str) -> Any:
@@ -91,8 +105,8 @@ def parameter_specs(cls: type) -> tuple[ParameterSpec, ...]:
         elif number is not None:
             specs.append(ParameterSpec(one.name, default, number.doc, number))
         else:
-            required = about.get("required", False)
-            specs.append(ParameterSpec(one.name, default, about["doc"], required=required))
+            extra = {name: about[name] for name in ("required", "choices") if name in about}
+            specs.append(ParameterSpec(one.name, default, about["doc"], **extra))
     return tuple(specs)
 
 
@@ -110,8 +124,7 @@ def markdown_table(cls: type) -> str:
     lines = ["| Parameter | Default | Range | Meaning |", "|---|---|---|---|"]
     for spec in parameter_specs(cls):
         default = "required" if spec.required and not spec.default else f"`{_shown(spec.default)}`"
-        allowed = spec.number.range_text if spec.number else ""
-        lines.append(f"| `{spec.name}` | {default} | {allowed} | {spec.doc} |")
+        lines.append(f"| `{spec.name}` | {default} | {spec.range_text} | {spec.doc} |")
     return "\n".join(lines)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import pytest
@@ -12,6 +12,7 @@ from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
 from swarm_loc_estimator.nodes.parameter_table import (
     ParameterError,
     ParameterSpec,
+    choice,
     from_values,
     markdown_table,
     parameter_specs,
@@ -55,3 +56,19 @@ def test_lists_come_as_lists_or_tuples() -> None:
     assert topics.checked(["a", "b"]) == topics.checked(("a", "b")) == ("a", "b")
     with pytest.raises(ParameterError, match="topics = 'a' must be a list of texts"):
         topics.checked("a")
+
+
+@dataclass(frozen=True)
+class Choosing:
+    """One parameter."""
+
+    colour: str = choice("red", ("red", "blue"), "of the wall")
+
+
+def test_a_choice_is_one_of_its_texts() -> None:
+    colour = spec_of(Choosing, "colour")
+    assert colour.checked("blue") == "blue"
+    for wrong in ("", "green"):
+        with pytest.raises(ParameterError, match=f"parameter colour = '{wrong}' must be one of red, blue"):
+            colour.checked(wrong)
+    assert '| `colour` | `"red"` | red, blue | of the wall |' in markdown_table(Choosing)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 from numpy.typing import NDArray
 
 Gray = NDArray[np.uint8]
@@ -67,6 +68,34 @@ _ENCODINGS = {
 """By the names of sensor_msgs/image_encodings."""
 
 
+@dataclass(frozen=True)
+class _Compression:
+    """How the bytes of a compressed picture begin, and what stands at the end of a whole one.
+
+    Attributes:
+        name: As formats tell it.
+        begin: First bytes.
+        data: What comes before pixels; the end is looked for behind its last occurrence.
+        end: Comes behind all pixels.
+    """
+
+    name: str
+    begin: bytes
+    data: bytes
+    end: bytes
+
+    def is_whole(self, data: bytes) -> bool:
+        """Whether bytes begin and end as such a picture; cameras may add bytes behind it."""
+        return data.startswith(self.begin) and data.rfind(self.end) > data.rfind(self.data) > 0
+
+
+_JPEG = _Compression("jpeg", b"\xff\xd8\xff", b"\xff\xda", b"\xff\xd9")
+_PNG = _Compression("png", b"\x89PNG\r\n\x1a\n", b"IDAT", b"IEND")
+_COMPRESSIONS = {"jpeg": _JPEG, "jpg": _JPEG, "png": _PNG}
+_COMPRESSED_DEPTH = "compressedDepth"
+"""Of image_transport's formats the one whose bytes are no plain picture."""
+
+
 def gray_image(
     encoding: str, width: int, height: int, step: int, data: object, *, is_bigendian: bool = False
 ) -> Gray:
@@ -99,3 +128,31 @@ def gray_image(
         pixels = pixels.view(">u2" if is_bigendian else "<u2")
     gray = np.ascontiguousarray(known.to_gray(pixels.reshape(height, width, known.channels)), np.uint8)
     return gray if gray.flags.writeable else gray.copy()  # read-only ones would be compiled for once more
+
+
+def decoded_image(how: str, data: object) -> Gray:
+    """A compressed picture as brightness (height, width), as it lies in the file: not turned by its EXIF.
+
+    Args:
+        how: `format` of sensor_msgs/CompressedImage, such as `jpeg` or `bgr8; jpeg compressed bgr8`.
+        data: The bytes.
+
+    Raises:
+        ImageError: The format is unknown (`encoding`), or the bytes are no whole picture of it (`corrupt`).
+    """
+    known = next((_COMPRESSIONS[name] for name in _COMPRESSIONS if name in how.lower()), None)
+    if known is None or _COMPRESSED_DEPTH in how:
+        raise ImageError("encoding", f"the format '{how}' is not one of {', '.join(_COMPRESSIONS)}.")
+    raw = np.frombuffer(data, np.uint8)  # type: ignore[call-overload] # whatever has a buffer
+    gray = _decoded(raw) if known.is_whole(raw.tobytes()) else None
+    if gray is None:
+        raise ImageError("corrupt", f"{raw.size} bytes are no whole picture in '{known.name}'.")
+    return np.asarray(gray, np.uint8)
+
+
+def _decoded(raw: NDArray[np.uint8]) -> MatLike | None:
+    """What OpenCV makes of the bytes; None: nothing, be it that the picture would be too large."""
+    try:
+        return cv2.imdecode(raw, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        return None

@@ -12,27 +12,26 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.swarm import CameraMount, Robot, Swarm
 from swarm_loc_estimator.io.swarm_file import load_swarm
-from swarm_loc_estimator.nodes.parameter_table import ParameterError, text, texts
+from swarm_loc_estimator.nodes.parameter_table import ParameterError, choice, text, texts
 from swarm_loc_vision.core.bodies import robot_body, up_of
 from swarm_loc_vision.core.camera import Camera
 from swarm_loc_vision.core.detector import MarkerDetector
-from swarm_loc_vision.core.families import Family, family_named
+from swarm_loc_vision.core.families import Family, families, family_named
 from swarm_loc_vision.core.selection import SelectionError, parse_ids, parse_lengths
 from swarm_loc_vision.core.settings import DetectorSettings
+from swarm_loc_vision.io.camera_detector import TRANSPORTS, CreateDetector
 
 IntArray = NDArray[np.int64]
-CreateDetector = Callable[[Camera], MarkerDetector]
 
 
 @dataclass(frozen=True)
 class DetectorParameters:
     """Parameters of `marker_detector_node`; those of the detector itself are its settings."""
 
-    family: str = text(
-        "artoolkit_bch_thin",
-        "kind of marker: artoolkit_bch_thin, artoolkit_bch_thick, aruco_mip_36h12 or apriltag_36h11",
-        required=True,
+    image_transport: str = choice(
+        "raw", tuple(TRANSPORTS), "how pictures come: as they are, or as JPEG or PNG"
     )
+    family: str = choice("artoolkit_bch_thin", tuple(families()), "kind of marker")
     ids: tuple[str, ...] = texts("ids in use, such as 5 or 0-31; empty: those of swarm_file, or else all")
     lengths: tuple[str, ...] = texts(
         "sides that differ from marker_length, such as 100-119:0.08 [m]; not with swarm_file, which has them"
@@ -53,10 +52,7 @@ def detector_maker(wishes: DetectorParameters) -> CreateDetector:
         ParameterError: A parameter cannot be used.
         SwarmFileError: The swarm description cannot be used.
     """
-    try:
-        family = family_named(wishes.family)
-    except ValueError as error:
-        raise ParameterError(f"parameter family = '{wishes.family}': {error}") from error
+    family = family_named(wishes.family)
     swarm = load_swarm(Path(wishes.swarm_file)) if wishes.swarm_file else Swarm()
     robot = _robot(wishes, swarm)
     ids = _ids(wishes, swarm, family)

@@ -6,12 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from node_world import Ros, overrides
 from rclpy.qos import qos_profile_sensor_data
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from vision_bench.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
 
 from swarm_loc_estimator.nodes.parameter_table import ParameterError
@@ -33,6 +34,15 @@ def image(number: int, encoding: str = "mono8", channels: int = 1) -> Image:
     return message
 
 
+def compressed(number: int, how: str = "jpeg", suffix: str = ".jpg") -> CompressedImage:
+    """The scene in a file's bytes, likewise."""
+    message = CompressedImage(format=how)
+    message.header.frame_id = FRAME
+    message.header.stamp.sec = number
+    message.data = cv2.imencode(suffix, PICTURE)[1].tobytes()
+    return message
+
+
 def camera_info(**changes: Any) -> CameraInfo:
     """The scene's camera."""
     message = CameraInfo(height=HEIGHT, width=WIDTH, distortion_model="plumb_bob", d=[0.0] * 5)
@@ -50,7 +60,12 @@ class Camera:
         node = MarkerDetectorNode(parameter_overrides=overrides(family=FAMILY, **parameters))
         ros.add(node)
         tester = ros.tester
-        self._image = tester.create_publisher(Image, "image_raw", qos_profile_sensor_data)
+        kind, topic = (
+            (CompressedImage, "image_raw/compressed")
+            if parameters.get("image_transport") == "compressed"
+            else (Image, "image_raw")
+        )
+        self._image = tester.create_publisher(kind, topic, qos_profile_sensor_data)
         self._info = tester.create_publisher(CameraInfo, "camera_info", qos_profile_sensor_data)
         self.detections: list[MarkerDetectionArray] = ros.listen(MarkerDetectionArray, "detections")
         self._diagnostics: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
@@ -74,17 +89,17 @@ class Camera:
         """Its figures."""
         return {pair.key: pair.value for pair in self.status().values}
 
-    def see(self, message: Image) -> MarkerDetectionArray:
+    def see(self, message: Image | CompressedImage) -> MarkerDetectionArray:
         """Publish a picture until its detections come; large best-effort messages may get lost."""
         stamp = message.header.stamp.sec
         self._publish_until(message, lambda: any(d.header.stamp.sec == stamp for d in self.detections))
         return next(d for d in self.detections if d.header.stamp.sec == stamp)
 
-    def see_dropped(self, message: Image, reason: str) -> None:
+    def see_dropped(self, message: Image | CompressedImage, reason: str) -> None:
         """Publish a picture until it is counted as dropped."""
         self._publish_until(message, lambda: f"dropped: {reason}" in self.values())
 
-    def _publish_until(self, message: Image, condition: Any) -> None:
+    def _publish_until(self, message: Image | CompressedImage, condition: Any) -> None:
         def happened() -> bool:
             if not condition():
                 self._image.publish(message)
@@ -149,6 +164,37 @@ def test_bad_pictures_are_dropped_and_counted(ros: Ros) -> None:
     assert camera.see(image(4)).detections  # and nothing else has stopped
 
 
+def test_compressed_pictures_are_read_and_bad_ones_dropped_and_counted(ros: Ros) -> None:
+    camera = Camera(ros, image_transport="compressed")
+    camera.calibrate(camera_info(), "nothing has come on /image_raw/compressed")
+    assert not ros.tester.get_subscriptions_info_by_topic("/image_raw")
+    for number, message in enumerate(
+        (compressed(1), compressed(2, "rgb8; jpeg compressed bgr8"), compressed(3, "png", ".png")), start=1
+    ):
+        array = camera.see(message)
+        assert array.header.stamp.sec == number
+        found = {detection.id: np.reshape(detection.corners_px, (4, 2)) for detection in array.detections}
+        assert set(found) == {truth.marker_id for truth in TRUTHS}
+        for truth in TRUTHS:
+            assert found[truth.marker_id] == pytest.approx(truth.corners, abs=0.5)
+    count = len(camera.detections)
+    cut, small = compressed(4), compressed(6)
+    cut.data = cut.data[: len(cut.data) // 2]
+    small.data = cv2.imencode(".jpg", PICTURE[:100])[1].tobytes()
+    camera.see_dropped(cut, "corrupt")
+    camera.see_dropped(compressed(5, "h264"), "encoding")
+    camera.see_dropped(small, "size")
+    assert all(detections.header.stamp.sec <= 3 for detections in camera.detections[count:])
+    assert camera.see(compressed(7)).detections  # and nothing else has stopped
+
+
+def test_who_renames_the_pictures_renames_the_compressed_ones(ros: Ros) -> None:
+    arguments = ["--ros-args", "-r", "image_raw:=front/image", "-p", "image_transport:=compressed"]
+    ros.add(MarkerDetectorNode(cli_args=arguments))
+    (subscription,) = ros.tester.get_subscriptions_info_by_topic("/front/image/compressed")
+    assert subscription.topic_type == "sensor_msgs/msg/CompressedImage"
+
+
 def test_ids_can_be_restricted(ros: Ros) -> None:
     used = sorted(truth.marker_id for truth in TRUTHS)[:2]
     camera = Camera(ros, ids=[str(marker_id) for marker_id in used])
@@ -159,7 +205,8 @@ def test_ids_can_be_restricted(ros: Ros) -> None:
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
-        ({"family": "qr"}, "there is no marker family 'qr'"),
+        ({"family": "qr"}, "parameter family = 'qr' must be one of artoolkit_bch_thin, "),
+        ({"image_transport": "theora"}, "image_transport = 'theora' must be one of raw, compressed"),
         ({"family": FAMILY, "ids": ["250"]}, "parameter ids: '250' must ascend within 0-249"),
         ({"family": FAMILY, "lengths": ["1:0"]}, "parameter lengths: '1:0' must give a length"),
         ({"family": FAMILY, "robot": "epuck1"}, "needs the parameter swarm_file"),

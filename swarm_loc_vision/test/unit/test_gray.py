@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swarm_loc_vision.core.gray import ImageError, gray_image
+from swarm_loc_vision.core.gray import ImageError, decoded_image, gray_image
 
 WIDTH, HEIGHT = 14, 10
 SHADES = np.linspace(10, 240, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH).astype(np.uint8)
@@ -67,4 +67,67 @@ def test_bayer_of_a_gray_scene_is_gray() -> None:
 def test_what_is_no_picture_is_refused(encoding: str, width: int, step: int, size: int, reason: str) -> None:
     with pytest.raises(ImageError) as caught:
         gray_image(encoding, width, HEIGHT, step, bytes(size))
+    assert caught.value.reason == reason
+
+
+def file_of(pixels: NDArray[np.uint8], suffix: str) -> bytes:
+    return cv2.imencode(suffix, pixels, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("how", "suffix", "pixels", "expected", "tolerance"),
+    [
+        ("jpeg", ".jpg", SHADES, SHADES, 4),
+        ("mono8; jpeg compressed mono8", ".jpg", SHADES, SHADES, 4),
+        ("bgr8; jpeg compressed bgr8", ".jpg", COLOURS[..., ::-1], RGB_GRAY, 12),
+        ("JPG", ".jpg", SHADES, SHADES, 4),
+        ("png", ".png", SHADES, SHADES, 0),
+        ("rgb8; png compressed bgr8", ".png", COLOURS[..., ::-1], RGB_GRAY, 1),
+        ("mono16; png compressed mono16", ".png", SHADES.astype(np.uint16) * 257, SHADES, 0),
+    ],
+)
+def test_compressed_pictures(
+    how: str, suffix: str, pixels: NDArray[np.uint8], expected: NDArray[np.uint8], tolerance: int
+) -> None:
+    data = file_of(np.ascontiguousarray(pixels), suffix)
+    for padded in (data, data + bytes(7)):  # cameras may send more bytes than the picture has
+        gray = decoded_image(how, np.frombuffer(padded, np.uint8))
+        assert gray.shape == SHADES.shape
+        assert np.abs(gray.astype(int) - expected).max() <= tolerance
+        assert gray.flags.writeable
+        assert gray.flags.c_contiguous
+
+
+def test_a_picture_is_not_turned_by_what_its_exif_says() -> None:
+    turned = bytes.fromhex("45786966000049492a00080000000100120103000100000006000000000000000000")
+    data = file_of(SHADES, ".jpg")
+    data = data[:2] + b"\xff\xe1" + (len(turned) + 2).to_bytes(2, "big") + turned + data[2:]
+    assert decoded_image("jpeg", data).shape == SHADES.shape
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_a_compressed_picture_cut_off_anywhere_is_refused(suffix: str) -> None:
+    data = file_of(SHADES, suffix)
+    end = data.rfind(b"IEND") if suffix == ".png" else len(data) - 1
+    for length in range(0, end, 3):
+        with pytest.raises(ImageError) as caught:
+            decoded_image(suffix, data[:length])
+        assert caught.value.reason == "corrupt"
+
+
+@pytest.mark.parametrize(
+    ("how", "data", "reason"),
+    [
+        ("", file_of(SHADES, ".jpg"), "encoding"),
+        ("tiff", file_of(SHADES, ".jpg"), "encoding"),
+        ("16UC1; compressedDepth png", bytes(12) + file_of(SHADES, ".png"), "encoding"),
+        ("png", file_of(SHADES, ".jpg"), "corrupt"),
+        ("jpeg", file_of(SHADES, ".png"), "corrupt"),
+        ("jpeg", b"\xff\xd8\xff\xda\xff\xd9", "corrupt"),
+        ("jpeg", np.random.default_rng(0).bytes(999), "corrupt"),
+    ],
+)
+def test_what_is_no_compressed_picture_is_refused(how: str, data: bytes, reason: str) -> None:
+    with pytest.raises(ImageError) as caught:
+        decoded_image(how, data)
     assert caught.value.reason == reason

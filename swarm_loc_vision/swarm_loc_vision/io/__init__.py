@@ -1,0 +1,1 @@
+"""What detectors read and write besides pictures themselves. No ROS here."""
