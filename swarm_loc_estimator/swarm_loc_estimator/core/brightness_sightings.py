@@ -21,8 +21,9 @@ from swarm_loc_estimator.core.ir.closed_form import ClosedForm
 from swarm_loc_estimator.core.ir.likelihood import MaximumLikelihood
 from swarm_loc_estimator.core.ir.platform import IrPlatform, PairGains
 from swarm_loc_estimator.core.ir.solution import IrEstimator, IrSolutions, Outcome
+from swarm_loc_estimator.core.matrices import ExchangeKey, MatrixScreening, Readings
 from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE, Kind, MeasurementArray
-from swarm_loc_estimator.core.robot_ir import IrMethod, RobotIr
+from swarm_loc_estimator.core.robot_ir import IrMethod
 from swarm_loc_estimator.core.screening import FAULTS, faults_of
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import Swarm
@@ -31,9 +32,6 @@ _METHODS: dict[IrMethod, Callable[[IrPlatform], IrEstimator]] = {
     IrMethod.LIKELIHOOD: MaximumLikelihood,
     IrMethod.CLOSED_FORM: ClosedForm,
 }
-
-_Key = tuple[int, int, int]
-"""Stamp, receiver and transmitter of an exchange; the latter two as robot indices."""
 
 
 class Change(NamedTuple):
@@ -53,12 +51,12 @@ class _Exchange:
     """What has come of an exchange.
 
     Attributes:
-        readings: Power -> (n, n) [count].
+        readings: Its matrices.
         measurement: (1,) as it is used, (0,) when there is none.
         fate: Why there is none.
     """
 
-    readings: dict[int, FloatArray] = field(default_factory=dict)
+    readings: Readings = field(default_factory=dict)
     measurement: MeasurementArray = field(default_factory=NO_MEASUREMENTS.copy)
     fate: str = ""
 
@@ -77,19 +75,19 @@ class BrightnessConverter:
     """
 
     def __init__(self, swarm: Swarm) -> None:
-        self._ir: dict[int, RobotIr] = {k: r.ir for k, r in enumerate(swarm.robots) if r.ir is not None}
-        self._robot_of = {ir.id: robot for robot, ir in self._ir.items()}
+        self._screening = MatrixScreening(swarm)
+        self._ir = self._screening.boards
         self._gate = {robot: float(gate_threshold(ir.gate_probability)) for robot, ir in self._ir.items()}
         self._dropped: Counter[str] = Counter()
         self._measured = 0
-        self._exchanges: dict[_Key, _Exchange] = {}
+        self._exchanges: dict[ExchangeKey, _Exchange] = {}
         for ir in self._ir.values():
             _estimator(ir.platform, ir.estimator)  # now, and not when the first message is waiting
 
     @property
     def drops(self) -> Counter[str]:
         """Matrices not used, by reason; what still comes of their exchanges may make them useful."""
-        return self._dropped + _fates(self._exchanges.values())
+        return self._screening.dropped + self._dropped + _fates(self._exchanges.values())
 
     @property
     def measured(self) -> int:
@@ -98,7 +96,7 @@ class BrightnessConverter:
 
     def forget_before(self, oldest_ns: int) -> None:
         """Let go of the exchanges before an instant: nothing more comes of them."""
-        self._forget([key for key in self._exchanges if key[0] < oldest_ns])
+        self._forget([key for key in self._exchanges if key.stamp_ns < oldest_ns])
 
     def restart(self) -> None:
         """Let go of all exchanges."""
@@ -106,13 +104,12 @@ class BrightnessConverter:
 
     def take(self, rows: BrightnessRows) -> Change:
         """Take matrices (b,) in."""
-        touched: dict[_Key, None] = {}
+        touched: dict[ExchangeKey, None] = {}
         for k in range(rows.robot.size):
-            fault = self._fault(rows, k)
-            if fault:
-                self._dropped[fault] += 1
-            else:
-                touched[self._noted(rows, k)] = None
+            key = self._screening.key_of(rows, k)
+            if key is not None:
+                self._screening.add(rows, k, self._exchanges.setdefault(key, _Exchange()).readings)
+                touched[key] = None
         added, withdrawn = [NO_MEASUREMENTS], [NO_MEASUREMENTS]
         for keys in self._alike(touched):
             for exchange, measurement in self._solved(keys):
@@ -121,62 +118,25 @@ class BrightnessConverter:
                 exchange.measurement = measurement
         return Change(np.concatenate(added), np.concatenate(withdrawn))
 
-    def _forget(self, keys: Iterable[_Key]) -> None:
+    def _forget(self, keys: Iterable[ExchangeKey]) -> None:
         """Let go of exchanges."""
         gone = [self._exchanges.pop(key) for key in keys]
         self._dropped += _fates(gone)
         self._measured += sum(exchange.measurement.size for exchange in gone)
 
-    def _fault(self, rows: BrightnessRows, k: int) -> str:
-        """Why matrix k cannot be used whatever else comes; "" if it can."""
-        receiver, transmitter = (self._robot_of.get(int(ids[k])) for ids in (rows.receiver, rows.transmitter))
-        ir = self._ir.get(int(rows.robot[k]))
-        if ir is None:
-            return "no_ir"
-        if receiver is None or transmitter is None:
-            return "ir_unknown_id"
-        if receiver != rows.robot[k]:
-            return "ir_wrong_receiver"
-        if transmitter == receiver:
-            return "ir_hears_itself"
-        if self._ir[transmitter].platform != ir.platform:
-            return "ir_other_board"
-        if rows.n[k] != ir.platform.n or rows.readings[k].size != ir.platform.n**2:
-            return "ir_wrong_size"
-        return "" if rows.power[k] < len(ir.platform.amplitudes) else "ir_unknown_power"
-
-    def _noted(self, rows: BrightnessRows, k: int) -> _Key:
-        """Keep matrix k with its exchange; of two for one power the same one counts in any order."""
-        robot = int(rows.robot[k])
-        platform, limit = self._ir[robot].platform, rows.saturation[k]
-        readings = rows.readings[k].reshape(platform.n, platform.n).astype(np.float64)
-        if limit > 0:  # a sensor that ends before the platform's does tells only that there was more
-            readings[(readings >= limit) & (readings < platform.saturation)] = np.nan
-        key = (int(rows.stamp_ns[k]), robot, self._robot_of[int(rows.transmitter[k])])
-        known, power = self._exchanges.setdefault(key, _Exchange()).readings, int(rows.power[k])
-        if power in known:
-            self._dropped["duplicate"] += 1
-            readings = min(readings, known[power], key=lambda matrix: matrix.tobytes())
-        known[power] = readings
-        return key
-
-    def _alike(self, keys: Iterable[_Key]) -> Iterable[list[_Key]]:
+    def _alike(self, keys: Iterable[ExchangeKey]) -> Iterable[list[ExchangeKey]]:
         """Exchanges of one kind of board and estimator together."""
-        groups: dict[IrEstimator, list[_Key]] = {}
+        groups: dict[IrEstimator, list[ExchangeKey]] = {}
         for key in keys:
-            ir = self._ir[key[1]]
+            ir = self._ir[key.receiver]
             groups.setdefault(_estimator(ir.platform, ir.estimator), []).append(key)
         return groups.values()
 
-    def _solved(self, keys: list[_Key]) -> list[tuple[_Exchange, MeasurementArray]]:
+    def _solved(self, keys: list[ExchangeKey]) -> list[tuple[_Exchange, MeasurementArray]]:
         """Exchanges of one kind whose measurement changes, with what it becomes, (1,) or (0,)."""
-        ir = self._ir[keys[0][1]]
+        ir = self._ir[keys[0].receiver]
         exchanges = [self._exchanges[key] for key in keys]
-        shape = (len(keys), len(ir.platform.amplitudes), ir.platform.n, ir.platform.n)
-        readings: FloatArray = np.full(shape, np.nan)
-        for k, exchange in enumerate(exchanges):
-            for power, matrix in exchange.readings.items():
-                readings[k, power] = matrix
+        readings = self._screening.together(keys[0].receiver, [one.readings for one in exchanges])
         sides = [[self._ir[key[side]].believed_gains for key in keys] for side in (1, 2)]
         solutions = _estimator(ir.platform, ir.estimator).solve(readings, PairGains.of(*sides))
         measurements = self._measurements(keys, solutions)
@@ -189,7 +149,7 @@ class BrightnessConverter:
                 changed.append((exchange, measurement))
         return changed
 
-    def _measurements(self, keys: list[_Key], solutions: IrSolutions) -> MeasurementArray:
+    def _measurements(self, keys: list[ExchangeKey], solutions: IrSolutions) -> MeasurementArray:
         """Measurements (k,) as the filter knows them: the transmitter's base_link in the receiver's.
 
         That one robot hears another and is heard by it are two measurements: other sensors read the light of
