@@ -11,7 +11,7 @@ from swarm_loc_drivers.core.droplet_exchange import AskSettings
 from swarm_loc_drivers.core.droplet_session import SessionSettings
 from swarm_loc_drivers.core.droplet_turns import SHORTEST_TURN_S, TurnSettings
 from swarm_loc_drivers.protocols.droplet import DROPLET_MODELS, ELEMENTS, FULL_POWER, DropletModel
-from swarm_loc_estimator.core.swarm import number
+from swarm_loc_estimator.core.number_spec import number
 from swarm_loc_estimator.nodes.parameter_table import ParameterError, flag, text, texts
 
 _ID = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})")

@@ -17,7 +17,7 @@ from rclpy.node import Node
 
 from swarm_loc_drivers.nodes.truth_steering import TruthSteering
 from swarm_loc_drivers.sim.droplet_swarm import Wander
-from swarm_loc_estimator.core.swarm import number
+from swarm_loc_estimator.core.number_spec import number
 from swarm_loc_estimator.io.swarm_file import load_swarm
 from swarm_loc_estimator.nodes.declare import declare_parameters
 from swarm_loc_estimator.nodes.parameter_table import ParameterError, text

@@ -14,8 +14,9 @@ from swarm_loc_drivers.sim.droplet_world import (
     DropletWorldSettings,
 )
 from swarm_loc_drivers.sim.eight import START_NS
+from swarm_loc_estimator.core.number_spec import number
 from swarm_loc_estimator.core.robot_ir import RobotIr
-from swarm_loc_estimator.core.swarm import Pose2, Robot, Swarm, number
+from swarm_loc_estimator.core.swarm import Pose2, Robot, Swarm
 from swarm_loc_estimator.io.swarm_file import load_swarm
 from swarm_loc_estimator.nodes.parameter_table import ParameterError, text, texts
 

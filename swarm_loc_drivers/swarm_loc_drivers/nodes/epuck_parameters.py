@@ -12,7 +12,8 @@ from swarm_loc_drivers.io.calibration_file import CalibrationError, CameraCalibr
 from swarm_loc_drivers.protocols import epuck_wifi
 from swarm_loc_drivers.protocols.epuck import EPUCK2, EPUCK_MODELS, EpuckModel
 from swarm_loc_drivers.transports.link import Address, AddressError, parse_address
-from swarm_loc_estimator.core.swarm import OdometryModel, number
+from swarm_loc_estimator.core.number_spec import number
+from swarm_loc_estimator.core.swarm import OdometryModel
 from swarm_loc_estimator.nodes.parameter_table import ParameterError, flag, text
 
 _ODOMETRY = OdometryModel()

@@ -24,7 +24,7 @@ from rclpy.qos import QoSProfile
 from rclpy.time import Time
 
 from swarm_loc_drivers.sim.steering import EightSteering
-from swarm_loc_estimator.core.swarm import number
+from swarm_loc_estimator.core.number_spec import number
 from swarm_loc_estimator.io.swarm_file import load_swarm
 from swarm_loc_estimator.nodes.declare import declare_parameters
 from swarm_loc_estimator.nodes.parameter_table import flag, text

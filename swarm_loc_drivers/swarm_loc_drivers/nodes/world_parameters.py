@@ -13,7 +13,8 @@ from swarm_loc_drivers.sim.photographer import Stage
 from swarm_loc_drivers.sim.pictures import FAMILY
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.worlds import WORLDS
-from swarm_loc_estimator.core.swarm import OdometryModel, Swarm, number
+from swarm_loc_estimator.core.number_spec import number
+from swarm_loc_estimator.core.swarm import OdometryModel, Swarm
 from swarm_loc_estimator.io.swarm_file import load_swarm
 from swarm_loc_estimator.nodes.parameter_table import ParameterError, text
 from swarm_loc_vision.core.families import family_named

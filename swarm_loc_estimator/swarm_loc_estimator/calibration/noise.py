@@ -18,8 +18,9 @@ from scipy.optimize import minimize
 from swarm_loc_estimator.calibration.in_order import run_in_order
 from swarm_loc_estimator.calibration.recording import Recording, Rows
 from swarm_loc_estimator.core.metrics import DEFAULT_GAP_NS, interpolate, nees
+from swarm_loc_estimator.core.number_spec import number_specs
 from swarm_loc_estimator.core.se2 import FloatArray, wrap_angle
-from swarm_loc_estimator.core.swarm import OdometryModel, Robot, SensorModel, Swarm, number_specs
+from swarm_loc_estimator.core.swarm import OdometryModel, Robot, SensorModel, Swarm
 from swarm_loc_estimator.replay_result import ReplayResult
 
 TICK_S = 1.0

@@ -5,7 +5,9 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 
-from swarm_loc_estimator.core.swarm import SwarmError
+
+class MotionResponseError(ValueError):
+    """A response that contradicts itself; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +23,7 @@ class MotionResponse:
         turn_share: (V, W) true turn rate per reported turn rate.
 
     Raises:
-        SwarmError: Sizes do not fit, an axis does not ascend, or a share is not in [0, 10].
+        MotionResponseError: Sizes do not fit, an axis does not ascend, or a share is not in [0, 10].
     """
 
     speeds: tuple[float, ...]
@@ -34,13 +36,15 @@ class MotionResponse:
             axis = getattr(self, name)
             ascends = all(low < high for low, high in itertools.pairwise(axis))
             if not axis or not all(0.0 <= v <= 1e3 for v in axis) or not ascends:
-                raise SwarmError(f"response.{name} is {list(axis)} but must ascend within [0, 1000].")
+                raise MotionResponseError(
+                    f"response.{name} is {list(axis)} but must ascend within [0, 1000]."
+                )
         for name in ("speed_share", "turn_share"):
             table = getattr(self, name)
             if len(table) != len(self.speeds) or any(len(row) != len(self.turn_rates) for row in table):
-                raise SwarmError(
+                raise MotionResponseError(
                     f"response.{name} must have {len(self.speeds)} rows, one per speed,"
                     f" of {len(self.turn_rates)} numbers, one per turn rate."
                 )
             if not all(0.0 <= v <= 10.0 for row in table for v in row):
-                raise SwarmError(f"response.{name} must hold numbers in [0, 10] only.")
+                raise MotionResponseError(f"response.{name} must hold numbers in [0, 10] only.")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from swarm_loc_estimator.core.ir.platform import IrGains, IrPlatform
-from swarm_loc_estimator.core.swarm import number
+from swarm_loc_estimator.core.number_spec import number
 
 
 class IrMethod(Enum):

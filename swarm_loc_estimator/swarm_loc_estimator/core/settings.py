@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from swarm_loc_estimator.core.swarm import number, number_specs
+from swarm_loc_estimator.core.number_spec import number, number_specs
 
 
 class SettingsError(ValueError):

@@ -16,7 +16,7 @@ from swarm_loc_estimator.core.ir.curves import (
     TabulatedCurve,
 )
 from swarm_loc_estimator.core.ir.platform import POWERS, IrPlatform
-from swarm_loc_estimator.core.swarm import NumberSpec, number_specs
+from swarm_loc_estimator.core.number_spec import NumberSpec, number_specs
 from swarm_loc_estimator.io.tree_checks import WHOLE_FILE, TreeChecks
 from swarm_loc_estimator.io.yaml_tree import Tree, YamlTreeError, read_tree, shown
 

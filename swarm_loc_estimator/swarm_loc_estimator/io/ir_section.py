@@ -11,8 +11,8 @@ from typing import Any
 
 from swarm_loc_estimator.core.ir.curves import IrPlatformError
 from swarm_loc_estimator.core.ir.platform import IrGains, IrPlatform
+from swarm_loc_estimator.core.number_spec import number_specs
 from swarm_loc_estimator.core.robot_ir import IrMethod, RobotIr
-from swarm_loc_estimator.core.swarm import number_specs
 from swarm_loc_estimator.io.ir_platform_file import IrPlatformFileError, load_ir_platform
 from swarm_loc_estimator.io.tree_checks import TreeChecks, nearest
 from swarm_loc_estimator.io.yaml_tree import Tree

@@ -43,7 +43,8 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from swarm_loc_estimator.core.motion_response import MotionResponse
+from swarm_loc_estimator.core.motion_response import MotionResponse, MotionResponseError
+from swarm_loc_estimator.core.number_spec import number_specs
 from swarm_loc_estimator.core.swarm import (
     CameraMount,
     Face,
@@ -55,7 +56,6 @@ from swarm_loc_estimator.core.swarm import (
     StartSigma,
     Swarm,
     SwarmError,
-    number_specs,
 )
 from swarm_loc_estimator.io.ir_section import IrSection, Values
 from swarm_loc_estimator.io.tree_checks import Numbers, TreeChecks, nearest
@@ -227,7 +227,7 @@ class _Loader(TreeChecks):
             return MotionResponse(
                 axes["speeds"], axes["turn_rates"], tables["speed_share"], tables["turn_share"]
             )
-        except SwarmError as error:
+        except MotionResponseError as error:
             raise SwarmFileError(f"{self._path}: {key.removesuffix('response')}{error}") from error
 
     def _faces(self, key: str, layers: Iterable[_Layer], ids_tree: Tree) -> tuple[Face, ...]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from swarm_loc_estimator.core.motion_response import MotionResponse
+from swarm_loc_estimator.core.number_spec import number_specs
 from swarm_loc_estimator.core.swarm import (
     CameraMount,
     Face,
@@ -18,7 +19,6 @@ from swarm_loc_estimator.core.swarm import (
     SensorModel,
     StartSigma,
     Swarm,
-    number_specs,
 )
 from swarm_loc_estimator.io.ir_section import ir_tree
 from swarm_loc_estimator.io.swarm_file import FILE_VERSION, LANDMARK_DEFAULTS

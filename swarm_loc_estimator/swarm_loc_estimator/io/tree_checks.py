@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from swarm_loc_estimator.core.swarm import NumberSpec
+from swarm_loc_estimator.core.number_spec import NumberSpec
 from swarm_loc_estimator.io.yaml_tree import Tree, shown
 
 Numbers = dict[str, "float | None"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from swarm_loc_estimator.core.number_spec import number
 from swarm_loc_estimator.core.settings import EstimatorSettings
-from swarm_loc_estimator.core.swarm import number
 from swarm_loc_estimator.nodes.parameter_table import flag, text
 
 

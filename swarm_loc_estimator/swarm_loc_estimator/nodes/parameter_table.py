@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
-from swarm_loc_estimator.core.swarm import NumberSpec
+from swarm_loc_estimator.core.number_spec import NumberSpec
 
 Value = bool | int | float | str | tuple[str, ...]
 Parameters = TypeVar("Parameters")

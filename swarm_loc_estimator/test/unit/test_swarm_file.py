@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.core.ir.platform import IrGains
 from swarm_loc_estimator.core.motion_response import MotionResponse
+from swarm_loc_estimator.core.number_spec import number_specs
 from swarm_loc_estimator.core.robot_ir import IrMethod, RobotIr
 from swarm_loc_estimator.core.swarm import (
     CameraMount,
@@ -25,7 +26,6 @@ from swarm_loc_estimator.core.swarm import (
     StartSigma,
     Swarm,
     SwarmError,
-    number_specs,
 )
 from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
 from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from swarm_loc_estimator.core.swarm import number
+from swarm_loc_estimator.core.number_spec import number
 
 
 @dataclass(frozen=True)

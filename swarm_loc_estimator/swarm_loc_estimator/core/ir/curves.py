@@ -16,8 +16,8 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from swarm_loc_estimator.core.compiled import compiled
+from swarm_loc_estimator.core.number_spec import number, number_specs
 from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.swarm import number, number_specs
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

@@ -20,8 +20,8 @@ from swarm_loc_estimator.core.ir.curves import (
     IrPlatformError,
     check_numbers,
 )
+from swarm_loc_estimator.core.number_spec import number, number_specs
 from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.swarm import number, number_specs
 
 POWERS = ("far", "near")
 """Powers of the emitters in the order of BrightnessMatrix's POWER_* constants; only the first is a must."""
