@@ -13,18 +13,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from swarm_loc_estimator.core.compiled import assign, compiled, wrap
-from swarm_loc_estimator.core.ir.platform import IrModel, IrPlatform, PairGains
-from swarm_loc_estimator.core.ir.search import (
+from swarm_loc_estimator.core.compiled import assign, assign_matrix, compiled, wrap
+from swarm_loc_estimator.core.ir.cost import (
+    DARK,
     MEASURED,
     MISSING,
     SATURATED,
     Pair,
     Scratch,
     new_scratch,
-    pose_covariance,
-    search,
 )
+from swarm_loc_estimator.core.ir.platform import IrModel, IrPlatform, PairGains
+from swarm_loc_estimator.core.ir.search import pose_covariance, search
 from swarm_loc_estimator.core.ir.solution import DARKEST, IrSolutions, Outcome, checked
 from swarm_loc_estimator.core.ir.start_table import (
     Float32Array,
@@ -55,11 +55,13 @@ _EXPLAINED = 0.5
 _WIDEST = 1.0
 """A bearing or heading less sure than this is open [rad]."""
 _APART = 0.1
-"""Two minima farther apart than this, in bearing or heading, are two poses [rad]."""
+"""Two minima farther apart than this, in bearing, heading [rad] or relative in range, are two poses."""
 _AROUND = [(b, h) for b in (-0.2, 0.0, 0.2) for h in (-0.2, 0.0, 0.2) if b or h]
 _ASIDE = np.array([(0.0, 0.1, 0.3), (0.0, -0.1, -0.3), *((0.0, b, h) for b, h in _AROUND)])
 """Where to look besides: two from the best minimum, where the second-best often is, and others from the
 table's best start; range, bearing, heading [m, rad]."""
+_OF_SECOND = 2
+"""How many of these are of the second-best minimum."""
 _LEAST_ODDS = 1e-4
 _EXACT = 1e-4
 """The own sigma of gains of which only the common part is unsure."""
@@ -112,6 +114,7 @@ class _Room(NamedTuple):
         kinds: (modes, n, n) of the readings.
         minima: (2, 4) range, bearing, heading and cost of the best two minima that lie apart.
         best: (P,) the best with its gains.
+        covariance: (3, 3) of its pose.
     """
 
     plain: Scratch
@@ -123,6 +126,7 @@ class _Room(NamedTuple):
     kinds: NDArray[np.int8]
     minima: FloatArray
     best: FloatArray
+    covariance: FloatArray
 
 
 @compiled
@@ -134,12 +138,13 @@ def _new_room(table: StartTable, modes: int, n: int, known: bool) -> _Room:
         plain,
         full,
         new_start_room(table),
-        np.empty((1 + _TABLE_STARTS + 1, 4)),
+        np.empty((1 + _TABLE_STARTS, 4)),
         np.empty(modes * n * n, np.float32),
         np.empty(modes * n * n, np.float32),
         np.empty((modes, n, n), np.int8),
         np.empty((2, 4)),
         np.empty(full.at.size),
+        np.empty((3, 3)),
     )
 
 
@@ -175,11 +180,12 @@ def _solve_one(models: Models, pair: Pair, room: _Room, out: IrSolutions, k: int
         return _TOO_WEAK
     _find_minima(models, pair, room, measured)
     best, other = room.minima[0], room.minima[1]
-    misfit = 2.0 * best[3] / (measured - 3)
+    covariance, odds = room.covariance, math.exp(best[3] - other[3])
+    determined = pose_covariance(models.exact, pair, room.best, room.full, covariance)
+    misfit = room.full.tally[0] / max(room.full.tally[1], 1.0)
     if misfit - 1.0 > (1.0 - _EXPLAINED) * max(bright / (measured + saturated) - 1.0, 0.0):
         return _MISFIT
-    covariance, odds = out.covariances[k], math.exp(best[3] - other[3])
-    if not pose_covariance(models.exact, pair, room.best, room.full, covariance):
+    if not determined:
         return _UNDETERMINED
     share = odds / (1.0 + odds)
     for p in range(3):
@@ -189,6 +195,7 @@ def _solve_one(models: Models, pair: Pair, room: _Room, out: IrSolutions, k: int
     if max(covariance[1, 1], covariance[2, 2]) > _WIDEST * _WIDEST:
         return _UNDETERMINED
     out.misfits[k], out.odds[k] = misfit, odds
+    assign_matrix(out.covariances[k], covariance)
     for p in range(3):
         out.poses[k, p] = best[p]
         if odds > _LEAST_ODDS:
@@ -204,21 +211,29 @@ def _apart(a: FloatArray, b: FloatArray, p: int) -> float:
 
 @compiled
 def _find_minima(models: Models, pair: Pair, room: _Room, measured: int) -> None:
-    """Search from all starts, and aside of the best minimum; writes the best of all and another one.
-
-    Where gains are known, what lies aside is only worth a look while the best minimum is in doubt.
-    """
+    """Search from all starts that are worth it; writes the best minimum of all and another one."""
     minima, at, reached = room.minima, room.full.at, 0
     minima[0, 3] = minima[1, 3] = math.inf
-    count = _list_starts(models, pair, room)
-    for s in range(count + _ASIDE.shape[0]):
-        best, start = minima[0, 3], room.starts[min(s, count)]
-        if s >= count:
-            doubt = reached < 2 or 2.0 * best > _SUSPICIOUS * (measured - 3)
-            if not (doubt or (at.size > 3 and s < count + 2)):
+    count, blocked = _list_starts(models, pair, room), 0
+    first, gains_are_sought = room.starts[1].copy(), at.size > 3
+    for way in range(count + _ASIDE.shape[0] + _TABLE_STARTS):
+        best = minima[0, 3]
+        doubt = reached < 2 or 2.0 * best > _SUSPICIOUS * (measured - 3)
+        aside, start = way - count, room.starts[way if way < count else 0]
+        last_resort = aside - _ASIDE.shape[0]
+        if last_resort == 0 and doubt and models.exact.blocked < math.inf:
+            dark = compress(models.exact, DARK * models.exact.noise)
+            blocked = find_starts(models.table, room.pattern, room.present, dark, room.start, room.starts)
+        if last_resort >= 0:
+            if last_resort >= min(blocked, _TABLE_STARTS):
                 break
+            start = room.starts[last_resort]
+        elif aside >= 0:
+            if not (doubt or (gains_are_sought and aside < _OF_SECOND)):
+                continue
+            origin = minima[0] if aside < _OF_SECOND else first
             for p in range(3):
-                start[p] = (minima[0, p] if s < count + 2 else room.starts[1, p]) + _ASIDE[s - count, p]
+                start[p] = origin[p] + _ASIDE[aside, p]
         cost = search(models.exact, pair, start, _STILL, room.full, minima[0])
         if _keep(minima, at[at.size - 3 :], cost):
             assign(room.best, at)
@@ -233,11 +248,11 @@ def _list_starts(models: Models, pair: Pair, room: _Room) -> int:
     """Write poses to begin at; returns how many.
 
     First where the soft model's search ends, then the best of the table, then others that fit there nearly as
-    well.
+    well. More are in `_ASIDE`, and at last those for readings of which some are blocked.
     """
     _compress(models.exact, pair, room.pattern, room.present)
     starts, found = room.starts, room.starts[1 : 1 + _TABLE_STARTS]
-    count = 1 + find_starts(models.table, room.pattern, room.present, room.start, found)
+    count = 1 + find_starts(models.table, room.pattern, room.present, -math.inf, room.start, found)
     search(models.blurred, pair, found[0], _LOOSE, room.plain, room.minima[0])
     for p in range(3):
         starts[0, p] = room.plain.at[p]
@@ -251,7 +266,8 @@ def _keep(minima: FloatArray, pose: FloatArray, cost: float) -> bool:
     """Sort a minimum into the best two that lie apart (2, 4); whether it is the best."""
     best, other = minima[0], minima[1]
     better = cost < best[3]
-    apart = max(abs(wrap(pose[1] - best[1])), abs(wrap(pose[2] - best[2]))) > _APART
+    turned = max(abs(wrap(pose[1] - best[1])), abs(wrap(pose[2] - best[2])))
+    apart = max(turned, abs(pose[0] / best[0] - 1.0)) > _APART
     if better and apart:
         assign(other, best)
     if better or (apart and cost < other[3]):

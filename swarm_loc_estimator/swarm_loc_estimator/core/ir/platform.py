@@ -44,6 +44,7 @@ class IrModel(NamedTuple):
         saturation: A reading tells no more from here on [count].
         noise: Of every reading, one standard deviation [count].
         relative_noise: Of every reading besides, relative to it [1].
+        blocked: The scale on which the cost of a reading that may be blocked ends; infinite: none is.
     """
 
     radius: float
@@ -55,6 +56,7 @@ class IrModel(NamedTuple):
     saturation: float
     noise: float
     relative_noise: float
+    blocked: float
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,9 @@ class IrPlatform:
     saturation: float = number(255.0, "count", 0.0, 1e9, "a reading tells no more from here on", above=True)
     noise: float = number(1.0, "count", 0.0, 1e6, "standard deviation of every reading", above=True)
     relative_noise: float = number(0.0, "1", 0.0, 1.0, "noise besides, relative to the reading")
+    blocked_share: float = number(
+        0.02, "1", 0.0, 0.5, "share of readings that something in between darkens; 0: none ever"
+    )
     element_sigma: float = number(
         0.1, "1", 0.0, 1.0, "how much elements differ, relative, one standard deviation; 0: not at all"
     )
@@ -120,6 +125,7 @@ class IrPlatform:
             self.saturation,
             self.noise,
             self.relative_noise,
+            -math.log(self.blocked_share) if self.blocked_share else math.inf,
         )
 
     def unknown_gains(self, count: int) -> PairGains:

@@ -1,25 +1,17 @@
 """The most likely pose from a start: damped Gauss-Newton on all readings of one pair of robots.
 
-What is sought is the pose and, where elements differ by an unknown amount, every sensor's and emitter's
-log-gain, which has a prior. A measured reading is its expectation plus Gaussian noise. A saturated one says
-only that expectation plus noise is at saturation or above, which has the probability of a normal tail. At a
-kink of the curves the slope is one-sided, which the damping bears.
+At a kink of the curves the slope is one-sided, which the damping bears. The covariance looks beyond a kink
+that is near.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.compiled import compiled, wrap
-from swarm_loc_estimator.core.ir.brightness import predict_brightness
+from swarm_loc_estimator.core.ir.cost import Pair, Scratch, cost_of
 from swarm_loc_estimator.core.ir.platform import IrModel
 from swarm_loc_estimator.core.se2 import FloatArray
-
-MISSING, MEASURED, SATURATED = 0, 1, 2
 
 _ROUNDS = 40
 _FIRST_DAMPING = 1e-3
@@ -30,8 +22,6 @@ _LONGEST_SHARE = 0.4
 """Of one step in range, relative."""
 _BESIDE = 0.03
 """A search that has come so near a known minimum [rad, relative in range], at its cost, would end there."""
-_TAIL = -6.0
-"""Below, the normal distribution is asymptotic [sigma]."""
 _AWAY = 2.5
 """How far around a minimum its covariance looks [sigma]."""
 _CORNER = 3.0**-0.5
@@ -42,77 +32,6 @@ _AROUND = (
     (-_CORNER, -_CORNER, _CORNER),
 )
 """Where to: the corners of a tetrahedron."""
-
-
-class Pair(NamedTuple):
-    """The readings of one pair of robots.
-
-    Attributes:
-        readings: (modes, n, n) [count].
-        kinds: (modes, n, n) MISSING, MEASURED or SATURATED.
-        sensor: (n,) gains of the receiver's sensors.
-        emitter: (n,) gains of the transmitter's emitters.
-        prior: (2, 2) of sensors and emitters: what weighs every log-gain's square, and the share of their
-            common part that this weight leaves free; weights of zero: gains are exact.
-        nearest: The least range to seek [m].
-        farthest: The largest.
-    """
-
-    readings: FloatArray
-    kinds: NDArray[np.int8]
-    sensor: FloatArray
-    emitter: FloatArray
-    prior: FloatArray
-    nearest: float
-    farthest: float
-
-
-class Scratch(NamedTuple):
-    """Room to work in; P unknowns are the log-gains of n sensors and n emitters, if sought, and the pose.
-
-    The pose comes last, so that the last rows of the Hessian's factor are those of the pose alone.
-
-    Attributes:
-        expected: (modes, n, n).
-        slopes: (3, modes, n, n).
-        at: (P,) the best so far.
-        trial: (P,).
-        factors: (2, n) sensors' and emitters' gains.
-        gradients: (2, P) of the cost at the best so far, or at the trial.
-        hessians: (2, P, P) likewise, by Gauss-Newton; lower triangles.
-        factor: (P, P) lower triangle.
-        step: (P,).
-        root: (3, 3) inverse of the pose's part of the factor, lower triangle.
-    """
-
-    expected: FloatArray
-    slopes: FloatArray
-    at: FloatArray
-    trial: FloatArray
-    factors: FloatArray
-    gradients: FloatArray
-    hessians: FloatArray
-    factor: FloatArray
-    step: FloatArray
-    root: FloatArray
-
-
-@compiled
-def new_scratch(modes: int, n: int, gains: bool) -> Scratch:
-    """Room for a platform, with or without gains to seek."""
-    size = 3 + 2 * n if gains else 3
-    return Scratch(
-        np.empty((modes, n, n)),
-        np.empty((3, modes, n, n)),
-        np.zeros(size),
-        np.zeros(size),
-        np.empty((2, n)),
-        np.empty((2, size)),
-        np.empty((2, size, size)),
-        np.empty((size, size)),
-        np.empty(size),
-        np.zeros((3, 3)),
-    )
 
 
 @compiled
@@ -133,12 +52,12 @@ def search(
     for p in range(3):
         at[size - 3 + p] = start[p]
     best, damping, growth = 0, _FIRST_DAMPING, 2.0
-    cost = _cost(model, pair, at, room, gradients[best], hessians[best])
+    cost = cost_of(model, pair, at, room, gradients[best], hessians[best])
     for _ in range(_ROUNDS):
         promise = _step(pair, room, gradients[best], hessians[best], damping)
         if promise < still:
             break
-        now = _cost(model, pair, room.trial, room, gradients[1 - best], hessians[1 - best])
+        now = cost_of(model, pair, room.trial, room, gradients[1 - best], hessians[1 - best])
         gain = (cost - now) / promise
         if gain > 1e-3:
             best, cost = 1 - best, now
@@ -197,104 +116,6 @@ def _step(pair: Pair, room: Scratch, gradient: FloatArray, hessian: FloatArray, 
 
 
 @compiled
-def _cost(
-    model: IrModel, pair: Pair, at: FloatArray, room: Scratch, gradient: FloatArray, hessian: FloatArray
-) -> float:
-    """The cost at some place; writes its gradient and Hessian there."""
-    size, modes, n = at.size, pair.readings.shape[0], pair.readings.shape[1]
-    predict_brightness(model, at[size - 3], at[size - 2], at[size - 1], room.expected, room.slopes)
-    sought = size > 3
-    for i in range(n):
-        room.factors[0, i] = pair.sensor[i] * (math.exp(at[i]) if sought else 1.0)
-        room.factors[1, i] = pair.emitter[i] * (math.exp(at[n + i]) if sought else 1.0)
-    for p in range(size):
-        gradient[p] = 0.0
-        for q in range(p + 1):
-            hessian[p, q] = 0.0
-    cost = _add_prior(pair, at, gradient, hessian) if sought else 0.0
-    x = size - 3
-    for m in range(modes):
-        for i in range(n):
-            for j in range(n):
-                kind = pair.kinds[m, i, j]
-                if kind == MISSING:
-                    continue
-                factor = room.factors[0, i] * room.factors[1, j]
-                expected = factor * room.expected[m, i, j]
-                one, pull, weight = _of_reading(model, pair.readings[m, i, j], kind, expected)
-                cost += one
-                if weight == 0.0:
-                    continue
-                a = factor * room.slopes[0, m, i, j]
-                b = factor * room.slopes[1, m, i, j]
-                c = factor * room.slopes[2, m, i, j]
-                gradient[x] += pull * a
-                gradient[x + 1] += pull * b
-                gradient[x + 2] += pull * c
-                hessian[x, x] += weight * a * a
-                hessian[x + 1, x] += weight * a * b
-                hessian[x + 1, x + 1] += weight * b * b
-                hessian[x + 2, x] += weight * a * c
-                hessian[x + 2, x + 1] += weight * b * c
-                hessian[x + 2, x + 2] += weight * c * c
-                if sought:
-                    gradient[i] += pull * expected
-                    gradient[n + j] += pull * expected
-                    both = weight * expected * expected
-                    hessian[i, i] += both
-                    hessian[n + j, n + j] += both
-                    hessian[n + j, i] += both
-                    for slope, row in ((a, x), (b, x + 1), (c, x + 2)):
-                        mixed = weight * expected * slope
-                        hessian[row, i] += mixed
-                        hessian[row, n + j] += mixed
-    return cost
-
-
-@compiled
-def _add_prior(pair: Pair, at: FloatArray, gradient: FloatArray, hessian: FloatArray) -> float:
-    """Add the priors of log-gains: independent errors, and one common to all of a side."""
-    n, cost = pair.sensor.size, 0.0
-    for side in range(2):
-        weight, common = pair.prior[side, 0], pair.prior[side, 1]
-        first, total = side * n, 0.0
-        for p in range(first, first + n):
-            total += at[p]
-        for p in range(first, first + n):
-            pull = weight * (at[p] - common * total)
-            cost += 0.5 * pull * at[p]
-            gradient[p] += pull
-            hessian[p, p] += weight * (1.0 - common)
-            for q in range(first, p):
-                hessian[p, q] -= weight * common
-    return cost
-
-
-@compiled
-def _of_reading(model: IrModel, reading: float, kind: int, expected: float) -> tuple[float, float, float]:
-    """What a reading adds to the cost, and its first and second derivative by the expectation."""
-    level = reading if kind == MEASURED else model.saturation
-    relative = model.relative_noise * level
-    weight = 1.0 / (model.noise * model.noise + relative * relative)
-    if kind == MEASURED:
-        pull = weight * (expected - reading)
-        return 0.5 * pull * (expected - reading), pull, weight
-    per_sigma = math.sqrt(weight)
-    z = (expected - level) * per_sigma
-    if z > -_TAIL:
-        return 0.0, 0.0, 0.0
-    if z > _TAIL:
-        share = 0.5 * math.erfc(-z / math.sqrt(2.0))
-        hazard = math.exp(-0.5 * z * z) / (math.sqrt(2.0 * math.pi) * share)
-        cost = -math.log(share)
-    else:
-        series = 1.0 - 1.0 / (z * z) + 3.0 / (z * z * z * z)
-        hazard = -z / series
-        cost = 0.5 * z * z + math.log(-z * math.sqrt(2.0 * math.pi) / series)
-    return cost, -hazard * per_sigma, max(hazard * (hazard + z), 0.0) * weight
-
-
-@compiled
 def _factorize(matrix: FloatArray, damping: float, factor: FloatArray, held: bool) -> bool:
     """Cholesky of the lower triangle with its diagonal grown by a share; whether it is positive definite.
 
@@ -342,10 +163,11 @@ def pose_covariance(
     """Write the pose's covariance (3, 3) at a minimum (P,); whether the readings determine the pose.
 
     It is the mean of the inverse information there and around: beyond a kink of the curves, readings may tell
-    much less of the pose.
+    much less of the pose. `room.tally` is that of the minimum.
     """
     hessian = room.hessians[0]
-    _cost(model, pair, at, room, room.gradients[0], hessian)
+    cost_of(model, pair, at, room, room.gradients[0], hessian)
+    squares, freedom = room.tally
     if not _invert(hessian, room):
         return False
     _add_square(room.root, covariance, 1.0 / (1.0 + len(_AROUND)), 0.0)
@@ -357,10 +179,11 @@ def pose_covariance(
             for q in range(p, 3):
                 room.trial[x + p] += _AWAY * root[q, p] * direction[q]
         room.trial[x] = max(room.trial[x], pair.nearest)
-        _cost(model, pair, room.trial, room, room.gradients[0], hessian)
+        cost_of(model, pair, room.trial, room, room.gradients[0], hessian)
         if not _invert(hessian, room):
             return False
         _add_square(room.root, covariance, 1.0 / (1.0 + len(_AROUND)), 1.0)
+    room.tally[0], room.tally[1] = squares, freedom
     return True
 
 

@@ -29,6 +29,8 @@ _KNEE = 10.0
 _SHOWN = 2.0
 """The table ends where an aligned pair is so bright [sigma]."""
 
+_BLOCKED = np.float32(0.2)
+"""What a blocked reading adds to the misfit at most."""
 _BLUR = 0.1
 """By how much `blurred` softens the curves [rad]."""
 _BLUR_NOISE = 0.1
@@ -117,7 +119,12 @@ def start_table(platform: IrPlatform) -> StartTable:
 
 @compiled
 def find_starts(
-    table: StartTable, pattern: Float32Array, present: Float32Array, room: StartRoom, starts: FloatArray
+    table: StartTable,
+    pattern: Float32Array,
+    present: Float32Array,
+    dark: float,
+    room: StartRoom,
+    starts: FloatArray,
 ) -> int:
     """Write the best poses to begin at, best first, each the best of its neighbours; returns how many.
 
@@ -125,6 +132,8 @@ def find_starts(
         table: Of the platform.
         pattern: (modes * n * n,) the readings by `compress`, something finite where missing.
         present: (modes * n * n,) 1 where there is a reading, else 0.
+        dark: Readings darker than this, by `compress`, may be blocked ones; how bright they are in all then
+            does not tell the range, and all ranges are tried.
         room: To work in.
         starts: (S, 4) range, bearing, heading, and how badly they fit.
     """
@@ -134,13 +143,17 @@ def find_starts(
         count += present[f]
     for d in range(room.misfit.size):
         patterns = table.patterns[d]
+        if dark > -math.inf:
+            room.level[d], room.misfit[d] = _best_level(patterns, pattern, present, np.float32(dark))
+            continue
         if count == pattern.size:
             level = _level(table.totals[d], total)
         else:
             for k in range(room.totals.size):
                 room.totals[k] = _sum_of_present(patterns[k], present)
             level = _level(room.totals, total)
-        room.level[d], room.misfit[d] = level, _misfit(patterns[level], pattern, present)
+        room.level[d] = level
+        room.misfit[d] = _misfit(patterns[level], pattern, present, np.float32(dark))
     return _best_minima(table, room, starts)
 
 
@@ -163,6 +176,19 @@ def _level(totals: Float32Array, total: float) -> int:
     return low if totals[low] - total < total - totals[high] else high
 
 
+@compiled
+def _best_level(
+    patterns: Float32Array, pattern: Float32Array, present: Float32Array, dark: np.float32
+) -> tuple[int, np.float32]:
+    """The range of patterns (L, modes * n * n) that fits best, and how badly it does."""
+    best, least = 0, np.float32(math.inf)
+    for level in range(patterns.shape[0]):
+        misfit = _misfit(patterns[level], pattern, present, dark)
+        if misfit < least:
+            best, least = level, misfit
+    return best, least
+
+
 @compiled_sums
 def _sum_of_present(pattern: Float32Array, present: Float32Array) -> np.float32:
     """The total of those readings that there are."""
@@ -173,12 +199,17 @@ def _sum_of_present(pattern: Float32Array, present: Float32Array) -> np.float32:
 
 
 @compiled_sums
-def _misfit(expected_here: Float32Array, pattern: Float32Array, present: Float32Array) -> np.float32:
-    """The sum of squares of the differences."""
+def _misfit(
+    expected_here: Float32Array, pattern: Float32Array, present: Float32Array, dark: np.float32
+) -> np.float32:
+    """The sum of squares of the differences, for readings that may be blocked up to a limit."""
     total: np.float32 = np.float32(0.0)
     for f in range(pattern.size):
-        difference = present[f] * (pattern[f] - expected_here[f])
-        total += difference * difference
+        difference = pattern[f] - expected_here[f]
+        square = difference * difference
+        if pattern[f] < dark and difference < 0.0:
+            square = min(square, _BLOCKED)
+        total += present[f] * square
     return total
 
 

@@ -1,0 +1,226 @@
+"""How unlikely readings are at a pose, with the slope and bend of that by pose and gains.
+
+What is sought is the pose and, where elements differ by an unknown amount, every sensor's and emitter's
+log-gain, which has a prior. A measured reading is its expectation plus Gaussian noise. A saturated one says
+only that expectation plus noise is at saturation or above, which has the probability of a normal tail. One
+that shows no light where some is expected may be blocked by another robot.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.compiled import compiled
+from swarm_loc_estimator.core.ir.brightness import predict_brightness
+from swarm_loc_estimator.core.ir.platform import IrModel
+from swarm_loc_estimator.core.se2 import FloatArray
+
+MISSING, MEASURED, SATURATED = 0, 1, 2
+
+_TAIL = -6.0
+"""Below, the normal distribution is asymptotic [sigma]."""
+DARK = 4.0
+"""Only darker readings can be blocked ones [sigma]."""
+_BELIEVED = 2.0
+"""A reading that costs less is no blocked one."""
+
+
+class Pair(NamedTuple):
+    """The readings of one pair of robots.
+
+    Attributes:
+        readings: (modes, n, n) [count].
+        kinds: (modes, n, n) MISSING, MEASURED or SATURATED.
+        sensor: (n,) gains of the receiver's sensors.
+        emitter: (n,) gains of the transmitter's emitters.
+        prior: (2, 2) of sensors and emitters: what weighs every log-gain's square, and the share of their
+            common part that this weight leaves free; weights of zero: gains are exact.
+        nearest: The least range to seek [m].
+        farthest: The largest.
+    """
+
+    readings: FloatArray
+    kinds: NDArray[np.int8]
+    sensor: FloatArray
+    emitter: FloatArray
+    prior: FloatArray
+    nearest: float
+    farthest: float
+
+
+class Scratch(NamedTuple):
+    """Room to work in; P unknowns are the log-gains of n sensors and n emitters, if sought, and the pose.
+
+    The pose comes last, so that the last rows of the Hessian's factor are those of the pose alone.
+
+    Attributes:
+        expected: (modes, n, n).
+        slopes: (3, modes, n, n).
+        at: (P,) the best so far.
+        trial: (P,).
+        factors: (2, n) sensors' and emitters' gains.
+        gradients: (2, P) of the cost at the best so far, or at the trial.
+        hessians: (2, P, P) likewise, by Gauss-Newton; lower triangles.
+        factor: (P, P) lower triangle.
+        step: (P,).
+        tally: (2,) squares of what is left of priors and of the readings that cannot be blocked ones, and the
+            degrees of freedom of these.
+        root: (3, 3) inverse of the pose's part of the factor, lower triangle.
+    """
+
+    expected: FloatArray
+    slopes: FloatArray
+    at: FloatArray
+    trial: FloatArray
+    factors: FloatArray
+    gradients: FloatArray
+    hessians: FloatArray
+    factor: FloatArray
+    step: FloatArray
+    tally: FloatArray
+    root: FloatArray
+
+
+@compiled
+def new_scratch(modes: int, n: int, gains: bool) -> Scratch:
+    """Room for a platform, with or without gains to seek."""
+    size = 3 + 2 * n if gains else 3
+    return Scratch(
+        np.empty((modes, n, n)),
+        np.empty((3, modes, n, n)),
+        np.zeros(size),
+        np.zeros(size),
+        np.empty((2, n)),
+        np.empty((2, size)),
+        np.empty((2, size, size)),
+        np.empty((size, size)),
+        np.empty(size),
+        np.empty(2),
+        np.zeros((3, 3)),
+    )
+
+
+@compiled
+def cost_of(
+    model: IrModel, pair: Pair, at: FloatArray, room: Scratch, gradient: FloatArray, hessian: FloatArray
+) -> float:
+    """The cost at some place; writes its gradient and Hessian there."""
+    size, modes, n = at.size, pair.readings.shape[0], pair.readings.shape[1]
+    predict_brightness(model, at[size - 3], at[size - 2], at[size - 1], room.expected, room.slopes)
+    sought = size > 3
+    for i in range(n):
+        room.factors[0, i] = pair.sensor[i] * (math.exp(at[i]) if sought else 1.0)
+        room.factors[1, i] = pair.emitter[i] * (math.exp(at[n + i]) if sought else 1.0)
+    for p in range(size):
+        gradient[p] = 0.0
+        for q in range(p + 1):
+            hessian[p, q] = 0.0
+    cost = _add_prior(pair, at, gradient, hessian) if sought else 0.0
+    squares, sure, x = 2.0 * cost, 0, size - 3
+    dark = DARK * model.noise if model.blocked < math.inf else -math.inf
+    for m in range(modes):
+        for i in range(n):
+            for j in range(n):
+                kind = pair.kinds[m, i, j]
+                if kind == MISSING:
+                    continue
+                factor = room.factors[0, i] * room.factors[1, j]
+                expected = factor * room.expected[m, i, j]
+                reading = pair.readings[m, i, j]
+                level = reading if kind == MEASURED else model.saturation
+                spread = model.relative_noise * level
+                weight = 1.0 / (model.noise * model.noise + spread * spread)
+                if kind == SATURATED:
+                    one, pull, weight = _of_saturated(
+                        math.sqrt(weight), (expected - level) * math.sqrt(weight)
+                    )
+                    squares += 2.0 * one
+                elif reading < dark and reading < expected:
+                    one, pull, weight = _of_dark(weight, expected - reading, model.blocked)
+                else:
+                    pull = weight * (expected - reading)
+                    one = 0.5 * pull * (expected - reading)
+                    squares += 2.0 * one
+                    sure += 1
+                cost += one
+                if weight == 0.0:
+                    continue
+                a = factor * room.slopes[0, m, i, j]
+                b = factor * room.slopes[1, m, i, j]
+                c = factor * room.slopes[2, m, i, j]
+                gradient[x] += pull * a
+                gradient[x + 1] += pull * b
+                gradient[x + 2] += pull * c
+                hessian[x, x] += weight * a * a
+                hessian[x + 1, x] += weight * a * b
+                hessian[x + 1, x + 1] += weight * b * b
+                hessian[x + 2, x] += weight * a * c
+                hessian[x + 2, x + 1] += weight * b * c
+                hessian[x + 2, x + 2] += weight * c * c
+                if sought:
+                    gradient[i] += pull * expected
+                    gradient[n + j] += pull * expected
+                    both = weight * expected * expected
+                    hessian[i, i] += both
+                    hessian[n + j, n + j] += both
+                    hessian[n + j, i] += both
+                    for slope, row in ((a, x), (b, x + 1), (c, x + 2)):
+                        mixed = weight * expected * slope
+                        hessian[row, i] += mixed
+                        hessian[row, n + j] += mixed
+    room.tally[0], room.tally[1] = squares, sure - 3.0
+    return cost
+
+
+@compiled
+def _add_prior(pair: Pair, at: FloatArray, gradient: FloatArray, hessian: FloatArray) -> float:
+    """Add the priors of log-gains: independent errors, and one common to all of a side."""
+    n, cost = pair.sensor.size, 0.0
+    for side in range(2):
+        weight, common = pair.prior[side, 0], pair.prior[side, 1]
+        first, total = side * n, 0.0
+        for p in range(first, first + n):
+            total += at[p]
+        for p in range(first, first + n):
+            pull = weight * (at[p] - common * total)
+            cost += 0.5 * pull * at[p]
+            gradient[p] += pull
+            hessian[p, p] += weight * (1.0 - common)
+            for q in range(first, p):
+                hessian[p, q] -= weight * common
+    return cost
+
+
+@compiled
+def _of_dark(weight: float, less: float, blocked: float) -> tuple[float, float, float]:
+    """The cost of a reading that shows no light and should, and its derivatives by the expectation.
+
+    It may be blocked by something in between: the more it is below expectation, the less it counts, and its
+    cost ends at a limit.
+    """
+    pull = weight * less
+    cost = 0.5 * pull * less
+    if cost < _BELIEVED:
+        return cost, pull, weight
+    seen = math.exp((_BELIEVED - cost) / blocked)
+    return _BELIEVED + blocked * (1.0 - seen), seen * pull, seen * weight
+
+
+@compiled
+def _of_saturated(per_sigma: float, z: float) -> tuple[float, float, float]:
+    """The cost of a saturated reading, and its derivatives by the expectation, z sigmas beyond saturation."""
+    if z > -_TAIL:
+        return 0.0, 0.0, 0.0
+    if z > _TAIL:
+        share = 0.5 * math.erfc(-z / math.sqrt(2.0))
+        hazard = math.exp(-0.5 * z * z) / (math.sqrt(2.0 * math.pi) * share)
+        cost = -math.log(share)
+    else:
+        series = 1.0 - 1.0 / (z * z) + 3.0 / (z * z * z * z)
+        hazard = -z / series
+        cost = 0.5 * z * z + math.log(-z * math.sqrt(2.0 * math.pi) / series)
+    return cost, -hazard * per_sigma, max(hazard * (hazard + z), 0.0) * per_sigma * per_sigma
