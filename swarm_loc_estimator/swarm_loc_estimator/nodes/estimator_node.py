@@ -2,8 +2,9 @@
 
     ./run swarm_loc_estimator estimator_node --ros-args -p swarm_file:=swarm.yaml
 
-It subscribes to `<robot>/odom` and `<robot>/detections` of all robots in the swarm description. It publishes
-`swarm/poses`, `<robot>/pose`, `/tf` (map to `<robot>/odom`, which no one else may publish), `/diagnostics`.
+It subscribes to `<robot>/odom`, `<robot>/detections`, `<robot>/brightness` and `<robot>/fix` of the robots in
+the swarm description. It publishes `swarm/poses`, `<robot>/pose`, `/tf` (map to `<robot>/odom`, which no one
+else may publish), `/diagnostics`.
 Services: `~/reset`, `~/set_robot_pose`. Parameters: see `estimator_parameters.py` and the package's README.
 """
 
