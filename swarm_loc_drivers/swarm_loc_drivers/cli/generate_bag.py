@@ -4,6 +4,7 @@
     generate_bag pictures bags/eight_pictures --seed 1 --duration 9 --robots 2
     generate_bag grid /tmp/grid100 --robots 100 --duration 20
     generate_bag droplets bags/droplets_twenty --seed 1 --duration 60
+    generate_bag droplets /tmp/same_boards --seed 2 --boards 1
 
 The bag holds <robot>/odom, <robot>/detections and <robot>/ground_truth; `swarm.yaml` lies inside its folder.
 `pictures` writes, in place of detections, what the cameras see: <robot>/image_raw/compressed (JPEG) and
@@ -47,7 +48,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"--robots {options.robots} must be at least 1")
     if options.seed < 0:
         parser.error(f"--seed {options.seed} must be at least 0")
-    words = [f"{name}={value}" for name, value in vars(options).items() if name not in ("bag", "write")]
+    if getattr(options, "boards", None) is not None and options.boards < 0:
+        parser.error(f"--boards {options.boards} must be at least 0")
+    said = {name: value for name, value in vars(options).items() if value is not None}
+    words = [f"{name}={value}" for name, value in said.items() if name not in ("bag", "write")]
     try:
         count = options.write(options, f"Simulated: {', '.join(words)}.")
     except (BagError, DefinitionsNotFoundError) as error:
@@ -89,6 +93,7 @@ def _droplets(options: argparse.Namespace, comment: str) -> int:
         world=options.world,
         calibrated=options.calibrated,
         start_known=options.start_known,
+        boards=options.boards,
     )
     return write_droplet_bag(simulate_droplets(settings), options.bag, comment, options.seed)
 
@@ -121,6 +126,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     droplets.add_argument("--calibrated", action="store_true", help="swarm.yaml tells the elements' gains")
     droplets.add_argument("--start-known", action="store_true", help="swarm.yaml tells the start poses")
+    droplets.add_argument("--boards", type=int, help="seed of the elements' gains (default: that of --seed)")
     _swarm(swarms, "grid", "many robots, each about its cell of a grid", 100, 20.0).set_defaults(write=_grid)
     return parser
 

@@ -57,6 +57,7 @@ class DropletRunSettings:
         world: How they err, of `DROPLET_WORLDS`.
         calibrated: Whether the description tells the gains of the elements, to 2 %.
         start_known: Whether it tells where robots begin.
+        boards: Runs with the same one have the same elements; None: as the seed says.
     """
 
     seed: int = 1
@@ -65,6 +66,7 @@ class DropletRunSettings:
     world: str = "d1"
     calibrated: bool = False
     start_known: bool = False
+    boards: int | None = None
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,7 @@ def simulate_droplets(settings: DropletRunSettings) -> DropletRun:
     layout = DropletSwarmSettings(settings.seed, settings.robots, settings.start_known)
     start = starts(layout)
     errors = DROPLET_WORLDS[settings.world]
-    world_settings = DropletWorldSettings(settings.seed, errors, platform, START_NS)
+    world_settings = DropletWorldSettings(settings.seed, errors, platform, START_NS, settings.boards)
     plain = describe_droplets(layout, start, platform, (None,) * settings.robots)
     ids = [robot.ir.id for robot in plain.robots if robot.ir is not None]
     world = DropletWorld(ids, start, world_settings)

@@ -73,12 +73,14 @@ class DropletWorldSettings:
         errors: Which errors there are.
         platform: The infrared board of all robots.
         start_ns: First moment.
+        boards: Fixes the gains of the elements instead of `seed`.
     """
 
     seed: int
     errors: DropletErrors
     platform: IrPlatform
     start_ns: int
+    boards: int | None = None
 
 
 class DropletWorld:
@@ -104,7 +106,7 @@ class DropletWorld:
         """(N, 3) where the robots truly are now, in map."""
         self._twists = np.zeros((count, 3))
         self._true = self._true_velocities(count)
-        rng = self._random(settings.seed, _GAINS)
+        rng = self._random(settings.seed if settings.boards is None else settings.boards, _GAINS)
         gains = np.exp(settings.errors.gain_sigma * rng.standard_normal((2, count, ELEMENTS)))
         self.gains: FloatArray = gains
         """(2, N, n) true factors of sensors and emitters."""

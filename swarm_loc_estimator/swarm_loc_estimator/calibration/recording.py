@@ -15,12 +15,23 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from swarm_loc_estimator.core.arrivals import NO_ODOMETRY, DetectionRows, Messages, OdometryRows, joined
+from swarm_loc_estimator.core.arrivals import (
+    NO_BRIGHTNESS,
+    NO_FIXES,
+    NO_ODOMETRY,
+    BrightnessRows,
+    DetectionRows,
+    FixRows,
+    Messages,
+    OdometryRows,
+    joined,
+)
 from swarm_loc_estimator.core.metrics import Track, interpolate
 from swarm_loc_estimator.core.swarm import Robot, Swarm
-from swarm_loc_estimator.io.bags import BagReader
+from swarm_loc_estimator.io.bags import BagReader, BagTopic
 from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
 from swarm_loc_estimator.io.ingest import Ingest
+from swarm_loc_estimator.io.inputs import InputKind
 from swarm_loc_estimator.io.truth import TruthReader
 
 IntArray = npt.NDArray[np.int64]
@@ -79,6 +90,8 @@ class Recording:
         odometry: Raw poses.
         detections: Of all cameras.
         truth: Robot name -> ground truth; robots without are missing.
+        brightness: Of all infrared boards.
+        fixes: Of all robots.
         remarks: What could not be read, one sentence each.
     """
 
@@ -86,6 +99,8 @@ class Recording:
     odometry: Rows
     detections: Rows
     truth: Mapping[str, Track]
+    brightness: BrightnessRows = NO_BRIGHTNESS
+    fixes: FixRows = NO_FIXES
     remarks: tuple[str, ...] = ()
 
     @property
@@ -95,7 +110,7 @@ class Recording:
         return (int(arrivals.min()), int(arrivals.max())) if arrivals.size else (0, 0)
 
     def between(self, from_ns: int, to_ns: int) -> Recording:
-        """What arrived from `from_ns` on and before `to_ns`, and the whole ground truth."""
+        """What wheels and cameras said from `from_ns` on and before `to_ns`; all else is whole."""
         odometry, detections = (
             rows.chosen((rows.arrival_ns >= from_ns) & (rows.arrival_ns < to_ns))
             for rows in (self.odometry, self.detections)
@@ -116,7 +131,7 @@ class Recording:
 
     @cached_property
     def messages(self) -> Messages:
-        """All of them in columns, in order of arrival."""
+        """What wheels and cameras said, in columns, in order of arrival."""
         odometry, detections, (begin_ns, end_ns) = self.odometry, self.detections, self.range_ns
         counts = [found.size for found in detections.data]
         columns = (detections.robot, detections.stamp_ns, detections.arrival_ns)
@@ -156,7 +171,7 @@ def read_recording(bag: Path, swarm: Swarm, progress: Progress | None = None) ->
             truth.add(others._replace(topic=others.topic - inputs))
             if progress is not None:
                 progress(reader.progress, "reading")
-        remarks = tuple(reader.losses)
+        remarks = (*reader.losses, *_strangers(reader.topics, ingest))
     odometry = joined([NO_ODOMETRY, *(part.odometry for part in parts)])
     detections = [_per_message(part.detections) for part in parts]
     tracks = {name: _each_stamp_once(track) for name, track in truth.tracks().items()}
@@ -167,6 +182,8 @@ def read_recording(bag: Path, swarm: Swarm, progress: Progress | None = None) ->
         ),
         _joined(detections),
         tracks,
+        joined([NO_BRIGHTNESS, *(part.brightness for part in parts)]),
+        joined([NO_FIXES, *(part.fixes for part in parts)]),
         remarks,
     )
 
@@ -191,6 +208,14 @@ def started_at_truth(swarm: Swarm, recording: Recording) -> Swarm:
     return replace(swarm, robots=tuple(robots))
 
 
+def _strangers(topics: list[BagTopic], ingest: Ingest) -> list[str]:
+    """A sentence when there are inputs of robots that the swarm does not have."""
+    kinds = {kind.topic: kind.message_type for kind in InputKind}
+    names = [t.name for t in topics if kinds.get(t.name.rpartition("/")[2]) == t.type]
+    strange = sorted(set(names) - set(ingest.handle_of))
+    return [f"No robot of the swarm description has the topics {', '.join(strange)}."] if strange else []
+
+
 def _each_stamp_once(track: Track) -> Track:
     """The track with the first of the poses that share a stamp."""
     stamp_ns, first = np.unique(track.stamp_ns, return_index=True)
@@ -202,7 +227,7 @@ def _per_message(rows: DetectionRows) -> Rows:
     columns = (rows.robot, rows.stamp_ns, rows.arrival_ns)
     new = np.logical_or.reduce([column[1:] != column[:-1] for column in columns])
     starts = np.flatnonzero(np.concatenate([np.ones(min(rows.robot.size, 1), dtype=bool), new]))
-    ends = [*starts[1:].tolist(), rows.robot.size]
+    ends = [*starts[1:].tolist(), rows.robot.size][: starts.size]
     data = tuple(rows.detection[a:b] for a, b in zip(starts.tolist(), ends, strict=True) if b > a)
     robot, stamp_ns, arrival_ns = (column[starts] for column in columns)
     return Rows(robot, stamp_ns, arrival_ns, data)

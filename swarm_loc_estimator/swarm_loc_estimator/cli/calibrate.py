@@ -16,7 +16,7 @@ from pathlib import Path
 
 from swarm_loc_estimator.calibration.fit import EVALUATIONS, Options, calibrate
 from swarm_loc_estimator.calibration.picture import draw, text_of
-from swarm_loc_estimator.calibration.recording import CalibrationError, read_recording
+from swarm_loc_estimator.calibration.recording import CalibrationError, Recording, read_recording
 from swarm_loc_estimator.cli.arguments import number_in
 from swarm_loc_estimator.cli.progress import ProgressLine
 from swarm_loc_estimator.cli.replay import swarm_beside
@@ -40,9 +40,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     options.out.parent.mkdir(parents=True, exist_ok=True)
     save_swarm(done.swarm, options.out, f"Calibrated with {options.bag.name}.")
-    print("\n".join([text_of(done), *recording.remarks]))
+    print("\n".join([text_of(done), *recording.remarks, *_unused(recording)]))
     print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
     return 0
+
+
+def _unused(recording: Recording) -> list[str]:
+    """A sentence when the bag holds inputs that nothing is fitted to."""
+    counts = {"brightness": recording.brightness.robot.size, "fix": recording.fixes.robot.size}
+    said = " and ".join(f"{count} messages on <robot>/{name}" for name, count in counts.items() if count)
+    return [f"Not used: {said}. Infrared boards are calibrated by calibrate_ir."] if said else []
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -62,6 +62,29 @@ def test_gains_come_out_as_they_are_and_as_sure_as_is_said(
     assert before > 1.3
 
 
+@pytest.mark.parametrize(("known", "own_limit", "pair_limit"), [(True, 0.01, 0.01), (False, 0.018, 0.055)])
+def test_ambient_light_that_was_not_subtracted_does_not_matter(
+    known: bool, own_limit: float, pair_limit: float
+) -> None:
+    logs, exchanges = recorded(300, 8, known=known)
+    ambient = np.random.default_rng(8).uniform(0.0, 1.5, (300, 1, 6, 1))
+    fit = estimate_gains(droplet(0.1), ROBOTS, exchanges._replace(readings=exchanges.readings + ambient))
+    own, pair = errors_of(fit, logs)
+    assert np.std(own) < own_limit
+    assert np.sqrt(np.mean(pair**2)) < pair_limit
+
+
+def test_gains_are_less_sure_of_exchanges_that_contradict_each_other() -> None:
+    """Robots that move while they exchange: poses that are a little off."""
+    logs, exchanges = recorded(300, 9, known=True)
+    rng = np.random.default_rng(9)
+    shaken = exchanges.poses + rng.standard_normal((300, 3)) * [0.001, 0.03, 0.03]
+    fit = estimate_gains(droplet(0.1), ROBOTS, exchanges._replace(poses=shaken))
+    own, _ = errors_of(fit, logs)
+    said = np.sqrt(np.mean([gains.sigma**2 for gains in fit.gains]))
+    assert 0.5 < np.std(own) / said < 1.8
+
+
 def test_calibrated_robots_measure_better() -> None:
     """As much as is asked of a Droplet at 20 cm: 10 % mismatch costs half a centimetre, then a tenth."""
     logs, exchanges = recorded(600, 2, known=False)

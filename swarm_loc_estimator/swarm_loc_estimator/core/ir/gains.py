@@ -1,9 +1,10 @@
 """Gains of robots' sensors and emitters, from the brightness matrices that they recorded of each other.
 
 All gains and the relative pose of every exchange are sought together by Gauss-Newton, each pose eliminated
-from its own readings. Without known poses, what all gains of a robot have in common is told from range only
-by near robots, whose pattern depends on it; far ones with brighter elements just seem nearer. The result says
-how unsure it is. Known poses determine it, but for a factor between sensors and emitters, which cancels.
+from its own readings, and so is the ambient light that a sensor did not subtract. Without known poses, what
+all gains of a robot have in common is told from range only by near robots, whose pattern depends on it; far
+ones with brighter elements just seem nearer. The result says how unsure it is. Known poses determine it, but
+for a factor between sensors and emitters, which cancels.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ _STILL = 1e-3
 """Rounds end when no log-gain moves by more."""
 _POSE_SIGMA = (0.0005, 0.005, 0.005)
 """How well known poses are known: range [m], bearing, heading [rad]."""
+_BACKGROUND = 0.5
+"""How much of the ambient light a sensor may read besides, one standard deviation [sigma of a reading]."""
 _SEARCH_SIGMA = 0.02
 """How unsure gains are taken to be while poses are searched with them."""
 _MOST_ODDS = 0.05
@@ -102,13 +105,13 @@ def estimate_gains(
     before = _residuals(platform, exchanges, logs, poses, used)
     for number in range(_ROUNDS):
         progress(f"gains, round {number + 1}")
-        logs, covariance, moved = _improved(platform, exchanges, logs, poses, used)
+        logs, covariances, moved = _improved(platform, exchanges, logs, poses, used)
         poses, used = _poses(estimator, exchanges, _pairs(exchanges, logs, _SEARCH_SIGMA))
         used = _without_worst(_residuals(platform, exchanges, logs, poses, used), used)
         if moved < _STILL:
             break
     after = _residuals(platform, exchanges, logs, poses, used)
-    return GainsFit(_as_gains(platform, exchanges, logs, covariance, used), used, before, after)
+    return GainsFit(_as_gains(platform, exchanges, logs, covariances, used), used, before, after)
 
 
 def _pairs(exchanges: Exchanges, logs: FloatArray, sigma: float) -> PairGains:
@@ -206,9 +209,13 @@ def _improved(
     poses: FloatArray,
     used: NDArray[np.bool_],
 ) -> tuple[FloatArray, FloatArray, float]:
-    """One step of Gauss-Newton: log-gains, their covariance, and the largest change."""
+    """One step of Gauss-Newton: log-gains, two covariances (2, P, P), and the largest change.
+
+    The first is that of the noise. The second, White's sandwich, is wider where exchanges pull apart more
+    than noise explains, as those of robots do that move meanwhile.
+    """
     linear = _linearized(platform, exchanges, logs, poses, used)
-    information, pull = _without_pose(linear, _known(exchanges)[used])
+    information, pull = _without_pose(linear, _known(exchanges)[used], _BACKGROUND * platform.noise)
     _, robots, n = logs.shape
     own = np.arange(n)
     sensors = exchanges.receiver[used, None] * n + own
@@ -216,20 +223,26 @@ def _improved(
     place = np.concatenate([sensors, emitters], axis=1)
     prior = 1.0 / platform.element_sigma**2
     matrix, vector = prior * np.eye(logs.size), -prior * logs.ravel()
-    np.add.at(matrix, (place[:, :, None], place[:, None, :]), information)
+    scatter, block = matrix.copy(), (place[:, :, None], place[:, None, :])
+    np.add.at(matrix, block, information)
+    np.add.at(scatter, block, pull[:, :, None] * pull[:, None, :])
     np.add.at(vector, place, pull)
     covariance = np.asarray(np.linalg.inv(matrix))
     step = np.clip(covariance @ vector, -_LONGEST_STEP, _LONGEST_STEP)
-    return logs + step.reshape(logs.shape), covariance, float(np.abs(step).max())
+    both = np.stack([covariance, covariance @ scatter @ covariance])
+    return logs + step.reshape(logs.shape), both, float(np.abs(step).max())
 
 
-def _without_pose(linear: _Linear, known: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+def _without_pose(
+    linear: _Linear, known: NDArray[np.bool_], background: float
+) -> tuple[FloatArray, FloatArray]:
     """The information (u, 2n, 2n) on log-gains of each exchange's sensors and emitters, and its pull (u, 2n).
 
-    The pose is eliminated, with what is known of it.
+    The pose is eliminated, with what is known of it, and so is the background of each sensor.
     """
     weight, expected, slopes = linear.weight, linear.expected, linear.slopes
-    square, mixed = weight * expected**2, (weight * expected)[..., None] * slopes
+    bright = weight * expected
+    square, mixed = bright * expected, bright[..., None] * slopes
     count, _, n, _ = weight.shape
     gains = np.zeros((count, 2 * n, 2 * n))
     both, own = square.sum(axis=1), np.arange(n)
@@ -238,26 +251,68 @@ def _without_pose(linear: _Linear, known: NDArray[np.bool_]) -> tuple[FloatArray
     to_pose = np.concatenate([mixed.sum(axis=(1, 3)), mixed.sum(axis=(1, 2))], axis=1)
     pose = np.einsum("kmij,kmija,kmijb->kab", weight, slopes, slopes)
     pose[known] += np.diag(1.0 / np.square(_POSE_SIGMA))
-    of_gains = weight * expected * linear.residual
+    of_gains = bright * linear.residual
     pull = np.concatenate([of_gains.sum(axis=(1, 3)), of_gains.sum(axis=(1, 2))], axis=1)
     of_pose = np.einsum("kmij,kmija->ka", weight * linear.residual, slopes)
+    dark = _of_background(linear, background)
+    gains, to_pose = gains - dark[:, :-4, :-4], to_pose - dark[:, :-4, -4:-1]
+    pose, pull, of_pose = pose - dark[:, -4:-1, -4:-1], pull - dark[:, :-4, -1], of_pose - dark[:, -4:-1, -1]
     back = np.linalg.solve(pose, np.swapaxes(to_pose, 1, 2))
     return gains - to_pose @ back, pull - np.einsum("kap,ka->kp", back, of_pose)
+
+
+def _of_background(linear: _Linear, sigma: float) -> FloatArray:
+    """What not knowing the background of each sensor takes away from all products of weighted columns.
+
+    Returns:
+        (u, 2n + 4, 2n + 4) for sensors, emitters, pose and residual.
+    """
+    weight, own = linear.weight, np.arange(linear.weight.shape[2])
+    bright = (weight * linear.expected).sum(axis=1)
+    pose = np.einsum("kmij,kmija->kia", weight, linear.slopes)
+    residual = (weight * linear.residual).sum(axis=(1, 3))
+    columns = np.concatenate([np.zeros_like(bright), bright, pose, residual[..., None]], axis=2)
+    columns[:, own, own] = bright.sum(axis=2)
+    columns /= np.sqrt(1.0 / sigma**2 + weight.sum(axis=(1, 3)))[..., None]
+    return np.asarray(np.swapaxes(columns, 1, 2) @ columns)
 
 
 def _as_gains(
     platform: IrPlatform,
     exchanges: Exchanges,
     logs: FloatArray,
-    covariance: FloatArray,
+    covariances: FloatArray,
     used: NDArray[np.bool_],
 ) -> tuple[IrGains, ...]:
-    """Gains with how unsure they are, each by itself and all of a robot together.
+    """Gains with how unsure they are, by the covariance (2, P, P) that says more."""
+    unseen = platform.element_sigma**2 / platform.n
+    sigmas = [_sigmas(exchanges, covariance, logs.shape, unseen, used) for covariance in covariances]
+    own, shared = np.max(sigmas, axis=0)
+    factors = np.clip(np.exp(logs), *GAIN_RANGE)
+    return tuple(
+        IrGains(
+            tuple(factors[0, k].tolist()),
+            tuple(factors[1, k].tolist()),
+            max(float(own[k]), _LEAST_SIGMA),
+            float(shared[k]),
+        )
+        for k in range(logs.shape[1])
+    )
+
+
+def _sigmas(
+    exchanges: Exchanges,
+    covariance: FloatArray,
+    shape: tuple[int, ...],
+    unseen: float,
+    used: NDArray[np.bool_],
+) -> FloatArray:
+    """How unsure each robot's gains are (2, robots): each by itself, and all of a robot together.
 
     The latter is what a receiver's sensors and a transmitter's emitters have in common, halved between them:
     sensors that read more and emitters that shine less by the same factor are no different.
     """
-    _, robots, n = logs.shape
+    _, robots, n = shape
     blocks = covariance.reshape(2 * robots, n, 2 * robots, n)
     means = blocks.mean(axis=(1, 3))
     own = np.array([np.trace(blocks[k, :, k]) / n - means[k, k] for k in range(2 * robots)])
@@ -269,16 +324,5 @@ def _as_gains(
         both = means[sensors, sensors] + means[emitters, emitters] + 2.0 * means[sensors, emitters]
         common[sensors].append(0.5 * float(both))
         common[emitters].append(0.5 * float(both))
-    unseen = platform.element_sigma**2 / n
     shared = np.array([np.mean(values) if values else unseen for values in common])
-    own, shared = (np.sqrt(np.mean(v.reshape(2, robots), axis=0)) for v in (own, shared))
-    factors = np.clip(np.exp(logs), *GAIN_RANGE)
-    return tuple(
-        IrGains(
-            tuple(factors[0, k].tolist()),
-            tuple(factors[1, k].tolist()),
-            max(float(own[k]), _LEAST_SIGMA),
-            float(shared[k]),
-        )
-        for k in range(robots)
-    )
+    return np.sqrt([np.mean(v.reshape(2, robots), axis=0) for v in (own, shared)])

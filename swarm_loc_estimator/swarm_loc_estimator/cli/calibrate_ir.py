@@ -1,0 +1,66 @@
+"""Find the gains of infrared sensors and emitters from what robots read of each other.
+
+    calibrate_ir bags/droplets_twenty
+    calibrate_ir recording.mcap --swarm swarm.yaml --out calibrated.yaml --without-truth
+
+The bag holds <robot>/brightness. Where it has <robot>/ground_truth, that is used, but it can do without: then
+the poses are sought together with the gains. The description is the `swarm.yaml` inside the bag's folder
+unless --swarm names another. Robots are calibrated with those of the same platform. Beside --out a picture of
+the same name shows the residuals before and after, and the gains.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from swarm_loc_estimator.calibration.infrared import calibrate_infrared
+from swarm_loc_estimator.calibration.infrared_picture import draw, text_of
+from swarm_loc_estimator.calibration.recording import CalibrationError, read_recording
+from swarm_loc_estimator.cli.progress import ProgressLine
+from swarm_loc_estimator.cli.replay import swarm_beside
+from swarm_loc_estimator.io.bag_file import BagError
+from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
+from swarm_loc_estimator.io.swarm_writer import save_swarm
+from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    options = _parser().parse_args(arguments)
+    try:
+        swarm = load_swarm(options.swarm or swarm_beside(options.bag))
+        with ProgressLine() as progress:
+            recording = read_recording(options.bag, swarm, progress)
+            done = calibrate_infrared(recording, swarm, progress, with_truth=not options.without_truth)
+    except (BagError, SwarmFileError, CalibrationError, DefinitionsNotFoundError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    save_swarm(done.swarm, options.out, f"Infrared gains calibrated with {options.bag.name}.")
+    print("\n".join([text_of(done), *recording.remarks]))
+    print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="calibrate_ir", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("bag", type=Path, help="rosbag2 folder, .mcap or .db3 file with <robot>/brightness")
+    parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/calibrated_ir.yaml"),
+        help="swarm description to write (default out/calibrated_ir.yaml)",
+    )
+    parser.add_argument("--without-truth", action="store_true", help="do as if there were no ground truth")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())
