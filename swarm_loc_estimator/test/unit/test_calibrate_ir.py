@@ -1,0 +1,202 @@
+"""The command `calibrate_ir`: from a bag to gains in a swarm description, or one sentence why not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ir_world import droplet, random_poses, readings_of
+from scipy.stats import chi2
+
+from swarm_loc_estimator.calibration.infrared import LEAST_EXCHANGES
+from swarm_loc_estimator.cli import calibrate_ir
+from swarm_loc_estimator.core import se2
+from swarm_loc_estimator.core.ir.platform import IrGains, IrPlatform, PairGains
+from swarm_loc_estimator.core.robot_ir import RobotIr
+from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.swarm import Robot, Swarm
+from swarm_loc_estimator.io.bag_writer import BagWriter
+from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
+from swarm_loc_estimator.io.messages import encode_brightness, encode_pose_stamped
+from swarm_loc_estimator.io.swarm_file import load_swarm
+from swarm_loc_estimator.io.swarm_writer import save_swarm
+from swarm_loc_estimator.io.typestore import BRIGHTNESS, POSE_STAMPED
+
+BEGIN_NS, STEP_NS = 1_700_000_000_000_000_000, 1_000_000_000
+SPREAD = 0.1
+UNKNOWN_ID = 99
+
+
+def described(names: tuple[str, ...], platform: IrPlatform, source: str, first_id: int = 1) -> list[Robot]:
+    """Robots with boards that were never calibrated."""
+    return [Robot(n, camera=None, ir=RobotIr(first_id + k, platform, source)) for k, n in enumerate(names)]
+
+
+def write_exchanges(bag: BagWriter, robots: list[Robot], count: int, seed: int) -> FloatArray:
+    """Robots that are somewhere else at every exchange; returns the true log-gains (2, robots, n)."""
+    rng = np.random.default_rng(seed)
+    board = robots[0].ir
+    assert board is not None
+    platform, ids = board.platform, [robot.ir.id for robot in robots if robot.ir]
+    logs = SPREAD * rng.standard_normal((2, len(robots), platform.n))
+    receiver = rng.integers(0, len(robots), count)
+    transmitter = (receiver + rng.integers(1, len(robots), count)) % len(robots)
+    relative = random_poses(count, seed, 0.08, 0.28)
+    gains = PairGains(np.exp(logs[0, receiver]), np.exp(logs[1, transmitter]), np.zeros((count, 4)))
+    readings = np.rint(readings_of(platform, relative, seed, gains))
+    seen = np.column_stack(
+        [relative[:, 0] * np.cos(relative[:, 1]), relative[:, 0] * np.sin(relative[:, 1]), relative[:, 2]]
+    )
+    places = rng.uniform(-1.0, 1.0, (count, 3))
+    for k in range(count):
+        stamp_ns = BEGIN_NS + k * STEP_NS
+        name = robots[receiver[k]].name
+        for power, matrix in enumerate(readings[k]):
+            pair = (ids[receiver[k]], ids[transmitter[k]])
+            data = encode_brightness(f"{name}/base_link", stamp_ns, pair, matrix, power)
+            bag.write(f"{name}/brightness", stamp_ns, data)
+        poses = ((receiver[k], places[k]), (transmitter[k], se2.compose(places[k], seen[k])))
+        for robot, pose in poses:
+            data = encode_pose_stamped("map", np.array([stamp_ns]), np.atleast_2d(pose))[0]
+            bag.write(f"{robots[robot].name}/ground_truth", stamp_ns, data)
+    return logs
+
+
+def add_topics(bag: BagWriter, robots: list[Robot]) -> None:
+    for robot in robots:
+        bag.add_topic(f"{robot.name}/brightness", BRIGHTNESS)
+        bag.add_topic(f"{robot.name}/ground_truth", POSE_STAMPED)
+
+
+def recorded(folder: Path, robots: list[Robot], count: int, seed: int) -> FloatArray:
+    """A bag with its swarm.yaml; returns the true log-gains."""
+    with BagWriter(folder) as bag:
+        add_topics(bag, robots)
+        logs = write_exchanges(bag, robots, count, seed)
+    save_swarm(Swarm(tuple(robots)), folder / "swarm.yaml")
+    return logs
+
+
+def gains_of(file: Path) -> list[IrGains | None]:
+    return [robot.ir.gains if robot.ir else None for robot in load_swarm(file).robots]
+
+
+def error_of(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    """The one sentence with which the command ends."""
+    assert calibrate_ir.main([str(argument) for argument in arguments]) == 1
+    shown = capsys.readouterr()
+    assert not shown.out
+    assert shown.err.count("\n") == 1
+    assert shown.err.endswith(".\n")
+    return shown.err
+
+
+@pytest.mark.parametrize("options", [(), ("--without-truth",)])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_gains_come_out_within_their_sigmas_and_are_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], seed: int
+) -> None:
+    robots = described(("a", "b", "c"), droplet(SPREAD), "droplet")
+    logs = recorded(tmp_path / "bag", robots, 300, seed)
+    out = tmp_path / "made" / "calibrated.yaml"
+    assert calibrate_ir.main([str(tmp_path / "bag"), "--out", str(out), *options]) == 0
+    shown = capsys.readouterr().out
+    assert out.with_suffix(".png").stat().st_size > 5_000
+    assert f"{out} written" in shown
+    assert all(f"\n{name} " in shown for name in "abc")
+    assert "of 300 exchanges used" in shown
+    assert (", 0 of them with ground truth" in shown) == bool(options)
+    found = [gains for gains in gains_of(out) if gains is not None]
+    error = np.log([[gains.sensor for gains in found], [gains.emitter for gains in found]]) - logs
+    own = error - error.mean(axis=-1, keepdims=True)
+    common = (error.mean(axis=-1)[0][:, None] + error.mean(axis=-1)[1])[~np.eye(3, dtype=bool)]
+    sigma, common_sigma = (
+        np.array([getattr(gains, name) for gains in found]) for name in ("sigma", "common_sigma")
+    )
+    assert sigma.max() < 0.4 * SPREAD
+    assert np.sum((own / sigma[:, None]) ** 2) < chi2.ppf(1.0 - 1e-4, own.size - 6)
+    both = np.hypot(common_sigma[:, None], common_sigma)[~np.eye(3, dtype=bool)]
+    assert np.abs(common / both).max() < 4.0
+    assert {robot.ir.source for robot in load_swarm(out).robots if robot.ir} == {"droplet"}
+
+
+def test_each_kind_of_board_is_calibrated_by_itself_and_what_is_wrong_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A pair of Droplets, a pair of other boards, a robot that nobody heard, and a stranger."""
+    droplets = described(("a", "b", "alone"), droplet(SPREAD), "droplet")
+    others = described(("c", "d"), load_ir_platform("epuck_twelve"), "epuck_twelve", first_id=10)
+    earlier = IrGains((1.1,) * 6, (1.0,) * 6, 0.02)
+    assert droplets[2].ir is not None
+    droplets[2] = replace(droplets[2], ir=replace(droplets[2].ir, gains=earlier))
+    folder = tmp_path / "bag"
+    with BagWriter(folder) as bag:
+        add_topics(bag, [*droplets, *others, Robot("stranger")])
+        write_exchanges(bag, droplets[:2], 120, 3)
+        write_exchanges(bag, others, 120, 4)
+        dark = np.zeros((6, 6))
+        for pair in ((1, UNKNOWN_ID), (1, 1), (2, 1), (1, 10)):
+            bag.write("a/brightness", BEGIN_NS, encode_brightness("a/base_link", BEGIN_NS, pair, dark))
+    save_swarm(Swarm((*droplets, *others)), folder / "swarm.yaml")
+    assert calibrate_ir.main([str(folder), "--out", str(tmp_path / "out.yaml")]) == 0
+    shown = capsys.readouterr().out
+    wrong = "1 ir_hears_itself, 1 ir_other_board, 1 ir_unknown_id, 1 ir_wrong_receiver"
+    assert f"Matrices not used: {wrong}." in shown
+    assert "No robot of the swarm description has the topics stranger/brightness." in shown
+    assert "as they were: alone." in shown
+    assert "platform droplet: " in shown
+    assert "platform epuck_twelve: " in shown
+    a, _, alone, c, _ = gains_of(tmp_path / "out.yaml")
+    assert alone == earlier
+    assert a is not None
+    assert c is not None
+    assert (len(a.sensor), len(c.sensor)) == (6, 12)
+    assert 0.003 <= max(a.sigma, c.sigma) < 0.05
+
+
+def test_a_board_that_cannot_be_calibrated_does_not_keep_others_from_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    droplets = described(("a", "b"), droplet(SPREAD), "droplet")
+    others = described(("c", "d"), load_ir_platform("epuck_twelve"), "epuck_twelve", first_id=10)
+    with BagWriter(tmp_path / "bag") as bag:
+        add_topics(bag, [*droplets, *others])
+        write_exchanges(bag, droplets, 100, 5)
+    save_swarm(Swarm((*droplets, *others)), tmp_path / "bag" / "swarm.yaml")
+    assert calibrate_ir.main([str(tmp_path / "bag"), "--out", str(tmp_path / "out.yaml")]) == 0
+    assert "Platform epuck_twelve: 0 exchanges are too few" in capsys.readouterr().out
+    assert [gains is None for gains in gains_of(tmp_path / "out.yaml")] == [False, False, True, True]
+
+
+def test_what_cannot_be_calibrated_is_said_in_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag, swarm = tmp_path / "bag", tmp_path / "other.yaml"
+    robots = described(("a", "b"), droplet(SPREAD), "droplet")
+    recorded(bag, robots, LEAST_EXCHANGES - 1, 6)
+    few = f"{LEAST_EXCHANGES - 1} exchanges are too few, {LEAST_EXCHANGES} are the least"
+    assert f"recording 'bag': Platform droplet: {few}." in error_of(capsys, bag)
+    assert "There is no bag" in error_of(capsys, tmp_path / "nowhere", "--swarm", bag / "swarm.yaml")
+    assert "missing.yaml" in error_of(capsys, bag, "--swarm", tmp_path / "missing.yaml")
+    save_swarm(Swarm((Robot("a"), Robot("b"))), swarm)
+    assert "no robot of the swarm description has an infrared" in error_of(capsys, bag, "--swarm", swarm)
+    save_swarm(Swarm(tuple(described(("a", "b"), droplet(SPREAD), "droplet", first_id=50))), swarm)
+    unknown = error_of(capsys, bag, "--swarm", swarm)
+    assert f"can be used: {2 * LEAST_EXCHANGES - 2} ir_unknown_id." in unknown
+    save_swarm(Swarm(tuple(described(("x", "y"), droplet(SPREAD), "droplet"))), swarm)
+    sentence = "recording 'bag' holds no <robot>/brightness of this swarm that can be used."
+    assert sentence in error_of(capsys, bag, "--swarm", swarm)
+    assert not (tmp_path / "out").exists()
+
+
+def test_boards_whose_elements_do_not_differ_need_no_calibration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    exact = (Path(calibrate_ir.__file__).parents[1] / "config/ir/droplet.yaml").read_text()
+    board = tmp_path / "board.yaml"
+    board.write_text(exact.replace("element_sigma: 0.1", "element_sigma: 0.0"))
+    robots = described(("a", "b"), load_ir_platform(str(board)), str(board))
+    recorded(tmp_path / "bag", robots, LEAST_EXCHANGES, 7)
+    assert "element_sigma of the platform is 0" in error_of(capsys, tmp_path / "bag")
