@@ -1,8 +1,9 @@
 """Candidates: quadrangles around what is darker than its neighbourhood.
 
 A marker's border is darker than the paper around it. So a picture is compared with its local mean, the
-outlines of what is dark are followed, and outlines made of four straight sides are kept. Once in full
-resolution for small markers, once in half resolution for blurred ones.
+outlines of what is dark are followed, and outlines made of four straight sides are kept. In full resolution
+with a small neighbourhood for small markers and with a large one for those that touch something dark, and in
+half resolution for blurred ones.
 """
 
 from __future__ import annotations
@@ -28,16 +29,24 @@ _FOLLOWED = 1
 """Value of a dark pixel whose left neighbour was seen to be light while an outline was followed."""
 _SAME = 0.15
 """Quadrangles nearer than this share of their size are the same."""
-_NOISE_SIGMAS = 2.0
+_NOISE_SIGMAS = 1.25
 """Fewer, and specks of noise would cost most of the time."""
+_SMOOTHING_PX = 0.5
+"""Standard deviation of the blur that keeps noise from tearing outlines; more would close narrow cells."""
 _NOISE_ROWS = 16
 """The noise is measured in every so many rows."""
 _DEVIATION = 1.4826
 """Standard deviation over the median of the absolute deviation."""
 _LEAST_AREA = 0.6
 """Of a quadrangle, over the square of the least side."""
-_LEAST_COMPACTNESS = 0.02
-"""Area of a quadrangle over the square of its outline; a square seen at 75 degrees has 0.04."""
+_LEAST_COMPACTNESS = 0.008
+"""Area of a quadrangle over the square of its outline: a square seen at 75 degrees has 0.04, a fourth of that
+when a gap leads inside and all around."""
+_SLACK_PX, _SLACK = 1.0, 0.05
+"""By how much an outline may leave a side [px], and over its length; light that falls in through a gap of the
+border, or something that lies on it, may take more of the outline away."""
+_LEAST_SEEN = 0.5
+"""Share of a side that has to be there."""
 _LEFT = 4
 """Of the eight directions, which count counter-clockwise from the right."""
 _LONGEST_OUTLINE = 4
@@ -57,7 +66,7 @@ class Binarization:
     halvings: int
 
 
-PASSES = (Binarization(7, 0), Binarization(11, 1))
+PASSES = (Binarization(7, 0), Binarization(25, 0), Binarization(35, 1))
 
 
 def find_quads(gray: Gray, least_side: float, least_contrast: float) -> FloatArray:
@@ -71,7 +80,7 @@ def find_quads(gray: Gray, least_side: float, least_contrast: float) -> FloatArr
     Returns:
         (N, 4, 2) corners, clockwise as one sees it, on the boundary between dark and light [px].
     """
-    scaled: MatLike = gray
+    scaled: MatLike = cv2.GaussianBlur(gray, (3, 3), _SMOOTHING_PX)
     scale = 1
     found: list[FloatArray] = []
     for how in PASSES:
@@ -213,17 +222,18 @@ def _quadrangle(points: IntArray, length: int, least_side: float, quad: FloatArr
         j = i + 1 if i + 1 < length else 0
         twice_area += points[i, 0] * points[j, 1] - points[j, 0] * points[i, 1]
     # followed counter-clockwise as seen: negative where v points down; the outlines of holes are positive
-    if -0.5 * twice_area < max(_LEAST_AREA * least_side**2, _LEAST_COMPACTNESS * length**2):
+    if twice_area >= 0:
         return False
     corners = np.empty(4, np.int64)
-    if not _corner_points(points, length, -0.5 * twice_area, corners):
+    area = _corner_points(points, length, corners)
+    if area < max(_LEAST_AREA * least_side**2, _LEAST_COMPACTNESS * length**2, -0.375 * twice_area):
         return False
     return _sides(points, length, corners, least_side, quad)
 
 
 @compiled
-def _corner_points(points: IntArray, length: int, area: float, corners: NDArray[np.int64]) -> bool:
-    """Indices of the four points of an outline that span the largest quadrangle, ascending."""
+def _corner_points(points: IntArray, length: int, corners: NDArray[np.int64]) -> float:
+    """Indices of the four points of an outline that span the largest quadrangle, ascending; its area."""
     mean_u, mean_v = 0.0, 0.0
     for i in range(length):
         mean_u += points[i, 0]
@@ -249,9 +259,9 @@ def _corner_points(points: IntArray, length: int, area: float, corners: NDArray[
     for k in range(4):
         a, b = corners[k - 1], corners[k]
         if a == b:
-            return False
+            return 0.0
         twice += points[a, 0] * points[b, 1] - points[b, 0] * points[a, 1]
-    return -0.5 * twice > 0.75 * area
+    return -0.5 * twice
 
 
 @compiled
@@ -286,18 +296,22 @@ def _sides(
         chord = math.hypot(du, dv)
         if chord < 0.6 * least_side:
             return False
-        skip = min(int(0.15 * count), 12)
+        steps = max(abs(du), abs(dv))
+        skip = min(int(0.15 * steps), 12)
+        slack = _SLACK_PX + _SLACK * chord
         n, su, sv, suu, suv, svv = 0, 0.0, 0.0, 0.0, 0.0, 0.0
         for step in range(skip, count - skip + 1):
-            i = (begin + step) % length
+            i = begin + step if begin + step < length else begin + step - length
             u, v = float(points[i, 0] - points[begin, 0]), float(points[i, 1] - points[begin, 1])
+            if abs(du * v - dv * u) > slack * chord:  # where a gap leads inside
+                continue
             n += 1
             su += u
             sv += v
             suu += u * u
             suv += u * v
             svv += v * v
-        if n < 2:
+        if n < max(_LEAST_SEEN * (steps - 2 * skip), 2):
             return False
         su, sv = su / n, sv / n
         suu, suv, svv = suu / n - su * su, suv / n - su * sv, svv / n - sv * sv
