@@ -6,8 +6,9 @@
 Nobody's start is known, every element has a gain of its own (10 %), steps are longer or shorter than the
 robots believe (8 %), every other robot wanders. "live" is the whole graph: emulated firmware on
 pseudo-terminals, drivers, DDS, the estimator node. "replay" is the same swarm as a bag, matrices 150-300 ms
-late and one in twenty lost, through the estimator's core. Errors are those of poses from a time on when the
-swarm has found itself.
+late and one in twenty lost, through the estimator's core; "calibrated" is a replay with gains that were found
+without ground truth (`calibrate_ir`) in another minute of the same robots. Errors are those of poses from a
+time on when the swarm has found itself.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ from swarm_loc_drivers.sim.droplet_run import (
     simulate_droplets,
 )
 from swarm_loc_drivers.sim.droplet_swarm import DropletSwarmSettings, describe_droplets, starts
+from swarm_loc_estimator.calibration.infrared import calibrate_infrared
+from swarm_loc_estimator.calibration.recording import read_recording
 from swarm_loc_estimator.core.metrics import Track, pool, summarise
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import Swarm
@@ -50,6 +53,9 @@ from swarm_loc_estimator.replay_result import ReplayResult
 
 ROBOTS = 20
 DURATION_S, SETTLED_S = 90.0, 45.0
+CALIBRATED, CALIBRATION_S = 3, 60.0
+"""So many of the bags are replayed once more, calibrated."""
+_ELSEWHERE = 1000
 WORLD = "d1"
 DRIVER_PROCESSES = 2
 _SILENCE_PATIENCE_S = 60.0
@@ -105,10 +111,25 @@ def outcome_of(result: ReplayResult) -> Outcome:
 
 def replayed(seed: int, folder: Path) -> ReplayResult:
     """The swarm as a bag through the estimator's core."""
-    settings = DropletRunSettings(seed=seed, duration_s=DURATION_S, robots=ROBOTS, world=WORLD)
-    bag = folder / f"replay{seed}"
-    write_droplet_bag(simulate_droplets(settings), bag, "Of the benchmark.", seed)
+    bag = _bag(folder / f"replay{seed}", seed, DURATION_S)
     return replace(replay(bag, load_swarm(bag / "swarm.yaml")), title=f"replay {seed}")
+
+
+def replayed_calibrated(seed: int, folder: Path) -> ReplayResult:
+    """The same bag, its robots calibrated from another one."""
+    other = _bag(folder / f"calibration{seed}", seed, CALIBRATION_S, seed + _ELSEWHERE)
+    swarm = load_swarm(other / "swarm.yaml")
+    recording = read_recording(other, swarm)
+    done = calibrate_infrared(recording, swarm, lambda _share, _what: None, with_truth=False)
+    return replace(replay(folder / f"replay{seed}", done.swarm), title=f"replay {seed} calibrated")
+
+
+def _bag(folder: Path, boards: int, duration_s: float, seed: int | None = None) -> Path:
+    """A bag of robots with such boards, whose motion another seed may fix."""
+    motion = boards if seed is None else seed
+    settings = DropletRunSettings(motion, duration_s, ROBOTS, WORLD, boards=boards)
+    write_droplet_bag(simulate_droplets(settings), folder, "Of the benchmark.", motion)
+    return folder
 
 
 def lived(seed: int, folder: Path, log: Path) -> ReplayResult:
@@ -205,11 +226,15 @@ def measure(live: Sequence[int], replays: Sequence[int]) -> dict[str, float]:
         for seed in replays:
             results.append(replayed(seed, Path(work)))
             print(f"\rreplay {seed} of {len(replays)}", end="", flush=True)
+        for seed in replays[:CALIBRATED]:
+            results.append(replayed_calibrated(seed, Path(work)))
+            print(f"\rreplay {seed}, calibrated", end="", flush=True)
     print()
     outcomes = [outcome_of(result) for result in results]
     report(outcomes)
     print(f"plot: {draw(results[0])}")
-    return figures_of(outcomes[: len(live)], outcomes[len(live) :])
+    plain = len(live) + len(replays)
+    return figures_of(outcomes[: len(live)], outcomes[len(live) : plain], outcomes[plain:])
 
 
 def report(outcomes: Sequence[Outcome]) -> None:
@@ -230,10 +255,16 @@ def report(outcomes: Sequence[Outcome]) -> None:
     print(table(head, rows))
 
 
-def figures_of(live: Sequence[Outcome], replays: Sequence[Outcome]) -> dict[str, float]:
+def figures_of(
+    live: Sequence[Outcome], replays: Sequence[Outcome], calibrated: Sequence[Outcome]
+) -> dict[str, float]:
     """Means over the runs; those of the whole graph where there are any."""
     figures: dict[str, float] = {}
-    for prefix, ones in (("swarm20", live or replays), ("swarm20.replay", replays)):
+    for prefix, ones in (
+        ("swarm20", live or replays),
+        ("swarm20.replay", replays),
+        ("swarm20.calibrated", calibrated),
+    ):
         for name in ("position_cm", "heading_deg", "nees", "located"):
             if ones:
                 figures[f"{prefix}.{name}"] = float(np.mean([getattr(one, name) for one in ones]))
