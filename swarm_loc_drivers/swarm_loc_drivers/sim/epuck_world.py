@@ -21,6 +21,7 @@ from .hidden_geometry import hidden_geometry
 from .photographer import Photographer, Stage
 from .proximity import proximity_values
 from .render.lens import CameraModel
+from .render.views import Views
 from .trajectories import Trajectories
 from .worlds import World
 
@@ -111,9 +112,10 @@ class EpuckWorld:
         """(N, 2) that the left and the right motor have done since the start."""
         self._past = deque([(self.now_ns, self.poses)], maxlen=_REMEMBERED_NS // STEP_NS)
         self._period_ns = round(1e9 / settings.camera_rate_hz)
-        phases = self._random(_PHASES).integers(0, self._period_ns, count)
         first_ns = settings.start_ns + round(1e9 * settings.world.exposure_early_s) + self._half_exposure_ns
-        self._next = [self._exposure(robot, 0, first_ns + int(phases[robot])) for robot in range(count)]
+        phases = self._random(_PHASES).integers(0, self._period_ns, count)
+        self._first_ns: list[int] = (first_ns + phases).tolist()
+        self._next = [self._exposure(robot, 0) for robot in range(count)]
         self.newest: list[Exposure | None] = [None] * count
         """The last picture that each camera has taken."""
 
@@ -142,6 +144,10 @@ class EpuckWorld:
         rng = self._random(_SENSOR, exposure.robot, exposure.number)
         return self._photographer.take(exposure.robot, exposure.middle_ns, track, rng)
 
+    def views(self, robot: int, poses: FloatArray) -> Views:
+        """Where markers lie in a robot's pictures when all robots stand at `poses` (N, 3); for evaluation."""
+        return self._photographer.views(robot, poses)
+
     def proximity(self, robot: int) -> NDArray[np.int64]:
         """Raw values (8,) of a robot's proximity sensors now."""
         rng = self._random(_PROXIMITY, robot, self.now_ns)
@@ -151,11 +157,16 @@ class EpuckWorld:
         """Note the picture that was due, and when the next one is."""
         exposure = self._next[robot]
         self.newest[robot] = exposure
-        self._next[robot] = self._exposure(robot, exposure.number + 1, exposure.stamp_ns + self._period_ns)
+        self._next[robot] = self._exposure(robot, exposure.number + 1)
         return exposure
 
-    def _exposure(self, robot: int, number: int, stamp_ns: int) -> Exposure:
-        """A picture to come; it is taken before its stamp as the world has it."""
+    def exposure_of(self, robot: int, stamp_ns: int) -> Exposure:
+        """The picture that a camera stamps so, at any time: which one it is, and when it is truly taken."""
+        return self._exposure(robot, round((stamp_ns - self._first_ns[robot]) / self._period_ns))
+
+    def _exposure(self, robot: int, number: int) -> Exposure:
+        """A picture; it is taken before its stamp as the world has it."""
+        stamp_ns = self._first_ns[robot] + number * self._period_ns
         early_s = self._settings.world.exposure_early_s * self._random(_EXPOSURES, robot, number).random()
         return Exposure(robot, number, stamp_ns, stamp_ns - round(1e9 * early_s))
 

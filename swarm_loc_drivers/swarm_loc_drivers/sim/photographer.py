@@ -15,6 +15,7 @@ from .render import scene as scenery
 from .render.lens import CameraModel
 from .render.raster import Patches
 from .render.renderer import Eye, Renderer, Scene
+from .render.views import Views, views_of
 from .trajectories import Trajectories
 
 FloatArray = NDArray[np.float64]
@@ -47,8 +48,9 @@ class Photographer:
     def __init__(
         self, swarm: Swarm, truth: HiddenGeometry, stage: Stage, model: CameraModel, seed: int
     ) -> None:
-        scene = _scene(swarm, truth, stage, np.random.default_rng(seed))
-        self._renderer = Renderer(scene, model)
+        self._faces, self._ids = _faces(swarm, truth, stage.family), truth.ids
+        self._scene = _scene(swarm, truth, stage, self._faces, np.random.default_rng(seed))
+        self._renderer = Renderer(self._scene, model)
         self._half_ns = round(0.5e9 * model.exposure_s)
         self._eyes = [
             Eye(index, model, _true_mount(robot.camera, mount), focal_scale=1.0 / scale)
@@ -75,23 +77,45 @@ class Photographer:
         poses = track.all_at(middle_ns + np.rint(shares * half_ns).astype(np.int64))
         return self._renderer.frame(eye, poses, rng)
 
+    def views(self, robot: int, poses: FloatArray) -> Views:
+        """Where markers lie in a picture of a robot's camera when all robots stand at `poses` (N, 3)."""
+        return views_of(self._scene, self._faces, self._ids, self._eyes[robot], poses)
+
 
 def _true_mount(camera: CameraMount | None, true: list[float]) -> CameraMount:
     """A described mount with its true place and yaw."""
     return replace(camera or CameraMount(), x=true[0], y=true[1], yaw=true[2])
 
 
-def _scene(swarm: Swarm, truth: HiddenGeometry, stage: Stage, rng: np.random.Generator) -> Scene:
-    """Arena, landmarks and robots."""
-
-    def board(pose: list[float], mark: Face | Landmark) -> Patches:
-        return scenery.marker(pose, mark.z, stage.family.pattern(mark.id) != 0, mark.size)
-
-    boards = [board(pose, mark) for pose, mark in zip(truth.landmarks.tolist(), swarm.landmarks, strict=True)]
-    all_faces = [face for robot in swarm.robots for face in robot.faces]
-    faces = [board(pose, face) for pose, face in zip(truth.faces.tolist(), all_faces, strict=True)]
-    robots = [
-        [scenery.body(), scenery.tower(), *(faces[k] for k in np.flatnonzero(truth.face_owner == robot))]
-        for robot in range(len(swarm.robots))
+def _faces(swarm: Swarm, truth: HiddenGeometry, family: Family) -> list[list[Patches]]:
+    """Of each robot the markers on it."""
+    faces = [
+        _board(pose, face, family)
+        for pose, face in zip(
+            truth.faces.tolist(), [face for robot in swarm.robots for face in robot.faces], strict=True
+        )
     ]
+    return [
+        [faces[k] for k in np.flatnonzero(truth.face_owner == robot)] for robot in range(len(swarm.robots))
+    ]
+
+
+def _scene(
+    swarm: Swarm,
+    truth: HiddenGeometry,
+    stage: Stage,
+    faces: list[list[Patches]],
+    rng: np.random.Generator,
+) -> Scene:
+    """Arena, landmarks and robots."""
+    boards = [
+        _board(pose, mark, stage.family)
+        for pose, mark in zip(truth.landmarks.tolist(), swarm.landmarks, strict=True)
+    ]
+    robots = [[scenery.body(), scenery.tower(), *own] for own in faces]
     return Scene(scenery.arena(stage.arena, rng), boards, robots)
+
+
+def _board(pose: list[float], mark: Face | Landmark, family: Family) -> Patches:
+    """A marker on its sheet."""
+    return scenery.marker(pose, mark.z, family.pattern(mark.id) != 0, mark.size)
