@@ -139,32 +139,35 @@ class Fusion:
         tied = known[measurements["observer"]] & known[measurements["target"]]
         rows = np.flatnonzero(tied)
         if rows.size:
-            poses, lost = self._advance(state, measurements[rows])
+            poses, motion, lost = self._advance(state, measurements[rows])
             good = ~(lost[measurements["observer"][rows]] | lost[measurements["target"][rows]])
             tied[rows[~good]] = False
             rows = rows[good]
-            verdicts[rows], nis[rows] = self._update(state, measurements[rows], poses[good])
+            verdicts[rows], nis[rows] = self._update(state, measurements[rows], poses[good], motion[good])
         for k in np.flatnonzero(~tied):
             verdicts[k] = self._note(state, measurements[k : k + 1])
 
     def _advance(
         self, state: SwarmState, measurements: MeasurementArray
-    ) -> tuple[FloatArray, NDArray[np.bool_]]:
+    ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
         """Predict the robots involved to the mean of their measurements; those unsure where they are leave.
 
         Returns:
-            Poses (m, 2, 3) of observers and targets at the stamps, and (N + 1,) whether each robot, and
-            nobody, was lost.
+            Poses (m, 2, 3) of observers and targets at the stamps, their relative motion (m, 3), and (N + 1,)
+            whether each robot, and nobody, was lost.
         """
+        motion = np.zeros((measurements.size, 3))
         poses, lost = np.zeros((measurements.size, 2, 3)), np.zeros(state.tracked.size + 1, dtype=bool)
         columns = MeasurementColumns.of(measurements)
-        judgement.advance_all(columns, self._tracks.arrays, state.arrays(), self._limits, poses, lost[:-1])
+        judgement.advance_all(
+            columns, self._tracks.arrays, state.arrays(), self._limits, poses, motion, lost[:-1]
+        )
         for robot in np.flatnonzero(lost):
             state.lose(int(robot))
-        return poses, lost
+        return poses, motion, lost
 
     def _update(
-        self, state: SwarmState, measurements: MeasurementArray, poses: FloatArray
+        self, state: SwarmState, measurements: MeasurementArray, poses: FloatArray, motion: FloatArray
     ) -> tuple[NDArray[np.uint8], FloatArray]:
         """Judge measurements (m,) against one belief, use those that pass; return verdicts and their NIS."""
         m = measurements.size
@@ -173,7 +176,9 @@ class Fusion:
         difference, noise = np.empty((m, 3)), np.empty((m, 3, 3))
         passed, nis = np.empty(m, dtype=bool), np.empty(m)
         fields = MeasurementColumns.of(measurements)
-        judgement.judge_all(fields, state.arrays(), poses, columns, jacobian, difference, noise, passed, nis)
+        judgement.judge_all(
+            fields, state.arrays(), poses, motion, columns, jacobian, difference, noise, passed, nis
+        )
         if passed.any():
             correction = state.filter.update(
                 columns[passed], jacobian[passed], difference[passed], noise[passed]

@@ -9,7 +9,7 @@ from swarm_loc_estimator.core.compiled import assign, assign_matrix, compiled, c
 from swarm_loc_estimator.core.dense_filter import IndexArray, update_one
 from swarm_loc_estimator.core.gate import position_distance, soften_heading, squared_distance
 from swarm_loc_estimator.core.measurements import MeasurementColumns, innovation, predict_one
-from swarm_loc_estimator.core.motion import TrackArrays, look_up
+from swarm_loc_estimator.core.motion import TrackArrays, look_up, rate_at
 from swarm_loc_estimator.core.parameters import CAMERA_SCALE, CAMERA_YAW, PARAMETERS
 from swarm_loc_estimator.core.prediction import advance
 from swarm_loc_estimator.core.se2 import FloatArray
@@ -52,7 +52,7 @@ def fuse_in_order(
     """
     pose, gathered, raw = np.empty((2, 3)), np.empty((2, 3, 3)), np.empty(3)
     columns, jacobian = np.empty(DEPENDS_ON, dtype=np.int64), np.empty((3, DEPENDS_ON))
-    difference, r = np.empty(3), np.empty((3, 3))
+    difference, r, motion = np.empty(3), np.empty((3, 3)), np.empty(3)
     for k in range(begin, measurements.stamp_ns.size):
         sides = (measurements.observer[k], measurements.target[k])
         for side in sides:
@@ -67,7 +67,8 @@ def fuse_in_order(
                     return k, LOST, sides[i]
         if measurements.landmark[k] > 0:
             assign(pose[1], belief.landmark[measurements.landmark[k] - 1])
-        passed, nis[k] = judge(measurements, k, belief, pose, columns, jacobian, difference, r)
+        relative_motion(measurements, k, tracks, pose, motion)
+        passed, nis[k] = judge(measurements, k, belief, pose, motion, columns, jacobian, difference, r)
         verdicts[k] = USED if passed else GATED
         if passed:
             correct(belief, update_one(belief.covariance, columns, jacobian, difference, r))
@@ -84,6 +85,7 @@ def advance_all(
     belief: BeliefArrays,
     limits: tuple[float, float, int],
     pose: FloatArray,
+    motion: FloatArray,
     unsure: NDArray[np.bool_],
 ) -> None:
     """Predict every robot involved to the mean of its measurements.
@@ -95,6 +97,7 @@ def advance_all(
         limits: See `fuse_in_order`.
         pose: (m, 2, 3) written: observers and targets in `map` at the stamps, or by what a landmark is moved;
             nobody's is not written.
+        motion: (m, 3) written, see `relative_motion`.
         unsure: (N,) written: robots involved that no longer know where they are.
     """
     robots = belief.tracked.size
@@ -123,6 +126,36 @@ def advance_all(
                 unsure[robot] = is_unsure(belief, robot, pose[k, i], limits[0], limits[1])
         if measurements.landmark[k] > 0:
             assign(pose[k, 1], belief.landmark[measurements.landmark[k] - 1])
+        relative_motion(measurements, k, tracks, pose[k], motion[k])
+
+
+@compiled
+def relative_motion(
+    measurements: MeasurementColumns, k: int, tracks: TrackArrays, pose: FloatArray, motion: FloatArray
+) -> None:
+    """Write how fast xi_target - xi_observer (3,) of measurement k changes by both robots' driving [1/s].
+
+    Zero where the stamp is exact, and it does not matter.
+
+    Args:
+        measurements: (m,).
+        k: Which one.
+        tracks: Odometry.
+        pose: (2, 3) of observer and target in `map`.
+        motion: Written.
+    """
+    motion.fill(0.0)
+    if measurements.stamp_variance[k] == 0.0:
+        return
+    rate, sides = np.empty(3), (measurements.observer[k], measurements.target[k])
+    for i in range(2):
+        if sides[i] >= 0:
+            rate_at(tracks, sides[i], measurements.stamp_ns[k], rate)
+            cos, sin, sign = np.cos(pose[i, 2]), np.sin(pose[i, 2]), 2.0 * i - 1.0
+            # the body's own velocity, seen from the origin of map
+            motion[0] += sign * (cos * rate[0] - sin * rate[1] + rate[2] * pose[i, 1])
+            motion[1] += sign * (sin * rate[0] + cos * rate[1] - rate[2] * pose[i, 0])
+            motion[2] += sign * rate[2]
 
 
 @compiled
@@ -139,6 +172,7 @@ def judge_all(
     measurements: MeasurementColumns,
     belief: BeliefArrays,
     pose: FloatArray,
+    motion: FloatArray,
     columns: IndexArray,
     jacobian: FloatArray,
     difference: FloatArray,
@@ -152,6 +186,7 @@ def judge_all(
         measurements: (m,).
         belief: Not changed.
         pose: (m, 2, 3) as `advance_all` writes it.
+        motion: (m, 3) likewise.
         columns: (m, DEPENDS_ON) written: what each depends on.
         jacobian: (m, 3, DEPENDS_ON) written.
         difference: (m, 3) written: the innovations.
@@ -161,7 +196,7 @@ def judge_all(
     """
     for k in range(measurements.stamp_ns.size):
         passed[k], nis[k] = judge(
-            measurements, k, belief, pose[k], columns[k], jacobian[k], difference[k], noise[k]
+            measurements, k, belief, pose[k], motion[k], columns[k], jacobian[k], difference[k], noise[k]
         )
 
 
@@ -171,6 +206,7 @@ def judge(
     k: int,
     belief: BeliefArrays,
     pose: FloatArray,
+    motion: FloatArray,
     columns: IndexArray,
     jacobian: FloatArray,
     difference: FloatArray,
@@ -200,6 +236,7 @@ def judge(
             jacobian[i, 6 + j] = chain[i, 3 + j] if camera_columns[j] >= 0 else 0.0
     s = np.empty((3, 3))
     assign_matrix(noise, measurements.covariance[k])
+    _add_stamp_noise(chain, motion, measurements.stamp_variance[k], noise)
     assign_matrix(s, noise)
     add_uncertainty(belief.covariance, bodies, camera_columns, chain, s)
     innovation(measurements, k, measurements.value[k], predicted, difference)
@@ -210,12 +247,25 @@ def judge(
             assign(difference, other)
     passed = position_distance(difference, s) <= measurements.gate[k]
     if measurements.has_heading[k]:
+        before = noise[:, 2].copy()
         soften_heading(difference, s, noise)
         for i in range(3):
-            s[i, 2] += noise[i, 2] - measurements.covariance[k, i, 2]
+            s[i, 2] += noise[i, 2] - before[i]
             if i < 2:
                 s[2, i] = s[i, 2]
     return passed, squared_distance(difference, s)
+
+
+@compiled
+def _add_stamp_noise(chain: FloatArray, motion: FloatArray, variance: float, noise: FloatArray) -> None:
+    """Add to `noise` (3, 3) what a stamp of such variance does to a value that changes by `motion` (3,)."""
+    change = np.zeros(3)
+    for i in range(3):
+        for j in range(3):
+            change[i] += chain[i, j] * motion[j]
+    for i in range(3):
+        for j in range(3):
+            noise[i, j] += variance * change[i] * change[j]
 
 
 @compiled

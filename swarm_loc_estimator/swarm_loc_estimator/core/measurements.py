@@ -50,6 +50,7 @@ MEASUREMENT_DTYPE = np.dtype(
         ("kind", np.int64),  # Kind
         ("has_heading", np.int64),  # 1 when value[2] was measured, else 0
         ("has_alternative", np.int64),  # 1 when `alternative` is a second, mirrored solution, else 0
+        ("stamp_variance", np.float64),  # of stamp_ns [s^2], times how many measurements share this error
         ("gate", np.float64),  # largest squared distance of its first two components that is believed
         ("sensor", np.float64, (3,)),  # S: x [m], y [m], yaw [rad] in the observer's base_link
         ("marker", np.float64, (3,)),  # M: in the target's base_link, or in map
@@ -76,6 +77,7 @@ class MeasurementColumns(NamedTuple):
     kind: NDArray[np.int64]
     has_heading: NDArray[np.int64]
     has_alternative: NDArray[np.int64]
+    stamp_variance: FloatArray
     gate: FloatArray
     sensor: FloatArray
     marker: FloatArray

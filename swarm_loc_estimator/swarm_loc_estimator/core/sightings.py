@@ -25,7 +25,7 @@ from swarm_loc_estimator.core.measurements import (
     MeasurementColumns,
 )
 from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.swarm import CameraMount, SensorModel, Swarm
+from swarm_loc_estimator.core.swarm import CameraMount, Face, SensorModel, Swarm
 
 IntArray = NDArray[np.int64]
 
@@ -70,12 +70,16 @@ class _Cameras(NamedTuple):
 
 
 class _Markers(NamedTuple):
-    """All markers by ascending id (k,): whose, which landmark, and M (k, 3), heading NaN if it has none."""
+    """All markers by ascending id (k,): whose, which landmark, M (k, 3), heading NaN if it has none.
+
+    `variance` (k,) is that of a face's place on its robot; a landmark's is up to the filter.
+    """
 
     id: IntArray
     owner: IntArray
     landmark: IntArray
     pose: FloatArray
+    variance: FloatArray
 
 
 class _Detections(NamedTuple):
@@ -119,6 +123,7 @@ class SightingConverter:
             owner=np.array([owner.robot_index for _, owner in owners], dtype=np.int64),
             landmark=np.array([number.get(marker_id, 0) for marker_id, _ in owners], dtype=np.int64),
             pose=np.array([[m.x, m.y, np.nan if m.yaw is None else m.yaw] for m in markers]).reshape(-1, 3),
+            variance=np.array([m.position_sigma**2 if isinstance(m, Face) else 0.0 for m in markers]),
         )
 
     def convert(self, robots: IntArray, stamps_ns: IntArray, detections: NDArray[np.void]) -> Conversion:
@@ -145,7 +150,21 @@ class SightingConverter:
         counts = np.bincount(fates, minlength=len(_FATES)).tolist()
         dropped = {_FATES[fate]: counts[fate] for fate in range(1, len(_FATES)) if counts[fate]}
         measured: NDArray[np.bool_] = fates == _MEASURED
-        return Conversion(measurements[measured], measured, dropped)
+        measurements = measurements[measured]
+        self._note_stamp_variance(measurements)
+        return Conversion(measurements, measured, dropped)
+
+    def _note_stamp_variance(self, measurements: MeasurementArray) -> None:
+        """Say how unsure the stamps are.
+
+        All that a picture shows shares the error of its stamp. Told of each alone, times their number, it is
+        not taken for smaller than it is by who takes them for independent.
+        """
+        variance = np.square(self._cameras.sensor["time_sigma_s"])[measurements["observer"]]
+        if variance.any():
+            pictures = np.stack([measurements["observer"], measurements["stamp_ns"]])
+            _, picture, count = np.unique(pictures, axis=1, return_inverse=True, return_counts=True)
+            measurements["stamp_variance"] = variance * count[picture]
 
 
 @compiled
@@ -177,6 +196,8 @@ def _convert_all(
         if detections.content[k] == CONTENT_POSITION or math.isnan(marker[2]):
             out.kind[k] = _POLAR
             _calibrate(sensor, position, out.target[k], out.value[k], out.covariance[k])
+            out.covariance[k, 0, 0] += markers.variance[place]
+            out.covariance[k, 1, 1] += markers.variance[place] / max(out.value[k, 0] ** 2, 1e-6)
             continue
         out.has_heading[k], out.marker[k, 2] = 1, marker[2]
         out.value[k, 0], out.value[k, 1] = position[0], position[1]
@@ -188,6 +209,8 @@ def _convert_all(
             out.alternative[k, 0], out.alternative[k, 1] = other_position[0], other_position[1]
             out.alternative[k, 2] = _face_heading(level, detections.alternative_orientation[k])
         _pose_noise(sensor, level, detections.covariance[k], out.covariance[k])
+        out.covariance[k, 0, 0] += markers.variance[place]
+        out.covariance[k, 1, 1] += markers.variance[place]
 
 
 @compiled

@@ -134,6 +134,9 @@ class SensorModel:
     time_offset_s: float = number(
         0.0, "s", -2.0, 2.0, "the picture was taken this much after its stamp (negative: before)"
     )
+    time_sigma_s: float = number(
+        0.0, "s", 0.0, 2.0, "noise of that time from picture to picture, the same for all that one shows"
+    )
     gate_probability: float = number(
         0.9999, "1", 0.5, 1.0, "share of good sightings that must pass the gate; 1 passes all"
     )
@@ -169,6 +172,7 @@ class Face:
         z: [m], up.
         yaw: Direction out of the face [rad]; None when the marker shows no heading.
         size: Side of the marker, black border included [m].
+        position_sigma: How unsure x and y are, each [m].
     """
 
     name: str
@@ -178,6 +182,9 @@ class Face:
     z: float = number(0.0, "m", -10.0, 10.0, "above base_link")
     yaw: float | None = number(None, "rad", -TURN, TURN, "direction out of the face; null: shows no heading")
     size: float = number(0.036, "m", 0.001, 10.0, "side of the marker, black border included")
+    position_sigma: float = number(
+        0.0, "m", 0.0, 10.0, "how unsure x and y are; adds to the noise of its sightings"
+    )
 
 
 @dataclass(frozen=True)

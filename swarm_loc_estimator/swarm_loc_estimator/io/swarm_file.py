@@ -14,7 +14,8 @@ types:
       speed_share: [[1.0, 0.9, 0.9], [1.0, 0.8, 0.7]]
       turn_share: [[1.0, 0.9, 0.9], [1.0, 0.9, 0.9]]
     camera: {x: 0.035, z: 0.028}            # null: it has none
-    faces: {front: {x: 0.035, yaw: 0.0, size: 0.036}}   # markers on the body; null takes one away
+    faces:                                  # markers on the body; null takes one away
+      front: {x: 0.035, yaw: 0.0, size: 0.036, position_sigma: 0.001}
   droplet:
     odometry: null                          # null: it has none, and stands where it is
     camera: null
