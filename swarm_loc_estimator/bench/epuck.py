@@ -8,13 +8,17 @@ worth to those who never see a landmark. W2 has hidden systematic errors that to
 experiment: unknown yaw and scale of every camera, a badly surveyed map, late stamps, turns that slip. There
 "paper" is the paper's own filter (closest stored state, printed sigmas, no gate), and "selfcal" estimates
 yaw, scale, slip and the map along with the poses. Errors are those of poses ten times a second as they come
-out, while sightings are still 150-300 ms late. At the end the marker detector sees the same pictures as
-others.
+out, while sightings are still 150-300 ms late. "rendered" is W2 with five robots through everything there is:
+rendered pictures, the marker detector, emulated firmware, drivers, the whole graph over DDS, with "selfcal"
+live and beside it the same data through the paper's filter. At the end the marker detector sees the same
+pictures as others.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
+import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -26,11 +30,14 @@ from vision_bench import report as vision_report
 
 from bench._common import Cell, new_plot, save_plot, table, write_figures
 from bench._core import errors_of, nees, run_core
+from bench.epuck_rendered_report import rendered_worlds
+from bench.epuck_rendered_report import report as report_rendered
 from swarm_loc_drivers.sim.dense import DenseSettings, blind_robots, simulate_dense
 from swarm_loc_drivers.sim.eight import EightSettings, simulate_eight
 from swarm_loc_drivers.sim.worlds import W0, W2, W2_FAST, World
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.swarm import Robot, Swarm
+from swarm_loc_estimator.live_graph import LiveError
 
 if TYPE_CHECKING:
     from swarm_loc_drivers.sim.record import SimulatedRun
@@ -38,6 +45,7 @@ if TYPE_CHECKING:
 SLOW, FAST = 0.06, 0.08
 W0_SEEDS, DENSE_SEEDS, WORLDS, FAST_WORLDS = 6, 3, 24, 8
 VISION_SEEDS, VISION_FRAMES = 3, 10
+RENDERED_SEEDS, RENDERED_S = 3, 60.0
 TICK_NS = 100_000_000
 SETTLING_S = 10.0
 LAPS_S = 108.0
@@ -110,9 +118,10 @@ def self_calibrating(swarm: Swarm) -> Swarm:
 
 
 def _self_calibrating(robot: Robot) -> Robot:
-    camera = robot.camera
+    camera, spread_s = robot.camera, W2.exposure_early_s
     return replace(
         robot,
+        faces=tuple(replace(face, position_sigma=W2.face_position_sigma) for face in robot.faces),
         odometry=replace(robot.odometry, turn_scale_sigma=0.1, distance_scale_sigma=0.01),
         camera=camera and replace(camera, yaw_sigma=0.03),
         sensor=replace(
@@ -121,7 +130,8 @@ def _self_calibrating(robot: Robot) -> Robot:
             left_sigma=0.01,
             heading_sigma=0.12,
             distance_scale_sigma=0.03,
-            time_offset_s=-0.5 * W2.exposure_early_s,
+            time_offset_s=-0.5 * spread_s,
+            time_sigma_s=spread_s / math.sqrt(12.0),
         ),
     )
 
@@ -254,22 +264,44 @@ def draw(results: dict[str, list[Outcome]]) -> None:
     print(f"plot: {save_plot(figure, 'epuck')}")
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def measure_rendered(count: int) -> dict[str, float]:
+    """The figures of so many worlds through the whole graph.
+
+    Raises:
+        LiveError: A node has ended, or nothing goes on.
+    """
+    if not count:
+        return {}
+    paper, settings = FILTERS["paper"]
+    worlds = rendered_worlds(range(1, count + 1), RENDERED_S, self_calibrating, paper, settings)
+    return report_rendered(worlds, SETTLING_S)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument(
         "--worlds", type=int, default=WORLDS, help="how many of W2, and at most of the others"
     )
+    parser.add_argument(
+        "--rendered", type=int, default=RENDERED_SEEDS, help="how many worlds through the whole graph"
+    )
     options = parser.parse_args(arguments)
+    try:
+        figures = measure_rendered(options.rendered)
+    except LiveError as error:
+        print(f"\n{error}", file=sys.stderr)
+        return 1
     rows = cases(options.worlds)
     outcome((replace(rows[-1], robots=2), 1))  # compiles what is not compiled yet
-    figures = report(measure(rows))
+    figures |= report(measure(rows))
     print("markers in pictures ...", flush=True)
     seen = vision_report.measure(range(VISION_SEEDS), VISION_FRAMES)
     print(f"{seen.tables()}\nplot: {vision_report.plot(seen.scores)}")
     figures |= seen.figures()
     print(f"figures: {write_figures('epuck', figures)}")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
