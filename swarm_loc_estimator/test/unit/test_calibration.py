@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +18,12 @@ from swarm_loc_estimator.calibration.rerun import rerun
 from swarm_loc_estimator.calibration.response import Drive, Lateness, fit_response, nodes_of
 from swarm_loc_estimator.calibration.robust import population, ridge, softened
 from swarm_loc_estimator.calibration.windows import steps_of, true_motion
+from swarm_loc_estimator.cli.calibrate import main
 from swarm_loc_estimator.core.motion_response import MotionResponse
 from swarm_loc_estimator.core.swarm import CameraMount, OdometryModel, Robot, SensorModel
+from swarm_loc_estimator.io.swarm_file import load_swarm
 
+DROPLETS = Path(__file__).parents[3] / "bags" / "droplets_twenty"
 TRUE = Robot(
     "true",
     odometry=OdometryModel(course_offset=0.02, axle_offset=-0.03, delay_s=0.08, lag_s=0.2),
@@ -141,6 +146,18 @@ def test_with_too_little_there_is_one_sentence() -> None:
     recording, swarm = record(World((robot(1, TRUE),), 13, duration_s=8.0))
     with pytest.raises(CalibrationError, match="too little ground truth"):
         calibrate(recording, swarm, Options(), quiet)
+
+
+def test_the_command_says_which_inputs_of_a_bag_it_does_not_use(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nor does it need any detection."""
+    out = tmp_path / "out.yaml"
+    assert main([str(DROPLETS), "--out", str(out), "--plain", "--evaluations", "1"]) == 0
+    shown = capsys.readouterr().out
+    said = r"Not used: \d{3} messages on <robot>/brightness and \d+ messages on <robot>/fix\. Infrared"
+    assert re.search(said, shown)
+    assert load_swarm(out).robots[0].odometry.turn_noise > 0.0
 
 
 def test_nodes_follow_what_was_driven() -> None:
