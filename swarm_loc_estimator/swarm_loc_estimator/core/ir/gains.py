@@ -20,7 +20,7 @@ from swarm_loc_estimator.core.ir.brightness import expected_with_slopes
 from swarm_loc_estimator.core.ir.likelihood import MaximumLikelihood
 from swarm_loc_estimator.core.ir.platform import GAIN_RANGE, IrGains, IrPlatform, PairGains
 from swarm_loc_estimator.core.ir.solution import DARKEST, Outcome
-from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.se2 import FloatArray, wrap_angle
 
 Progress = Callable[[str], None]
 
@@ -126,16 +126,30 @@ def _poses(
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """The pose (k, 3) of every exchange, and which of them can be relied on.
 
+    Readings have a say even where the pose is known: robots may have moved while they exchanged.
+
     Raises:
         GainsError: None of them.
     """
     solutions = estimator.solve(exchanges.readings, pairs)
     known = _known(exchanges)
     sure = (solutions.odds < _MOST_ODDS) & (solutions.misfits < _MOST_MISFIT)
-    used = np.asarray((solutions.outcomes == Outcome.FOUND) & (known | sure))
+    found = solutions.outcomes == Outcome.FOUND
+    used = np.asarray(found & (known | sure))
     if not used.any():
         raise GainsError(f"None of {len(used)} exchanges determines a pose.")
-    return np.where(known[:, None], exchanges.poses, solutions.poses), used
+    poses, both = np.where(known[:, None], exchanges.poses, solutions.poses), found & known
+    prior = np.diag(np.square(_POSE_SIGMA))
+    share = prior @ np.linalg.inv(prior + solutions.covariances[both])
+    poses[both] += np.einsum("kab,kb->ka", share, _apart(solutions.poses[both], poses[both]))
+    return poses, used
+
+
+def _apart(poses: FloatArray, others: FloatArray) -> FloatArray:
+    """Poses (k, 3) less others, angles wrapped."""
+    apart = poses - others
+    apart[:, 1:] = wrap_angle(apart[:, 1:])
+    return apart
 
 
 def _known(exchanges: Exchanges) -> NDArray[np.bool_]:
@@ -215,7 +229,8 @@ def _improved(
     than noise explains, as those of robots do that move meanwhile.
     """
     linear = _linearized(platform, exchanges, logs, poses, used)
-    information, pull = _without_pose(linear, _known(exchanges)[used], _BACKGROUND * platform.noise)
+    to_known = _apart(exchanges.poses[used], poses[used])
+    information, pull = _without_pose(linear, to_known, _BACKGROUND * platform.noise)
     _, robots, n = logs.shape
     own = np.arange(n)
     sensors = exchanges.receiver[used, None] * n + own
@@ -233,12 +248,15 @@ def _improved(
     return logs + step.reshape(logs.shape), both, float(np.abs(step).max())
 
 
-def _without_pose(
-    linear: _Linear, known: NDArray[np.bool_], background: float
-) -> tuple[FloatArray, FloatArray]:
+def _without_pose(linear: _Linear, to_known: FloatArray, background: float) -> tuple[FloatArray, FloatArray]:
     """The information (u, 2n, 2n) on log-gains of each exchange's sensors and emitters, and its pull (u, 2n).
 
     The pose is eliminated, with what is known of it, and so is the background of each sensor.
+
+    Args:
+        linear: The readings.
+        to_known: (u, 3) from the poses to those that are known; NaN where none is.
+        background: Standard deviation of each sensor's [count].
     """
     weight, expected, slopes = linear.weight, linear.expected, linear.slopes
     bright = weight * expected
@@ -250,10 +268,12 @@ def _without_pose(
     gains[:, :n, n:], gains[:, n:, :n] = both, np.swapaxes(both, 1, 2)
     to_pose = np.concatenate([mixed.sum(axis=(1, 3)), mixed.sum(axis=(1, 2))], axis=1)
     pose = np.einsum("kmij,kmija,kmijb->kab", weight, slopes, slopes)
+    known = np.isfinite(to_known[:, 0])
     pose[known] += np.diag(1.0 / np.square(_POSE_SIGMA))
     of_gains = bright * linear.residual
     pull = np.concatenate([of_gains.sum(axis=(1, 3)), of_gains.sum(axis=(1, 2))], axis=1)
     of_pose = np.einsum("kmij,kmija->ka", weight * linear.residual, slopes)
+    of_pose[known] += to_known[known] / np.square(_POSE_SIGMA)
     dark = _of_background(linear, background)
     gains, to_pose = gains - dark[:, :-4, :-4], to_pose - dark[:, :-4, -4:-1]
     pose, pull, of_pose = pose - dark[:, -4:-1, -4:-1], pull - dark[:, :-4, -1], of_pose - dark[:, -4:-1, -1]
