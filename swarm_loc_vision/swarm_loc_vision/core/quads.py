@@ -35,8 +35,8 @@ _SMOOTHING_PX = 0.5
 """Standard deviation of the blur that keeps noise from tearing outlines; more would close narrow cells."""
 _NOISE_ROWS = 16
 """The noise is measured in every so many rows."""
-_DEVIATION = 1.4826
-"""Standard deviation over the median of the absolute deviation."""
+_DEVIATION = 0.75
+"""Standard deviation of noise, blurred as above, over the median of its second differences."""
 _LEAST_AREA = 0.6
 """Of a quadrangle, over the square of the least side."""
 _LEAST_COMPACTNESS = 0.008
@@ -110,9 +110,7 @@ def _distinct(quads: FloatArray) -> FloatArray:
 def _dark(gray: MatLike, window: int, least_contrast: float) -> NDArray[np.uint8]:
     """255 where a picture is darker than around; its frame is light, so that outlines end inside."""
     mean = cv2.blur(gray, (window, window))
-    rows = slice(None, None, _NOISE_ROWS)
-    noise = _DEVIATION * float(np.median(cv2.absdiff(mean[rows], gray[rows])))
-    contrast = max(least_contrast, _NOISE_SIGMAS * noise)
+    contrast = max(least_contrast, _NOISE_SIGMAS * _noise(gray))
     dark = cv2.threshold(cv2.subtract(mean, gray), contrast - 0.5, _DARK, cv2.THRESH_BINARY)[1]
     surplus = -dark.shape[1] % 8
     if surplus:
@@ -120,6 +118,12 @@ def _dark(gray: MatLike, window: int, least_contrast: float) -> NDArray[np.uint8
     dark[[0, -1]] = 0
     dark[:, [0, -1 - surplus]] = 0
     return np.asarray(dark, np.uint8)
+
+
+def _noise(gray: MatLike) -> float:
+    """Standard deviation of the noise [counts]; second differences hardly see what a picture shows."""
+    rows = gray[::_NOISE_ROWS].astype(np.int16)
+    return _DEVIATION * float(np.median(np.abs(rows[:, :-2] - 2 * rows[:, 1:-1] + rows[:, 2:])))
 
 
 def _quads(dark: NDArray[np.uint8], least_side: float) -> FloatArray:
