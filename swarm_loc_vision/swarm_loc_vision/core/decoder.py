@@ -28,6 +28,8 @@ _MOST_DARK_ERRORS = 3.0
 """Cells of the 28 of the border's inner ring that may look light."""
 _MOST_SLOPE = 0.5
 """Over the contrast: by how much the border's darkness may differ from side to side."""
+_MIDDLE, _LOW = 0.5, 0.28
+"""Where dark ends between ink and paper; and where, if half the marker lies in a shadow."""
 _FAR = 1e9
 _WEIGHED = 4
 """Words that differ in so many bits more than the nearest one may still be nearer when bits are weighed."""
@@ -117,25 +119,31 @@ def _read(
     clear = np.empty(BITS)
     bits = np.empty(len(words), np.uint8)
     for n in range(len(cells)):
-        contrast[n] = _clear_cells(cells[n], clear)
-        if contrast[n] < least_contrast:
-            continue
-        seen = np.uint64(0)
-        for bit in range(BITS):
-            seen = (seen << np.uint64(1)) | np.uint64(clear[bit] > 0.0)
-        best, distance, runner_up = nearest(words, seen, clear, bits)
-        if distance > correctable or runner_up <= distance:
-            continue
-        quarters[n], word[n] = divmod(best, len(words) // 4)
-        errors[n], margin[n] = distance, 0.5 * (runner_up - distance)
+        before = np.uint64(0)
+        for level in (_MIDDLE, _LOW):
+            contrast[n] = _clear_cells(cells[n], level, clear)
+            if contrast[n] < least_contrast:
+                continue
+            seen = np.uint64(0)
+            for bit in range(BITS):
+                seen = (seen << np.uint64(1)) | np.uint64(clear[bit] > 0.0)
+            if level == _LOW and seen == before:
+                continue
+            before = seen
+            best, distance, runner_up = nearest(words, seen, clear, bits)
+            if distance > correctable or runner_up <= distance:
+                continue
+            quarters[n], word[n] = divmod(best, len(words) // 4)
+            errors[n], margin[n] = distance, 0.5 * (runner_up - distance)
+            break
 
 
 @compiled
-def _clear_cells(cells: FloatArray, clear: FloatArray) -> float:
+def _clear_cells(cells: FloatArray, level: float, clear: FloatArray) -> float:
     """From brightness to -1 (dark) ... 1 (light), in `clear`; the contrast, 0 where there is no dark border.
 
     Dark is a plane through the border's inner ring, which takes in light that falls off; light is the mean
-    of the lighter cells.
+    of the lighter cells. What lies at `level` between them, 0 to 1, is neither.
     """
     sharp = np.empty((GRID - 2, GRID - 2))
     for row in range(GRID - 2):
@@ -180,7 +188,8 @@ def _clear_cells(cells: FloatArray, clear: FloatArray) -> float:
     wrong = 0.0
     for row in range(GRID - 2):
         for column in range(GRID - 2):
-            value = min(max(2.0 * sharp[row, column] / high - 1.0, -1.0), 1.0)
+            above = sharp[row, column] / high - level
+            value = min(max(above / (level if above < 0.0 else min(1.0 - level, 2.0 * level)), -1.0), 1.0)
             if 0 < row < GRID - 3 and 0 < column < GRID - 3:
                 clear[(row - 1) * CELLS + column - 1] = value
             elif value > 0.0:

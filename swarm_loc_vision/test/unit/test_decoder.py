@@ -65,7 +65,7 @@ def test_flipped_bits_are_corrected_as_far_as_is_safe(marker_id: int, flipped: s
     if len(flipped) <= dictionary.correctable:
         assert dictionary.ids[readings.word[0]] == marker_id
         clear = np.empty(BITS)
-        _clear_cells(cells[0], clear)
+        _clear_cells(cells[0], 0.5, clear)
         assert readings.errors[0] == pytest.approx(np.abs(clear[sorted(flipped)]).sum())
         # least clear is a cell like its neighbours; counted through for all that these ids and bits can be
         assert 0.42 * len(flipped) <= readings.errors[0] <= len(flipped)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,7 @@ from vision_bench.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, random_scene
 from swarm_loc_estimator.core.sightings import CONTENT_POSE, CONTENT_POSE_TWO
 from swarm_loc_vision.core.camera import Camera
 from swarm_loc_vision.core.detector import Detections, MarkerDetector
+from swarm_loc_vision.core.draw import draw_marker
 from swarm_loc_vision.core.families import Family, family_named, packed
 from swarm_loc_vision.core.rows import detection_rows
 from swarm_loc_vision.core.settings import DetectorSettings
@@ -100,6 +102,64 @@ def test_only_ids_in_use_are_found() -> None:
     detections = MarkerDetector(DetectorSettings(), [(family, used)]).detect(picture)
     assert set(detections.id.tolist()) <= set(used.tolist())
     assert detections.poses is None
+
+
+def half_in_shadow(picture: Gray) -> Gray:
+    """Stripes of shadow, as of blinds, each as wide as three markers or so."""
+    u = np.arange(WIDTH)
+    return np.asarray(picture * np.where(np.sin(u / 45.0) > 0.0, 1.0, 0.45), np.uint8)
+
+
+def as_jpeg(picture: Gray) -> Gray:
+    """At a quality of 60."""
+    data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 60])[1]
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("change", "share"),
+    [
+        (half_in_shadow, 0.85),
+        (as_jpeg, 0.95),
+        (lambda picture: (picture * 0.12).astype(np.uint8), 0.95),
+        (lambda picture: np.clip(picture * 1.6, 0, 255).astype(np.uint8), 0.95),
+        (lambda picture: cv2.GaussianBlur(picture, (0, 0), 1.5), 0.85),
+    ],
+    ids=["shadows", "jpeg", "dark", "bright", "out of focus"],
+)
+def test_bad_light_and_bad_cameras_hide_few_markers(change: Callable[[Gray], Gray], share: float) -> None:
+    family, found, shown = family_named("apriltag_36h11"), 0, 0
+    for seed in range(3):
+        picture, truths = random_scene(np.random.default_rng(seed), family, 15, Look())
+        truths = [truth for truth in truths if truth.side_px > 24.0]
+        detections = own_detector(family).detect(change(picture))
+        found += len(match(detections, truths))
+        shown += len(truths)
+    assert shown > 30
+    assert found >= share * shown
+
+
+def test_crowded_markers_and_those_with_part_of_the_border_covered_are_found() -> None:
+    family = family_named("apriltag_36h11")
+    ids = np.arange(0, 560, 4)
+    tiles = [np.pad(draw_marker(family, int(i), 5, 0), (0, 5), constant_values=255) for i in ids]
+    rows = [np.hstack(tiles[i : i + 14]) for i in range(0, len(tiles), 14)]
+    sheet = np.pad(np.vstack(rows), 20, constant_values=255)
+    sheet = np.clip(cv2.GaussianBlur(sheet, (0, 0), 0.7) * 0.7 + 30.0, 0, 255).astype(np.uint8)
+    detector = own_detector(family)
+    assert sorted(detector.detect(sheet).id.tolist()) == ids.tolist()
+    pitch = tiles[0].shape[0]
+    for row in range(10):
+        for column in range(14):  # a light strip across the border, as of a reflection or a straw
+            v, u = 20 + row * pitch, 20 + column * pitch
+            sheet[v - 2 : v + 5, u + 14 : u + 20] = 200
+    assert len(np.intersect1d(detector.detect(sheet).id, ids)) > 0.95 * len(ids)
+
+
+def test_inverted_markers_are_none() -> None:
+    family = family_named("apriltag_36h11")
+    picture, _ = random_scene(np.random.default_rng(1), family, 15, Look(clutter=0))
+    assert len(own_detector(family).detect(255 - picture)) == 0
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (7, 5), (33, 41), (960, 1277)])
