@@ -14,11 +14,9 @@ from swarm_loc_estimator.calibration.recording import IntArray, Recording
 from swarm_loc_estimator.core.fusion import Fusion
 from swarm_loc_estimator.core.measurements import MeasurementArray
 from swarm_loc_estimator.core.odometry import OdometryTracks
-from swarm_loc_estimator.core.parameters import ParameterTable
 from swarm_loc_estimator.core.readout import read_out
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.sightings import SightingConverter
-from swarm_loc_estimator.core.state import SwarmState
 from swarm_loc_estimator.core.swarm import Swarm
 from swarm_loc_estimator.replay_result import ReplayResult
 
@@ -44,10 +42,8 @@ def run_in_order(recording: Recording, swarm: Swarm, tick_s: float) -> ReplayRes
     """Poses at every whole multiple of `tick_s`, each from all that was true by then."""
     began = time.perf_counter()
     tracks, measured = tracks_of(recording, swarm), measurements_of(recording, swarm)
-    fusion, state = (
-        Fusion(swarm, EstimatorSettings(), tracks),
-        SwarmState(ParameterTable.of(swarm.robots, swarm.landmarks)),
-    )
+    fusion = Fusion(swarm, EstimatorSettings(), tracks)
+    state = fusion.new_state()
     timeout_s = np.array([robot.odometry.timeout_s for robot in swarm.robots])
     verdicts, nis = np.zeros(measured.size, dtype=np.uint8), np.empty(measured.size)
     stamps_ns, ends = _ticks(recording, measured["stamp_ns"], round(tick_s * 1e9))

@@ -162,6 +162,7 @@ class BrightnessConverter:
         measurements["kind"], measurements["has_heading"] = Kind.POLAR, 1
         measurements["gate"] = [self._gate[receiver] for receiver in receivers.tolist()]
         measurements["value"], measurements["covariance"] = solutions.poses, solutions.covariances
+        measurements["lasting"] = np.nan_to_num(solutions.lasting)
         ambiguous = np.isfinite(solutions.alternatives).all(axis=1)
         measurements["has_alternative"] = ambiguous
         measurements["alternative"][ambiguous] = solutions.alternatives[ambiguous]

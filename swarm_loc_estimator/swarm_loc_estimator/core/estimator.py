@@ -13,12 +13,10 @@ from swarm_loc_estimator.core.fusion import Fusion, Verdict
 from swarm_loc_estimator.core.learned import learned
 from swarm_loc_estimator.core.measurements import Kind, MeasurementArray
 from swarm_loc_estimator.core.odometry import OdometryTracks
-from swarm_loc_estimator.core.parameters import ParameterTable
 from swarm_loc_estimator.core.readout import Status, SwarmEstimate, read_out
 from swarm_loc_estimator.core.screening import Screening, about_robots
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.settings import EstimatorSettings
-from swarm_loc_estimator.core.state import SwarmState
 from swarm_loc_estimator.core.swarm import Swarm
 from swarm_loc_estimator.core.timeline import Timeline
 
@@ -44,11 +42,8 @@ class SwarmEstimator:
         self._screening = Screening(swarm, round(self.settings.future_tolerance_s * 1e9))
         self._brightness = BrightnessConverter(swarm)
         self._fusion = Fusion(swarm, self.settings, self._tracks)
-        self._parameters = ParameterTable.of(swarm.robots, swarm.landmarks)
         self._reach_ns = self._tracks.reach_ns + round(0.5e9 * self.settings.state_period_s)
-        self._timeline = Timeline(
-            self.settings, self._fusion.step, SwarmState(self._parameters), self._reach_ns
-        )
+        self._timeline = Timeline(self.settings, self._fusion.step, self._fusion.new_state(), self._reach_ns)
         self._horizon_ns = round(self.settings.horizon_s * 1e9)
         self._jump_back_ns = round(self.settings.jump_back_s * 1e9)
         self.time_jumps = 0
@@ -63,7 +58,7 @@ class SwarmEstimator:
         self.drop("reset", sum(rows.robot.size for rows in self._odometry) + self._timeline.waiting)
         self._screening.drops.update(self._timeline_drops())
         self._tracks.clear()
-        self._timeline.restart(SwarmState(self._parameters))
+        self._timeline.restart(self._fusion.new_state())
         self._brightness.restart()
         self._begin()
 

@@ -11,11 +11,15 @@ from swarm_loc_estimator.core import judgement, se2
 from swarm_loc_estimator.core.fix import ClueBook
 from swarm_loc_estimator.core.measurements import Kind, MeasurementArray, MeasurementColumns
 from swarm_loc_estimator.core.odometry import OdometryTracks
+from swarm_loc_estimator.core.parameters import ParameterTable
+from swarm_loc_estimator.core.repetition import remember, remember_clue
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.state import SwarmState
 from swarm_loc_estimator.core.swarm import Swarm
 
+_HEARD = 32
+"""A robot remembers what so many others have told it by infrared."""
 _MANY = 64
 """From so many measurements on, one update with all of them costs less than one each, at any swarm size."""
 
@@ -52,6 +56,12 @@ class Fusion:
             if r.start is not None
         }
         self._clues = ClueBook(tracks, settings.fix_window_s)
+        self._table = ParameterTable.of(swarm.robots, swarm.landmarks)
+        self._places = _HEARD if any(robot.ir is not None for robot in swarm.robots) else 0
+
+    def new_state(self) -> SwarmState:
+        """Nothing is known yet."""
+        return SwarmState(self._table, self._places)
 
     def with_starts(self, state: SwarmState, stamp_ns: int) -> SwarmState:
         """The state, together with those robots at their starts about whom there was no measurement yet."""
@@ -173,12 +183,24 @@ class Fusion:
         m = measurements.size
         columns = np.empty((m, judgement.DEPENDS_ON), dtype=np.int64)
         jacobian = np.empty((m, 3, judgement.DEPENDS_ON))
-        difference, noise = np.empty((m, 3)), np.empty((m, 3, 3))
+        difference, noise, predicted = np.empty((m, 3)), np.empty((m, 3, 3)), np.empty((m, 3))
         passed, nis = np.empty(m, dtype=bool), np.empty(m)
         fields = MeasurementColumns.of(measurements)
         judgement.judge_all(
-            fields, state.arrays(), poses, motion, columns, jacobian, difference, noise, passed, nis
+            fields,
+            state.arrays(),
+            poses,
+            motion,
+            columns,
+            jacobian,
+            difference,
+            noise,
+            predicted,
+            passed,
+            nis,
         )
+        for k in np.flatnonzero(passed & (measurements["lasting"] > 0.0).any(axis=1)).tolist():
+            remember(fields, k, state.arrays(), predicted[k], noise[k])
         if passed.any():
             correction = state.filter.update(
                 columns[passed], jacobian[passed], difference[passed], noise[passed]
@@ -190,7 +212,10 @@ class Fusion:
 
     def _note(self, state: SwarmState, one: MeasurementArray) -> Verdict:
         """Keep a measurement (1,) as a clue if it ties a waiting robot to something located."""
-        return Verdict.CLUE if self._clues.note(state, one) else Verdict.UNTIED
+        if not self._clues.note(state, one):
+            return Verdict.UNTIED
+        remember_clue(MeasurementColumns.of(one), 0, state.arrays())
+        return Verdict.CLUE
 
     def _obey(self, state: SwarmState, order: MeasurementArray) -> Verdict:
         """Seat a robot anew or forget it, as the order (1,) says."""

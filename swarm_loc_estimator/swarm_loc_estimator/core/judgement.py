@@ -12,8 +12,10 @@ from swarm_loc_estimator.core.measurements import MeasurementColumns, innovation
 from swarm_loc_estimator.core.motion import TrackArrays, look_up, rate_at
 from swarm_loc_estimator.core.parameters import CAMERA_SCALE, CAMERA_YAW, PARAMETERS
 from swarm_loc_estimator.core.prediction import advance
+from swarm_loc_estimator.core.repetition import remember, widen
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.state import BeliefArrays
+from swarm_loc_estimator.core.uncertainty import add_uncertainty
 
 DEPENDS_ON = 8
 """Filter columns that a measurement depends on: both bodies, observer first, yaw and scale of the camera."""
@@ -52,7 +54,7 @@ def fuse_in_order(
     """
     pose, gathered, raw = np.empty((2, 3)), np.empty((2, 3, 3)), np.empty(3)
     columns, jacobian = np.empty(DEPENDS_ON, dtype=np.int64), np.empty((3, DEPENDS_ON))
-    difference, r, motion = np.empty(3), np.empty((3, 3)), np.empty(3)
+    difference, r, predicted, motion = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3)
     for k in range(begin, measurements.stamp_ns.size):
         sides = (measurements.observer[k], measurements.target[k])
         for side in sides:
@@ -68,9 +70,12 @@ def fuse_in_order(
         if measurements.landmark[k] > 0:
             assign(pose[1], belief.landmark[measurements.landmark[k] - 1])
         relative_motion(measurements, k, tracks, pose, motion)
-        passed, nis[k] = judge(measurements, k, belief, pose, motion, columns, jacobian, difference, r)
+        passed, nis[k] = judge(
+            measurements, k, belief, pose, motion, columns, jacobian, difference, r, predicted
+        )
         verdicts[k] = USED if passed else GATED
         if passed:
+            remember(measurements, k, belief, predicted, r)
             correct(belief, update_one(belief.covariance, columns, jacobian, difference, r))
         lost = count(measurements, k, belief, passed, limits[2])
         if lost >= 0:
@@ -177,6 +182,7 @@ def judge_all(
     jacobian: FloatArray,
     difference: FloatArray,
     noise: FloatArray,
+    predicted: FloatArray,
     passed: NDArray[np.bool_],
     nis: FloatArray,
 ) -> None:
@@ -191,12 +197,22 @@ def judge_all(
         jacobian: (m, 3, DEPENDS_ON) written.
         difference: (m, 3) written: the innovations.
         noise: (m, 3, 3) written: covariances of the measurements.
+        predicted: (m, 3) written: variances of what was to be expected.
         passed: (m,) written: whether the gate lets it through.
         nis: (m,) written.
     """
     for k in range(measurements.stamp_ns.size):
         passed[k], nis[k] = judge(
-            measurements, k, belief, pose[k], motion[k], columns[k], jacobian[k], difference[k], noise[k]
+            measurements,
+            k,
+            belief,
+            pose[k],
+            motion[k],
+            columns[k],
+            jacobian[k],
+            difference[k],
+            noise[k],
+            predicted[k],
         )
 
 
@@ -211,6 +227,7 @@ def judge(
     jacobian: FloatArray,
     difference: FloatArray,
     noise: FloatArray,
+    variances: FloatArray,
 ) -> tuple[bool, float]:
     """Linearise measurement k and decide on it; return whether it passes, and its NIS.
 
@@ -239,6 +256,8 @@ def judge(
     _add_stamp_noise(chain, motion, measurements.stamp_variance[k], noise)
     assign_matrix(s, noise)
     add_uncertainty(belief.covariance, bodies, camera_columns, chain, s)
+    for i in range(3):
+        variances[i] = s[i, i] - noise[i, i]
     innovation(measurements, k, measurements.value[k], predicted, difference)
     if measurements.has_alternative[k]:
         other = np.empty(3)
@@ -253,6 +272,7 @@ def judge(
             s[i, 2] += noise[i, 2] - before[i]
             if i < 2:
                 s[2, i] = s[i, 2]
+    widen(measurements, k, belief, variances, noise)
     return passed, squared_distance(difference, s)
 
 
@@ -276,57 +296,6 @@ def _body_columns(measurements: MeasurementColumns, k: int, belief: BeliefArrays
     if measurements.landmark[k] > 0:
         first = belief.table.survey_column[measurements.landmark[k] - 1]
     return (3 * observer if observer >= 0 else -1), first
-
-
-@compiled
-def add_uncertainty(
-    p: FloatArray, bodies: tuple[int, int], camera: IndexArray, chain: FloatArray, s: FloatArray
-) -> None:
-    """Add H P H^T (3, 3), eq. (13) of the e-puck paper, where H is `chain` (3, 5) by xi_target - xi_observer.
-
-    The difference is taken first: a third of the work.
-
-    Args:
-        p: (n, n) covariance.
-        bodies: First column of the observer and of the target, or -1.
-        camera: (2,) columns of its parameters, or -1.
-        chain: (3, 5).
-        s: (3, 3) added to.
-    """
-    o, t = max(bodies[0], 0), max(bodies[1], 0)
-    of_observer, of_target = 1.0 if bodies[0] >= 0 else 0.0, 1.0 if bodies[1] >= 0 else 0.0
-    difference, half = np.empty((3, 3)), np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            across = of_target * of_observer * (p[t + i, o + j] + p[o + i, t + j])
-            difference[i, j] = of_target * p[t + i, t + j] + of_observer * p[o + i, o + j] - across
-    _turned(chain, difference, half)
-    for i in range(3):
-        for j in range(3):
-            for a in range(3):
-                s[i, j] += half[i, a] * chain[j, a]
-    for k in range(2):
-        if camera[k] >= 0:
-            for a in range(3):
-                of_side = of_target * p[t + a, camera[k]] - of_observer * p[o + a, camera[k]]
-                difference[a, 0] = of_side
-            for i in range(3):
-                beside = chain[i, 0] * difference[0, 0] + chain[i, 1] * difference[1, 0]
-                beside += chain[i, 2] * difference[2, 0]
-                for other in range(2):  # its own variance, and its covariance with the other parameter
-                    if camera[other] >= 0:
-                        beside += 0.5 * chain[i, 3 + other] * p[camera[other], camera[k]]
-                for j in range(3):
-                    s[i, j] += beside * chain[j, 3 + k]
-                    s[j, i] += beside * chain[j, 3 + k]
-
-
-@compiled
-def _turned(chain: FloatArray, matrix: FloatArray, out: FloatArray) -> None:
-    """Write the product of the first three columns of `chain` and a matrix (3, 3)."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = chain[i, 0] * matrix[0, j] + chain[i, 1] * matrix[1, j] + chain[i, 2] * matrix[2, j]
 
 
 @compiled

@@ -61,6 +61,7 @@ MEASUREMENT_DTYPE = np.dtype(
             np.float64,
             (3, 3),
         ),  # of value; a heading not measured has no covariance and variance 1
+        ("lasting", np.float64, (3,)),  # share of each variance that comes again, see core/repetition.py
     ]
 )
 
@@ -84,6 +85,7 @@ class MeasurementColumns(NamedTuple):
     value: FloatArray
     alternative: FloatArray
     covariance: FloatArray
+    lasting: FloatArray
 
     @classmethod
     def of(cls, measurements: MeasurementArray) -> MeasurementColumns:

@@ -30,6 +30,9 @@ class BeliefArrays(NamedTuple):
     tracked: NDArray[np.bool_]
     last_fix_ns: NDArray[np.int64]
     gated_in_a_row: NDArray[np.int64]
+    heard_robot: NDArray[np.int64]
+    heard_ns: NDArray[np.int64]
+    heard: FloatArray
 
 
 class SwarmState:
@@ -37,6 +40,7 @@ class SwarmState:
 
     Args:
         table: Which parameters are estimated besides the poses.
+        places: Of how many others each robot remembers what it has heard.
 
     Attributes:
         transform: (N, 3) T, from `map` to the frame of the robot's odometry track.
@@ -50,12 +54,15 @@ class SwarmState:
         fresh: (N,) whether the robot may still enter at its configured start.
         last_fix_ns: (N,) newest accepted measurement tied to a landmark or an absolute fix.
         gated_in_a_row: (N,) gated measurements since the last accepted one.
+        heard_robot: (N, places) whom each has heard; -1: nobody.
+        heard_ns: (N, places) when last.
+        heard: (N, places, 3, 3) what was told, see `core/repetition.py`.
         losses: (N,) how often the robot left the estimate.
         clues: Per robot that is not tracked, sightings which may locate it (see `core/fix.py`).
         next_attempt_ns: (N,) before this instant nothing more is made of its clues.
     """
 
-    def __init__(self, table: ParameterTable) -> None:
+    def __init__(self, table: ParameterTable, places: int = 0) -> None:
         robots = table.column.shape[0]
         self._table = table
         self.transform: FloatArray = np.zeros((robots, 3))
@@ -71,6 +78,9 @@ class SwarmState:
         self.last_fix_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
         self.gated_in_a_row: NDArray[np.int64] = np.zeros(robots, dtype=np.int64)
         self.losses: NDArray[np.int64] = np.zeros(robots, dtype=np.int64)
+        self.heard_robot: NDArray[np.int64] = np.full((robots, places), -1)
+        self.heard_ns: NDArray[np.int64] = np.full((robots, places), NEVER_NS)
+        self.heard: FloatArray = np.zeros((robots, places, 3, 3))
         self.clues: dict[int, NDArray[np.void]] = {}
         self.next_attempt_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
 
@@ -95,6 +105,9 @@ class SwarmState:
             self.tracked,
             self.last_fix_ns,
             self.gated_in_a_row,
+            self.heard_robot,
+            self.heard_ns,
+            self.heard,
         )
 
     def enter(
@@ -120,6 +133,8 @@ class SwarmState:
             columns: (s,) first filter columns of the others' errors.
             shares: (s, 3, 3) how they enter its own.
         """
+        if self.tracked[robot]:
+            self._forget_heard(robot)
         self.transform[robot] = transform
         self._isolate(robot, covariance)
         others = (columns[:, None] + np.arange(3)).reshape(-1)
@@ -135,10 +150,16 @@ class SwarmState:
     def lose(self, robot: int) -> None:
         """Take the robot out of the estimate; it waits for a fix."""
         self._isolate(robot, np.eye(3))
+        self._forget_heard(robot)
         self.tracked[robot] = False
         self.fresh[robot] = False
         self.losses[robot] += 1
         self.gated_in_a_row[robot] = 0
+
+    def _forget_heard(self, robot: int) -> None:
+        """Let go of what the robot has heard, and others of it: its errors now are others."""
+        for gone in (self.heard_robot == robot, np.s_[robot]):
+            self.heard_robot[gone], self.heard_ns[gone] = -1, NEVER_NS
 
     def _isolate(self, robot: int, covariance: FloatArray) -> None:
         """Give the pose this covariance (3, 3) and the parameters theirs at the beginning."""

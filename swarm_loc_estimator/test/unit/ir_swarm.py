@@ -13,7 +13,7 @@ from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.arrivals import BrightnessRows, FixRows, IntArray, Messages, OdometryRows
 from swarm_loc_estimator.core.estimator import SwarmEstimate, SwarmEstimator
 from swarm_loc_estimator.core.ir.brightness import expected
-from swarm_loc_estimator.core.ir.platform import IrGains, IrPlatform
+from swarm_loc_estimator.core.ir.platform import IrGains, IrPlatform, PairGains
 from swarm_loc_estimator.core.robot_ir import RobotIr
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.settings import EstimatorSettings
@@ -88,6 +88,7 @@ class Plan:
         known: Robots whose start is known.
         walking: Whether they walk, now in one of six directions, now turning; the others stand.
         noise: Scale of the sensors' noise.
+        differ: By how much elements differ, unknown to all.
     """
 
     columns: int = 3
@@ -97,6 +98,7 @@ class Plan:
     known: Sequence[int] = ()
     walking: bool = False
     noise: float = 1.0
+    differ: float = 0.0
 
 
 @dataclass
@@ -115,6 +117,7 @@ def simulate(plan: Plan, seed: int) -> Run:
     places = plan.pitch * np.array([divmod(k, plan.columns) for k in range(n)], dtype=float)
     poses = np.column_stack([places + 0.008 * rng.standard_normal((n, 2)), rng.uniform(-3.1, 3.1, n)])
     run = Run(Swarm(tuple(_robot(rng, plan, k, poses[k]) for k in range(n))))
+    gains = np.exp(plan.differ * np.random.default_rng([seed, n]).standard_normal((2, n, DROPLET.n)))
     odometry, ways = np.zeros((n, 3)), np.zeros((n, 3))
     for step in range(round(plan.seconds * 10)):
         stamp_ns = T0 + (step + 1) * SECOND // 10
@@ -125,7 +128,7 @@ def simulate(plan: Plan, seed: int) -> Run:
                 run.events += [Move(k, stamp_ns, odometry[k]) for k in range(n)]
         run.truth[stamp_ns] = poses
         if step % 4 == 3:
-            run.events += exchange(rng, poses, step // 4 % n, stamp_ns, noise=plan.noise)
+            run.events += exchange(rng, poses, step // 4 % n, stamp_ns, noise=plan.noise, gains=gains)
         if step % 10 == 9:
             run.events += [
                 Place(k, stamp_ns, poses[k] + FIX_SIGMA * rng.standard_normal(3)) for k in plan.fixed
@@ -143,7 +146,7 @@ def _robot(rng: np.random.Generator, plan: Plan, number: int, pose: FloatArray) 
         start=(float(x), float(y), float(theta)) if number in plan.known else None,
         start_sigma=sigma,
         stands=not plan.walking,
-        ir=RobotIr(number + 1, DROPLET, "droplet", gains=calibrated(DROPLET)),
+        ir=RobotIr(number + 1, DROPLET, "droplet", gains=None if plan.differ else calibrated(DROPLET)),
     )
 
 
@@ -180,13 +183,18 @@ def exchange(
     stamp_ns: int,
     platform: IrPlatform = DROPLET,
     noise: float = 1.0,
+    gains: FloatArray | None = None,
 ) -> list[Light]:
-    """What all robots in reach read of one that lights its emitters, at each power."""
+    """What all robots in reach read of one that lights its emitters, at each power; gains (2, N, n)."""
     seen = se2.between(poses, poses[transmitter])
     away = np.hypot(seen[:, 0], seen[:, 1])
     relative = np.column_stack([away, np.arctan2(seen[:, 1], seen[:, 0]), seen[:, 2]])
     near = [int(k) for k in np.flatnonzero(away < REACH_M) if k != transmitter]
-    bright = expected(platform, relative[near])
+    pairs = None
+    if gains is not None:
+        emitters = np.broadcast_to(gains[1, transmitter], (len(near), platform.n))
+        pairs = PairGains(gains[0, near], emitters, np.zeros((len(near), 4)))
+    bright = expected(platform, relative[near], pairs)
     read = np.rint(bright + noise * platform.noise * rng.standard_normal(bright.shape))
     read = np.minimum(read, platform.saturation)
     return [

@@ -141,6 +141,23 @@ def test_readings_that_fit_badly_widen_the_covariance() -> None:
     assert np.median(grown) == pytest.approx(9.0, rel=0.2)
 
 
+def test_the_share_that_lasts_is_what_exchanges_with_other_noise_have_in_common() -> None:
+    poses = random_poses(4000, 18, low=0.12, high=0.24)
+    gains = differing_gains(len(poses), 6, 0.1, 18)
+    once, again = (DIFFERING.solve(readings_of(droplet(), poses, seed, gains)) for seed in (18, 19))
+    found = (once.outcomes == Outcome.FOUND) & (again.outcomes == Outcome.FOUND)
+    one, other = (pose_errors(s.poses, poses)[found] for s in (once, again))
+    variances = np.diagonal(once.covariances[found], axis1=1, axis2=2)
+    core = (np.abs(one) < 4.0 * np.sqrt(variances)).all(axis=1) & (other**2 < 16.0 * variances).all(axis=1)
+    scaled = 1.0 / variances[core]  # every pair counts alike
+    common = np.mean(one[core] * other[core] * scaled, axis=0) / np.mean(one[core] ** 2 * scaled, axis=0)
+    np.testing.assert_allclose(common, once.lasting[found][core].mean(axis=0), atol=0.12)
+    assert (once.lasting[found] > 0.0).all()
+    assert (once.lasting[found] <= 1.0).all()
+    exact = MaximumLikelihood(droplet()).solve(readings_of(droplet(), poses[:50], 18))
+    assert (exact.lasting[exact.outcomes == Outcome.FOUND] == 0.0).all()
+
+
 def with_a_robot_between(poses: FloatArray, seed: int) -> tuple[FloatArray, FloatArray]:
     """Readings (k, modes, n, n) with a third robot between, and the share of light that it blocks (k,)."""
     rng = np.random.default_rng(seed)

@@ -56,6 +56,16 @@ def test_all_are_located_through_infrared_from_one_surveyed_in_or_two_with_fixes
     assert 0.8 < np.mean(normal) < 6.0
 
 
+def test_robots_that_stand_for_long_do_not_take_repeated_errors_for_news() -> None:
+    """Elements differ by an unknown 10 %: every exchange of two robots errs as the one before."""
+    normal = []
+    for seed in range(4):
+        run = simulate(Plan(fixed=[0, 8], seconds=40.0, differ=0.1), seed)
+        _, estimates = play(run, settings=SLOW)
+        normal.append(nees(errors(run, estimates[-2]), estimates[-2].covariances).mean())
+    assert 0.8 < np.mean(normal) < 6.0
+
+
 def test_robots_that_all_start_unknown_wait_however_much_they_hear() -> None:
     estimator, estimates = play(simulate(Plan(seconds=6.0), 0))
     assert (estimates[-1].status == Status.WAITING).all()

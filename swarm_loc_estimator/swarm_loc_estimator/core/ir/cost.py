@@ -69,6 +69,7 @@ class Scratch(NamedTuple):
         step: (P,).
         tally: (2,) squares of what is left of priors and of the readings that cannot be blocked ones, and the
             degrees of freedom of these.
+        of_gains: (3,) the part of the pose's variances that is the unknown gains'.
         root: (3, 3) inverse of the pose's part of the factor, lower triangle.
     """
 
@@ -82,6 +83,7 @@ class Scratch(NamedTuple):
     factor: FloatArray
     step: FloatArray
     tally: FloatArray
+    of_gains: FloatArray
     root: FloatArray
 
 
@@ -100,6 +102,7 @@ def new_scratch(modes: int, n: int, gains: bool) -> Scratch:
         np.empty((size, size)),
         np.empty(size),
         np.empty(2),
+        np.zeros(3),
         np.zeros((3, 3)),
     )
 

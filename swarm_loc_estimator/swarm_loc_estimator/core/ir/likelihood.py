@@ -195,6 +195,7 @@ def _solve_one(models: Models, pair: Pair, room: _Room, out: IrSolutions, k: int
     if max(covariance[1, 1], covariance[2, 2]) > _WIDEST * _WIDEST:
         return _UNDETERMINED
     out.misfits[k], out.odds[k] = misfit, odds
+    assign(out.lasting[k], room.full.of_gains)
     assign_matrix(out.covariances[k], covariance)
     for p in range(3):
         out.poses[k, p] = best[p]

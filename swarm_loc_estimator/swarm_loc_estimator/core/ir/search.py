@@ -163,13 +163,14 @@ def pose_covariance(
     """Write the pose's covariance (3, 3) at a minimum (P,); whether the readings determine the pose.
 
     It is the mean of the inverse information there and around: beyond a kink of the curves, readings may tell
-    much less of the pose. `room.tally` is that of the minimum.
+    much less of the pose. `room.tally` is that of the minimum, `room.of_gains` the gains' share there.
     """
     hessian = room.hessians[0]
     cost_of(model, pair, at, room, room.gradients[0], hessian)
     squares, freedom = room.tally
     if not _invert(hessian, room):
         return False
+    _write_share_of_gains(pair, room)
     _add_square(room.root, covariance, 1.0 / (1.0 + len(_AROUND)), 0.0)
     root, x = room.root.copy(), at.size - 3
     for direction in _AROUND:
@@ -185,6 +186,30 @@ def pose_covariance(
         _add_square(room.root, covariance, 1.0 / (1.0 + len(_AROUND)), 1.0)
     room.tally[0], room.tally[1] = squares, freedom
     return True
+
+
+@compiled
+def _write_share_of_gains(pair: Pair, room: Scratch) -> None:
+    """Write which share of the pose's variances, by the factor, comes from errors of the gains.
+
+    With the inverse Hessian C and the prior weight W of the gains, the pose errs by -C_pose,gains W times
+    their errors.
+    """
+    x, n, row = room.at.size - 3, pair.sensor.size, room.step
+    for p in range(3):
+        room.of_gains[p] = 0.0
+        if x == 0:
+            continue
+        for q in range(row.size):
+            row[q] = 1.0 if q == x + p else 0.0
+        _solve(room.factor, row)
+        for side in range(2):
+            squares, total = 0.0, 0.0
+            for q in range(side * n, side * n + n):
+                squares += row[q] * row[q]
+                total += row[q]
+            part = pair.prior[side, 0] * (squares - pair.prior[side, 1] * total * total)
+            room.of_gains[p] += part / row[x + p]
 
 
 @compiled

@@ -34,6 +34,7 @@ class IrSolutions(NamedTuple):
         outcomes: (k,) of `Outcome`.
         alternatives: (k, 3) the second-best pose where it is nearly as likely, else NaN.
         odds: (k,) its likelihood relative to the best one's, in [0, 1].
+        lasting: (k, 3) share of each variance that is the unknown gains' and the same every time.
         misfits: (k,) squares of what is left of the readings, per degree of freedom; about 1 where the
             platform's noise is that of the readings.
     """
@@ -43,18 +44,20 @@ class IrSolutions(NamedTuple):
     outcomes: NDArray[np.int64]
     alternatives: FloatArray
     odds: FloatArray
+    lasting: FloatArray
     misfits: FloatArray
 
     @classmethod
     def none(cls, count: int) -> IrSolutions:
         """Without any pose."""
-        nothing = np.full((5, count, 3), np.nan)
+        nothing = np.full((6, count, 3), np.nan)
         return cls(
             nothing[0],
             nothing[1:4].reshape(count, 3, 3),
             np.zeros(count, np.int64),
             nothing[4],
             np.zeros(count),
+            nothing[5],
             np.full(count, np.nan),
         )
 
