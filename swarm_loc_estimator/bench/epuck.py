@@ -52,6 +52,12 @@ LAPS_S = 108.0
 PAPER_STATE_PERIOD_S = 1.0 / 7.5
 _PROCESSES = 2
 
+_ASIDE_M, _ASIDE = 0.3, 0.5
+"""How far from the optical axis markers are [m], [rad] in the worse half of a picture.
+
+A focal length that is not known stretches distances, which is estimated, but also moves what is aside.
+"""
+
 PAPER = {
     "w2.paper.robots1": (2.90, 1.86),
     "w2.paper.robots5": (2.02, 1.56),
@@ -130,6 +136,8 @@ def _self_calibrating(robot: Robot) -> Robot:
             left_sigma=0.01,
             heading_sigma=0.12,
             distance_scale_sigma=0.03,
+            residual_position_sigma=W2.scale_sigma * _ASIDE_M,
+            residual_heading_sigma=W2.scale_sigma * _ASIDE,
             time_offset_s=-0.5 * spread_s,
             time_sigma_s=spread_s / math.sqrt(12.0),
         ),

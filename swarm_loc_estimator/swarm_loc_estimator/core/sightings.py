@@ -310,3 +310,6 @@ def _pose_noise(sensor: SensorModel, level: FloatArray, published: FloatArray, n
             for a in range(6):
                 for b in range(6):
                     noise[i, j] += to_plane[i, a] * published[a, b] * to_plane[j, b]
+    noise[0, 0] += sensor.residual_position_sigma**2
+    noise[1, 1] += sensor.residual_position_sigma**2
+    noise[2, 2] += sensor.residual_heading_sigma**2

@@ -108,6 +108,14 @@ class SensorModel:
         0.01, "m", 0.0, 10.0, "noise across the optical axis, sightings with heading", above=True
     )
     heading_sigma: float = number(0.1, "rad", 0.0, 10.0, "noise of the marker's heading", above=True)
+    residual_position_sigma: float = number(
+        0.0,
+        "m",
+        0.0,
+        10.0,
+        "error forward and left besides the noise that a detection tells, as of calibration",
+    )
+    residual_heading_sigma: float = number(0.0, "rad", 0.0, 10.0, "likewise of the marker's heading")
     range_sigma: float = number(
         0.15, "m", 0.0, 10.0, "noise of the range, sightings without heading", above=True
     )

@@ -55,6 +55,21 @@ def test_how_unsure_a_face_sits_adds_to_the_noise_of_its_sightings() -> None:
         np.testing.assert_allclose(measured["covariance"][2], sure)
 
 
+def test_what_is_left_of_systematic_errors_adds_to_the_noise_that_a_detection_tells() -> None:
+    known, unknown = (detection(7, marker_frame(1.0, 0.0, 0.0, 3.0)) for _ in range(2))
+    known["covariance"] = np.diag([1e-6, 2e-6, 3e-6, 4e-6, 5e-6, 6e-6])
+    sensor = replace(SEER.sensor, residual_position_sigma=0.01, residual_heading_sigma=0.02)
+    seers = SWARM, replace(SWARM, robots=(replace(SEER, sensor=sensor), SWARM.robots[1]))
+    plain, more = (
+        SightingConverter(swarm)
+        .convert(np.zeros(2, np.int64), np.full(2, T0), joined([known, unknown]))
+        .measurements["covariance"]
+        for swarm in seers
+    )
+    np.testing.assert_allclose(more[0] - plain[0], np.diag([1e-4, 1e-4, 4e-4]), atol=1e-15)
+    np.testing.assert_array_equal(more[1], plain[1])
+
+
 @pytest.mark.parametrize("target", [-1, 1])
 def test_relative_motion_is_the_rate_of_what_is_predicted(target: int) -> None:
     """Robots drive arcs, with base_link ahead of the axle; rates against differences of predictions."""
