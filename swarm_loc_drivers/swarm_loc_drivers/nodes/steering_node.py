@@ -10,19 +10,14 @@ there.
 
 from __future__ import annotations
 
-import math
 import sys
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from geometry_msgs.msg import PoseStamped, Twist
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
-from rclpy.time import Time
 
+from swarm_loc_drivers.nodes.truth_steering import TruthSteering
 from swarm_loc_drivers.sim.steering import EightSteering
 from swarm_loc_estimator.core.number_spec import number
 from swarm_loc_estimator.io.swarm_file import load_swarm
@@ -56,37 +51,10 @@ class EightSteeringNode(Node):
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("eight_steering", **node_arguments)
         wishes = declare_parameters(self, SteeringParameters)
-        robots = load_swarm(Path(wishes.swarm_file)).robots
-        self._steering = EightSteering(len(robots), wishes.speed)
-        self._driving = False
-        located = ["swarm/poses", *(f"{robot.name}/detections" for robot in robots)]
-        self._awaited = located if wishes.wait_for_poses else []
-        self._commands = [
-            self.create_publisher(Twist, f"{robot.name}/cmd_vel", QoSProfile(depth=1)) for robot in robots
-        ]
-        for index, robot in enumerate(robots):
-            self.create_subscription(
-                PoseStamped, f"{robot.name}/ground_truth", partial(self._on_pose, index), QoSProfile(depth=1)
-            )
-
-    def _on_pose(self, robot: int, message: PoseStamped) -> None:
-        self._driving = self._driving or self._all_there()
-        if not self._driving:
-            return
-        place, turn = message.pose.position, message.pose.orientation
-        pose = np.array([place.x, place.y, 2.0 * math.atan2(turn.z, turn.w)])
-        if not np.isfinite(pose).all():
-            self.get_logger().warning("dropped a pose that is not finite", throttle_duration_sec=10.0)
-            return
-        stamp_ns = Time.from_msg(message.header.stamp).nanoseconds
-        command = Twist()
-        command.linear.x, command.angular.z = self._steering.command(robot, stamp_ns, pose)
-        self._commands[robot].publish(command)
-
-    def _all_there(self) -> bool:
-        """Whether the eight can begin."""
-        drivers = all(one.get_subscription_count() for one in self._commands)
-        return drivers and all(self.count_publishers(topic) for topic in self._awaited)
+        names = [robot.name for robot in load_swarm(Path(wishes.swarm_file)).robots]
+        located = ["swarm/poses", *(f"{name}/detections" for name in names)]
+        steer = EightSteering(len(names), wishes.speed).command
+        self._steering = TruthSteering(self, names, steer, located if wishes.wait_for_poses else ())
 
 
 def main() -> int:

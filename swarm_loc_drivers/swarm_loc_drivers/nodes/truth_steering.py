@@ -27,10 +27,11 @@ class TruthSteering:
         node: Whose subscriptions.
         names: Of the robots.
         steer: Tells what to do.
+        awaited: Topics that must have publishers, too, before the robots drive.
     """
 
-    def __init__(self, node: Node, names: Sequence[str], steer: Steer) -> None:
-        self._node, self._steer = node, steer
+    def __init__(self, node: Node, names: Sequence[str], steer: Steer, awaited: Sequence[str] = ()) -> None:
+        self._node, self._steer, self._awaited = node, steer, awaited
         self._driving = False
         qos = QoSProfile(depth=1)
         self._commands = [node.create_publisher(Twist, f"{name}/cmd_vel", qos) for name in names]
@@ -38,7 +39,7 @@ class TruthSteering:
             node.create_subscription(PoseStamped, f"{name}/ground_truth", partial(self._on_pose, index), qos)
 
     def _on_pose(self, robot: int, message: PoseStamped) -> None:
-        self._driving = self._driving or all(one.get_subscription_count() for one in self._commands)
+        self._driving = self._driving or self._all_there()
         if not self._driving:
             return
         place, turn = message.pose.position, message.pose.orientation
@@ -50,3 +51,8 @@ class TruthSteering:
             return
         forward, left, rate = self._steer(robot, Time.from_msg(message.header.stamp).nanoseconds, pose)
         self._commands[robot].publish(Twist(linear=Vector3(x=forward, y=left), angular=Vector3(z=rate)))
+
+    def _all_there(self) -> bool:
+        """Whether the robots can begin to drive."""
+        drivers = all(one.get_subscription_count() for one in self._commands)
+        return drivers and all(self._node.count_publishers(topic) for topic in self._awaited)

@@ -19,41 +19,32 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
-from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.time import Time
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 
 from swarm_loc_drivers.nodes.unanswered import Unanswered
 from swarm_loc_drivers.nodes.world_parameters import WorldParameters, make_world
+from swarm_loc_drivers.nodes.world_time import WorldTime
 from swarm_loc_drivers.protocols.epuck import EPUCK_MODELS
 from swarm_loc_drivers.sim.epuck_world import STEP_NS, Exposure, SimulatedEpuck
 from swarm_loc_drivers.sim.firmware.host import FirmwareHost
 from swarm_loc_drivers.sim.firmware.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.firmware.wifi_firmware import WifiFirmware
 from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_estimator.io.messages import encode_pose_stamped
 from swarm_loc_estimator.nodes.declare import declare_parameters
 from swarm_loc_estimator.nodes.parameter_table import ParameterError
 from swarm_loc_estimator.nodes.running import Stop, run_node
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
-_CLOCK_QOS = QoSProfile(depth=10)
-_TRUTH_QOS = QoSProfile(depth=10)
-_STEP_S = STEP_NS * 1e-9
 _CAMERA_QOS = QoSProfile(depth=5)
 """Reliable: who wants so gets every picture, and who listens with best effort gets what comes."""
 _ANSWER_QOS = QoSProfile(depth=100)
-_ANSWER_WAKE_S = 0.002
 _ANSWER_PATIENCE_S = 10.0
 _THROTTLE_S = 30.0
-_LONGEST_LAG_S = 0.1
-"""A world that cannot keep up goes on from now instead of hurrying after."""
 
 
 class EpuckWorldNode(Node):
@@ -75,49 +66,36 @@ class EpuckWorldNode(Node):
         self._host = FirmwareHost()
         for robot, name in enumerate(self._names):
             self.get_logger().info(f"{name} answers at {self._serve(robot)}")
-        self._clock_publisher = self.create_publisher(Clock, "/clock", _CLOCK_QOS)
-        self._truths = [
-            self._publisher(PoseStamped, name, "ground_truth", _TRUTH_QOS) for name in self._names
-        ]
-        self._images = [self._publisher(Image, name, "image_raw", _CAMERA_QOS) for name in self._names]
-        self._infos = [self._publisher(CameraInfo, name, "camera_info", _CAMERA_QOS) for name in self._names]
+        rate, truth_rate = self._wishes.rate, self._wishes.truth_rate
+        self._time = WorldTime(self, self._names, STEP_NS, rate, truth_rate)
+        self._images = [self._publisher(Image, name, "image_raw") for name in self._names]
+        self._infos = [self._publisher(CameraInfo, name, "camera_info") for name in self._names]
+        self._held_since_s: float | None = None
         self._unanswered = Unanswered(self._wishes.answer_within)
         if self._wishes.answer_within > 0.0:
             for robot, name in enumerate(self._names):
                 answered = partial(self._on_detections, robot)
                 self.create_subscription(MarkerDetectionArray, f"{name}/detections", answered, _ANSWER_QOS)
-        self._truth_steps = max(1, round(1.0 / (self._wishes.truth_rate * _STEP_S)))
 
     def run(self, stop: Stop) -> int:
         """Let time pass until asked to stop; the exit status."""
-        executor = EventsExecutor()
-        executor.add_node(self)
-        due_s = time.monotonic()
-        steps = 0
-        while not stop.requested:
-            self._publish(self._world.step(), with_truth=steps % self._truth_steps == 0)
-            steps += 1
-            due_s = max(due_s + _STEP_S / self._wishes.rate, time.monotonic() - _LONGEST_LAG_S)
-            self._host.poll(0.0)
-            while (left_s := due_s - time.monotonic()) > 0.0:
-                self._host.poll(left_s)
-            executor.spin_once(timeout_sec=0.0)
-            self._wait_for_answers(executor, stop)
-        executor.shutdown()
+        self._time.run(self._step, self._host, stop, self._is_held)
         return 0
 
-    def _wait_for_answers(self, executor: EventsExecutor, stop: Stop) -> None:
-        """Let time stand still, but answer the drivers, while pictures have not become detections."""
-        since_s = time.monotonic()
-        while self._unanswered.is_late(self._world.now_ns) and not stop.requested:
-            self._host.poll(0.0)
-            executor.spin_once(timeout_sec=_ANSWER_WAKE_S)
-            if time.monotonic() > since_s + _ANSWER_PATIENCE_S:
-                name, since_s = self._names[self._unanswered.give_up()], time.monotonic()
-                self.get_logger().warning(
-                    f"a picture of {name} has not become {name}/detections; time goes on without",
-                    throttle_duration_sec=_THROTTLE_S,
-                )
+    def _is_held(self) -> bool:
+        """Whether time stands still because a picture has not become detections; not for ever."""
+        if not self._unanswered.is_late(self._world.now_ns):
+            self._held_since_s = None
+            return False
+        now_s = time.monotonic()
+        self._held_since_s = self._held_since_s or now_s
+        if now_s > self._held_since_s + _ANSWER_PATIENCE_S:
+            name, self._held_since_s = self._names[self._unanswered.give_up()], None
+            self.get_logger().warning(
+                f"a picture of {name} has not become {name}/detections; time goes on without",
+                throttle_duration_sec=_THROTTLE_S,
+            )
+        return True
 
     def destroy_node(self) -> None:
         """Switch the robots off, too."""
@@ -139,17 +117,13 @@ class EpuckWorldNode(Node):
                 f"parameter {name} = {value} cannot be used for {self._names[robot]}: {error.strerror}."
             ) from error
 
-    def _publisher(self, kind: type, robot: str, topic: str, qos: QoSProfile) -> Publisher:
-        return self.create_publisher(kind, f"{robot}/{topic}", qos)
+    def _publisher(self, kind: type, robot: str, topic: str) -> Publisher:
+        return self.create_publisher(kind, f"{robot}/{topic}", _CAMERA_QOS)
 
-    def _publish(self, taken: list[Exposure], *, with_truth: bool) -> None:
-        """Tell the time, and then what belongs to it."""
-        now_ns = self._world.now_ns
-        self._clock_publisher.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
-        if with_truth:
-            stamp_ns = np.array([now_ns], np.int64)
-            for publisher, pose in zip(self._truths, self._world.poses, strict=True):
-                publisher.publish(encode_pose_stamped("map", stamp_ns, pose[None])[0])
+    def _step(self) -> None:
+        """Let the world do a step; tell the time, and then what belongs to it."""
+        taken = self._world.step()
+        self._time.tell(self._world.now_ns, self._world.poses)
         for exposure in taken:
             if self._images[exposure.robot].get_subscription_count():
                 self._publish_picture(exposure)

@@ -20,6 +20,7 @@ from swarm_loc_estimator.nodes.running import Stop
 
 _CLOCK_QOS = QoSProfile(depth=10)
 _TRUTH_QOS = QoSProfile(depth=10)
+_HELD_WAKE_S = 0.002
 _LONGEST_LAG_S = 0.1
 """A world that cannot keep up goes on from now instead of hurrying after."""
 
@@ -66,8 +67,21 @@ class WorldTime:
                 publisher.publish(encode_pose_stamped("map", stamp_ns, pose[None])[0])
         self._steps += 1
 
-    def run(self, step: Callable[[], None], host: FirmwareHost, stop: Stop) -> None:
-        """Step again and again, and answer drivers in between, until asked to stop."""
+    def run(
+        self,
+        step: Callable[[], None],
+        host: FirmwareHost,
+        stop: Stop,
+        is_held: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Step again and again, and answer drivers in between, until asked to stop.
+
+        Args:
+            step: Lets the world do its next step.
+            host: Of the robots' firmware.
+            stop: Says when to end.
+            is_held: While it says so time stands still.
+        """
         executor = EventsExecutor()
         executor.add_node(self._node)
         due_s = time.monotonic()
@@ -78,4 +92,7 @@ class WorldTime:
             while (left_s := due_s - time.monotonic()) > 0.0:
                 host.poll(left_s)
             executor.spin_once(timeout_sec=0.0)
+            while is_held() and not stop.requested:
+                host.poll(0.0)
+                executor.spin_once(timeout_sec=_HELD_WAKE_S)
         executor.shutdown()

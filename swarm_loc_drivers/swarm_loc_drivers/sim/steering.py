@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_drivers.core.velocity_command import Velocity
+
 from .eight import HALF_WIDTH, follow
 from .lemniscate import Lemniscate
 
@@ -25,8 +27,8 @@ class EightSteering:
         self._control = [follow(path, offset[None], speed, 1e-9) for offset in offsets]
         self._begin_ns: int | None = None
 
-    def command(self, robot: int, stamp_ns: int, pose: FloatArray) -> tuple[float, float]:
-        """What a robot should do now: forward [m/s] and to the left [rad/s].
+    def command(self, robot: int, stamp_ns: int, pose: FloatArray) -> Velocity:
+        """What a robot should do now.
 
         Args:
             robot: Its index.
@@ -36,4 +38,4 @@ class EightSteering:
         if self._begin_ns is None or stamp_ns < self._begin_ns:
             self._begin_ns = stamp_ns
         speed, turn_rate = self._control[robot](stamp_ns - self._begin_ns, pose[None])
-        return float(speed[0]), float(turn_rate[0])
+        return float(speed[0]), 0.0, float(turn_rate[0])

@@ -65,7 +65,7 @@ def test_steering_brings_a_robot_back_onto_the_eight() -> None:
     pose = np.array([0.63, -0.01, 1.3])
     step_ns = 50_000_000
     for step in range(400):
-        speed, turn_rate = steering.command(0, 10**12 + step * step_ns, pose)
+        speed, _, turn_rate = steering.command(0, 10**12 + step * step_ns, pose)
         heading = pose[2] + 0.5 * 0.05 * turn_rate
         pose = pose + 0.05 * np.array([speed * np.cos(heading), speed * np.sin(heading), turn_rate])
     r2 = float(pose[:2] @ pose[:2])
