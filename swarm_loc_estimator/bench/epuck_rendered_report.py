@@ -24,6 +24,7 @@ from swarm_loc_estimator.io.report_overview import plot_overview
 from swarm_loc_estimator.io.report_style import INK, colour_of
 from swarm_loc_estimator.replay import replay
 from swarm_loc_estimator.replay_result import ReplayResult
+from swarm_loc_vision.core.warm_up import warm_up
 
 OUTPUT_NS = 100_000_000
 """Of the poses, which come twice as often, those that the other rows of the benchmark have, too."""
@@ -65,6 +66,7 @@ def rendered_worlds(
     Raises:
         LiveError: A node has ended, or nothing goes on.
     """
+    warm_up()  # once, not in every robot's detector at a time
     swarm, worlds = starting_swarm(), []
     for count, seed in enumerate(seeds, start=1):
         folder = OUT / "epuck_rendered" / f"seed{seed}"

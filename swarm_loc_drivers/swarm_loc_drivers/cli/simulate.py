@@ -19,8 +19,10 @@ from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
 from swarm_loc_estimator.cli.arguments import number_in
 from swarm_loc_estimator.cli.graph import say
+from swarm_loc_estimator.core.compiled import is_warm
 from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
 from swarm_loc_estimator.processes import GraphError, run_graph
+from swarm_loc_vision.core.warm_up import CORE, warm_up
 
 
 def parse(arguments: Sequence[str], link_folder: str) -> SimulationOptions:
@@ -61,6 +63,9 @@ def main() -> int:
         with tempfile.TemporaryDirectory(prefix="epucks-") as links:
             options = parse(sys.argv[1:], links)
             robots = [robot.name for robot in load_swarm(Path(options.swarm_file)).robots]
+            if not is_warm(CORE):  # once, not in every robot's detector at a time
+                say("compiling the marker detector for this machine: about half a minute")
+                warm_up()
             return run_graph(simulation_nodes(options, robots), say)
     except (GraphError, SwarmFileError) as error:
         print(error, file=sys.stderr)
