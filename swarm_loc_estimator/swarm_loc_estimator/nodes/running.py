@@ -55,6 +55,7 @@ class Stop:
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
         self.requested = True
         if not self._noted_only:
+            self._noted_only = True  # a launch sends it twice: once to all, once to each
             raise KeyboardInterrupt
 
 
