@@ -48,6 +48,6 @@ def test_the_robots_of_the_demo_are_located_to_millimetres() -> None:
 
 
 def test_five_robots_that_calibrate_themselves_are_located_to_millimetres() -> None:
-    """3.5 mm in the world of systematic errors, 21 mm by the paper's own filter."""
+    """3.3 mm in the world of systematic errors, 21 mm by the paper's own filter."""
     assert_good(replayed("eight_five_robots_w2", "self_calibrating.yaml"), 0.0045, 1.5, (0.8, 3.5))
     assert summarise(pool([*replayed("eight_five_robots_w2").errors.values()])).position_rmse > 0.015
