@@ -29,6 +29,7 @@ from swarm_loc_drivers.sim.picture_bag import write_picture_bag
 from swarm_loc_drivers.sim.pictures import photograph_eight
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.worlds import WORLDS
+from swarm_loc_estimator.cli.ending import told_in_a_sentence
 from swarm_loc_estimator.io.bag_file import BagError
 from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
 
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 _SHORTEST_S = 2.0
 
 
+@told_in_a_sentence(BagError, DefinitionsNotFoundError)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     parser = _parser()
@@ -52,11 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"--boards {options.boards} must be at least 0")
     said = {name: value for name, value in vars(options).items() if value is not None}
     words = [f"{name}={value}" for name, value in said.items() if name not in ("bag", "write")]
-    try:
-        count = options.write(options, f"Simulated: {', '.join(words)}.")
-    except (BagError, DefinitionsNotFoundError) as error:
-        print(error, file=sys.stderr)
-        return 1
+    count = options.write(options, f"Simulated: {', '.join(words)}.")
     print(f"{count} messages of {options.robots} robots written to {options.bag}")
     return 0
 

@@ -87,7 +87,7 @@ def calibrate_infrared(
         with_truth: Whether ground truth is used, where there is some.
 
     Raises:
-        CalibrationError: There is nothing to fit to.
+        CalibrationError: There is nothing to fit to, or nothing comes out.
     """
     groups, dropped = _groups(recording, swarm, with_truth=with_truth)
     remarks = [f"Matrices not used: {_counts(dropped)}."] if dropped else []
@@ -99,15 +99,23 @@ def calibrate_infrared(
             remarks.append(f"Platform {group.source}: {error}")
     if not boards:
         raise CalibrationError(f"recording '{recording.name}': {' '.join(remarks)}")
-    robots, poor = list(swarm.robots), list[str]()
+    robots, unheard, unsure = list(swarm.robots), list[str](), list[str]()
     for board in boards:
         for place, index in enumerate(board.group.robots):
-            if board.of_robot(place)[0]:
-                robots[index] = _with_gains(robots[index], board.fit.gains[place])
+            if not board.of_robot(place)[0]:
+                unheard.append(robots[index].name)
+            elif board.fit.gains[place] == IrGains.unknown(board.group.platform):
+                unsure.append(robots[index].name)
             else:
-                poor.append(robots[index].name)
-    if poor:
-        remarks.append(f"In no exchange that could be used, and as they were: {', '.join(poor)}.")
+                robots[index] = _with_gains(robots[index], board.fit.gains[place])
+    if unheard:
+        remarks.append(f"In no exchange that could be used, and as they were: {', '.join(unheard)}.")
+    if unsure:
+        remarks.append(
+            f"What they read contradicts itself or the ground truth, and as they were: {', '.join(unsure)}."
+        )
+    if len(unheard) + len(unsure) == sum(len(board.group.robots) for board in boards):
+        raise CalibrationError(f"recording '{recording.name}': {' '.join(remarks)}")
     return InfraredCalibration(replace(swarm, robots=tuple(robots)), tuple(boards), tuple(remarks))
 
 
@@ -157,9 +165,8 @@ def _groups(recording: Recording, swarm: Swarm, *, with_truth: bool) -> tuple[li
             screening.add(rows, k, exchanges.setdefault(key, {}))
     if not exchanges:
         said = f": {_counts(screening.dropped)}" if screening.dropped else ""
-        raise CalibrationError(
-            f"recording '{recording.name}' holds no <robot>/brightness of this swarm that can be used{said}."
-        )
+        nothing = f"holds no <robot>/brightness of this swarm that can be used{said}."
+        raise CalibrationError(" ".join([f"recording '{recording.name}' {nothing}", *recording.remarks]))
     keys = sorted(exchanges)
     groups = []
     for members in _alike(screening):

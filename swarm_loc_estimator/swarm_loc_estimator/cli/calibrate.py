@@ -17,7 +17,8 @@ from pathlib import Path
 from swarm_loc_estimator.calibration.fit import EVALUATIONS, Options, calibrate
 from swarm_loc_estimator.calibration.picture import draw, text_of
 from swarm_loc_estimator.calibration.recording import CalibrationError, Recording, read_recording
-from swarm_loc_estimator.cli.arguments import number_in
+from swarm_loc_estimator.cli.arguments import number_in, yaml_to_write
+from swarm_loc_estimator.cli.ending import told_in_a_sentence
 from swarm_loc_estimator.cli.progress import ProgressLine
 from swarm_loc_estimator.cli.replay import swarm_beside
 from swarm_loc_estimator.io.bag_file import BagError
@@ -26,19 +27,15 @@ from swarm_loc_estimator.io.swarm_writer import save_swarm
 from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
 
 
+@told_in_a_sentence(BagError, SwarmFileError, CalibrationError, DefinitionsNotFoundError)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
     chosen = Options(plain=options.plain, response=not options.no_response, evaluations=options.evaluations)
-    try:
-        swarm = load_swarm(options.swarm or swarm_beside(options.bag))
-        with ProgressLine() as progress:
-            recording = read_recording(options.bag, swarm, progress)
-            done = calibrate(recording, swarm, chosen, progress)
-    except (BagError, SwarmFileError, CalibrationError, DefinitionsNotFoundError) as error:
-        print(error, file=sys.stderr)
-        return 1
-    options.out.parent.mkdir(parents=True, exist_ok=True)
+    swarm = load_swarm(options.swarm or swarm_beside(options.bag))
+    with ProgressLine() as progress:
+        recording = read_recording(options.bag, swarm, progress)
+        done = calibrate(recording, swarm, chosen, progress)
     save_swarm(done.swarm, options.out, f"Calibrated with {options.bag.name}.")
     print("\n".join([text_of(done), *recording.remarks, *_unused(recording)]))
     print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
@@ -59,7 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("bag", type=Path, help="rosbag2 folder, .mcap or .db3 file with <robot>/ground_truth")
     parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
-    parser.add_argument("--out", type=Path, required=True, help="swarm description to write")
+    parser.add_argument("--out", type=yaml_to_write, required=True, help="swarm description to write")
     parser.add_argument("--plain", action="store_true", help="fit only noise, calibrate nothing")
     parser.add_argument(
         "--no-response",

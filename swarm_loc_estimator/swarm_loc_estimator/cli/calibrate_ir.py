@@ -19,6 +19,8 @@ from pathlib import Path
 from swarm_loc_estimator.calibration.infrared import calibrate_infrared
 from swarm_loc_estimator.calibration.infrared_picture import draw, text_of
 from swarm_loc_estimator.calibration.recording import CalibrationError, read_recording
+from swarm_loc_estimator.cli.arguments import yaml_to_write
+from swarm_loc_estimator.cli.ending import told_in_a_sentence
 from swarm_loc_estimator.cli.progress import ProgressLine
 from swarm_loc_estimator.cli.replay import swarm_beside
 from swarm_loc_estimator.io.bag_file import BagError
@@ -27,18 +29,14 @@ from swarm_loc_estimator.io.swarm_writer import save_swarm
 from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
 
 
+@told_in_a_sentence(BagError, SwarmFileError, CalibrationError, DefinitionsNotFoundError)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
-    try:
-        swarm = load_swarm(options.swarm or swarm_beside(options.bag))
-        with ProgressLine() as progress:
-            recording = read_recording(options.bag, swarm, progress)
-            done = calibrate_infrared(recording, swarm, progress, with_truth=not options.without_truth)
-    except (BagError, SwarmFileError, CalibrationError, DefinitionsNotFoundError) as error:
-        print(error, file=sys.stderr)
-        return 1
-    options.out.parent.mkdir(parents=True, exist_ok=True)
+    swarm = load_swarm(options.swarm or swarm_beside(options.bag))
+    with ProgressLine() as progress:
+        recording = read_recording(options.bag, swarm, progress)
+        done = calibrate_infrared(recording, swarm, progress, with_truth=not options.without_truth)
     save_swarm(done.swarm, options.out, f"Infrared gains calibrated with {options.bag.name}.")
     print("\n".join([text_of(done), *recording.remarks]))
     print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
@@ -54,8 +52,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
     parser.add_argument(
         "--out",
-        type=Path,
-        default=Path("out/calibrated_ir.yaml"),
+        type=yaml_to_write,
+        default="out/calibrated_ir.yaml",
         help="swarm description to write (default out/calibrated_ir.yaml)",
     )
     parser.add_argument("--without-truth", action="store_true", help="do as if there were no ground truth")

@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from swarm_loc_estimator.cli.ending import told_in_a_sentence
 from swarm_loc_estimator.cli.progress import ProgressLine
 from swarm_loc_estimator.io.bag_file import BagError
 from swarm_loc_estimator.io.mrclam import MrclamError, read_dataset
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
+@told_in_a_sentence(MrclamError, BagError, DefinitionsNotFoundError)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     parser = _parser()
@@ -33,14 +35,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"--delay-ms {low_ms} {high_ms} {seed}: 0 <= LO <= HI and 0 <= SEED are needed")
     began = time.monotonic()
     delay = Delay(low_ms * 1_000_000, high_ms * 1_000_000, seed)
-    try:
-        with ProgressLine() as progress:
-            progress(0.0, "reading")
-            dataset = read_dataset(options.folder)
-            done = convert(dataset, options.bag, delay, progress)
-    except (MrclamError, BagError, DefinitionsNotFoundError) as error:
-        print(error, file=sys.stderr)
-        return 1
+    with ProgressLine() as progress:
+        progress(0.0, "reading")
+        dataset = read_dataset(options.folder)
+        done = convert(dataset, options.bag, delay, progress)
     for remark in done.remarks:
         print(remark)
     names = ", ".join(f"robot{robot.subject}" for robot in dataset.robots)

@@ -21,7 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.cli.arguments import number_in
+from swarm_loc_estimator.cli.arguments import folder_to_write, number_in, yaml_to_write
+from swarm_loc_estimator.cli.ending import told_in_a_sentence
 from swarm_loc_estimator.cli.progress import ProgressLine
 from swarm_loc_estimator.core.learned import learns
 from swarm_loc_estimator.core.settings import EstimatorSettings, SettingsError
@@ -41,25 +42,22 @@ _COVARIANCE = ("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
 _COLUMNS = ("stamp_ns", "robot", "x_m", "y_m", "theta_rad", *_COVARIANCE)
 
 
+@told_in_a_sentence(BagError, SwarmFileError, SettingsError, DefinitionsNotFoundError)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
-    try:
-        settings = read_settings(options.set)
-        swarm = load_swarm(options.swarm or swarm_beside(options.bag))
-        with ProgressLine() as progress:
-            if options.learned and not learns(swarm):
-                print(_NOTHING_TO_LEARN, file=sys.stderr)
-                return 1
-            result = replay(options.bag, swarm, settings, tick_s=options.tick, progress=progress)
-            progress(1.0, "writing the report")
-            files = write_report(result, options.out)
-            write_poses(result, options.out / "poses.csv")
-            if options.learned and result.learned:
-                save_swarm(result.learned, options.learned, f"Learned from {result.title}.")
-    except (BagError, SwarmFileError, SettingsError, DefinitionsNotFoundError) as error:
-        print(error, file=sys.stderr)
-        return 1
+    settings = read_settings(options.set)
+    swarm = load_swarm(options.swarm or swarm_beside(options.bag))
+    with ProgressLine() as progress:
+        if options.learned and not learns(swarm):
+            print(_NOTHING_TO_LEARN, file=sys.stderr)
+            return 1
+        result = replay(options.bag, swarm, settings, tick_s=options.tick, progress=progress)
+        progress(1.0, "writing the report")
+        files = write_report(result, options.out)
+        write_poses(result, options.out / "poses.csv")
+        if options.learned and result.learned:
+            save_swarm(result.learned, options.learned, f"Learned from {result.title}.")
     print(files.text.read_text(encoding="utf-8"))
     print(f"Report:  {files.page}\nPicture: {files.overview}")
     return 0
@@ -106,8 +104,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("bag", type=Path, help="rosbag2 folder, .mcap or .db3 file")
     parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
-    parser.add_argument("--out", type=Path, default=Path("out/replay"), help="folder for the report")
-    parser.add_argument("--learned", type=Path, metavar="FILE", help="where to write what was learned")
+    parser.add_argument("--out", type=folder_to_write, default="out/replay", help="folder for the report")
+    parser.add_argument(
+        "--learned", type=yaml_to_write, metavar="FILE", help="where to write what was learned"
+    )
     parser.add_argument(
         "--tick", type=number_in(1e-3, 3600.0, "s"), default=TICK_S, help="seconds between outputs"
     )

@@ -42,11 +42,12 @@ def save_swarm(swarm: Swarm, path: Path, comment: str = "") -> None:
 
     Args:
         swarm: What to write.
-        path: The file; replaced when it exists.
+        path: The file; replaced when it exists, its folder created when missing.
         comment: Lines that say where the numbers come from.
     """
     text = "".join(f"# {line}\n" for line in [*comment.splitlines(), *_units()])
     text += yaml.safe_dump(_tree(swarm, path.parent), sort_keys=False, default_flow_style=None, width=100)
+    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".part")
     temporary.write_text(text, encoding="utf-8")
     temporary.replace(path)

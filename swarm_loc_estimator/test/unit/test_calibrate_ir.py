@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,8 +35,18 @@ def described(names: tuple[str, ...], platform: IrPlatform, source: str, first_i
     return [Robot(n, camera=None, ir=RobotIr(first_id + k, platform, source)) for k, n in enumerate(names)]
 
 
-def write_exchanges(bag: BagWriter, robots: list[Robot], count: int, seed: int) -> FloatArray:
-    """Robots that are somewhere else at every exchange; returns the true log-gains (2, robots, n)."""
+def write_exchanges(
+    bag: BagWriter,
+    robots: list[Robot],
+    count: int,
+    seed: int,
+    told: Callable[[FloatArray], FloatArray] = lambda pose: pose,
+) -> FloatArray:
+    """Robots that are somewhere else at every exchange, and the ground truth `told` of where they are.
+
+    Returns:
+        The true log-gains (2, robots, n).
+    """
     rng = np.random.default_rng(seed)
     board = robots[0].ir
     assert board is not None
@@ -59,7 +70,7 @@ def write_exchanges(bag: BagWriter, robots: list[Robot], count: int, seed: int) 
             bag.write(f"{name}/brightness", stamp_ns, data)
         poses = ((receiver[k], places[k]), (transmitter[k], se2.compose(places[k], seen[k])))
         for robot, pose in poses:
-            data = encode_pose_stamped("map", np.array([stamp_ns]), np.atleast_2d(pose))[0]
+            data = encode_pose_stamped("map", np.array([stamp_ns]), np.atleast_2d(told(pose)))[0]
             bag.write(f"{robots[robot].name}/ground_truth", stamp_ns, data)
     return logs
 
@@ -187,8 +198,47 @@ def test_what_cannot_be_calibrated_is_said_in_one_sentence(
     assert f"can be used: {2 * LEAST_EXCHANGES - 2} ir_unknown_id." in unknown
     save_swarm(Swarm(tuple(described(("x", "y"), droplet(SPREAD), "droplet"))), swarm)
     sentence = "recording 'bag' holds no <robot>/brightness of this swarm that can be used."
-    assert sentence in error_of(capsys, bag, "--swarm", swarm)
+    strangers = "No robot of the swarm description has the topics a/brightness, b/brightness."
+    assert f"{sentence} {strangers}" in error_of(capsys, bag, "--swarm", swarm)
     assert not (tmp_path / "out").exists()
+
+
+def test_ground_truth_that_contradicts_what_was_read_calibrates_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of another run, say: gains less sure than before would come out of it."""
+    robots = described(("a", "b", "c"), droplet(SPREAD), "droplet")
+    rng = np.random.default_rng(8)
+    with BagWriter(tmp_path / "bag") as bag:
+        add_topics(bag, robots)
+        write_exchanges(bag, robots, 60, 8, lambda _: rng.uniform(-0.15, 0.15, 3))
+    save_swarm(Swarm(tuple(robots)), tmp_path / "bag" / "swarm.yaml")
+    said = error_of(capsys, tmp_path / "bag", "--out", tmp_path / "out.yaml")
+    assert "What they read contradicts itself or the ground truth, and as they were: a, b, c." in said
+    assert not (tmp_path / "out.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("out", "words"),
+    [
+        ("gains.png", "'gains.png' must end in .yaml"),
+        ("bag/x.yaml", "bag/x.yaml cannot be written: it is a folder"),
+        ("file/deep/x.yaml", "file/deep cannot be written: "),
+    ],
+)
+def test_what_cannot_be_written_is_said_before_the_work(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    out: str,
+    words: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bag" / "x.yaml").mkdir(parents=True)
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit):
+        calibrate_ir.main(["bag", "--out", out])
+    assert words in capsys.readouterr().err
 
 
 def test_boards_whose_elements_do_not_differ_need_no_calibration(

@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from swarm_loc_estimator.cli.ending import told_in_a_sentence
 from swarm_loc_estimator.cli.progress import ProgressLine
 from swarm_loc_estimator.cli.replay import swarm_beside
 from swarm_loc_estimator.io.bag_file import BagError
@@ -32,21 +33,18 @@ _GIVEN_OTHERWISE = ("image_transport", "swarm_file", "robot")
 """Parameters that follow from the bag and from --swarm."""
 
 
+@told_in_a_sentence(BagError, ParameterError, SwarmFileError, DefinitionsNotFoundError)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
     beside = swarm_beside(options.bag)
     swarm_file = options.swarm or (beside if beside.exists() else None)
-    try:
-        wishes = read_wishes(options.set, "" if swarm_file is None else str(swarm_file))
-        pictures = PictureBag(options.bag, camera_maker(wishes))
-        with ProgressLine() as progress:
-            count = pictures.detect(options.output, progress)
-        if swarm_file is not None:
-            shutil.copyfile(swarm_file, options.output / "swarm.yaml")
-    except (BagError, ParameterError, SwarmFileError, DefinitionsNotFoundError) as error:
-        print(error, file=sys.stderr)
-        return 1
+    wishes = read_wishes(options.set, "" if swarm_file is None else str(swarm_file))
+    pictures = PictureBag(options.bag, camera_maker(wishes))
+    with ProgressLine() as progress:
+        count = pictures.detect(options.output, progress)
+    if swarm_file is not None:
+        shutil.copyfile(swarm_file, options.output / "swarm.yaml")
     for loss in pictures.losses:
         print(loss)
     for name, camera in pictures.cameras.items():

@@ -67,7 +67,8 @@ class GainsFit:
     """Gains of all robots, and how well they explain what was read.
 
     Attributes:
-        gains: One per robot.
+        gains: One per robot; as if never calibrated where its exchanges contradict each other by so much that
+            they would be less sure than that.
         used: (k,) which exchanges were used.
         before: (k, modes, n, n) residuals with all gains 1, in sigmas; NaN where a reading was not used.
         after: Likewise with the gains.
@@ -304,7 +305,7 @@ def _as_gains(
     covariances: FloatArray,
     used: NDArray[np.bool_],
 ) -> tuple[IrGains, ...]:
-    """Gains with how unsure they are, by the covariance (2, P, P) that says more."""
+    """Gains with how unsure they are, by the covariance (2, P, P) that is wider; see `GainsFit`."""
     unseen = platform.element_sigma**2 / platform.n
     sigmas = [_sigmas(exchanges, covariance, logs.shape, unseen, used) for covariance in covariances]
     own, shared = np.max(sigmas, axis=0)
@@ -316,6 +317,8 @@ def _as_gains(
             max(float(own[k]), _LEAST_SIGMA),
             float(shared[k]),
         )
+        if max(own[k], shared[k]) < platform.element_sigma
+        else IrGains.unknown(platform)
         for k in range(logs.shape[1])
     )
 

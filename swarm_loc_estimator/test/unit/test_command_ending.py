@@ -1,0 +1,45 @@
+"""How commands end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from swarm_loc_estimator.cli.arguments import folder_to_write
+from swarm_loc_estimator.cli.ending import told_in_a_sentence
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "words"),
+    [
+        (ValueError("This is wrong."), 1, "This is wrong.\n"),
+        (OSError(28, "No space left on device", "out/x.yaml"), 1, "out/x.yaml cannot be used: No space left"),
+        (KeyboardInterrupt(), 130, ""),
+    ],
+)
+def test_what_goes_wrong_ends_a_command_with_a_sentence(
+    error: BaseException, status: int, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    @told_in_a_sentence(ValueError)
+    def main() -> int:
+        raise error
+
+    assert main() == status
+    said = capsys.readouterr().err
+    assert said.startswith(words)
+    assert said.count("\n") == bool(words)
+
+
+def test_faults_of_the_program_are_not_hidden() -> None:
+    @told_in_a_sentence(ValueError)
+    def main() -> int:
+        raise KeyError
+
+    with pytest.raises(KeyError):
+        main()
+
+
+def test_folders_are_not_made_before_there_is_anything_to_write(tmp_path: Path) -> None:
+    assert folder_to_write(str(tmp_path / "a" / "b")) == tmp_path / "a" / "b"
+    assert not (tmp_path / "a").exists()
