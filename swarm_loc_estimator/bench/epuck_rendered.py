@@ -48,13 +48,6 @@ _TOPICS: dict[str, tuple[type, str]] = {
     "ground_truth": (PoseStamped, POSE_STAMPED),
 }
 
-_PARAMETERS = f"""
-/**/marker_detector:
-  ros__parameters:
-    layout_sigma: {WORLDS[WORLD].face_position_sigma}
-"""
-"""As a careful user sets them: how exactly faces sit on robots."""
-
 Say = Callable[[str], None]
 
 
@@ -197,11 +190,7 @@ def run_rendered(swarm: Swarm, seed: int, duration_s: float, folder: Path, say: 
     links.mkdir(parents=True)
     swarm_file, names = folder / "swarm.yaml", [robot.name for robot in swarm.robots]
     save_swarm(swarm, swarm_file)
-    parameters = folder / "parameters.yaml"
-    parameters.write_text(_PARAMETERS, encoding="utf-8")
-    options = SimulationOptions(
-        str(swarm_file), str(links), world=WORLD, seed=seed, parameter_file=str(parameters)
-    )
+    options = SimulationOptions(str(swarm_file), str(links), world=WORLD, seed=seed)
     nodes = simulation_nodes(options, names)
     with LiveGraph(nodes, folder / "nodes.log") as graph:
         listener = _Listener(graph, names)

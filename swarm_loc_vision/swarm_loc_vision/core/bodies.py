@@ -20,6 +20,8 @@ from swarm_loc_vision.core.pose import Poses, Upright, body_pose, square
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+_LEAST_SIGMA = 0.0005
+"""No face is glued on truer [m]."""
 _MOST_CHI2 = 25.0
 """Per degree of freedom; where faces fit worse, they do not sit as described, and each stays on its own."""
 
@@ -31,10 +33,12 @@ class Placement:
     Attributes:
         rotation: (3, 3) from the marker's frame to the body's.
         position: (3,) in the body's frame [m].
+        sigma: How unsure its position is, each way [m].
     """
 
     rotation: FloatArray
     position: FloatArray
+    sigma: float
 
 
 Body = Mapping[int, Placement]
@@ -50,7 +54,7 @@ def _placement(face: Face, yaw: float) -> Placement:
     """A face stands upright and looks along its yaw."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     rotation = np.array([[-sin, 0.0, cos], [cos, 0.0, sin], [0.0, 1.0, 0.0]])
-    return Placement(rotation, np.array([face.x, face.y, face.z]))
+    return Placement(rotation, np.array([face.x, face.y, face.z]), max(face.position_sigma, _LEAST_SIGMA))
 
 
 def up_of(mount: CameraMount) -> FloatArray:
@@ -78,9 +82,7 @@ class Seen:
     poses: Poses
 
 
-def solve_bodies(
-    seen: Seen, bodies: Iterable[Body], intrinsics: FloatArray, upright: Upright | None, layout_sigma: float
-) -> None:
+def solve_bodies(seen: Seen, bodies: Iterable[Body], intrinsics: FloatArray, upright: Upright | None) -> None:
     """Replace the poses of markers that sit on one body by what they say together.
 
     Args:
@@ -88,7 +90,6 @@ def solve_bodies(
         bodies: What carries several.
         intrinsics: (4,) fx, fy, cx, cy [px].
         upright: Given when the bodies are known to stand upright.
-        layout_sigma: How exactly markers sit on bodies, each way [m].
     """
     solved = np.isfinite(seen.poses.chi2[:, 0])
     for body in bodies:
@@ -96,7 +97,7 @@ def solve_bodies(
         distinct = {int(seen.id[i]) for i in rows}
         if len(rows) < 2 or len(distinct) < len(rows):
             continue
-        _solve(seen, rows, [body[int(seen.id[i])] for i in rows], intrinsics, upright, layout_sigma)
+        _solve(seen, rows, [body[int(seen.id[i])] for i in rows], intrinsics, upright)
 
 
 def _solve(
@@ -105,13 +106,15 @@ def _solve(
     places: Sequence[Placement],
     intrinsics: FloatArray,
     upright: Upright | None,
-    layout_sigma: float,
 ) -> None:
     """One body, seen in some rows."""
     points = np.stack(
         [square(seen.lengths[i]) @ at.rotation.T + at.position for i, at in zip(rows, places, strict=True)]
     )
-    shifts = [_shift_covariance(layout_sigma, seen.poses.position[i, 0], intrinsics) for i in rows]
+    shifts = [
+        _shift_covariance(at.sigma, seen.poses.position[i, 0], intrinsics)
+        for i, at in zip(rows, places, strict=True)
+    ]
     covariance = seen.covariance[rows] + np.stack(shifts)
     starts = _starts(seen, rows, places)
     found = body_pose(points, seen.corners[rows], covariance, intrinsics, starts, upright)

@@ -156,7 +156,7 @@ class MarkerDetector:
         poses = marker_poses(markers.corners, markers.covariance, lengths, intrinsics, self._upright)
         if self._bodies:
             seen = Seen(markers.id, markers.corners, markers.covariance, lengths, poses)
-            solve_bodies(seen, self._bodies, intrinsics, self._upright, self._settings.layout_sigma)
+            solve_bodies(seen, self._bodies, intrinsics, self._upright)
         return poses
 
 

@@ -22,7 +22,6 @@ class DetectorSettings:
     tilt_sigma: float = number(
         0.0, "rad", 0.0, 1.0, "how upright markers stand towards a level camera's mount; 0: any way up"
     )
-    layout_sigma: float = number(0.0005, "m", 0.0, 0.1, "how exactly faces sit on a robot")
     ambiguity: float = number(
         16.0, "1", 0.0, 1e4, "the mirrored pose is told when it fits worse by no more than this chi square"
     )

@@ -24,7 +24,7 @@ def warm_up() -> None:
     height, width = picture.shape
     camera = Camera(width, height, 500.0, 500.0, 0.5 * width, 0.5 * height)
     apart = 0.05 * (family.side + 8) / family.side
-    body = {i: Placement(np.eye(3), np.array([apart * i, 0.0, 0.0])) for i in (1, 2)}
+    body = {i: Placement(np.eye(3), np.array([apart * i, 0.0, 0.0]), 0.001) for i in (1, 2)}
     up = np.array([0.0, -1.0, 0.0])
     settings = DetectorSettings(tilt_sigma=0.1)
     MarkerDetector(settings, [(family, np.array([1, 2]))], camera, up=up, bodies=[body]).detect(picture)

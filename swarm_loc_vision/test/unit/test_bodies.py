@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ FACES = tuple(
     Face(f"face{k}", k, 0.035 * math.cos(yaw), 0.035 * math.sin(yaw), 0.06, yaw)
     for k, yaw in enumerate(2.0 * math.pi * np.arange(5) / 5)
 )
-BODY = robot_body(Robot("epuck", faces=FACES))
+BODY = {k: replace(at, sigma=0.0) for k, at in robot_body(Robot("epuck", faces=FACES)).items()}
 OPTICAL_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
@@ -52,7 +53,7 @@ def test_two_faces_have_one_pose_without_flips() -> None:
         assert len(seen.id) >= 2
         true_turn = [rotation @ BODY[int(k)].rotation for k in seen.id]
         alone += [_angle(seen.poses.rotation[i, 0], turn) for i, turn in enumerate(true_turn)]
-        solve_bodies(seen, [BODY], INTRINSICS, None, 0.0)
+        solve_bodies(seen, [BODY], INTRINSICS, None)
         together += [_angle(seen.poses.rotation[i, 0], turn) for i, turn in enumerate(true_turn)]
         at = BODY[int(seen.id[0])]
         error = np.concatenate(
@@ -73,10 +74,27 @@ def _angle(a: FloatArray, b: FloatArray) -> float:
     return float(np.linalg.norm(Rotation.from_matrix(a @ b.T).as_rotvec()))
 
 
+@pytest.mark.parametrize(("told", "counts"), [(0.0, 0.0005), (0.003, 0.003)])
+def test_a_description_says_how_exactly_faces_sit(told: float, counts: float) -> None:
+    faces = tuple(replace(face, position_sigma=told) for face in FACES)
+    assert {at.sigma for at in robot_body(Robot("epuck", faces=faces)).values()} == {counts}
+
+
+def test_faces_that_sit_a_little_off_make_the_pose_less_sure() -> None:
+    unsure = {k: replace(at, sigma=0.003) for k, at in BODY.items()}
+    for seed in range(5):
+        sizes = []
+        for body in (BODY, unsure):
+            seen, _, _ = sighting(seed)
+            solve_bodies(seen, [body], INTRINSICS, None)
+            sizes.append(np.linalg.det(seen.poses.covariance[0, 0]))
+        assert sizes[1] > 10.0 * sizes[0]
+
+
 def test_faces_that_do_not_fit_stay_on_their_own() -> None:
     seen, _, _ = sighting(0, body_shift=0.02)
     before = [column.copy() for column in seen.poses]
-    solve_bodies(seen, [BODY], INTRINSICS, None, 0.0)
+    solve_bodies(seen, [BODY], INTRINSICS, None)
     assert all((now == then).all() for now, then in zip(seen.poses, before, strict=True))
 
 
@@ -84,7 +102,7 @@ def test_an_id_seen_twice_is_not_trusted() -> None:
     seen, _, _ = sighting(0)
     seen.id[:] = seen.id[0]
     before = seen.poses.position.copy()
-    solve_bodies(seen, [BODY], INTRINSICS, None, 0.0)
+    solve_bodies(seen, [BODY], INTRINSICS, None)
     assert (seen.poses.position == before).all()
 
 

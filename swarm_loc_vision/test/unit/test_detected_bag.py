@@ -22,8 +22,8 @@ from swarm_loc_estimator.replay_result import ReplayResult
 from swarm_loc_vision.cli.detect import main
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_pictures"
-SWARM = load_swarm(BAG / "self_calibrating.yaml")
-FACES_SIT_TO = ["--set", "layout_sigma=0.003"]
+DESCRIPTION = BAG / "self_calibrating.yaml"
+SWARM = load_swarm(DESCRIPTION)
 BEGINNING_S = 2.5
 GAP_NS = 200_000_000
 TO_EDGE = 0.47
@@ -36,7 +36,7 @@ Messages = list[tuple[str, str, int, bytes]]
 @pytest.fixture(scope="module")
 def detected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("detected") / "detected"
-    assert main([str(BAG), "--output", str(path), *FACES_SIT_TO]) == 0
+    assert main([str(BAG), "--output", str(path), "--swarm", str(DESCRIPTION)]) == 0
     return path
 
 
@@ -108,12 +108,11 @@ def test_the_same_pictures_give_the_same_bytes(detected: Path, tmp_path: Path) -
     shutil.copyfile(BAG / "swarm.yaml", tmp_path / "beginning" / "swarm.yaml")
     for part in ("one", "two"):
         (tmp_path / part).mkdir()
-        assert (
-            main([str(tmp_path / "beginning"), "--output", str(tmp_path / part / "bag"), *FACES_SIT_TO]) == 0
-        )
+        arguments = ["--output", str(tmp_path / part / "bag"), "--swarm", str(DESCRIPTION)]
+        assert main([str(tmp_path / "beginning"), *arguments]) == 0
     one, two = tmp_path / "one" / "bag", tmp_path / "two" / "bag"
     assert (one / "bag.mcap").read_bytes() == (two / "bag.mcap").read_bytes()
-    assert (one / "swarm.yaml").read_bytes() == (BAG / "swarm.yaml").read_bytes()
+    assert (one / "swarm.yaml").read_bytes() == DESCRIPTION.read_bytes()
     beginning = messages(one)
     assert beginning == messages(detected)[: len(beginning)]
     kept = [message for message in messages(BAG) if not message[0].endswith("compressed")]
