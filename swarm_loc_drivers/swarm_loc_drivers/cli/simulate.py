@@ -13,11 +13,14 @@ import argparse
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+from swarm_loc_drivers.sim.epuck_world import WorldError, check_swarm
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
 from swarm_loc_estimator.cli.arguments import number_in
+from swarm_loc_estimator.cli.ending import told_in_a_sentence
 from swarm_loc_estimator.cli.graph import say
 from swarm_loc_estimator.core.compiled import is_warm
 from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
@@ -25,8 +28,8 @@ from swarm_loc_estimator.processes import GraphError, run_graph
 from swarm_loc_vision.core.warm_up import CORE, warm_up
 
 
-def parse(arguments: Sequence[str], link_folder: str) -> SimulationOptions:
-    """Read the command line."""
+def parse(arguments: Sequence[str] | None) -> SimulationOptions:
+    """Read the command line; links have no folder yet."""
     parser = argparse.ArgumentParser(
         prog="simulate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -54,22 +57,21 @@ def parse(arguments: Sequence[str], link_folder: str) -> SimulationOptions:
         help="simulated seconds per second, as far as the machine keeps up (default: 1)",
     )
     parser.add_argument("--params-file", dest="parameter_file", help="ROS parameter file for all nodes")
-    return SimulationOptions(link_folder=link_folder, **vars(parser.parse_args(arguments)))
+    return SimulationOptions(link_folder="", **vars(parser.parse_args(arguments)))
 
 
-def main() -> int:
+@told_in_a_sentence(GraphError, SwarmFileError, WorldError)
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run until a node ends or Ctrl-C."""
-    try:
-        with tempfile.TemporaryDirectory(prefix="epucks-") as links:
-            options = parse(sys.argv[1:], links)
-            robots = [robot.name for robot in load_swarm(Path(options.swarm_file)).robots]
-            if not is_warm(CORE):  # once, not in every robot's detector at a time
-                say("compiling the marker detector for this machine: about half a minute")
-                warm_up()
-            return run_graph(simulation_nodes(options, robots), say)
-    except (GraphError, SwarmFileError) as error:
-        print(error, file=sys.stderr)
-        return 1
+    options = parse(arguments)
+    swarm = load_swarm(Path(options.swarm_file))
+    check_swarm(swarm)  # here, and not by the world when a score of processes have started
+    if not is_warm(CORE):  # once, not in every robot's detector at a time
+        say("compiling the marker detector for this machine: about half a minute")
+        warm_up()
+    with tempfile.TemporaryDirectory(prefix="epucks-") as links:
+        chosen = replace(options, link_folder=links)
+        return run_graph(simulation_nodes(chosen, [robot.name for robot in swarm.robots]), say)
 
 
 if __name__ == "__main__":

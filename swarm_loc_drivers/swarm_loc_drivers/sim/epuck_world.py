@@ -93,7 +93,7 @@ class EpuckWorld:
     """
 
     def __init__(self, swarm: Swarm, settings: EpuckWorldSettings) -> None:
-        _check(swarm)
+        check_swarm(swarm)
         self._settings = settings
         self._drive = Drive(
             settings.wheels.wheel_separation, settings.world.wheel_noise, settings.world.turn_slip
@@ -228,8 +228,12 @@ def bodies(world: EpuckWorld, count: int) -> Sequence[SimulatedEpuck]:
     return [SimulatedEpuck(world, robot) for robot in range(count)]
 
 
-def _check(swarm: Swarm) -> None:
-    """Raise what the robots or markers lack."""
+def check_swarm(swarm: Swarm) -> None:
+    """Make sure that nothing is lacking.
+
+    Raises:
+        WorldError: What a robot or a marker lacks.
+    """
     for robot in swarm.robots:
         if robot.start is None:
             raise WorldError(

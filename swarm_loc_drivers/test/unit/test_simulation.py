@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
+
 from swarm_loc_drivers.cli import simulate
 from swarm_loc_drivers.nodes.unanswered import Unanswered
 from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
 
+BAGS = Path(__file__).parents[3] / "bags"
 SECOND = 1_000_000_000
 
 
@@ -31,8 +36,29 @@ def test_every_robot_has_a_driver_on_its_link_and_a_detector_for_its_camera() ->
 
 def test_the_command_line_becomes_options() -> None:
     line = ["swarm.yaml", "--world", "w0", "--seed", "7", "--speed", "0.08", "--rate", "2"]
-    expected = SimulationOptions("swarm.yaml", "/links", world="w0", seed=7, speed=0.08, rate=2.0)
-    assert simulate.parse(line, "/links") == expected
+    expected = SimulationOptions("swarm.yaml", "", world="w0", seed=7, speed=0.08, rate=2.0)
+    assert simulate.parse(line) == expected
+
+
+@pytest.mark.parametrize(
+    ("bag", "old", "new", "words"),
+    [
+        ("droplets_twenty", "", "", "robot 'droplet1' has no start pose"),
+        ("eight_one_robot_slow", "start:", "start: null #", "robot 'epuck1' has no start pose"),
+        ("eight_one_robot_slow", "fileversion: 1", "fileversion: 2", "fileversion is 2 but must be 1"),
+    ],
+)
+def test_a_swarm_that_cannot_be_simulated_is_told_before_anything_starts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], bag: str, old: str, new: str, words: str
+) -> None:
+    described, swarm_file = (BAGS / bag / "swarm.yaml").read_text(), tmp_path / "swarm.yaml"
+    assert old in described
+    swarm_file.write_text(described.replace(old, new) if old else described)
+    assert simulate.main([str(swarm_file)]) == 1
+    said = capsys.readouterr()
+    assert not said.out
+    assert words in said.err
+    assert said.err.count("\n") == 1
 
 
 def test_a_world_waits_for_its_oldest_picture() -> None:

@@ -300,8 +300,8 @@ def boards(board_id: int) -> st.SearchStrategy[RobotIr]:
         st.just(DROPLET),
         st.just("droplet"),
         st.sampled_from(IrMethod),
-        st.none() | st.builds(IrGains, gain, gain, st.floats(0.0, 1.0)),
-        st.sampled_from([0.9999, 0.9]),
+        st.none() | st.builds(IrGains, gain, gain, st.floats(0.0, 1.0), st.floats(0.0, 1.0)),
+        st.floats(0.5, 1.0),
     )
 
 
