@@ -213,7 +213,9 @@ def recorded(
     receiver = rng.integers(0, 2, CALIBRATION)
     poses = random_poses(rng, CALIBRATION, 8, 28)
     readings = readings_of(platform, poses, rng, pairs(factors, receiver))
-    return Exchanges(receiver, 1 - receiver, readings, poses if known else np.full_like(poses, np.nan))
+    saturation = np.full(readings.shape[:2], platform.saturation)
+    told = poses if known else np.full_like(poses, np.nan)
+    return Exchanges(receiver, 1 - receiver, readings, saturation, told)
 
 
 def times() -> dict[str, float]:

@@ -175,9 +175,9 @@ def _groups(recording: Recording, swarm: Swarm, *, with_truth: bool) -> tuple[li
         columns = np.array(own, dtype=np.int64).reshape(-1, 3).T
         place = np.searchsorted(members, columns[1:])
         poses = _true_poses(recording, swarm, columns) if with_truth else np.full((len(own), 3), np.nan)
-        readings = screening.together(members[0], [exchanges[key] for key in own])
+        readings, saturation = screening.together(members[0], [exchanges[key] for key in own])
         board = screening.boards[members[0]]
-        read = Exchanges(place[0], place[1], readings, poses)
+        read = Exchanges(place[0], place[1], readings, saturation, poses)
         groups.append(BoardGroup(board.source, board.platform, tuple(members), read))
     return groups, screening.dropped
 

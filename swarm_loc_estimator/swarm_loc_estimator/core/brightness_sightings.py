@@ -136,14 +136,14 @@ class BrightnessConverter:
         """Exchanges of one kind whose measurement changes, with what it becomes, (1,) or (0,)."""
         ir = self._ir[keys[0].receiver]
         exchanges = [self._exchanges[key] for key in keys]
-        readings = self._screening.together(keys[0].receiver, [one.readings for one in exchanges])
+        readings, limits = self._screening.together(keys[0].receiver, [one.readings for one in exchanges])
         sides = [[self._ir[key[side]].believed_gains for key in keys] for side in (1, 2)]
-        solutions = _estimator(ir.platform, ir.estimator).solve(readings, PairGains.of(*sides))
+        solutions = _estimator(ir.platform, ir.estimator).solve(readings, PairGains.of(*sides), limits)
         measurements = self._measurements(keys, solutions)
         faults = faults_of(measurements)
         changed = []
         for k, exchange in enumerate(exchanges):
-            exchange.fate = _reason(int(solutions.outcomes[k]), readings[k], ir.platform) or FAULTS[faults[k]]
+            exchange.fate = _reason(int(solutions.outcomes[k]), readings[k], limits[k]) or FAULTS[faults[k]]
             measurement = NO_MEASUREMENTS if exchange.fate else measurements[k : k + 1]
             if measurement.tobytes() != exchange.measurement.tobytes():
                 changed.append((exchange, measurement))
@@ -178,10 +178,10 @@ def _fates(exchanges: Iterable[_Exchange]) -> Counter[str]:
     return counts
 
 
-def _reason(outcome: int, readings: FloatArray, platform: IrPlatform) -> str:
-    """Why readings (modes, n, n) gave no pose, "" if they did."""
+def _reason(outcome: int, readings: FloatArray, saturation: FloatArray) -> str:
+    """Why readings (modes, n, n), of saturation (modes,), gave no pose, "" if they did."""
     if outcome == Outcome.FOUND:
         return ""
-    if np.all(readings[np.isfinite(readings)] >= platform.saturation):
+    if np.all(np.isnan(readings) | (readings >= saturation[:, None, None])):
         return "ir_saturated"
     return f"ir_{Outcome(outcome).name.lower()}"

@@ -15,8 +15,21 @@ from swarm_loc_estimator.core.robot_ir import RobotIr
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import Swarm
 
-Readings = dict[int, FloatArray]
-"""Of an exchange: power -> (n, n) [count], [sensor, emitter]; NaN: not known."""
+
+class Matrix(NamedTuple):
+    """What was read at one power.
+
+    Attributes:
+        counts: (n, n) [count], [sensor, emitter].
+        saturation: Counts of it or more tell only that it was at least so bright.
+    """
+
+    counts: FloatArray
+    saturation: float
+
+
+Readings = dict[int, Matrix]
+"""Of an exchange, by power."""
 
 
 class ExchangeKey(NamedTuple):
@@ -56,24 +69,27 @@ class MatrixScreening:
 
     def add(self, rows: BrightnessRows, k: int, readings: Readings) -> None:
         """Put matrix k to others of its exchange; of two for one power the same one counts in any order."""
-        platform, limit = self.boards[int(rows.robot[k])].platform, rows.saturation[k]
-        matrix = rows.readings[k].reshape(platform.n, platform.n).astype(np.float64)
-        if limit > 0:  # a sensor that ends before the platform's does tells only that there was more
-            matrix[(matrix >= limit) & (matrix < platform.saturation)] = np.nan
+        platform, told = self.boards[int(rows.robot[k])].platform, float(rows.saturation[k])
+        counts = rows.readings[k].reshape(platform.n, platform.n).astype(np.float64)
+        matrix = Matrix(counts, min(told, platform.saturation) if told > 0.0 else platform.saturation)
         power = int(rows.power[k])
         if power in readings:
             self.dropped["duplicate"] += 1
-            matrix = min(matrix, readings[power], key=lambda one: one.tobytes())
+            matrix = min(matrix, readings[power], key=lambda one: (one.counts.tobytes(), one.saturation))
         readings[power] = matrix
 
-    def together(self, robot: int, exchanges: list[Readings]) -> FloatArray:
-        """Readings (k, modes, n, n) of exchanges of a robot's board, NaN where not measured."""
+    def together(self, robot: int, exchanges: list[Readings]) -> tuple[FloatArray, FloatArray]:
+        """Readings (k, modes, n, n) of exchanges of a robot's board, NaN where not measured, and saturation.
+
+        Saturation is (k, modes).
+        """
         platform = self.boards[robot].platform
         whole = np.full((len(exchanges), len(platform.amplitudes), platform.n, platform.n), np.nan)
+        saturation = np.full(whole.shape[:2], platform.saturation)
         for k, exchange in enumerate(exchanges):
             for power, matrix in exchange.items():
-                whole[k, power] = matrix
-        return whole
+                whole[k, power], saturation[k, power] = matrix
+        return whole, saturation
 
     def _fault(self, rows: BrightnessRows, k: int) -> str:
         """Why matrix k cannot be used; "" if it can."""

@@ -111,6 +111,12 @@ def with_column(**columns: object) -> Callable[[BrightnessRows], BrightnessRows]
     return lambda rows: rows._replace(**{n: np.full(rows.robot.size, v) for n, v in columns.items()})
 
 
+def with_both(
+    one: Callable[[BrightnessRows], BrightnessRows], other: Callable[[BrightnessRows], BrightnessRows]
+) -> Callable[[BrightnessRows], BrightnessRows]:
+    return lambda rows: other(one(rows))
+
+
 def with_readings(readings: FloatArray) -> Callable[[BrightnessRows], BrightnessRows]:
     def change(rows: BrightnessRows) -> BrightnessRows:
         column = np.empty(rows.robot.size, dtype=object)
@@ -136,6 +142,9 @@ def with_readings(readings: FloatArray) -> Callable[[BrightnessRows], Brightness
         (with_readings(np.zeros(36)), "ir_too_weak"),
         (with_readings(np.random.default_rng(0).normal(0.0, 1.0, 36).round()), "ir_too_weak"),
         (with_readings(np.full(36, 255)), "ir_saturated"),
+        (with_both(with_readings(np.full(36, 240)), with_column(saturation=240)), "ir_saturated"),
+        (with_both(with_readings(np.full(36, 255)), with_column(saturation=4095)), "ir_saturated"),
+        (with_both(with_readings(np.full(36, 255)), with_column(saturation=-1)), "ir_saturated"),
         (with_readings(np.full(36, -200)), "ir_too_few"),
         (with_readings(np.where(np.arange(36) % 7 == 3, 200, 0)), "ir_misfit"),
         (with_readings(np.full(36, -(2**31))), "ir_too_few"),
@@ -187,15 +196,41 @@ def test_a_sensor_that_ends_early_tells_no_more_from_there_on() -> None:
     assert not wrong.size or abs(wrong["value"][0, 0] - relative(0, 1)[0]) > 5e-3
 
 
+def test_where_readings_end_is_each_matrixs_own_and_in_any_order_the_same() -> None:
+    far, near = heard(poses=CLOSE)[:2]
+    limits = {one.power: int(0.7 * one.readings.max()) for one in (far, near)}
+    events = [replace(one, readings=np.minimum(one.readings, limits[one.power])) for one in (far, near)]
+    assert all((one.readings == limits[one.power]).any() for one in events)
+    repeated = [(one, limit) for one in events for limit in (limits[one.power], 4095)]
+    results = set()
+    for order in (repeated, repeated[::-1], repeated[1:] + repeated[:1]):
+        converter, last = BrightnessConverter(swarm_of()), b""
+        for event, limit in order:
+            added = converter.take(with_column(saturation=limit)(rows_of(event))).added
+            last = added.tobytes() or last
+        assert converter.drops == {"duplicate": 2}
+        results.add(last)
+    assert len(results) == 1
+    told = [with_column(saturation=limits[one.power])(rows_of(one)) for one in events]
+    converter = BrightnessConverter(swarm_of())
+    converter.take(told[0])
+    measured = converter.take(told[1]).added
+    error = measured["value"][0] - [np.hypot(*CLOSE[1, :2]), *relative(0, 1)[1:]]
+    assert np.sum(error * np.linalg.solve(measured["covariance"][0], error)) < 16.3  # one in a thousand
+
+
 class Ambiguous:
     """An estimator that finds two poses, and poses that are no good."""
 
     def __init__(self, _platform: IrPlatform) -> None:
         pass
 
-    def solve(self, readings: FloatArray, gains: PairGains | None = None) -> IrSolutions:
+    def solve(
+        self, readings: FloatArray, gains: PairGains | None = None, saturation: FloatArray | None = None
+    ) -> IrSolutions:
         """Always the same, but for the robots whose brightest reading is odd."""
         assert gains is not None
+        assert saturation is not None
         k = len(readings)
         solutions = IrSolutions.none(k)
         solutions.outcomes[:] = Outcome.FOUND

@@ -27,7 +27,9 @@ def recorded(
     transmitter = (receiver + rng.integers(1, ROBOTS, count)) % ROBOTS
     poses = random_poses(count, seed, low, high)
     readings = readings_of(droplet(), poses, seed, pairs_of(logs, receiver, transmitter))
-    return logs, Exchanges(receiver, transmitter, readings, poses if known else np.full_like(poses, np.nan))
+    saturation = np.full(readings.shape[:2], droplet().saturation)
+    told = poses if known else np.full_like(poses, np.nan)
+    return logs, Exchanges(receiver, transmitter, readings, saturation, told)
 
 
 def pairs_of(logs: FloatArray, receiver: IntArray, transmitter: IntArray) -> PairGains:

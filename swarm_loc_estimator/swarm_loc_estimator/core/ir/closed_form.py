@@ -52,11 +52,13 @@ class ClosedForm:
         self._ranges = np.geomspace(2.0 * platform.radius, max(farthest, 4.0 * platform.radius), _LEVELS)
         self._errors: dict[int, FloatArray] = {}
 
-    def solve(self, readings: ArrayLike, gains: PairGains | None = None) -> IrSolutions:
+    def solve(
+        self, readings: ArrayLike, gains: PairGains | None = None, saturation: ArrayLike | None = None
+    ) -> IrSolutions:
         """Relative poses of k pairs, see `solution.IrEstimator`; there are no alternatives."""
-        values, known = checked(self._platform, readings, gains)
+        values, known, limits = checked(self._platform, readings, gains, saturation)
         solutions = IrSolutions.none(len(values))
-        _solve_all(self._platform.model, values, known, solutions.poses, solutions.outcomes)
+        _solve_all(self._platform.model, values, known, limits, solutions.poses, solutions.outcomes)
         found = np.flatnonzero(solutions.outcomes == Outcome.FOUND)
         steps = np.ceil(np.sqrt(0.5 * np.sum(known.sigma[found] ** 2, axis=-1)) / _SIGMA_STEP).astype(int)
         for step in np.unique(steps):
@@ -90,7 +92,7 @@ class ClosedForm:
         spread = np.hypot(platform.noise, platform.relative_noise * readings)
         readings = np.minimum(readings + spread * rng.standard_normal(readings.shape), platform.saturation)
         found, outcomes = np.zeros_like(poses), np.zeros(count, np.int64)
-        _solve_all(platform.model, readings, platform.unknown_gains(count), found, outcomes)
+        _solve_all(platform.model, *checked(platform, readings, None, None), found, outcomes)
         errors, level = found - poses, self._level(found[:, 0])
         errors[:, 1:] = wrap_angle(errors[:, 1:])
         beside = [(outcomes == _FOUND) & (np.abs(level - k) <= 1) for k in range(_LEVELS)]
@@ -109,13 +111,18 @@ def _core_squares(errors: FloatArray) -> FloatArray:
 
 @compiled
 def _solve_all(
-    model: IrModel, readings: FloatArray, gains: PairGains, poses: FloatArray, outcomes: NDArray[np.int64]
+    model: IrModel,
+    readings: FloatArray,
+    gains: PairGains,
+    saturation: FloatArray,
+    poses: FloatArray,
+    outcomes: NDArray[np.int64],
 ) -> None:
     """All pairs, one after the other."""
     n = readings.shape[2]
     matrix, light = np.empty((n, n)), np.empty((2, n))
     for k in range(readings.shape[0]):
-        mode = _best_power(model, readings[k])
+        mode = _best_power(model, readings[k], saturation[k])
         if mode < 0:
             outcomes[k] = _TOO_WEAK
             continue
@@ -128,7 +135,7 @@ def _solve_all(
 
 
 @compiled
-def _best_power(model: IrModel, readings: FloatArray) -> int:
+def _best_power(model: IrModel, readings: FloatArray, saturation: FloatArray) -> int:
     """The first power that neither saturates nor is faint, else the last that saturates; -1: all faint."""
     saturated = -1
     for m in range(readings.shape[0]):
@@ -137,7 +144,7 @@ def _best_power(model: IrModel, readings: FloatArray) -> int:
             for j in range(readings.shape[2]):
                 if math.isfinite(readings[m, i, j]):
                     brightest = max(brightest, readings[m, i, j])
-        if brightest >= model.saturation:
+        if brightest >= saturation[m]:
             saturated = m
         elif brightest > _FAINTEST * model.noise:
             return m

@@ -34,6 +34,7 @@ class Pair(NamedTuple):
 
     Attributes:
         readings: (modes, n, n) [count].
+        saturation: (modes,) from where on they are SATURATED [count].
         kinds: (modes, n, n) MISSING, MEASURED or SATURATED.
         sensor: (n,) gains of the receiver's sensors.
         emitter: (n,) gains of the transmitter's emitters.
@@ -44,6 +45,7 @@ class Pair(NamedTuple):
     """
 
     readings: FloatArray
+    saturation: FloatArray
     kinds: NDArray[np.int8]
     sensor: FloatArray
     emitter: FloatArray
@@ -134,7 +136,7 @@ def cost_of(
                 factor = room.factors[0, i] * room.factors[1, j]
                 expected = factor * room.expected[m, i, j]
                 reading = pair.readings[m, i, j]
-                level = reading if kind == MEASURED else model.saturation
+                level = reading if kind == MEASURED else pair.saturation[m]
                 spread = model.relative_noise * level
                 weight = 1.0 / (model.noise * model.noise + spread * spread)
                 if kind == SATURATED:

@@ -52,6 +52,7 @@ class Exchanges(NamedTuple):
         receiver: (k,) index of the robot that measured.
         transmitter: (k,) index of the robot that lit its emitters.
         readings: (k, modes, n, n) [count], [mode, sensor, emitter], NaN where not measured.
+        saturation: (k, modes) from where on readings tell no more [count].
         poses: (k, 3) of the transmitter seen from the receiver, range [m], bearing, heading [rad]; NaN where
             not known.
     """
@@ -59,6 +60,7 @@ class Exchanges(NamedTuple):
     receiver: NDArray[np.int64]
     transmitter: NDArray[np.int64]
     readings: FloatArray
+    saturation: FloatArray
     poses: FloatArray
 
 
@@ -132,7 +134,7 @@ def _poses(
     Raises:
         GainsError: None of them.
     """
-    solutions = estimator.solve(exchanges.readings, pairs)
+    solutions = estimator.solve(exchanges.readings, pairs, exchanges.saturation)
     known = _known(exchanges)
     sure = (solutions.odds < _MOST_ODDS) & (solutions.misfits < _MOST_MISFIT)
     found = solutions.outcomes == Outcome.FOUND
@@ -207,11 +209,11 @@ def _linearized(
     """The readings of the exchanges used."""
     pairs = PairGains(*(values[used] for values in _pairs(exchanges, logs, 0.0)))
     expected, slopes = expected_with_slopes(platform, poses[used], pairs)
-    readings = exchanges.readings[used]
+    readings, limit = exchanges.readings[used], exchanges.saturation[used][..., None, None]
     with np.errstate(invalid="ignore"):
         spread = np.hypot(platform.noise, platform.relative_noise * readings)
-        clear = expected < platform.saturation - _CLEAR_OF_SATURATION * platform.noise
-        light = (readings > DARKEST * platform.noise) & (readings < platform.saturation)
+        clear = expected < limit - _CLEAR_OF_SATURATION * platform.noise
+        light = (readings > DARKEST * platform.noise) & (readings < limit)
     usable = np.isfinite(readings) & clear & light
     weight = np.where(usable, 1.0 / np.where(usable, spread, 1.0) ** 2, 0.0)
     return _Linear(weight, np.where(usable, readings - expected, 0.0), expected, slopes)

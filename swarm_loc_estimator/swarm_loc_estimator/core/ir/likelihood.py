@@ -79,11 +79,13 @@ class MaximumLikelihood:
         self._platform = platform
         self._models = Models(platform.model, blurred(platform), start_table(platform))
 
-    def solve(self, readings: ArrayLike, gains: PairGains | None = None) -> IrSolutions:
+    def solve(
+        self, readings: ArrayLike, gains: PairGains | None = None, saturation: ArrayLike | None = None
+    ) -> IrSolutions:
         """Relative poses of k pairs, see `solution.IrEstimator`."""
-        values, known = checked(self._platform, readings, gains)
+        values, known, limits = checked(self._platform, readings, gains, saturation)
         solutions = IrSolutions.none(len(values))
-        _solve_all(self._models, values, known, solutions)
+        _solve_all(self._models, values, known, limits, solutions)
         return solutions
 
 
@@ -149,7 +151,9 @@ def _new_room(table: StartTable, modes: int, n: int, known: bool) -> _Room:
 
 
 @compiled
-def _solve_all(models: Models, readings: FloatArray, gains: PairGains, out: IrSolutions) -> None:
+def _solve_all(
+    models: Models, readings: FloatArray, gains: PairGains, saturation: FloatArray, out: IrSolutions
+) -> None:
     """All pairs, one after the other."""
     modes, n = readings.shape[1], readings.shape[2]
     rooms = [_new_room(models.table, modes, n, known > 0) for known in range(2)]
@@ -157,7 +161,8 @@ def _solve_all(models: Models, readings: FloatArray, gains: PairGains, out: IrSo
     prior = np.empty((2, 2))
     for k in range(readings.shape[0]):
         room = rooms[1 if _write_prior(gains.sigma[k], n, prior) else 0]
-        pair = Pair(readings[k], room.kinds, gains.sensor[k], gains.emitter[k], prior, nearest, farthest)
+        sensor, emitter = gains.sensor[k], gains.emitter[k]
+        pair = Pair(readings[k], saturation[k], room.kinds, sensor, emitter, prior, nearest, farthest)
         out.outcomes[k] = _solve_one(models, pair, room, out, k)
 
 
@@ -307,9 +312,9 @@ def _classify(model: IrModel, pair: Pair) -> tuple[int, int, float]:
                 if not math.isfinite(reading) or reading < DARKEST * model.noise:
                     kinds[m, i, j] = MISSING
                     continue
-                sigmas = min(reading, model.saturation) / model.noise
+                sigmas = min(reading, pair.saturation[m]) / model.noise
                 bright += sigmas * sigmas
-                if reading >= model.saturation:
+                if reading >= pair.saturation[m]:
                     kinds[m, i, j] = SATURATED
                     saturated += 1
                 else:

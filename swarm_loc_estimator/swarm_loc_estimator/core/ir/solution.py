@@ -69,12 +69,16 @@ class ReadingsError(ValueError):
 class IrEstimator(Protocol):
     """One of `ClosedForm` and `MaximumLikelihood`."""
 
-    def solve(self, readings: ArrayLike, gains: PairGains | None = None) -> IrSolutions:
+    def solve(
+        self, readings: ArrayLike, gains: PairGains | None = None, saturation: ArrayLike | None = None
+    ) -> IrSolutions:
         """Relative poses of k pairs.
 
         Args:
             readings: (k, modes, n, n) [count], [mode, sensor, emitter], NaN where not measured.
             gains: Of the k pairs; None: never calibrated.
+            saturation: (k, modes) a reading of it or more tells only that it is at least so bright [count];
+                None: the platform's.
 
         Raises:
             ReadingsError: They have another shape.
@@ -82,9 +86,9 @@ class IrEstimator(Protocol):
 
 
 def checked(
-    platform: IrPlatform, readings: ArrayLike, gains: PairGains | None
-) -> tuple[FloatArray, PairGains]:
-    """Readings (k, modes, n, n) and gains as estimators take them.
+    platform: IrPlatform, readings: ArrayLike, gains: PairGains | None, saturation: ArrayLike | None
+) -> tuple[FloatArray, PairGains, FloatArray]:
+    """Readings (k, modes, n, n), gains and saturation (k, modes) as estimators take them.
 
     Raises:
         ReadingsError: They have another shape.
@@ -101,4 +105,9 @@ def checked(
         raise ReadingsError(
             f"gains have the shape {known.sensor.shape} but must have {(len(values), platform.n)}."
         )
-    return values, known
+    if saturation is None:
+        return values, known, np.full(values.shape[:2], platform.saturation)
+    limits = np.ascontiguousarray(saturation, dtype=np.float64)
+    if limits.shape != values.shape[:2]:
+        raise ReadingsError(f"saturation has the shape {limits.shape} but must have {values.shape[:2]}.")
+    return values, known, limits
