@@ -1,4 +1,4 @@
-"""What all tests share: node tests each have a ROS domain of their own, which never leaves this machine."""
+"""What all tests share: code compiled before, and for each node test a ROS domain that no other has."""
 
 from __future__ import annotations
 
@@ -8,12 +8,24 @@ from collections.abc import Iterator
 import pytest
 from hypothesis import HealthCheck, settings
 
+from swarm_loc_estimator.core.compiled import is_warm
+from swarm_loc_vision.core.warm_up import CORE, warm_up
+
 # Each run draws examples of its own; where CI is set all draw the same, so that only a change can break a
 # test there. How long an example takes says nothing: the machine may be busy, the first call may compile.
 settings.register_profile(
     "workspace", derandomize="CI" in os.environ, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("workspace")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile before any test's time runs, once and not in every worker; `make setup` does the estimator."""
+    if hasattr(session.config, "workerinput"):
+        return
+    if not is_warm(CORE):
+        print("compiling the marker detector for this machine: about half a minute", flush=True)
+        warm_up()
 
 
 @pytest.fixture(autouse=True)
