@@ -36,6 +36,10 @@ FloatArray = NDArray[np.float64]
 _MODELS = {"": (0,), "plumb_bob": (0, 4, 5), "rational_polynomial": (0, 8), "equidistant": (0, 4)}
 """Distortion models of sensor_msgs/CameraInfo, and how many coefficients they may have."""
 
+_LONGEST_FOCAL = 100.0
+"""Of all lenses that could see a marker, in widths of the picture."""
+_STRONGEST = 1e4
+
 
 class CameraError(ValueError):
     """A camera that cannot be used; the message is one sentence."""
@@ -79,6 +83,12 @@ class Camera:
             )
         if self.width <= 0 or self.height <= 0:
             raise CameraError(f"the camera's picture has {self.width} x {self.height} pixels.")
+        longest = _LONGEST_FOCAL * max(self.width, self.height)
+        if max(self.fx, self.fy) > longest or max(map(abs, self.distortion), default=0.0) > _STRONGEST:
+            raise CameraError(
+                f"the camera's calibration cannot be: focal lengths must be at most {longest:g} px"
+                f" and distortion coefficients within {_STRONGEST:g}."
+            )
         if self.model not in _MODELS:
             known = ", ".join(filter(None, _MODELS))
             raise CameraError(f"the camera's distortion model '{self.model}' is not one of {known}.")

@@ -57,6 +57,8 @@ def test_raw_pixels_are_opencvs(distortion: tuple[float, ...], model: str) -> No
         ({"fx": 0.0}, "not calibrated: its focal lengths are 0 and 990 px"),
         ({"cx": float("nan")}, "not finite"),
         ({"width": 0}, "0 x 960 pixels"),
+        ({"fx": 1e300}, "focal lengths must be at most 128000 px"),
+        ({"distortion": (1e300, 0.0, 0.0, 0.0)}, "distortion coefficients within 10000"),
         ({"model": "magic"}, "'magic' is not one of plumb_bob, rational_polynomial, equidistant"),
         ({"distortion": (0.1, 0.2)}, "has 2 coefficients, but must have 0 or 4 or 5"),
     ],
