@@ -38,16 +38,16 @@ from swarm_loc_drivers.sim.droplet_run import (
 from swarm_loc_drivers.sim.droplet_swarm import DropletSwarmSettings, describe_droplets, starts
 from swarm_loc_estimator.calibration.infrared import calibrate_infrared
 from swarm_loc_estimator.calibration.recording import read_recording
-from swarm_loc_estimator.core.metrics import Track, pool, summarise
+from swarm_loc_estimator.core.metrics import pool, summarise
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import Swarm
 from swarm_loc_estimator.graph import NodeSpec, ParameterValue
-from swarm_loc_estimator.io.cdr import decode_pose_stamped
 from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
 from swarm_loc_estimator.io.swarm_file import load_swarm
 from swarm_loc_estimator.io.swarm_writer import save_swarm
+from swarm_loc_estimator.io.truth import read_truth
 from swarm_loc_estimator.live_graph import START_PATIENCE_S, LiveGraph
-from swarm_loc_estimator.nodes.recorder import read_poses
+from swarm_loc_estimator.nodes.recorder import read_history, read_poses
 from swarm_loc_estimator.replay import replay
 from swarm_loc_estimator.replay_result import ReplayResult
 
@@ -91,13 +91,7 @@ def outcome_of(result: ReplayResult) -> Outcome:
     since_s = (result.stamp_ns - begin_ns) * 1e-9
     first_s = [float(since_s[known[:, robot]].min(initial=np.inf)) for robot in range(known.shape[1])]
     settled = result.stamp_ns >= begin_ns + SETTLED_S * 1e9
-    late = replace(
-        result,
-        stamp_ns=result.stamp_ns[settled],
-        pose=result.pose[settled],
-        covariance=result.covariance[settled],
-    )
-    whole = summarise(pool(list(late.errors.values())))
+    whole = summarise(pool(list(result.chosen(settled).errors.values())))
     return Outcome(
         result.title,
         100.0 * whole.position_mean,
@@ -156,16 +150,8 @@ def lived(seed: int, folder: Path, log: Path) -> ReplayResult:
         graph.wait_for(is_over, "go on publishing poses", _SILENCE_PATIENCE_S)
         print()
         drops = dict(recorder.drops)
-    poses = [read_poses(data) for data in recorder.raw]
-    return ReplayResult(
-        title=f"live {seed}",
-        swarm=known_swarm,
-        stamp_ns=np.array([one.stamp_ns for one in poses], dtype=np.int64),
-        pose=np.array([one.pose for one in poses]),
-        covariance=np.array([one.covariance for one in poses]),
-        truth={name: _track(messages) for name, messages in truth.items()},
-        counters=drops,
-    )
+    tracks = read_truth(known_swarm, truth)
+    return ReplayResult(f"live {seed}", known_swarm, *read_history(recorder.raw)[:3], tracks, drops)
 
 
 def _write_swarms(seed: int, folder: Path) -> Swarm:
@@ -201,13 +187,6 @@ def _nodes(seed: int, folder: Path, swarm: Swarm) -> list[NodeSpec]:
         ),
         NodeSpec(drivers, "droplet_steering_node", "steering", parameters={**real, **time}),
     ]
-
-
-def _track(messages: list[bytes]) -> Track:
-    """Where a robot truly was."""
-    decoded = [decode_pose_stamped(data) for data in messages]
-    stamps = np.array([one.stamp_ns for one in decoded], dtype=np.int64)
-    return Track(stamps, np.array([one.pose for one in decoded]).reshape(-1, 3))
 
 
 def measure(live: Sequence[int], replays: Sequence[int]) -> dict[str, float]:

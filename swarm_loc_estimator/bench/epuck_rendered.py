@@ -24,15 +24,15 @@ from swarm_loc_drivers.sim.eight import HALF_WIDTH, EightSettings, describe
 from swarm_loc_drivers.sim.lemniscate import Lemniscate
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
-from swarm_loc_estimator.core.metrics import Track
 from swarm_loc_estimator.core.swarm import Swarm
 from swarm_loc_estimator.io.bag_writer import BagWriter
 from swarm_loc_estimator.io.cdr import DetectionArrayMessage, decode_detections, decode_pose_stamped
 from swarm_loc_estimator.io.messages import UNKNOWN_COVARIANCE, encode_detections
 from swarm_loc_estimator.io.swarm_writer import save_swarm
+from swarm_loc_estimator.io.truth import read_truth
 from swarm_loc_estimator.io.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED
 from swarm_loc_estimator.live_graph import START_PATIENCE_S, LiveError, LiveGraph, cpu_seconds
-from swarm_loc_estimator.nodes.recorder import read_poses
+from swarm_loc_estimator.nodes.recorder import read_history, read_poses
 from swarm_loc_estimator.replay_result import ReplayResult
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
@@ -210,13 +210,14 @@ def run_rendered(swarm: Swarm, seed: int, duration_s: float, folder: Path, say: 
         cpu_s = {name: cpu_seconds(pid) - used_s[name] for name, pid in processes.items()}
     listener.write(folder / "bag", with_noise=True)
     listener.write(folder / "described_bag", with_noise=False)
+    live, age_s = _lived(listener, swarm, begin_ns)
     return RenderedRun(
         seed=seed,
         swarm_file=swarm_file,
         bag=folder / "bag",
         described_bag=folder / "described_bag",
-        live=_lived(listener, swarm, begin_ns),
-        age_s=_ages(listener, begin_ns),
+        live=live,
+        age_s=age_s,
         seen={name: _seen(listener, name, begin_ns) for name in names},
         cpu_s=cpu_s,
         pictures=listener.pictures,
@@ -247,33 +248,15 @@ def _now_ns(listener: _Listener) -> int:
     return read_poses(listener.graph.recorder.raw[-1]).stamp_ns
 
 
-def _lived(listener: _Listener, swarm: Swarm, begin_ns: int) -> ReplayResult:
-    """The poses as they came out, and the truth."""
-    poses = [one for one in map(read_poses, listener.graph.recorder.raw) if one.stamp_ns >= begin_ns]
-    return ReplayResult(
-        title="rendered, live",
-        swarm=swarm,
-        stamp_ns=np.array([one.stamp_ns for one in poses], dtype=np.int64),
-        pose=np.array([one.pose for one in poses]),
-        covariance=np.array([one.covariance for one in poses]),
-        truth={name: _track(listener.kept[name, "ground_truth"][1]) for name in listener.names},
-        counters=dict(listener.graph.recorder.drops),
-    )
-
-
-def _ages(listener: _Listener, begin_ns: int) -> NDArray[np.float64]:
-    """How old poses were when they came [s]."""
+def _lived(listener: _Listener, swarm: Swarm, begin_ns: int) -> tuple[ReplayResult, NDArray[np.float64]]:
+    """The poses as they came out, and the truth; and how old they were then (A,) [s]."""
     recorder = listener.graph.recorder
-    stamp_ns = np.array([read_poses(data).stamp_ns for data in recorder.raw])
-    age_s: NDArray[np.float64] = (np.array(recorder.received_ns) - stamp_ns) * 1e-9
-    return age_s[stamp_ns >= begin_ns]
-
-
-def _track(messages: Sequence[bytes]) -> Track:
-    """Where a robot truly was."""
-    decoded = [decode_pose_stamped(data) for data in messages]
-    stamps = np.array([one.stamp_ns for one in decoded], dtype=np.int64)
-    return Track(stamps, np.array([one.pose for one in decoded]).reshape(-1, 3))
+    history = read_history(recorder.raw)
+    driving = history.stamp_ns >= begin_ns
+    truth = read_truth(swarm, {name: listener.kept[name, "ground_truth"][1] for name in listener.names})
+    live = ReplayResult("rendered, live", swarm, *history[:3], truth, dict(recorder.drops)).chosen(driving)
+    age_ns = np.array(recorder.received_ns, dtype=np.int64) - history.stamp_ns
+    return live, age_ns[driving].astype(np.float64) * 1e-9
 
 
 def _seen(listener: _Listener, name: str, begin_ns: int) -> list[DetectionArrayMessage]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -96,13 +96,7 @@ class _Line:
 def errors_within(result: ReplayResult, begin_ns: int, end_ns: int) -> ErrorSummary:
     """The errors ten times a second in a stretch of time, of all robots."""
     chosen = (result.stamp_ns >= begin_ns) & (result.stamp_ns <= end_ns) & (result.stamp_ns % OUTPUT_NS == 0)
-    part = replace(
-        result,
-        stamp_ns=result.stamp_ns[chosen],
-        pose=result.pose[chosen],
-        covariance=result.covariance[chosen],
-    )
-    return summarise(pool(list(part.errors.values())))
+    return summarise(pool(list(result.chosen(chosen).errors.values())))
 
 
 def figures_of(one: Rendered, settling_s: float) -> dict[str, float]:

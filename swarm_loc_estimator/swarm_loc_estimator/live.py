@@ -20,7 +20,7 @@ from swarm_loc_estimator.io.swarm_file import load_swarm
 from swarm_loc_estimator.io.truth import TruthReader
 from swarm_loc_estimator.live_graph import START_PATIENCE_S, LiveError, LiveGraph, cpu_seconds
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
-from swarm_loc_estimator.nodes.recorder import Recorder, read_poses
+from swarm_loc_estimator.nodes.recorder import Recorder, read_history, read_poses
 from swarm_loc_estimator.replay_result import ReplayResult
 
 ESTIMATOR, PLAYER = "estimator", "player"
@@ -148,22 +148,19 @@ def play_live(
         if player.returncode:
             raise LiveError(f"The player ended with status {player.returncode}; see {log}.")
         _wait_for_the_rest(graph, len(content.arrival_ns), content.end_ns)
-    poses = [read_poses(data) for data in recorder.raw]
+    history = read_history(recorder.raw)
     result = ReplayResult(
-        title=f"{bag.name}, live at {rate:g} x",
-        swarm=swarm,
-        stamp_ns=np.array([one.stamp_ns for one in poses], dtype=np.int64),
-        pose=np.array([one.pose for one in poses]),
-        covariance=np.array([one.covariance for one in poses]),
+        f"{bag.name}, live at {rate:g} x",
+        swarm,
+        *history[:3],
         truth=content.truth,
         counters=dict(recorder.drops),
         remarks=content.remarks,
         data_s=(content.end_ns - content.begin_ns) * 1e-9,
         wall_s=played_s,
     )
-    status = np.array([one.status for one in poses])
     age_s = _ages(np.array(recorder.received_ns, dtype=np.int64), result.stamp_ns)
-    return LiveRun(result, content.arrival_ns, rate, status, recorder.inputs, core, age_s)
+    return LiveRun(result, content.arrival_ns, rate, history.status, recorder.inputs, core, age_s)
 
 
 def _ages(received_ns: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> FloatArray:

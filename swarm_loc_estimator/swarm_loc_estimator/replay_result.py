@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -51,6 +51,12 @@ class ReplayResult:
     def speed_factor(self) -> float:
         """How much faster than the data's own time the replay ran."""
         return self.data_s / self.wall_s if self.wall_s > 0.0 else float("nan")
+
+    def chosen(self, rows: npt.NDArray[np.bool_]) -> ReplayResult:
+        """The same with the poses at some of the stamps (T,) only."""
+        return replace(
+            self, stamp_ns=self.stamp_ns[rows], pose=self.pose[rows], covariance=self.covariance[rows]
+        )
 
     def track(self, index: int) -> Track:
         """The estimated poses of a robot where it has one."""

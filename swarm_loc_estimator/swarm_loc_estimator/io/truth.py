@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
 from swarm_loc_estimator.core.metrics import StampArray, Track
@@ -10,6 +12,19 @@ from swarm_loc_estimator.io.cdr import decode_pose_stamped
 from swarm_loc_estimator.io.message_batch import MessageBatch
 from swarm_loc_estimator.io.spool import Spool
 from swarm_loc_estimator.io.streams import PoseReader
+
+
+def read_truth(swarm: Swarm, messages: Mapping[str, Sequence[bytes]]) -> dict[str, Track]:
+    """Ground truth that did not come from a bag.
+
+    Args:
+        swarm: Whose.
+        messages: Robot name -> its serialized PoseStamped.
+    """
+    reader = TruthReader(swarm)
+    topics = ((swarm.index_of[name], data) for name, all_of in messages.items() for data in all_of)
+    reader.add(MessageBatch.of([(topic, data, 0) for topic, data in topics]))
+    return reader.tracks()
 
 
 class TruthReader:

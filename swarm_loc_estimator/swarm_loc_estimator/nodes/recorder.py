@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +34,22 @@ class Poses(NamedTuple):
     """
 
     stamp_ns: int
+    pose: FloatArray
+    covariance: FloatArray
+    status: NDArray[np.uint8]
+
+
+class PoseHistory(NamedTuple):
+    """Many messages of swarm/poses; begins like the columns of a `ReplayResult`.
+
+    Attributes:
+        stamp_ns: (T,) when the poses hold.
+        pose: (T, N, 3) x [m], y [m], theta [rad] in map.
+        covariance: (T, N, 3, 3).
+        status: (T, N) of `SwarmPose.status`.
+    """
+
+    stamp_ns: NDArray[np.int64]
     pose: FloatArray
     covariance: FloatArray
     status: NDArray[np.uint8]
@@ -89,3 +106,9 @@ def read_poses(data: bytes) -> Poses:
         np.array([one.covariance for one in robots]).reshape(-1, 3, 3),
         np.array([one.status for one in robots], dtype=np.uint8),
     )
+
+
+def read_history(raw: Sequence[bytes]) -> PoseHistory:
+    """The numbers of serialized SwarmPoses, of which there is at least one."""
+    stamps_ns, *columns = zip(*map(read_poses, raw), strict=True)
+    return PoseHistory(np.array(stamps_ns, dtype=np.int64), *map(np.array, columns))
