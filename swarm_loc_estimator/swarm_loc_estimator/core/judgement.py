@@ -253,7 +253,8 @@ def judge(
             jacobian[i, 6 + j] = chain[i, 3 + j] if camera_columns[j] >= 0 else 0.0
     s = np.empty((3, 3))
     assign_matrix(noise, measurements.covariance[k])
-    _add_stamp_noise(chain, motion, measurements.stamp_variance[k], noise)
+    if measurements.stamp_variance[k] > 0.0:
+        _add_stamp_noise(chain, motion, measurements.stamp_variance[k], noise)
     assign_matrix(s, noise)
     add_uncertainty(belief.covariance, bodies, camera_columns, chain, s)
     for i in range(3):
