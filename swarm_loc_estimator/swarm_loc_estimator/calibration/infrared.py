@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -99,24 +99,11 @@ def calibrate_infrared(
             remarks.append(f"Platform {group.source}: {error}")
     if not boards:
         raise CalibrationError(f"recording '{recording.name}': {' '.join(remarks)}")
-    robots, unheard, unsure = list(swarm.robots), list[str](), list[str]()
-    for board in boards:
-        for place, index in enumerate(board.group.robots):
-            if not board.of_robot(place)[0]:
-                unheard.append(robots[index].name)
-            elif board.fit.gains[place] == IrGains.unknown(board.group.platform):
-                unsure.append(robots[index].name)
-            else:
-                robots[index] = _with_gains(robots[index], board.fit.gains[place])
-    if unheard:
-        remarks.append(f"In no exchange that could be used, and as they were: {', '.join(unheard)}.")
-    if unsure:
-        remarks.append(
-            f"What they read contradicts itself or the ground truth, and as they were: {', '.join(unsure)}."
-        )
-    if len(unheard) + len(unsure) == sum(len(board.group.robots) for board in boards):
+    robots, left = _with_fits(swarm.robots, boards)
+    remarks += [f"{why}, and as they were: {', '.join(names)}." for why, names in left.items()]
+    if sum(map(len, left.values())) == sum(len(board.group.robots) for board in boards):
         raise CalibrationError(f"recording '{recording.name}': {' '.join(remarks)}")
-    return InfraredCalibration(replace(swarm, robots=tuple(robots)), tuple(boards), tuple(remarks))
+    return InfraredCalibration(replace(swarm, robots=robots), tuple(boards), tuple(remarks))
 
 
 def rms(residuals: FloatArray) -> float:
@@ -208,6 +195,24 @@ def _true_poses(recording: Recording, swarm: Swarm, columns: IntArray) -> FloatA
                 place[rows], _ = interpolate(truth, stamp_ns[rows], DENSE_GAP_NS)
     x, y, heading = se2.between(places[0], places[1]).T
     return np.column_stack([np.hypot(x, y), np.arctan2(y, x), heading])
+
+
+def _with_fits(
+    robots: Sequence[Robot], boards: Iterable[BoardFit]
+) -> tuple[tuple[Robot, ...], dict[str, list[str]]]:
+    """The robots with the gains that were found, and the names of those without by why there are none."""
+    changed, left = list(robots), dict[str, list[str]]()
+    for board in boards:
+        for place, index in enumerate(board.group.robots):
+            gains = board.fit.gains[place]
+            if not board.of_robot(place)[0]:
+                left.setdefault("In no exchange that could be used", []).append(robots[index].name)
+            elif gains == IrGains.unknown(board.group.platform):
+                why = "What they read contradicts itself or the ground truth"
+                left.setdefault(why, []).append(robots[index].name)
+            else:
+                changed[index] = _with_gains(robots[index], gains)
+    return tuple(changed), left
 
 
 def _with_gains(robot: Robot, gains: IrGains) -> Robot:
