@@ -81,7 +81,7 @@ def find_quads(gray: Gray, least_side: float, least_contrast: float) -> FloatArr
         (N, 4, 2) corners, clockwise as one sees it, on the boundary between dark and light [px].
     """
     scaled: MatLike = cv2.GaussianBlur(gray, (3, 3), _SMOOTHING_PX)
-    scale = 1
+    scale, noise = 1, _noise(scaled)
     found: list[FloatArray] = []
     for how in PASSES:
         if min(gray.shape) < _LEAST_SIDE_PX << how.halvings:
@@ -91,7 +91,8 @@ def find_quads(gray: Gray, least_side: float, least_contrast: float) -> FloatArr
             even = scaled[: 2 * height, : 2 * width]
             scaled = cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA)
             scale *= 2
-        dark = _dark(scaled, how.window, least_contrast)
+            noise = _noise(scaled)
+        dark = _dark(scaled, how.window, max(least_contrast, _NOISE_SIGMAS * noise))
         found.append((_quads(dark, least_side / scale) + 0.5) * scale - 0.5)
     return _distinct(np.concatenate([np.zeros((0, 4, 2)), *found]))
 
@@ -107,10 +108,9 @@ def _distinct(quads: FloatArray) -> FloatArray:
     return distinct
 
 
-def _dark(gray: MatLike, window: int, least_contrast: float) -> NDArray[np.uint8]:
+def _dark(gray: MatLike, window: int, contrast: float) -> NDArray[np.uint8]:
     """255 where a picture is darker than around; its frame is light, so that outlines end inside."""
     mean = cv2.blur(gray, (window, window))
-    contrast = max(least_contrast, _NOISE_SIGMAS * _noise(gray))
     dark = cv2.threshold(cv2.subtract(mean, gray), contrast - 0.5, _DARK, cv2.THRESH_BINARY)[1]
     surplus = -dark.shape[1] % 8
     if surplus:
