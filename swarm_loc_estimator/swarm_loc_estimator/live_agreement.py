@@ -12,7 +12,7 @@ from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.live import LiveRun
-from swarm_loc_estimator.nodes.pace import LONGEST_STEP_NS, STEP_S
+from swarm_loc_estimator.nodes.pace import clock_step_ns
 from swarm_loc_estimator.replay import replay
 from swarm_loc_estimator.replay_result import ReplayResult
 
@@ -76,8 +76,7 @@ def compare_with_replay(live: LiveRun, bag: Path, settings: EstimatorSettings | 
 
 def _settled(live: LiveRun) -> NDArray[np.bool_]:
     """(T,) whether all messages sent before a stamp were sent long enough before it to have arrived."""
-    step_ns = min(round(STEP_S * live.rate * 1e9), LONGEST_STEP_NS)
-    way_ns = step_ns + round(_TRANSPORT_S * live.rate * 1e9)
+    way_ns = clock_step_ns(live.rate) + round(_TRANSPORT_S * live.rate * 1e9)
     behind = np.searchsorted(live.arrival_ns, live.result.stamp_ns, side="right")
     newest_ns = np.concatenate([[np.iinfo(np.int64).min // 2], live.arrival_ns])[behind]
     settled: NDArray[np.bool_] = live.result.stamp_ns > newest_ns + way_ns

@@ -14,6 +14,11 @@ LONGEST_STEP_NS = 20_000_000
 """A step is never longer than this much bag time, at any rate and however far behind."""
 
 
+def clock_step_ns(rate: float) -> int:
+    """By how much /clock goes on at a time, where a bag is played at `rate` seconds per second."""
+    return max(1, min(round(STEP_S * rate * _SECOND), LONGEST_STEP_NS))
+
+
 @dataclass
 class PlayedSoFar:
     """What went out.
@@ -62,7 +67,7 @@ def play(
         wait_until: Returns when that clock has come to an instant.
         so_far: Is kept up to date.
     """
-    step_ns = max(1, min(round(STEP_S * rate * _SECOND), LONGEST_STEP_NS))
+    step_ns = clock_step_ns(rate)
     begin_s, clock_ns = now_s(), begin_ns
     bag_before_ns, wall_before_s = so_far.bag_ns, so_far.wall_s
     publish_clock(begin_ns)
