@@ -116,12 +116,13 @@ def _read(
     contrast: FloatArray,
 ) -> None:
     """Fill `Readings`."""
-    clear = np.empty(BITS)
+    clear, flat = np.empty(BITS), np.empty((GRID - 2, GRID - 2))
     bits = np.empty(len(words), np.uint8)
     for n in range(len(cells)):
         before = np.uint64(0)
+        light = _flatten(cells[n], flat)
         for level in (_MIDDLE, _LOW):
-            contrast[n] = _clear_cells(cells[n], level, clear)
+            contrast[n] = light if light > 0.0 and _clear_cells(flat, light, level, clear) else 0.0
             if contrast[n] < least_contrast:
                 continue
             seen = np.uint64(0)
@@ -139,13 +140,12 @@ def _read(
 
 
 @compiled
-def _clear_cells(cells: FloatArray, level: float, clear: FloatArray) -> float:
-    """From brightness to -1 (dark) ... 1 (light), in `clear`; the contrast, 0 where there is no dark border.
+def _flatten(cells: FloatArray, sharp: FloatArray) -> float:
+    """Write sharpened brightness above what is dark, (GRID - 2, GRID - 2); that of light, 0 if there is none.
 
     Dark is a plane through the border's inner ring, which takes in light that falls off; light is the mean
-    of the lighter cells. What lies at `level` between them, 0 to 1, is neither.
+    of the lighter cells.
     """
-    sharp = np.empty((GRID - 2, GRID - 2))
     for row in range(GRID - 2):
         for column in range(GRID - 2):
             here = cells[row + 1, column + 1]
@@ -183,18 +183,25 @@ def _clear_cells(cells: FloatArray, level: float, clear: FloatArray) -> float:
     if light == 0:
         return 0.0
     high = total / light
-    if (abs(by_x) + abs(by_y)) * (GRID - 3) > _MOST_SLOPE * high:
-        return 0.0
+    return high if (abs(by_x) + abs(by_y)) * (GRID - 3) <= _MOST_SLOPE * high else 0.0
+
+
+@compiled
+def _clear_cells(flat: FloatArray, light: float, level: float, clear: FloatArray) -> bool:
+    """From brightness to -1 (dark) ... 1 (light), in `clear`; whether the border is dark.
+
+    What lies at `level` between dark and `light`, 0 to 1, is neither.
+    """
     wrong = 0.0
     for row in range(GRID - 2):
         for column in range(GRID - 2):
-            above = sharp[row, column] / high - level
+            above = flat[row, column] / light - level
             value = min(max(above / (level if above < 0.0 else min(1.0 - level, 2.0 * level)), -1.0), 1.0)
             if 0 < row < GRID - 3 and 0 < column < GRID - 3:
                 clear[(row - 1) * CELLS + column - 1] = value
             elif value > 0.0:
                 wrong += value
-    return high if wrong <= _MOST_DARK_ERRORS else 0.0
+    return wrong <= _MOST_DARK_ERRORS
 
 
 @compiled

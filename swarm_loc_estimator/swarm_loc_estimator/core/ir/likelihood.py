@@ -218,35 +218,41 @@ def _apart(a: FloatArray, b: FloatArray, p: int) -> float:
 @compiled
 def _find_minima(models: Models, pair: Pair, room: _Room, measured: int) -> None:
     """Search from all starts that are worth it; writes the best minimum of all and another one."""
-    minima, at, reached = room.minima, room.full.at, 0
-    minima[0, 3] = minima[1, 3] = math.inf
-    count, blocked = _list_starts(models, pair, room), 0
-    first, gains_are_sought = room.starts[1].copy(), at.size > 3
-    for way in range(count + _ASIDE.shape[0] + _TABLE_STARTS):
-        best = minima[0, 3]
-        doubt = reached < 2 or 2.0 * best > _SUSPICIOUS * (measured - 3)
-        aside, start = way - count, room.starts[way if way < count else 0]
-        last_resort = aside - _ASIDE.shape[0]
-        if last_resort == 0 and doubt and models.exact.blocked < math.inf:
-            dark = compress(models.exact, DARK * models.exact.noise)
-            blocked = find_starts(models.table, room.pattern, room.present, dark, room.start, room.starts)
-        if last_resort >= 0:
-            if last_resort >= min(blocked, _TABLE_STARTS):
-                break
-            start = room.starts[last_resort]
-        elif aside >= 0:
-            if not (doubt or (gains_are_sought and aside < _OF_SECOND)):
-                continue
-            origin = minima[0] if aside < _OF_SECOND else first
+    room.minima[:, 3] = math.inf
+    reached = 0
+    for s in range(_list_starts(models, pair, room)):
+        reached = _search_from(models, pair, room, room.starts[s], reached)
+    first, start = room.starts[1].copy(), room.starts[0]
+    for aside in range(_ASIDE.shape[0]):
+        of_second = aside < _OF_SECOND
+        if _in_doubt(room, reached, measured) or (of_second and room.full.at.size > 3):  # gains are sought
+            origin = room.minima[0] if of_second else first
             for p in range(3):
                 start[p] = origin[p] + _ASIDE[aside, p]
-        cost = search(models.exact, pair, start, _STILL, room.full, minima[0])
-        if _keep(minima, at[at.size - 3 :], cost):
-            assign(room.best, at)
-        if abs(cost - best) < _SAME:
-            reached += 1
-        elif cost < best:
-            reached = 1
+            reached = _search_from(models, pair, room, start, reached)
+    if _in_doubt(room, reached, measured) and models.exact.blocked < math.inf:
+        dark = compress(models.exact, DARK * models.exact.noise)
+        blocked = find_starts(models.table, room.pattern, room.present, dark, room.start, room.starts)
+        for s in range(min(blocked, _TABLE_STARTS)):
+            reached = _search_from(models, pair, room, room.starts[s], reached)
+
+
+@compiled
+def _in_doubt(room: _Room, reached: int, measured: int) -> bool:
+    """Whether the best minimum may not be the best of all: reached but once, or it fits badly."""
+    return reached < 2 or 2.0 * room.minima[0, 3] > _SUSPICIOUS * (measured - 3)
+
+
+@compiled
+def _search_from(models: Models, pair: Pair, room: _Room, start: FloatArray, reached: int) -> int:
+    """Search from a start, keep where it ends; how often the best minimum was reached, before and now."""
+    at, best = room.full.at, room.minima[0, 3]
+    cost = search(models.exact, pair, start, _STILL, room.full, room.minima[0])
+    if _keep(room.minima, at[at.size - 3 :], cost):
+        assign(room.best, at)
+    if abs(cost - best) < _SAME:
+        return reached + 1
+    return 1 if cost < best else reached
 
 
 @compiled
