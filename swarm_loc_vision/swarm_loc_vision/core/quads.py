@@ -9,7 +9,6 @@ half resolution for blurred ones.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -51,22 +50,8 @@ _LEFT = 4
 """Of the eight directions, which count counter-clockwise from the right."""
 _LONGEST_OUTLINE = 4
 """Points of an outline over height plus width of the picture."""
-
-
-@dataclass(frozen=True)
-class Binarization:
-    """How dark is told from light.
-
-    Attributes:
-        window: Side of the neighbourhood [px of the halved picture].
-        halvings: How often the picture is halved before.
-    """
-
-    window: int
-    halvings: int
-
-
-PASSES = (Binarization(7, 0), Binarization(25, 0), Binarization(35, 1))
+WINDOWS = ((7, 25), (35,))
+"""Sides of the neighbourhoods that are compared with [px], in full and in half resolution."""
 
 
 def find_quads(gray: Gray, least_side: float, least_contrast: float) -> FloatArray:
@@ -81,19 +66,19 @@ def find_quads(gray: Gray, least_side: float, least_contrast: float) -> FloatArr
         (N, 4, 2) corners, clockwise as one sees it, on the boundary between dark and light [px].
     """
     scaled: MatLike = cv2.GaussianBlur(gray, (3, 3), _SMOOTHING_PX)
-    scale, noise = 1, _noise(scaled)
     found: list[FloatArray] = []
-    for how in PASSES:
-        if min(gray.shape) < _LEAST_SIDE_PX << how.halvings:
+    for halvings, windows in enumerate(WINDOWS):
+        scale = 1 << halvings
+        if min(gray.shape) < _LEAST_SIDE_PX * scale:
             break
-        while scale < 1 << how.halvings:
+        if halvings:
             height, width = (size // 2 for size in scaled.shape)
             even = scaled[: 2 * height, : 2 * width]
             scaled = cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA)
-            scale *= 2
-            noise = _noise(scaled)
-        dark = _dark(scaled, how.window, max(least_contrast, _NOISE_SIGMAS * noise))
-        found.append((_quads(dark, least_side / scale) + 0.5) * scale - 0.5)
+        contrast = max(least_contrast, _NOISE_SIGMAS * _noise(scaled))
+        for window in windows:
+            quads = _quads(_dark(scaled, window, contrast), least_side / scale)
+            found.append((quads + 0.5) * scale - 0.5)
     return _distinct(np.concatenate([np.zeros((0, 4, 2)), *found]))
 
 

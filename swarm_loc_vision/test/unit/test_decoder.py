@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from swarm_loc_vision.core.decoder import FALSE_READINGS, Dictionary, _clear_cells, correctable_bits
+from swarm_loc_vision.core.decoder import FALSE_READINGS, Dictionary, _clear_cells, _flatten, correctable_bits
 from swarm_loc_vision.core.families import BITS, Family, family_named
 from swarm_loc_vision.core.sampling import GRID
 
@@ -64,8 +64,8 @@ def test_flipped_bits_are_corrected_as_far_as_is_safe(marker_id: int, flipped: s
     readings = dictionary.read(cells, 10.0)
     if len(flipped) <= dictionary.correctable:
         assert dictionary.ids[readings.word[0]] == marker_id
-        clear = np.empty(BITS)
-        _clear_cells(cells[0], 0.5, clear)
+        flat, clear = np.empty((GRID - 2, GRID - 2)), np.empty(BITS)
+        _clear_cells(flat, _flatten(cells[0], flat), 0.5, clear)
         assert readings.errors[0] == pytest.approx(np.abs(clear[sorted(flipped)]).sum())
         # least clear is a cell like its neighbours; counted through for all that these ids and bits can be
         assert 0.42 * len(flipped) <= readings.errors[0] <= len(flipped)
