@@ -65,15 +65,14 @@ class DropletDriverNode(Node):
         self._base_frame = f"{prefix}{self._wishes.base_frame}"
         self._transforms = transform_publisher(self) if self._wishes.publish_tf else None
         self._brightness = self.create_publisher(BrightnessMatrix, "brightness", _BRIGHTNESS_QOS)
-        above = robot.rpartition("/")[0]
         self._odometry = {OWN: self._odometry_output("odom", prefix)}
         for name in settings.relayed:
-            path = f"{above}/{name}" if above else name
+            path = _relayed_path(robot, name)
             self._odometry[name] = self._odometry_output(f"/{path}/odom", f"{path}/")
         listeners = DropletListeners(self._publish_odometry, self._publish_brightness)
         self._driver = DropletDriver(settings, listeners, self._now_ns)
         for name in self._odometry:
-            topic = f"/{above}/{name}/cmd_vel".replace("//", "/") if name else "cmd_vel"
+            topic = f"/{_relayed_path(robot, name)}/cmd_vel" if name else "cmd_vel"
             self.create_subscription(Twist, topic, partial(self._on_cmd_vel, name), _COMMAND_QOS)
         self.create_service(Trigger, "~/measure", self._on_measure)
         name, address = f"{prefix}{self.get_name()}", settings.device
@@ -122,6 +121,11 @@ class DropletDriverNode(Node):
         )
         message.readings = array("i", one.readings.ravel().tolist())
         self._brightness.publish(message)
+
+
+def _relayed_path(robot: str, name: str) -> str:
+    """Where the topics of a robot without a cable are: beside those of the robot at the cable."""
+    return "/".join([*robot.split("/")[:-1], name])
 
 
 def main() -> int:

@@ -16,10 +16,9 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rclpy.time import Time
 
 from swarm_loc_drivers.nodes.droplet_world_parameters import DropletWorldParameters, make_droplet_world
-from swarm_loc_drivers.nodes.odometry_output import yaw_quaternion
+from swarm_loc_drivers.nodes.odometry_output import stamp_message, yaw_quaternion
 from swarm_loc_drivers.nodes.world_time import WorldTime
 from swarm_loc_drivers.sim.droplet_fixes import Fix, Tracker
 from swarm_loc_drivers.sim.droplet_world import STEP_NS, SimulatedDroplet
@@ -99,7 +98,7 @@ class DropletWorldNode(Node):
 
     def _fix_message(self, fix: Fix) -> PoseWithCovarianceStamped:
         message = PoseWithCovarianceStamped()
-        message.header.stamp = Time(nanoseconds=fix.stamp_ns).to_msg()
+        message.header.stamp = stamp_message(fix.stamp_ns)
         message.header.frame_id = "map"
         pose, (sigma, heading_sigma) = message.pose.pose, self._tracker.sigmas
         pose.position.x, pose.position.y = float(fix.pose[0]), float(fix.pose[1])

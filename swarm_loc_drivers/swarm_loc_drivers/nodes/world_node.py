@@ -26,6 +26,7 @@ from rclpy.qos import QoSProfile
 from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image
 
+from swarm_loc_drivers.nodes.odometry_output import stamp_message
 from swarm_loc_drivers.nodes.unanswered import Unanswered
 from swarm_loc_drivers.nodes.world_parameters import WorldParameters, make_world
 from swarm_loc_drivers.nodes.world_time import WorldTime
@@ -130,7 +131,7 @@ class EpuckWorldNode(Node):
 
     def _publish_picture(self, exposure: Exposure) -> None:
         message = image_message(self._world.picture(exposure))
-        message.header.stamp = Time(nanoseconds=exposure.stamp_ns).to_msg()
+        message.header.stamp = stamp_message(exposure.stamp_ns)
         message.header.frame_id = f"{self._names[exposure.robot]}/camera_optical_frame"
         info = camera_info_message(self._wishes.camera)
         info.header = message.header

@@ -10,9 +10,9 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
+from swarm_loc_drivers.nodes.odometry_output import stamp_message
 from swarm_loc_drivers.sim.firmware.host import FirmwareHost
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.io.messages import encode_pose_stamped
@@ -60,7 +60,7 @@ class WorldTime:
     def tell(self, now_ns: int, poses: FloatArray) -> None:
         """A step was done: publish the time, and at times the true poses (N, 3)."""
         if self._steps % self._clock_steps == 0:
-            self._clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+            self._clock.publish(Clock(clock=stamp_message(now_ns)))
         if self._steps % self._truth_steps == 0:
             stamp_ns = np.array([now_ns], np.int64)
             for publisher, pose in zip(self._truths, poses, strict=True):

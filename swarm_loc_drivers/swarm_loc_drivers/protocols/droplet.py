@@ -17,7 +17,6 @@ TURN_CLOCKWISE, TURN_COUNTERCLOCKWISE = 6, 7
 WALKS = range(6)
 """Direction d walks towards d times 60 degrees clockwise from the front."""
 DIRECTIONS = range(8)
-MOTORS = 3
 
 _TICK_S = 1.024e-3
 _ON_TICKS, _OFF_TICKS, _TRIMS_PER_TICK = 20, 40, 32
@@ -25,10 +24,6 @@ _UNCALIBRATED = 0xFFFF - 1000
 """An EEPROM that was never written holds 0xFFFF; the firmware calls all that is near it uncalibrated."""
 _UNCALIBRATED_WALK_MM, _UNCALIBRATED_TURN_DEG = 600, 2000
 """What the firmware then reckons with, per 1000 steps."""
-
-Velocity = tuple[float, float, float]
-"""Forward [m/s], to the left [m/s], turning to the left [rad/s]."""
-STILL: Velocity = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -66,8 +61,8 @@ class Gait(NamedTuple):
     turn: float
 
     @property
-    def velocity(self) -> Velocity:
-        """Mean velocity."""
+    def velocity(self) -> tuple[float, float, float]:
+        """Mean velocity: forward [m/s], to the left [m/s], turning to the left [rad/s]."""
         return self.forward / self.step_s, self.left / self.step_s, self.turn / self.step_s
 
 

@@ -24,8 +24,6 @@ LINE_AT_MOST = 63
 """The line buffer has 64 characters, and one of them ends the text."""
 TARGETED_AT_MOST = 31
 """A command for a certain other robot is copied into 32 characters without looking."""
-BROADCAST_AT_MOST = 40
-"""The data of an infrared message."""
 MOST_STEPS = 0xFFFF
 
 GET_ID = "get_id"
@@ -63,17 +61,6 @@ def for_robot(robot: int, line: str) -> str:
     if len(line) > TARGETED_AT_MOST:
         raise CommandError(f"'{line}' is too long: another robot takes {TARGETED_AT_MOST} characters.")
     return f"tgt_cmd {robot:04X} {line}"
-
-
-def for_all(line: str) -> str:
-    """Send a line to all other robots by infrared.
-
-    Raises:
-        CommandError: It is too long for that.
-    """
-    if len(line) > BROADCAST_AT_MOST:
-        raise CommandError(f"'{line}' is too long: other robots take {BROADCAST_AT_MOST} characters.")
-    return f"cmd {line}"
 
 
 def typed(line: str) -> bytes:

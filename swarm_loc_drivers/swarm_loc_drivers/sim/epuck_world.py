@@ -7,7 +7,6 @@ wants to see them, and look the same whenever that is.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -221,11 +220,6 @@ class SimulatedEpuck:
     def now_ns(self) -> int:
         """The world's time [ns]."""
         return self._world.now_ns
-
-
-def bodies(world: EpuckWorld, count: int) -> Sequence[SimulatedEpuck]:
-    """The robots of a world in the order of its swarm."""
-    return [SimulatedEpuck(world, robot) for robot in range(count)]
 
 
 def check_swarm(swarm: Swarm) -> None:
