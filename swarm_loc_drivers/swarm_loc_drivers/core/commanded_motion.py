@@ -46,6 +46,10 @@ class _Move:
     def end_ns(self) -> int:
         return self.begin_ns + round(self.steps * self.gait.step_s * _NS)
 
+    def steps_left(self, stamp_ns: int) -> float:
+        """How many steps are still to be done."""
+        return min(max(0.0, (self.end_ns - stamp_ns) / (_NS * self.gait.step_s)), self.steps)
+
 
 class CommandedMotion:
     """Adds up commands.
@@ -73,7 +77,7 @@ class CommandedMotion:
             stamp_ns: When [ns].
             gait: What a step does.
             steps: How many.
-            doubt: Variance of the way in units of the way, of a command that was perhaps not heard.
+            doubt: Variance of the way in units of the way: how likely the command was not heard.
         """
         self._advance(stamp_ns)
         if not self.moving(stamp_ns):
@@ -81,10 +85,19 @@ class CommandedMotion:
             self._move = _Move(gait, steps, stamp_ns)
             self._doubted = (self._pose, doubt)
 
-    def stop(self, stamp_ns: int) -> None:
-        """The robot stands."""
+    def stop(self, stamp_ns: int, doubt: float = 0.0) -> None:
+        """The robot stands.
+
+        Args:
+            stamp_ns: When [ns].
+            doubt: How likely the command was not heard, and the robot does all that it was told before.
+        """
+        move = self._move
         self._advance(stamp_ns)
         self._settle()
+        if move is not None:
+            rest = self._way(move.gait, move.steps_left(stamp_ns))
+            self._covariance = self._covariance + doubt * np.outer(rest, rest)
         self._move = None
 
     def lose(self, stamp_ns: int) -> None:
@@ -132,17 +145,16 @@ class CommandedMotion:
 
     def _step(self, gait: Gait, steps: float) -> None:
         """Do some steps."""
-        dx, dy = (steps * part for part in self._turned(gait, self._pose[2]))
+        way = self._way(gait, steps)
+        dx, dy, _ = way
         self._covariance = carried_on(self._covariance, dx, dy)
         walk, _, heading = self._body_noise(gait, steps)
         # an error of the heading that grows on the way leads aside by half of it, give or take
         effect, spread = np.array([-0.5 * dy, 0.5 * dx, 1.0]), np.array([-dy, dx, 0.0])
         self._covariance += np.diag([walk, walk, 0.0])
         self._covariance += heading * (np.outer(effect, effect) + np.outer(spread, spread) / 12.0)
-        theta = self._pose[2] + steps * gait.turn
-        self._pose = np.array(
-            [self._pose[0] + dx, self._pose[1] + dy, (theta + math.pi) % (2.0 * math.pi) - math.pi]
-        )
+        self._pose = self._pose + way
+        self._pose[2] = (self._pose[2] + math.pi) % (2.0 * math.pi) - math.pi
 
     def _body_noise(self, gait: Gait, steps: float) -> FloatArray:
         """Variances (3,) of some steps: along, across, heading."""
@@ -150,8 +162,8 @@ class CommandedMotion:
         walk = self._noise.walk_noise * path
         return np.array([walk, walk, self._noise.veer_noise * path + self._noise.turn_noise * turn])
 
-    @staticmethod
-    def _turned(gait: Gait, theta: float) -> tuple[float, float]:
-        """A step's way in the odometry's frame."""
-        cos, sin = math.cos(theta), math.sin(theta)
-        return cos * gait.forward - sin * gait.left, sin * gait.forward + cos * gait.left
+    def _way(self, gait: Gait, steps: float) -> FloatArray:
+        """Where some steps lead (3,) from here, in the odometry's frame; the turn is not wrapped."""
+        cos, sin = math.cos(self._pose[2]), math.sin(self._pose[2])
+        step = [cos * gait.forward - sin * gait.left, sin * gait.forward + cos * gait.left, gait.turn]
+        return steps * np.array(step)

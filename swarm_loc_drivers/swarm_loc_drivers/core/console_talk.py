@@ -86,10 +86,14 @@ class ConsoleTalk:
         return output
 
     def until(self, condition: Callable[[], bool], timeout_ns: int | None = None) -> Talk[bool]:
-        """Wait for something; whether it came before the timeout, that of an echo if none is given."""
-        deadline_ns = self.now_ns + (self._timeout_ns if timeout_ns is None else timeout_ns)
+        """Wait for something; whether it came before the timeout, that of an echo if none is given.
+
+        Who waits while time jumps back waits no longer: how long it has been is not known.
+        """
+        begin_ns = self.now_ns
+        deadline_ns = begin_ns + (self._timeout_ns if timeout_ns is None else timeout_ns)
         while not condition():
-            if self.now_ns >= deadline_ns:
+            if not begin_ns <= self.now_ns < deadline_ns:
                 return False
             yield deadline_ns
         return True

@@ -61,7 +61,7 @@ class DropletMover:
         self._command = command
         self._stride_s = stride_s
         self._target = target
-        self._doubt = relay_loss * (1.0 - relay_loss)
+        self._doubt = relay_loss  # believed is all of a way, of which by this share nothing is done
         self._told: int | None = None
         self.asked: MoveStarted | None = None
         """What the robot will say that it was told, the last time."""
@@ -90,7 +90,7 @@ class DropletMover:
         """Make the robot stand."""
         stamp_ns = yield from self._enter(console, protocol.STOP)
         self._told = None
-        self.motion.stop(stamp_ns)
+        self.motion.stop(stamp_ns, self._doubt)
 
     def _enter(self, console: ConsoleTalk, line: str) -> Talk[int]:
         """Have the robot take a line; when it did [ns]."""

@@ -167,12 +167,12 @@ class DropletSession:
         elif isinstance(event, StepLength):
             self._lengths[event.direction] = event.per_kilostep
         elif isinstance(event, MoveStarted):
-            self._note_move(said.stamp_ns, event)
+            self._note_move(event)
         else:
             self._exchanging.note(said)
 
-    def _note_move(self, stamp_ns: int, started: MoveStarted) -> None:
+    def _note_move(self, started: MoveStarted) -> None:
         """The robot was told to move: here, or by infrared."""
         if started != self._mover.asked and started.direction in self._gaits:
             self._counts["foreign_moves"] += 1
-            self._mover.motion.begin(stamp_ns, self._gaits[started.direction], started.steps)
+            self._mover.motion.begin(self._console.now_ns, self._gaits[started.direction], started.steps)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from droplet_bench import IDEAL, IDS, NOISE, SECOND, START_NS, FloatArray, Lab, asking, world_of
+from droplet_bench import IDEAL, IDS, NOISE, SECOND, START_NS, TRIANGLE, FloatArray, Lab, asking, world_of
 from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_drivers.core.commanded_motion import CommandedMotion, MotionNoise
-from swarm_loc_drivers.core.droplet_mover import nearest_motion
-from swarm_loc_drivers.protocols.droplet import AUDIO_DROPLET, DIRECTIONS, Gait
+from swarm_loc_drivers.core.console_talk import ConsoleTalk, Talk
+from swarm_loc_drivers.core.droplet_mover import DropletMover, nearest_motion
+from swarm_loc_drivers.core.velocity_command import VelocityCommand
+from swarm_loc_drivers.protocols.droplet import AUDIO_DROPLET, DIRECTIONS, ELEMENTS, Gait
 from swarm_loc_drivers.sim.droplet_world import STEP_NS, nominal_gait
 from swarm_loc_estimator.core import se2
 
@@ -119,6 +122,50 @@ def test_what_was_perhaps_not_heard_is_uncertain_as_a_whole() -> None:
     assert after.covariance == pytest.approx(states[1].covariance)
 
 
+def test_a_stop_that_was_perhaps_not_heard_leaves_the_rest_of_the_way_in_doubt() -> None:
+    sure, unsure = CommandedMotion(NOISE), CommandedMotion(NOISE)
+    for motion, doubt in ((sure, 0.0), (unsure, 0.09)):
+        motion.begin(START_NS, TURN, 100)
+        motion.stop(START_NS + round(20 * TURN.step_s * SECOND), doubt)
+    one, other = (motion.state(START_NS + 60 * SECOND) for motion in (sure, unsure))
+    assert other.pose == pytest.approx(one.pose)
+    rest = 80 * TURN.turn
+    assert np.diag(other.covariance - one.covariance) == pytest.approx([0.0, 0.0, 0.09 * rest**2])
+
+
+def hold(console: ConsoleTalk, talk: Talk[None]) -> None:
+    """Have a talk with a robot that echoes at once."""
+    while True:
+        try:
+            due_ns = next(talk)
+        except StopIteration:
+            return
+        output = console.take_output()
+        console.hear(output.replace(b"\r", b"\r\n"), console.now_ns if output else due_ns)
+
+
+@pytest.mark.parametrize("loss", [0.1, 1.0])
+def test_what_was_relayed_is_in_doubt_by_the_share_of_commands_that_are_lost(loss: float) -> None:
+    motion = CommandedMotion(MotionNoise(0.0, 0.0, 0.0))
+    console = ConsoleTalk(ELEMENTS, SECOND, lambda _: None, Counter())
+    console.hear(b"", START_NS)
+    command = VelocityCommand(1.0, lambda: START_NS, Counter())
+    command.set((0.01, 0.0, 0.0))
+    mover = DropletMover(command, motion, 2.0, IDS[1], loss)
+    hold(console, mover.tell(console, GAITS))
+    console.hear(b"", console.now_ns + SECOND)
+    walked = motion.state(console.now_ns)
+    # the error is all of the way, or nothing: so its mean square is that share of the way's
+    assert walked.covariance[0, 0] == pytest.approx(loss * walked.pose[0] ** 2)
+    hold(console, mover.stop(console))
+    stopped = motion.state(console.now_ns)
+    assert mover.asked is not None
+    rest = mover.asked.steps * AHEAD.forward - stopped.pose[0]
+    assert rest > 0.0
+    squares = stopped.pose[0] ** 2 + rest**2
+    assert stopped.covariance[0, 0] == pytest.approx(loss * squares)
+
+
 def test_behind_a_broken_link_the_robot_may_stand_or_go_on() -> None:
     motion = CommandedMotion(NOISE)
     motion.begin(START_NS, AHEAD, 1000)
@@ -185,3 +232,20 @@ def test_a_move_that_somebody_else_commands_is_believed_too() -> None:
     assert me.odometry().pose == pytest.approx([20 * AHEAD.forward, 0.0, 0.0], abs=1e-6)
     moved = se2.between([0.0, 0.0, 0.3], lab.world.poses[0])
     assert moved == pytest.approx(me.odometry().pose, abs=1e-4)
+
+
+def test_a_move_that_somebody_else_commands_does_not_end_the_own_one() -> None:
+    lab = Lab(world_of(), asking()).connected()
+    (cable,) = lab.cables
+    lab.control = lambda: cable.set_velocity((0.01, 0.0, 0.0))
+    lab.run(0.5)
+    cable.session.step(b"walk direction 7, ", lab.world.now_ns)
+    lab.run(0.01)
+    assert cable.odometry().twist.any()
+    lab.run(0.01)
+    cable.session.step(b"num_steps 20\r\n", lab.world.now_ns)
+    assert cable.counts["foreign_moves"] == 1
+    lab.run(0.5)
+    moved = se2.between(TRIANGLE[0], lab.world.poses[0])
+    assert moved[0] > 0.8 * SPEED
+    assert cable.odometry().pose == pytest.approx(moved, abs=1e-4)

@@ -289,6 +289,18 @@ def test_who_does_not_speak_the_language_is_told(answer: Callable[[bytes], bytes
         lab.run(60.0)
 
 
+def test_a_clock_that_jumps_back_keeps_nobody_waiting() -> None:
+    session = Lab(world_of(), asking()).cables[0].session
+    session.step(b"", START_NS)
+
+    def wait(seconds: int) -> None:
+        for second in range(1, seconds):
+            session.step(b"", second * SECOND)
+
+    with pytest.raises(SessionError, match="does not echo 'stop_walk'"):  # as of every silent robot
+        wait(60)
+
+
 def test_without_a_clock_nothing_is_stamped() -> None:
     lab = Lab(world_of(), asking(IDS[1], period_s=1.0))
     session = lab.cables[0].session
