@@ -64,6 +64,9 @@ class LinkKeeper:
             except (LinkError, SessionError) as error:
                 self.trouble = str(error)
                 self._counts["link_failures"] += 1
+            except Exception as error:  # a mistake up here: the thread ends, and nobody else would say so
+                self.trouble = f"the driver has failed: {error!r}"
+                raise
             else:
                 return
             if self.stopping.is_set():

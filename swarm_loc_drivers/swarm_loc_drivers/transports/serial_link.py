@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import termios
+
 import serial
 
 from swarm_loc_drivers.transports.link import LinkError
+
+_BROKEN = (OSError, TypeError, termios.error)
+"""What pyserial raises when a port hangs up; one that vanishes makes it compare None."""
 
 
 class SerialLink:
@@ -23,7 +28,7 @@ class SerialLink:
         self._device = device
         try:
             self._port = serial.Serial(device, baud_rate, write_timeout=write_timeout_s, exclusive=True)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, termios.error) as error:
             raise LinkError(f"{device} cannot be opened: {_reason(error)}") from error
 
     def read(self, timeout_s: float) -> bytes:
@@ -32,14 +37,14 @@ class SerialLink:
             self._port.timeout = timeout_s
             first = self._port.read(1)
             return bytes(first + self._port.read(self._port.in_waiting)) if first else b""
-        except (OSError, TypeError) as error:  # a port that vanishes makes pyserial compare None
+        except _BROKEN as error:
             raise LinkError(f"{self._device} is broken: {_reason(error)}") from error
 
     def write(self, data: bytes) -> None:
         """See `Link.write`."""
         try:
             self._port.write(data)
-        except OSError as error:
+        except _BROKEN as error:
             raise LinkError(f"{self._device} is broken: {_reason(error)}") from error
 
     def close(self) -> None:
@@ -48,4 +53,4 @@ class SerialLink:
 
 
 def _reason(error: Exception) -> str:
-    return getattr(error, "strerror", None) or str(error)
+    return str(error.args[-1])
