@@ -37,6 +37,7 @@ class VelocityCommand:
         self._counts = counts
         self._steady_s = steady_s
         self._latest: tuple[int, Velocity] | None = None
+        self._expired: tuple[int, Velocity] | None = None  # of `velocity` alone: only `set` writes the newest
         self._clock_ran = (0, steady_s())
 
     def set(self, velocity: Velocity) -> None:
@@ -51,12 +52,12 @@ class VelocityCommand:
         latest, now_ns = self._latest, self._clock()
         if now_ns != self._clock_ran[0]:
             self._clock_ran = (now_ns, self._steady_s())
-        if latest is None:
+        if latest is None or latest is self._expired:
             return STILL
         age_ns = now_ns - latest[0]
         if 0 <= age_ns <= self._timeout_ns and self._steady_s() <= self._clock_ran[1] + STANDING_CLOCK_S:
             return latest[1]
         if latest[1] != STILL:
             self._counts["stale_cmd_vel"] += 1
-        self._latest = None
+        self._expired = latest
         return STILL
