@@ -97,6 +97,7 @@ class WifiSession:
         """What has come, after a moment at most."""
         data = self._link.read(timeout_s)
         now_s, now_ns = time.monotonic(), self._clock()
+        self._heard_ns = min(self._heard_ns, now_ns)  # the clock may jump back
         if data:
             self._heard_s, self._heard_ns = now_s, now_ns
         elif min(now_s - self._heard_s, (now_ns - self._heard_ns) * 1e-9) > self._silence_s:

@@ -44,7 +44,7 @@ class WheelOdometry:
     Args:
         geometry: The wheels.
         wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
-        counts: Gets `implausible_counters` and `counter_restarts`.
+        counts: Gets `implausible_counters`, `counter_restarts` and `time_jumps`.
     """
 
     def __init__(self, geometry: WheelGeometry, wheel_noise: float, counts: Counter[str]) -> None:
@@ -76,12 +76,15 @@ class WheelOdometry:
     def update(self, stamp_ns: int, left: int, right: int) -> OdometryState | None:
         """Take counters of 16 bits; the state, or None when they tell nothing new or cannot be true."""
         last = self._last
-        if last is None or stamp_ns < last[0]:
+        if last is None:
             self._restart(stamp_ns, left, right)
             return self._state(stamp_ns, 0.0, 0.0, 0.0)
-        if stamp_ns - last[0] < _SHORTEST_NS:
+        if 0 <= stamp_ns - last[0] < _SHORTEST_NS:
             return None
-        elapsed_s = (stamp_ns - last[0]) * 1e-9
+        has_jumped = stamp_ns < last[0]
+        if has_jumped:
+            self._counts["time_jumps"] += 1
+        elapsed_s = 0.0 if has_jumped else (stamp_ns - last[0]) * 1e-9
         counters = ((last[1], left), (last[2], right))
         left_steps, right_steps = (
             unwrapped_difference(before, after, rate * elapsed_s)
@@ -90,7 +93,7 @@ class WheelOdometry:
         paths = left_steps * self._geometry.metres_per_step, right_steps * self._geometry.metres_per_step
         if self._possible((left_steps, right_steps), elapsed_s):
             self._advance(*paths)
-        elif self._doubtful:
+        elif self._doubtful or has_jumped:
             self._counts["counter_restarts"] += 1
             self._forget_motion(elapsed_s)
             paths = 0.0, 0.0
@@ -154,7 +157,7 @@ class WheelOdometry:
     def _forget_motion(self, elapsed_s: float) -> None:
         """The robot went nobody knows where, at most as fast as it was told."""
         rate = max(abs(rate) for limit in self._limits() for rate in limit)
-        reach = rate * self._geometry.metres_per_step * elapsed_s
+        reach = rate * self._geometry.metres_per_step * (elapsed_s + _TIMING_SLACK_S)
         turned = min(2.0 * reach / self._geometry.wheel_separation, math.pi)
         self._covariance += np.diag([reach**2, reach**2, turned**2]) / 3.0
 

@@ -88,6 +88,23 @@ def test_a_clock_that_jumps_back_stops_the_robot() -> None:
     assert command.velocity() == STILL
 
 
+def test_a_velocity_that_comes_while_an_old_one_expires_is_kept() -> None:
+    coming: list[Velocity] = []
+
+    def clock() -> int:
+        if coming:
+            command.set(coming.pop())
+        return now_ns
+
+    now_ns = SECOND
+    command = VelocityCommand(0.5, clock, Counter())
+    command.set((0.01, 0.0, 0.0))
+    now_ns += SECOND
+    coming.append(AHEAD)  # in another thread, when the old velocity has just been read
+    assert command.velocity() == STILL
+    assert command.velocity() == AHEAD
+
+
 @pytest.mark.parametrize("velocity", [(math.nan, 0.0, 0.0), (0.0, 0.0, math.inf), (0.0, -math.inf, math.nan)])
 def test_what_is_not_finite_is_dropped(velocity: Velocity) -> None:
     command, counts = command_with(Watch())
@@ -235,18 +252,47 @@ def test_a_robot_that_was_switched_off_is_counted_from_anew_and_less_sure(
     assert counts == {"implausible_counters": 1, "counter_restarts": 1}
 
 
-def test_time_that_stands_tells_nothing_and_time_that_jumps_back_begins_anew(odometry: WheelOdometry) -> None:
+def test_time_that_stands_tells_nothing(odometry: WheelOdometry) -> None:
     wheels = Wheels(odometry)
-    wheels.read()
+    assert wheels.read() is not None
     assert wheels.read() is None
+
+
+@pytest.mark.parametrize("back_s", [0.051, 5.0])
+def test_a_step_of_the_clock_costs_no_way(
+    odometry: WheelOdometry, counts: Counter[str], back_s: float
+) -> None:
+    wheels = Wheels(odometry, steps=(32700, 32700))
+    wheels.read()
+    wheels.command(1000.0, 1000.0)
+    for jump_s in (0.0, back_s, 0.0):
+        wheels.run(0.05)
+        wheels.now_ns -= round(jump_s * SECOND)
+        state = wheels.read()
+    assert state is not None
+    assert state.pose == pytest.approx([150 * GEOMETRY.metres_per_step, 0.0, 0.0], abs=1e-9)
+    assert counts == {"time_jumps": 1}
+
+
+def test_counters_that_begin_anew_with_time_tell_no_way(
+    odometry: WheelOdometry, counts: Counter[str]
+) -> None:
+    wheels = Wheels(odometry, steps=(20000, 20000))
+    wheels.read()
     wheels.command(400.0, 400.0)
     wheels.run(1.0)
     before = wheels.read()
-    wheels.now_ns -= 5 * SECOND
-    again = wheels.read()
+    wheels.now_ns, wheels.steps = SECOND // 2, np.zeros(2)
+    jumped = wheels.read()
+    wheels.run(0.5)
+    after = wheels.read()
     assert before is not None
-    assert again is not None
-    assert again.pose == pytest.approx(before.pose)
+    assert jumped is not None
+    assert after is not None
+    assert jumped.pose == pytest.approx(before.pose)
+    assert jumped.covariance[0, 0] > before.covariance[0, 0]
+    assert after.pose[0] - jumped.pose[0] == pytest.approx(200 * GEOMETRY.metres_per_step, abs=1e-9)
+    assert counts == {"time_jumps": 1, "counter_restarts": 1}
 
 
 @given(legs=st.lists(st.tuples(RATE, RATE, st.integers(1, 20)), min_size=1, max_size=12))

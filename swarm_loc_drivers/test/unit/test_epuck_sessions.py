@@ -10,6 +10,7 @@ from epuck_body import DrivenBody
 from swarm_loc_drivers.core.epuck_serial_session import SerialCamera, SerialSession
 from swarm_loc_drivers.core.epuck_session import Photo, Reading
 from swarm_loc_drivers.core.epuck_wifi_session import WifiSession
+from swarm_loc_drivers.core.link_keeper import SessionError
 from swarm_loc_drivers.protocols.epuck import EPUCK1
 from swarm_loc_drivers.sim.firmware.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.firmware.wifi_firmware import CYCLE_NS, WifiFirmware
@@ -26,6 +27,7 @@ class Wire:
         self.firmware: SerialFirmware | WifiFirmware = WifiFirmware(self.body)
         self._read_ns = read_ns
         self._answer = b""
+        self.is_cut = False
 
     def clock(self) -> int:
         """The time [ns]."""
@@ -39,7 +41,7 @@ class Wire:
         """See `Link`."""
         self.now_ns += self._read_ns if timeout_s > 0.0 else 0
         data, self._answer = self._answer + self.firmware.stream(), b""
-        return data
+        return b"" if self.is_cut else data
 
     def close(self) -> None:
         """Nothing is to be done."""
@@ -59,6 +61,18 @@ def test_of_a_stream_as_many_readings_are_used_as_wanted(period_s: float) -> Non
     assert gaps_ns.size > 50
     assert abs(gaps_ns.mean() - period_s * 1e9) <= CYCLE_NS / gaps_ns.size
     assert np.abs(gaps_ns - period_s * 1e9).max() < CYCLE_NS
+
+
+def test_a_silent_robot_is_found_out_although_the_clock_has_jumped_back() -> None:
+    wire = Wire(CYCLE_NS)
+    wire.now_ns = 1000 * 10**9
+    session = WifiSession(wire, False, 0.05, 0.0, wire.clock, Counter())
+    session.begin()
+    assert session.exchange(lambda: (0, 0))
+    wire.now_ns, wire.is_cut = 10**9, True
+    assert session.exchange(lambda: (0, 0)) == []  # shows that the clock has jumped
+    with pytest.raises(SessionError, match="silent"):
+        session.exchange(lambda: (0, 0))
 
 
 def test_over_the_serial_port_every_tick_gives_a_reading_and_pictures_keep_their_period() -> None:
