@@ -217,15 +217,19 @@ def nearest(
         bits: (N,) filled with the number of bits that differ.
 
     Returns:
-        Index of the nearest word, its weighed distance, and that of the second nearest.
+        Index of the nearest word, its weighed distance, and that of the second nearest. A second that
+        is far off is the one with the fewest bits that differ: another may weigh a tenth of a bit less.
     """
-    fewest = np.uint8(BITS)
+    fewest, second = np.uint8(BITS), np.uint8(BITS)
     for i in range(len(words)):
         bits[i] = _bits_set(words[i] ^ seen)
         fewest = min(fewest, bits[i])
+    for i in range(len(words)):  # a loop of its own: together the compiler does not turn them into vectors
+        second = min(second, bits[i] if bits[i] > fewest else np.uint8(BITS))
+    reach = max(fewest + _WEIGHED, second)  # so that there is a second nearest, however far it is
     best, distance, runner_up = -1, _FAR, _FAR
     for i in range(len(words)):
-        if bits[i] > fewest + _WEIGHED:
+        if bits[i] > reach:
             continue
         different = words[i] ^ seen
         cost = 0.0

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from swarm_loc_vision.core.decoder import FALSE_READINGS, Dictionary, _clear_cells, _flatten, correctable_bits
-from swarm_loc_vision.core.families import BITS, Family, family_named
+from swarm_loc_vision.core.families import BITS, Family, family_named, rotated, unpacked
 from swarm_loc_vision.core.sampling import GRID
 
 INK, PAPER = 40.0, 200.0
@@ -27,6 +27,14 @@ def cells_of(patterns: NDArray[np.uint8]) -> NDArray[np.float64]:
     return cells
 
 
+def bits_apart(family: Family, ids: NDArray[np.int64], used: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Bits by which the nearest other reading, an id in use or the same one turned, differs from each id."""
+    turned = np.concatenate([rotated(family.words[used], quarters) for quarters in range(4)])
+    signs, own = (2.0 * unpacked(words).reshape(-1, BITS) - 1.0 for words in (turned, family.words[ids]))
+    apart = 0.5 * (BITS - own @ signs.T)
+    return np.asarray(np.sort(apart, axis=1)[:, 1])
+
+
 def patterns_of(family: Family, ids: NDArray[np.int64]) -> NDArray[np.uint8]:
     border = family.border
     return np.stack([family.pattern(int(i))[border:-border, border:-border] for i in ids])
@@ -40,6 +48,8 @@ def test_all_bch_ids_are_read_in_every_rotation(quarters: int) -> None:
     assert (readings.quarters == quarters).all()
     assert (readings.errors == 0.0).all()
     assert 0.5 < readings.margin.min() <= 1.0  # two ids come as close as two bits when turned
+    some = ids[::32]
+    assert (readings.margin[some] <= 0.5 * bits_apart(BCH, some, ids)).all()
 
 
 def test_uneven_light_and_noise_do_not_matter() -> None:
@@ -56,7 +66,8 @@ def test_uneven_light_and_noise_do_not_matter() -> None:
 @example(0, {7})
 def test_flipped_bits_are_corrected_as_far_as_is_safe(marker_id: int, flipped: set[int]) -> None:
     family = family_named("aruco_mip_36h12")
-    dictionary = Dictionary([(family, np.arange(20))])
+    used = np.arange(20)
+    dictionary = Dictionary([(family, used)])
     marker_id %= 20
     pattern = patterns_of(family, np.array([marker_id]))
     pattern.reshape(-1)[sorted(flipped)] ^= 1
@@ -64,14 +75,23 @@ def test_flipped_bits_are_corrected_as_far_as_is_safe(marker_id: int, flipped: s
     readings = dictionary.read(cells, 10.0)
     if len(flipped) <= dictionary.correctable:
         assert dictionary.ids[readings.word[0]] == marker_id
-        flat, clear = np.empty((GRID - 2, GRID - 2)), np.empty(BITS)
-        _clear_cells(flat, _flatten(cells[0], flat), 0.5, clear)
-        assert readings.errors[0] == pytest.approx(np.abs(clear[sorted(flipped)]).sum())
         # least clear is a cell like its neighbours; counted through for all that these ids and bits can be
         assert 0.42 * len(flipped) <= readings.errors[0] <= len(flipped)
         assert readings.margin[0] > 0.25 * (12 - 2 * len(flipped))
-    else:
-        assert readings.word[0] == -1 or readings.errors[0] <= dictionary.correctable
+        assert readings.margin[0] <= 0.5 * (bits_apart(family, np.array([marker_id]), used) + len(flipped))
+    if readings.word[0] >= 0:
+        flat, clear = np.empty((GRID - 2, GRID - 2)), np.empty(BITS)
+        _clear_cells(flat, _flatten(cells[0], flat), 0.5, clear)
+        read = np.rot90(patterns_of(family, dictionary.ids[readings.word])[0], readings.quarters[0])
+        weighed = np.abs(clear)[read.ravel() != pattern.ravel()].sum()
+        assert readings.errors[0] == pytest.approx(weighed)
+        assert weighed <= dictionary.correctable
+
+
+def test_of_a_single_id_the_margin_is_to_itself_turned() -> None:
+    family, used = family_named("aruco_mip_36h12"), np.array([7])
+    readings = Dictionary([(family, used)]).read(cells_of(patterns_of(family, used)), 10.0)
+    assert 0.25 * bits_apart(family, used, used) < readings.margin <= 0.5 * bits_apart(family, used, used)
 
 
 def test_fewer_ids_in_use_let_more_bits_be_corrected() -> None:
