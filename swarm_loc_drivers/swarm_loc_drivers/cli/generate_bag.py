@@ -29,6 +29,7 @@ from swarm_loc_drivers.sim.picture_bag import write_picture_bag
 from swarm_loc_drivers.sim.pictures import photograph_eight
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.worlds import WORLDS
+from swarm_loc_estimator.cli.arguments import number_in
 from swarm_loc_estimator.cli.ending import told_in_a_sentence
 from swarm_loc_estimator.io.bag_file import BagError
 from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
@@ -36,22 +37,13 @@ from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-_SHORTEST_S = 2.0
+_ANY_SEED = number_in(0, 2**31 - 1)
 
 
 @told_in_a_sentence(BagError, DefinitionsNotFoundError)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
-    if options.duration < _SHORTEST_S:
-        parser.error(f"--duration {options.duration:g} must be at least {_SHORTEST_S:g} s")
-    if options.robots < 1:
-        parser.error(f"--robots {options.robots} must be at least 1")
-    if options.seed < 0:
-        parser.error(f"--seed {options.seed} must be at least 0")
-    if getattr(options, "boards", None) is not None and options.boards < 0:
-        parser.error(f"--boards {options.boards} must be at least 0")
+    options = _parser().parse_args(arguments)
     said = {name: value for name, value in vars(options).items() if value is not None}
     words = [f"{name}={value}" for name, value in said.items() if name not in ("bag", "write")]
     count = options.write(options, f"Simulated: {', '.join(words)}.")
@@ -102,18 +94,18 @@ def _parser() -> argparse.ArgumentParser:
         prog="generate_bag", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     swarms = parser.add_subparsers(dest="swarm", required=True, metavar="SWARM")
-    eight = _swarm(swarms, "eight", "e-pucks driving the paper's eight among wall markers", 5, 54.0)
+    eight = _swarm(swarms, "eight", "e-pucks driving the paper's eight among wall markers", 5, 9, 54.0)
     eight.set_defaults(write=_eight)
-    pictures = _swarm(swarms, "pictures", "the same, with what their cameras see", 2, 9.0)
+    pictures = _swarm(swarms, "pictures", "the same, with what their cameras see", 2, 9, 9.0)
     pictures.set_defaults(write=_pictures)
     for one in (eight, pictures):
         one.add_argument(
             "--world", choices=sorted(WORLDS), default="w0", help="imperfections; see sim/worlds.py"
         )
-        one.add_argument("--speed", type=float, default=0.06, help="[m/s]")
+        one.add_argument("--speed", type=number_in(0.001, 0.12, "m/s"), default=0.06, help="[m/s]")
         one.add_argument("--start-unknown", action="store_true", help="swarm.yaml tells no start poses")
     droplets = _swarm(
-        swarms, "droplets", "Droplets that see each other by infrared, two by a tracker", 20, 90.0
+        swarms, "droplets", "Droplets that see each other by infrared, two by a tracker", 20, 1000, 90.0
     )
     droplets.set_defaults(write=_droplets)
     droplets.add_argument(
@@ -124,8 +116,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     droplets.add_argument("--calibrated", action="store_true", help="swarm.yaml tells the elements' gains")
     droplets.add_argument("--start-known", action="store_true", help="swarm.yaml tells the start poses")
-    droplets.add_argument("--boards", type=int, help="seed of the elements' gains (default: that of --seed)")
-    _swarm(swarms, "grid", "many robots, each about its cell of a grid", 100, 20.0).set_defaults(write=_grid)
+    droplets.add_argument(
+        "--boards", type=_ANY_SEED, help="seed of the elements' gains (default: that of --seed)"
+    )
+    grid = _swarm(swarms, "grid", "many robots, each about its cell of a grid", 100, 10_000, 20.0)
+    grid.set_defaults(write=_grid)
     return parser
 
 
@@ -134,14 +129,17 @@ def _swarm(
     name: str,
     text: str,
     robots: int,
+    most: int,
     seconds: float,
 ) -> argparse.ArgumentParser:
-    """A sub-command with what all simulated swarms have."""
+    """A sub-command with what all simulated swarms have; of robots there are `most` at most."""
     parser = swarms.add_parser(name, help=text, description=text)
     parser.add_argument("bag", type=Path, help="bag folder to create")
-    parser.add_argument("--seed", type=int, default=1, help="the same seed gives the same bag")
-    parser.add_argument("--duration", type=float, default=seconds, help="simulated time [s]")
-    parser.add_argument("--robots", type=int, default=robots, help="how many")
+    parser.add_argument("--seed", type=_ANY_SEED, default=1, help="the same seed gives the same bag")
+    parser.add_argument(
+        "--duration", type=number_in(2.0, 3600.0, "s"), default=seconds, help="simulated time [s]"
+    )
+    parser.add_argument("--robots", type=number_in(1, most), default=robots, help="how many")
     return parser
 
 

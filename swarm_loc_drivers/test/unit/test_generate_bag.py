@@ -80,8 +80,31 @@ def test_an_existing_bag_is_not_overwritten(bag: Path, capsys: pytest.CaptureFix
     assert str(bag) in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("wrong", [["--duration", "1"], ["--robots", "0"], ["--seed", "-1"]])
-def test_a_value_out_of_range_is_refused(wrong: list[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("swarm", "option", "value", "limits"),
+    [
+        ("grid", "--duration", "1", "[2, 3600] s"),
+        ("grid", "--duration", "nan", "[2, 3600] s"),
+        ("droplets", "--duration", "inf", "[2, 3600] s"),
+        ("grid", "--robots", "0", "[1, 10000]"),
+        ("eight", "--robots", "10", "[1, 9]"),
+        ("grid", "--seed", "-1", "[0, 2.14748e+09]"),
+        ("droplets", "--boards", "-1", "[0, 2.14748e+09]"),
+        ("eight", "--speed", "nan", "[0.001, 0.12] m/s"),
+        ("pictures", "--speed", "0", "[0.001, 0.12] m/s"),
+        ("eight", "--speed", "-0.06", "[0.001, 0.12] m/s"),
+        ("eight", "--speed", "5", "[0.001, 0.12] m/s"),
+    ],
+)
+def test_a_value_out_of_range_is_refused(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    swarm: str,
+    option: str,
+    value: str,
+    limits: str,
+) -> None:
     with pytest.raises(SystemExit):
-        main(["grid", str(tmp_path / "bag"), *wrong])
+        main([swarm, str(tmp_path / "bag"), option, value])
+    assert f"argument {option}: {value} must be a number in {limits}" in capsys.readouterr().err
     assert not (tmp_path / "bag").exists()
