@@ -30,6 +30,15 @@ from swarm_loc_estimator.nodes.running import run_node, spin
 
 _COMMAND_QOS = QoSProfile(depth=1)
 _TF_STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_RATES = ("readings", "pictures")
+_WRONG = {
+    "bad_cmd_vel": "velocities that were not finite",
+    "bad_pictures": "pictures of another size or kind than asked for",
+    "counter_restarts": "counters that did not go on, as after a reset",
+    "implausible_counters": "readings that no command could have led to",
+    "missed_replies": "questions that were not answered in time or not whole",
+    "time_jumps": "stamps that stepped back",
+}
 
 
 class EpuckDriverNode(Node):
@@ -58,7 +67,7 @@ class EpuckDriverNode(Node):
         self._driver = EpuckDriver(settings, listeners, self._now_ns)
         self._advertise()
         name, address = f"{self._prefix}{self.get_name()}", str(settings.address)
-        self._diagnostics = DriverDiagnostics(self, self._driver, name, address, ("readings", "pictures"))
+        self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
         self.create_subscription(Twist, "cmd_vel", self._on_cmd_vel, _COMMAND_QOS)
         self.create_timer(1.0 / wishes.reading_rate, self._driver.tick)
         self._driver.start()

@@ -263,6 +263,13 @@ def test_the_robot_stands_when_commands_stop(ros: Ros, robot: Start, driver: Sta
     ros.until(lambda: not is_moving(controller.odometry[-1]))
 
 
+def test_velocities_that_are_not_finite_are_warned_of(ros: Ros, robot: Start, driver: Start) -> None:
+    controller = Controller(ros)
+    program = driver("wifi", robot("wifi").place)
+    controller.velocity = (math.nan, 0.0)
+    ros.until(lambda: " bad_cmd_vel: velocities that were not finite" in program.output)
+
+
 @OVER
 def test_a_robot_that_dies_is_told_and_found_again(ros: Ros, robot: Start, driver: Start, over: str) -> None:
     controller, emulated = Controller(ros), robot(over)
