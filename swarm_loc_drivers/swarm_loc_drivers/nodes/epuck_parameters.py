@@ -14,7 +14,7 @@ from swarm_loc_drivers.protocols.epuck import EPUCK2, EPUCK_MODELS, EpuckModel
 from swarm_loc_drivers.transports.link import Address, AddressError, parse_address
 from swarm_loc_estimator.core.number_spec import number
 from swarm_loc_estimator.core.swarm import OdometryModel
-from swarm_loc_estimator.nodes.parameter_table import ParameterError, flag, text
+from swarm_loc_estimator.nodes.parameter_table import ParameterError, choice, flag, text
 
 _ODOMETRY = OdometryModel()
 
@@ -28,14 +28,15 @@ class EpuckParameters:
         "a serial port such as /dev/rfcomm0, or tcp://HOST[:1000] for the WiFi firmware of an e-puck2",
         required=True,
     )
-    model: str = text("epuck2", "epuck1 or epuck2", required=True)
+    model: str = choice("epuck2", tuple(EPUCK_MODELS), "generation of the robot; only epuck2 has WiFi")
     baud_rate: int = number(115_200, "bit/s", 1200, 12_000_000, "of a serial port")
     reading_rate: float = number(
         20.0,
         "1/s",
         0.1,
         200.0,
-        "readings that are wanted; a serial robot is asked, of a stream's 62 some are used",
+        "readings that are wanted; a serial robot is asked so often and at each cmd_vel,"
+        " of a stream's 62 some are used",
     )
     reply_timeout_s: float = number(
         0.5, "s", 0.01, 10.0, "how long an answer may take; a stream may be silent twice as long"
@@ -67,7 +68,7 @@ def epuck_settings(wishes: EpuckParameters) -> EpuckSettings:
     Raises:
         ParameterError: One cannot be used, or does not go with another.
     """
-    address, model = _address(wishes), _model(wishes)
+    address, model = _address(wishes), EPUCK_MODELS[wishes.model]
     if address.host and model is not EPUCK2:
         raise ParameterError(
             f"parameter model = '{model.name}' does not go with address = '{address}': only epuck2 has WiFi."
@@ -106,12 +107,6 @@ def _address(wishes: EpuckParameters) -> Address:
         return parse_address(wishes.address, epuck_wifi.PORT)
     except AddressError as error:
         raise ParameterError(f"parameter address = {error}") from error
-
-
-def _model(wishes: EpuckParameters) -> EpuckModel:
-    if wishes.model not in EPUCK_MODELS:
-        raise ParameterError(f"parameter model = '{wishes.model}' must be one of {', '.join(EPUCK_MODELS)}.")
-    return EPUCK_MODELS[wishes.model]
 
 
 def _camera(wishes: EpuckParameters, address: Address, model: EpuckModel) -> SerialCamera:

@@ -16,8 +16,8 @@ from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.core.number_spec import number
 from swarm_loc_estimator.core.swarm import OdometryModel, Swarm
 from swarm_loc_estimator.io.swarm_file import load_swarm
-from swarm_loc_estimator.nodes.parameter_table import ParameterError, text
-from swarm_loc_vision.core.families import family_named
+from swarm_loc_estimator.nodes.parameter_table import ParameterError, choice, text
+from swarm_loc_vision.core.families import families
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,7 @@ class WorldParameters:
     """Parameters of `epuck_world_node`; the camera's are those of `CameraModel`."""
 
     swarm_file: str = text("", "path of the swarm description; every robot needs a start", required=True)
-    world: str = text(
-        "w2", "which errors robots and cameras have: w0 or w2; see sim/worlds.py", required=True
-    )
+    world: str = choice("w2", tuple(WORLDS), "which errors robots and cameras have; see sim/worlds.py")
     seed: int = number(1, "1", 0, 2**31 - 1, "fixes the errors")
     rate: float = number(
         1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
@@ -43,16 +41,14 @@ class WorldParameters:
         "", "where each robot's serial port appears under its name; empty: robots on WiFi"
     )
     first_port: int = number(0, "1", 0, 65000, "TCP port of the first robot on WiFi, the others follow")
-    model: str = text(
-        "epuck2", "generation of the robots: epuck1 or epuck2; WiFi has only epuck2", required=True
-    )
+    model: str = choice("epuck2", tuple(EPUCK_MODELS), "generation of the robots; only epuck2 has WiFi")
     wheel_diameter: float = number(0.041, "m", 0.001, 1.0, "diameter of the wheels")
     wheel_separation: float = number(
         OdometryModel().wheel_separation, "m", 0.001, 10.0, "distance between the two wheels"
     )
     arena_x: float = number(ARENA[0], "m", 0.1, 1000.0, "size of the arena along x, around the origin")
     arena_y: float = number(ARENA[1], "m", 0.1, 1000.0, "likewise along y")
-    family: str = text(FAMILY, "kind of the markers", required=True)
+    family: str = choice(FAMILY, tuple(families()), "kind of the markers")
     camera_rate: float = number(CAMERA_RATE_HZ, "1/s", 2.0, 60.0, "pictures of each camera")
     truth_rate: float = number(20.0, "1/s", 0.1, 200.0, "published true poses of each robot")
     camera: CameraModel = field(default_factory=CameraModel, metadata={"numbers_of": CameraModel})
@@ -65,17 +61,13 @@ def make_world(wishes: WorldParameters) -> tuple[Swarm, EpuckWorld]:
         ParameterError: A parameter cannot be used.
         SwarmFileError: The swarm description cannot be used.
     """
-    if wishes.world not in WORLDS:
-        raise ParameterError(f"parameter world = '{wishes.world}' must be one of {', '.join(WORLDS)}.")
-    if wishes.model not in EPUCK_MODELS:
-        raise ParameterError(f"parameter model = '{wishes.model}' must be one of {', '.join(EPUCK_MODELS)}.")
     if not wishes.link_folder and EPUCK_MODELS[wishes.model] is not EPUCK2:
         raise ParameterError(
             f"parameter model = '{wishes.model}' needs the parameter link_folder: only epuck2 has WiFi."
         )
     swarm = load_swarm(Path(wishes.swarm_file))
     try:
-        stage = Stage((wishes.arena_x, wishes.arena_y), family_named(wishes.family))
+        stage = Stage((wishes.arena_x, wishes.arena_y), families()[wishes.family])
         settings = EpuckWorldSettings(
             seed=wishes.seed,
             world=WORLDS[wishes.world],

@@ -10,6 +10,7 @@ from swarm_loc_drivers.nodes.world_parameters import WorldParameters, make_world
 from swarm_loc_drivers.sim.eight import EightSettings, describe
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.steering import EightSteering
+from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.io.swarm_writer import save_swarm
 from swarm_loc_estimator.nodes.parameter_table import ParameterError, markdown_table, parameter_specs
 
@@ -35,18 +36,22 @@ def test_robots_begin_where_the_description_says(wishes: WorldParameters) -> Non
     np.testing.assert_allclose(world.poses, START)
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"world": "w9"}, "parameter world = 'w9' must be one of w0, w2"),
-        ({"model": "khepera"}, "parameter model = 'khepera' must be one of"),
-        ({"model": "epuck1"}, "parameter model = 'epuck1' needs the parameter link_folder"),
-        ({"family": "round"}, "parameter family = 'round'"),
-    ],
-)
-def test_what_cannot_be_used_is_named(wishes: WorldParameters, change: dict[str, str], said: str) -> None:
-    with pytest.raises(ParameterError, match=said):
-        make_world(replace(wishes, **change))  # type: ignore[arg-type]
+def test_the_worlds_that_there_are_can_be_chosen() -> None:
+    (spec,) = (spec for spec in parameter_specs(WorldParameters) if spec.name == "world")
+    assert [spec.checked(name) for name in WORLDS] == list(WORLDS)
+    with pytest.raises(ParameterError, match=r"parameter world = 'w9' must be one of w0, w2, w2fast\."):
+        spec.checked("w9")
+
+
+def test_robots_without_wifi_need_serial_ports(wishes: WorldParameters) -> None:
+    with pytest.raises(ParameterError, match="parameter model = 'epuck1' needs the parameter link_folder"):
+        make_world(replace(wishes, model="epuck1"))
+
+
+def test_a_family_without_a_markers_id_is_named(wishes: WorldParameters) -> None:
+    save_swarm(describe(EightSettings(robots=2), START, first_face_id=250), Path(wishes.swarm_file))
+    with pytest.raises(ParameterError, match=r"parameter family = 'aruco_mip_36h12': .* has ids 0 to 249"):
+        make_world(replace(wishes, family="aruco_mip_36h12"))
 
 
 def test_a_robot_without_a_start_is_named(wishes: WorldParameters) -> None:
