@@ -79,10 +79,11 @@ class PictureBag:
         count = 0
         camera_at = {name: self.cameras[space.rstrip("/")] for space, (name, _) in self._pictures.items()}
         info_at = {f"{space}camera_info": self.cameras[space.rstrip("/")] for space in self._pictures}
-        replaced = {f"{space}detections" for space in self._pictures}
+        written = {f"{space}detections" for space in self._pictures}
+        replaced = {f"{space}image_raw{t.suffix}" for space in self._pictures for t in TRANSPORTS.values()}
         with BagReader(self._bag) as reader, BagWriter(folder) as writer:
-            kept = [topic for topic in reader.topics if not _is_picture(topic) and topic.name not in replaced]
-            for topic in (*kept, *(BagTopic(name, DETECTIONS) for name in sorted(replaced))):
+            kept = [topic for topic in reader.topics if topic.name not in written | replaced]
+            for topic in (*kept, *(BagTopic(name, DETECTIONS) for name in sorted(written))):
                 writer.add_topic(topic.name, topic.type)
             for name, kind, log_ns, data in reader.messages([*(topic.name for topic in kept), *camera_at]):
                 progress(reader.progress, "detecting")
@@ -107,11 +108,6 @@ def _spaces(topics: Sequence[BagTopic], name: str, message_type: str) -> list[st
         for topic in topics
         if topic.type == message_type and f"/{topic.name}".endswith(f"/{name}")
     ]
-
-
-def _is_picture(topic: BagTopic) -> bool:
-    """Whether a topic holds pictures."""
-    return topic.type in {transport.message_type for transport in TRANSPORTS.values()}
 
 
 def _detected(camera: CameraDetector, kind: str, data: bytes) -> bytes | None:

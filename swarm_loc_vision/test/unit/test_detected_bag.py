@@ -119,6 +119,18 @@ def test_the_same_pictures_give_the_same_bytes(detected: Path, tmp_path: Path) -
     assert [m for m in messages(detected) if not m[0].endswith("detections")] == kept
 
 
+def test_pictures_of_other_topics_are_kept(tmp_path: Path) -> None:
+    own = [message for message in messages(BAG) if message[0].startswith("epuck1/")]
+    info = next(message for message in own if message[1] == CAMERA_INFO)
+    _, kind, log_ns, data = next(message for message in own if message[1] == IMAGE)
+    picture = ("epuck1/image_raw/compressed", kind, log_ns, data)
+    others = [(name, kind, log_ns, data) for name in ("epuck1/image_rect/compressed", "overhead/compressed")]
+    write(tmp_path / "bag", [info, picture, *others])
+    assert main([str(tmp_path / "bag"), "--output", str(tmp_path / "out")]) == 0
+    left = messages(tmp_path / "out")
+    assert [message for message in left if message[0] != "epuck1/detections"] == [info, *others]
+
+
 def test_bad_pictures_are_counted_and_the_others_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
