@@ -38,7 +38,7 @@ _MESSAGES = {"sensor_msgs/msg/Image": Image, "sensor_msgs/msg/CompressedImage": 
 _DIAGNOSTICS_PERIOD_S = 1.0
 _THROTTLE_S = 30.0
 _PATIENCE_S = 5.0
-"""How long nothing may come before the log names what is missing."""
+"""How long no picture may come before the log names what is missing."""
 
 
 class MarkerDetectorNode(Node):
@@ -62,7 +62,8 @@ class MarkerDetectorNode(Node):
         transport = TRANSPORTS[self._wishes.image_transport]
         self._camera = CameraDetector(create_detector, transport.gray_of, self._wishes.settings.ambiguity)
         self._cost_s = 0.0
-        self._waiting_since_s: float | None = time.monotonic()
+        self._picture_s = time.monotonic()
+        self._has_said_missing = False
         self._detections = self.create_publisher(MarkerDetectionArray, "detections", QoSProfile(depth=10))
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
         self.create_subscription(CameraInfo, "camera_info", self._on_camera_info, qos_profile_sensor_data)
@@ -92,8 +93,9 @@ class MarkerDetectorNode(Node):
             self._detections.publish(self._camera.detect(message))
         except ImageError as error:
             self.get_logger().warning(f"dropped a picture: {error}", throttle_duration_sec=_THROTTLE_S)
-            return
-        self._cost_s += time.process_time() - begin_s
+        finally:
+            self._cost_s += time.process_time() - begin_s
+            self._picture_s = time.monotonic()
 
     def _on_diagnostics(self) -> None:
         trouble, camera = self._trouble(), self._camera
@@ -114,22 +116,28 @@ class MarkerDetectorNode(Node):
         self._diagnostics.publish(message)
 
     def _trouble(self) -> str:
-        """What keeps the node from detecting; said in the log, too, after a while and once."""
+        """What keeps the node from detecting; said in the log, too, once for each silence of the camera."""
         missing = self._missing()
         if not missing:
-            self._waiting_since_s = None
-        elif self._waiting_since_s is not None and time.monotonic() > self._waiting_since_s + _PATIENCE_S:
-            self._waiting_since_s = None
+            self._has_said_missing = False
+        elif not self._has_said_missing and self._silence_s() > _PATIENCE_S:
+            self._has_said_missing = True
             self.get_logger().warning(f"waiting: {missing}")
         return self._camera.trouble or missing
 
     def _missing(self) -> str:
-        """The topic on which nothing has come."""
+        """The topic on which nothing has come, or nothing for a while."""
         if not self._camera.is_calibrated and not self._camera.trouble:
             return f"nothing has come on {self.resolve_topic_name('camera_info')}"
         if not self._camera.pictures:
             return f"nothing has come on {self._image_topic}"
+        if self._silence_s() > _PATIENCE_S:
+            return f"nothing has come on {self._image_topic} for {self._silence_s():.0f} s"
         return ""
+
+    def _silence_s(self) -> float:
+        """How long no picture has come."""
+        return time.monotonic() - self._picture_s
 
 
 def main() -> int:

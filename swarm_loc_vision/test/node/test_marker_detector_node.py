@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from node_world import Ros, overrides
+from rcl_interfaces.msg import Log
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from vision_bench.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
@@ -18,6 +19,7 @@ from vision_bench.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
 from swarm_loc_estimator.nodes.parameter_table import ParameterError
 from swarm_loc_msgs.msg import MarkerDetection, MarkerDetectionArray
 from swarm_loc_vision.core.families import family_named
+from swarm_loc_vision.nodes import marker_detector_node
 from swarm_loc_vision.nodes.marker_detector_node import MarkerDetectorNode
 
 FAMILY = "aruco_mip_36h12"
@@ -137,6 +139,21 @@ def test_pictures_become_detections_with_their_stamp_and_frame(ros: Ros) -> None
     assert camera.status().level == DiagnosticStatus.OK
 
 
+def test_a_camera_that_falls_silent_is_told_each_time(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(marker_detector_node, "_PATIENCE_S", 0.3)
+    monkeypatch.setattr(marker_detector_node, "_DIAGNOSTICS_PERIOD_S", 0.1)
+    silence = "nothing has come on /image_raw for "
+    logged: list[Log] = ros.listen(Log, "/rosout")
+    camera = Camera(ros)
+    camera.calibrate(camera_info(), "image_raw")
+    for number in (1, 2):
+        camera._publish_until(image(number), lambda: camera.status().message == "detecting")
+        ros.until(lambda: camera.status().message.startswith(silence))
+        assert camera.status().level == DiagnosticStatus.WARN
+        ros.until(lambda: any(f"waiting: {silence}" in log.msg for log in logged))
+        logged.clear()
+
+
 def test_without_calibration_there_are_no_detections(ros: Ros) -> None:
     camera = Camera(ros)
     camera.see_dropped(image(1), "no_calibration")
@@ -161,6 +178,7 @@ def test_bad_pictures_are_dropped_and_counted(ros: Ros) -> None:
     dropped = int(camera.values()["dropped: size"])
     camera._publish_until(short, lambda: int(camera.values()["dropped: size"]) > dropped)
     assert not camera.detections
+    assert float(camera.values()["CPU time per picture [ms]"]) > 0.0  # bad ones cost time as well
     assert camera.see(image(4)).detections  # and nothing else has stopped
 
 
