@@ -31,7 +31,7 @@ COPIED = (
     "action/*",
 )
 """Files of a package that end up in a build as they were then; all others are linked."""
-LINKED_ONE_BY_ONE = ("config/*", "launch/*")
+LINKED_ONE_BY_ONE = "launch/*"
 
 
 def ensure() -> None:
@@ -99,7 +99,7 @@ def _inputs(name: str) -> str:
     if name == "tf2_msgs":
         return digest([], *facts, *tf2_msgs.FILES.values())
     folder = ROOT / name
-    names = [path.name for pattern in LINKED_ONE_BY_ONE for path in sorted(folder.glob(pattern))]
+    names = [path.name for path in sorted(folder.glob(LINKED_ONE_BY_ONE))]
     return digest(_copied(folder), *facts, *names)
 
 
