@@ -36,7 +36,7 @@ class CameraDetector:
     Attributes:
         pictures: How many came.
         markers: How many were found in them.
-        drops: Pictures that were dropped, and markers without a pose, by reason.
+        drops: Pictures and calibrations that were dropped, and markers without a pose, by reason.
         trouble: What is wrong with the calibration, a sentence; empty: nothing.
     """
 

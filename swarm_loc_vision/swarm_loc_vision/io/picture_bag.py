@@ -115,6 +115,7 @@ def _detected(camera: CameraDetector, kind: str, data: bytes) -> bytes | None:
     try:
         message: Any = typestore().deserialize_cdr(data, kind)
     except _NOT_A_MESSAGE:
+        camera.pictures += 1
         camera.drops["corrupt"] += 1
         return None
     try:
@@ -125,5 +126,10 @@ def _detected(camera: CameraDetector, kind: str, data: bytes) -> bytes | None:
 
 def _calibrate(camera: CameraDetector, data: bytes) -> None:
     """Take over a calibration; one that cannot be used is told by the camera's `trouble`."""
-    with suppress(CameraError, *_NOT_A_MESSAGE):
-        camera.calibrate(typestore().deserialize_cdr(data, _CAMERA_INFO))
+    try:
+        message: Any = typestore().deserialize_cdr(data, _CAMERA_INFO)
+    except _NOT_A_MESSAGE:
+        camera.drops["corrupt calibration"] += 1
+        return
+    with suppress(CameraError):
+        camera.calibrate(message)

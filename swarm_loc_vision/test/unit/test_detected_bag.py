@@ -139,10 +139,13 @@ def test_bad_pictures_are_counted_and_the_others_read(
     early, cut, endless, whole = [message for message in own if message[1] == IMAGE][:4]
     cut = (*cut[:3], cut[3][: len(cut[3]) // 2])
     endless = (*endless[:3], endless[3].replace(b"\xff\xd9", b"\0\0"))
-    write(tmp_path / "bag", [early, (*info[:2], early[2] + 1, info[3]), cut, endless, whole])
+    infos = [(*info[:2], early[2] + 1, info[3]), (*info[:2], early[2] + 2, info[3][: len(info[3]) // 2])]
+    write(tmp_path / "bag", [early, *infos, cut, endless, whole])
     assert main([str(tmp_path / "bag"), "--output", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
-    assert "in 3 pictures, dropped: corrupt 2, dropped: no_calibration 1" in said
+    assert (
+        "in 4 pictures, dropped: corrupt 2, dropped: corrupt calibration 1, dropped: no_calibration 1" in said
+    )
     assert [m[2] for m in messages(tmp_path / "out") if m[0] == "epuck1/detections"] == [whole[2]]
 
 
