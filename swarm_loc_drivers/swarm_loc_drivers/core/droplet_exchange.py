@@ -166,11 +166,10 @@ class Asking:
         self._answer: tuple[int, Matrix] | None = None
         self._aborted = False
 
-    def request(self) -> int:
-        """Have one exchange with every partner soon; how many."""
+    def request(self) -> None:
+        """Have one exchange with every partner soon."""
         self._skips.clear()
         self._requested = len(self._partners)
-        return self._requested
 
     def note(self, said: Said) -> None:
         """The console has printed a line."""

@@ -86,9 +86,9 @@ class DropletSession:
         """Its id; 0, which no robot has, until it is known."""
         return self._exchanging.judge.robot or 0
 
-    def request_exchanges(self) -> int:
-        """Have one exchange with every partner soon; how many."""
-        return self._exchanging.request()
+    def request_exchanges(self) -> None:
+        """Have one exchange with every partner soon."""
+        self._exchanging.request()
 
     def step(self, data: bytes, now_ns: int) -> bytes:
         """Go on; what to send.

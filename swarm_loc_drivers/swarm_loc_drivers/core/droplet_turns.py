@@ -87,9 +87,8 @@ class Turns:
         self._emitted = -1
         self._kept: dict[int, tuple[int, Brightness]] = {}
 
-    def request(self) -> int:
+    def request(self) -> None:
         """Nobody asks where turns are taken."""
-        return 0
 
     def note(self, said: Said) -> None:
         """The console has printed a line."""

@@ -45,9 +45,10 @@ class LinkKeeper:
         self._thread.start()
 
     def stop(self) -> None:
-        """End; returns when it has ended."""
+        """End, also what has not begun; returns when it has ended."""
         self.stopping.set()
-        self._thread.join()
+        if self._thread.ident is not None:
+            self._thread.join()
 
     def note_connection(self) -> None:
         """The robot answers."""

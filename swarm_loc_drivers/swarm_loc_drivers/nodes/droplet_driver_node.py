@@ -28,13 +28,14 @@ from swarm_loc_drivers.nodes.driver_diagnostics import DriverDiagnostics
 from swarm_loc_drivers.nodes.droplet_parameters import DropletParameters, droplet_settings
 from swarm_loc_drivers.nodes.odometry_output import OdometryOutput, stamp_message, transform_publisher
 from swarm_loc_estimator.nodes.declare import declare_parameters
-from swarm_loc_estimator.nodes.running import run_node, spin
+from swarm_loc_estimator.nodes.running import Stop, run_node, spin
 from swarm_loc_msgs.msg import BrightnessMatrix
 
 _COMMAND_QOS = QoSProfile(depth=1)
 _BRIGHTNESS_QOS = QoSProfile(depth=50)
 _RATES = ("exchanges", "lines")
 _WRONG = {
+    "bad_cmd_vel": "velocities that were not finite",
     "broken_matrices": "print-outs that were no whole matrix of numbers",
     "equal_powers": "exchanges as bright at near as at far power; does the firmware obey set_ir?",
     "firmware_errors": "lines in which the firmware complains",
@@ -77,11 +78,19 @@ class DropletDriverNode(Node):
         self.create_service(Trigger, "~/measure", self._on_measure)
         name, address = f"{prefix}{self.get_name()}", settings.device
         self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
-        self._driver.start()
 
     def _odometry_output(self, topic: str, prefix: str) -> OdometryOutput:
         odom_frame, base_frame = f"{prefix}{self._wishes.odom_frame}", f"{prefix}{self._wishes.base_frame}"
         return OdometryOutput(self, topic, odom_frame, base_frame, self._transforms)
+
+    def start(self) -> None:
+        """Begin to talk to the robot; not when constructed, since who is interrupted there is not stopped."""
+        self._driver.start()
+
+    def run(self, stop: Stop) -> int:
+        """Drive the robot until asked to stop; the exit status."""
+        self.start()
+        return spin(self, stop)
 
     def begin_to_stop(self) -> None:
         """Have the robots stand; `destroy_node` waits until they do."""
@@ -99,12 +108,14 @@ class DropletDriverNode(Node):
         self._driver.set_velocity(name, (message.linear.x, message.linear.y, message.angular.z))
 
     def _on_measure(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = bool(self._wishes.partners) and not self._wishes.turns
-        if response.success:
-            self._driver.request_exchanges()
-            response.message = f"{len(self._wishes.partners)} partners are asked to emit."
-        else:
+        if self._wishes.turns or not self._wishes.partners:
             response.message = "Nobody is asked: there are no partners, or Droplets take turns."
+        elif self._driver.trouble:
+            response.message = f"Nobody is asked: {self._driver.trouble}"
+        else:
+            self._driver.request_exchanges()
+            response.success = True
+            response.message = f"{len(self._wishes.partners)} partners are asked to emit."
         return response
 
     def _publish_odometry(self, name: str, state: OdometryState) -> None:
@@ -130,7 +141,7 @@ def _relayed_path(robot: str, name: str) -> str:
 
 def main() -> int:
     """Run until SIGINT or SIGTERM; 1 when a parameter cannot be used."""
-    return run_node("droplet_driver_node", DropletDriverNode, spin)
+    return run_node("droplet_driver_node", DropletDriverNode, DropletDriverNode.run)
 
 
 if __name__ == "__main__":

@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from swarm_loc_drivers.core.commanded_motion import MotionNoise
 from swarm_loc_drivers.core.droplet_driver import DropletSettings
 from swarm_loc_drivers.core.droplet_exchange import AskSettings
 from swarm_loc_drivers.core.droplet_session import SessionSettings
 from swarm_loc_drivers.core.droplet_turns import SHORTEST_TURN_S, TurnSettings
-from swarm_loc_drivers.protocols.droplet import DROPLET_MODELS, ELEMENTS, FULL_POWER, DropletModel
+from swarm_loc_drivers.protocols.droplet import DROPLET_MODELS, ELEMENTS, FULL_POWER
 from swarm_loc_estimator.core.number_spec import number
-from swarm_loc_estimator.nodes.parameter_table import ParameterError, flag, text, texts
+from swarm_loc_estimator.nodes.parameter_table import ParameterError, Value, choice, flag, text, texts
 
 _ID = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})")
-_TURN_S = 1.0
 _RELAYED = re.compile(r"([A-Za-z]\w*)=(.*)")
 
 
 @dataclass(frozen=True)
-class DropletParameters:
-    """Parameters of `droplet_driver_node`."""
+class DropletTraits:
+    """Parameters that all Droplets of a table share."""
 
-    address: str = text("", "the serial port of the Droplet at the cable", required=True)
-    model: str = text(
-        "droplet", "droplet, or audio_droplet, which moves only ahead, back and in turns", required=True
+    model: str = choice(
+        "droplet", tuple(DROPLET_MODELS), "an audio_droplet moves only ahead, back and in turns"
     )
     reply_timeout_s: float = number(0.3, "s", 0.01, 10.0, "how long an echo or an answer may take")
     cmd_vel_timeout_s: float = number(0.5, "s", 0.02, 10.0, "without cmd_vel for so long the robot stops")
@@ -38,16 +36,27 @@ class DropletParameters:
     )
     veer_noise: float = number(0.05, "rad^2/m", 0.0, 100.0, "likewise of the heading per metre walked")
     turn_noise: float = number(0.01, "rad", 0.0, 10.0, "likewise of the heading per radian turned")
-    partners: tuple[str, ...] = texts("ids of the Droplets to measure, in hexadecimal as they print them")
-    exchange_rate: float = number(
-        0.5, "1/s", 0.0, 2.0, "exchanges in which a partner is asked to emit; 0: only on request"
-    )
-    retries: int = number(5, "1", 0, 100, "how often a partner is asked anew when no matrix comes")
     far_power: int = number(FULL_POWER, "1", 1, FULL_POWER, "of the emitters in far exchanges")
     near_power: int = number(40, "1", 0, FULL_POWER - 1, "likewise in near ones; 0: only far ones")
     saturation: int = number(
         240, "count", 1, 4095, "a reading tells no more from here on: full scale less ambient light"
     )
+    turn_s: float = number(1.0, "s", SHORTEST_TURN_S, 60.0, "how long a turn to emit lasts")
+    odom_frame: str = text("odom", "the pose is in <robot>/odom_frame", required=True)
+    base_frame: str = text("base_link", "the pose is that of <robot>/base_frame", required=True)
+    publish_tf: bool = flag(True, "publish the transform from odom to base_link")
+
+
+@dataclass(frozen=True)
+class DropletParameters(DropletTraits):
+    """Parameters of `droplet_driver_node`."""
+
+    address: str = text("", "the serial port of the Droplet at the cable", required=True)
+    partners: tuple[str, ...] = texts("ids of the Droplets to measure, in hexadecimal as they print them")
+    exchange_rate: float = number(
+        0.5, "1/s", 0.0, 2.0, "exchanges in which a partner is asked to emit; 0: only on request"
+    )
+    retries: int = number(5, "1", 0, 100, "how often a partner is asked anew when no matrix comes")
     least_brightness: int = number(
         5, "count", 0, 4095, "a far matrix of no brighter reading shows nobody and is asked for anew"
     )
@@ -59,25 +68,25 @@ class DropletParameters:
         "with a cable at every Droplet: how many take turns to emit; 0: partners are asked",
     )
     turn: int = number(0, "1", 0, 9_999, "which turn is this one's, counted from 0")
-    turn_s: float = number(_TURN_S, "s", SHORTEST_TURN_S, 60.0, "how long a turn lasts")
     relayed: tuple[str, ...] = texts(
         "NAME=ID of Droplets without a cable, which are driven by infrared through this one"
     )
     relay_loss: float = number(0.1, "1", 0.0, 1.0, "share of the commands by infrared that are not heard")
-    odom_frame: str = text("odom", "the pose is in <robot>/odom_frame", required=True)
-    base_frame: str = text("base_link", "the pose is that of <robot>/base_frame", required=True)
-    publish_tf: bool = flag(True, "publish the transform from odom to base_link")
 
 
 @dataclass(frozen=True)
-class DropletTableParameters:
+class DropletTableParameters(DropletTraits):
     """Parameters of `droplet_table_node`."""
 
     swarm_file: str = text("", "path of the swarm description: which robots there are", required=True)
     link_folder: str = text("", "where each robot's serial port lies under its name", required=True)
     part: int = number(0, "1", 0, 999, "of the table's parts, each in a process of its own, this one")
     parts: int = number(1, "1", 1, 1000, "how many parts there are")
-    turn_s: float = number(_TURN_S, "s", SHORTEST_TURN_S, 60.0, "how long a turn lasts")
+
+    @property
+    def traits(self) -> dict[str, Value]:
+        """The parameters of every robot's driver that stand here."""
+        return {one.name: getattr(self, one.name) for one in fields(DropletTraits)}
 
 
 def droplet_settings(wishes: DropletParameters) -> DropletSettings:
@@ -92,7 +101,9 @@ def droplet_settings(wishes: DropletParameters) -> DropletSettings:
         )
     return DropletSettings(
         device=wishes.address,
-        session=SessionSettings(_model(wishes), ELEMENTS, wishes.reply_timeout_s, _exchanges(wishes)),
+        session=SessionSettings(
+            DROPLET_MODELS[wishes.model], ELEMENTS, wishes.reply_timeout_s, _exchanges(wishes)
+        ),
         noise=MotionNoise(wishes.walk_noise, wishes.veer_noise, wishes.turn_noise),
         stride_s=wishes.stride_s,
         relayed=_relayed(wishes),
@@ -102,17 +113,9 @@ def droplet_settings(wishes: DropletParameters) -> DropletSettings:
     )
 
 
-def _model(wishes: DropletParameters) -> DropletModel:
-    if wishes.model not in DROPLET_MODELS:
-        raise ParameterError(
-            f"parameter model = '{wishes.model}' must be one of {', '.join(DROPLET_MODELS)}."
-        )
-    return DROPLET_MODELS[wishes.model]
-
-
 def _exchanges(wishes: DropletParameters) -> AskSettings | TurnSettings:
     """How brightness is measured."""
-    partners = tuple(_id("partners", one) for one in wishes.partners)
+    partners = _partners(wishes)
     if wishes.near_power >= wishes.far_power:
         raise ParameterError(
             f"parameter near_power = {wishes.near_power} must be below far_power = {wishes.far_power}."
@@ -126,14 +129,28 @@ def _exchanges(wishes: DropletParameters) -> AskSettings | TurnSettings:
     return TurnSettings(wishes.turn, wishes.turns, wishes.turn_s, powers, partners)
 
 
+def _partners(wishes: DropletParameters) -> tuple[int, ...]:
+    """Ids of whom to ask."""
+    found: list[int] = []
+    for one in wishes.partners:
+        robot = _id("partners", one)
+        if robot in found:
+            raise ParameterError(f"parameter partners has '{one}', but each id may stand once.")
+        found.append(robot)
+    return tuple(found)
+
+
 def _relayed(wishes: DropletParameters) -> dict[str, int]:
     """Names and ids of the robots without a cable."""
-    found = {}
+    found: dict[str, int] = {}
     for one in wishes.relayed:
         match = _RELAYED.fullmatch(one)
         if match is None:
             raise ParameterError(f"parameter relayed has '{one}' but must have entries as droplet2=6B6F.")
-        found[match[1]] = _id("relayed", match[2])
+        name, robot = match[1], _id("relayed", match[2])
+        if name in found or robot in found.values():
+            raise ParameterError(f"parameter relayed has '{one}', but each name and each id may stand once.")
+        found[name] = robot
     return found
 
 

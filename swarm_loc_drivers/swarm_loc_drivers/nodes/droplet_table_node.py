@@ -3,7 +3,8 @@
     ./run swarm_loc_drivers droplet_table_node --ros-args -p swarm_file:=swarm.yaml -p link_folder:=/tmp/links
 
 For every robot of the swarm description that has an infrared board it starts what `droplet_driver_node` is,
-in the robot's namespace and at the port of `link_folder` that is named like it; they take turns to emit.
+in the robot's namespace and at the port of `link_folder` that is named like it; they take turns to emit. What
+Droplets share, such as their model and their noise, is set once for all of them.
 """
 
 from __future__ import annotations
@@ -46,16 +47,18 @@ class DropletTableNode(Node):
         self._drivers: list[DropletDriverNode] = []
         for turn in range(wishes.part, len(names), wishes.parts):
             parameters = {
+                **wishes.traits,
                 "address": str(Path(wishes.link_folder) / names[turn]),
                 "turns": len(names),
                 "turn": turn,
-                "turn_s": wishes.turn_s,
                 "use_sim_time": simulated,
             }
             self._drivers.append(_driver(names[turn], parameters))
 
     def run(self, stop: Stop) -> int:
-        """Handle all nodes' events until asked to stop."""
+        """Drive all robots until asked to stop; the exit status."""
+        for driver in self._drivers:
+            driver.start()
         return spin(self, stop, *self._drivers)
 
     def destroy_node(self) -> None:

@@ -26,7 +26,7 @@ from swarm_loc_drivers.nodes.driver_diagnostics import DriverDiagnostics
 from swarm_loc_drivers.nodes.epuck_parameters import EpuckParameters, camera_calibration, epuck_settings
 from swarm_loc_drivers.nodes.odometry_output import OdometryOutput, transform_publisher
 from swarm_loc_estimator.nodes.declare import declare_parameters
-from swarm_loc_estimator.nodes.running import run_node, spin
+from swarm_loc_estimator.nodes.running import Stop, run_node, spin
 
 _COMMAND_QOS = QoSProfile(depth=1)
 _TF_STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -70,7 +70,6 @@ class EpuckDriverNode(Node):
         self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
         self.create_subscription(Twist, "cmd_vel", self._on_cmd_vel, _COMMAND_QOS)
         self.create_timer(1.0 / wishes.reading_rate, self._driver.tick)
-        self._driver.start()
 
     def _advertise(self) -> None:
         # one topic each: eight at once on one would overrun the few places of a sensor-data queue
@@ -85,6 +84,15 @@ class EpuckDriverNode(Node):
         self._tf_static = self.create_publisher(TFMessage, "/tf_static", _TF_STATIC_QOS)
         sensors = epuck_messages.proximity_transforms(self._now_ns(), self._base_frame, self._prefix)
         self._tf_static.publish(TFMessage(transforms=sensors))
+
+    def start(self) -> None:
+        """Begin to talk to the robot; not when constructed, since who is interrupted there is not stopped."""
+        self._driver.start()
+
+    def run(self, stop: Stop) -> int:
+        """Drive the robot until asked to stop; the exit status."""
+        self.start()
+        return spin(self, stop)
 
     def destroy_node(self) -> None:
         """Stop the robot first."""
@@ -113,7 +121,7 @@ class EpuckDriverNode(Node):
 
 def main() -> int:
     """Run until SIGINT or SIGTERM; 1 when a parameter cannot be used."""
-    return run_node("epuck_driver_node", EpuckDriverNode, spin)
+    return run_node("epuck_driver_node", EpuckDriverNode, EpuckDriverNode.run)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -16,10 +17,11 @@ from diagnostic_msgs.msg import DiagnosticArray
 from droplet_bench import IDS, TRIANGLE, FloatArray
 from geometry_msgs.msg import Twist, Vector3
 from nav_msgs.msg import Odometry
-from node_world import Program, Ros, stamp_ns
+from node_world import Program, Ros, overrides, stamp_ns
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
+from swarm_loc_drivers.nodes.droplet_driver_node import DropletDriverNode
 from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.ir.brightness import expected
 from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
@@ -78,11 +80,18 @@ def test_a_droplet_walks_measures_and_stands_at_the_end(ros: Ros, robots: Robots
     log = tmp_path / "log"
     with Program("droplet_driver_node", log, parameters, arguments, package="swarm_loc_drivers") as program:
         ros.until(lambda: odometry and relayed)
+        publisher = ros.tester.create_publisher(Twist, "droplet1/cmd_vel", 1)
+
+        def is_warned_of() -> bool:
+            """Whether the log tells of a velocity that is none."""
+            publisher.publish(Twist(linear=Vector3(x=math.nan)))
+            return "bad_cmd_vel: velocities that were not finite" in program.output
+
+        ros.until(is_warned_of)
         measure = ros.tester.create_client(Trigger, "droplet1/droplet_driver/measure")
         assert measure.wait_for_service(60.0)
         measure.call_async(Trigger.Request())
         ros.until(lambda: len(matrices) == 4)
-        publisher = ros.tester.create_publisher(Twist, "droplet1/cmd_vel", 1)
         timer = ros.tester.create_timer(0.05, lambda: publisher.publish(Twist(linear=Vector3(x=-0.01))))
         ros.until(lambda: odometry[-1].pose.pose.position.x < -0.004)
         ros.until(lambda: transforms and diagnostics)
@@ -112,6 +121,16 @@ def test_a_droplet_walks_measures_and_stands_at_the_end(ros: Ros, robots: Robots
     values = {pair.key: pair.value for pair in status.values}
     assert (status.name, status.message) == ("droplet1/droplet_driver", "connected")
     assert values["exchanges"] == "2"
+
+
+def test_nobody_is_asked_while_the_link_is_down(ros: Ros, tmp_path: Path) -> None:
+    address = str(tmp_path / "nothing")
+    parameters = overrides(address=address, partners=["6B6F"], relayed=["droplet3=DF64"])
+    ros.add(DropletDriverNode(namespace="/table/droplet1", parameter_overrides=parameters))
+    response = ros.call(Trigger, "table/droplet1/droplet_driver/measure", Trigger.Request())
+    assert not response.success
+    assert address in response.message
+    assert ros.tester.count_subscribers("table/droplet3/cmd_vel") == 1
 
 
 @pytest.mark.parametrize(

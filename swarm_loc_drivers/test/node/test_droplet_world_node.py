@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -10,9 +11,10 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from node_world import Program, Ros, stamp_ns
+from node_world import Program, Ros, overrides, stamp_ns
 from rosgraph_msgs.msg import Clock
 
+from swarm_loc_drivers.nodes.droplet_table_node import DropletTableNode
 from swarm_loc_drivers.sim.droplet_swarm import DropletSwarmSettings, describe_droplets, starts
 from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
@@ -35,6 +37,20 @@ def swarm_file(tmp_path: Path) -> Path:
 def way_of(odometry: list[Odometry]) -> float:
     place = odometry[-1].pose.pose.position
     return float(np.hypot(place.x, place.y))
+
+
+@pytest.mark.usefixtures("ros")
+def test_the_drivers_of_a_table_share_what_is_set_and_begin_when_all_are_made(
+    swarm_file: Path, tmp_path: Path
+) -> None:
+    shared = {"model": "audio_droplet", "walk_noise": 0.002, "far_power": 200, "publish_tf": False}
+    values = {"swarm_file": str(swarm_file), "link_folder": str(tmp_path), "parts": 2, **shared}
+    table = DropletTableNode(parameter_overrides=overrides(**values))
+    told = {"address": str(tmp_path / "droplet3"), "turns": ROBOTS, "turn": 2, **shared}
+    _, driver = table._drivers
+    assert {name: driver.get_parameter(name).value for name in told} == told
+    assert not [one for one in threading.enumerate() if one.name.startswith("driver of")]
+    table.destroy_node()  # as when interrupted before it works
 
 
 def test_droplets_wander_and_measure_each_other(ros: Ros, swarm_file: Path, tmp_path: Path) -> None:

@@ -85,7 +85,9 @@ def world(ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator
 def node_on(address: object, **values: object) -> EpuckDriverNode:
     """A node on simulated time."""
     settings = {"address": str(address), "use_sim_time": True, "reading_rate": 50.0, "cmd_vel_timeout_s": 0.1}
-    return EpuckDriverNode(namespace="/epuck1", parameter_overrides=overrides(**settings, **values))
+    node = EpuckDriverNode(namespace="/epuck1", parameter_overrides=overrides(**settings, **values))
+    node.start()
+    return node
 
 
 def serve(world: World, over: str) -> tuple[Emulator, object]:
