@@ -1,5 +1,7 @@
 """Start simulated e-pucks: ros2 launch swarm_loc_drivers simulation.launch.py swarm_file:=FILE."""
 
+import atexit
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -8,6 +10,7 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
+from swarm_loc_drivers.sim.epuck_world import check_swarm
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
 from swarm_loc_estimator.io.swarm_file import load_swarm
@@ -35,14 +38,18 @@ def start_nodes(context: LaunchContext) -> list[Node]:
     def argument(name: str) -> str:
         return str(LaunchConfiguration(name).perform(context))
 
+    swarm_file = argument("swarm_file")
+    swarm = load_swarm(Path(swarm_file))
+    check_swarm(swarm)  # here, and not by the world when a score of processes have started
+    links = tempfile.mkdtemp(prefix="epucks-")
+    atexit.register(shutil.rmtree, links, ignore_errors=True)  # when the last process has ended
     options = SimulationOptions(
-        swarm_file=argument("swarm_file"),
-        link_folder=tempfile.mkdtemp(prefix="epucks-"),
+        swarm_file=swarm_file,
+        link_folder=links,
         world=argument("world"),
         seed=int(argument("seed")),
         speed=float(argument("speed")),
         rate=float(argument("rate")),
         parameter_file=argument("params_file") or None,
     )
-    robots = [robot.name for robot in load_swarm(Path(options.swarm_file)).robots]
-    return [node_action(spec) for spec in simulation_nodes(options, robots)]
+    return [node_action(spec) for spec in simulation_nodes(options, [robot.name for robot in swarm.robots])]

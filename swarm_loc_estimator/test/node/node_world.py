@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import os
 import signal
@@ -10,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -54,6 +56,16 @@ SETTINGS = {"fusion_load": 1.0}
 """Every tick fuses, however fast the test lets time pass."""
 
 Poses = dict[str, tuple[float, float, float]]
+
+
+def module_at(path: Path) -> ModuleType:
+    """A Python file that belongs to no package, such as a launch file."""
+    spec = importlib.util.spec_from_file_location(path.name.partition(".")[0], path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def write_swarm(folder: Path) -> Path:

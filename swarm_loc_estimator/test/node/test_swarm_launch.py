@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+from node_world import module_at
 
 from swarm_loc_estimator.graph import GraphOptions, graph_nodes
 
@@ -16,17 +15,8 @@ pytest.importorskip("launch_ros")
 LAUNCH_FILE = Path(__file__).parents[2] / "launch" / "swarm.launch.py"
 
 
-def _launch_file() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("swarm_launch", LAUNCH_FILE)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_launch_arguments_become_the_graphs_nodes() -> None:
-    module = _launch_file()
+    module = module_at(LAUNCH_FILE)
     context = launch.LaunchContext()
     chosen = {
         "swarm_file": "swarm.yaml",
