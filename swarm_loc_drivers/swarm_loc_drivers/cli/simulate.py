@@ -16,7 +16,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from swarm_loc_drivers.sim.epuck_world import WorldError, check_swarm
+from swarm_loc_drivers.sim.epuck_world import check_swarm
+from swarm_loc_drivers.sim.world_error import WorldError
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
 from swarm_loc_estimator.cli.arguments import number_in

@@ -10,10 +10,10 @@ import numpy as np
 from swarm_loc_drivers.sim.droplet_world import (
     DROPLET_WORLDS,
     DropletWorld,
-    DropletWorldError,
     DropletWorldSettings,
 )
 from swarm_loc_drivers.sim.eight import START_NS
+from swarm_loc_drivers.sim.world_error import WorldError, start_of
 from swarm_loc_estimator.core.number_spec import number
 from swarm_loc_estimator.core.robot_ir import RobotIr
 from swarm_loc_estimator.core.swarm import Pose2, Robot, Swarm
@@ -62,7 +62,7 @@ def make_droplet_world(wishes: DropletWorldParameters) -> tuple[Swarm, DropletWo
             wishes.seed, DROPLET_WORLDS[wishes.world], boards[0].platform, START_NS
         )
         return swarm, DropletWorld([board.id for board in boards], np.array(starts), settings)
-    except DropletWorldError as error:
+    except WorldError as error:
         raise ParameterError(f"parameter swarm_file = '{wishes.swarm_file}': {error}") from error
 
 
@@ -70,12 +70,9 @@ def _needed(robot: Robot) -> tuple[RobotIr, Pose2]:
     """The board and the start of a robot.
 
     Raises:
-        DropletWorldError: It has none.
+        WorldError: It has none.
     """
-    if robot.start is None:
-        raise DropletWorldError(
-            f"robot '{robot.name}' has no start pose, and a simulated robot has to be somewhere."
-        )
+    start = start_of(robot)
     if robot.ir is None:
-        raise DropletWorldError(f"robot '{robot.name}' has no infrared board, and a Droplet has one.")
-    return robot.ir, robot.start
+        raise WorldError(f"robot '{robot.name}' has no infrared board, and a Droplet has one.")
+    return robot.ir, start

@@ -8,10 +8,11 @@ from pathlib import Path
 from swarm_loc_drivers.core.wheels import WheelGeometry
 from swarm_loc_drivers.protocols.epuck import EPUCK2, EPUCK_MODELS
 from swarm_loc_drivers.sim.eight import ARENA, CAMERA_RATE_HZ, START_NS
-from swarm_loc_drivers.sim.epuck_world import EpuckWorld, EpuckWorldSettings, WorldError
+from swarm_loc_drivers.sim.epuck_world import EpuckWorld, EpuckWorldSettings
 from swarm_loc_drivers.sim.photographer import Stage
 from swarm_loc_drivers.sim.pictures import FAMILY
 from swarm_loc_drivers.sim.render.lens import CameraModel
+from swarm_loc_drivers.sim.world_error import WorldError
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.core.number_spec import number
 from swarm_loc_estimator.core.swarm import OdometryModel, Swarm

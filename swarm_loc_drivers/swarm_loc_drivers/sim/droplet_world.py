@@ -18,6 +18,7 @@ from swarm_loc_estimator.core.se2 import FloatArray
 from .body import Command, Measured
 from .droplet_infrared import DropletInfrared, InfraredSettings
 from .droplet_light import DropletLight
+from .world_error import WorldError
 
 STEP_NS = 5_000_000
 NEAR_POWER = 40
@@ -27,10 +28,6 @@ _WALK_MM, _TURN_DEG = 300, 1200
 """Per 1000 steps: 2.4 mm/s and 6.4 deg/s, as real Droplets were logged."""
 _MOTION, _GAINS, _INFRARED = range(3)
 """Streams of random numbers."""
-
-
-class DropletWorldError(ValueError):
-    """A swarm that cannot be simulated; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +89,7 @@ class DropletWorld:
         settings: How the world is.
 
     Raises:
-        DropletWorldError: The robots cannot be simulated.
+        WorldError: The robots cannot be simulated.
     """
 
     def __init__(self, ids: Sequence[int], start: FloatArray, settings: DropletWorldSettings) -> None:
@@ -224,8 +221,8 @@ def _check(ids: Sequence[int], platform: IrPlatform) -> None:
     """Raise what cannot be simulated."""
     wrong = [robot for robot in ids if not 0 < robot <= 0xFFFF]
     if wrong:
-        raise DropletWorldError(f"id {wrong[0]} must lie in [1, 65535].")
+        raise WorldError(f"id {wrong[0]} must lie in [1, 65535].")
     if len(set(ids)) < len(ids):
-        raise DropletWorldError("two robots have one id.")
+        raise WorldError("two robots have one id.")
     if platform.n != ELEMENTS:
-        raise DropletWorldError(f"the board has {platform.n} elements, but a Droplet has {ELEMENTS}.")
+        raise WorldError(f"the board has {platform.n} elements, but a Droplet has {ELEMENTS}.")

@@ -22,6 +22,7 @@ from .proximity import proximity_values
 from .render.lens import CameraModel
 from .render.views import Views
 from .trajectories import Trajectories
+from .world_error import WorldError, start_of
 from .worlds import World
 
 FloatArray = NDArray[np.float64]
@@ -34,10 +35,6 @@ _REMEMBERED_NS = 700_000_000
 """Pictures can be drawn as long after they were taken, less the longest error of their stamps."""
 _PHASES, _EXPOSURES, _SENSOR, _PROXIMITY = range(4)
 """Streams of random numbers, each a function of the seed, the stream, and what it is for."""
-
-
-class WorldError(ValueError):
-    """A swarm that cannot be simulated; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -229,10 +226,7 @@ def check_swarm(swarm: Swarm) -> None:
         WorldError: What a robot or a marker lacks.
     """
     for robot in swarm.robots:
-        if robot.start is None:
-            raise WorldError(
-                f"robot '{robot.name}' has no start pose, and a simulated robot has to be somewhere."
-            )
+        start_of(robot)
         if robot.camera is None:
             raise WorldError(f"robot '{robot.name}' has no camera, and a simulated e-puck has one.")
     for marker_id, owner in swarm.owner_of.items():

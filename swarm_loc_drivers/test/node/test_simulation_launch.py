@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from node_world import module_at
 
-from swarm_loc_drivers.sim.epuck_world import WorldError
+from swarm_loc_drivers.sim.world_error import WorldError
 from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
 
 launch = pytest.importorskip("launch")

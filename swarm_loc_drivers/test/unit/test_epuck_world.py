@@ -15,10 +15,10 @@ from swarm_loc_drivers.sim.epuck_world import (
     EpuckWorldSettings,
     Exposure,
     SimulatedEpuck,
-    WorldError,
 )
 from swarm_loc_drivers.sim.photographer import Stage
 from swarm_loc_drivers.sim.render.lens import CameraModel
+from swarm_loc_drivers.sim.world_error import WorldError
 from swarm_loc_drivers.sim.worlds import W0, W2, World
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import Swarm
