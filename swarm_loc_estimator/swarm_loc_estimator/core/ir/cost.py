@@ -125,8 +125,7 @@ def cost_of(
         for q in range(p + 1):
             hessian[p, q] = 0.0
     cost = _add_prior(pair, at, gradient, hessian) if sought else 0.0
-    squares, sure, x = 2.0 * cost, 0, size - 3
-    dark = DARK * model.noise if model.blocked < math.inf else -math.inf
+    squares, sure = 2.0 * cost, 0
     for m in range(modes):
         for i in range(n):
             for j in range(n):
@@ -135,50 +134,90 @@ def cost_of(
                     continue
                 factor = room.factors[0, i] * room.factors[1, j]
                 expected = factor * room.expected[m, i, j]
-                reading = pair.readings[m, i, j]
-                level = reading if kind == MEASURED else pair.saturation[m]
-                spread = model.relative_noise * level
-                weight = 1.0 / (model.noise * model.noise + spread * spread)
-                if kind == SATURATED:
-                    one, pull, weight = _of_saturated(
-                        math.sqrt(weight), (expected - level) * math.sqrt(weight)
-                    )
-                    squares += 2.0 * one
-                elif reading < dark and reading < expected:
-                    one, pull, weight = _of_dark(weight, expected - reading, model.blocked)
-                else:
-                    pull = weight * (expected - reading)
-                    one = 0.5 * pull * (expected - reading)
-                    squares += 2.0 * one
-                    sure += 1
+                limit = pair.saturation[m]
+                one, pull, weight, blocked = _of_reading(model, kind, pair.readings[m, i, j], limit, expected)
                 cost += one
+                if not blocked:
+                    squares += 2.0 * one
+                    sure += 1 if kind == MEASURED else 0
                 if weight == 0.0:
                     continue
                 a = factor * room.slopes[0, m, i, j]
                 b = factor * room.slopes[1, m, i, j]
                 c = factor * room.slopes[2, m, i, j]
-                gradient[x] += pull * a
-                gradient[x + 1] += pull * b
-                gradient[x + 2] += pull * c
-                hessian[x, x] += weight * a * a
-                hessian[x + 1, x] += weight * a * b
-                hessian[x + 1, x + 1] += weight * b * b
-                hessian[x + 2, x] += weight * a * c
-                hessian[x + 2, x + 1] += weight * b * c
-                hessian[x + 2, x + 2] += weight * c * c
+                _add_by_pose(pull, weight, a, b, c, gradient, hessian)
                 if sought:
-                    gradient[i] += pull * expected
-                    gradient[n + j] += pull * expected
-                    both = weight * expected * expected
-                    hessian[i, i] += both
-                    hessian[n + j, n + j] += both
-                    hessian[n + j, i] += both
-                    for slope, row in ((a, x), (b, x + 1), (c, x + 2)):
-                        mixed = weight * expected * slope
-                        hessian[row, i] += mixed
-                        hessian[row, n + j] += mixed
+                    _add_by_gains(pull, weight, expected, i, n + j, gradient, hessian)
+                    _add_by_both(weight * expected, a, b, c, i, n + j, hessian)
     room.tally[0], room.tally[1] = squares, sure - 3.0
     return cost
+
+
+@compiled
+def _of_reading(
+    model: IrModel, kind: int, reading: float, limit: float, expected: float
+) -> tuple[float, float, float, bool]:
+    """The cost of a reading, its two derivatives by the expectation, and whether it may be a blocked one.
+
+    Args:
+        model: The platform.
+        kind: MEASURED or SATURATED.
+        reading: [count].
+        limit: From where on it is SATURATED [count].
+        expected: At this pose with these gains [count].
+    """
+    spread = model.relative_noise * (reading if kind == MEASURED else limit)
+    weight = 1.0 / (model.noise * model.noise + spread * spread)
+    if kind == SATURATED:
+        per_sigma = math.sqrt(weight)
+        cost, pull, weight = _of_saturated(per_sigma, (expected - limit) * per_sigma)
+        return cost, pull, weight, False
+    if model.blocked < math.inf and reading < min(DARK * model.noise, expected):
+        cost, pull, weight = _of_dark(weight, expected - reading, model.blocked)
+        return cost, pull, weight, True
+    pull = weight * (expected - reading)
+    return 0.5 * pull * (expected - reading), pull, weight, False
+
+
+@compiled
+def _add_by_pose(
+    pull: float, weight: float, a: float, b: float, c: float, gradient: FloatArray, hessian: FloatArray
+) -> None:
+    """Add a reading whose slopes by range, bearing and heading are a, b and c."""
+    x = gradient.size - 3
+    gradient[x] += pull * a
+    gradient[x + 1] += pull * b
+    gradient[x + 2] += pull * c
+    hessian[x, x] += weight * a * a
+    hessian[x + 1, x] += weight * a * b
+    hessian[x + 1, x + 1] += weight * b * b
+    hessian[x + 2, x] += weight * a * c
+    hessian[x + 2, x + 1] += weight * b * c
+    hessian[x + 2, x + 2] += weight * c * c
+
+
+@compiled
+def _add_by_gains(
+    pull: float, weight: float, slope: float, i: int, j: int, gradient: FloatArray, hessian: FloatArray
+) -> None:
+    """Add a reading by the log-gains i of its sensor and j of its emitter; by both it has the same slope."""
+    gradient[i] += pull * slope
+    gradient[j] += pull * slope
+    both = weight * slope * slope
+    hessian[i, i] += both
+    hessian[j, j] += both
+    hessian[j, i] += both
+
+
+@compiled
+def _add_by_both(weight: float, a: float, b: float, c: float, i: int, j: int, hessian: FloatArray) -> None:
+    """Add what couples the pose to the log-gains i and j, by its slopes a, b and c."""
+    row = hessian.shape[0] - 3
+    for slope in (a, b, c):
+        mixed = weight * slope
+        hessian[row, i] += mixed
+        hessian[row, j] += mixed
+        row += 1
 
 
 @compiled
