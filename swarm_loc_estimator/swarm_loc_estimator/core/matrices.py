@@ -20,11 +20,11 @@ class Matrix(NamedTuple):
     """What was read at one power.
 
     Attributes:
-        counts: (n, n) [count], [sensor, emitter].
-        saturation: Counts of it or more tell only that it was at least so bright.
+        light: (n, n) [count], [sensor, emitter], what is read in the dark taken off.
+        saturation: Light of it or more tells only that it was at least so bright.
     """
 
-    counts: FloatArray
+    light: FloatArray
     saturation: float
 
 
@@ -71,11 +71,12 @@ class MatrixScreening:
         """Put matrix k to others of its exchange; of two for one power the same one counts in any order."""
         platform, told = self.boards[int(rows.robot[k])].platform, float(rows.saturation[k])
         counts = rows.readings[k].reshape(platform.n, platform.n).astype(np.float64)
-        matrix = Matrix(counts, min(told, platform.saturation) if told > 0.0 else platform.saturation)
+        limit = min(told, platform.saturation) if told > 0.0 else platform.saturation
+        matrix = Matrix(counts - platform.dark_level, limit - platform.dark_level)
         power = int(rows.power[k])
         if power in readings:
             self.dropped["duplicate"] += 1
-            matrix = min(matrix, readings[power], key=lambda one: (one.counts.tobytes(), one.saturation))
+            matrix = min(matrix, readings[power], key=lambda one: (one.light.tobytes(), one.saturation))
         readings[power] = matrix
 
     def together(self, robot: int, exchanges: list[Readings]) -> tuple[FloatArray, FloatArray]:

@@ -194,7 +194,7 @@ def exchange(
     if gains is not None:
         emitters = np.broadcast_to(gains[1, transmitter], (len(near), platform.n))
         pairs = PairGains(gains[0, near], emitters, np.zeros((len(near), 4)))
-    bright = expected(platform, relative[near], pairs)
+    bright = platform.dark_level + expected(platform, relative[near], pairs)
     read = np.rint(bright + noise * platform.noise * rng.standard_normal(bright.shape))
     read = np.minimum(read, platform.saturation)
     return [

@@ -67,7 +67,7 @@ def test_the_transmitter_lies_where_it_is_seen_from_the_receiver(method: IrMetho
 
 def test_the_two_powers_of_an_exchange_make_one_measurement_in_any_order() -> None:
     """Each alone is used at once, and replaced by both."""
-    far, near = heard(poses=CLOSE)[:2]
+    far, near = heard(noise=0.0, poses=CLOSE)[:2]
     both = BrightnessConverter(swarm_of()).take(rows_of(far, near)).added
     assert both.size == 1
     for one, other in ((far, near), (near, far)):
@@ -182,6 +182,21 @@ def test_a_matrix_that_is_useless_alone_is_counted_until_its_partner_makes_it_us
     assert not converter.drops
     converter.restart()
     assert not converter.drops
+
+
+@pytest.mark.parametrize("method", IrMethod)
+def test_what_is_read_in_the_dark_is_no_light(method: IrMethod) -> None:
+    """Readings and the saturation of their matrix are both higher by it."""
+    limit = 150
+    for poses in (POSES, CLOSE):
+        events, results = heard(poses=poses), []
+        for dark in (0.0, 7.0):
+            board = replace(DROPLET, dark_level=dark)
+            lifted = [replace(one, readings=np.minimum(one.readings + dark, limit + dark)) for one in events]
+            told = with_column(saturation=limit + dark)(rows_of(*lifted))
+            results.append(BrightnessConverter(swarm_of(board, method)).take(told).added)
+        assert results[0].size
+        assert results[0].tobytes() == results[1].tobytes()
 
 
 def test_a_sensor_that_ends_early_tells_no_more_from_there_on() -> None:

@@ -136,6 +136,7 @@ def test_curves_that_cannot_be_are_refused(pieces: tuple[PowerPiece, ...], words
         ({"angles": (0.0, 1.0, math.nan)}, "must lie within"),
         ({"radius": 0.0}, r"radius is 0 but must lie in \(0, 10\] m"),
         ({"noise": math.nan}, "noise is nan"),
+        ({"dark_level": 255.0}, "dark_level is 255 count but must be below saturation, 255"),
         ({"amplitudes": ()}, "must have one or two"),
     ],
 )

@@ -70,7 +70,7 @@ class IrPlatform:
         amplitudes: A for each power of the emitters, in the order of `POWERS`.
 
     Raises:
-        IrPlatformError: A number is out of its range, or elements coincide.
+        IrPlatformError: A number is out of its range, elements coincide, or it is too bright in the dark.
     """
 
     angles: tuple[float, ...]
@@ -79,6 +79,9 @@ class IrPlatform:
     amplitudes: tuple[Amplitude, ...]
     radius: float = number(0.022, "m", 0.0, 10.0, "from the centre to the elements", above=True)
     saturation: float = number(255.0, "count", 0.0, 1e9, "a reading tells no more from here on", above=True)
+    dark_level: float = number(
+        0.0, "count", -1e6, 1e6, "what sensors read on average where there is no light"
+    )
     noise: float = number(1.0, "count", 0.0, 1e6, "standard deviation of every reading", above=True)
     relative_noise: float = number(0.0, "1", 0.0, 1.0, "noise besides, relative to the reading")
     blocked_share: float = number(
@@ -97,6 +100,10 @@ class IrPlatform:
         ahead = np.sort(np.mod(self.angles, 2.0 * math.pi))
         if np.min(np.diff(ahead, append=ahead[0] + 2.0 * math.pi)) < _TOGETHER:
             raise IrPlatformError(f"angles is {list(self.angles)} but no two elements may coincide.")
+        if self.dark_level >= self.saturation:
+            raise IrPlatformError(
+                f"dark_level is {self.dark_level:g} count but must be below saturation, {self.saturation:g}."
+            )
         if not 1 <= len(self.amplitudes) <= len(POWERS):
             raise IrPlatformError(f"amplitudes has {len(self.amplitudes)} powers but must have one or two.")
 
