@@ -117,15 +117,22 @@ class ConsoleTalk:
                     self._counts["lines"] += 1
                     return self.now_ns
             self._counts["bad_echoes"] += 1
-            yield from self.forget_line()
+            if not (yield from self.forget_line()):
+                break
         raise SessionError(f"the robot does not echo '{line}'")
 
-    def forget_line(self) -> Talk[None]:
-        """Take back whatever was typed and not ended, no faster than the robot can answer."""
-        for _ in range(0, protocol.LINE_AT_MOST, _ERASED_AT_ONCE):
-            if not (yield from self._erase(_ERASED_AT_ONCE)):
-                break
-        yield from self.until(lambda: not self._parser.partial)
+    def forget_line(self) -> Talk[bool]:
+        """Take back whatever was typed and not ended, no faster than the robot can answer; whether it did.
+
+        What shows of the line does not tell how much there is: a print-out that falls into an echo ends it.
+        """
+        erased = missed = 0
+        while erased < protocol.LINE_AT_MOST:
+            if (yield from self._erase(_ERASED_AT_ONCE)):
+                erased += _ERASED_AT_ONCE
+            elif (missed := missed + 1) == _TRIES:
+                return False
+        return True
 
     def _erase(self, count: int) -> Talk[bool]:
         """Take back so many characters; whether the robot answers."""

@@ -268,6 +268,27 @@ def test_over_a_bad_wire_no_other_command_arrives_than_was_meant(seed: int) -> N
     assert cable.counts["exchanges"] > 5
 
 
+def test_what_a_deaf_robot_kept_of_a_line_is_not_executed_with_the_next_one() -> None:
+    lab = Lab(world_of(), asking()).connected()
+    (cable,) = lab.cables
+    executed: list[str] = []
+    firmware = cable.wire(lambda one: one)
+    assert isinstance(firmware, DropletFirmware)
+
+    def noting(line: str) -> None:
+        executed.append(line)
+
+    firmware._execute = noting  # type: ignore[method-assign]
+    deaf_until_ns = lab.world.now_ns + SECOND // 2
+    cable._body.deaf_until_ns = lambda: deaf_until_ns  # type: ignore[method-assign]
+    cable.set_velocity((0.01, 0.0, 0.0))
+    lab.run(0.52)
+    cable.session.step(b"\r\n\t(RNB) ID: 6B6F | R: 173 B: -90 H: 45\r\n", lab.world.now_ns)
+    lab.until(lambda: executed)
+    assert cable.counts["bad_echoes"] > 0
+    assert executed[0] == "stop_walk"
+
+
 @pytest.mark.parametrize(
     ("answer", "sentence"),
     [
