@@ -18,7 +18,7 @@ from swarm_loc_estimator.core.number_spec import number
 from swarm_loc_estimator.core.robot_ir import RobotIr
 from swarm_loc_estimator.core.swarm import Pose2, Robot, Swarm
 from swarm_loc_estimator.io.swarm_file import load_swarm
-from swarm_loc_estimator.nodes.parameter_table import ParameterError, text, texts
+from swarm_loc_estimator.nodes.parameter_table import ParameterError, choice, text, texts
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class DropletWorldParameters:
     swarm_file: str = text(
         "", "path of the swarm description; every robot needs a start and an infrared board", required=True
     )
-    world: str = text("d1", "how the robots err: d0 or d1; see sim/droplet_world.py", required=True)
+    world: str = choice("d1", tuple(DROPLET_WORLDS), "how the robots err; see sim/droplet_world.py")
     seed: int = number(1, "1", 0, 2**31 - 1, "fixes the errors")
     rate: float = number(
         1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
@@ -48,10 +48,6 @@ def make_droplet_world(wishes: DropletWorldParameters) -> tuple[Swarm, DropletWo
         ParameterError: A parameter cannot be used.
         SwarmFileError: The swarm description cannot be used.
     """
-    if wishes.world not in DROPLET_WORLDS:
-        raise ParameterError(
-            f"parameter world = '{wishes.world}' must be one of {', '.join(DROPLET_WORLDS)}."
-        )
     swarm = load_swarm(Path(wishes.swarm_file))
     for name in wishes.fixed:
         if name not in swarm.index_of:
