@@ -42,7 +42,7 @@ _RECORD_HEAD = 9  # opcode, length
 _MESSAGE_HEAD = 22  # channel, sequence, log time, publish time
 _IS_MESSAGE = int(Opcode.MESSAGE)
 _UNWANTED, _UNKNOWN = -1, -2
-_OPCODES = frozenset(int(opcode) for opcode in Opcode)
+_OPCODES = frozenset({*map(int, Opcode), *range(0x80, 0x100)})  # these are applications' own, to be skipped
 _RUN_BYTES = 1 << 20
 _MAX_RECORD = 1 << 31
 

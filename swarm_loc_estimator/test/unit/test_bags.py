@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
@@ -191,6 +192,35 @@ def test_mcap_cut_off_anywhere_gives_what_was_there(tmp_path: Path, compression:
     assert counts == sorted(counts)
     assert counts[-1] == 60
     assert 5 < counts[len(counts) // 3] < 60
+
+
+def record_of(opcode: int, content: bytes) -> bytes:
+    return bytes([opcode]) + len(content).to_bytes(8, "little") + content
+
+
+def test_records_of_an_application_are_skipped(tmp_path: Path) -> None:
+    messages, path = some_messages(60), tmp_path / "x.mcap"
+    write_mcap(path, messages, compression=CompressionType.NONE, enable_crcs=False, use_chunking=False)
+    data, own = path.read_bytes(), record_of(0x80, b"hello")
+    place = data.index(messages[20][2]) + len(messages[20][2])
+    path.write_bytes(data[:place] + own + data[place:])
+    assert read(path) == (expected(messages), [])
+
+
+def test_records_of_an_application_inside_a_chunk_are_skipped(tmp_path: Path) -> None:
+    messages, path, own = some_messages(8), tmp_path / "x.mcap", record_of(0xFF, b"")
+    write_mcap(path, messages, compression=CompressionType.NONE, enable_crcs=False)
+    data = path.read_bytes()
+    chunk = data.index(bytes([Opcode.CHUNK]), 8)
+    while int.from_bytes(data[chunk + 1 : chunk + 9], "little") > len(data):
+        chunk = data.index(bytes([Opcode.CHUNK]), chunk + 1)
+    place = data.index(messages[3][2]) + len(messages[3][2])
+    grown = bytearray(data[:place] + own + data[place:])
+    for field in (1, 25, 41):  # lengths of the record, of what is packed, and of the packed
+        number = int.from_bytes(grown[chunk + field : chunk + field + 8], "little") + len(own)
+        grown[chunk + field : chunk + field + 8] = number.to_bytes(8, "little")
+    path.write_bytes(grown)
+    assert read(path) == (expected(messages), [])
 
 
 def test_damaged_chunk_is_lost_alone_and_named(tmp_path: Path) -> None:
