@@ -22,7 +22,7 @@ from swarm_loc_estimator.core.metrics import Track
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.swarm import Swarm
 from swarm_loc_estimator.io.bags import BagReader
-from swarm_loc_estimator.io.ingest import Ingest
+from swarm_loc_estimator.io.ingest import LONGEST_PAUSE_NS, Ingest
 from swarm_loc_estimator.io.spool import Spool
 from swarm_loc_estimator.io.truth import TruthReader
 from swarm_loc_estimator.replay_result import ReplayResult
@@ -58,7 +58,8 @@ def replay(
     """
     estimator, ingest, truth = SwarmEstimator(swarm, settings), Ingest(swarm), TruthReader(swarm)
     period_ns = round(tick_s * 1e9)
-    recorder = _Recorder(estimator, _Periodic(period_ns) if stamp_ns is None else _Listed(stamp_ns))
+    schedule = _Periodic(period_ns) if stamp_ns is None else _Listed(stamp_ns)
+    recorder = _Recorder(estimator, schedule)
     inputs = len(ingest.topics)
     began = time.perf_counter()
     with BagReader(bag) as reader:
@@ -72,7 +73,7 @@ def replay(
             if progress is not None:
                 progress(reader.progress, "replaying")
         recorder.tick_until(last_ns + period_ns if stamp_ns is None else int(stamp_ns.max(initial=0)))
-        remarks = (*reader.losses, *_missing(ingest), *truth.remarks())
+        remarks = (*reader.losses, *_missing(ingest), *truth.remarks(), *schedule.remarks())
     data_s = (last_ns - first_ns) * 1e-9
     return recorder.result(bag.name, ingest.received(), truth.tracks(), remarks, data_s, began)
 
@@ -83,21 +84,36 @@ class _Schedule(Protocol):
     def due(self, now_ns: int) -> Iterator[int]:
         """The instants until now that were not due before."""
 
+    def remarks(self) -> tuple[str, ...]:
+        """What else must be said."""
+
 
 class _Periodic:
-    """At every whole multiple of a period."""
+    """At every whole multiple of a period, but where time jumps ahead."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
         self._next_ns: int | None = None
+        self._jumps = 0
 
     def due(self, now_ns: int) -> Iterator[int]:
         """The instants until now that were not due before."""
         if self._next_ns is None:
             self._next_ns = (now_ns // self._period_ns + 1) * self._period_ns
+        if now_ns - self._next_ns > LONGEST_PAUSE_NS:
+            self._next_ns = (now_ns // self._period_ns + 1) * self._period_ns
+            self._jumps += 1
         while self._next_ns <= now_ns:
             yield self._next_ns
             self._next_ns += self._period_ns
+
+    def remarks(self) -> tuple[str, ...]:
+        """What else must be said."""
+        if not self._jumps:
+            return ()
+        return (
+            f"The log time jumps ahead by more than an hour, {self._jumps} x; no poses are given meanwhile.",
+        )
 
 
 class _Listed:
@@ -112,6 +128,10 @@ class _Listed:
         while self._place < len(self._stamp_ns) and self._stamp_ns[self._place] <= now_ns:
             yield self._stamp_ns[self._place]
             self._place += 1
+
+    def remarks(self) -> tuple[str, ...]:
+        """What else must be said."""
+        return ()
 
 
 class _Recorder:

@@ -21,6 +21,9 @@ from swarm_loc_estimator.io.channels import CHANNELS
 from swarm_loc_estimator.io.inputs import InputKind, input_topics
 from swarm_loc_estimator.io.message_batch import MessageBatch
 
+LONGEST_PAUSE_NS = 3_600_000_000_000
+"""Where arrivals are further apart, the clock was set, as when a robot without one gets the time."""
+
 _STATISTICS_DTYPE = np.dtype(
     [
         (name, np.int64)
@@ -117,10 +120,11 @@ class Ingest:
         """Read messages, numbered as `topics`, in order of arrival.
 
         Yields:
-            One part for each stretch in which time does not go back.
+            One part for each stretch in which time neither goes back nor jumps ahead.
         """
-        back = np.flatnonzero(batch.log_ns[1:] < batch.log_ns[:-1]) + 1
-        for begin, end in itertools.pairwise([0, *back.tolist(), batch.size]):
+        passed_ns = np.diff(batch.log_ns)
+        jumps = np.flatnonzero((passed_ns < 0) | (passed_ns > LONGEST_PAUSE_NS)) + 1
+        for begin, end in itertools.pairwise([0, *jumps.tolist(), batch.size]):
             if begin < end:
                 yield self._read_forwards(batch.chosen(slice(begin, end)))
 

@@ -55,6 +55,24 @@ def test_a_bag_cut_in_the_middle_gives_the_poses_up_to_there(tmp_path: Path) -> 
     np.testing.assert_array_equal(part.pose[:same], whole.pose[:same])
 
 
+@pytest.mark.parametrize("share", [0.1, 0.5])
+def test_a_clock_that_is_set_ends_no_replay(bag: Path, tmp_path: Path, share: float) -> None:
+    """As that of a robot that gets the time when its recording has begun."""
+    swarm, ahead_ns = load_swarm(DEMO / "swarm.yaml"), 50 * 365 * 86400 * 10**9
+    with BagReader(bag) as reader, BagWriter(tmp_path / "bag") as writer:
+        for topic in reader.topics:
+            writer.add_topic(topic.name, topic.type)
+        messages = list(reader.messages())
+        for number, (name, _, log_ns, data) in enumerate(messages):
+            writer.write(name, log_ns + ahead_ns * (number > share * len(messages)), data)
+    whole, jumping = replay(bag, swarm), replay(tmp_path / "bag", swarm)
+    assert "jumps ahead by more than an hour, 1 x" in jumping.remarks[-1]
+    assert abs(len(whole.stamp_ns) - len(jumping.stamp_ns)) <= 2
+    before = int(np.sum(jumping.stamp_ns < ahead_ns))
+    assert before == pytest.approx(share * len(whole.stamp_ns), abs=2)
+    np.testing.assert_array_equal(jumping.pose[:before], whole.pose[:before])
+
+
 def repeated(folder: Path, times: int) -> Path:
     """The demo's messages several times over, each time later."""
     with BagReader(DEMO) as reader, BagWriter(folder) as writer:
