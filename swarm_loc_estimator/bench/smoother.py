@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.calibration.in_order import measurements_of, tracks_of
+from swarm_loc_estimator.calibration.in_order import tracks_and_measurements
 from swarm_loc_estimator.calibration.recording import Recording
 from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.measurements import (
@@ -89,7 +89,7 @@ def smooth(recording: Recording, online: ReplayResult) -> Mapping[str, Errors]:
         SmootherError: The solution does not settle.
     """
     swarm = online.swarm
-    tracks, measured = tracks_of(recording, swarm), measurements_of(recording, swarm)
+    tracks, measured = tracks_and_measurements(recording, swarm)
     estimates = [online.track(index) for index in range(len(swarm.robots))]
     measured = measured[_within(measured, estimates)]
     nodes = _nodes(tracks, estimates, measured)

@@ -29,6 +29,7 @@ from swarm_loc_estimator.calibration.windows import steps_of, true_motion, windo
 from swarm_loc_estimator.core.motion_response import MotionResponse
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.io.ingest import LONGEST_PAUSE_NS
 
 EVALUATIONS = 80
 """How often the estimator runs over the recording to fit the noise."""
@@ -126,11 +127,16 @@ def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Pr
         progress: Called now and then with the share done and what is being done.
 
     Raises:
-        CalibrationError: There is no ground truth, or too little of it.
+        CalibrationError: There is no ground truth, or too little of it, or the recording's clock was set.
     """
     if not recording.truth:
         raise CalibrationError(
             f"recording '{recording.name}' holds no <robot>/ground_truth; a calibration needs it."
+        )
+    if recording.longest_pause_ns > LONGEST_PAUSE_NS:
+        raise CalibrationError(
+            f"recording '{recording.name}' has a jump of {recording.longest_pause_ns / 3.6e12:.0f} h"
+            " in its times; a calibration needs a part of it without."
         )
     whole = fit_models(recording, swarm, options, progress)
     folds = _folds(recording, swarm, whole, options)

@@ -15,33 +15,25 @@ from swarm_loc_estimator.core.fusion import Fusion
 from swarm_loc_estimator.core.measurements import MeasurementArray
 from swarm_loc_estimator.core.odometry import OdometryTracks
 from swarm_loc_estimator.core.readout import read_out
+from swarm_loc_estimator.core.screening import Screening
 from swarm_loc_estimator.core.settings import EstimatorSettings
-from swarm_loc_estimator.core.sightings import SightingConverter
 from swarm_loc_estimator.core.swarm import Swarm
 from swarm_loc_estimator.replay_result import ReplayResult
 
 
-def tracks_of(recording: Recording, swarm: Swarm) -> OdometryTracks:
-    """All odometry, calibrated."""
+def tracks_and_measurements(recording: Recording, swarm: Swarm) -> tuple[OdometryTracks, MeasurementArray]:
+    """All odometry, calibrated, and all sightings of known markers in the order of their stamps."""
+    arrivals = Screening(swarm, EstimatorSettings()).screen(recording.messages)
+    odometry, measured = arrivals.odometry, arrivals.measurements
     tracks = OdometryTracks(swarm.robots)
-    rows = recording.odometry
-    tracks.extend(rows.robot, rows.stamp_ns, rows.poses)
-    return tracks
-
-
-def measurements_of(recording: Recording, swarm: Swarm) -> MeasurementArray:
-    """All sightings of known markers in the order of their stamps."""
-    rows = recording.detections
-    counts = [found.size for found in rows.data]
-    robots, stamps_ns = np.repeat(rows.robot, counts), np.repeat(rows.stamp_ns, counts)
-    measured = SightingConverter(swarm).convert(robots, stamps_ns, rows.detections).measurements
-    return measured[np.lexsort([measured[name] for name in ("marker_id", "observer", "stamp_ns")])]
+    tracks.extend(odometry.robot, odometry.stamp_ns, odometry.pose)
+    return tracks, measured[np.lexsort([measured[name] for name in ("marker_id", "observer", "stamp_ns")])]
 
 
 def run_in_order(recording: Recording, swarm: Swarm, tick_s: float) -> ReplayResult:
     """Poses at every whole multiple of `tick_s`, each from all that was true by then."""
     began = time.perf_counter()
-    tracks, measured = tracks_of(recording, swarm), measurements_of(recording, swarm)
+    tracks, measured = tracks_and_measurements(recording, swarm)
     fusion = Fusion(swarm, EstimatorSettings(), tracks)
     state = fusion.new_state()
     timeout_s = np.array([robot.odometry.timeout_s for robot in swarm.robots])

@@ -27,6 +27,8 @@ from swarm_loc_estimator.core.arrivals import (
     joined,
 )
 from swarm_loc_estimator.core.metrics import Track, interpolate
+from swarm_loc_estimator.core.screening import Screening
+from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.swarm import Robot, Swarm
 from swarm_loc_estimator.io.bags import BagReader, BagTopic
 from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
@@ -109,6 +111,16 @@ class Recording:
         arrivals = np.concatenate([self.odometry.arrival_ns, self.detections.arrival_ns])
         return (int(arrivals.min()), int(arrivals.max())) if arrivals.size else (0, 0)
 
+    @property
+    def longest_pause_ns(self) -> int:
+        """The longest time between two neighbouring stamps, or between two arrivals."""
+        parts = (self.odometry, self.detections)
+        times = (
+            np.concatenate([part.stamp_ns for part in parts]),
+            np.concatenate([part.arrival_ns for part in parts]),
+        )
+        return max(int(np.diff(np.sort(column)).max(initial=0)) for column in times)
+
     def between(self, from_ns: int, to_ns: int) -> Recording:
         """What wheels and cameras said from `from_ns` on and before `to_ns`; all else is whole."""
         odometry, detections = (
@@ -172,7 +184,8 @@ def read_recording(bag: Path, swarm: Swarm, progress: Progress | None = None) ->
             if progress is not None:
                 progress(reader.progress, "reading")
         remarks = (*reader.losses, *_strangers(reader.topics, ingest))
-    odometry = joined([NO_ODOMETRY, *(part.odometry for part in parts)])
+    screening = Screening(swarm, EstimatorSettings())
+    odometry = joined([NO_ODOMETRY, *(screening.screen(part).odometry for part in parts)])
     detections = [_per_message(part.detections) for part in parts]
     tracks = {name: _each_stamp_once(track) for name, track in truth.tracks().items()}
     return Recording(
@@ -184,7 +197,7 @@ def read_recording(bag: Path, swarm: Swarm, progress: Progress | None = None) ->
         tracks,
         joined([NO_BRIGHTNESS, *(part.brightness for part in parts)]),
         joined([NO_FIXES, *(part.fixes for part in parts)]),
-        remarks,
+        (*remarks, *(f"{count} inputs are not used: {reason}." for reason, count in screening.drops.items())),
     )
 
 

@@ -209,7 +209,10 @@ def _regression(
         first, last = windows(motion, WINDOW_S)
         bases.append(integral[last] - integral[first])
         targets.append(true[last] - true[first])
-        borders.append(np.column_stack([first, last]) * _BLOCKS // motion.time_s.size)
+        cuts = np.quantile(
+            first, np.arange(1, _BLOCKS) / _BLOCKS
+        )  # each block holds windows, whatever is known
+        borders.append(np.searchsorted(cuts, np.column_stack([first, last]), side="right"))
     return _Regression(np.concatenate(bases), np.concatenate(targets), *np.concatenate(borders).T)
 
 

@@ -39,7 +39,7 @@ class SwarmEstimator:
         self.settings = settings or EstimatorSettings()
         self._timeout_s = np.array([robot.odometry.timeout_s for robot in swarm.robots])
         self._tracks = OdometryTracks(swarm.robots)
-        self._screening = Screening(swarm, round(self.settings.future_tolerance_s * 1e9))
+        self._screening = Screening(swarm, self.settings)
         self._brightness = BrightnessConverter(swarm)
         self._fusion = Fusion(swarm, self.settings, self._tracks)
         self._reach_ns = self._tracks.reach_ns + round(0.5e9 * self.settings.state_period_s)

@@ -27,6 +27,7 @@ from swarm_loc_estimator.core.dense_filter import cholesky3
 from swarm_loc_estimator.core.gate import gate_threshold
 from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE, NOBODY, Kind, MeasurementArray
 from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.sightings import SightingConverter
 from swarm_loc_estimator.core.swarm import Swarm
 
@@ -48,17 +49,17 @@ class Screening:
 
     Args:
         swarm: Whom they are about.
-        future_ns: By how much a stamp may be ahead of the arrival.
+        settings: Say by how much a stamp may be ahead of the arrival.
 
     Attributes:
         drops: Reason -> how much could not be used.
     """
 
-    def __init__(self, swarm: Swarm, future_ns: int) -> None:
+    def __init__(self, swarm: Swarm, settings: EstimatorSettings) -> None:
         self.drops: Counter[str] = Counter()
         self._converter = SightingConverter(swarm)
         self._stands = np.array([robot.stands for robot in swarm.robots], dtype=bool)
-        self._future_ns = future_ns
+        self._future_ns = round(settings.future_tolerance_s * 1e9)
 
     def screen(self, messages: Messages) -> Arrivals:
         """Turn messages into what can be used of them, and count the rest."""

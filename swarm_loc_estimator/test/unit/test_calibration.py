@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,18 +13,24 @@ from calibration_world import World, record, robot
 
 from swarm_loc_estimator.calibration.fit import Options, calibrate, fit_models
 from swarm_loc_estimator.calibration.in_order import run_in_order
-from swarm_loc_estimator.calibration.noise import Score, score, thinned
-from swarm_loc_estimator.calibration.recording import CalibrationError, started_at_truth
+from swarm_loc_estimator.calibration.noise import Score, score, thinned, with_noise
+from swarm_loc_estimator.calibration.recording import CalibrationError, read_recording, started_at_truth
 from swarm_loc_estimator.calibration.rerun import rerun
 from swarm_loc_estimator.calibration.response import Drive, Lateness, fit_response, nodes_of
 from swarm_loc_estimator.calibration.robust import population, ridge, softened
 from swarm_loc_estimator.calibration.windows import steps_of, true_motion
 from swarm_loc_estimator.cli.calibrate import main
+from swarm_loc_estimator.core.metrics import Track
 from swarm_loc_estimator.core.motion_response import MotionResponse
+from swarm_loc_estimator.core.sightings import CONTENT_POSE
 from swarm_loc_estimator.core.swarm import CameraMount, OdometryModel, Robot, SensorModel
+from swarm_loc_estimator.io.bag_writer import BagWriter
+from swarm_loc_estimator.io.bags import BagReader
 from swarm_loc_estimator.io.swarm_file import load_swarm
+from swarm_loc_estimator.io.typestore import typestore
 
-DROPLETS = Path(__file__).parents[3] / "bags" / "droplets_twenty"
+BAGS = Path(__file__).parents[3] / "bags"
+DROPLETS, FAST = BAGS / "droplets_twenty", BAGS / "eight_one_robot_fast"
 TRUE = Robot(
     "true",
     odometry=OdometryModel(course_offset=0.02, axle_offset=-0.03, delay_s=0.08, lag_s=0.2),
@@ -121,12 +128,57 @@ def test_the_noise_makes_the_estimator_consistent_and_better() -> None:
 
 def test_a_plain_fit_changes_nothing_but_noise() -> None:
     recording, swarm = record(World((robot(1, TRUE),), 10, duration_s=60.0))
-    found = calibrate(recording, swarm, Options(plain=True, evaluations=3), quiet).swarm.robots[0]
-    assert found.response is None
-    assert found.camera == swarm.robots[0].camera
-    assert found.sensor.range_curve == 0.0
-    assert found.odometry.delay_s == 0.0
-    assert found.sensor.range_sigma_per_m > 0.0
+    done = calibrate(recording, swarm, Options(plain=True, evaluations=3), quiet)
+    (robot_before,) = swarm.robots
+    noise = {**asdict(robot_before.odometry), **asdict(robot_before.sensor)}
+    assert with_noise(done.swarm, {name: noise[name] for name in done.noise}) == swarm
+    assert done.noise["range_sigma_per_m"] > 0.0
+
+
+@pytest.mark.parametrize(("from_share", "to_share"), [(0.0, 0.7), (0.4, 1.0)])
+def test_ground_truth_of_a_part_is_enough(from_share: float, to_share: float) -> None:
+    recording, swarm = record(World((robot(1, TRUE),), 21, duration_s=200.0))
+    truth = recording.truth["robot1"]
+    begin, end = (int(share * truth.stamp_ns.size) for share in (from_share, to_share))
+    part = Track(truth.stamp_ns[begin:end], truth.pose[begin:end])
+    found = fit_models(replace(recording, truth={"robot1": part}), swarm, Options(), quiet).swarm.robots[0]
+    assert found.response is not None
+    np.testing.assert_allclose(np.array(found.response.turn_share)[1:, -1], 0.95, atol=0.03)
+
+
+def test_a_message_that_the_estimator_drops_spoils_no_run() -> None:
+    recording, swarm = record(World((robot(1, HONEST),), 22, duration_s=30.0))
+    swarm = started_at_truth(swarm, recording)
+    odometry, detections = recording.odometry, recording.detections
+    bad = detections.data[5].copy()
+    bad["content"], bad["covariance"] = CONTENT_POSE, -np.eye(6) * [1, 1, 1, 1, 1, -1]
+    spoilt = replace(
+        recording,
+        odometry=replace(odometry, data=((np.nan,) * 3, *odometry.data[1:])),
+        detections=replace(detections, data=(*detections.data[:5], bad, *detections.data[6:])),
+    )
+    poses = run_in_order(spoilt, swarm, 0.5).pose
+    assert np.isfinite(poses).all()
+    apart = np.abs(poses - run_in_order(recording, swarm, 0.5).pose)
+    assert np.max(apart) < 0.05
+
+
+def test_what_cannot_be_used_is_not_read_and_said(tmp_path: Path) -> None:
+    swarm = load_swarm(FAST / "swarm.yaml")
+    with BagReader(FAST) as reader, BagWriter(tmp_path / "bag") as writer:
+        for topic in reader.topics:
+            writer.add_topic(topic.name, topic.type)
+        for count, (name, kind, log_ns, data) in enumerate(reader.messages(["epuck1/odom"])):
+            if count == 100:
+                break
+            message: Any = typestore().deserialize_cdr(data, kind)
+            if count == 3:
+                message.pose.pose.position.x = np.nan
+            writer.write(name, log_ns, bytes(typestore().serialize_cdr(message, kind)))
+    recording = read_recording(tmp_path / "bag", swarm)
+    assert recording.odometry.robot.size == 99
+    assert np.isfinite(recording.odometry.poses).all()
+    assert "1 inputs are not used: odometry_non_finite." in recording.remarks
 
 
 def test_thinned_odometry_gives_nearly_the_same_poses() -> None:
@@ -140,6 +192,15 @@ def test_without_ground_truth_there_is_one_sentence() -> None:
     recording, swarm = record(World((robot(1, TRUE),), 12, duration_s=10.0))
     with pytest.raises(CalibrationError, match=r"recording 'world' holds no <robot>/ground_truth"):
         calibrate(replace(recording, truth={}), swarm, Options(), quiet)
+
+
+def test_a_clock_that_was_set_is_one_sentence() -> None:
+    recording, swarm = record(World((robot(1, TRUE),), 12, duration_s=10.0))
+    odometry = recording.odometry
+    stamps_ns = np.where(np.arange(odometry.robot.size) < 50, odometry.stamp_ns - 10**18, odometry.stamp_ns)
+    recording = replace(recording, odometry=replace(odometry, stamp_ns=stamps_ns))
+    with pytest.raises(CalibrationError, match="jump of 277778 h"):
+        calibrate(recording, swarm, Options(), quiet)
 
 
 def test_with_too_little_there_is_one_sentence() -> None:
