@@ -54,6 +54,13 @@ class PlayNode(Node):
         super().__init__("player", **node_arguments)
         self._wishes = declare_parameters(self, PlayerParameters)
         self._reader = BagReader(Path(self._wishes.bag))
+        first_ns, last_ns = self._reader.time_range_ns
+        self._begin_ns = first_ns + round(self._wishes.start_offset_s * 1e9)
+        if self._begin_ns > last_ns:
+            raise ParameterError(
+                f"parameter start_offset_s = {self._wishes.start_offset_s:g} must lie within the bag,"
+                f" which lasts {1e-9 * (last_ns - first_ns):g} s."
+            )
         self._publisher_of: dict[str, Publisher] = {}
         for topic in self._chosen_topics():
             self._add_publisher(topic)
@@ -68,10 +75,11 @@ class PlayNode(Node):
     def run(self, stop: Stop) -> int:
         """Play to the end, or until asked to stop; the exit status."""
         self._wait_for_subscribers(stop)
-        if not stop.requested:
+        while not stop.requested:
+            played_before = self.so_far.messages
             self._play_once(stop)
-        while self._wishes.loop and not stop.requested:
-            self._play_once(stop)
+            if not self._wishes.loop or self.so_far.messages == played_before:
+                break
         self._wait_for_acknowledgements()
         if not stop.requested:
             self._run_clock_on()
@@ -109,10 +117,9 @@ class PlayNode(Node):
         self._publisher_of[topic.name] = self.create_publisher(message_class, topic.name, qos)
 
     def _play_once(self, stop: Stop) -> None:
-        begin_ns = self._reader.time_range_ns[0] + round(self._wishes.start_offset_s * 1e9)
         play(
             takewhile(lambda _: not stop.requested, self._reader.messages(self._publisher_of)),
-            begin_ns,
+            self._begin_ns,
             self._wishes.rate,
             self._publish,
             self._publish_clock,

@@ -107,11 +107,24 @@ def test_a_loop_begins_anew_until_a_signal(ros: Ros, bag: Path, tmp_path: Path) 
         assert "played" in player.output
 
 
+def test_a_loop_over_nothing_ends(ros: Ros, tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("alpha/odom", ODOMETRY)
+    with _player(tmp_path / "bag", tmp_path, loop="true") as player:
+        ros.until(lambda: player.process.poll() is not None)
+        assert player.end() == 0
+        assert "played 0 messages" in player.output
+
+
 @pytest.mark.parametrize(
     ("parameters", "sentence"),
     [
         ({"bag": "/nowhere"}, "There is no bag '/nowhere'."),
         ({"topics": "[gamma/odom]"}, "parameter topics names 'gamma/odom', but"),
+        (
+            {"start_offset_s": 10.5},
+            "parameter start_offset_s = 10.5 must lie within the bag, which lasts 9.95 s.",
+        ),
     ],
 )
 def test_a_wrong_parameter_ends_the_player_with_one_sentence(
