@@ -19,7 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.cli.arguments import number_in
+from swarm_loc_estimator.cli.arguments import folder_to_write, number_in
+from swarm_loc_estimator.cli.ending import told_in_a_sentence
 from swarm_loc_estimator.cli.replay import swarm_beside
 from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.estimator import Status
@@ -50,23 +51,18 @@ _REDRAW_S = 0.2
 _REDRAW_UNWATCHED_S = 5.0
 
 
+@told_in_a_sentence(BagError, SwarmFileError, DefinitionsNotFoundError, GraphError, LiveError)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
     swarm_file = swarm_beside(options.bag)
+    progress = _Progress(load_swarm(swarm_file))
     print(f"Playing {options.bag} at {options.rate:g} x into the live graph", flush=True)
-    try:
-        progress = _Progress(load_swarm(swarm_file))
-        live = play_live(
-            options.bag, swarm_file, log=options.out / "nodes.log", rate=options.rate, watch=progress
-        )
-        progress.close()
-        compared = compare_with_replay(live, options.bag)
-    except (BagError, SwarmFileError, DefinitionsNotFoundError, GraphError, LiveError) as error:
-        print(error, file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
+    live = play_live(
+        options.bag, swarm_file, log=options.out / "nodes.log", rate=options.rate, watch=progress
+    )
+    progress.close()
+    compared = compare_with_replay(live, options.bag)
     files = write_report(live.result, options.out)
     print(files.text.read_text(encoding="utf-8"))
     print("\n".join(live_facts(live, compared)))
@@ -180,7 +176,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--rate", type=number_in(0.1, 100.0), default=RATE, help=f"speed of the bag (default: {RATE:g})"
     )
-    parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for the report")
+    parser.add_argument("--out", type=folder_to_write, default="out/demo", help="folder for the report")
     return parser
 
 

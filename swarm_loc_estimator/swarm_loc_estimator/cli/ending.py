@@ -31,7 +31,10 @@ def told_in_a_sentence(
                 print(error, file=sys.stderr)
                 return 1
             except OSError as error:
-                print(f"{error.filename or 'A file'} cannot be used: {error.strerror}.", file=sys.stderr)
+                print(
+                    f"{error.filename or 'A file'} cannot be used: {error.strerror or error}.",
+                    file=sys.stderr,
+                )
                 return 1
             except KeyboardInterrupt:
                 return _INTERRUPTED

@@ -64,7 +64,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def swarm_beside(bag: Path) -> Path:
-    """The swarm description that belongs to a bag."""
+    """The swarm description that belongs to a bag; raises BagError where there is none."""
+    if not bag.exists():
+        raise BagError(f"There is no bag '{bag}'.")
     return (bag if bag.is_dir() else bag.parent) / "swarm.yaml"
 
 

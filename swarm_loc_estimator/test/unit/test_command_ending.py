@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from swarm_loc_estimator.cli import calibrate, calibrate_ir, replay
 from swarm_loc_estimator.cli.arguments import folder_to_write
 from swarm_loc_estimator.cli.ending import told_in_a_sentence
 
@@ -15,6 +17,7 @@ from swarm_loc_estimator.cli.ending import told_in_a_sentence
     [
         (ValueError("This is wrong."), 1, "This is wrong.\n"),
         (OSError(28, "No space left on device", "out/x.yaml"), 1, "out/x.yaml cannot be used: No space left"),
+        (OSError("cannot mmap an empty file"), 1, "A file cannot be used: cannot mmap an empty file."),
         (KeyboardInterrupt(), 130, ""),
     ],
 )
@@ -38,6 +41,14 @@ def test_faults_of_the_program_are_not_hidden() -> None:
 
     with pytest.raises(KeyError):
         main()
+
+
+@pytest.mark.parametrize("main", [replay.main, calibrate.main, calibrate_ir.main])
+def test_a_bag_that_is_not_there_is_said(
+    main: Callable[[list[str]], int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(tmp_path / "nope"), "--out", str(tmp_path / "out.yaml")]) == 1
+    assert capsys.readouterr().err == f"There is no bag '{tmp_path / 'nope'}'.\n"
 
 
 def test_folders_are_not_made_before_there_is_anything_to_write(tmp_path: Path) -> None:
