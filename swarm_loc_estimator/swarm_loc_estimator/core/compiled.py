@@ -9,7 +9,9 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import shutil
 import sys
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
@@ -23,6 +25,7 @@ from numpy.typing import NDArray
 Function = TypeVar("Function", bound=Callable[..., object])
 
 _CORE = Path(__file__).resolve().parent
+_KEPT_S = 30 * 86400.0
 
 
 @cache
@@ -44,9 +47,17 @@ def is_warm(folder: Path = _CORE) -> bool:
 
 
 def note_warm(folder: Path = _CORE) -> None:
-    """Remember that the compiled code of a folder's sources has now been called throughout."""
+    """Remember that the compiled code of a folder's sources has now been called throughout.
+
+    Caches that have not been used for a month are deleted.
+    """
+    own = _cache_folder(folder)
     with suppress(OSError):  # where nothing can be kept, the next start compiles again
         _mark(folder).touch()
+        os.utime(own)
+        for other in own.parent.iterdir():  # of other states of the sources
+            if other != own and other.stat().st_mtime < time.time() - _KEPT_S:
+                shutil.rmtree(other, ignore_errors=True)
 
 
 def _mark(folder: Path) -> Path:

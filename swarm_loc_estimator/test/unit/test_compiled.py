@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 USED = """
@@ -40,3 +41,20 @@ def test_a_change_in_another_file_is_noticed(tmp_path: Path) -> None:
         (tmp_path / "used.py").write_text(USED.format(factor=factor), encoding="utf-8")
         said.append(run(tmp_path, tmp_path / "cache"))
     assert said == [["False", "3.0", "0"], ["True", "3.0", "1"], ["False", "5.0", "0"]]
+
+
+def test_caches_of_sources_long_gone_are_deleted(tmp_path: Path) -> None:
+    (tmp_path / "using.py").write_text(USING, encoding="utf-8")
+    (tmp_path / "used.py").write_text(USED.format(factor="1.5"), encoding="utf-8")
+    cache = tmp_path / "cache" / "swarm_loc_estimator"
+    for name, age_s in (("old", 31 * 86400.0), ("recent", 29 * 86400.0)):
+        (cache / name / "source").mkdir(parents=True)
+        (cache / name / "source" / "code.nbc").touch()
+        os.utime(cache / name, times=(0.0, time.time() - age_s))
+    run(tmp_path, tmp_path / "cache")
+    assert not (cache / "old").exists()
+    assert (cache / "recent" / "source" / "code.nbc").exists()
+    (own,) = (one for one in cache.iterdir() if (one / "warm").exists())
+    os.utime(own, times=(0.0, 0.0))
+    assert run(tmp_path, tmp_path / "cache")[0] == "True"  # in use, however old
+    assert own.stat().st_mtime > time.time() - 86400.0
