@@ -150,12 +150,12 @@ class _Loader(TreeChecks):
             for name, tree in self._named(sections.get("robots", {}), "robots")
         )
         if not robots:
-            raise SwarmFileError(f"{self._path}: robots is empty but must name at least one robot.")
+            raise self.said("robots is empty but must name at least one robot")
         landmarks = self._landmarks(sections.get("landmarks", {}), sections.get("defaults", {}))
         try:
             return Swarm(robots, landmarks)
         except SwarmError as error:
-            raise SwarmFileError(f"{self._path}: {error}") from error
+            raise self.said(str(error).removesuffix(".")) from error
 
     def _robot(self, name: str, tree: Tree, defaults: _Layer, types: Mapping[str, _Layer]) -> Robot:
         """One robot from its three layers."""
@@ -164,7 +164,7 @@ class _Loader(TreeChecks):
         type_name = mapping.get("type", "")
         if type_name and (not isinstance(type_name, str) or type_name not in types):
             raise self.error(f"{key}.type", type_name, f"must be one of the types{nearest(type_name, types)}")
-        own = self._layer(mapping, key, _ROBOT)
+        own = self._layer(mapping, key, _ROBOT, of_robot=True)
         layers = [defaults, *([types[type_name]] if type_name else []), own]
         sections = {section: _said(layers, section) for section in (*_MODELS, "ir")}
         models: dict[str, Any] = {
@@ -182,7 +182,7 @@ class _Loader(TreeChecks):
             **{**models, "odometry": models["odometry"] or OdometryModel()},
         )
 
-    def _layer(self, tree: Tree, key: str, known: Collection[str]) -> _Layer:
+    def _layer(self, tree: Tree, key: str, known: Collection[str], *, of_robot: bool = False) -> _Layer:
         """The settings that one layer says."""
         mapping = self.mapping(tree, key, known)
         sections: dict[str, Values | None] = {
@@ -193,7 +193,7 @@ class _Loader(TreeChecks):
             if section in mapping
         }
         if "ir" in mapping:
-            sections["ir"] = self._ir.layer(mapping["ir"], f"{key}.ir", of_robot="ids" in known)
+            sections["ir"] = self._ir.layer(mapping["ir"], f"{key}.ir", of_robot=of_robot)
         faces = self._named(mapping.get("faces", {}), f"{key}.faces")
         specs = number_specs(Face)
         return _Layer(
@@ -213,7 +213,7 @@ class _Loader(TreeChecks):
         mapping = self.mapping(tree, key, _RESPONSE)
         for name in _RESPONSE:
             if name not in mapping:
-                raise SwarmFileError(f"{self._path}: {key} lacks {name}, a list of numbers.")
+                raise self.said(f"{key} lacks {name}, a list of numbers")
         axes = {
             name: self.list_of_numbers(mapping[name], f"{key}.{name}") for name in ("speeds", "turn_rates")
         }
@@ -229,7 +229,7 @@ class _Loader(TreeChecks):
                 axes["speeds"], axes["turn_rates"], tables["speed_share"], tables["turn_share"]
             )
         except MotionResponseError as error:
-            raise SwarmFileError(f"{self._path}: {key.removesuffix('response')}{error}") from error
+            raise self.said(f"{key.removesuffix('response')}{error}".removesuffix(".")) from error
 
     def _faces(self, key: str, layers: Iterable[_Layer], ids_tree: Tree) -> tuple[Face, ...]:
         """The robot's markers: where they sit from the layers, which they are from its ids."""
@@ -243,9 +243,8 @@ class _Loader(TreeChecks):
         ids = self.mapping(ids_tree, f"{key}.ids", places)
         missing = [name for name in places if name not in ids]
         if missing:
-            raise SwarmFileError(
-                f"{self._path}: {key}.ids has no id for face '{missing[0]}';"
-                f" give one or set faces.{missing[0]} to null."
+            raise self.said(
+                f"{key}.ids has no id for face '{missing[0]}'; give one or set faces.{missing[0]} to null"
             )
         return tuple(
             Face(name, self._marker_id(ids[name], f"{key}.ids.{name}"), **numbers)  # type: ignore[arg-type]
