@@ -1,0 +1,53 @@
+"""The README has all numbers of a swarm description and all options of the commands."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from swarm_loc_estimator.cli import calibrate, calibrate_ir, import_mrclam, replay
+from swarm_loc_estimator.core.number_spec import number_specs
+from swarm_loc_estimator.core.swarm import (
+    CameraMount,
+    Face,
+    Landmark,
+    OdometryModel,
+    SensorModel,
+    StartSigma,
+)
+
+README = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+
+
+def table_of(cls: type, *required: str) -> str:
+    """The numbers of a dataclass as a table for a README."""
+    lines = ["| Key | Default | Range | Meaning |", "|---|---|---|---|"]
+    defaults = {f.name: "null" if f.default is None else f"{f.default:g}" for f in fields(cls) if f.metadata}
+    for name, spec in number_specs(cls).items():
+        default = "required" if name in required else f"`{defaults[name]}`"
+        lines.append(f"| `{name}` | {default} | {spec.range_text} | {spec.doc} |")
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("cls", [OdometryModel, CameraMount, SensorModel, Face, StartSigma])
+def test_every_number_of_a_robot_stands_in_the_readme(cls: type) -> None:
+    assert table_of(cls) in README
+
+
+def test_every_number_of_a_landmark_stands_in_the_readme() -> None:
+    assert table_of(Landmark, "x", "y") in README
+
+
+@pytest.mark.parametrize("command", [replay, calibrate, calibrate_ir, import_mrclam])
+def test_every_option_of_a_command_stands_in_the_readme(
+    command: object, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main: Callable[[list[str]], int] = command.main  # type: ignore[attr-defined]
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    options = set(re.findall(r"(?<!\S)\[?--([a-z-]+)", capsys.readouterr().out)) - {"help"}
+    assert {option for option in options if f"`--{option}" not in README} == set()
