@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from swarm_loc_estimator.cli.demo import main
 from swarm_loc_estimator.core.estimator import Status
 from swarm_loc_estimator.core.metrics import interpolate
 from swarm_loc_estimator.graph import GraphOptions, graph_nodes
@@ -71,3 +72,15 @@ def test_a_graph_that_fails_says_so(bag: Path, tmp_path: Path) -> None:
     with pytest.raises(LiveError, match=r"Node estimator has ended, status 1;.*missing\.yaml"), graph:
         pytest.fail("the graph started without a swarm description")
     assert graph.process(ESTIMATOR).returncode == 1
+
+
+def test_what_the_demo_cannot_use_is_said_in_a_sentence(
+    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(tmp_path / "nope")]) == 1
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit):
+        main([str(bag), "--out", str(tmp_path / "file" / "out")])
+    first, *_, last = capsys.readouterr().err.splitlines()
+    assert first == f"There is no bag '{tmp_path / 'nope'}'."
+    assert "cannot be written" in last
