@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from swarm_loc_estimator.core.metrics import StampArray, Track, interpolate
+from swarm_loc_estimator.core.sightings import CONTENT_POSITION
 from swarm_loc_estimator.core.swarm import CameraMount, Face, Landmark, OdometryModel, Pose2, Robot, Swarm
 from swarm_loc_estimator.io.bag_writer import BagWriter
 from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
@@ -33,7 +34,6 @@ TIMEOUT_S = 2.0
 """Every two minutes or so the logs pause for just over a second; the robots drive on as commanded."""
 
 _FAMILY_OTHER = 255
-_CONTENT_POSITION = 1
 _REPORT_EVERY = 5000
 _SERIALIZING = 0.3
 """Share of the time that is not writing."""
@@ -231,7 +231,7 @@ def _detection_rows(robot: RobotLog) -> npt.NDArray[np.void]:
     distance, bearing = robot.sighting.T
     rows["id"] = robot.barcode
     rows["family"] = _FAMILY_OTHER
-    rows["content"] = _CONTENT_POSITION
+    rows["content"] = CONTENT_POSITION
     rows["id_margin"] = rows["alternative_ratio"] = np.nan
     rows["corners_px"] = np.nan
     rows["position"][:, 0] = -distance * np.sin(bearing)

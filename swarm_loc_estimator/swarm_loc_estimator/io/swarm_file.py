@@ -72,7 +72,7 @@ _SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks")
 _LAYER = ("odometry", "response", "camera", "sensor", "ir", "faces", "start_sigma")
 _DEFAULTS = (*_LAYER, "landmark")
 _ROBOT = ("type", *_LAYER, "ids", "start")
-_MODELS: dict[str, type] = {
+MODELS: dict[str, type] = {
     "odometry": OdometryModel,
     "camera": CameraMount,
     "sensor": SensorModel,
@@ -166,10 +166,10 @@ class _Loader(TreeChecks):
             raise self.error(f"{key}.type", type_name, f"must be one of the types{nearest(type_name, types)}")
         own = self._layer(mapping, key, _ROBOT, of_robot=True)
         layers = [defaults, *([types[type_name]] if type_name else []), own]
-        sections = {section: _said(layers, section) for section in (*_MODELS, "ir")}
+        sections = {section: _said(layers, section) for section in (*MODELS, "ir")}
         models: dict[str, Any] = {
             section: None if (values := sections[section]) is None else cls(**values)
-            for section, cls in _MODELS.items()
+            for section, cls in MODELS.items()
         }
         return Robot(
             name=name,
@@ -189,7 +189,7 @@ class _Loader(TreeChecks):
             section: None
             if mapping[section] is None and section in _MAY_BE_NONE
             else self.numbers(mapping[section], f"{key}.{section}", number_specs(cls))
-            for section, cls in _MODELS.items()
+            for section, cls in MODELS.items()
             if section in mapping
         }
         if "ir" in mapping:

@@ -11,28 +11,18 @@ import yaml
 from swarm_loc_estimator.core.motion_response import MotionResponse
 from swarm_loc_estimator.core.number_spec import number_specs
 from swarm_loc_estimator.core.swarm import (
-    CameraMount,
     Face,
     Landmark,
-    OdometryModel,
     Robot,
-    SensorModel,
-    StartSigma,
     Swarm,
 )
 from swarm_loc_estimator.io.ir_section import ir_tree
-from swarm_loc_estimator.io.swarm_file import FILE_VERSION, LANDMARK_DEFAULTS
+from swarm_loc_estimator.io.swarm_file import FILE_VERSION, LANDMARK_DEFAULTS, MODELS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-_MODELS: dict[str, type] = {
-    "odometry": OdometryModel,
-    "camera": CameraMount,
-    "sensor": SensorModel,
-    "start_sigma": StartSigma,
-}
 _WHOLE = frozenset({"camera", "faces", "response"})
 Mapping = dict[Any, Any]
 
@@ -55,7 +45,7 @@ def save_swarm(swarm: Swarm, path: Path, comment: str = "") -> None:
 
 def _units() -> list[str]:
     """One comment per group of numbers, with the unit of each."""
-    groups = {**_MODELS, "faces": Face, "landmarks": Landmark}
+    groups = {**MODELS, "faces": Face, "landmarks": Landmark}
     lines = ["Units:"]
     for name, cls in groups.items():
         units = ", ".join(f"{key} [{spec.unit}]" for key, spec in number_specs(cls).items())
@@ -102,9 +92,7 @@ def _numbers(model: Any, keep: tuple[str, ...] = ()) -> Mapping:
 
 def _layer(robot: Robot, folder: Path) -> Mapping:
     """Everything about a robot that a type can say, as far as it differs from the defaults."""
-    layer: Mapping = {
-        section: _numbers(getattr(robot, section)) for section in _MODELS if section != "camera"
-    }
+    layer: Mapping = {section: _numbers(getattr(robot, section)) for section in MODELS if section != "camera"}
     layer["response"] = {} if robot.response is None else _lists(robot.response)
     layer["camera"] = None if robot.camera is None else _numbers(robot.camera)
     if robot.stands:
