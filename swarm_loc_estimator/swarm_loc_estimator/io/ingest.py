@@ -31,6 +31,7 @@ _STATISTICS_DTYPE = np.dtype(
             "received",
             "malformed",
             "last_stamp_ns",
+            "first_arrival_ns",
             "last_arrival_ns",
             "late_sum_ns",
             "late_max_ns",
@@ -69,6 +70,12 @@ class InputStatistics:
     def last_arrival_ns(self) -> int | None:
         """When it arrived."""
         return int(self._row["last_arrival_ns"][0]) if self.received > self.malformed else None
+
+    @property
+    def mean_period_ns(self) -> float | None:
+        """Mean time between two well-formed ones; None before the second."""
+        row, count = self._row[0], self.received - self.malformed
+        return float(row["last_arrival_ns"] - row["first_arrival_ns"]) / (count - 1) if count > 1 else None
 
     @property
     def late_count(self) -> int:
@@ -169,6 +176,8 @@ def _count(
         if not valid[k]:
             one.malformed += 1
             continue
+        if one.received - one.malformed == 1:
+            one.first_arrival_ns = arrival_ns[k]
         late_ns = arrival_ns[k] - stamp_ns[k]
         one.last_stamp_ns, one.last_arrival_ns = stamp_ns[k], arrival_ns[k]
         one.late_max_ns = max(one.late_max_ns, late_ns) if one.late_count else late_ns

@@ -14,11 +14,13 @@ from swarm_loc_estimator.core.fusion import Verdict
 from swarm_loc_estimator.core.measurements import MeasurementArray
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import Robot, Swarm
-from swarm_loc_estimator.io.ingest import Ingest
+from swarm_loc_estimator.io.ingest import Ingest, InputStatistics
 from swarm_loc_estimator.io.inputs import InputKind, InputTopic
 
 _SHOWN_NAMES = 8
 _FULL_LOAD = 0.95
+_PATIENCE_S, _PATIENCE_PERIODS = 10.0, 5.0
+"""An expected input that is silent for longer than so many seconds and of its mean periods may have died."""
 
 
 @dataclass
@@ -156,22 +158,18 @@ class Health:
             )
         if statistics.last_arrival_ns is None:
             return [f"no message on {topic.name} is a {topic.kind.message_type}"]
-        found = self._ingest.frame_id(handle)
-        if topic.kind is InputKind.FIXES and found != self._ingest.map_frame:
-            return [f"{topic.name} is in frame '{found}' but must be in '{self._ingest.map_frame}'"]
-        if topic.kind is not InputKind.ODOMETRY:
-            return []
+        troubles, found = [], self._ingest.frame_id(handle)
         silent_s = (now_ns - statistics.last_arrival_ns) * 1e-9
-        expected = f"{robot.name}/{self._odom_frame}"
-        silence = (
-            [f"{topic.name} is silent for {silent_s:.1f} s"] if silent_s > robot.odometry.timeout_s else []
-        )
-        foreign = (
-            [f"{topic.name} is in frame '{found}' but transforms are published for '{expected}'"]
-            if found != expected
-            else []
-        )
-        return silence + foreign
+        if silent_s > _patience_s(topic, robot, statistics):
+            troubles.append(f"{topic.name} is silent for {silent_s:.1f} s")
+        map_frame, odom_frame = self._ingest.map_frame, f"{robot.name}/{self._odom_frame}"
+        if topic.kind is InputKind.FIXES and found != map_frame:
+            troubles.append(f"{topic.name} is in frame '{found}' but must be in '{map_frame}'")
+        if topic.kind is InputKind.ODOMETRY and found != odom_frame:
+            troubles.append(
+                f"{topic.name} is in frame '{found}' but transforms are published for '{odom_frame}'"
+            )
+        return troubles
 
     def _input_values(self, handle: int, topic: InputTopic, now_ns: int, elapsed_s: float) -> dict[str, str]:
         """Figures of an input over the interval; begins its next one."""
@@ -223,6 +221,15 @@ def merged(reports: Sequence[Report], name: str) -> Report:
     warnings = [report.message for report in reports if report.warning]
     values = {key: value for report in reports for key, value in report.values.items()}
     return Report(name, "; ".join(warnings or [report.message for report in reports]), bool(warnings), values)
+
+
+def _patience_s(topic: InputTopic, robot: Robot, statistics: InputStatistics) -> float:
+    """How long an input may be silent; detectors and infrared boards have periods of their own."""
+    if topic.kind is InputKind.ODOMETRY:
+        return robot.odometry.timeout_s
+    if not topic.expected:
+        return math.inf
+    return max(_PATIENCE_S, _PATIENCE_PERIODS * 1e-9 * (statistics.mean_period_ns or 0.0))
 
 
 def _used_per_robot(recent: Recent, robots: int) -> tuple[list[int], list[float]]:

@@ -9,9 +9,10 @@ from swarm_loc_estimator.core.estimator import Status, SwarmEstimate
 from swarm_loc_estimator.core.fusion import Verdict
 from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE
 from swarm_loc_estimator.core.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
 from swarm_loc_estimator.io.ingest import Ingest
 from swarm_loc_estimator.io.message_batch import MessageBatch
-from swarm_loc_estimator.io.messages import encode_odometry
+from swarm_loc_estimator.io.messages import encode_detections, encode_odometry
 from swarm_loc_estimator.nodes.estimator_health import Health, Recent, TickCost, load_report
 
 SECOND = 1_000_000_000
@@ -24,6 +25,11 @@ class World:
     def __init__(self) -> None:
         self.ingest = Ingest(SWARM)
         self.health = Health(SWARM, self.ingest, "odom", lambda name: f" (why {name[0]})")
+
+    def detections(self, now_ns: int) -> None:
+        """A picture of robot a without any marker."""
+        data = encode_detections("a/camera_optical_frame", now_ns, np.zeros(0, DETECTION_DTYPE))
+        list(self.ingest.read(MessageBatch.of([(self.ingest.handle_of["a/detections"], data, now_ns)])))
 
     def odometry(self, robot: str, stamp_ns: int, now_ns: int, frame: str | None = None) -> None:
         """One message."""
@@ -104,6 +110,23 @@ def test_a_robot_is_told_apart_as_waiting_lost_silent_or_in_a_foreign_frame() ->
     world.odometry("b", now_ns, now_ns, frame="odom")
     _, b, _ = world.health.reports(now_ns, estimate(now_ns, Status.TRACKED, Status.TRACKED), recent(), {})
     assert b.message == "b/odom is in frame 'odom' but transforms are published for 'b/odom'"
+
+
+@pytest.mark.parametrize(("period_s", "patience_s"), [(0.05, 10.0), (1.0, 10.0), (60.0, 300.0)])
+def test_a_detector_that_falls_silent_is_named_as_soon_as_its_period_allows(
+    period_s: float, patience_s: float
+) -> None:
+    world, last_ns = World(), round(3 * period_s * SECOND)
+    for k in range(4):
+        world.detections(round(k * period_s * SECOND))
+    for late_s, message in (
+        (-0.1, "tracked"),
+        (0.1, f"a/detections is silent for {patience_s + 0.1:.1f} s"),
+    ):
+        now_ns = last_ns + round((patience_s + late_s) * SECOND)
+        world.odometry("a", now_ns, now_ns)
+        status = estimate(now_ns, Status.TRACKED, Status.TRACKED)
+        assert world.health.reports(now_ns, status, recent(), {})[0].message == message
 
 
 def test_nis_is_the_mean_of_what_was_used() -> None:
