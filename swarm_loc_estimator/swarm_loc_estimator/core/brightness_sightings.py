@@ -91,7 +91,7 @@ class BrightnessConverter:
 
     @property
     def measured(self) -> int:
-        """Exchanges that gave a measurement."""
+        """Exchanges that gave a measurement, since the last `restart`."""
         return self._measured + sum(exchange.measurement.size for exchange in self._exchanges.values())
 
     def forget_before(self, oldest_ns: int) -> None:
@@ -101,6 +101,7 @@ class BrightnessConverter:
     def restart(self) -> None:
         """Let go of all exchanges."""
         self._forget(list(self._exchanges))
+        self._measured = 0
 
     def take(self, rows: BrightnessRows) -> Change:
         """Take matrices (b,) in."""

@@ -199,6 +199,17 @@ def test_what_is_read_in_the_dark_is_no_light(method: IrMethod) -> None:
         assert results[0].tobytes() == results[1].tobytes()
 
 
+def test_measured_exchanges_are_those_since_the_last_restart() -> None:
+    converter = BrightnessConverter(swarm_of())
+    converter.take(rows_of(*heard()))
+    converter.forget_before(T0 + 1)
+    assert converter.measured == 2
+    converter.restart()
+    assert converter.measured == 0
+    converter.take(rows_of(*heard()))
+    assert converter.measured == 2
+
+
 def test_a_sensor_that_ends_early_tells_no_more_from_there_on() -> None:
     """A reading cut at 100 counts would be taken for a far robot."""
     far = heard(noise=0.0)[0]
