@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.compiled import assign, assign_matrix, carry, compiled, composed, wrap
-from swarm_loc_estimator.core.measurements import NOBODY, MeasurementArray
+from swarm_loc_estimator.core.measurements import NOBODY, POLAR, MeasurementArray
 from swarm_loc_estimator.core.se2 import FloatArray
 
 if TYPE_CHECKING:
@@ -181,7 +181,7 @@ def _describe(
         mtheta += camera[0]
     x, y, angle = value[0], value[1], ltheta if sees else mtheta
     xx, xy, yy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
-    if one.kind == 1:  # Kind.POLAR: along and across the line of sight
+    if one.kind == POLAR:  # along and across the line of sight
         x, y, angle = value[0], 0.0, angle + value[1]
         xy, yy = value[0] * xy, value[0] * value[0] * yy
     size = 1.0 / (1.0 + camera[1])

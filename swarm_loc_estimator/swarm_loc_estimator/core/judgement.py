@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.core.compiled import assign, assign_matrix, compiled, composed, moved_by_twist, wrap
 from swarm_loc_estimator.core.dense_filter import IndexArray, update_one
 from swarm_loc_estimator.core.gate import position_distance, soften_heading, squared_distance
-from swarm_loc_estimator.core.measurements import MeasurementColumns, innovation, predict_one
+from swarm_loc_estimator.core.measurements import SEAT, MeasurementColumns, innovation, predict_one
 from swarm_loc_estimator.core.motion import TrackArrays, look_up, rate_at
 from swarm_loc_estimator.core.parameters import CAMERA_SCALE, CAMERA_YAW, PARAMETERS
 from swarm_loc_estimator.core.prediction import advance
@@ -58,7 +58,7 @@ def fuse_in_order(
     for k in range(begin, measurements.stamp_ns.size):
         sides = (measurements.observer[k], measurements.target[k])
         for side in sides:
-            if measurements.kind[k] > 1 or (side >= 0 and not belief.tracked[side]):
+            if measurements.kind[k] >= SEAT or (side >= 0 and not belief.tracked[side]):
                 return k, UNTIED, -1
         for i in range(2):
             if sides[i] >= 0:
@@ -128,7 +128,7 @@ def advance_all(
             robot = sides[i]
             if robot >= 0:
                 to_map(belief, robot, pose[k, i])
-                unsure[robot] = is_unsure(belief, robot, pose[k, i], limits[0], limits[1])
+                unsure[robot] |= is_unsure(belief, robot, pose[k, i], limits[0], limits[1])
         if measurements.landmark[k] > 0:
             assign(pose[k, 1], belief.landmark[measurements.landmark[k] - 1])
         relative_motion(measurements, k, tracks, pose[k], motion[k])

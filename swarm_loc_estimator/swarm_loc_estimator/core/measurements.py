@@ -39,6 +39,9 @@ class Kind(IntEnum):
     FORGET = 3  # the target is not where it was believed to be
 
 
+POLAR, SEAT = int(Kind.POLAR), int(Kind.SEAT)
+"""Kinds as plain numbers, for compiled code."""
+
 MEASUREMENT_DTYPE = np.dtype(
     [
         ("stamp_ns", np.int64),  # when it was true
@@ -149,7 +152,7 @@ def predict_one(
         jacobian[0, j] *= stretch
         jacobian[1, j] *= stretch
     jacobian[0, 4], jacobian[1, 4], jacobian[2, 4] = x, y, 0.0
-    if measurements.kind[k] == 1:  # Kind.POLAR
+    if measurements.kind[k] == POLAR:
         distance = max(math.hypot(x, y), 1e-6)
         ux, uy = x / distance, y / distance
         value[0], value[1] = stretch * distance, math.atan2(y, x)
@@ -170,5 +173,5 @@ def innovation(
     out[0] = measured[0] - predicted[0]
     out[1] = measured[1] - predicted[1]
     out[2] = wrap(measured[2] - predicted[2]) if measurements.has_heading[k] else 0.0
-    if measurements.kind[k] == 1:  # Kind.POLAR
+    if measurements.kind[k] == POLAR:
         out[1] = wrap(out[1])

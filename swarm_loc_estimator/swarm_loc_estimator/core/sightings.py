@@ -20,7 +20,7 @@ from swarm_loc_estimator.core.gate import gate_threshold
 from swarm_loc_estimator.core.measurements import (
     MEASUREMENT_DTYPE,
     NOBODY,
-    Kind,
+    POLAR,
     MeasurementArray,
     MeasurementColumns,
 )
@@ -36,9 +36,8 @@ CONTENT_POSE = 2
 CONTENT_POSE_TWO = 3
 """Detection content: likewise, with a mirrored second solution."""
 
-_FATES = ("measured", "unknown_id", "own_marker", "no_camera", "non_finite", "absurd")
-_MEASURED, _UNKNOWN_ID, _OWN_MARKER, _NO_CAMERA, _NON_FINITE, _ABSURD = range(len(_FATES))
-_POLAR = int(Kind.POLAR)
+_FATES = ("measured", "unknown_id", "own_marker", "no_camera", "bad_content", "non_finite", "absurd")
+_MEASURED, _UNKNOWN_ID, _OWN_MARKER, _NO_CAMERA, _BAD_CONTENT, _NON_FINITE, _ABSURD = range(len(_FATES))
 _FARTHEST_M = 1e3
 _FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _SENSOR_DTYPE = np.dtype([(f.name, np.float64) for f in fields(SensorModel)])
@@ -51,7 +50,8 @@ class Conversion:
     Attributes:
         measurements: (m,) of MEASUREMENT_DTYPE.
         measured: (d,) which detections they come from.
-        dropped: Reason -> count, for `unknown_id`, `own_marker`, `no_camera`, `non_finite` and `absurd`.
+        dropped: Reason -> count, for `unknown_id`, `own_marker`, `no_camera`, `bad_content`, `non_finite` and
+            `absurd`.
     """
 
     measurements: MeasurementArray
@@ -194,7 +194,7 @@ def _convert_all(
         _levelled(level, detections.position[k], position)
         _scale(position, 1.0 / sensor.distance_scale)
         if detections.content[k] == CONTENT_POSITION or math.isnan(marker[2]):
-            out.kind[k] = _POLAR
+            out.kind[k] = POLAR
             _calibrate(sensor, position, out.target[k], out.value[k], out.covariance[k])
             out.covariance[k, 0, 0] += markers.variance[place]
             out.covariance[k, 1, 1] += markers.variance[place] / max(out.value[k, 0] ** 2, 1e-6)
@@ -224,6 +224,8 @@ def _fate(
         return _OWN_MARKER
     if not cameras.present[robot]:
         return _NO_CAMERA
+    if not CONTENT_POSITION <= detections.content[k] <= CONTENT_POSE_TWO:
+        return _BAD_CONTENT
     position, sound = detections.position[k], True
     for i in range(3):
         sound = sound and math.isfinite(position[i])

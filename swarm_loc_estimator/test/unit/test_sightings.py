@@ -161,6 +161,7 @@ def broken(name: str, value: float, content: int = POSE_TWO) -> NDArray[np.void]
         (broken("alternative_orientation", math.nan), "non_finite"),
         (broken("alternative_position", math.nan), "non_finite"),
         (broken("position", 1e6), "absurd"),
+        *((broken("content", content), "bad_content") for content in (0, 4, 7, 255)),
     ],
 )
 def test_what_cannot_be_used_is_dropped_with_a_reason(one: NDArray[np.void], reason: str) -> None:
