@@ -57,7 +57,6 @@ class SwarmState:
         heard_robot: (N, places) whom each has heard; -1: nobody.
         heard_ns: (N, places) when last.
         heard: (N, places, 3, 3) what was told, see `core/repetition.py`.
-        losses: (N,) how often the robot left the estimate.
         clues: Per robot that is not tracked, sightings which may locate it (see `core/fix.py`).
         next_attempt_ns: (N,) before this instant nothing more is made of its clues.
     """
@@ -77,7 +76,6 @@ class SwarmState:
         self.fresh: NDArray[np.bool_] = np.ones(robots, dtype=bool)
         self.last_fix_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
         self.gated_in_a_row: NDArray[np.int64] = np.zeros(robots, dtype=np.int64)
-        self.losses: NDArray[np.int64] = np.zeros(robots, dtype=np.int64)
         self.heard_robot: NDArray[np.int64] = np.full((robots, places), -1)
         self.heard_ns: NDArray[np.int64] = np.full((robots, places), NEVER_NS)
         self.heard: FloatArray = np.zeros((robots, places, 3, 3))
@@ -153,7 +151,6 @@ class SwarmState:
         self._forget_heard(robot)
         self.tracked[robot] = False
         self.fresh[robot] = False
-        self.losses[robot] += 1
         self.gated_in_a_row[robot] = 0
 
     def _forget_heard(self, robot: int) -> None:
