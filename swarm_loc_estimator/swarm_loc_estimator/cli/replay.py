@@ -16,8 +16,9 @@ import argparse
 import csv
 import sys
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -72,16 +73,17 @@ def swarm_beside(bag: Path) -> Path:
 
 def read_settings(pairs: Sequence[str]) -> EstimatorSettings:
     """Settings from texts such as `horizon_s=1.0`; raises SettingsError."""
-    known = [f.name for f in fields(EstimatorSettings)]
-    values = {}
+    kind_of = {name: type(value) for name, value in asdict(EstimatorSettings()).items()}
+    values: dict[str, Any] = {}
     for pair in pairs:
         name, _, text = pair.partition("=")
-        if name not in known:
-            raise SettingsError(f"--set {pair}: '{name}' is no setting; there are {', '.join(known)}.")
+        if name not in kind_of:
+            raise SettingsError(f"--set {pair}: '{name}' is no setting; there are {', '.join(kind_of)}.")
         try:
-            values[name] = float(text)
+            values[name] = kind_of[name](text)
         except ValueError:
-            raise SettingsError(f"--set {pair}: '{text}' is not a number.") from None
+            wanted = "whole number" if kind_of[name] is int else "number"
+            raise SettingsError(f"--set {pair}: '{text}' is not a {wanted}.") from None
     return EstimatorSettings(**values)
 
 

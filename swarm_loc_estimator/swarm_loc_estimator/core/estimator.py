@@ -7,14 +7,14 @@ from collections import Counter
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from swarm_loc_estimator.core.arrivals import Arrivals, FixRows, Messages, OdometryRows, joined
+from swarm_loc_estimator.core.arrivals import Arrivals, Messages, OdometryRows, joined
 from swarm_loc_estimator.core.brightness_sightings import BrightnessConverter
 from swarm_loc_estimator.core.fusion import Fusion, Verdict
 from swarm_loc_estimator.core.learned import learned
 from swarm_loc_estimator.core.measurements import Kind, MeasurementArray
 from swarm_loc_estimator.core.odometry import OdometryTracks
 from swarm_loc_estimator.core.readout import Status, SwarmEstimate, read_out
-from swarm_loc_estimator.core.screening import Screening, about_robots
+from swarm_loc_estimator.core.screening import FAULTS, Screening, about_robots, faults_of
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.settings import EstimatorSettings
 from swarm_loc_estimator.core.swarm import Swarm
@@ -82,21 +82,21 @@ class SwarmEstimator:
             self._timeline.add(change.added)
             self._timeline.withdraw(change.withdrawn)
 
-    def add_fix(self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike, now_ns: int) -> None:
-        """Take in an absolute fix: pose (3,) in `map`, heading NaN if not measured, and covariance (3, 3)."""
-        fix = FixRows(
-            robot=np.array([robot]),
-            stamp_ns=np.array([stamp_ns]),
-            pose=np.array([pose], dtype=float),
-            covariance=np.array([covariance], dtype=float),
-            arrival_ns=np.array([now_ns]),
-        )
-        self.receive(Messages(now_ns, now_ns, fixes=fix))
+    def seat(self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike) -> str:
+        """Set a robot to a pose (3,) in `map` with covariance (3, 3), whatever was believed.
 
-    def seat(self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike) -> None:
-        """Set a robot to a pose (3,) in `map` with covariance (3, 3), whatever was believed."""
+        Returns:
+            Why that cannot be, a reason of `drops`: "untied" before its odometry; "" when it is done.
+        """
+        if self._odometry:
+            self._use_odometry()
         seat = about_robots(robot, stamp_ns, np.array([pose]), np.array([covariance]), Kind.SEAT)
-        self._timeline.add(seat[self._screening.sound(seat)])
+        fault = FAULTS[faults_of(seat)[0]] or ("" if self._tracks.begun(robot, stamp_ns) else "untied")
+        if fault:
+            self.drop(fault)
+        else:
+            self._timeline.add(seat)
+        return fault
 
     def forget(self, robot: int, stamp_ns: int) -> None:
         """Take a robot out of the estimate; it waits for a fix."""
@@ -121,11 +121,11 @@ class SwarmEstimator:
     @property
     def counters(self) -> dict[str, int]:
         """What was used since the last reset, by name."""
-        exchanges = self._brightness.measured
-        return {
-            "measurements used": self.used,
-            **({"infrared exchanges measured": exchanges} if exchanges else {}),
+        others = {
+            "clues kept": int(self._timeline.verdict_counts()[Verdict.CLUE]),
+            "infrared exchanges measured": self._brightness.measured,
         }
+        return {"measurements used": self.used} | {name: count for name, count in others.items() if count}
 
     def recent(self) -> tuple[MeasurementArray, NDArray[np.uint8], FloatArray]:
         """The measurements within the horizon, their verdicts and normalised innovations squared."""

@@ -42,7 +42,7 @@ class ClueBook:
         self._window_ns = int(window_s * 1e9)
 
     def note(self, state: SwarmState, one: MeasurementArray) -> bool:
-        """Keep a measurement (1,) that ties a waiting robot to something located; with a fix it enters.
+        """Keep a measurement (1,) that ties a waiting robot to something located; enough of them locate it.
 
         Returns:
             Whether the measurement does so.

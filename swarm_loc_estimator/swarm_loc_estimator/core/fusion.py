@@ -45,7 +45,7 @@ class Fusion:
 
     def __init__(self, swarm: Swarm, settings: EstimatorSettings, tracks: OdometryTracks) -> None:
         self._tracks = tracks
-        self._limits = (settings.lost_sigma, settings.lost_heading_sigma, int(settings.lost_after))
+        self._limits = (settings.lost_sigma, settings.lost_heading_sigma, settings.lost_after)
         self._together = settings.fusion_period_s > 0.0
         self._starts = {
             i: (

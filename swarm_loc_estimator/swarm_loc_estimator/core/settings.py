@@ -42,8 +42,8 @@ class EstimatorSettings:
     jump_back_s: float = number(
         0.5, "s", 0.0, 3600.0, "a clock that goes back by more than this resets the filter"
     )
-    lost_after: float = number(
-        12.0, "1", 2.0, 1e6, "so many gated measurements in a row and the robot counts as lost"
+    lost_after: int = number(
+        12, "1", 2, 1_000_000, "so many gated measurements in a row and the robot counts as lost"
     )
     lost_sigma: float = number(
         1.0, "m", 0.01, 1e3, "a position less sure than this and the robot counts as lost"

@@ -10,6 +10,7 @@ Services: `~/reset`, `~/set_robot_pose`. Parameters: see `estimator_parameters.p
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -39,7 +40,7 @@ from swarm_loc_estimator.nodes.estimator_outputs import EstimateOutputs
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
 from swarm_loc_estimator.nodes.fusion_pace import FusionPace
 from swarm_loc_estimator.nodes.running import run_node, spin
-from swarm_loc_estimator.nodes.seating import SeatRequestError, planar_seat
+from swarm_loc_estimator.nodes.seating import REFUSALS, SeatRequestError, planar_seat
 from swarm_loc_estimator.nodes.warm_up import warm_up
 from swarm_loc_msgs.msg import BrightnessMatrix, MarkerDetectionArray
 from swarm_loc_msgs.srv import SetRobotPose
@@ -114,6 +115,7 @@ class EstimatorNode(Node):
         self._clock_runs = False
         self._has_said_missing = False
         self._known_drops: dict[str, int] = {}
+        self._told_drops_s = -math.inf
         self._offer_services()
         self._subscribe()
         self._start_timers()
@@ -197,7 +199,7 @@ class EstimatorNode(Node):
             if load.warning:
                 self.get_logger().warning(load.message, throttle_duration_sec=_THROTTLE_S)
             reports = self._estimate_reports(load)
-            self._warn_of_drops()
+            self._warn_of_drops(now_s)
         self._say_what_is_missing(now_s)
         self._publish_diagnostics(reports)
 
@@ -212,14 +214,14 @@ class EstimatorNode(Node):
         whole.values.update({name: str(count) for name, count in self._estimator.counters.items()})
         return [*robots, merged([whole, load], "estimator")]
 
-    def _warn_of_drops(self) -> None:
-        """Tell of data that is dropped for being wrong."""
+    def _warn_of_drops(self, now_s: float) -> None:
+        """Tell of data that is dropped for being wrong, not too often; what is not told now is told later."""
         drops = self._estimator.drops
         wrong = {reason: count for reason, count in drops.items() if reason not in _ORDINARY_DROPS}
-        if wrong != self._known_drops:
-            self._known_drops = wrong
+        if wrong != self._known_drops and now_s >= self._told_drops_s + _THROTTLE_S:
+            self._known_drops, self._told_drops_s = wrong, now_s
             words = ", ".join(f"{count} {reason}" for reason, count in wrong.items())
-            self.get_logger().warning(f"dropped so far: {words}", throttle_duration_sec=_THROTTLE_S)
+            self.get_logger().warning(f"dropped so far: {words}")
 
     def _say_what_is_missing(self, now_s: float) -> None:
         """Name what is waited for, after a while and once: first the clock, then the topics."""
@@ -258,6 +260,7 @@ class EstimatorNode(Node):
         )
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._estimator.drop("reset", len(self._backlog))
         self._backlog.clear()
         self._estimator.reset()
         response.success, response.message = True, "All robots begin anew at their configured starts."
@@ -287,7 +290,9 @@ class EstimatorNode(Node):
             self._estimator.forget(robot, now_ns)
             return f"Robot '{request.robot}' waits for a fix."
         pose, covariance = planar_seat(request.pose, self._swarm.robots[robot].start_sigma)
-        self._estimator.seat(robot, now_ns, pose, covariance)
+        fault = self._estimator.seat(robot, now_ns, pose, covariance)
+        if fault:
+            raise SeatRequestError(REFUSALS[fault])
         x, y, theta = pose
         return f"Robot '{request.robot}' is at x {x:.3f} m, y {y:.3f} m, theta {theta:.3f} rad."
 

@@ -13,6 +13,15 @@ from swarm_loc_estimator.core.swarm import StartSigma
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 
 
+REFUSALS = {
+    "absurd": "the pose must lie within 1000 km of the origin.",
+    "bad_covariance": "the covariance of x, y and yaw must be positive definite, with variances of 1e-14 to"
+    " 1e14, or zero for the default.",
+    "untied": "the robot has sent no odometry yet.",
+}
+"""What the estimator's reasons not to seat a robot mean, each a sentence."""
+
+
 class SeatRequestError(ValueError):
     """A pose that a robot cannot be set to; the message is one sentence."""
 
@@ -25,18 +34,14 @@ def planar_seat(pose: PoseWithCovariance, start_sigma: StartSigma) -> tuple[Floa
         start_sigma: Taken when the covariance was left at zero.
 
     Raises:
-        SeatRequestError: Numbers that are not finite, no quaternion, or no covariance.
+        SeatRequestError: Numbers that are not finite, or no quaternion.
     """
     position, q = pose.pose.position, pose.pose.orientation
     sine, cosine = 2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z
     planar = np.array([position.x, position.y, math.atan2(sine, cosine)])
-    if not np.isfinite(planar).all() or not (sine or cosine):
-        raise SeatRequestError("the pose must be finite numbers and a quaternion that is not zero.")
     covariance = np.array(pose.covariance, dtype=float).reshape(6, 6)[_PLANAR]
+    if not (np.isfinite(planar).all() and np.isfinite(covariance).all() and (sine or cosine)):
+        raise SeatRequestError("pose and covariance must be finite numbers, and the quaternion not zero.")
     if not covariance.any():
         covariance = np.diag([start_sigma.x**2, start_sigma.y**2, start_sigma.theta**2])
-    if not np.isfinite(covariance).all() or np.linalg.eigvalsh(0.5 * (covariance + covariance.T))[0] <= 0.0:
-        raise SeatRequestError(
-            "the covariance of x, y and yaw must be positive definite, or zero for the default."
-        )
     return planar, 0.5 * (covariance + covariance.T)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -166,6 +167,57 @@ def test_services_reset_seat_and_forget(ros: Ros, robots: Robots) -> None:
     assert ros.call(Trigger, "estimator/reset", Trigger.Request()).success
     robots.step(now_ns + STEP_NS)
     assert robots.newest("alpha").x == pytest.approx(0.0, abs=0.03)
+
+
+def test_a_seat_that_cannot_be_taken_is_refused_in_a_sentence(ros: Ros, robots: Robots) -> None:
+    robots.tell_time(T0_NS)
+    ros.until(lambda: robots.poses)
+    name, seat = "estimator/set_robot_pose", SetRobotPose.Request(robot="alpha")
+    response = ros.call(SetRobotPose, name, seat)
+    assert (response.success, response.message) == (
+        False,
+        "Nothing was changed: the robot has sent no odometry yet.",
+    )
+    robots.run(T0_NS + STEP_NS, 2)
+    seat.pose.pose.position.x = 2e6
+    response = ros.call(SetRobotPose, name, seat)
+    assert not response.success
+    assert "within 1000 km" in response.message
+    seat.pose.pose.position.x = np.nan
+    response = ros.call(SetRobotPose, name, seat)
+    assert not response.success
+    assert "finite" in response.message
+    assert robots.located("alpha")
+
+
+def test_a_reset_counts_what_had_not_been_read_yet(ros: Ros, robots: Robots, node: EstimatorNode) -> None:
+    heard = ros.listen(DiagnosticArray, "/diagnostics")
+    for step in range(3):
+        robots.odometry("alpha", odometry_bytes("alpha", T0_NS + step))
+    ros.until(lambda: len(node._backlog) == 3)
+    assert ros.call(Trigger, "estimator/reset", Trigger.Request()).success
+    robots.tell_time(T0_NS + STEP_NS)
+    ros.until(lambda: heard and "dropped: reset" in report(heard, "estimator")[1])
+    assert report(heard, "estimator")[1]["dropped: reset"] == "3"
+
+
+def test_drops_of_a_second_kind_are_told_once_the_throttle_allows(
+    ros: Ros, swarm_file: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: Any = StandIn()
+    node = ros.add(EstimatorNode(lambda *_: told, parameter_overrides=overrides(swarm_file=str(swarm_file))))
+    lines: list[str] = []
+    monkeypatch.setattr(node, "get_logger", lambda: SimpleNamespace(warning=lines.append))
+    for now_s, drops in (
+        (0.0, {"absurd": 3}),
+        (1.0, {"absurd": 3, "non_finite": 40}),
+        (29.0, {"absurd": 3, "non_finite": 40}),
+        (31.0, {"absurd": 3, "non_finite": 40}),
+        (90.0, {"absurd": 3, "non_finite": 40, "gated": 7}),
+    ):
+        told.drops = drops
+        node._warn_of_drops(now_s)
+    assert lines == ["dropped so far: 3 absurd", "dropped so far: 3 absurd, 40 non_finite"]
 
 
 def test_diagnostics_name_what_is_missing_and_why(ros: Ros, swarm_file: Any) -> None:

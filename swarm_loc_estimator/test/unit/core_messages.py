@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from swarm_loc_estimator.core.arrivals import DetectionRows, Messages, OdometryRows
+from swarm_loc_estimator.core.arrivals import DetectionRows, FixRows, Messages, OdometryRows
 from swarm_loc_estimator.core.estimator import SwarmEstimator
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
@@ -35,6 +35,20 @@ def joined(detections: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
         b"".join(one.tobytes() for one in detections), dtype=DETECTION_DTYPE
     ).copy()
     return together
+
+
+def give_fix(
+    estimator: SwarmEstimator, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike, now_ns: int
+) -> None:
+    """Hand in an absolute fix: pose (3,) in `map`, heading NaN if not measured, and covariance (3, 3)."""
+    fix = FixRows(
+        robot=np.array([robot]),
+        stamp_ns=np.array([stamp_ns]),
+        pose=np.array([pose], dtype=float),
+        covariance=np.array([covariance], dtype=float),
+        arrival_ns=np.array([now_ns]),
+    )
+    estimator.receive(Messages(now_ns, now_ns, fixes=fix))
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from core_geometry import marker_frame, seen, wrapped
-from core_messages import POSE, POSE_TWO, POSITION, SECOND, T0, Event, detection, joined
+from core_messages import POSE, POSE_TWO, POSITION, SECOND, T0, Event, detection, give_fix, joined
 from core_run import on_time, play, settled, ticks
 from core_world import MOUNT, ODOMETRY, Plan, World, simulate
 from hypothesis import example, given, settings
@@ -59,7 +59,7 @@ def assert_same(a: Outcome, b: Outcome) -> None:
     fusion_period_s=st.sampled_from([0.0, 0.2, 0.5]),
     state_period_s=st.sampled_from([0.0, 0.0, 0.13]),
     outliers=st.sampled_from([0.0, 0.1, 0.6]),
-    lost_after=st.sampled_from([2.0, 12.0]),
+    lost_after=st.sampled_from([2, 12]),
     late_s=st.sampled_from([0.3, 1.0, 1.9]),
     lasting=st.sampled_from([0.0, 1.0]),
 )
@@ -71,7 +71,7 @@ def assert_same(a: Outcome, b: Outcome) -> None:
     fusion_period_s=0.0,
     state_period_s=0.13,
     outliers=0.0,
-    lost_after=2.0,
+    lost_after=2,
     late_s=1.9,
     lasting=0.0,
 )
@@ -83,7 +83,7 @@ def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
     fusion_period_s: float,
     state_period_s: float,
     outliers: float,
-    lost_after: float,
+    lost_after: int,
     late_s: float,
     lasting: float,
 ) -> None:
@@ -226,7 +226,7 @@ def _give_order(estimator: SwarmEstimator, number: int) -> None:
     """A seat, or a fix at the same instant."""
     pose, covariance = np.array([0.0, 0.1, 0.2]), 1e-4 * np.eye(3)
     if number:
-        estimator.add_fix(0, T0 + SECOND, pose, covariance, T0 + SECOND)
+        give_fix(estimator, 0, T0 + SECOND, pose, covariance, T0 + SECOND)
     else:
         estimator.seat(0, T0 + SECOND, pose, covariance)
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from core_geometry import marker_frame, nees, seen
-from core_messages import POSE, POSE_TWO, POSITION, SECOND, T0, Event, detection, joined
+from core_messages import POSE, POSE_TWO, POSITION, SECOND, T0, Event, detection, give_fix, joined
 from core_run import on_time, play, settled, ticks
 from core_world import MOUNT, Plan, World, simulate
 from numpy.typing import NDArray
@@ -122,11 +122,22 @@ def test_seats_and_fixes_are_checked(
     play(estimator, on_time(run), ticks(T0, END))
     before = estimator.drops.get(reason, 0)
     if order == "seat":
-        estimator.seat(0, END, pose, covariance)
+        assert estimator.seat(0, END, pose, covariance) == reason
     else:
-        estimator.add_fix(0, END, pose, covariance, END)
+        give_fix(estimator, 0, END, pose, covariance, END)
     assert_sound(estimator.tick(END))
     assert estimator.drops[reason] == before + 1
+
+
+def test_a_robot_is_seated_from_its_first_odometry_on_and_before_that_refused() -> None:
+    estimator = SwarmEstimator(world().swarm)
+    assert estimator.seat(0, T0, GOOD, 1e-4 * np.eye(3)) == "untied"
+    assert estimator.tick(T0).status[0] == Status.WAITING
+    assert estimator.drops == {"untied": 1}
+    Event(0, T0 + 1, (0.0, 0.0, 0.0)).give(estimator, T0 + 1)
+    assert not estimator.seat(0, T0 + 1, GOOD, 1e-4 * np.eye(3))
+    np.testing.assert_allclose(estimator.tick(T0 + 1).poses[0], GOOD, atol=1e-12)
+    assert estimator.drops == {"untied": 1}
 
 
 def test_an_ancient_first_odometry_does_not_poison_the_track() -> None:
@@ -183,11 +194,13 @@ def test_precise_sightings_during_a_silence_keep_the_covariance_positive(turn_ra
         assert_sound(estimator.tick(now_ns))
 
 
-@pytest.mark.parametrize("setting", [{"state_period_s": 0.5}, {"state_period_s": 1.0}])
-def test_poses_before_the_newest_measurement_have_sound_covariances(setting: dict[str, float]) -> None:
+@pytest.mark.parametrize("state_period_s", [0.5, 1.0])
+def test_poses_before_the_newest_measurement_have_sound_covariances(state_period_s: float) -> None:
     run = simulate(Plan(2, 4.0, speed=0.5), 2)
     for estimate in play(
-        SwarmEstimator(run.swarm, EstimatorSettings(**setting)), on_time(run), ticks(T0, END, 0.05)
+        SwarmEstimator(run.swarm, EstimatorSettings(state_period_s=state_period_s)),
+        on_time(run),
+        ticks(T0, END, 0.05),
     ):
         assert_sound(estimate)
 
@@ -242,6 +255,18 @@ def test_data_from_before_the_jump_are_from_the_future_after_it() -> None:
     Event(0, END, (0.0, 0.0, 0.0)).give(estimator, T0)
     Event(0, END, None, spoiled("position", 0.0)).give(estimator, T0)
     assert estimator.drops["future_stamp"] == 2
+
+
+@pytest.mark.parametrize(("ahead_ns", "drops"), [(90_000_000, {}), (110_000_000, {"future_stamp": 2})])
+def test_a_stamp_may_be_ahead_of_the_clock_by_its_tolerance(ahead_ns: int, drops: dict[str, int]) -> None:
+    estimator = SwarmEstimator(world().swarm, EstimatorSettings(future_tolerance_s=0.1))
+    estimator.tick(T0)
+    Event(0, T0 + ahead_ns, (0.0, 0.0, 0.0)).give(estimator, T0)
+    Event(0, T0 + ahead_ns, None, detection(1000, marker_frame(0.0, 0.0, 1.0, 0.0))).give(estimator, T0)
+    estimator.tick(T0 + ahead_ns)
+    assert estimator.drops.get("future_stamp", 0) == drops.get("future_stamp", 0)
+    assert sum(settled(estimator).values()) == (0 if drops else 1)
+    assert bool(estimator._tracks.arrays.filled[0]) == (not drops)
 
 
 def test_an_estimator_started_in_the_middle_finds_everybody() -> None:

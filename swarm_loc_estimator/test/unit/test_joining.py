@@ -7,13 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from core_geometry import marker_frame, nees, seen
-from core_messages import POSE, POSE_TWO, POSITION, SECOND, T0, Event, detection
+from core_messages import POSE, POSE_TWO, POSITION, SECOND, T0, Event, detection, give_fix
 from core_run import on_time, play, settled, ticks
 from core_world import MOUNT, Plan, World, simulate
 from scipy.spatial.transform import Rotation
 
+from swarm_loc_estimator.core import fusion
 from swarm_loc_estimator.core.estimator import Status, SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.core.measurements import Kind
+from swarm_loc_estimator.core.odometry import OdometryTracks
+from swarm_loc_estimator.core.screening import about_robots
 from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.settings import EstimatorSettings
+from swarm_loc_estimator.core.swarm import Robot, Swarm
 
 
 def errors(world: World, estimates: list[SwarmEstimate]) -> FloatArray:
@@ -120,6 +126,46 @@ def test_a_filter_that_locks_good_measurements_out_notices() -> None:
     assert errors(world, estimates)[-1, 0] < 0.05
 
 
+@pytest.mark.parametrize("many", [64, 1])
+@pytest.mark.parametrize(
+    ("lost_sigma", "lost_heading_sigma", "is_lost"),
+    [(1e3, 10.0, False), (0.05, 10.0, True), (1e3, 0.2, True)],
+)
+def test_a_robot_too_unsure_after_a_silence_waits_and_is_found_again(
+    lost_sigma: float, lost_heading_sigma: float, is_lost: bool, many: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fusion, "_MANY", many)
+    world, silent_ns, heard_ns = simulate(Plan(1, 8.0), 1), T0 + 2 * SECOND, T0 + 7 * SECOND // 2
+    limits = EstimatorSettings(lost_sigma=lost_sigma, lost_heading_sigma=lost_heading_sigma)
+    arrivals = [(t, e) for t, e in on_time(world) if not silent_ns < t < heard_ns]
+    estimates = play(SwarmEstimator(world.swarm, limits), arrivals, ticks(T0, T0 + 8 * SECOND))
+    before = [e.status[0] for e in estimates if e.stamp_ns < heard_ns]
+    after = [e.status[0] for e in estimates if e.stamp_ns >= heard_ns]
+    assert Status.WAITING not in before
+    assert (Status.WAITING in after) == is_lost
+    assert after[-1] == Status.TRACKED
+    assert errors(world, estimates)[-1, 0] < 0.05
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_robot_unsure_at_one_of_many_measurements_is_lost_in_whatever_order_they_come(
+    order: tuple[int, int],
+) -> None:
+    """Far from the origin of its track an unsure heading makes for an unsure place."""
+    swarm = Swarm((Robot("a"),))
+    tracks = OdometryTracks(swarm.robots)
+    stamps_ns = T0 + np.array([0, SECOND // 10])
+    tracks.extend(np.zeros(2, dtype=np.int64), stamps_ns, np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]))
+    limits = EstimatorSettings(lost_sigma=0.05, lost_heading_sigma=10.0)
+    steps = fusion.Fusion(swarm, limits, tracks)
+    state = steps.new_state()
+    state.enter(0, np.zeros(3), np.diag([1e-6, 1e-6, 1.0]), np.zeros((2, 3, 3)), T0)
+    fixes = about_robots(0, stamps_ns, np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), Kind.CARTESIAN)
+    _, _, lost = steps._advance(state, fixes[list(order)])
+    assert lost.tolist() == [True, False]
+    assert not state.tracked[0]
+
+
 def test_a_robot_silent_for_a_minute_comes_back() -> None:
     world = simulate(Plan(2, 70.0, camera_hz=1.0), 2)
     begin_ns, end_ns = T0 + 5 * SECOND, T0 + 65 * SECOND
@@ -146,13 +192,26 @@ def test_an_operator_seats_and_forgets_a_robot() -> None:
     estimator = SwarmEstimator(world.swarm)
     play(estimator, on_time(world), ticks(T0, T0 + 3 * SECOND))
     stamp_ns = T0 + 2 * SECOND
-    estimator.seat(0, stamp_ns, world.at(stamp_ns)[0], np.diag([1e-6, 1e-6, 1e-6]))
+    assert not estimator.seat(0, stamp_ns, world.at(stamp_ns)[0], np.diag([1e-6, 1e-6, 1e-6]))
     rest = [arrival for arrival in on_time(world) if arrival[0] > T0 + 3 * SECOND]
     last = play(estimator, rest, ticks(T0 + 3 * SECOND, T0 + 4 * SECOND))[-1]
     assert errors(world, [last])[0, 0] < 0.02
     estimator.forget(0, T0 + 4 * SECOND)
     assert estimator.tick(T0 + 4 * SECOND).status[0] == Status.WAITING
     assert estimator.tick(T0 + 5 * SECOND).status[0] == Status.WAITING
+
+
+def test_a_robot_that_waits_enters_with_the_third_exact_fix_and_the_clues_before_are_counted() -> None:
+    world = simulate(Plan(1, 4.0, landmarks=0, start_known=(False,)), 5)
+    estimator, status = SwarmEstimator(world.swarm), []
+    for stamp_ns, event in on_time(world):
+        event.give(estimator, stamp_ns)
+        if (stamp_ns - T0) % SECOND == 0:
+            give_fix(estimator, 0, stamp_ns, world.at(stamp_ns)[0], 1e-6 * np.eye(3), stamp_ns)
+            status.append((estimator.tick(stamp_ns).status[0], *estimator.counters.values()))
+    waiting, tracked = Status.WAITING, Status.TRACKED
+    assert status == [(waiting, 0, 1), (waiting, 0, 2), (tracked, 0, 3), (tracked, 1, 3), (tracked, 2, 3)]
+    assert not estimator.drops
 
 
 def test_fixes_from_outside_locate_and_hold_a_robot() -> None:
@@ -164,7 +223,7 @@ def test_fixes_from_outside_locate_and_hold_a_robot() -> None:
         event.give(estimator, stamp_ns)
         pose = world.at(stamp_ns)[0] + 0.01 * rng.standard_normal(3)
         pose[2] = math.nan if rng.uniform() < 0.5 else pose[2]
-        estimator.add_fix(0, stamp_ns, pose, 1e-4 * np.eye(3), stamp_ns)
+        give_fix(estimator, 0, stamp_ns, pose, 1e-4 * np.eye(3), stamp_ns)
         estimates.append(estimator.tick(stamp_ns))
     assert estimates[-1].fix_age_s[0] == 0.0
     last = estimates[-1].poses[0] - world.at(estimates[-1].stamp_ns)[0]

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.core.settings import EstimatorSettings
+from swarm_loc_estimator.cli.replay import read_settings
+from swarm_loc_estimator.core.settings import EstimatorSettings, SettingsError
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
 from swarm_loc_estimator.nodes.parameter_table import (
     ParameterError,
@@ -35,6 +36,24 @@ def test_defaults_make_the_default_object() -> None:
 def test_every_setting_of_the_estimator_is_a_parameter() -> None:
     names = {spec.name for spec in parameter_specs(EstimatorParameters)}
     assert {field.name for field in fields(EstimatorSettings)} <= names
+
+
+def test_settings_from_texts_are_whole_numbers_where_the_setting_is_one() -> None:
+    read = read_settings(["horizon_s=3", "lost_after=5"])
+    assert (read.horizon_s, type(read.horizon_s), read.lost_after, type(read.lost_after)) == (
+        3.0,
+        float,
+        5,
+        int,
+    )
+    with pytest.raises(SettingsError, match=r"--set lost_after=2\.9: '2\.9' is not a whole number"):
+        read_settings(["lost_after=2.9"])
+    with pytest.raises(SettingsError, match="--set horizon_s=x: 'x' is not a number"):
+        read_settings(["horizon_s=x"])
+    with pytest.raises(SettingsError, match="'nothing' is no setting"):
+        read_settings(["nothing=1"])
+    with pytest.raises(ParameterError, match=r"lost_after = 2\.9 must be a whole number"):
+        spec_of(EstimatorParameters, "lost_after").checked(2.9)
 
 
 def spec_of(cls: type, name: str) -> ParameterSpec:
