@@ -233,24 +233,11 @@ def judge(
 
     Of a planar marker's two solutions the likelier counts. Arguments as of `judge_all`, for one.
     """
-    observer, bodies = measurements.observer[k], _body_columns(measurements, k, belief)
+    bodies = _body_columns(measurements, k, belief)
+    camera, camera_columns = _camera(belief, measurements.observer[k])
     predicted, chain = np.empty(3), np.empty((3, 5))
-    camera, camera_columns = np.zeros(2), np.full(2, -1)
-    if observer >= 0:
-        camera[0] = belief.parameter[observer, CAMERA_YAW]
-        camera[1] = belief.parameter[observer, CAMERA_SCALE]
-        camera_columns[0] = belief.table.column[observer, CAMERA_YAW]
-        camera_columns[1] = belief.table.column[observer, CAMERA_SCALE]
     predict_one(measurements, k, pose[0], pose[1], camera, predicted, chain)
-    for j in range(3):  # columns of nobody do not matter: their Jacobian is zero
-        columns[j], columns[3 + j] = max(bodies[0], 0) + j, max(bodies[1], 0) + j
-        for i in range(3):
-            jacobian[i, j] = -chain[i, j] if bodies[0] >= 0 else 0.0
-            jacobian[i, 3 + j] = chain[i, j] if bodies[1] >= 0 else 0.0
-    for j in range(2):
-        columns[6 + j] = max(camera_columns[j], 0)
-        for i in range(3):
-            jacobian[i, 6 + j] = chain[i, 3 + j] if camera_columns[j] >= 0 else 0.0
+    _write_jacobian(chain, bodies, camera_columns, columns, jacobian)
     s = np.empty((3, 3))
     assign_matrix(noise, measurements.covariance[k])
     if measurements.stamp_variance[k] > 0.0:
@@ -275,6 +262,41 @@ def judge(
                 s[2, i] = s[i, 2]
     widen(measurements, k, belief, variances, noise)
     return passed, squared_distance(difference, s)
+
+
+@compiled
+def _camera(belief: BeliefArrays, observer: int) -> tuple[FloatArray, IndexArray]:
+    """Yaw and scale (2,) of an observer's camera, and their columns (2,); -1: has none."""
+    camera, columns = np.zeros(2), np.full(2, -1)
+    if observer >= 0:
+        camera[0] = belief.parameter[observer, CAMERA_YAW]
+        camera[1] = belief.parameter[observer, CAMERA_SCALE]
+        columns[0] = belief.table.column[observer, CAMERA_YAW]
+        columns[1] = belief.table.column[observer, CAMERA_SCALE]
+    return camera, columns
+
+
+@compiled
+def _write_jacobian(
+    chain: FloatArray,
+    bodies: tuple[int, int],
+    camera_columns: IndexArray,
+    columns: IndexArray,
+    jacobian: FloatArray,
+) -> None:
+    """Write the Jacobian of an innovation (3, DEPENDS_ON) by the state's columns (DEPENDS_ON,).
+
+    Columns of nobody do not matter: their Jacobian is zero.
+    """
+    for j in range(3):
+        columns[j], columns[3 + j] = max(bodies[0], 0) + j, max(bodies[1], 0) + j
+        for i in range(3):
+            jacobian[i, j] = -chain[i, j] if bodies[0] >= 0 else 0.0
+            jacobian[i, 3 + j] = chain[i, j] if bodies[1] >= 0 else 0.0
+    for j in range(2):
+        columns[6 + j] = max(camera_columns[j], 0)
+        for i in range(3):
+            jacobian[i, 6 + j] = chain[i, 3 + j] if camera_columns[j] >= 0 else 0.0
 
 
 @compiled
