@@ -12,6 +12,7 @@ from swarm_loc_drivers.sim.detections import as_detections
 from swarm_loc_estimator.core import se2
 from swarm_loc_estimator.core.arrivals import DetectionRows, Messages, OdometryRows, chosen
 from swarm_loc_estimator.core.estimator import SwarmEstimator
+from swarm_loc_estimator.core.metrics import nees
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -83,7 +84,6 @@ def position_rmse(errors: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.sum(errors[..., :2] ** 2, axis=-1))))
 
 
-def nees(errors: FloatArray, covariances: FloatArray) -> float:
-    """Mean normalised error squared; 3 is ideal."""
-    solved = np.linalg.solve(covariances, errors[..., None])[..., 0]
-    return float(np.mean(np.sum(errors * solved, axis=-1)))
+def mean_nees(errors: FloatArray, covariances: FloatArray) -> float:
+    """Mean normalised error squared of errors (..., 3) with covariances (..., 3, 3); 3 is ideal."""
+    return float(np.mean(nees(errors.reshape(-1, 3), covariances.reshape(-1, 3, 3))))

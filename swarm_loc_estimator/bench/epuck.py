@@ -29,7 +29,7 @@ import numpy as np
 from vision_bench import report as vision_report
 
 from bench._common import Cell, new_plot, save_plot, table, write_figures
-from bench._core import errors_of, nees, run_core
+from bench._core import errors_of, mean_nees, run_core
 from bench.epuck_rendered_report import rendered_worlds
 from bench.epuck_rendered_report import report as report_rendered
 from swarm_loc_drivers.sim.dense import DenseSettings, blind_robots, simulate_dense
@@ -201,7 +201,7 @@ def outcome(task: tuple[Case, int]) -> tuple[str, Outcome]:
     return case.name, Outcome(
         100.0 * float(np.mean(np.hypot(errors[:, 0], errors[:, 1]))),
         float(np.degrees(np.mean(np.abs(errors[:, 2])))),
-        nees(errors, covariances),
+        mean_nees(errors, covariances),
     )
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench._common import OUT, new_plot, save_plot, table, write_figures
-from bench._core import errors_of, nees, position_rmse, run_core
+from bench._core import errors_of, mean_nees, position_rmse, run_core
 from bench.peers import filterpy_ekf, gtsam_batch, gtsam_lag
 from swarm_loc_drivers.sim.bag import write_bag
 from swarm_loc_drivers.sim.grid import GridSettings, simulate_grid
@@ -55,7 +55,7 @@ def measure(robots: int, duration_s: float, seed: int, settings: EstimatorSettin
         "cpu_s_per_s": core.cpu_s / run.duration_s,
         "position_rmse_mm": 1e3 * position_rmse(errors),
         "heading_rmse_deg": float(np.degrees(np.sqrt(np.mean(errors[..., 2] ** 2)))),
-        "nees": nees(errors, core.covariances[settled]),
+        "nees": mean_nees(errors, core.covariances[settled]),
     }
     part = first_part(run, min(duration_s, max(2.0, PEER_ROBOT_SECONDS / robots)))
     for name, peer in (("filterpy", filterpy_ekf), ("gtsam", gtsam_lag)):

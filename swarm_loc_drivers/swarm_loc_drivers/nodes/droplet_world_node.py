@@ -24,7 +24,7 @@ from swarm_loc_drivers.sim.droplet_fixes import Fix, Tracker
 from swarm_loc_drivers.sim.droplet_world import STEP_NS, SimulatedDroplet
 from swarm_loc_drivers.sim.firmware.droplet_firmware import DropletFirmware
 from swarm_loc_drivers.sim.firmware.host import FirmwareHost
-from swarm_loc_estimator.io.messages import planar_covariance
+from swarm_loc_estimator.io.planar import planar_covariance
 from swarm_loc_estimator.nodes.declare import declare_parameters
 from swarm_loc_estimator.nodes.parameter_table import ParameterError
 from swarm_loc_estimator.nodes.running import Stop, run_node

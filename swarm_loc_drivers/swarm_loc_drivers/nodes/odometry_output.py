@@ -16,13 +16,13 @@ from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
 from swarm_loc_drivers.core.odometry_state import OdometryState
+from swarm_loc_estimator.io.planar import PLANE
 
 ODOMETRY_QOS = QoSProfile(depth=10)
 _TF_QOS = QoSProfile(depth=100)
 
 _FIXED_VARIANCE = 1e-9
 """Of what the plane fixes: z, roll, pitch; and the least of what a robot does not do."""
-_XYYAW = np.ix_((0, 1, 5), (0, 1, 5))
 
 
 def stamp_message(stamp_ns: int) -> TimeMessage:
@@ -45,8 +45,8 @@ def odometry_message(state: OdometryState, odom_frame: str, base_frame: str) -> 
     message.pose.pose.orientation = yaw_quaternion(yaw)
     twist.linear.x, twist.linear.y, twist.angular.z = (float(value) for value in state.twist)
     covariance, twist_covariance = np.eye(6) * _FIXED_VARIANCE, np.eye(6) * _FIXED_VARIANCE
-    covariance[_XYYAW] += state.covariance
-    twist_covariance[_XYYAW] += state.twist_covariance
+    covariance[PLANE] += state.covariance
+    twist_covariance[PLANE] += state.twist_covariance
     message.pose.covariance = covariance.ravel()
     message.twist.covariance = twist_covariance.ravel()
     return message

@@ -15,14 +15,16 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from swarm_loc_estimator.io.planar import PLANE, yaw_of
+
 Array = npt.NDArray[np.float64]
 
 ENCAPSULATION = 4
 """Bytes before the payload; alignment counts from behind them."""
 
-_MAX_PADDING = 7
+MAX_PADDING = 7
+"""Bytes that may come behind a message."""
 _NANOSECONDS = 1_000_000_000
-_COVARIANCE_XYYAW = np.array([[0, 1, 5], [6, 7, 11], [30, 31, 35]])
 
 
 class CdrError(ValueError):
@@ -152,7 +154,7 @@ class _Layout:
 
 
 _LAYOUTS = {b"\x00\x00": _Layout(">"), b"\x00\x01": _Layout("<")}
-_ODOMETRY_DOUBLES = 7 + 36 + 6 + 36
+ODOMETRY_DOUBLES = 7 + 36 + 6 + 36
 
 
 @lru_cache(maxsize=4096)
@@ -203,20 +205,19 @@ def _check_end(data: bytes, end: int) -> None:
     """Refuse a message that is too short for its type, or too long to be of it."""
     if len(data) < end:
         raise CdrError(f"cut off after {len(data)} of {end} bytes.")
-    if len(data) > end + _MAX_PADDING:
+    if len(data) > end + MAX_PADDING:
         raise CdrError(f"{len(data) - end} bytes more than the message has.")
 
 
 def _pose2(x: float, y: float, qx: float, qy: float, qz: float, qw: float) -> tuple[float, float, float]:
     """Planar pose; the quaternion need not be normalised."""
-    sine, cosine = 2.0 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz
-    return x, y, math.atan2(sine, cosine) if sine or cosine else math.nan
+    return x, y, yaw_of(qx, qy, qz, qw)
 
 
 def _planar_covariance(data: bytes, layout: _Layout, offset: int) -> Array:
     """3x3 over x, y, yaw of the 6x6 at an offset."""
     whole = np.frombuffer(data, layout.double, 36, offset)
-    return whole.take(_COVARIANCE_XYYAW).astype(np.float64, copy=False)
+    return whole.reshape(6, 6)[PLANE].astype(np.float64, copy=False)
 
 
 def decode_odometry(data: bytes) -> OdometryMessage:
@@ -232,7 +233,7 @@ def decode_odometry(data: bytes) -> OdometryMessage:
     stamp_ns, frame_id, offset = _header(data, layout)
     child_frame_id, offset = _string(data, layout, offset)
     offset += -(offset - ENCAPSULATION) % 8
-    _check_end(data, offset + 8 * _ODOMETRY_DOUBLES)
+    _check_end(data, offset + 8 * ODOMETRY_DOUBLES)
     x, y, _, qx, qy, qz, qw = layout.pose.unpack_from(data, offset)
     vx, vy, _, _, _, rate = layout.twist.unpack_from(data, offset + 8 * 43)
     covariance = _planar_covariance(data, layout, offset + 56)

@@ -13,7 +13,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from swarm_loc_estimator.io.cdr import DETECTION_DTYPE, DETECTION_GAP, DETECTION_PADDING, ENCAPSULATION
+from swarm_loc_estimator.io.cdr import (
+    DETECTION_DTYPE,
+    DETECTION_GAP,
+    DETECTION_PADDING,
+    ENCAPSULATION,
+    ODOMETRY_DOUBLES,
+)
+from swarm_loc_estimator.io.planar import PLANE, POSE_DOUBLES, planar_covariance, position_and_quaternion
 from swarm_loc_estimator.io.typestore import (
     BRIGHTNESS,
     DETECTION,
@@ -28,18 +35,8 @@ from swarm_loc_estimator.io.typestore import (
 Array = npt.NDArray[np.float64]
 
 _NANOSECONDS = 1_000_000_000
-POSE_DOUBLES = 7
-"""Numbers of a geometry_msgs/Pose: position and quaternion."""
-_PLANE = (0, 1, 5)
-"""Rows of x, y and yaw in a 6x6 covariance."""
-_ODOMETRY_DOUBLES = 7 + 36 + 6 + 36
 UNKNOWN_COVARIANCE = np.diag([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 """6x6; a negative first element says that the sender does not know (the convention of sensor_msgs)."""
-
-
-def planar_covariance(x: float, y: float, yaw: float) -> Array:
-    """6x6 covariance from three variances; what the plane fixes (z, roll, pitch) is all but certain."""
-    return np.diag([x, y, 1e-9, 1e-9, 1e-9, yaw])
 
 
 def encode_odometry(
@@ -67,12 +64,12 @@ def encode_odometry(
     """
     template = _odometry_template(frame_id, child_frame_id)
     rows = _stamped_rows(template, stamp_ns)
-    body = np.zeros((len(stamp_ns), _ODOMETRY_DOUBLES))
-    body[:, :7] = position_and_quaternion(pose)
+    body = np.zeros((len(stamp_ns), ODOMETRY_DOUBLES))
+    body[:, :POSE_DOUBLES] = position_and_quaternion(pose)
     body[:, 7:43] = covariance.reshape(36)
     body[:, [43, 44, 48]] = twist
     body[:, 49:] = twist_covariance.reshape(36)
-    rows[:, -8 * _ODOMETRY_DOUBLES :] = body.view(np.uint8)
+    rows[:, -8 * ODOMETRY_DOUBLES :] = body.view(np.uint8)
     return _split(rows)
 
 
@@ -107,7 +104,7 @@ def encode_fix(frame_id: str, stamp_ns: int, pose: npt.ArrayLike, covariance: np
         covariance: (3, 3) of it.
     """
     types, whole = typestore().types, planar_covariance(0.0, 0.0, 0.0)
-    whole[np.ix_(_PLANE, _PLANE)] = covariance
+    whole[PLANE] = covariance
     place = _pose(position_and_quaternion(np.asarray(pose, dtype=float)[None])[0])
     body = types["geometry_msgs/msg/PoseWithCovariance"](place, whole.reshape(36))
     return encode(types[POSE_WITH_COVARIANCE](_header(frame_id, stamp_ns), body), POSE_WITH_COVARIANCE)
@@ -156,15 +153,6 @@ def _stamped_rows(template: bytes, stamp_ns: npt.NDArray[np.int64]) -> npt.NDArr
     stamp[:, 0], stamp[:, 1] = np.divmod(stamp_ns, _NANOSECONDS)
     rows[:, ENCAPSULATION : ENCAPSULATION + 8] = stamp.view(np.uint8)
     return rows
-
-
-def position_and_quaternion(poses: Array) -> Array:
-    """(N, 7) x, y, z [m] and quaternion x, y, z, w of planar poses (N, 3)."""
-    columns = np.zeros((len(poses), POSE_DOUBLES))
-    columns[:, :2] = poses[:, :2]
-    columns[:, 5] = np.sin(poses[:, 2] / 2.0)
-    columns[:, 6] = np.cos(poses[:, 2] / 2.0)
-    return columns
 
 
 def _split(rows: npt.NDArray[np.uint8]) -> list[bytes]:

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.io.messages import POSE_DOUBLES, planar_covariance, position_and_quaternion
+from swarm_loc_estimator.io.planar import PLANE, POSE_DOUBLES, planar_covariance, position_and_quaternion
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"
 _NANOSECONDS = 1_000_000_000
 _STAMP_SIZE = 8
-_XYYAW = (0, 1, 5)
-_PLANAR = [6 * row + column for row in _XYYAW for column in _XYYAW]
+_COVARIANCE = POSE_DOUBLES + np.arange(36).reshape(6, 6)[PLANE].ravel()
+"""Where a planar covariance stands behind a pose."""
 
 Bytes = NDArray[np.uint8]
 
@@ -141,7 +141,7 @@ class PoseEncoder:
         numbers = np.zeros((len(poses), POSE_DOUBLES + 36))
         numbers[:, :POSE_DOUBLES] = position_and_quaternion(poses)
         numbers[:, POSE_DOUBLES:] = self._plane
-        numbers[:, [POSE_DOUBLES + place for place in _PLANAR]] = covariances.reshape(-1, 9)
+        numbers[:, _COVARIANCE] = covariances.reshape(-1, 9)
         rows[:, self._start :] = _as_bytes(numbers)
         length, joined = rows.shape[1], rows.tobytes()
         return [joined[begin : begin + length] for begin in range(0, len(joined), length)]

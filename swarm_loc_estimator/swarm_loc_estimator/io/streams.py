@@ -8,7 +8,6 @@ how many robots one process can listen to and how fast a bag replays.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
@@ -21,6 +20,7 @@ from swarm_loc_estimator.io.cdr import (
     DETECTION_DTYPE,
     DETECTION_GAP,
     ENCAPSULATION,
+    MAX_PADDING,
     BrightnessMessage,
     CdrError,
     DetectionArrayMessage,
@@ -30,6 +30,7 @@ from swarm_loc_estimator.io.cdr import (
     decode_detections,
 )
 from swarm_loc_estimator.io.message_batch import MessageBatch
+from swarm_loc_estimator.io.planar import yaw_of
 
 IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
@@ -42,7 +43,6 @@ _NANOSECONDS = 1_000_000_000
 _NAMES = ENCAPSULATION + 8
 """Offset of the first frame name's length, behind the stamp."""
 _DETECTION_SIZE = DETECTION_DTYPE.itemsize
-_MAX_PADDING = 7
 
 
 class _Models(NamedTuple):
@@ -265,11 +265,9 @@ def _read_poses(batch: MessageBatch, models: _Models, k: int, stamp_ns: IntArray
             return k
         for i in range(7):
             bits[i] = _word(batch.data, offset + start + 8 * i, 8)
-        qx, qy, qz, qw = numbers[3], numbers[4], numbers[5], numbers[6]
-        sine, cosine = 2.0 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz
         stamp_ns[k] = _stamp_ns(batch.data, offset)
         pose[k, 0], pose[k, 1] = numbers[0], numbers[1]
-        pose[k, 2] = math.atan2(sine, cosine) if sine != 0.0 or cosine != 0.0 else math.nan
+        pose[k, 2] = yaw_of(numbers[3], numbers[4], numbers[5], numbers[6])
         k += 1
     return k
 
@@ -286,7 +284,7 @@ def _scan_detections(
         found = np.int64(_word(batch.data, offset + start - 4, 4))
         gap = 4 if found and start % 8 == ENCAPSULATION else 0
         end = start + found * _DETECTION_SIZE + gap
-        if not end <= length <= end + _MAX_PADDING:
+        if not end <= length <= end + MAX_PADDING:
             return k
         stamp_ns[k], count[k], begin[k] = _stamp_ns(batch.data, offset), found, offset + start
         k += 1

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from geometry_msgs.msg import PoseWithCovariance
 
 from swarm_loc_estimator.core.se2 import FloatArray
 from swarm_loc_estimator.core.swarm import StartSigma
-
-_PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
-
+from swarm_loc_estimator.io.planar import PLANE, yaw_of
 
 REFUSALS = {
     "absurd": "the pose must lie within 1000 km of the origin.",
@@ -37,10 +33,9 @@ def planar_seat(pose: PoseWithCovariance, start_sigma: StartSigma) -> tuple[Floa
         SeatRequestError: Numbers that are not finite, or no quaternion.
     """
     position, q = pose.pose.position, pose.pose.orientation
-    sine, cosine = 2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z
-    planar = np.array([position.x, position.y, math.atan2(sine, cosine)])
-    covariance = np.array(pose.covariance, dtype=float).reshape(6, 6)[_PLANAR]
-    if not (np.isfinite(planar).all() and np.isfinite(covariance).all() and (sine or cosine)):
+    planar = np.array([position.x, position.y, yaw_of(q.x, q.y, q.z, q.w)])
+    covariance = np.array(pose.covariance, dtype=float).reshape(6, 6)[PLANE]
+    if not (np.isfinite(planar).all() and np.isfinite(covariance).all()):
         raise SeatRequestError("pose and covariance must be finite numbers, and the quaternion not zero.")
     if not covariance.any():
         covariance = np.diag([start_sigma.x**2, start_sigma.y**2, start_sigma.theta**2])
