@@ -14,6 +14,8 @@ from swarm_loc_drivers.sim.epuck_world import EpuckWorld
 from swarm_loc_drivers.sim.render.views import Views
 from swarm_loc_estimator.core.metrics import DEFAULT_GAP_NS, interpolate
 
+_PENDING_NS = 300_000_000
+"""At the end of a run pictures so fresh may still be on their way; the world waits for older ones."""
 MOST_INCIDENCE, LEAST_SIDE_PX, LEAST_MARGIN_PX = math.radians(70.0), 10.0, 6.0
 """Which markers count as visible, as in the pictures that the detectors' comparison draws."""
 _NEAR_PX, _NEAR = 12.0, 0.3
@@ -28,10 +30,10 @@ class Seen:
     """The pictures of a run, summed up.
 
     Attributes:
-        frames: Pictures that were taken while the robots drove.
+        frames: Pictures that were taken while the robots drove, but for those of the last moment.
         lost: Those of which no detections have come.
-        detections: Markers reported.
-        visible: Markers that can be seen well in the pictures that have not got lost.
+        detections: Markers reported of the others.
+        visible: Markers that can be seen well in the others.
         found: Those of them that were reported.
         false_ids: Reports of markers that are not there.
     """
@@ -56,9 +58,10 @@ def count_seen(run: RenderedRun) -> Seen:
 
 def _of_robot(run: RenderedRun, world: EpuckWorld, robot: int, name: str) -> NDArray[np.int64]:
     """The counts of `Seen` of one camera."""
-    messages = run.seen[name]
+    end_ns = run.end_ns - _PENDING_NS
+    frames = _taken_before(world, robot, end_ns) - _taken_before(world, robot, run.begin_ns)
+    messages = [one for one in run.seen[name] if one.stamp_ns < end_ns]
     exposures = [world.exposure_of(robot, one.stamp_ns) for one in messages]
-    frames = exposures[-1].number - exposures[0].number + 1 if exposures else 0
     poses = _poses(run, np.array([one.middle_ns for one in exposures], np.int64))
     detections = visible = found = false_ids = 0
     for message, there in zip(messages, poses, strict=True):
@@ -72,6 +75,12 @@ def _of_robot(run: RenderedRun, world: EpuckWorld, robot: int, name: str) -> NDA
         found += int(np.isin(views.id[clear], message.detections["id"][matched]).sum())
         false_ids += int((~matched).sum())
     return np.array([frames, frames - len(messages), detections, visible, found, false_ids])
+
+
+def _taken_before(world: EpuckWorld, robot: int, stamp_ns: int) -> int:
+    """How many pictures of a camera have an earlier stamp."""
+    nearest = world.exposure_of(robot, stamp_ns)
+    return nearest.number + (nearest.stamp_ns < stamp_ns)
 
 
 def is_visible(views: Views) -> NDArray[np.bool_]:

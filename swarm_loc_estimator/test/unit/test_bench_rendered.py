@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from swarm_loc_drivers.sim.epuck_world import Exposure
 from swarm_loc_drivers.sim.render.views import Views
 from swarm_loc_estimator.core.metrics import Track
 from swarm_loc_estimator.core.swarm import Robot, Swarm
-from swarm_loc_estimator.io.cdr import DETECTION_DTYPE, decode_detections
+from swarm_loc_estimator.io.cdr import DETECTION_DTYPE, DetectionArrayMessage, decode_detections
 from swarm_loc_estimator.io.messages import encode_detections
 from swarm_loc_estimator.replay_result import ReplayResult
 
@@ -44,6 +47,38 @@ def test_a_detection_counts_where_its_marker_is() -> None:
             detections["corners_px"][row].shape
         )
     assert seen._matched(views(), detections).tolist() == [True, False, False]
+
+
+class Camera:
+    """Stands for a world whose cameras take ten pictures a second and see one marker."""
+
+    PERIOD_NS = SECOND // 10
+
+    def exposure_of(self, robot: int, stamp_ns: int) -> Exposure:
+        """See `EpuckWorld`."""
+        number = round(stamp_ns / self.PERIOD_NS)
+        return Exposure(robot, number, number * self.PERIOD_NS, number * self.PERIOD_NS)
+
+    def views(self, _robot: int, _poses: NDArray[np.float64]) -> Views:
+        """See `EpuckWorld`."""
+        return views(1)
+
+
+@pytest.mark.parametrize(("last", "lost"), [(600, 0), (598, 0), (596, 1), (12, 585), (0, 597)])
+def test_pictures_of_which_nothing_is_heard_are_lost_however_long_it_lasts(last: int, lost: int) -> None:
+    """The robots drive for a minute, and detections come until the last one."""
+    stamps = np.arange(0, 60 * SECOND + 1, SECOND // 20)
+    track = Track(stamps + SECOND // 20, np.zeros((len(stamps), 3)))
+    live = SimpleNamespace(swarm=Swarm((Robot("r"),)), truth={"r": track})
+    messages = [
+        DetectionArrayMessage(number * Camera.PERIOD_NS, "r/camera", np.zeros(0, DETECTION_DTYPE))
+        for number in range(1, last + 1)
+    ]
+    run = SimpleNamespace(
+        seen={"r": messages}, live=live, begin_ns=SECOND // 20, end_ns=60 * SECOND + SECOND // 20
+    )
+    frames, missing, *others = seen._of_robot(run, Camera(), 0, "r").tolist()
+    assert (frames, missing, others) == (597, lost, [0, 597 - lost, 0, 0])
 
 
 def test_detections_without_their_noise_are_else_the_same() -> None:
