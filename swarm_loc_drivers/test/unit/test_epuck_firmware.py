@@ -104,6 +104,31 @@ def test_lines_are_answered(model: EpuckModel, line: str, answer: str, body: Dri
     assert SerialFirmware(body, model).receive(line.encode()).decode() == answer
 
 
+@MODELS
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("D,40000,-40000", (-25536, 25536)),
+        ("D,99999999999999999999,0", (-1, 0)),
+        (f"D,{'9' * 5000},1", None),
+        ("P,99999999999999999999,0", (0, 0)),
+        ("J,300,10,10,1", (0, 0)),
+        ("J,-1,99999999999999999999,1,1", (0, 0)),
+        ("J,1,10,10,99999999999", (0, 0)),
+    ],
+)
+def test_numbers_that_do_not_fit_wrap_and_stop_nothing(
+    model: EpuckModel, line: str, told: tuple[int, int] | None, body: DrivenBody
+) -> None:
+    firmware = SerialFirmware(body, model)
+    firmware.receive(f"{line}\r".encode())
+    speeds = firmware.receive(b"\xbb\x00")
+    left, right = struct.unpack("<2h", speeds)
+    assert told in (None, (left, right))
+    assert firmware.receive(b"E\r") == f"e,{left},{right}\r\n".encode()
+    assert len(firmware.receive(b"\xb1\xb7\x00")) > 4 + 3
+
+
 def test_counters_can_be_preset_and_wrap(body: DrivenBody, clock: Clock) -> None:
     first, second = SerialFirmware(body, EPUCK1), SerialFirmware(body, EPUCK2)
     for firmware in (first, second):

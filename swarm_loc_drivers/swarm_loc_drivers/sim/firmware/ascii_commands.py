@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from swarm_loc_drivers.sim.firmware.serial_robot import CameraSetting, SerialRobot
 
-_NUMBER = re.compile(r",\s*([-+]?\d+)")
+_NUMBER = re.compile(r",\s*([-+]?\d{1,1000})")
 _UNKNOWN = "z,Command not found"
 _VERSIONS = ("v,Version 1.1.3 September 2006", "v,Version 1.2.2 e-puck2")
 
@@ -17,10 +17,10 @@ def _line(letter: str, *values: int) -> str:
 
 
 def _numbers(text: str) -> list[int]:
-    """The arguments that scanf would find."""
+    """The arguments that scanf would find, integers of 32 bits."""
     numbers, end = [], 1
     while match := _NUMBER.match(text, end):
-        numbers.append(int(match[1]))
+        numbers.append((int(match[1]) + 2**31) % 2**32 - 2**31)
         end = match.end()
     return numbers
 

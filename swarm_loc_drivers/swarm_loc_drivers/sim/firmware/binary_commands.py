@@ -102,7 +102,8 @@ class BinaryCommands:
 
     def _image(self) -> bytes:
         camera = self._robot.camera
-        return bytes([camera.mode, camera.width & 0xFF, camera.height & 0xFF]) + self._robot.pixels()
+        header = (camera.mode & 0xFF, camera.width & 0xFF, camera.height & 0xFF)
+        return bytes(header) + self._robot.pixels()
 
     def _all_sensors(self) -> bytes:
         return self._robot.values().tobytes()[: _ALL_SENSORS_SIZE - 1] + b"\x00"

@@ -42,9 +42,9 @@ class Motors:
         self.commanded = (0, 0)
 
     def set_speeds(self, left: int, right: int) -> None:
-        """Turn the wheels [steps/s]."""
-        self.commanded = (left, right)
-        self._body.set_wheel_speeds(self._model.rate(left), self._model.rate(right))
+        """Turn the wheels [steps/s]; the firmware keeps speeds in 16 bits."""
+        self.commanded = (as_counter(left), as_counter(right))
+        self._body.set_wheel_speeds(*map(self._model.rate, self.commanded))
 
     def steps(self) -> tuple[int, int]:
         """The counters, unbounded."""
