@@ -31,8 +31,8 @@ Picture = NDArray[np.uint8]
 STEP_NS = 5_000_000
 _SLIP_S = 0.05
 """How long a slip of a wheel lasts: 3 mm of its way at 0.06 m/s."""
-_REMEMBERED_NS = 700_000_000
-"""Pictures can be drawn as long after they were taken, less the longest error of their stamps."""
+_KEPT_NS = 400_000_000
+"""So long a picture can still be drawn after its camera has taken the next one."""
 _PHASES, _EXPOSURES, _SENSOR, _PROXIMITY = range(4)
 """Streams of random numbers, each a function of the seed, the stream, and what it is for."""
 
@@ -106,9 +106,11 @@ class EpuckWorld:
         """(N, 2) of the left and the right wheel, as commanded [steps/s]."""
         self.steps: FloatArray = np.zeros((count, 2))
         """(N, 2) that the left and the right motor have done since the start."""
-        self._past = deque([(self.now_ns, self.poses)], maxlen=_REMEMBERED_NS // STEP_NS)
         self._period_ns = round(1e9 / settings.camera_rate_hz)
-        first_ns = settings.start_ns + round(1e9 * settings.world.exposure_early_s) + self._half_exposure_ns
+        early_ns = round(1e9 * settings.world.exposure_early_s)
+        remembered_ns = self._period_ns + early_ns + 2 * self._half_exposure_ns + _KEPT_NS
+        self._past = deque([(self.now_ns, self.poses)], maxlen=remembered_ns // STEP_NS)
+        first_ns = settings.start_ns + early_ns + self._half_exposure_ns
         phases = self._random(_PHASES).integers(0, self._period_ns, count)
         self._first_ns: list[int] = (first_ns + phases).tolist()
         self._next = [self._exposure(robot, 0) for robot in range(count)]

@@ -133,6 +133,22 @@ def test_a_picture_shows_where_the_robot_was_when_it_was_taken() -> None:
     assert np.abs(world.picture(taken).astype(int) - later.picture(same)).max() > 40
 
 
+@pytest.mark.parametrize(("rate", "exposure_s"), [(2.0, 0.133), (2.0, 1e-5), (60.0, 0.133), (60.0, 0.008)])
+def test_the_newest_picture_can_be_drawn_until_the_next_one_is_taken(rate: float, exposure_s: float) -> None:
+    stage = Stage(ARENA, family_named("artoolkit_bch_thin"))
+    camera = replace(CAMERA, width=32, height=24, exposure_s=exposure_s)
+    settings = EpuckWorldSettings(1, W2, stage, camera, WHEELS, rate, 1_000_000_000_000)
+    world = EpuckWorld(describe(EightSettings(robots=3), START), settings)
+    run(world, 0.8)
+    for _ in range(5 * round(1e9 / rate) // STEP_NS):
+        newest = list(world.newest)
+        world.step()
+        for exposure in newest:
+            assert exposure is not None
+            if world.newest[exposure.robot] is not exposure:
+                assert world.picture(exposure).shape == (24, 32)
+
+
 def _with_camera(camera: CameraModel, start: FloatArray) -> EpuckWorld:
     stage = Stage(ARENA, family_named("artoolkit_bch_thin"))
     settings = EpuckWorldSettings(1, IDEAL, stage, camera, WHEELS, 7.5, 1_000_000_000_000)
