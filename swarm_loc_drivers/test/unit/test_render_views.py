@@ -24,9 +24,9 @@ STILL = replace(W2, exposure_early_s=0.0)
 BESIDE = np.array([[-0.6, 0.0, 0.1], [0.0, 0.1, 2.0], [-0.1, -0.25, -1.0]])
 
 
-def world_at(poses: FloatArray) -> EpuckWorld:
+def world_at(poses: FloatArray, camera: CameraModel = CAMERA) -> EpuckWorld:
     settings = EpuckWorldSettings(
-        3, STILL, Stage(ARENA, FAMILY), CAMERA, WheelGeometry(0.041, 0.053), 7.5, 10**12
+        3, STILL, Stage(ARENA, FAMILY), camera, WheelGeometry(0.041, 0.053), 7.5, 10**12
     )
     return EpuckWorld(describe(EightSettings(robots=len(poses)), poses), settings)
 
@@ -44,6 +44,18 @@ def test_markers_lie_where_the_detector_finds_them() -> None:
     place = {int(one): k for k, one in enumerate(views.id)}
     for marker, corners in zip(found.id.tolist(), found.corners, strict=True):
         assert np.abs(corners - views.corners[place[marker]]).max() < 0.3, marker
+
+
+@pytest.mark.parametrize("heading", np.linspace(-3.0, 3.0, 7))
+def test_a_lens_does_not_bring_into_the_picture_what_is_far_beside_it(heading: float) -> None:
+    poses = np.array([[0.1, -0.2, heading], [-1.0, 0.6, 0.0]])
+    bent, wide = (
+        world_at(poses, camera).views(0, poses)
+        for camera in (CameraModel(k1=-0.3), CameraModel(field_of_view=math.radians(100.0)))
+    )
+    seen = set(bent.id[bent.margin > 0.0].tolist())
+    assert seen
+    assert seen <= set(wide.id[wide.margin > 0.0].tolist())
 
 
 def test_a_robot_hides_what_is_behind_it_but_not_its_own_faces() -> None:

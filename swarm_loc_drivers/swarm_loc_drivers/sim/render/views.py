@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.core import se2
 
-from .raster import FX, Patches
+from .raster import Patches, project
 from .renderer import Eye, Motion, Scene
 
 FloatArray = NDArray[np.float64]
@@ -123,15 +123,9 @@ def _in_optical_frame(
 
 
 def _pixels(eye: Eye, points: FloatArray) -> FloatArray:
-    """(..., 2) of points (..., 3) before the camera."""
-    matrix = eye.model.matrix.copy()
-    matrix[[0, 1], [0, 1]] = eye.lens[FX]
-    if not points.size:
-        return np.zeros((*points.shape[:-1], 2))
-    flat, _ = cv2.projectPoints(
-        points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), matrix, eye.model.distortion
-    )
-    return np.asarray(flat, float).reshape(*points.shape[:-1], 2)
+    """(..., 2) of points (..., 3) before the camera, as they are drawn."""
+    pixels = [project(eye.lens, x / z, y / z) for x, y, z in points.reshape(-1, 3).tolist()]
+    return np.reshape(np.array(pixels, float), (*points.shape[:-1], 2))
 
 
 def _outline(eye: Eye, robot: Sequence[Patches], motion: Motion) -> FloatArray:
