@@ -14,6 +14,8 @@ _BYTE_NS = 2_500_000
 """As a comment in the firmware has it; ten bits at 3200 baud would be 3.1 ms."""
 _HEADER = 7
 """Sender, checksum, length and flags, target."""
+LONGEST_MESSAGE = 40
+"""Bytes; who hears of more takes nothing."""
 
 HANDLING_NS = 5 * _MS
 """From the last byte of a command until it is obeyed."""

@@ -17,6 +17,7 @@ from .body import Command, Measured
 from .droplet_light import DropletLight, distance_to_segments
 
 _REMEMBERED_NS = 1_000_000_000
+"""So long messages and exchanges that are over are kept: longer than any message takes."""
 _BASELINE_PERIOD_NS = 5_407_000_000
 _DRIFT_NS = 100_000_000
 _RECEIVING, _TRANSMITTING, _TIMED, _BLOCKED = 1, 2, 4, 8
@@ -24,7 +25,7 @@ _RECEIVING, _TRANSMITTING, _TIMED, _BLOCKED = 1, 2, 4, 8
 
 @dataclass(frozen=True)
 class InfraredSettings:
-    """How infrared fails.
+    """How infrared fails; messages make no light in measurements.
 
     Attributes:
         reach: How far messages reach [m].
@@ -72,6 +73,7 @@ class _Exchange:
         receivers: (k,) indices of the robots that have heard the call.
         readings: (k, n, n) emitters by sensors, as far as measured.
         flashes: How many.
+        done: Whether it is over and its readings are told.
     """
 
     emitter: int
@@ -80,10 +82,15 @@ class _Exchange:
     receivers: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     readings: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0, 0), dtype=np.int64))
     flashes: int = 0
+    done: bool = False
 
     @property
     def end_ns(self) -> int:
         return self.begin_ns + timing.EXCHANGE_NS
+
+    def has(self, robot: int) -> bool:
+        """Whether a robot emits or measures."""
+        return robot == self.emitter or robot in self.receivers
 
     def lit(self, now_ns: int) -> int | None:
         """The emitter that is lit now."""
@@ -152,7 +159,7 @@ class DropletInfrared:
             if message.end_ns > self._now_ns:
                 status |= _TRANSMITTING if message.sender == robot else 0
                 status |= _RECEIVING if robot in message.hearers else 0
-        if any(robot == one.emitter or robot in one.receivers for one in self._exchanges):
+        if any(not one.done and one.has(robot) for one in self._exchanges):
             status |= _TIMED | _BLOCKED
         return status
 
@@ -166,14 +173,17 @@ class DropletInfrared:
                 message.done = True
                 self._deliver(message)
         for exchange in self._exchanges:
+            if exchange.done:
+                continue
             while (
                 exchange.flashes < self._platform.n
                 and exchange.begin_ns + timing.flash_ns(exchange.flashes) <= now_ns
             ):
                 self._measure(exchange, poses)
             if exchange.end_ns <= now_ns:
+                exchange.done = True
                 self._finish(exchange)
-        self._exchanges = [one for one in self._exchanges if one.end_ns > now_ns]
+        self._exchanges = [one for one in self._exchanges if one.end_ns > now_ns - _REMEMBERED_NS]
         self._messages = [one for one in self._messages if one.end_ns > now_ns - _REMEMBERED_NS]
 
     def _in_reach(self, sender: int, poses: FloatArray) -> NDArray[np.int64]:
@@ -204,8 +214,9 @@ class DropletInfrared:
     def _is_clear(self, robot: int, message: _Message) -> bool:
         """Whether a robot listens all the time of a message, and hears nothing else."""
         if any(
-            (robot == one.emitter or robot in one.receivers)
+            one.has(robot)
             and one.begin_ns < message.end_ns
+            and one.end_ns > message.begin_ns
             and one.emitter != message.sender
             for one in self._exchanges
         ):

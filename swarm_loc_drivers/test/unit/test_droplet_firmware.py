@@ -123,6 +123,15 @@ def test_a_command_reaches_one_robot_or_all_by_infrared(robots: Robots) -> None:
     assert "My ID is: DF64" in robots.printed[2]
 
 
+def test_messages_longer_than_the_buffer_are_not_sent(robots: Robots) -> None:
+    longest = "x" * 40
+    printed = robots.type(0, f"cmd {longest}x")
+    assert printed.endswith("of length 41.\r\nERROR: Message exceeds IR_BUFFER_SIZE.\r\n")
+    assert "ERROR" not in robots.type(0, f"cmd {longest}")
+    robots.run(message_ns(40) + HANDLING_NS + STEP_NS)
+    assert robots.printed[1:] == [f"\tCommand ( {longest} ) not recognized.\r\n"] * 2
+
+
 def test_who_is_sending_sends_nothing_else(robots: Robots) -> None:
     robots.type(0, "cmd get_id")
     assert robots.type(0, "cmd stop_walk").endswith("Aborting IR send [02] while trying: stop_walk\r\n")

@@ -146,6 +146,22 @@ def test_who_measures_hears_nothing_else() -> None:
     assert [type(one) for one in world.infrared.heard[1]] == [Measured]
 
 
+def test_who_measured_when_a_message_began_does_not_understand_it() -> None:
+    far = np.vstack([TRIANGLE[:2], [0.35, 0.02, 0.0]])  # hears the second, and not the first
+    world = world_of(far)
+    world.infrared.emit(0, FULL_POWER, world.poses)
+    run(world, EXCHANGE_NS - 2 * STEP_NS)
+    world.infrared.send(2, "get_id", 0, world.poses)
+    run(world, 2 * STEP_NS)
+    assert not world.infrared.status(0)
+    run(world, message_ns(6))
+    assert [type(one) for one in world.infrared.heard[1]] == [Measured]
+    assert world.infrared.counts["exchanges"] == 1
+    world.infrared.send(2, "get_id", 0, world.poses)
+    run(world, message_ns(6))
+    assert [type(one) for one in world.infrared.heard[1]] == [Measured, Command]
+
+
 def test_light_of_two_at_once_adds_up() -> None:
     row = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.4, 0.0, 0.0]])
     alone = exchange(world_of(row), power=FULL_POWER)[1]

@@ -15,6 +15,7 @@ from swarm_loc_drivers.protocols.droplet import DIRECTIONS, FULL_POWER, gait
 from swarm_loc_drivers.protocols.droplet_infrared import (
     EMIT_DELAY_NS,
     HANDLING_NS,
+    LONGEST_MESSAGE,
     PRINT_DELAY_NS,
     SET_POWER_DELAY_NS,
 )
@@ -228,6 +229,8 @@ class DropletFirmware:
         status = self._body.infrared_status()
         if status >= _BUSY_SENDING:
             self._say(f"Aborting IR send [{status:02x}] while trying: {line}")
+        elif len(line) > LONGEST_MESSAGE:
+            self._say("ERROR: Message exceeds IR_BUFFER_SIZE.")
         else:
             self._body.send(line, target)
 
