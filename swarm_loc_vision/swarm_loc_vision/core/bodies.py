@@ -111,13 +111,15 @@ def _solve(
     points = np.stack(
         [square(seen.lengths[i]) @ at.rotation.T + at.position for i, at in zip(rows, places, strict=True)]
     )
-    shifts = [
-        _shift_covariance(at.sigma, seen.poses.position[i, 0], intrinsics)
-        for i, at in zip(rows, places, strict=True)
-    ]
-    covariance = seen.covariance[rows] + np.stack(shifts)
     starts = _starts(seen, rows, places)
-    found = body_pose(points, seen.corners[rows], covariance, intrinsics, starts, upright)
+    own = [square(seen.lengths[i]) @ seen.poses.rotation[i, 0].T + seen.poses.position[i, 0] for i in rows]
+    for _ in range(2):  # what a shift does depends on how faces lie, which each alone tells badly
+        shifts = [_shift_covariance(at.sigma, c, intrinsics) for at, c in zip(places, own, strict=True)]
+        covariance = seen.covariance[rows] + np.stack(shifts)
+        found = body_pose(points, seen.corners[rows], covariance, intrinsics, starts, upright)
+        if not np.isfinite(found.chi2[0, 0]):
+            return
+        own = list(points @ found.rotation[0, 0].T + found.position[0, 0])
     freedom = 8.0 * len(rows) - 6.0
     if not found.chi2[0, 0] < _MOST_CHI2 * freedom:
         return
@@ -144,10 +146,14 @@ def _starts(seen: Seen, rows: Sequence[int], places: Sequence[Placement]) -> tup
     return np.stack(rotations), np.stack(positions)
 
 
-def _shift_covariance(sigma: float, position: FloatArray, intrinsics: FloatArray) -> FloatArray:
-    """(8, 8) of four corners that are shifted together [px^2]."""
-    u, v = (sigma * intrinsics[:2] / position[2]) ** 2
-    return np.asarray(np.kron(np.ones((4, 4)), np.diag([u, v])), np.float64)
+def _shift_covariance(sigma: float, corners: FloatArray, intrinsics: FloatArray) -> FloatArray:
+    """(8, 8) in the picture of corners (4, 3) in the camera frame that are shifted together [px^2]."""
+    fx, fy = intrinsics[:2]
+    x, y, z = corners.T
+    by_shift = np.zeros((8, 3))
+    by_shift[0::2, 0], by_shift[0::2, 2] = fx / z, -fx * x / z**2
+    by_shift[1::2, 1], by_shift[1::2, 2] = fy / z, -fy * y / z**2
+    return np.asarray(sigma**2 * by_shift @ by_shift.T)
 
 
 def _moved(covariance: FloatArray, lever: FloatArray) -> FloatArray:

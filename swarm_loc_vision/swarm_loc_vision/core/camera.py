@@ -121,7 +121,7 @@ class Camera:
         """The constants of `sampling.raw_pixel`."""
         lens = np.zeros(LENS_SIZE)
         lens[[FX, FY, CX, CY]] = self.fx, self.fy, self.cx, self.cy
-        if any(self.distortion):
+        if self.model == "equidistant" or any(self.distortion):
             lens[LENS_KIND] = FISHEYE if self.model == "equidistant" else RADIAL
             places = [K1, K2, K3, K4] if self.model == "equidistant" else [K1, K2, P1, P2, K3, K4, K5, K6]
             lens[places[: len(self.distortion)]] = self.distortion
@@ -132,7 +132,7 @@ class Camera:
         if self.lens[LENS_KIND] == STRAIGHT or not pixels.size:
             return np.array(pixels)
         flat = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
-        coefficients = np.array(self.distortion)
+        coefficients = np.array(self.distortion or (0.0,) * 4)
         if self.model == "equidistant":
             ideal = cv2.fisheye.undistortPoints(flat, self.matrix, coefficients, P=self.matrix)
         else:

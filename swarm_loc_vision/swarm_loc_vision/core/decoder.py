@@ -21,7 +21,8 @@ FloatArray = NDArray[np.float64]
 Words = NDArray[np.uint64]
 
 FALSE_READINGS = 1e-5
-"""Of random squares, so many may be read as a marker in use."""
+"""Of random squares, so many may be read as a marker in use, by whole bits at one threshold. Weighed bits and
+the second threshold add to it: with all 4096 ids one or two of 100 000 are read."""
 _SHARPENING = 0.2
 """How much of the difference to its four neighbours is added to a cell, each."""
 _MOST_DARK_ERRORS = 3.0
@@ -63,7 +64,7 @@ class Dictionary:
         codes: (N,) the family's code of each word.
         ids: (N,) its id in it.
         strips: (N, 4, cells) the row of cells behind the border along each side, clockwise; 1 is white.
-        correctable: Bits that may differ while random squares are read as a marker at `FALSE_READINGS`.
+        correctable: Bits that may differ; see `FALSE_READINGS`.
     """
 
     def __init__(self, family_ids: Sequence[tuple[Family, NDArray[np.int64]]]) -> None:
@@ -93,7 +94,7 @@ class Dictionary:
 
 
 def correctable_bits(words: int) -> int:
-    """Most bits that may differ so that a random square is still read at most at a rate of FALSE_READINGS."""
+    """Most whole bits that may differ while random squares are read at most at a rate of FALSE_READINGS."""
     near, bits = 1, 0
     while bits < BITS // 4:
         near += math.comb(BITS, bits + 1)

@@ -28,6 +28,9 @@ _NOWHERE = 1e12
 _TRUST = 6.0
 """The corners' covariance counts like so many degrees of freedom; where corners fit worse than it says, as on
 a marker that is partly covered, the pose is as much less sure. A marker alone has two of its own."""
+_SAME = 1.0 + 2.0 * math.cos(0.05)
+"""Solutions that are turned against each other by less than 0.05 rad are the same one. Multiplied element by
+element, rotations add up to 1 + 2 cos of the angle between them."""
 
 
 class Upright(NamedTuple):
@@ -93,7 +96,7 @@ def marker_poses(
     intrinsics: FloatArray,
     upright: Upright | None = None,
 ) -> Poses:
-    """Both solutions for each marker.
+    """Both solutions for each marker, or one where both starts lead to the same.
 
     Args:
         corners: (N, 4, 2) clockwise from the marker's own upper left [ideal px].
@@ -115,6 +118,8 @@ def marker_poses(
     worse = poses.chi2[:, 0] > poses.chi2[:, 1]
     for column in poses:
         column[worse] = column[worse, ::-1]
+    turned = np.einsum("nij,nij->n", poses.rotation[:, 0], poses.rotation[:, 1])
+    poses.chi2[turned >= _SAME, 1] = np.inf
     return poses
 
 
@@ -149,17 +154,13 @@ def body_pose(
         chi2[i] = _refine(sight, rotations[i], positions[i], covariances[i])
     order = np.argsort(chi2, kind="stable")
     best = order[0]
-    turned = np.einsum("ij,sij->s", rotations[best], rotations)  # 1 + 2 cos of the angle between
-    others = [i for i in order if turned[i] < 1.0 + 2.0 * math.cos(_ANOTHER_KIND)]
+    turned = np.einsum("ij,sij->s", rotations[best], rotations)
+    others = [i for i in order if turned[i] < _SAME]
     chosen = [best, others[0] if others else best]
     found = Poses(*(column[chosen][None] for column in (rotations, positions, covariances, chi2)))
     if not others:
         found.chi2[0, 1] = np.inf
     return found
-
-
-_ANOTHER_KIND = 0.05
-"""Solutions that are turned against each other by less are the same one [rad]."""
 
 
 def _tilt(upright: Upright | None) -> tuple[FloatArray, float]:

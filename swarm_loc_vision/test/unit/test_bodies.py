@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 from vision_bench.scenes import CAMERA, project
 
 from swarm_loc_estimator.core.swarm import CameraMount, Face, Robot
@@ -26,8 +27,8 @@ BODY = {k: replace(at, sigma=0.0) for k, at in robot_body(Robot("epuck", faces=F
 OPTICAL_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
-def sighting(seed: int, body_shift: float = 0.0) -> tuple[Seen, FloatArray, FloatArray]:
-    """Two faces of a robot, and its pose in the camera frame."""
+def sighting(seed: int, body_shift: float = 0.0, sigma: float = 0.0) -> tuple[Seen, FloatArray, FloatArray]:
+    """Two faces of a robot that sit off by `sigma` each way, and its pose in the camera frame."""
     rng = np.random.default_rng(seed)
     yaw = math.pi + math.pi / 5 + rng.uniform(-0.2, 0.2)  # between two faces
     rotation = OPTICAL_FROM_LEVEL @ Rotation.from_euler("z", yaw).as_matrix()
@@ -36,7 +37,8 @@ def sighting(seed: int, body_shift: float = 0.0) -> tuple[Seen, FloatArray, Floa
     corners = []
     for k in facing:
         at = BODY[k]
-        shifted = at.position + (body_shift if k == facing[0] else 0.0)
+        shifted = at.position + sigma * np.random.default_rng([seed, k]).standard_normal(3)
+        shifted += body_shift if k == facing[0] else 0.0
         seen = project(rotation @ at.rotation, position + rotation @ shifted, square(LENGTH))
         corners.append(seen + SIGMA_PX * rng.normal(size=(4, 2)))
     count = len(facing)
@@ -55,19 +57,23 @@ def test_two_faces_have_one_pose_without_flips() -> None:
         alone += [_angle(seen.poses.rotation[i, 0], turn) for i, turn in enumerate(true_turn)]
         solve_bodies(seen, [BODY], INTRINSICS, None)
         together += [_angle(seen.poses.rotation[i, 0], turn) for i, turn in enumerate(true_turn)]
-        at = BODY[int(seen.id[0])]
-        error = np.concatenate(
-            [
-                seen.poses.position[0, 0] - position - rotation @ at.position,
-                Rotation.from_matrix(seen.poses.rotation[0, 0] @ true_turn[0].T).as_rotvec(),
-            ]
-        )
-        covariance = seen.poses.covariance[0, 0] / len(seen.id)
-        nees.append(error @ np.linalg.inv(covariance) @ error)
+        nees.append(nees_of(seen, rotation, position))
         assert (seen.poses.chi2[:, 1] > seen.poses.chi2[:, 0] + 100.0).all()
     assert max(together) < 0.06
     assert np.mean(np.square(together)) < 0.2 * np.mean(np.square(alone))
     assert 4.0 < np.median(nees) < 6.5  # the surplus over what the corners say is told
+
+
+def nees_of(seen: Seen, rotation: FloatArray, position: FloatArray) -> float:
+    """Weighed square of the error of the first face, which has the pose of all."""
+    at = BODY[int(seen.id[0])]
+    error = np.concatenate(
+        [
+            seen.poses.position[0, 0] - position - rotation @ at.position,
+            Rotation.from_matrix(seen.poses.rotation[0, 0] @ (rotation @ at.rotation).T).as_rotvec(),
+        ]
+    )
+    return float(error @ np.linalg.solve(seen.poses.covariance[0, 0] / len(seen.id), error))
 
 
 def _angle(a: FloatArray, b: FloatArray) -> float:
@@ -89,6 +95,21 @@ def test_faces_that_sit_a_little_off_make_the_pose_less_sure() -> None:
             solve_bodies(seen, [body], INTRINSICS, None)
             sizes.append(np.linalg.det(seen.poses.covariance[0, 0]))
         assert sizes[1] > 10.0 * sizes[0]
+
+
+def test_faces_that_sit_off_as_told_have_a_common_pose_as_sure_as_it_says() -> None:
+    sigma, count = 0.003, 60
+    unsure = {k: replace(at, sigma=sigma) for k, at in BODY.items()}
+    nees = []
+    for seed in range(count):
+        seen, rotation, position = sighting(seed, sigma=sigma)
+        alone = seen.poses.position.copy()
+        solve_bodies(seen, [unsure], INTRINSICS, None)
+        assert (seen.poses.position != alone).any()
+        nees.append(nees_of(seen, rotation, position))
+    assert (
+        3.0 * count < sum(nees) < chi2.ppf(0.9999, 6 * count)
+    )  # the surplus over what fits makes less of it
 
 
 def test_faces_that_do_not_fit_stay_on_their_own() -> None:

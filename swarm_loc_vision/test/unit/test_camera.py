@@ -34,13 +34,15 @@ def ideal_pixels(one: Camera) -> NDArray[np.float64]:
         (PLUMB_BOB, "plumb_bob"),
         (RATIONAL, "rational_polynomial"),
         (EQUIDISTANT, "equidistant"),
+        ((0.0,) * 4, "equidistant"),
+        ((), "equidistant"),
     ],
 )
 def test_raw_pixels_are_opencvs(distortion: tuple[float, ...], model: str) -> None:
     one = camera(distortion, model)
     if model == "equidistant":
         expected = cv2.fisheye.projectPoints(
-            directions()[:, None], np.zeros(3), np.zeros(3), one.matrix, np.array(distortion)
+            directions()[:, None], np.zeros(3), np.zeros(3), one.matrix, np.array(distortion or (0.0,) * 4)
         )[0]
     else:
         expected = cv2.projectPoints(

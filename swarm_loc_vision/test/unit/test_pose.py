@@ -93,6 +93,14 @@ def test_the_other_solution_is_there_where_the_plane_is_ambiguous() -> None:
     assert (poses.chi2[:, 0] <= poses.chi2[:, 1]).all()
 
 
+def test_where_both_starts_lead_to_one_solution_there_is_no_other() -> None:
+    poses = solve(corners_of(*upright_markers(400, 3), SIGMA_PX))
+    apart = np.linalg.norm(turn_errors(poses.rotation[:, 0], poses.rotation[:, 1]), axis=1)
+    assert (apart < 0.01).sum() > 10
+    assert np.isinf(poses.chi2[apart < 0.0499, 1]).all()
+    assert np.isfinite(poses.chi2[apart > 0.0501, 1]).sum() > 200
+
+
 def test_knowing_that_markers_stand_upright_makes_them_surer() -> None:
     rotation, position = upright_markers(400, 3)
     corners = corners_of(rotation, position, 4 * SIGMA_PX)

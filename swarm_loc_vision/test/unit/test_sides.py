@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from swarm_loc_vision.core.camera import Camera
 from swarm_loc_vision.core.decoder import Dictionary
-from swarm_loc_vision.core.edges import Corners, refine_read
+from swarm_loc_vision.core.edges import Corners, refine, refine_read
 from swarm_loc_vision.core.families import family_named
 from swarm_loc_vision.core.sampling import LENS_SIZE
 from swarm_loc_vision.core.side_pixels import INNER, side_pixels
@@ -129,9 +129,18 @@ def test_a_covered_side_is_less_sure(cover: float) -> None:
 
 
 def test_what_cannot_be_fitted_keeps_what_the_profiles_say() -> None:
+    at, cell, marker_id = (20.3, 20.3), 5.0, 100
+    image = picture(at, cell, seed=marker_id)
+    far_off = corners_of(at, cell) + np.array([2.0, 0.0])  # too far for the fit, not for the profiles
+    found = fitted(image, far_off, marker_id)
+    assert found.contrast[0] > 0.0
+    for column, by_profiles in zip(found, refine(image, STRAIGHT, far_off[None], FAMILY.side), strict=True):
+        assert (column == by_profiles).all()
+
+
+def test_where_there_is_no_marker_there_are_no_corners() -> None:
     image = np.full((SIZE_PX, SIZE_PX), 120, np.uint8)
-    found = fitted(image, corners_of((20.0, 20.0), 5.0), 0)
-    assert found.contrast[0] == 0.0
+    assert fitted(image, corners_of((20.0, 20.0), 5.0), 0).contrast[0] == 0.0
 
 
 @settings(max_examples=30)
