@@ -280,7 +280,9 @@ def draw(curves: dict[str, FloatArray], ratios: FloatArray) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--poses", type=int, default=POSES, help="per range; a twelfth of each mismatch")
+    parser.add_argument(
+        "--poses", type=int, default=POSES, help="per range; of mismatch a twelfth per couple"
+    )
     parser.add_argument("--live", type=int, default=LIVE, help="runs of the swarm over the whole graph")
     parser.add_argument("--replays", type=int, default=REPLAYS, help="bags of the swarm")
     options = parser.parse_args(arguments)
