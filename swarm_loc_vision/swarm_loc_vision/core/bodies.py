@@ -2,7 +2,8 @@
 
 One face seen head-on cannot be told from its mirror image, two faces together can. The answer is given face
 by face: each with the common pose, and with its covariance times the number of faces. So whoever takes the
-faces for independent gets the common pose with its true covariance.
+faces for independent gets the common pose with its true covariance. As of a face alone, that covariance
+leaves out how exactly faces sit; who knows it from the description adds it to each.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ _LEAST_SIGMA = 0.0005
 """No face is glued on truer [m]."""
 _MOST_CHI2 = 25.0
 """Per degree of freedom; where faces fit worse, they do not sit as described, and each stays on its own."""
+
+_MOST_LEFT_OUT = 0.99
+"""Of a position's variance."""
 
 
 @dataclass(frozen=True)
@@ -124,13 +128,17 @@ def _solve(
     if not found.chi2[0, 0] < _MOST_CHI2 * freedom:
         return
     surplus = max(1.0, found.chi2[0, 0] / freedom)
+    told = max(min(at.sigma for at in places) ** 2 - _LEAST_SIGMA**2, 0.0)
     for i, at in zip(rows, places, strict=True):
         for s in range(2):
             rotation, position = found.rotation[0, s], found.position[0, s]
             lever = rotation @ at.position
             seen.poses.rotation[i, s] = rotation @ at.rotation
             seen.poses.position[i, s] = position + lever
-            seen.poses.covariance[i, s] = len(rows) * surplus * _moved(found.covariance[0, s], lever)
+            of_one = len(rows) * surplus * _moved(found.covariance[0, s], lever)
+            if np.isfinite(found.chi2[0, s]):
+                _leave_out(told, of_one)
+            seen.poses.covariance[i, s] = of_one
             seen.poses.chi2[i, s] = found.chi2[0, s] / surplus
 
 
@@ -154,6 +162,17 @@ def _shift_covariance(sigma: float, corners: FloatArray, intrinsics: FloatArray)
     by_shift[0::2, 0], by_shift[0::2, 2] = fx / z, -fx * x / z**2
     by_shift[1::2, 1], by_shift[1::2, 2] = fy / z, -fy * y / z**2
     return np.asarray(sigma**2 * by_shift @ by_shift.T)
+
+
+def _leave_out(variance: float, covariance: FloatArray) -> None:
+    """Take a variance of the position, each way, from a pose's covariance (6, 6), which stays positive.
+
+    Faces shifted on their own are all shifted by one part, which moves the body, and by others, which tell of
+    themselves. So that of one part is in there whole, but for what a pose not quite right makes of it.
+    """
+    of_position = np.linalg.inv(np.linalg.inv(covariance)[:3, :3])  # were the rotation known
+    most = _MOST_LEFT_OUT * np.linalg.eigvalsh(of_position)[0]
+    covariance[:3, :3] -= min(variance, most) * np.eye(3)
 
 
 def _moved(covariance: FloatArray, lever: FloatArray) -> FloatArray:

@@ -64,8 +64,8 @@ def test_two_faces_have_one_pose_without_flips() -> None:
     assert 4.0 < np.median(nees) < 6.5  # the surplus over what the corners say is told
 
 
-def nees_of(seen: Seen, rotation: FloatArray, position: FloatArray) -> float:
-    """Weighed square of the error of the first face, which has the pose of all."""
+def nees_of(seen: Seen, rotation: FloatArray, position: FloatArray, sigma: float = 0.0) -> float:
+    """Weighed square of the error of the first face, which has the pose of all that sit off by `sigma`."""
     at = BODY[int(seen.id[0])]
     error = np.concatenate(
         [
@@ -73,7 +73,8 @@ def nees_of(seen: Seen, rotation: FloatArray, position: FloatArray) -> float:
             Rotation.from_matrix(seen.poses.rotation[0, 0] @ (rotation @ at.rotation).T).as_rotvec(),
         ]
     )
-    return float(error @ np.linalg.solve(seen.poses.covariance[0, 0] / len(seen.id), error))
+    covariance = seen.poses.covariance[0, 0] + np.diag([sigma**2] * 3 + [0.0] * 3)
+    return float(error @ np.linalg.solve(covariance / len(seen.id), error))
 
 
 def _angle(a: FloatArray, b: FloatArray) -> float:
@@ -106,10 +107,23 @@ def test_faces_that_sit_off_as_told_have_a_common_pose_as_sure_as_it_says() -> N
         alone = seen.poses.position.copy()
         solve_bodies(seen, [unsure], INTRINSICS, None)
         assert (seen.poses.position != alone).any()
-        nees.append(nees_of(seen, rotation, position))
+        nees.append(nees_of(seen, rotation, position, sigma))
     assert (
         3.0 * count < sum(nees) < chi2.ppf(0.9999, 6 * count)
     )  # the surplus over what fits makes less of it
+
+
+def test_the_covariance_leaves_out_how_exactly_faces_sit() -> None:
+    exact, told = 0.0005, 0.003
+    sideways = []
+    for seed in range(20):
+        seen, _, _ = sighting(seed, sigma=told)
+        solve_bodies(seen, [{k: replace(at, sigma=told) for k, at in BODY.items()}], INTRINSICS, None)
+        covariance = seen.poses.covariance[0, 0]
+        assert np.linalg.eigvalsh(covariance)[0] > 0.0
+        sideways.append(covariance[0, 0])  # where corners say most
+    assert min(sideways) > exact**2
+    assert np.median(sideways) < (0.5 * told) ** 2
 
 
 def test_faces_that_do_not_fit_stay_on_their_own() -> None:
