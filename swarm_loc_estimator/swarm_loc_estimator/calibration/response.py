@@ -209,9 +209,8 @@ def _regression(
         first, last = windows(motion, WINDOW_S)
         bases.append(integral[last] - integral[first])
         targets.append(true[last] - true[first])
-        cuts = np.quantile(
-            first, np.arange(1, _BLOCKS) / _BLOCKS
-        )  # each block holds windows, whatever is known
+        # each block holds windows, whichever part of the time is known
+        cuts = np.quantile(first, np.arange(1, _BLOCKS) / _BLOCKS)
         borders.append(np.searchsorted(cuts, np.column_stack([first, last]), side="right"))
     return _Regression(np.concatenate(bases), np.concatenate(targets), *np.concatenate(borders).T)
 
