@@ -1,15 +1,20 @@
-"""What all tests share: code compiled before, and for each node test a ROS domain that no other has."""
+"""What all tests share: code compiled before, and for each node test ROS in a domain that no other has."""
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from swarm_loc_estimator.core.compiled import is_warm
-from swarm_loc_vision.core.warm_up import CORE, warm_up
+from swarm_loc_estimator.numerics.jit import is_warm
+from swarm_loc_vision.core.warm_up import WARM_UP, warm_up
+
+if TYPE_CHECKING:
+    from node_world import Ros  # unit tests do without ROS
 
 # Each run draws examples of its own; where CI is set all draw the same, so that only a change can break a
 # test there. How long an example takes says nothing: the machine may be busy, the first call may compile.
@@ -23,9 +28,14 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile before any test's time runs, once and not in every worker; `make setup` does the estimator."""
     if hasattr(session.config, "workerinput"):
         return
-    if not is_warm(CORE):
+    if not is_warm(WARM_UP):
         print("compiling the marker detector for this machine: about half a minute", flush=True)
         warm_up()
+
+
+def pytest_collection_finish() -> None:
+    """Let the garbage collector pass over all modules and tests: they stay, and are looked through else."""
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)
@@ -40,3 +50,13 @@ def _own_ros_domain(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         yield
+
+
+@pytest.fixture
+def ros() -> Iterator[Ros]:
+    """ROS, for one node test."""
+    from node_world import Ros  # noqa: PLC0415 - unit tests do without ROS
+
+    ros = Ros()
+    yield ros
+    ros.close()

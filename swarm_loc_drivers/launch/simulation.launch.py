@@ -1,20 +1,17 @@
 """Start simulated e-pucks: ros2 launch swarm_loc_drivers simulation.launch.py swarm_file:=FILE."""
 
 import atexit
-import shutil
-import tempfile
-from pathlib import Path
+from contextlib import ExitStack
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from swarm_loc_drivers.sim.epuck_world import check_swarm
-from swarm_loc_drivers.sim.worlds import WORLDS
-from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
-from swarm_loc_estimator.io.swarm_file import load_swarm
-from swarm_loc_estimator.launching import node_action
+from swarm_loc_drivers.link_folder import link_folder
+from swarm_loc_drivers.sim.common.error_model import WORLDS
+from swarm_loc_drivers.simulation import SimulationOptions, simulated_swarm, simulation_nodes
+from swarm_loc_estimator.launching.options import options_from
+from swarm_loc_estimator.launching.ros_launch import argument_texts, node_action
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -34,22 +31,10 @@ def generate_launch_description() -> LaunchDescription:
 
 def start_nodes(context: LaunchContext) -> list[Node]:
     """The actions that start the simulation's nodes."""
-
-    def argument(name: str) -> str:
-        return str(LaunchConfiguration(name).perform(context))
-
-    swarm_file = argument("swarm_file")
-    swarm = load_swarm(Path(swarm_file))
-    check_swarm(swarm)  # here, and not by the world when a score of processes have started
-    links = tempfile.mkdtemp(prefix="epucks-")
-    atexit.register(shutil.rmtree, links, ignore_errors=True)  # when the last process has ended
-    options = SimulationOptions(
-        swarm_file=swarm_file,
-        link_folder=links,
-        world=argument("world"),
-        seed=int(argument("seed")),
-        speed=float(argument("speed")),
-        rate=float(argument("rate")),
-        parameter_file=argument("params_file") or None,
-    )
-    return [node_action(spec) for spec in simulation_nodes(options, [robot.name for robot in swarm.robots])]
+    options = options_from(SimulationOptions, argument_texts(context, SimulationOptions))
+    swarm = simulated_swarm(options)
+    stack = ExitStack()
+    links = stack.enter_context(link_folder())
+    atexit.register(stack.close)  # when the last process has ended
+    names = [robot.name for robot in swarm.robots]
+    return [node_action(spec) for spec in simulation_nodes(options, names, links)]

@@ -7,13 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from swarm_loc_estimator.graph import NodeSpec, ParameterValue
+from swarm_loc_drivers.sim.common.error_model import WORLDS
+from swarm_loc_drivers.sim.epuck.world import check_swarm
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.launching.graph import NodeSpec, ParameterValue
+from swarm_loc_estimator.launching.options import check_parameter_file
+from swarm_loc_estimator.parameters.number_spec import number
+from swarm_loc_estimator.parameters.table import ParameterError
 
 Parameters = dict[str, ParameterValue]
 
 _ANSWER_WITHIN_S = 0.15
-"""Pictures of real robots take so long to become detections, too."""
+"""Images of real robots take so long to become detections, too."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +30,6 @@ class SimulationOptions:
 
     Attributes:
         swarm_file: Path of the swarm description.
-        link_folder: Where the robots' serial ports appear; exists.
         world: Which errors robots and cameras have.
         seed: Fixes them.
         speed: Along the eight [m/s].
@@ -31,20 +38,36 @@ class SimulationOptions:
     """
 
     swarm_file: str
-    link_folder: str
     world: str = "w2"
-    seed: int = 1
-    speed: float = 0.06
-    rate: float = 1.0
+    seed: int = number(1, "1", 0, 2**31 - 1, "fixes them")
+    speed: float = number(0.06, "m/s", 0.001, 0.12, "along the eight")
+    rate: float = number(
+        1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
+    )
     parameter_file: str | None = None
 
 
-def simulation_nodes(options: SimulationOptions, robots: Sequence[str]) -> list[NodeSpec]:
+def simulated_swarm(options: SimulationOptions) -> Swarm:
+    """The swarm of a simulation; looked at here, and not by the world when a score of processes have started.
+
+    Raises:
+        UserError: A file cannot be used, or the swarm cannot be simulated.
+    """
+    if options.world not in WORLDS:
+        raise ParameterError(f"argument world = '{options.world}' must be one of {', '.join(WORLDS)}.")
+    check_parameter_file(options.parameter_file)
+    swarm = load_swarm(Path(options.swarm_file))
+    check_swarm(swarm)
+    return swarm
+
+
+def simulation_nodes(options: SimulationOptions, robots: Sequence[str], links: str) -> list[NodeSpec]:
     """The nodes of a simulation, in the order in which they start.
 
     Args:
         options: What the user chose.
         robots: The names of the swarm's robots.
+        links: Folder where their serial ports appear; exists.
     """
     drivers, vision, estimator = "swarm_loc_drivers", "swarm_loc_vision", "swarm_loc_estimator"
     swarm: Parameters = {"swarm_file": options.swarm_file}
@@ -54,7 +77,7 @@ def simulation_nodes(options: SimulationOptions, robots: Sequence[str]) -> list[
         "world": options.world,
         "seed": options.seed,
         "rate": options.rate,
-        "link_folder": options.link_folder,
+        "link_folder": links,
         "answer_within": _ANSWER_WITHIN_S,
     }
     steering: Parameters = {**swarm, "speed": options.speed, "wait_for_poses": True}
@@ -65,9 +88,12 @@ def simulation_nodes(options: SimulationOptions, robots: Sequence[str]) -> list[
         NodeSpec(drivers, "eight_steering_node", "eight_steering", "", {**steering, **time}, file),
     ]
     for robot in robots:
-        address: Parameters = {"address": f"{options.link_folder}/{robot}"}
-        # no picture may get lost because the machine is busy
-        reliable: Parameters = {f"qos_overrides./{robot}/image_raw.subscription.reliability": "reliable"}
+        address: Parameters = {"address": f"{links}/{robot}"}
+        # no image may get lost because the machine is busy, nor the calibration before the first one
+        reliable: Parameters = {
+            f"qos_overrides./{robot}/{topic}.subscription.reliability": "reliable"
+            for topic in ("image_raw", "camera_info")
+        }
         camera: Parameters = {**swarm, "robot": robot, **reliable}
         nodes += [
             NodeSpec(drivers, "epuck_driver_node", "epuck_driver", robot, {**address, **time}, file),

@@ -2,11 +2,11 @@
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from swarm_loc_estimator.graph import GraphOptions, graph_nodes
-from swarm_loc_estimator.launching import node_action
+from swarm_loc_estimator.launching.graph import GraphOptions, graph_nodes
+from swarm_loc_estimator.launching.options import check_graph, options_from
+from swarm_loc_estimator.launching.ros_launch import argument_texts, node_action
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -25,15 +25,6 @@ def generate_launch_description() -> LaunchDescription:
 
 def start_nodes(context: LaunchContext) -> list[Node]:
     """The actions that start the graph's nodes."""
-
-    def argument(name: str) -> str:
-        return str(LaunchConfiguration(name).perform(context))
-
-    options = GraphOptions(
-        swarm_file=argument("swarm_file"),
-        bag=argument("bag") or None,
-        rate=float(argument("rate")),
-        use_sim_time=argument("use_sim_time") == "true",
-        parameter_file=argument("params_file") or None,
-    )
+    options = options_from(GraphOptions, argument_texts(context, GraphOptions))
+    check_graph(options)  # here, and not by nodes, whose ends say nothing of why
     return [node_action(spec) for spec in graph_nodes(options)]

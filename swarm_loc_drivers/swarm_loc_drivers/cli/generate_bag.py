@@ -19,20 +19,18 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from swarm_loc_drivers.sim.bag import write_bag
-from swarm_loc_drivers.sim.droplet_bag import write_droplet_bag
-from swarm_loc_drivers.sim.droplet_run import DropletRunSettings, simulate_droplets
-from swarm_loc_drivers.sim.droplet_world import DROPLET_WORLDS
-from swarm_loc_drivers.sim.eight import EightSettings, simulate_eight
-from swarm_loc_drivers.sim.grid import GridSettings, simulate_grid
-from swarm_loc_drivers.sim.picture_bag import write_picture_bag
-from swarm_loc_drivers.sim.pictures import photograph_eight
+from swarm_loc_drivers.sim.common.error_model import WORLDS
+from swarm_loc_drivers.sim.droplet.world import DROPLET_WORLDS
+from swarm_loc_drivers.sim.recording.bag import write_bag
+from swarm_loc_drivers.sim.recording.droplet_bag import write_droplet_bag
+from swarm_loc_drivers.sim.recording.image_bag import write_image_bag
 from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_drivers.sim.worlds import WORLDS
+from swarm_loc_drivers.sim.scenarios.droplet_run import DropletRunSettings, simulate_droplets
+from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
+from swarm_loc_drivers.sim.scenarios.eight_images import simulate_eight_images
+from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.cli.arguments import number_in
-from swarm_loc_estimator.cli.ending import told_in_a_sentence
-from swarm_loc_estimator.io.bag_file import BagError
-from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
+from swarm_loc_estimator.cli.errors import exit_with_message
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,7 +38,7 @@ if TYPE_CHECKING:
 _ANY_SEED = number_in(0, 2**31 - 1)
 
 
-@told_in_a_sentence(BagError, DefinitionsNotFoundError)
+@exit_with_message
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
@@ -57,7 +55,7 @@ def _eight_settings(options: argparse.Namespace) -> EightSettings:
         duration_s=options.duration,
         robots=options.robots,
         speed=options.speed,
-        world=WORLDS[options.world],
+        errors=WORLDS[options.world],
         start_known=not options.start_unknown,
     )
 
@@ -66,8 +64,10 @@ def _eight(options: argparse.Namespace, comment: str) -> int:
     return write_bag(simulate_eight(_eight_settings(options)), options.bag, comment)
 
 
-def _pictures(options: argparse.Namespace, comment: str) -> int:
-    return write_picture_bag(photograph_eight(_eight_settings(options), CameraModel()), options.bag, comment)
+def _images(options: argparse.Namespace, comment: str) -> int:
+    return write_image_bag(
+        simulate_eight_images(_eight_settings(options), CameraModel()), options.bag, comment
+    )
 
 
 def _grid(options: argparse.Namespace, comment: str) -> int:
@@ -96,11 +96,14 @@ def _parser() -> argparse.ArgumentParser:
     swarms = parser.add_subparsers(dest="swarm", required=True, metavar="SWARM")
     eight = _swarm(swarms, "eight", "e-pucks driving the paper's eight among wall markers", 5, 9, 54.0)
     eight.set_defaults(write=_eight)
-    pictures = _swarm(swarms, "pictures", "the same, with what their cameras see", 2, 9, 9.0)
-    pictures.set_defaults(write=_pictures)
-    for one in (eight, pictures):
+    images = _swarm(swarms, "pictures", "the same, with what their cameras see", 2, 9, 9.0)
+    images.set_defaults(write=_images)
+    for one in (eight, images):
         one.add_argument(
-            "--world", choices=sorted(WORLDS), default="w0", help="imperfections; see sim/worlds.py"
+            "--world",
+            choices=sorted(WORLDS),
+            default="w0",
+            help="imperfections; see sim/common/error_model.py",
         )
         one.add_argument("--speed", type=number_in(0.001, 0.12, "m/s"), default=0.06, help="[m/s]")
         one.add_argument("--start-unknown", action="store_true", help="swarm.yaml tells no start poses")
@@ -112,7 +115,7 @@ def _parser() -> argparse.ArgumentParser:
         "--world",
         choices=sorted(DROPLET_WORLDS),
         default="d1",
-        help="imperfections; see sim/droplet_world.py",
+        help="imperfections; see sim/droplet/world.py",
     )
     droplets.add_argument("--calibrated", action="store_true", help="swarm.yaml tells the elements' gains")
     droplets.add_argument("--start-known", action="store_true", help="swarm.yaml tells the start poses")

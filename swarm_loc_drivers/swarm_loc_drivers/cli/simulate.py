@@ -11,68 +11,56 @@ from __future__ import annotations
 
 import argparse
 import sys
-import tempfile
 from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
 
-from swarm_loc_drivers.sim.epuck_world import check_swarm
-from swarm_loc_drivers.sim.world_error import WorldError
-from swarm_loc_drivers.sim.worlds import WORLDS
-from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_drivers.link_folder import link_folder
+from swarm_loc_drivers.sim.common.error_model import WORLDS
+from swarm_loc_drivers.simulation import SimulationOptions, simulated_swarm, simulation_nodes
 from swarm_loc_estimator.cli.arguments import number_in
-from swarm_loc_estimator.cli.ending import told_in_a_sentence
+from swarm_loc_estimator.cli.errors import exit_with_message
 from swarm_loc_estimator.cli.graph import say
-from swarm_loc_estimator.core.compiled import is_warm
-from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
-from swarm_loc_estimator.processes import GraphError, run_graph
-from swarm_loc_vision.core.warm_up import CORE, warm_up
+from swarm_loc_estimator.launching.processes import run_graph
+from swarm_loc_estimator.numerics.jit import is_warm
+from swarm_loc_estimator.parameters.number_spec import number_specs
+from swarm_loc_vision.core.warm_up import WARM_UP, warm_up
 
 
 def parse(arguments: Sequence[str] | None) -> SimulationOptions:
-    """Read the command line; links have no folder yet."""
+    """Read the command line."""
     parser = argparse.ArgumentParser(
         prog="simulate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    defaults = SimulationOptions("", "")
     parser.add_argument("swarm_file", metavar="SWARM_FILE", help="the swarm description")
+    defaults = SimulationOptions("")
     parser.add_argument(
         "--world",
         choices=sorted(WORLDS),
         default=defaults.world,
         help=f"which errors robots and cameras have (default: {defaults.world})",
     )
-    parser.add_argument(
-        "--seed", type=number_in(0, 2**31 - 1), default=defaults.seed, help="fixes them (default: 1)"
-    )
-    parser.add_argument(
-        "--speed",
-        type=number_in(0.001, 0.12, "m/s"),
-        default=defaults.speed,
-        help=f"along the eight (default: {defaults.speed} m/s)",
-    )
-    parser.add_argument(
-        "--rate",
-        type=number_in(0.01, 100.0),
-        default=defaults.rate,
-        help="simulated seconds per second, as far as the machine keeps up (default: 1)",
-    )
+    for name, spec in number_specs(SimulationOptions).items():
+        default = getattr(defaults, name)
+        kind = type(default)
+        parser.add_argument(
+            f"--{name}",
+            type=number_in(kind(spec.low), kind(spec.high), spec.unit.strip("1")),
+            default=default,
+            help=f"{spec.doc} (default: {default:g})",
+        )
     parser.add_argument("--params-file", dest="parameter_file", help="ROS parameter file for all nodes")
-    return SimulationOptions(link_folder="", **vars(parser.parse_args(arguments)))
+    return SimulationOptions(**vars(parser.parse_args(arguments)))
 
 
-@told_in_a_sentence(GraphError, SwarmFileError, WorldError)
+@exit_with_message
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run until a node ends or Ctrl-C."""
     options = parse(arguments)
-    swarm = load_swarm(Path(options.swarm_file))
-    check_swarm(swarm)  # here, and not by the world when a score of processes have started
-    if not is_warm(CORE):  # once, not in every robot's detector at a time
+    swarm = simulated_swarm(options)
+    if not is_warm(WARM_UP):  # once, not in every robot's detector at a time
         say("compiling the marker detector for this machine: about half a minute")
         warm_up()
-    with tempfile.TemporaryDirectory(prefix="epucks-") as links:
-        chosen = replace(options, link_folder=links)
-        return run_graph(simulation_nodes(chosen, [robot.name for robot in swarm.robots]), say)
+    with link_folder() as links:
+        return run_graph(simulation_nodes(options, [robot.name for robot in swarm.robots], links), say)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,12 @@
-"""What every driver tells about the motion of its robot."""
+"""Odometry of a robot at an instant: pose, twist and their covariances."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,16 @@
-"""The last velocity that was asked for, and when it no longer counts."""
+"""The velocity command with its timeout."""
 
 from __future__ import annotations
 
-import math
 import time
 from collections import Counter
 from collections.abc import Callable
 
 STANDING_CLOCK_S = 1.0
 """A clock that stands still for so long of real time has died; a robot without a watchdog must stop then."""
+
+MAX_VELOCITY = 1e3
+"""[m/s] and [rad/s]; what is beyond is a mistake of who asks for it."""
 
 Velocity = tuple[float, float, float]
 """Forward [m/s], to the left [m/s], turning to the left [rad/s]."""
@@ -41,8 +43,8 @@ class VelocityCommand:
         self._clock_ran = (0, steady_s())
 
     def set(self, velocity: Velocity) -> None:
-        """A velocity has come; one that is not finite is dropped."""
-        if not all(map(math.isfinite, velocity)):
+        """A velocity has come; one that is not finite, or absurd, is dropped."""
+        if not all(abs(component) <= MAX_VELOCITY for component in velocity):
             self._counts["bad_cmd_vel"] += 1
             return
         self._latest = (self._clock(), velocity)

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from swarm_loc_estimator.io.yaml_tree import YamlTreeError, read_tree, shown
+from swarm_loc_estimator.parameters.errors import UserError
 
 _COEFFICIENTS = {"plumb_bob": (5,), "rational_polynomial": (8,), "equidistant": (4,)}
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
-class CalibrationError(ValueError):
-    """A calibration that cannot be used; the message is one sentence."""
+class CalibrationFileError(UserError):
+    """A camera's calibration that cannot be used; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class CameraCalibration:
     """What sensor_msgs/CameraInfo says of a camera.
 
     Attributes:
-        width: Columns of the picture [px].
+        width: Columns of the image [px].
         height: Rows [px].
         model: Distortion model.
         distortion: Its coefficients.
@@ -42,17 +43,17 @@ class CameraCalibration:
 
 
 def load_calibration(path: Path, width: int, height: int) -> CameraCalibration:
-    """Read the calibration of a camera whose pictures have this size [px].
+    """Read the calibration of a camera whose images have this size [px].
 
     Raises:
-        CalibrationError: It cannot be read, is incomplete, or is that of another size.
+        CalibrationFileError: It cannot be read, is incomplete, or is that of another size.
     """
     try:
         tree = read_tree(path)
     except YamlTreeError as error:
-        raise CalibrationError(str(error)) from error
+        raise CalibrationFileError(str(error)) from error
     if not isinstance(tree, dict):
-        raise CalibrationError(f"{path} is not a camera calibration.")
+        raise CalibrationFileError(f"{path} is not a camera calibration.")
     return _Reader(path, tree).calibration(width, height)
 
 
@@ -66,19 +67,19 @@ class _Reader:
     def calibration(self, width: int, height: int) -> CameraCalibration:
         size = (self._value("image_width"), self._value("image_height"))
         if size != (width, height):
-            raise CalibrationError(
-                f"{self._path} is for pictures of {shown(size[0])} x {shown(size[1])} px,"
+            raise CalibrationFileError(
+                f"{self._path} is for images of {shown(size[0])} x {shown(size[1])} px,"
                 f" but the camera's have {width} x {height} px."
             )
         model = self._value("distortion_model")
         if model not in _COEFFICIENTS:
             known = ", ".join(_COEFFICIENTS)
-            raise CalibrationError(
+            raise CalibrationFileError(
                 f"{self._path}: distortion_model is {shown(model)} but must be one of {known}."
             )
         matrix = self._numbers("camera_matrix", (9,))
         if not (matrix[0] > 0.0 and matrix[4] > 0.0):
-            raise CalibrationError(
+            raise CalibrationFileError(
                 f"{self._path}: camera_matrix has the focal lengths {matrix[0]:g} and {matrix[4]:g} px,"
                 " but they must be above 0 px."
             )
@@ -95,7 +96,7 @@ class _Reader:
 
     def _value(self, key: str) -> Any:
         if key not in self._tree:
-            raise CalibrationError(f"{self._path} has no {key}.")
+            raise CalibrationFileError(f"{self._path} has no {key}.")
         return self._tree[key]
 
     def _numbers(
@@ -109,7 +110,7 @@ class _Reader:
         right = isinstance(data, list) and len(data) in counts and all(map(_is_number, data))
         if not right or data is None:
             wanted = " or ".join(map(str, counts))
-            raise CalibrationError(f"{self._path}: {key}.data must be a list of {wanted} finite numbers.")
+            raise CalibrationFileError(f"{self._path}: {key}.data must be a list of {wanted} finite numbers.")
         return tuple(float(number) for number in data)
 
 

@@ -1,4 +1,4 @@
-"""What a driver tells about itself: on /diagnostics once a second, in the log when the link comes or goes."""
+"""Diagnostics of a driver: counts and rates once a second, changes of the link in the log."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Protocol
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock
@@ -14,18 +14,10 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
+from swarm_loc_drivers.core.robot_driver import RobotDriver
+
 _PERIOD_S = 1.0
 _THROTTLE_S, _WRONG_THROTTLE_S = 10.0, 60.0
-
-
-class Driver(Protocol):
-    """A driver as far as it is told about."""
-
-    counts: Counter[str]
-
-    @property
-    def trouble(self) -> str:
-        """Why there is no connection; "" while there is one."""
 
 
 class DriverDiagnostics:
@@ -43,7 +35,7 @@ class DriverDiagnostics:
     def __init__(
         self,
         node: Node,
-        driver: Driver,
+        driver: RobotDriver[Any],
         name: str,
         address: str,
         rates: Sequence[str],

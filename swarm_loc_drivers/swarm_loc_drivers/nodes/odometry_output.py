@@ -16,7 +16,7 @@ from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
 from swarm_loc_drivers.core.odometry_state import OdometryState
-from swarm_loc_estimator.io.planar import PLANE
+from swarm_loc_estimator.io.messages.planar import PLANE
 
 ODOMETRY_QOS = QoSProfile(depth=10)
 _TF_QOS = QoSProfile(depth=100)
@@ -28,6 +28,11 @@ _FIXED_VARIANCE = 1e-9
 def stamp_message(stamp_ns: int) -> TimeMessage:
     """A time [ns] as a message."""
     return Time(nanoseconds=stamp_ns).to_msg()
+
+
+def nanoseconds(stamp: TimeMessage) -> int:
+    """A message's time [ns]; also one before zero, which `rclpy.time.Time` cannot be."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def yaw_quaternion(yaw: float) -> Quaternion:

@@ -1,4 +1,4 @@
-"""Steers the robots of a swarm by their true poses: the way does not depend on how well they are located."""
+"""Steering by ground truth: where robots drive does not depend on how well they are localized."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped, Twist, Vector3
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rclpy.time import Time
 
 from swarm_loc_drivers.core.velocity_command import Velocity
-from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_drivers.nodes.odometry_output import nanoseconds
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 Steer = Callable[[int, int, FloatArray], Velocity]
 """Robot's index, stamp [ns], true pose (3,) in map -> what it should do."""
@@ -44,12 +44,13 @@ class TruthSteering:
             return
         place, turn = message.pose.position, message.pose.orientation
         pose = np.array([place.x, place.y, 2.0 * math.atan2(turn.z, turn.w)])
-        if not np.isfinite(pose).all():
+        stamp_ns = nanoseconds(message.header.stamp)
+        if stamp_ns < 0 or not np.isfinite(pose).all():
             self._node.get_logger().warning(
-                "dropped a pose that is not finite", throttle_duration_sec=_THROTTLE_S
+                "dropped a pose that is not finite or is from before zero", throttle_duration_sec=_THROTTLE_S
             )
             return
-        forward, left, rate = self._steer(robot, Time.from_msg(message.header.stamp).nanoseconds, pose)
+        forward, left, rate = self._steer(robot, stamp_ns, pose)
         self._commands[robot].publish(Twist(linear=Vector3(x=forward, y=left), angular=Vector3(z=rate)))
 
     def _all_there(self) -> bool:

@@ -1,166 +1,119 @@
-"""One simulated world of e-pucks as a ROS 2 node: robots that answer their drivers' bytes, cameras, /clock.
-
-    ./run swarm_loc_drivers epuck_world_node --ros-args -p swarm_file:=swarm.yaml -p first_port:=20000
-
-Drivers connect to tcp://localhost:20000, 20001, ... in the order of the swarm description, or with
-`link_folder` to serial ports named like the robots. The node publishes `/clock`, per robot `ground_truth`
-(for evaluation and steering) and, in the place of the camera board's own driver,
-`image_raw` and `camera_info` of the 1280x960 camera; pictures that nobody listens to are not drawn. With
-`answer_within` time does not run away from those who read them.
-"""
+"""A simulated world as a ROS node: tells time and true poses, answers its robots' drivers."""
 
 from __future__ import annotations
 
-import sys
 import time
-from array import array
-from functools import partial
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from rclpy.node import Node
-from rclpy.publisher import Publisher
+from geometry_msgs.msg import PoseStamped
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.qos import QoSProfile
-from rclpy.time import Time
-from sensor_msgs.msg import CameraInfo, Image
+from rosgraph_msgs.msg import Clock
 
 from swarm_loc_drivers.nodes.odometry_output import stamp_message
-from swarm_loc_drivers.nodes.unanswered import Unanswered
-from swarm_loc_drivers.nodes.world_parameters import WorldParameters, make_world
-from swarm_loc_drivers.nodes.world_time import WorldTime
-from swarm_loc_drivers.protocols.epuck import EPUCK_MODELS
-from swarm_loc_drivers.sim.epuck_world import STEP_NS, Exposure, SimulatedEpuck
-from swarm_loc_drivers.sim.firmware.host import FirmwareHost
-from swarm_loc_drivers.sim.firmware.serial_firmware import SerialFirmware
-from swarm_loc_drivers.sim.firmware.wifi_firmware import WifiFirmware
-from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_estimator.nodes.declare import declare_parameters
-from swarm_loc_estimator.nodes.parameter_table import ParameterError
-from swarm_loc_estimator.nodes.running import Stop, run_node
-from swarm_loc_msgs.msg import MarkerDetectionArray
+from swarm_loc_drivers.sim.common.link_host import FirmwareHost
+from swarm_loc_estimator.io.messages.encoders import encode_pose_stamped
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.parameters.table import ParameterError
+from swarm_loc_estimator.ros.declare import Parameters
+from swarm_loc_estimator.ros.running import ConfiguredNode, Stop
 
-_CAMERA_QOS = QoSProfile(depth=5)
-"""Reliable: who wants so gets every picture, and who listens with best effort gets what comes."""
-_ANSWER_QOS = QoSProfile(depth=100)
-_ANSWER_PATIENCE_S = 10.0
-_THROTTLE_S = 30.0
+_CLOCK_QOS = QoSProfile(depth=10)
+_TRUTH_QOS = QoSProfile(depth=10)
+_HELD_WAKE_S = 0.002
+_MAX_LAG_S = 0.1
+"""A world that cannot keep up goes on from now instead of hurrying after."""
 
 
-class EpuckWorldNode(Node):
-    """Steps the world, serves its robots' links, publishes what is to be seen of it.
+class Pace(NamedTuple):
+    """How a world's time passes and is told.
 
-    Args:
-        node_arguments: Further arguments of `rclpy.node.Node`.
-
-    Raises:
-        ParameterError: A parameter cannot be used.
-        SwarmFileError: The swarm description cannot be used.
+    Attributes:
+        step_ns: Simulated time of a step.
+        rate: Simulated seconds per second, as far as the machine keeps up.
+        truth_rate: Published true poses of each robot [1/s].
+        clock_steps: The time is told every so many steps.
     """
 
-    def __init__(self, **node_arguments: Any) -> None:
-        super().__init__("epuck_world", **node_arguments)
-        self._wishes = declare_parameters(self, WorldParameters)
-        swarm, self._world = make_world(self._wishes)
-        self._names = [robot.name for robot in swarm.robots]
-        self._host = FirmwareHost()
-        for robot, name in enumerate(self._names):
-            self.get_logger().info(f"{name} answers at {self._serve(robot)}")
-        rate, truth_rate = self._wishes.rate, self._wishes.truth_rate
-        self._time = WorldTime(self, self._names, STEP_NS, rate, truth_rate)
-        self._images = [self._publisher(Image, name, "image_raw") for name in self._names]
-        self._infos = [self._publisher(CameraInfo, name, "camera_info") for name in self._names]
-        self._held_since_s: float | None = None
-        self._unanswered = Unanswered(self._wishes.answer_within)
-        if self._wishes.answer_within > 0.0:
-            for robot, name in enumerate(self._names):
-                answered = partial(self._on_detections, robot)
-                self.create_subscription(MarkerDetectionArray, f"{name}/detections", answered, _ANSWER_QOS)
+    step_ns: int
+    rate: float
+    truth_rate: float
+    clock_steps: int = 1
+
+
+class WorldNode(ConfiguredNode[Parameters]):
+    """Lets the time of a world pass; a kind of world says what a step does. See `ConfiguredNode`."""
+
+    def __init__(self, name: str, parameters: type[Parameters], **node_arguments: Any) -> None:
+        super().__init__(name, parameters, **node_arguments)
+        self.host = FirmwareHost()
+        self._steps = 0
+
+    def begin(self, names: Sequence[str], pace: Pace, serve: Callable[[int], str], place: str) -> None:
+        """Put all robots on their links, and publish from now on.
+
+        Args:
+            names: Of the robots.
+            pace: How time passes.
+            serve: Puts a robot on its link; returns the address for its driver.
+            place: The parameter that says where links are, and its value, for errors.
+
+        Raises:
+            ParameterError: A link cannot be there.
+        """
+        for robot, name in enumerate(names):
+            try:
+                self.get_logger().info(f"{name} answers at {serve(robot)}")
+            except OSError as error:
+                raise ParameterError(
+                    f"parameter {place} cannot be used for {name}: {error.strerror}."
+                ) from error
+        self._step_s, self._rate, self._clock_steps = pace.step_ns * 1e-9, pace.rate, pace.clock_steps
+        self._truth_steps = max(1, round(1.0 / (pace.truth_rate * self._step_s)))
+        self._clock_publisher = self.create_publisher(Clock, "/clock", _CLOCK_QOS)
+        self._truths = [
+            self.create_publisher(PoseStamped, f"{name}/ground_truth", _TRUTH_QOS) for name in names
+        ]
+
+    def step(self) -> None:
+        """Let the world do its next step, and `tell` it."""
+        raise NotImplementedError
+
+    def is_held(self) -> bool:
+        """Whether time stands still for now."""
+        return False
+
+    def tell(self, now_ns: int, poses: FloatArray) -> None:
+        """A step was done: publish the time, and at times the true poses (N, 3)."""
+        if self._steps % self._clock_steps == 0:
+            self._clock_publisher.publish(Clock(clock=stamp_message(now_ns)))
+        if self._steps % self._truth_steps == 0:
+            stamp_ns = np.array([now_ns], np.int64)
+            for publisher, pose in zip(self._truths, poses, strict=True):
+                publisher.publish(encode_pose_stamped("map", stamp_ns, pose[None])[0])
+        self._steps += 1
 
     def run(self, stop: Stop) -> int:
-        """Let time pass until asked to stop; the exit status."""
-        self._time.run(self._step, self._host, stop, self._is_held)
+        """Step again and again, and answer drivers in between, until asked to stop; the exit status."""
+        executor = EventsExecutor()
+        executor.add_node(self)
+        due_s = time.monotonic()
+        while not stop.requested:
+            self.step()
+            due_s = max(due_s + self._step_s / self._rate, time.monotonic() - _MAX_LAG_S)
+            self.host.poll(0.0)
+            while (left_s := due_s - time.monotonic()) > 0.0:
+                self.host.poll(left_s)
+            executor.spin_once(timeout_sec=0.0)
+            while self.is_held() and not stop.requested:
+                self.host.poll(0.0)
+                executor.spin_once(timeout_sec=_HELD_WAKE_S)
+        executor.shutdown()
         return 0
-
-    def _is_held(self) -> bool:
-        """Whether time stands still because a picture has not become detections; not for ever."""
-        if not self._unanswered.is_late(self._world.now_ns):
-            self._held_since_s = None
-            return False
-        now_s = time.monotonic()
-        self._held_since_s = self._held_since_s or now_s
-        if now_s > self._held_since_s + _ANSWER_PATIENCE_S:
-            name, self._held_since_s = self._names[self._unanswered.give_up()], None
-            self.get_logger().warning(
-                f"a picture of {name} has not become {name}/detections; time goes on without",
-                throttle_duration_sec=_THROTTLE_S,
-            )
-        return True
 
     def destroy_node(self) -> None:
         """Switch the robots off, too."""
-        self._host.close()
+        self.host.close()
         super().destroy_node()
-
-    def _serve(self, robot: int) -> str:
-        """Put a robot on its link; the address for its driver."""
-        body, folder = SimulatedEpuck(self._world, robot), self._wishes.link_folder
-        try:
-            if folder:
-                link = Path(folder) / self._names[robot]
-                return str(self._host.serve_pty(SerialFirmware(body, EPUCK_MODELS[self._wishes.model]), link))
-            port = self._wishes.first_port + robot if self._wishes.first_port else 0
-            return f"tcp://localhost:{self._host.serve_tcp(WifiFirmware(body), port=port)}"
-        except OSError as error:
-            name, value = ("link_folder", folder) if folder else ("first_port", str(self._wishes.first_port))
-            raise ParameterError(
-                f"parameter {name} = {value} cannot be used for {self._names[robot]}: {error.strerror}."
-            ) from error
-
-    def _publisher(self, kind: type, robot: str, topic: str) -> Publisher:
-        return self.create_publisher(kind, f"{robot}/{topic}", _CAMERA_QOS)
-
-    def _step(self) -> None:
-        """Let the world do a step; tell the time, and then what belongs to it."""
-        taken = self._world.step()
-        self._time.tell(self._world.now_ns, self._world.poses)
-        for exposure in taken:
-            if self._images[exposure.robot].get_subscription_count():
-                self._publish_picture(exposure)
-
-    def _publish_picture(self, exposure: Exposure) -> None:
-        message = image_message(self._world.picture(exposure))
-        message.header.stamp = stamp_message(exposure.stamp_ns)
-        message.header.frame_id = f"{self._names[exposure.robot]}/camera_optical_frame"
-        info = camera_info_message(self._wishes.camera)
-        info.header = message.header
-        self._infos[exposure.robot].publish(info)
-        self._images[exposure.robot].publish(message)
-        self._unanswered.ask(exposure.robot, exposure.stamp_ns, self._world.now_ns)
-
-    def _on_detections(self, robot: int, message: MarkerDetectionArray) -> None:
-        self._unanswered.answer(robot, Time.from_msg(message.header.stamp).nanoseconds)
-
-
-def image_message(picture: NDArray[np.uint8]) -> Image:
-    """A grey picture (height, width) as sensor_msgs/Image, without its header."""
-    height, width = picture.shape
-    message = Image(height=height, width=width, encoding="mono8", step=width)
-    message.data = array("B", picture.tobytes())  # a list would be checked byte by byte
-    return message
-
-
-def camera_info_message(model: CameraModel) -> CameraInfo:
-    """The calibration as sensor_msgs/CameraInfo, without its header."""
-    fields = model.camera_info()
-    return CameraInfo(**{**fields, "d": fields["d"].tolist()})
-
-
-def main() -> int:
-    """Run until SIGINT or SIGTERM; 1 when a parameter cannot be used."""
-    return run_node("epuck_world_node", EpuckWorldNode, EpuckWorldNode.run)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from typing import Protocol
 from urllib.parse import urlsplit
 
+from swarm_loc_estimator.parameters.errors import UserError
+
 
 class LinkError(OSError):
     """A link cannot be opened or has broken; the message says which and why."""
 
 
-class AddressError(ValueError):
+class AddressError(UserError):
     """An address that cannot be understood; the message is one sentence."""
 
 

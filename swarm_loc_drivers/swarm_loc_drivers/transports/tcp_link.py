@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import time
 
 from swarm_loc_drivers.transports.link import LinkError
 
@@ -53,22 +52,5 @@ class TcpLink:
             raise LinkError(f"{self._name} is broken: {error.strerror or error}") from error
 
     def close(self) -> None:
-        """See `Link.close`.
-
-        What has come and was not read would make the system reset the connection, and the last bytes sent
-        might never arrive; so it is read first.
-        """
-        try:
-            self._socket.shutdown(socket.SHUT_WR)
-            self._read_to_end(time.monotonic() + self._timeout_s)
-        except OSError:
-            pass  # it was broken already
-        finally:
-            self._socket.close()
-
-    def _read_to_end(self, deadline_s: float) -> None:
-        """Read until the robot closes, too, or time is up."""
-        while (left_s := deadline_s - time.monotonic()) > 0.0:
-            self._socket.settimeout(left_s)
-            if not self._socket.recv(_CHUNK):
-                return
+        """See `Link.close`: at once, since some robots never close their end."""
+        self._socket.close()

@@ -11,11 +11,11 @@ import sys
 import time
 from pathlib import Path
 
-from droplet_bench import SECOND, world_of
+from droplet_rig import SECOND, world_of
 
-from swarm_loc_drivers.sim.droplet_world import STEP_NS, SimulatedDroplet
-from swarm_loc_drivers.sim.firmware.droplet_firmware import DropletFirmware
-from swarm_loc_drivers.sim.firmware.host import FirmwareHost
+from swarm_loc_drivers.sim.common.link_host import FirmwareHost
+from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
+from swarm_loc_drivers.sim.droplet.world import STEP_NS, SimulatedDroplet
 
 
 def main() -> None:

@@ -13,10 +13,10 @@ from pathlib import Path
 
 from epuck_body import DrivenBody
 
-from swarm_loc_drivers.protocols.epuck import EPUCK_MODELS
-from swarm_loc_drivers.sim.firmware.host import FirmwareHost
-from swarm_loc_drivers.sim.firmware.serial_firmware import SerialFirmware
-from swarm_loc_drivers.sim.firmware.wifi_firmware import WifiFirmware
+from swarm_loc_drivers.protocols.epuck.hardware import EPUCK_MODELS
+from swarm_loc_drivers.sim.common.link_host import FirmwareHost
+from swarm_loc_drivers.sim.epuck.firmware.serial_firmware import SerialFirmware
+from swarm_loc_drivers.sim.epuck.firmware.wifi_firmware import WifiFirmware
 
 
 def main() -> None:

@@ -14,17 +14,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from droplet_bench import IDS, TRIANGLE, FloatArray
+from droplet_rig import IDS, TRIANGLE
 from geometry_msgs.msg import Twist, Vector3
 from nav_msgs.msg import Odometry
 from node_world import Program, Ros, overrides, stamp_ns
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_drivers.nodes.droplet_driver_node import DropletDriverNode
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.ir.brightness import expected
-from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
+from swarm_loc_drivers.nodes.droplet.droplet_driver_node import DropletDriverNode
+from swarm_loc_estimator.core.infrared.brightness import expected
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_msgs.msg import BrightnessMatrix
 
 UNIT = Path(__file__).parents[1] / "unit"

@@ -14,11 +14,11 @@ from nav_msgs.msg import Odometry
 from node_world import Program, Ros, overrides, stamp_ns
 from rosgraph_msgs.msg import Clock
 
-from swarm_loc_drivers.nodes.droplet_table_node import DropletTableNode
-from swarm_loc_drivers.sim.droplet_swarm import DropletSwarmSettings, describe_droplets, starts
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
-from swarm_loc_estimator.io.swarm_writer import save_swarm
+from swarm_loc_drivers.nodes.droplet.droplet_fleet_node import DropletFleetNode
+from swarm_loc_drivers.sim.scenarios.droplet_table import DropletSwarmSettings, describe_droplets, starts
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.numerics import se2
 from swarm_loc_msgs.msg import BrightnessMatrix
 
 ROBOTS = 3
@@ -45,7 +45,7 @@ def test_the_drivers_of_a_table_share_what_is_set_and_begin_when_all_are_made(
 ) -> None:
     shared = {"model": "audio_droplet", "walk_noise": 0.002, "far_power": 200, "publish_tf": False}
     values = {"swarm_file": str(swarm_file), "link_folder": str(tmp_path), "parts": 2, **shared}
-    table = DropletTableNode(parameter_overrides=overrides(**values))
+    table = DropletFleetNode(parameter_overrides=overrides(**values))
     told = {"address": str(tmp_path / "droplet3"), "turns": ROBOTS, "turn": 2, **shared}
     _, driver = table._drivers
     assert {name: driver.get_parameter(name).value for name in told} == told
@@ -71,7 +71,7 @@ def test_droplets_wander_and_measure_each_other(ros: Ros, swarm_file: Path, tmp_
             "droplet_world_node", "world.log", {**swarm, **seen, "link_folder": tmp_path, "rate": 2.0}
         )
         ros.until(lambda: clock)
-        start("droplet_table_node", "table.log", {**swarm, "link_folder": tmp_path, "use_sim_time": "true"})
+        start("droplet_fleet_node", "table.log", {**swarm, "link_folder": tmp_path, "use_sim_time": "true"})
         start("droplet_steering_node", "steering.log", {**swarm, "use_sim_time": "true"})
         ros.until(lambda: any(one.twist.twist.linear.x or one.twist.twist.linear.y for one in odometry))
         ros.until(lambda: len({one.transmitter for one in matrices}) == 2 and len(fixes) > 5)

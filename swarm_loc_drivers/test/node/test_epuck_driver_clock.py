@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from epuck_bench import Emulator, Robots
 from epuck_body import GEOMETRY, DrivenBody
+from epuck_rig import Emulator, Robots
 from geometry_msgs.msg import Twist, Vector3
 from nav_msgs.msg import Odometry
 from node_world import SECOND, T0_NS, Ros, overrides, stamp_ns
@@ -20,9 +22,10 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 
-from swarm_loc_drivers.core import velocity_command
-from swarm_loc_drivers.nodes.epuck_driver_node import EpuckDriverNode
-from swarm_loc_drivers.protocols.epuck import EPUCK2
+from swarm_loc_drivers.core import robot_driver, velocity_command
+from swarm_loc_drivers.core.epuck import wifi_session
+from swarm_loc_drivers.nodes.epuck.epuck_driver_node import EpuckDriverNode
+from swarm_loc_drivers.protocols.epuck.hardware import EPUCK2
 
 STEP_NS = SECOND // 50
 CALIBRATION = """
@@ -40,6 +43,11 @@ class World:
 
     To it the time comes after the driver's node has it. What it streams at once when a step begins would
     else be taken for a second reading of the step before, and no other would follow while time stands still.
+
+    Attributes:
+        heard: What the firmware has received.
+        rounds: How often it has gone on.
+        age_ns: Of the readings that it sends.
     """
 
     def __init__(self, ros: Ros, robots: Robots) -> None:
@@ -47,6 +55,8 @@ class World:
         self._ros = ros
         self.body = DrivenBody(lambda: self.now_ns, steps=(32700, -32700))
         self.robots = robots
+        self.heard = b""
+        self.rounds = self.age_ns = 0
         self._clock = ros.tester.create_publisher(Clock, "/clock", 10)
         self._commands = ros.tester.create_publisher(Twist, "epuck1/cmd_vel", 10)
         self.odometry: list[Odometry] = ros.listen(Odometry, "epuck1/odom")
@@ -70,16 +80,35 @@ class World:
         self._commands.publish(Twist(linear=Vector3(x=speed), angular=Vector3(z=turn_rate)))
 
     def step(self) -> None:
-        """Let time go on, and wait for odometry of the new time."""
+        """Let time go on when the firmware waits for it, and wait for odometry as new as it can be."""
+        self.rest()
         self.tell_time(self.now_ns + STEP_NS)
-        self._ros.until(lambda: self.odometry and stamp_ns(self.odometry[-1]) >= self.now_ns)
+        self._ros.until(lambda: stamp_ns(self.odometry[-1]) >= self.now_ns - self.age_ns)
+
+    def rest(self) -> None:
+        """Wait until the firmware waits for time to go on."""
+        rounds = self.rounds
+        self._ros.until(lambda: self.rounds > rounds + 1)
+
+    def until(self, condition: Callable[[], object]) -> None:
+        """Let time go on, a moment for what is under way at each step, until something is so."""
+        end_s = time.monotonic() + 60.0
+        while not condition():
+            assert time.monotonic() < end_s, "waited in vain"
+            self.tell_time(self.now_ns + STEP_NS)
+            moment_s = time.monotonic() + 0.1
+            while not condition() and time.monotonic() < moment_s:
+                self._ros.executor.spin_once(timeout_sec=0.02)
 
 
 @pytest.fixture
 def world(ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
-    monkeypatch.setattr(velocity_command, "STANDING_CLOCK_S", math.inf)  # real time does not count here
+    # real time does not count here
+    monkeypatch.setattr(velocity_command, "STANDING_CLOCK_S", math.inf)
+    monkeypatch.setattr(wifi_session, "_REPEAT_S", math.inf)
+    monkeypatch.setattr(robot_driver, "MAX_STOP_S", 0.1)  # who could answer is gone when the node ends
     with ExitStack() as stack:
-        yield World(ros, Robots(tmp_path, stack))
+        yield World(ros, Robots(tmp_path, stack, stack))
 
 
 def node_on(address: object, **values: object) -> EpuckDriverNode:
@@ -92,27 +121,47 @@ def node_on(address: object, **values: object) -> EpuckDriverNode:
 
 def serve(world: World, over: str) -> tuple[Emulator, object]:
     """The robot, and its address."""
+
+    def noting(firmware: Any) -> Any:
+        receive, stream = firmware.receive, firmware.stream
+
+        def heard(data: bytes) -> Any:
+            answer = receive(data)
+            world.heard += data
+            return answer
+
+        def streamed() -> Any:
+            answer = stream()
+            world.rounds += 1
+            return answer
+
+        firmware.receive, firmware.stream = heard, streamed
+        return firmware
+
     if over == "wifi":
-        return world.robots.wifi(body=world.body), world.robots.tcp_address
-    return world.robots.serial(EPUCK2, body=world.body), world.robots.serial_address
+        world.age_ns = STEP_NS  # it streams what it has read a cycle before
+        return world.robots.wifi(body=world.body, wrap=noting), world.robots.tcp_address
+    return world.robots.serial(EPUCK2, body=world.body, wrap=noting), world.robots.serial_address
 
 
 @pytest.mark.parametrize("over", ["serial", "wifi"])
 def test_stamps_motion_and_timeout_follow_simulated_time(world: World, ros: Ros, over: str) -> None:
+    """The wheels turn for 0.12 s: until the first step at which the command is older than its 0.1 s.
+
+    Over the serial port that step's question stops them at once, as the command itself starts them. By WiFi a
+    cycle takes a step and reads one command, which the next one obeys. The start comes when a cycle has read
+    its command, the stop in answer to what a cycle streams, so that the same one may still read it: 0.02 s
+    less. Whole steps of the motors are counted.
+    """
     _, address = serve(world, over)
     world.connect(node_on(address))
-    world.step()
+    world.until(lambda: world.odometry)
+    world.rest()
     world.command(0.1)
-    ros.until(lambda: any(world.body.rates))
-    rate = world.body.rates[0]
-    begin_ns = world.now_ns
-    while world.now_ns < begin_ns + SECOND // 10:
+    speeds = GEOMETRY.commands_for(0.1, 0.0, EPUCK2)
+    ros.until(lambda: struct.pack("<2h", *speeds) in world.heard)
+    for _ in range(10):
         world.step()
-    ros.until(lambda: any(world.body.rates))  # the command is not yet older than the timeout
-    world.step()
-    world.step()
-    ros.until(lambda: not any(world.body.rates))
-    world.step()
 
     stamps = np.array([stamp_ns(message) for message in world.odometry])
     # a stream is stamped when read; an answer in the middle since its question, and time may step between
@@ -121,13 +170,15 @@ def test_stamps_motion_and_timeout_follow_simulated_time(world: World, ros: Ros,
     assert (np.diff(stamps) > 0).all()
     driven = world.odometry[-1].pose.pose.position.x
     assert driven == pytest.approx(world.body.pose[0], abs=2 * GEOMETRY.metres_per_step)
-    assert 0.1 * rate <= driven / GEOMETRY.metres_per_step <= 0.16 * rate
+    assert not any(world.body.rates)
+    rate = EPUCK2.rate(speeds[0])
+    assert math.floor(0.1 * rate) <= round(driven / GEOMETRY.metres_per_step) <= 0.14 * rate
 
 
 def test_time_that_jumps_back_stops_the_robot_and_goes_on(world: World, ros: Ros) -> None:
     _, address = serve(world, "serial")
     world.connect(node_on(address))
-    world.step()
+    world.until(lambda: world.odometry)
     world.command(0.1)
     ros.until(lambda: any(world.body.rates))
     world.step()
@@ -150,11 +201,8 @@ def test_pictures_come_with_their_calibration(world: World, ros: Ros, tmp_path: 
     frame = np.stack([rows // 8, columns // 8, 0 * rows], axis=-1).astype(np.uint8)
     _, address = serve(world, "wifi")
     world.connect(node_on(address, camera=True, camera_info_file=str(path)))
-    world.body.frame = (frame, world.now_ns)
-    end_s = time.monotonic() + 60.0
-    while not (images and infos):
-        world.step()
-        assert time.monotonic() < end_s
+    world.body.frame = (frame, None)
+    world.until(lambda: images and infos)
 
     image, info = images[0], infos[0]
     assert (image.width, image.height, image.step, image.encoding) == (160, 120, 480, "rgb8")

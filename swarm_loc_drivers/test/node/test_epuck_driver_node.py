@@ -16,21 +16,20 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from epuck_bench import SQUARE
 from epuck_body import GEOMETRY
+from epuck_rig import SQUARE
 from geometry_msgs.msg import Twist, Vector3
 from nav_msgs.msg import Odometry
 from node_world import Program, Ros
-from numpy.typing import NDArray
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import Range
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_drivers.protocols.epuck import PROXIMITY_BEARINGS
-from swarm_loc_estimator.core import se2
+from swarm_loc_drivers.protocols.epuck.hardware import PROXIMITY_BEARINGS
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 UNIT = Path(__file__).parents[1] / "unit"
-FloatArray = NDArray[np.float64]
 
 
 class Robot:
@@ -267,7 +266,7 @@ def test_velocities_that_are_not_finite_are_warned_of(ros: Ros, robot: Start, dr
     controller = Controller(ros)
     program = driver("wifi", robot("wifi").place)
     controller.velocity = (math.nan, 0.0)
-    ros.until(lambda: " bad_cmd_vel: velocities that were not finite" in program.output)
+    ros.until(lambda: " bad_cmd_vel: velocities that were not finite, or absurd" in program.output)
 
 
 @OVER
@@ -309,7 +308,7 @@ def test_a_robot_that_dies_is_told_and_found_again(ros: Ros, robot: Start, drive
         ({"address": "/dev/nothing", "camera": "true"}, "parameter camera_info_file is not set"),
         (
             {"address": "/dev/nothing", "camera": "true", "image_width": 60, "image_height": 60},
-            "make pictures of 7200 bytes, but an epuck2 can send at most 4136.",
+            "make images of 7200 bytes, but an epuck2 can send at most 4128.",
         ),
         (
             {"address": "/dev/nothing", "camera": "true", "camera_info_file": "/nowhere.yaml"},

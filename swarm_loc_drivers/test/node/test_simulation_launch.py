@@ -1,32 +1,29 @@
-"""The launch file starts what the `simulate` command starts; runs where launch_ros is installed."""
+"""The launch file starts what the `simulate` command starts, or says why not and ends with an error."""
 
 from __future__ import annotations
 
 import atexit
 import tempfile
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
-from node_world import module_at
 
-from swarm_loc_drivers.sim.world_error import WorldError
 from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
 
-launch = pytest.importorskip("launch")
-pytest.importorskip("launch_ros")
+pytest.importorskip("launch_ros.actions")
+from launch_world import end_of, nodes_of
 
 LAUNCH_FILE = Path(__file__).parents[2] / "launch" / "simulation.launch.py"
 BAGS = Path(__file__).parents[3] / "bags"
+SWARM_FILE = str(BAGS / "eight_one_robot_slow" / "swarm.yaml")
 
 
 @pytest.fixture
 def at_exit(monkeypatch: pytest.MonkeyPatch) -> list[Callable[[], object]]:
     """What is to be done when the launch ends."""
     asked: list[Callable[[], object]] = []
-    monkeypatch.setattr(atexit, "register", lambda *call, **options: asked.append(partial(*call, **options)))
+    monkeypatch.setattr(atexit, "register", asked.append)
     return asked
 
 
@@ -37,27 +34,37 @@ def links(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def context_of(bag: str) -> Any:
-    """A launch with a bag's swarm."""
-    context = launch.LaunchContext()
-    chosen = {"world": "w0", "seed": "3", "speed": "0.06", "rate": "1.0", "params_file": ""}
-    context.launch_configurations.update(chosen, swarm_file=str(BAGS / bag / "swarm.yaml"))
-    return context
-
-
 def test_launch_arguments_become_the_simulations_nodes(
     links: Path, at_exit: list[Callable[[], object]]
 ) -> None:
-    actions = module_at(LAUNCH_FILE).start_nodes(context_of("eight_one_robot_slow"))
+    chosen = {"world": "w0", "seed": "3", "speed": "0.06", "rate": "1.0", "params_file": ""}
+    started = nodes_of(LAUNCH_FILE, swarm_file=SWARM_FILE, **chosen)
     (folder,) = links.iterdir()
-    specs = simulation_nodes(SimulationOptions("swarm.yaml", str(folder)), ["epuck1"])
-    assert [action.node_executable for action in actions] == [spec.executable for spec in specs]
+    specs = simulation_nodes(SimulationOptions(SWARM_FILE), ["epuck1"], str(folder))
+    assert started == [spec.executable for spec in specs]
     (clean_up,) = at_exit
     clean_up()
     assert not list(links.iterdir())
 
 
-def test_a_swarm_that_cannot_be_simulated_starts_nothing(links: Path) -> None:
-    with pytest.raises(WorldError, match="robot 'droplet1' has no start pose"):
-        module_at(LAUNCH_FILE).start_nodes(context_of("droplets_twenty"))
-    assert not list(links.iterdir())
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"swarm_file": "missing.yaml"}, "missing.yaml"),
+        ({"swarm_file": str(BAGS / "droplets_twenty" / "swarm.yaml")}, "'droplet1' has no start pose"),
+        ({"params_file": "missing.yaml"}, "missing.yaml"),
+        ({"rate": "abc"}, "argument rate = 'abc' must be a number in [0.01, 100]."),
+        ({"rate": "0"}, "argument rate = '0' must be a number in [0.01, 100]."),
+        ({"seed": "1.5"}, "argument seed = '1.5' must be a whole number in"),
+        ({"speed": "7"}, "argument speed = '7' must be a number in [0.001, 0.12] m/s."),
+    ],
+)
+def test_an_argument_that_cannot_be_used_ends_the_launch_with_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: dict[str, str], sentence: str
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    status, said = end_of(LAUNCH_FILE, **{"swarm_file": SWARM_FILE, **changed})
+    assert status == 1
+    assert sentence in said
+    assert "process started" not in said
+    assert not list(tmp_path.glob("epucks-*"))

@@ -1,4 +1,4 @@
-"""Everything at once over DDS: pictures, firmware, drivers, detectors and estimator give true poses."""
+"""Everything at once over DDS: images, firmware, drivers, detectors and estimator give true poses."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
 
-from swarm_loc_drivers.sim.eight import HALF_WIDTH, EightSettings, describe
-from swarm_loc_drivers.sim.lemniscate import Lemniscate
+from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
+from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
 from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
-from swarm_loc_estimator.core.estimator import Status
-from swarm_loc_estimator.io.swarm_writer import save_swarm
-from swarm_loc_estimator.live_graph import LiveGraph
-from swarm_loc_estimator.nodes.recorder import read_poses
+from swarm_loc_estimator.core.estimation.estimator import Status
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.live.graph import LiveGraph
+from swarm_loc_estimator.live.recorder import read_poses
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
 PATIENCE_S = 100.0
@@ -31,11 +31,10 @@ def test_robots_are_located_by_what_their_cameras_see(tmp_path: Path) -> None:
     (tmp_path / "links").mkdir()
     options = SimulationOptions(
         str(tmp_path / "swarm.yaml"),
-        str(tmp_path / "links"),
         world="w0",
         parameter_file=str(tmp_path / "parameters.yaml"),
     )
-    nodes = simulation_nodes(options, [robot.name for robot in swarm.robots])
+    nodes = simulation_nodes(options, [robot.name for robot in swarm.robots], str(tmp_path / "links"))
     truth: dict[int, np.ndarray[tuple[int], np.dtype[np.float64]]] = {}
     seen: list[MarkerDetectionArray] = []
 
@@ -62,3 +61,6 @@ def test_robots_are_located_by_what_their_cameras_see(tmp_path: Path) -> None:
     ]
     assert np.median(errors) < 0.02
     assert sum(len(array.detections) for array in seen) > len(seen)
+    log = (tmp_path / "nodes.log").read_text(encoding="utf-8")
+    assert "dropped" not in log
+    assert "time goes on without" not in log

@@ -17,10 +17,10 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 
-from swarm_loc_drivers.sim.eight import HALF_WIDTH, EightSettings, describe
-from swarm_loc_drivers.sim.lemniscate import Lemniscate
 from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_estimator.io.swarm_writer import save_swarm
+from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
+from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
 
 SECOND = 1_000_000_000
 SIZE = {"width": 320, "height": 240}
@@ -74,7 +74,7 @@ def test_robots_drive_the_eight_by_their_bytes_and_their_cameras_look(
             program = Program(name, tmp_path / log, parameters, arguments, package="swarm_loc_drivers")
             return running.enter_context(program)
 
-        world = start("world_node", "world.log", {**swarm, **place, **SIZE, "rate": RATE})
+        world = start("epuck_world_node", "world.log", {**swarm, **place, **SIZE, "rate": RATE})
         ros.until(lambda: clock)
         for robot in range(2):
             address = (
@@ -86,7 +86,7 @@ def test_robots_drive_the_eight_by_their_bytes_and_their_cameras_look(
                 {"address": address, **sim_time},
                 namespace=f"epuck{robot + 1}",
             )
-        start("steering_node", "steering.log", {**swarm, "speed": SPEED, **sim_time})
+        start("eight_steering_node", "steering.log", {**swarm, "speed": SPEED, **sim_time})
         ros.until(lambda: any(one.twist.twist.linear.x > 0.9 * SPEED for one in odometry))
         moving_ns = stamp_ns(truth[-1])
         ros.until(lambda: stamp_ns(truth[-1]) > moving_ns + CATCHING_UP_NS)
@@ -111,13 +111,13 @@ def test_robots_drive_the_eight_by_their_bytes_and_their_cameras_look(
     assert np.std(np.frombuffer(images[-1].data, np.uint8)) > 10.0
     assert images[-1].header.frame_id == "epuck2/camera_optical_frame"
     model = CameraModel(**SIZE)
-    np.testing.assert_allclose(infos[-1].k, model.matrix.reshape(9))
+    np.testing.assert_allclose(infos[-1].k, model.camera.matrix.reshape(9))
     assert len({stamp_ns(one) for one in infos} & set(stamps)) > 0.9 * len(stamps)
 
 
 def test_a_parameter_that_cannot_be_used_ends_it_with_one_sentence(swarm_file: Path, tmp_path: Path) -> None:
     program = Program(
-        "world_node",
+        "epuck_world_node",
         tmp_path / "log",
         {"swarm_file": swarm_file, "model": "epuck1"},
         package="swarm_loc_drivers",

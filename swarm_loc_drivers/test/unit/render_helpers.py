@@ -1,4 +1,4 @@
-"""A small scene, and what a picture of it must show, worked out by casting rays: slow and independent."""
+"""A small scene, and what an image of it must show, worked out by casting rays: slow and independent."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.sim.eight import ARENA, faces, wall_markers
 from swarm_loc_drivers.sim.render import scene as scenery
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.raster import Patches
-from swarm_loc_drivers.sim.render.renderer import Eye, Scene
-
-FloatArray = NDArray[np.float64]
+from swarm_loc_drivers.sim.render.renderer import RobotCamera, Scene
+from swarm_loc_drivers.sim.scenarios.eight import ARENA, faces, wall_markers
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 LANDMARK_SIZE = wall_markers()[0].size
 
@@ -52,9 +51,9 @@ def pose_matrix(pose: Sequence[float] | FloatArray) -> FloatArray:
     return np.array([[cos, -sin, 0, pose[0]], [sin, cos, 0, pose[1]], [0, 0, 1, 0], [0, 0, 0, 1]], float)
 
 
-def camera_matrix(eye: Eye, pose: Sequence[float] | FloatArray) -> FloatArray:
+def camera_matrix(camera: RobotCamera, pose: Sequence[float] | FloatArray) -> FloatArray:
     """From the optical frame to map (4, 4), by the definition of the camera's mount."""
-    mount = eye.mount
+    mount = camera.mount
     turn = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     for angle, axis in ((mount.roll, (1, 0, 0)), (mount.pitch, (0, 1, 0)), (mount.yaw, (0, 0, 1))):
         turn = np.asarray(cv2.Rodrigues(np.multiply(angle, axis))[0], float) @ turn
@@ -65,11 +64,11 @@ def camera_matrix(eye: Eye, pose: Sequence[float] | FloatArray) -> FloatArray:
     return to_map
 
 
-def pixels_of(eye: Eye, model: CameraModel, pose: FloatArray, points: FloatArray) -> FloatArray:
+def pixels_of(camera: RobotCamera, model: CameraModel, pose: FloatArray, points: FloatArray) -> FloatArray:
     """Where OpenCV projects points (n, 3) of map (n, 2)."""
-    to_optical = np.linalg.inv(camera_matrix(eye, pose))
+    to_optical = np.linalg.inv(camera_matrix(camera, pose))
     turn, shift = cv2.Rodrigues(to_optical[:3, :3])[0], to_optical[:3, 3]
-    pixels = cv2.projectPoints(points, turn, shift, model.matrix, model.distortion)[0]
+    pixels = cv2.projectPoints(points, turn, shift, model.camera.matrix, np.array(model.camera.distortion))[0]
     return np.asarray(pixels, float)[:, 0]
 
 
@@ -99,23 +98,24 @@ class RayCaster:
         value = np.full(len(rays), scenery.ROOM)
         for corners, change, covers in self._surfaces:
             normal = np.cross(corners[0, 3] - corners[0, 0], corners[0, 1] - corners[0, 0])
-            facing = np.minimum(
-                rays @ normal, -1e-12
-            )  # away from the front: hit so far off that nothing is there
-            distance = ((corners[0, 0] - origin) @ normal) / facing
-            hit = origin + distance[:, None] * rays
-            inside = np.array([_within(quad, hit, normal) for quad in corners])
+            centre = corners.mean(axis=(0, 1))
+            reach = np.linalg.norm(corners - centre, axis=-1).max() + 1e-9
+            height = float((corners[0, 0] - origin) @ normal)
+            facing = rays @ normal
+            # one that runs along the surface, or away from its front, meets it nowhere
+            distance = np.divide(height, facing, out=np.full(len(rays), -1.0), where=facing < -1e-12)
+            near = np.linalg.norm(origin + distance[:, None] * rays - centre, axis=1) <= reach
+            which = np.flatnonzero((distance > 0.0) & (distance < nearest + 1e-5) & near)
+            hit = origin + distance[which, None] * rays[which]
+            inside = _within(corners, hit, normal)
             total = (inside * change[:, None]).sum(axis=0) + (0.0 if covers else scenery.ROOM)
-            met = (
-                inside.any(axis=0) & (distance > 0.0) & (distance < nearest + 1e-5)
-            )  # a marker on a wall wins
-            nearest[met], value[met] = distance[met], total[met]
+            met = which[inside.any(axis=0)]
+            nearest[met], value[met] = distance[met], total[inside.any(axis=0)]
         return value
 
 
-def _within(quad: FloatArray, points: FloatArray, normal: FloatArray) -> NDArray[np.bool_]:
-    """Which points (n, 3) of a quadrangle's plane lie inside it; clockwise as seen from the front."""
-    inside = np.ones(len(points), bool)
-    for start, end in zip(quad, np.roll(quad, -1, axis=0), strict=True):
-        inside &= np.cross(end - start, points - start) @ normal <= 0.0
-    return inside
+def _within(quads: FloatArray, points: FloatArray, normal: FloatArray) -> NDArray[np.bool_]:
+    """Which points (n, 3) lie inside quadrangles (Q, 4, 3) that are clockwise from the front (Q, n)."""
+    outwards = np.cross(normal, np.roll(quads, -1, axis=1) - quads)
+    beyond = outwards @ points.T - np.sum(outwards * quads, axis=-1, keepdims=True)
+    return np.asarray((beyond <= 0.0).all(axis=1))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from swarm_loc_drivers.sim.dense import PITCH, DenseSettings, blind_robots, simulate_dense
+from swarm_loc_drivers.sim.scenarios.dense import PITCH, DenseSettings, blind_robots, simulate_dense
 
 
 def test_the_inner_robots_see_robots_but_no_landmark_and_others_see_both() -> None:
@@ -17,11 +17,16 @@ def test_the_inner_robots_see_robots_but_no_landmark_and_others_see_both() -> No
     assert run.frames["first"].tolist() == (np.cumsum(run.frames["count"]) - run.frames["count"]).tolist()
 
 
-def test_neighbours_keep_their_distance_and_a_seed_its_run() -> None:
+def test_a_seed_keeps_its_run() -> None:
+    one, again, other = (simulate_dense(DenseSettings(seed=seed, duration_s=1.0)) for seed in (4, 4, 5))
+    assert one.sightings.size > 100
+    np.testing.assert_array_equal(one.sightings, again.sightings)
+    assert one.sightings.tobytes() != other.sightings.tobytes()
+
+
+def test_neighbours_keep_their_distance() -> None:
     run = simulate_dense(DenseSettings(seed=4, duration_s=20.0))
     poses = run.truth.poses[::50]
     apart = np.linalg.norm(poses[:, 1, :2] - poses[:, 0, :2], axis=-1)
     assert apart.min() > 0.6 * PITCH
     assert apart.max() < 1.4 * PITCH
-    again = simulate_dense(DenseSettings(seed=4, duration_s=20.0))
-    np.testing.assert_array_equal(run.sightings, again.sightings)

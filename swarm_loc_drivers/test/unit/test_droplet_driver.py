@@ -11,26 +11,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from droplet_bench import (
-    IDEAL,
-    IDS,
-    LINK,
-    NOISE,
-    SECOND,
-    TRIANGLE,
-    FloatArray,
-    asking,
-    session_settings,
-    world_of,
-)
+from droplet_rig import IDEAL, IDS, LINK, NOISE, SECOND, TRIANGLE, asking, session_settings, world_of
 
-from swarm_loc_drivers.core.droplet_driver import OWN, DropletDriver, DropletListeners, DropletSettings
-from swarm_loc_drivers.core.droplet_exchange import AskSettings, Brightness
+from swarm_loc_drivers.core.droplet.driver import OWN, DropletDriver, DropletListeners, DropletSettings
+from swarm_loc_drivers.core.droplet.exchange import Brightness, PollingSettings
 from swarm_loc_drivers.core.odometry_state import OdometryState
-from swarm_loc_drivers.sim.droplet_world import STEP_NS, DropletWorld, SimulatedDroplet, nominal_gait
-from swarm_loc_drivers.sim.firmware.droplet_firmware import DropletFirmware
-from swarm_loc_drivers.sim.firmware.host import FirmwareHost
-from swarm_loc_estimator.core import se2
+from swarm_loc_drivers.sim.common.link_host import FirmwareHost
+from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
+from swarm_loc_drivers.sim.droplet.world import STEP_NS, DropletWorld, SimulatedDroplet, nominal_gait
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 PATIENCE_S = 60.0
 SPEED = nominal_gait(0).velocity[0]
@@ -118,7 +108,7 @@ class Lab:
         self._stack.callback(emulator.kill)
         return emulator
 
-    def desk(self, exchanges: AskSettings, **relayed: int) -> Desk:
+    def desk(self, exchanges: PollingSettings, **relayed: int) -> Desk:
         """A driver at work."""
         settings = DropletSettings(
             device=str(self.device),

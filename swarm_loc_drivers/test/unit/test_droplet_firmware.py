@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from droplet_bench import IDS, TRIANGLE, world_of
+from droplet_rig import IDS, TRIANGLE, world_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_drivers.protocols.droplet_console import ConsoleParser, Matrix
-from swarm_loc_drivers.protocols.droplet_infrared import (
+from swarm_loc_drivers.protocols.droplet.console import ConsoleParser, Matrix
+from swarm_loc_drivers.protocols.droplet.infrared_timing import (
     EMITTED_AFTER_NS,
     EXCHANGE_NS,
     HANDLING_NS,
@@ -17,14 +17,14 @@ from swarm_loc_drivers.protocols.droplet_infrared import (
     PRINT_DELAY_NS,
     message_ns,
 )
-from swarm_loc_drivers.sim.droplet_world import STEP_NS, DropletWorld, SimulatedDroplet, nominal_gait
-from swarm_loc_drivers.sim.firmware.droplet_firmware import (
+from swarm_loc_drivers.sim.droplet.firmware import (
     DropletFirmware,
     Print,
     print_2014,
     print_2016,
     print_named,
 )
+from swarm_loc_drivers.sim.droplet.world import STEP_NS, DropletWorld, SimulatedDroplet, nominal_gait
 
 
 class Robots:

@@ -6,15 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from droplet_bench import IDEAL, LINK, QUIET, SECOND, TRIANGLE, FloatArray, world_of
+from droplet_rig import IDEAL, LINK, QUIET, SECOND, TRIANGLE, world_of
 
-from swarm_loc_drivers.protocols.droplet import FULL_POWER
-from swarm_loc_drivers.protocols.droplet_infrared import EXCHANGE_NS, message_ns
-from swarm_loc_drivers.sim.body import Command, Measured
-from swarm_loc_drivers.sim.droplet_infrared import InfraredSettings
-from swarm_loc_drivers.sim.droplet_world import NEAR_POWER, STEP_NS, DropletErrors, DropletWorld
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.ir.brightness import expected
+from swarm_loc_drivers.protocols.droplet.hardware import FULL_POWER
+from swarm_loc_drivers.protocols.droplet.infrared_timing import EXCHANGE_NS, message_ns
+from swarm_loc_drivers.sim.common.body import Command, Measured
+from swarm_loc_drivers.sim.droplet.infrared import InfraredSettings
+from swarm_loc_drivers.sim.droplet.world import NEAR_POWER, STEP_NS, DropletErrors, DropletWorld
+from swarm_loc_estimator.core.infrared.brightness import expected
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 
 def with_link(**changes: float) -> DropletErrors:

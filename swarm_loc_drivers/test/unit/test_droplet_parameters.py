@@ -8,42 +8,49 @@ from typing import Any
 
 import pytest
 
-from swarm_loc_drivers.core.droplet_exchange import AskSettings
-from swarm_loc_drivers.core.droplet_turns import TurnSettings
-from swarm_loc_drivers.nodes.droplet_parameters import (
+from swarm_loc_drivers.core.droplet.exchange import PollingSettings
+from swarm_loc_drivers.core.droplet.tdma import TdmaSettings
+from swarm_loc_drivers.nodes.droplet.droplet_parameters import (
+    DropletFleetParameters,
     DropletParameters,
-    DropletTableParameters,
     droplet_settings,
 )
-from swarm_loc_drivers.nodes.droplet_world_parameters import DropletWorldParameters
-from swarm_loc_drivers.protocols.droplet import AUDIO_DROPLET
-from swarm_loc_estimator.nodes.parameter_table import ParameterError, markdown_table
+from swarm_loc_drivers.nodes.droplet.droplet_world_parameters import DropletWorldParameters
+from swarm_loc_drivers.protocols.droplet.hardware import AUDIO_DROPLET
+from swarm_loc_estimator.parameters.table import ParameterError, markdown_table
 
-README = Path(__file__).parents[2] / "README.md"
+DOC = Path(__file__).parents[2] / "doc"
 PLAIN = DropletParameters(address="/dev/ttyUSB0")
 
 
-@pytest.mark.parametrize("parameters", [DropletParameters, DropletTableParameters, DropletWorldParameters])
-def test_the_readme_says_what_the_table_says(parameters: type) -> None:
-    assert markdown_table(parameters) in README.read_text(encoding="utf-8")
+@pytest.mark.parametrize(
+    ("page", "parameters"),
+    [
+        ("droplet_driver_node.md", DropletParameters),
+        ("droplet_fleet_node.md", DropletFleetParameters),
+        ("droplet_world_node.md", DropletWorldParameters),
+    ],
+)
+def test_the_page_says_what_the_table_says(page: str, parameters: type) -> None:
+    assert markdown_table(parameters) in (DOC / page).read_text(encoding="utf-8")
 
 
 def test_partners_are_asked_unless_turns_are_taken() -> None:
-    wishes = replace(PLAIN, model="audio_droplet", partners=("6B6F", "0x0029", "df64"), exchange_rate=0.5)
-    session = droplet_settings(wishes).session
+    parameters = replace(PLAIN, model="audio_droplet", partners=("6B6F", "0x0029", "df64"), exchange_rate=0.5)
+    session = droplet_settings(parameters).session
     assert session.model is AUDIO_DROPLET
-    assert isinstance(session.exchanges, AskSettings)
+    assert isinstance(session.exchanges, PollingSettings)
     assert session.exchanges.partners == (0x6B6F, 0x29, 0xDF64)
     assert session.exchanges.period_s == 2.0
     assert session.exchanges.powers == (256, 40)
-    turns = droplet_settings(replace(wishes, turns=20, turn=19)).session.exchanges
-    assert isinstance(turns, TurnSettings)
+    turns = droplet_settings(replace(parameters, turns=20, turn=19)).session.exchanges
+    assert isinstance(turns, TdmaSettings)
     assert (turns.turn, turns.turns, turns.known) == (19, 20, (0x6B6F, 0x29, 0xDF64))
 
 
 def test_without_a_rate_or_a_near_power() -> None:
     exchanges = droplet_settings(replace(PLAIN, exchange_rate=0.0, near_power=0)).session.exchanges
-    assert isinstance(exchanges, AskSettings)
+    assert isinstance(exchanges, PollingSettings)
     assert exchanges.period_s == 0.0
     assert exchanges.powers == (256,)
 

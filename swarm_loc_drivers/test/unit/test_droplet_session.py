@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from droplet_bench import (
+from droplet_rig import (
     IDEAL,
     IDS,
     LINK,
@@ -15,7 +15,6 @@ from droplet_bench import (
     SECOND,
     START_NS,
     TRIANGLE,
-    FloatArray,
     Lab,
     asking,
     taking_turns,
@@ -23,15 +22,16 @@ from droplet_bench import (
 )
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.core.droplet_exchange import Brightness, Power
-from swarm_loc_drivers.core.link_keeper import SessionError
-from swarm_loc_drivers.protocols.droplet import FULL_POWER
-from swarm_loc_drivers.sim.droplet_world import NEAR_POWER, DropletErrors
-from swarm_loc_drivers.sim.firmware.droplet_firmware import DropletFirmware, Print, print_2014, print_2016
-from swarm_loc_drivers.sim.firmware.host import ConsoleFirmware
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.ir.brightness import expected
-from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
+from swarm_loc_drivers.core.droplet.exchange import Brightness, Power
+from swarm_loc_drivers.core.robot_driver import SessionError
+from swarm_loc_drivers.protocols.droplet.hardware import FULL_POWER
+from swarm_loc_drivers.sim.common.link_host import ConsoleFirmware
+from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, Print, print_2014, print_2016
+from swarm_loc_drivers.sim.droplet.world import NEAR_POWER, DropletErrors
+from swarm_loc_estimator.core.infrared.brightness import expected
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 PLATFORM = load_ir_platform("droplet")
 

@@ -10,13 +10,20 @@ from epuck_body import PROXIMITY, DrivenBody
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_drivers.protocols import epuck_serial, epuck_wifi
-from swarm_loc_drivers.protocols.epuck import EPUCK1, EPUCK2, EpuckModel
-from swarm_loc_drivers.protocols.rgb565 import decode_rgb565
-from swarm_loc_drivers.sim.firmware.serial_firmware import SerialFirmware
-from swarm_loc_drivers.sim.firmware.wifi_firmware import CYCLE_NS, WifiFirmware
+from swarm_loc_drivers.protocols.epuck import serial as epuck_serial
+from swarm_loc_drivers.protocols.epuck import wifi as epuck_wifi
+from swarm_loc_drivers.protocols.epuck.hardware import EPUCK1, EPUCK2, EpuckModel
+from swarm_loc_drivers.protocols.epuck.rgb565 import decode_rgb565
+from swarm_loc_drivers.sim.epuck.firmware.serial_firmware import SerialFirmware
+from swarm_loc_drivers.sim.epuck.firmware.wifi_firmware import (
+    DELAY_NS,
+    FAILED_EXCHANGE_NS,
+    IMAGE_NS,
+    WifiFirmware,
+)
 
-SECOND = 1_000_000_000
+MS = 1_000_000
+SECOND = 1000 * MS
 MODELS = pytest.mark.parametrize("model", [EPUCK1, EPUCK2], ids=lambda model: model.name)
 
 
@@ -56,7 +63,7 @@ def test_answers_come_at_the_end_of_a_chain_in_the_order_of_the_requests(
     model: EpuckModel, body: DrivenBody
 ) -> None:
     firmware = SerialFirmware(body, model)
-    request = epuck_serial.readings_request(300, -20)
+    request = epuck_serial.readings_request(300, -20, is_new=True)
     assert firmware.receive(request.data[:-1]) == b""
     reply = firmware.receive(request.data[-1:])
     assert reply == request.mark + struct.pack("<2h8H", 0, 0, *PROXIMITY) + request.mark
@@ -171,18 +178,18 @@ def test_only_the_first_generation_resets(body: DrivenBody, clock: Clock) -> Non
 
 def test_a_lone_end_of_line_swallows_binary_commands(body: DrivenBody) -> None:
     firmware = SerialFirmware(body, EPUCK1)
-    assert firmware.receive(b"\r" + epuck_serial.readings_request(1, 1).data) == b""
+    assert firmware.receive(b"\r" + epuck_serial.readings_request(1, 1, is_new=True).data) == b""
     assert firmware.receive(b"\r").startswith(b"z,")
 
 
 @MODELS
-@given(noise=st.binary(max_size=80))
+@given(noise=st.binary(max_size=80).map(lambda noise: noise.replace(b"\xb7", b"")))  # two images are too many
 def test_from_any_state_the_resynchronisation_leads_to_an_answer(model: EpuckModel, noise: bytes) -> None:
     firmware = SerialFirmware(DrivenBody(lambda: SECOND), model)
     firmware.receive(noise)
-    reply = firmware.receive(epuck_serial.RESYNC)
-    assert epuck_serial.ASCII_SPEED_REPLY.search(reply)
-    request = epuck_serial.readings_request(3, 4)
+    reply = firmware.receive(epuck_serial.resync(5, -6))
+    assert epuck_serial.speed_reply(5, -6).search(reply)
+    request = epuck_serial.readings_request(3, 4, is_new=True)
     assert epuck_serial.ReplyParser(request).feed(firmware.receive(request.data)) is not None
 
 
@@ -191,7 +198,7 @@ def test_a_picture_is_the_middle_of_the_frame(body: DrivenBody) -> None:
     frame[320:640, 320:960] = (255, 0, 0)
     frame[:, 640:] //= 2
     body.frame = (frame, 5)
-    firmware = SerialFirmware(body, EPUCK2)
+    firmware = SerialFirmware(body, EPUCK1)
     firmware.receive(b"J,1,40,20,8\r")
     request = epuck_serial.image_request(0, 0, 40, 20)
     parsed = epuck_serial.ReplyParser(request).feed(firmware.receive(request.data))
@@ -203,73 +210,191 @@ def test_a_picture_is_the_middle_of_the_frame(body: DrivenBody) -> None:
     assert (picture[:, 20:] == (123, 0, 0)).all()
 
 
+@pytest.mark.parametrize("zoom", [3, 8])
+def test_an_epuck2_shows_a_zoom_that_it_lacks_as_four_and_says_nothing(body: DrivenBody, zoom: int) -> None:
+    body.frame = (np.arange(480 * 640).reshape(480, 640).astype(np.uint8), 5)
+    firmware = SerialFirmware(body, EPUCK2)
+    assert firmware.receive(f"J,1,40,20,{zoom}\rI\r".encode()) == f"j\r\ni,1,40,20,{zoom},1600\r\n".encode()
+    shown = firmware.receive(b"\xb7\x00")
+    firmware.receive(b"J,1,40,20,4\r")
+    assert firmware.receive(b"\xb7\x00") == shown
+
+
+@pytest.mark.parametrize(("model", "width", "height"), [(EPUCK1, 41, 42), (EPUCK2, 48, 43)])
+def test_an_image_that_fits_without_the_speeds_around_it_overruns_the_memory(
+    model: EpuckModel, width: int, height: int, body: DrivenBody
+) -> None:
+    largest = SerialFirmware(body, model)
+    largest.receive(f"J,1,{width},{height},4\r".encode())
+    request = epuck_serial.image_request(0, 0, width, height)
+    assert len(largest.receive(request.data)) == 2 * width * height + 11 <= model.answer_buffer
+    assert model.largest_image == model.answer_buffer - 11
+    beyond = SerialFirmware(body, model)
+    beyond.receive(b"J,1,48,36,4\r" if model is EPUCK1 else b"J,1,47,44,4\r")
+    assert beyond.receive(request.data) == b""
+    assert beyond.receive(epuck_serial.resync(0, 0)) == b""
+
+
 def command(left: int, right: int, *, camera: bool = False, sensors: bool = True) -> bytes:
     return epuck_wifi.Command(left, right, camera=camera, sensors=sensors).encode()
 
 
-def test_nothing_is_streamed_before_a_valid_command(body: DrivenBody, clock: Clock) -> None:
-    firmware = WifiFirmware(body)
-    for data in (b"", bytes(21), command(1, 1)[:20]):
-        firmware.receive(data)
-        clock.now_ns += CYCLE_NS
-        assert firmware.stream() == b""
+CYCLE_NS = 2 * DELAY_NS
+
+
+class Client:
+    """Reads what a WiFi firmware streams, every millisecond."""
+
+    def __init__(self, firmware: WifiFirmware, clock: Clock) -> None:
+        self._firmware, self._clock = firmware, clock
+        self._parser = epuck_wifi.StreamParser()
+
+    def read(self, duration_ns: int) -> list[epuck_wifi.Message]:
+        """The messages of some time."""
+        messages = []
+        for _ in range(duration_ns // MS):
+            self._clock.now_ns += MS
+            if data := self._firmware.stream():
+                messages += self._parser.feed(data, self._clock.now_ns)
+        return messages
+
+
+@pytest.fixture
+def firmware(body: DrivenBody) -> WifiFirmware:
+    return WifiFirmware(body)
+
+
+@pytest.fixture
+def client(firmware: WifiFirmware, clock: Clock) -> Client:
+    return Client(firmware, clock)
+
+
+@pytest.mark.parametrize("first", [b"", bytes(21), bytes(20) + command(1, 1)])
+def test_nothing_is_streamed_before_a_command_that_is_read_whole(
+    firmware: WifiFirmware, client: Client, first: bytes
+) -> None:
+    firmware.receive(first[:20])
+    assert client.read(CYCLE_NS) == []
+    firmware.receive(first[20:])
+    assert client.read(CYCLE_NS) == []
+
+
+def test_a_command_is_obeyed_when_the_values_before_it_have_been_fetched(
+    firmware: WifiFirmware, client: Client, body: DrivenBody
+) -> None:
     firmware.receive(command(100, 200))
-    clock.now_ns += CYCLE_NS
-    assert len(firmware.stream()) == 105
+    (message,) = client.read(CYCLE_NS)
+    assert message.id == epuck_wifi.SENSORS_ID
     assert body.rates == (100.0, 200.0)
 
 
-def test_later_commands_are_not_checked_and_misalignment_persists(body: DrivenBody) -> None:
-    firmware = WifiFirmware(body)
+def test_later_commands_are_not_checked_and_misalignment_persists(
+    firmware: WifiFirmware, client: Client, body: DrivenBody
+) -> None:
     firmware.receive(command(0, 0))
-    firmware.receive(b"\x07" + command(100, 100))
-    firmware.receive(command(100, 100))
+    client.read(CYCLE_NS)
+    firmware.receive(b"\x07" + command(100, 100) + command(100, 100))
+    client.read(3 * CYCLE_NS)
     assert body.rates != (100.0, 100.0)
 
 
-def test_of_too_many_commands_the_last_counts(body: DrivenBody) -> None:
-    firmware = WifiFirmware(body)
-    firmware.receive(command(0, 0))
-    firmware.receive(b"".join(command(speed, speed) for speed in (50, 60, 70, 80, 100)))
+def test_of_too_many_commands_the_last_counts(
+    firmware: WifiFirmware, client: Client, body: DrivenBody
+) -> None:
+    firmware.receive(b"".join(command(speed, speed) for speed in (0, 50, 60, 70, 80, 100)))
+    client.read(CYCLE_NS)
     assert body.rates == (100.0, 100.0)
 
 
-def test_the_stream_keeps_its_cycle_and_sends_every_frame_once(body: DrivenBody, clock: Clock) -> None:
-    firmware = WifiFirmware(body)
-    firmware.receive(command(500, -500, camera=True))
-    parser = epuck_wifi.StreamParser()
-    messages = []
-    for step in range(200):
-        clock.now_ns += 4_000_000
-        if step % 33 == 0:
-            body.frame = (np.full((96, 128), step, np.uint8), clock.now_ns)
-        messages += parser.feed(firmware.stream(), clock.now_ns)
-    kinds = [message.id for message in messages]
-    assert kinds.count(epuck_wifi.SENSORS_ID) == 1 + 200 * 4 // 16
-    assert kinds.count(epuck_wifi.IMAGE_ID) == 7
-    counters = [int(m.sensors["left_counter"]) for m in messages if m.id == epuck_wifi.SENSORS_ID]
-    assert np.diff(counters)[1:] == pytest.approx(8, abs=1)
+def test_without_camera_fifty_readings_a_second_come_each_a_cycle_old(
+    firmware: WifiFirmware, client: Client
+) -> None:
+    firmware.receive(command(500, -500))
+    messages = client.read(2 * SECOND)
+    assert {message.id for message in messages} == {epuck_wifi.SENSORS_ID}
+    assert 98 <= len(messages) <= 100
+    counters = [int(message.sensors["left_counter"]) for message in messages]
+    assert counters[0] == counters[1] == 0  # read when the robot was switched on, and when it was told to go
+    assert np.diff(counters)[1:] == pytest.approx(10, abs=1)
+    assert counters[-1] == pytest.approx(500 * (messages[-2].stamp_ns - messages[0].stamp_ns) / SECOND, abs=1)
     assert (messages[-1].sensors["proximity"] == PROXIMITY).all()
 
 
-def test_both_streams_off_is_said_and_counters_can_be_preset(body: DrivenBody, clock: Clock) -> None:
-    firmware = WifiFirmware(body)
+def test_with_camera_every_image_is_followed_by_one_reading_a_cycle_old(
+    firmware: WifiFirmware, client: Client, body: DrivenBody, clock: Clock
+) -> None:
+    firmware.receive(command(500, -500, camera=True))
+    messages = []
+    for step in range(60):
+        body.frame = (np.full((96, 128), step, np.uint8), clock.now_ns)
+        messages += client.read(33 * MS)
+    kinds = [message.id for message in messages]
+    assert kinds[:20] == [epuck_wifi.IMAGE_ID, epuck_wifi.SENSORS_ID] * 10
+    readings = [message for message in messages if message.id == epuck_wifi.SENSORS_ID]
+    assert 10.0 <= len(readings) / 1.98 <= 12.0
+    counters = [int(message.sensors["left_counter"]) for message in readings]
+    assert counters[-1] == pytest.approx(500 * (readings[-2].stamp_ns - readings[0].stamp_ns) / SECOND, abs=1)
+
+
+def test_an_image_is_sent_once_and_the_next_one_waited_for(
+    firmware: WifiFirmware, client: Client, body: DrivenBody
+) -> None:
+    firmware.receive(command(0, 0, camera=True))
+    body.frame = (np.zeros((96, 128), np.uint8), 1)
+    assert len(client.read(SECOND)) == 2
+    body.frame = (np.zeros((96, 128), np.uint8), 2)
+    assert len(client.read(2 * IMAGE_NS)) == 2
+
+
+@pytest.mark.parametrize("blocked_ns", [200 * MS, SECOND])
+def test_what_waited_while_sending_was_blocked_is_as_old_as_that(
+    firmware: WifiFirmware, client: Client, clock: Clock, blocked_ns: int
+) -> None:
+    firmware.receive(command(500, 500))
+    before = client.read(SECOND)[-1]
+    clock.now_ns += blocked_ns
+    stale, fresh, *_ = client.read(2 * CYCLE_NS)
+    gone = [int(message.sensors["left_counter"]) for message in (before, stale, fresh)]
+    assert gone[1] - gone[0] == pytest.approx(10, abs=1)
+    assert gone[2] - gone[1] == pytest.approx(500 * (blocked_ns + CYCLE_NS) / SECOND, abs=10)
+
+
+def test_an_exchange_between_the_chips_that_fails_costs_a_second(
+    firmware: WifiFirmware, client: Client
+) -> None:
+    firmware.receive(command(500, 500))
+    client.read(SECOND)
+    firmware.exchange_fails = True
+    gaps_ns = np.diff([message.stamp_ns for message in client.read(2 * SECOND)])
+    assert FAILED_EXCHANGE_NS <= gaps_ns.max() <= FAILED_EXCHANGE_NS + CYCLE_NS
+
+
+def test_old_firmware_counts_the_right_wheel_backwards(clock: Clock, body: DrivenBody) -> None:
+    firmware = WifiFirmware(body, counts_right_backwards=True)
+    firmware.receive(command(500, 500))
+    sensors = Client(firmware, clock).read(SECOND)[-1].sensors
+    assert sensors["left_counter"] > 400
+    assert sensors["right_counter"] == -sensors["left_counter"]
+
+
+def test_both_streams_off_is_said_and_counters_can_be_preset(
+    firmware: WifiFirmware, client: Client, body: DrivenBody
+) -> None:
     preset = bytearray(command(-5, 7, sensors=False))
     preset[2] = 4
     firmware.receive(bytes(preset))
-    clock.now_ns += CYCLE_NS
-    assert firmware.stream() == bytes([epuck_wifi.NOTHING_ID])
+    assert {message.id for message in client.read(2 * CYCLE_NS)} == {epuck_wifi.NOTHING_ID}
     assert body.rates == (0.0, 0.0)
     firmware.receive(command(0, 0))
-    clock.now_ns += CYCLE_NS
-    (message,) = epuck_wifi.StreamParser().feed(firmware.stream(), 0)
+    message = client.read(2 * CYCLE_NS)[-1]
     assert (message.sensors["left_counter"], message.sensors["right_counter"]) == (-5, 7)
 
 
-def test_wheels_run_on_when_the_client_leaves(body: DrivenBody, clock: Clock) -> None:
-    firmware = WifiFirmware(body)
+def test_wheels_run_on_when_the_client_leaves(
+    firmware: WifiFirmware, client: Client, body: DrivenBody
+) -> None:
     firmware.receive(command(100, 100))
+    client.read(CYCLE_NS)
     firmware.disconnect()
-    clock.now_ns += CYCLE_NS
-    assert firmware.stream() == b""
+    assert client.read(CYCLE_NS) == []
     assert body.rates == (100.0, 100.0)

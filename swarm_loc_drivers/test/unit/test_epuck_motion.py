@@ -12,13 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from swarm_loc_drivers.core.epuck.wheel_odometry import WheelOdometry
 from swarm_loc_drivers.core.odometry_state import OdometryState
 from swarm_loc_drivers.core.velocity_command import STANDING_CLOCK_S, STILL, Velocity, VelocityCommand
-from swarm_loc_drivers.core.wheel_odometry import WheelOdometry
-from swarm_loc_drivers.protocols.epuck import EPUCK1, EPUCK2, as_counter
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.odometry import OdometryTracks
-from swarm_loc_estimator.core.swarm import OdometryModel, Robot
+from swarm_loc_drivers.protocols.epuck.hardware import EPUCK1, EPUCK2, as_counter
+from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot
+from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.numerics import se2
 
 SECOND = 1_000_000_000
 NOISE = 2e-4
@@ -105,8 +105,10 @@ def test_a_velocity_that_comes_while_an_old_one_expires_is_kept() -> None:
     assert command.velocity() == AHEAD
 
 
-@pytest.mark.parametrize("velocity", [(math.nan, 0.0, 0.0), (0.0, 0.0, math.inf), (0.0, -math.inf, math.nan)])
-def test_what_is_not_finite_is_dropped(velocity: Velocity) -> None:
+@pytest.mark.parametrize(
+    "velocity", [(math.nan, 0.0, 0.0), (0.0, 0.0, math.inf), (0.0, -math.inf, math.nan), (1e308, 0.0, 0.0)]
+)
+def test_what_is_not_finite_or_absurd_is_dropped(velocity: Velocity) -> None:
     command, counts = command_with(Watch())
     command.set(AHEAD)
     command.set(velocity)
@@ -311,9 +313,9 @@ def test_the_covariance_is_that_of_the_estimators_model(legs: list[tuple[float, 
     model = OdometryModel(wheel_separation=GEOMETRY.wheel_separation, wheel_noise=NOISE, timeout_s=60.0)
     tracks = OdometryTracks([Robot("one", odometry=model)])
     tracks.extend(np.zeros(len(stamps), np.int64), stamps, poses)
-    gathered = tracks.at(np.zeros(1, np.int64), stamps[-1:]).gathered[0, 0]
+    covariance = tracks.at(np.zeros(1, np.int64), stamps[-1:]).covariance[0]
     jacobian = se2.error_to_pose_jacobian(poses[-1])
-    expected = jacobian @ gathered @ jacobian.T
+    expected = jacobian @ covariance @ jacobian.T
 
     last = states[-1]
     assert last is not None

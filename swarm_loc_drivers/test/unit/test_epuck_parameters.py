@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_drivers.io.calibration_file import CalibrationError, load_calibration
-from swarm_loc_drivers.nodes.epuck_parameters import EpuckParameters, camera_calibration, epuck_settings
+from swarm_loc_drivers.io.calibration_file import CalibrationFileError, load_calibration
+from swarm_loc_drivers.nodes.epuck.epuck_parameters import EpuckParameters, camera_calibration, epuck_settings
 from swarm_loc_drivers.transports.link import Address, AddressError, parse_address
-from swarm_loc_estimator.nodes.parameter_table import ParameterError, markdown_table
+from swarm_loc_estimator.parameters.table import ParameterError, markdown_table
 
-README = Path(__file__).parents[2] / "README.md"
+PAGE = Path(__file__).parents[2] / "doc" / "epuck_driver_node.md"
 CALIBRATION = """
 image_width: 40
 image_height: 30
@@ -25,8 +25,8 @@ projection_matrix: {rows: 3, cols: 4, data: [44, 0, 20, 0, 0, 44, 15, 0, 0, 0, 1
 """
 
 
-def test_the_readme_says_what_the_table_says() -> None:
-    assert markdown_table(EpuckParameters) in README.read_text(encoding="utf-8")
+def test_the_page_says_what_the_table_says() -> None:
+    assert markdown_table(EpuckParameters) in PAGE.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_a_calibration_is_read(path: Path) -> None:
         (
             "image_width: 40",
             "image_width: 41",
-            "is for pictures of 41 x 30 px, but the camera's have 40 x 30 px.",
+            "is for images of 41 x 30 px, but the camera's have 40 x 30 px.",
         ),
         ("image_height: 30\n", "", "has no image_height."),
         ("plumb_bob", "fisheye", "distortion_model is 'fisheye' but must be one of plumb_bob,"),
@@ -86,27 +86,33 @@ def test_a_calibration_is_read(path: Path) -> None:
 )
 def test_a_wrong_calibration_is_named_in_one_sentence(path: Path, old: str, new: str, sentence: str) -> None:
     path.write_text(CALIBRATION.replace(old, new, 1), encoding="utf-8")
-    with pytest.raises(CalibrationError) as caught:
+    with pytest.raises(CalibrationFileError) as caught:
         load_calibration(path, 40, 30)
     assert str(path) in str(caught.value)
     assert sentence in str(caught.value)
 
 
 def test_over_wifi_pictures_have_the_size_that_the_robot_sends(path: Path) -> None:
-    wishes = EpuckParameters(address="tcp://robot", camera=True, camera_info_file=str(path))
-    settings = epuck_settings(wishes)
+    parameters = EpuckParameters(address="tcp://robot", camera=True, camera_info_file=str(path))
+    settings = epuck_settings(parameters)
     assert settings.camera is not None
     assert (settings.camera.width, settings.camera.height) == (160, 120)
     with pytest.raises(ParameterError, match="40 x 30 px, but the camera's have 160 x 120 px"):
-        camera_calibration(wishes, settings.camera)
+        camera_calibration(parameters, settings.camera)
 
 
 def test_over_a_serial_port_pictures_fit_the_robots_buffer(path: Path) -> None:
-    wishes = EpuckParameters(
+    parameters = EpuckParameters(
         address="/dev/x", camera=True, camera_info_file=str(path), image_width=40, image_height=30
     )
-    settings = epuck_settings(wishes)
+    settings = epuck_settings(parameters)
     assert settings.camera is not None
-    assert camera_calibration(wishes, settings.camera).width == 40
-    with pytest.raises(ParameterError, match="epuck2 can send at most 4136"):
-        epuck_settings(replace(wishes, image_width=60, image_height=40))
+    assert camera_calibration(parameters, settings.camera).width == 40
+    with pytest.raises(ParameterError, match="epuck2 can send at most 4128"):
+        epuck_settings(replace(parameters, image_width=60, image_height=40))
+    with pytest.raises(ParameterError, match=r"image_zoom = 8 must be one of 1, 2, 4 for an epuck2\.$"):
+        epuck_settings(replace(parameters, image_zoom=8))
+    first = replace(parameters, model="epuck1", image_zoom=8)
+    assert epuck_settings(replace(first, image_width=41, image_height=42)).camera is not None
+    with pytest.raises(ParameterError, match="images of 3456 bytes, but an epuck1 can send at most 3445"):
+        epuck_settings(replace(first, image_width=48, image_height=36))

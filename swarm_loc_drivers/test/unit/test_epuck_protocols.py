@@ -14,8 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.protocols import epuck_serial, epuck_wifi
-from swarm_loc_drivers.protocols.epuck import (
+from swarm_loc_drivers.protocols.epuck import serial as epuck_serial
+from swarm_loc_drivers.protocols.epuck import wifi as epuck_wifi
+from swarm_loc_drivers.protocols.epuck.hardware import (
     EPUCK1,
     EPUCK2,
     PROXIMITY_BEARINGS,
@@ -23,9 +24,9 @@ from swarm_loc_drivers.protocols.epuck import (
     as_counter,
     unwrapped_difference,
 )
-from swarm_loc_drivers.protocols.epuck_proximity import MAX_RANGE_M, range_of_raw, raw_of_distance
-from swarm_loc_drivers.protocols.epuck_wifi import SENSORS_DTYPE, Command, StreamParser, plausible
-from swarm_loc_drivers.protocols.rgb565 import decode_rgb565, encode_rgb565
+from swarm_loc_drivers.protocols.epuck.proximity import MAX_RANGE_M, range_of_raw, raw_of_distance
+from swarm_loc_drivers.protocols.epuck.rgb565 import decode_rgb565, encode_rgb565
+from swarm_loc_drivers.protocols.epuck.wifi import SENSORS_DTYPE, Command, StreamParser, plausible
 
 MODELS = pytest.mark.parametrize("model", [EPUCK1, EPUCK2], ids=lambda model: model.name)
 SPEED = st.integers(-1100, 1100)
@@ -104,10 +105,10 @@ def test_pixels_survive_decoding(data: bytes) -> None:
 
 
 def test_a_request_sets_the_speeds_and_is_framed_by_them() -> None:
-    request = epuck_serial.readings_request(200, -200)
+    request = epuck_serial.readings_request(200, -200, is_new=True)
     assert request.data.hex(" ").upper() == "BC C8 00 38 FF BB AF B2 BB 00"
     assert request.mark == struct.pack("<2h", 200, -200)
-    assert epuck_serial.image_request(0, 0, 40, 40).data.hex(" ").upper() == "BC 00 00 00 00 BB B7 BB 00"
+    assert epuck_serial.image_request(0, 0, 40, 40).data.hex(" ").upper() == "BB B7 BB 00"
 
 
 def test_readings_are_little_endian() -> None:
@@ -132,7 +133,7 @@ CUTS = st.lists(st.integers(0, 10**6), max_size=12)
 
 @given(left=SPEED, right=SPEED, body=st.binary(min_size=20, max_size=20), cuts=CUTS)
 def test_a_reply_is_found_in_any_pieces(left: int, right: int, body: bytes, cuts: list[int]) -> None:
-    request = epuck_serial.readings_request(left, right)
+    request = epuck_serial.readings_request(left, right, is_new=True)
     parser = epuck_serial.ReplyParser(request)
     found = [parser.feed(piece) for piece in cut(request.mark + body + request.mark, cuts)]
 
@@ -151,7 +152,7 @@ def test_a_reply_is_found_in_any_pieces(left: int, right: int, body: bytes, cuts
 def test_a_reply_is_found_behind_garbage(
     left: int, right: int, body: bytes, garbage: bytes, cuts: list[int]
 ) -> None:
-    request = epuck_serial.readings_request(left, right)
+    request = epuck_serial.readings_request(left, right, is_new=True)
     frame = request.mark + body + request.mark
     if (garbage + frame).find(request.mark) != len(garbage):
         return  # the garbage itself looks like a mark
@@ -166,7 +167,7 @@ def test_a_reply_is_found_behind_garbage(
     left=SPEED.filter(bool), right=SPEED, body=st.binary(min_size=20, max_size=20), lost=st.integers(0, 27)
 )
 def test_a_reply_that_lost_a_byte_is_none(left: int, right: int, body: bytes, lost: int) -> None:
-    request = epuck_serial.readings_request(left, right)
+    request = epuck_serial.readings_request(left, right, is_new=True)
     frame = request.mark + body + request.mark
     assert epuck_serial.ReplyParser(request).feed(frame[:lost] + frame[lost + 1 :]) is None
 

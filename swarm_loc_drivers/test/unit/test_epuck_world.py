@@ -6,23 +6,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.core.wheels import WheelGeometry
-from swarm_loc_drivers.protocols.epuck_proximity import raw_of_distance
-from swarm_loc_drivers.sim.eight import ARENA, EightSettings, describe
-from swarm_loc_drivers.sim.epuck_world import (
+from swarm_loc_drivers.core.epuck.wheels import WheelGeometry
+from swarm_loc_drivers.protocols.epuck.proximity import raw_of_distance
+from swarm_loc_drivers.sim.common.error_model import W0, W2, ErrorModel
+from swarm_loc_drivers.sim.common.world_error import WorldError
+from swarm_loc_drivers.sim.epuck.world import (
     STEP_NS,
     EpuckWorld,
     EpuckWorldSettings,
     Exposure,
     SimulatedEpuck,
 )
-from swarm_loc_drivers.sim.photographer import Stage
+from swarm_loc_drivers.sim.render.camera_rig import Arena
 from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_drivers.sim.world_error import WorldError
-from swarm_loc_drivers.sim.worlds import W0, W2, World
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.swarm import Swarm
-from swarm_loc_vision.core.families import family_named
+from swarm_loc_drivers.sim.scenarios.eight import ARENA, EightSettings, describe
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_vision.core.decoding.families import family_named
 
 WHEELS = WheelGeometry(wheel_diameter=0.041, wheel_separation=0.053)
 IDEAL = replace(W0, wheel_noise=0.0)
@@ -30,10 +30,10 @@ CAMERA = CameraModel(width=320, height=240)
 START = np.array([[0.0, 0.0, 0.3], [0.3, 0.05, 2.0], [-0.4, 0.3, -1.0]])
 
 
-def world_of(world: World = IDEAL, seed: int = 1, start: FloatArray = START) -> EpuckWorld:
-    stage = Stage(ARENA, family_named("artoolkit_bch_thin"))
+def world_of(errors: ErrorModel = IDEAL, seed: int = 1, start: FloatArray = START) -> EpuckWorld:
+    arena = Arena(ARENA, family_named("artoolkit_bch_thin"))
     swarm = describe(EightSettings(robots=len(start)), start)
-    return EpuckWorld(swarm, EpuckWorldSettings(seed, world, stage, CAMERA, WHEELS, 7.5, 1_000_000_000_000))
+    return EpuckWorld(swarm, EpuckWorldSettings(seed, errors, arena, CAMERA, WHEELS, 7.5, 1_000_000_000_000))
 
 
 def run(world: EpuckWorld, duration_s: float) -> list[Exposure]:
@@ -112,11 +112,11 @@ def test_a_picture_is_there_once_its_shutter_has_closed_and_not_before() -> None
     assert image is not None
     assert image[1] == taken[0].stamp_ns
     assert image[0].shape == (240, 320)
-    np.testing.assert_array_equal(image[0], world.picture(taken[0]))
+    np.testing.assert_array_equal(image[0], world.image(taken[0]))
 
 
 def test_a_picture_shows_where_the_robot_was_when_it_was_taken() -> None:
-    """The robot turns; the picture equals that of a robot that stands where this one was at the middle."""
+    """The robot turns; the image equals that of a robot that stands where this one was at the middle."""
     short = replace(CAMERA, exposure_s=1e-5)
     world = _with_camera(short, START)
     world.rates[0] = -60.0, 60.0
@@ -126,18 +126,18 @@ def test_a_picture_shows_where_the_robot_was_when_it_was_taken() -> None:
     there[0, 2] += rate * (taken.middle_ns - 1_000_000_000_000) * 1e-9
     still = _with_camera(short, there)
     same = [one for one in run(still, 0.6) if one.robot == 0][-1]
-    difference = world.picture(taken).astype(int) - still.picture(same).astype(int)
+    difference = world.image(taken).astype(int) - still.image(same).astype(int)
     assert np.abs(difference).max() <= 2
     later = _with_camera(short, there + np.array([0.0, 0.0, 0.02]))
     run(later, 0.6)
-    assert np.abs(world.picture(taken).astype(int) - later.picture(same)).max() > 40
+    assert np.abs(world.image(taken).astype(int) - later.image(same)).max() > 40
 
 
 @pytest.mark.parametrize(("rate", "exposure_s"), [(2.0, 0.133), (2.0, 1e-5), (60.0, 0.133), (60.0, 0.008)])
 def test_the_newest_picture_can_be_drawn_until_the_next_one_is_taken(rate: float, exposure_s: float) -> None:
-    stage = Stage(ARENA, family_named("artoolkit_bch_thin"))
+    arena = Arena(ARENA, family_named("artoolkit_bch_thin"))
     camera = replace(CAMERA, width=32, height=24, exposure_s=exposure_s)
-    settings = EpuckWorldSettings(1, W2, stage, camera, WHEELS, rate, 1_000_000_000_000)
+    settings = EpuckWorldSettings(1, W2, arena, camera, WHEELS, rate, 1_000_000_000_000)
     world = EpuckWorld(describe(EightSettings(robots=3), START), settings)
     run(world, 0.8)
     for _ in range(5 * round(1e9 / rate) // STEP_NS):
@@ -146,12 +146,12 @@ def test_the_newest_picture_can_be_drawn_until_the_next_one_is_taken(rate: float
         for exposure in newest:
             assert exposure is not None
             if world.newest[exposure.robot] is not exposure:
-                assert world.picture(exposure).shape == (24, 32)
+                assert world.image(exposure).shape == (24, 32)
 
 
 def _with_camera(camera: CameraModel, start: FloatArray) -> EpuckWorld:
-    stage = Stage(ARENA, family_named("artoolkit_bch_thin"))
-    settings = EpuckWorldSettings(1, IDEAL, stage, camera, WHEELS, 7.5, 1_000_000_000_000)
+    arena = Arena(ARENA, family_named("artoolkit_bch_thin"))
+    settings = EpuckWorldSettings(1, IDEAL, arena, camera, WHEELS, 7.5, 1_000_000_000_000)
     return EpuckWorld(describe(EightSettings(robots=len(start)), start), settings)
 
 
@@ -159,12 +159,12 @@ def test_the_same_seed_and_commands_give_the_same_world_whoever_looks() -> None:
     watched, alone, other = world_of(W2, 5), world_of(W2, 5), world_of(W2, 6)
     for world in (watched, alone, other):
         world.rates[:] = [[300.0, 380.0], [350.0, 300.0], [100.0, 150.0]]
-    pictures = [watched.picture(one) for one in run(watched, 0.5)]
+    images = [watched.image(one) for one in run(watched, 0.5)]
     watched.proximity(0)
     taken = run(alone, 0.5)
     run(other, 0.5)
     np.testing.assert_array_equal(watched.poses, alone.poses)
-    np.testing.assert_array_equal(pictures[-1], alone.picture(taken[-1]))
+    np.testing.assert_array_equal(images[-1], alone.image(taken[-1]))
     assert np.abs(watched.poses - other.poses).max() > 1e-5
 
 
@@ -193,6 +193,6 @@ def test_a_swarm_that_cannot_be_simulated_is_refused_in_one_sentence(
 ) -> None:
     swarm = describe(EightSettings(robots=2), START[:2])
     lacking = Swarm((replace(swarm.robots[0], **change), swarm.robots[1]), swarm.landmarks)  # type: ignore[arg-type]
-    stage = Stage(ARENA, family_named("artoolkit_bch_thin"))
+    arena = Arena(ARENA, family_named("artoolkit_bch_thin"))
     with pytest.raises(WorldError, match=said):
-        EpuckWorld(lacking, EpuckWorldSettings(1, W0, stage, CAMERA, WHEELS, 7.5, 0))
+        EpuckWorld(lacking, EpuckWorldSettings(1, W0, arena, CAMERA, WHEELS, 7.5, 0))

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from swarm_loc_drivers.cli.generate_bag import main
-from swarm_loc_drivers.sim.eight import EightSettings, simulate_eight
-from swarm_loc_estimator.io.bags import BagReader
-from swarm_loc_estimator.io.cdr import decode_detections, decode_odometry, decode_pose_stamped
-from swarm_loc_estimator.io.swarm_file import load_swarm
+from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
+from swarm_loc_estimator.io.bags.reader import BagReader
+from swarm_loc_estimator.io.messages.cdr import decode_detections, decode_odometry, decode_pose_stamped
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
 
 
 @pytest.fixture(scope="module")
@@ -41,18 +41,18 @@ def test_messages_come_when_they_arrived_with_the_stamps_of_what_they_show(bag: 
     np.testing.assert_allclose([one.pose for _, one in odometry], rows["pose"], atol=1e-12)
     assert odometry[0][1].frame_id == "epuck2/odom"
     assert np.mean([one.twist[0] for _, one in odometry[1:]]) == pytest.approx(0.06, abs=0.003)
-    pictures = [
+    images = [
         (log_ns, decode_detections(data))
         for topic, _, log_ns, data in messages
         if topic == "epuck2/detections"
     ]
     frames = run.frames[run.frames["robot"] == 1]
-    assert [log_ns for log_ns, _ in pictures] == frames["arrival_ns"].tolist()
-    assert [one.stamp_ns for _, one in pictures] == frames["stamp_ns"].tolist()
-    assert [len(one.detections) for _, one in pictures] == frames["count"].tolist()
+    assert [log_ns for log_ns, _ in images] == frames["arrival_ns"].tolist()
+    assert [one.stamp_ns for _, one in images] == frames["stamp_ns"].tolist()
+    assert [len(one.detections) for _, one in images] == frames["count"].tolist()
     shown = run.sightings[frames[0]["first"] : frames[0]["first"] + frames[0]["count"]]
-    assert pictures[0][1].detections["id"].tolist() == shown["marker_id"].tolist()
-    np.testing.assert_allclose(pictures[0][1].detections["position"][:, 2], shown["value"][:, 0])
+    assert images[0][1].detections["id"].tolist() == shown["marker_id"].tolist()
+    np.testing.assert_allclose(images[0][1].detections["position"][:, 2], shown["value"][:, 0])
 
 
 def test_ground_truth_is_that_of_the_simulation(bag: Path) -> None:

@@ -1,4 +1,4 @@
-"""Where markers are said to lie in pictures, against what the marker detector finds there."""
+"""Where markers are said to lie in images, against what the marker detector finds there."""
 
 import math
 from dataclasses import replace
@@ -6,17 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.core.wheels import WheelGeometry
-from swarm_loc_drivers.sim.eight import ARENA, FACE_DISTANCE, EightSettings, describe
-from swarm_loc_drivers.sim.epuck_world import EpuckWorld, EpuckWorldSettings
-from swarm_loc_drivers.sim.photographer import Stage
+from swarm_loc_drivers.core.epuck.wheels import WheelGeometry
+from swarm_loc_drivers.sim.common.error_model import W2
+from swarm_loc_drivers.sim.epuck.world import EpuckWorld, EpuckWorldSettings
+from swarm_loc_drivers.sim.render.camera_rig import Arena
 from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_drivers.sim.worlds import W2
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_vision.core.camera import Camera
-from swarm_loc_vision.core.detector import MarkerDetector
-from swarm_loc_vision.core.families import family_named
-from swarm_loc_vision.core.settings import DetectorSettings
+from swarm_loc_drivers.sim.scenarios.eight import ARENA, FACE_DISTANCE, EightSettings, describe
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_vision.core.decoding.families import family_named
+from swarm_loc_vision.core.detection.detector import MarkerDetector
+from swarm_loc_vision.core.detection.settings import DetectorSettings
 
 FAMILY = family_named("artoolkit_bch_thin")
 CAMERA = CameraModel(k1=-0.2, k2=0.05)
@@ -26,7 +25,7 @@ BESIDE = np.array([[-0.6, 0.0, 0.1], [0.0, 0.1, 2.0], [-0.1, -0.25, -1.0]])
 
 def world_at(poses: FloatArray, camera: CameraModel = CAMERA) -> EpuckWorld:
     settings = EpuckWorldSettings(
-        3, STILL, Stage(ARENA, FAMILY), camera, WheelGeometry(0.041, 0.053), 7.5, 10**12
+        3, STILL, Arena(ARENA, FAMILY), camera, WheelGeometry(0.041, 0.053), 7.5, 10**12
     )
     return EpuckWorld(describe(EightSettings(robots=len(poses)), poses), settings)
 
@@ -35,8 +34,8 @@ def test_markers_lie_where_the_detector_finds_them() -> None:
     world = world_at(BESIDE)
     while not (taken := [one for one in world.step() if one.robot == 0]):
         pass
-    camera = Camera.from_matrix((CAMERA.width, CAMERA.height), CAMERA.matrix, tuple(CAMERA.distortion))
-    found = MarkerDetector(DetectorSettings(), [(FAMILY, None)], camera).detect(world.picture(taken[0]))
+    camera = CAMERA.camera
+    found = MarkerDetector(DetectorSettings(), [(FAMILY, None)], camera).detect(world.image(taken[0]))
     views = world.views(0, BESIDE)
     clear = (views.margin > 4.0) & ~views.hidden & (views.incidence < 1.2) & (views.side_px > 12.0)
     assert clear.sum() >= 6
@@ -81,12 +80,12 @@ def test_size_and_incidence_are_those_of_the_plane_geometry() -> None:
         STILL, camera_yaw_sigma=0.0, scale_sigma=0.0, map_position_sigma=0.0, face_position_sigma=0.0
     )
     settings = EpuckWorldSettings(
-        3, exact, Stage(ARENA, FAMILY), CameraModel(), WheelGeometry(0.041, 0.053), 7.5, 10**12
+        3, exact, Arena(ARENA, FAMILY), CameraModel(), WheelGeometry(0.041, 0.053), 7.5, 10**12
     )
     views = EpuckWorld(swarm, settings).views(0, start)
     back = views.id == 22
     assert views.incidence[back] == pytest.approx(0.0, abs=1e-6)
     distance = 0.5 - FACE_DISTANCE - 0.03
     size = swarm.robots[1].faces[2].size
-    assert views.side_px[back] == pytest.approx(CameraModel().focal_px * size / distance, rel=1e-6)
+    assert views.side_px[back] == pytest.approx(CameraModel().camera.fx * size / distance, rel=1e-6)
     assert views.margin[back] > 0.0

@@ -1,7 +1,6 @@
 """The simulated bags of the repository are what their own first line says that they were made by."""
 
 import re
-from collections.abc import Iterator
 from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,8 @@ import numpy as np
 import pytest
 
 from swarm_loc_drivers.cli.generate_bag import main
-from swarm_loc_estimator.io.bags import BagReader
-from swarm_loc_estimator.io.typestore import typestore
+from swarm_loc_estimator.io.bags.reader import BagReader
+from swarm_loc_estimator.io.messages.typestore import typestore
 
 BAGS = Path(__file__).parents[3] / "bags"
 SIMULATED = [
@@ -32,28 +31,38 @@ def test_a_bag_comes_out_of_its_generator_again(name: str, tmp_path: Path) -> No
     assert "True" not in said.values()
     options = [word for key, value in said.items() if value != "False" for word in (f"--{key}", value)]
     assert main([swarm, str(tmp_path / name), *options]) == 0
-    moved: list[Any] = []
-    stayed: list[Any] = []
+    moved, stayed = Leaves(), Leaves()
     with BagReader(tmp_path / name) as again, BagReader(BAGS / name) as kept:
         for one, other in zip(again.messages(), kept.messages(), strict=True):
             assert one[:3] == other[:3]
             if one != other:
-                moved += leaves(typestore().deserialize_cdr(one[3], one[1]))
-                stayed += leaves(typestore().deserialize_cdr(other[3], other[1]))
-    assert [x for x in moved if not isinstance(x, float)] == [x for x in stayed if not isinstance(x, float)]
-    numbers, others = (np.array([x for x in part if isinstance(x, float)]) for part in (moved, stayed))
+                moved.add(typestore().deserialize_cdr(one[3], one[1]))
+                stayed.add(typestore().deserialize_cdr(other[3], other[1]))
+    assert moved.others == stayed.others
+    numbers, others = (np.concatenate([[0.0], *leaves.numbers]) for leaves in (moved, stayed))
     np.testing.assert_allclose(numbers, others, rtol=0.0, atol=ROUNDING)
 
 
-def leaves(part: Any) -> Iterator[Any]:
-    """The texts and numbers of a message."""
-    if isinstance(part, np.ndarray):
-        yield from part.ravel().tolist()
-    elif isinstance(part, list):
-        for one in part:
-            yield from leaves(one)
-    elif is_dataclass(part):
-        for one in vars(part).values():
-            yield from leaves(one)
-    else:
-        yield part
+class Leaves:
+    """The real numbers of messages, and their other values and texts."""
+
+    def __init__(self) -> None:
+        self.numbers: list[Any] = []
+        self.others: list[Any] = []
+
+    def add(self, part: Any) -> None:
+        """Take a message, or a part of one."""
+        if isinstance(part, str | int):
+            self.others.append(part)
+        elif isinstance(part, float):
+            self.numbers.append([part])
+        elif isinstance(part, np.ndarray) and part.dtype.kind == "f":
+            self.numbers.append(part.ravel())
+        elif isinstance(part, np.ndarray | list):
+            for one in part:
+                self.add(one)
+        elif is_dataclass(part):
+            for one in vars(part).values():
+                self.add(one)
+        else:
+            self.others.append(part)

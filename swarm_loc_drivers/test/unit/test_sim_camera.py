@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.sim.camera import View, deliver, exposures, hidden
-from swarm_loc_drivers.sim.eight import VIEW, EightSettings, describe, simulate_eight, wall_markers
-from swarm_loc_drivers.sim.grid import SENSOR, GridSettings, border, cells, simulate_grid
-from swarm_loc_drivers.sim.record import SIGHTING_DTYPE, SimulatedRun
-from swarm_loc_drivers.sim.worlds import W0, W2
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_drivers.sim.common.camera import View, deliver, hidden, schedule_exposures
+from swarm_loc_drivers.sim.common.error_model import W0, W2
+from swarm_loc_drivers.sim.common.record import SIGHTING_DTYPE, SimulatedRun
+from swarm_loc_drivers.sim.scenarios.eight import VIEW, EightSettings, describe, simulate_eight, wall_markers
+from swarm_loc_drivers.sim.scenarios.grid import SENSOR, GridSettings, border, cells, simulate_grid
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 IntArray = NDArray[np.integer]
 
@@ -33,7 +33,7 @@ def exact_values(run: SimulatedRun) -> tuple[FloatArray, IntArray, IntArray]:
 
 @pytest.fixture(scope="module")
 def white() -> SimulatedRun:
-    return simulate_eight(EightSettings(duration_s=30.0, world=W0))
+    return simulate_eight(EightSettings(duration_s=30.0, errors=W0))
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_white_noise_has_the_printed_sigmas(white: SimulatedRun) -> None:
 
 def test_flips_mirror_the_heading_at_the_line_of_sight() -> None:
     exactly = replace(W0, forward_sigma=0.0, left_sigma=0.0, heading_sigma=0.0, flip_probability=0.25)
-    run = simulate_eight(EightSettings(duration_s=20.0, world=exactly))
+    run = simulate_eight(EightSettings(duration_s=20.0, errors=exactly))
     exact, _, _ = exact_values(run)
     value = run.sightings["value"]
     np.testing.assert_allclose(value[:, :2], exact[:, :2], atol=1e-12)
@@ -121,7 +121,7 @@ def test_flips_mirror_the_heading_at_the_line_of_sight() -> None:
 
 def test_gross_errors_come_at_their_rate() -> None:
     rough = replace(W0, forward_sigma=1e-4, left_sigma=1e-4, heading_sigma=1e-4, gross_probability=0.05)
-    run = simulate_eight(EightSettings(duration_s=20.0, world=rough))
+    run = simulate_eight(EightSettings(duration_s=20.0, errors=rough))
     exact, _, _ = exact_values(run)
     gross = np.abs(run.sightings["value"][:, :2] - exact[:, :2]).max(axis=1) > 1e-3
     assert gross.mean() == pytest.approx(0.05, abs=0.015)
@@ -137,7 +137,7 @@ def test_a_world_of_systematic_errors_differs_by_robot() -> None:
         exposure_early_s=0.0,
     )
     flat = replace(still, map_position_sigma=0.0, face_position_sigma=0.0, turn_slip=0.0)
-    run = simulate_eight(EightSettings(duration_s=20.0, world=flat))
+    run = simulate_eight(EightSettings(duration_s=20.0, errors=flat))
     exact, robot, _ = exact_values(run)
     value = run.sightings["value"]
     scale = np.linalg.norm(value[:, :2], axis=1) / np.linalg.norm(exact[:, :2], axis=1)
@@ -165,18 +165,18 @@ def test_pictures_are_late_lost_and_out_of_order() -> None:
 
 def test_lost_pictures_take_their_sightings_with_them() -> None:
     rng = np.random.default_rng(3)
-    pictures = exposures(rng, 3, 7.5, 0, 10_000_000_000)
-    count = len(pictures[0])
+    exposures = schedule_exposures(rng, 3, 7.5, 0, 10_000_000_000)
+    count = len(exposures[0])
     frame = np.repeat(np.arange(count), 2)
     sightings = np.zeros(2 * count, SIGHTING_DTYPE)
     sightings["marker_id"] = frame
-    frames, kept = deliver(rng, pictures, frame, sightings, end_ns=9_000_000_000, loss=0.3)
+    frames, kept = deliver(rng, exposures, frame, sightings, end_ns=9_000_000_000, loss=0.3)
     assert len(kept) == 2 * len(frames) < 2 * count
     shown = [np.unique(kept["marker_id"][f["first"] : f["first"] + f["count"]]) for f in frames]
     for one, ids in zip(frames, shown, strict=True):
         assert len(ids) == 1
-        assert pictures[1][ids[0]] == one["stamp_ns"]
-        assert pictures[0][ids[0]] == one["robot"]
+        assert exposures[1][ids[0]] == one["stamp_ns"]
+        assert exposures[0][ids[0]] == one["robot"]
 
 
 @pytest.mark.parametrize("rate_hz", [20.0, 50.0])
@@ -192,7 +192,7 @@ def test_odometry_comes_at_its_rate_from_every_robot(rate_hz: float) -> None:
 
 def test_the_same_seed_gives_the_same_run_and_another_does_not() -> None:
     one, same, other = (
-        simulate_eight(EightSettings(seed=seed, duration_s=5.0, world=W2)) for seed in (7, 7, 8)
+        simulate_eight(EightSettings(seed=seed, duration_s=5.0, errors=W2)) for seed in (7, 7, 8)
     )
     for name in ("odometry", "frames", "sightings"):
         assert getattr(one, name).tobytes() == getattr(same, name).tobytes()

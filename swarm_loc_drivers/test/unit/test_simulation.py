@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from swarm_loc_drivers.cli import simulate
-from swarm_loc_drivers.nodes.unanswered import Unanswered
+from swarm_loc_drivers.nodes.epuck.pending_images import Unanswered
 from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
 
 BAGS = Path(__file__).parents[3] / "bags"
@@ -15,10 +15,8 @@ SECOND = 1_000_000_000
 
 
 def test_every_robot_has_a_driver_on_its_link_and_a_detector_for_its_camera() -> None:
-    options = SimulationOptions(
-        "swarm.yaml", "/links", world="w0", seed=3, rate=0.5, parameter_file="all.yaml"
-    )
-    nodes = {node.full_name: node for node in simulation_nodes(options, ["a", "b"])}
+    options = SimulationOptions("swarm.yaml", world="w0", seed=3, rate=0.5, parameter_file="all.yaml")
+    nodes = {node.full_name: node for node in simulation_nodes(options, ["a", "b"], "/links")}
 
     assert list(nodes) == [
         *("estimator", "epuck_world", "eight_steering"),
@@ -36,7 +34,7 @@ def test_every_robot_has_a_driver_on_its_link_and_a_detector_for_its_camera() ->
 
 def test_the_command_line_becomes_options() -> None:
     line = ["swarm.yaml", "--world", "w0", "--seed", "7", "--speed", "0.08", "--rate", "2"]
-    expected = SimulationOptions("swarm.yaml", "", world="w0", seed=7, speed=0.08, rate=2.0)
+    expected = SimulationOptions("swarm.yaml", world="w0", seed=7, speed=0.08, rate=2.0)
     assert simulate.parse(line) == expected
 
 

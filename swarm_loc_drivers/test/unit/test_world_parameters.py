@@ -6,32 +6,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.nodes.world_parameters import WorldParameters, make_world
-from swarm_loc_drivers.sim.eight import EightSettings, describe
+from swarm_loc_drivers.nodes.epuck.epuck_world_parameters import WorldParameters, make_world
+from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_drivers.sim.steering import EightSteering
-from swarm_loc_drivers.sim.worlds import WORLDS
-from swarm_loc_estimator.io.swarm_writer import save_swarm
-from swarm_loc_estimator.nodes.parameter_table import ParameterError, markdown_table, parameter_specs
+from swarm_loc_drivers.sim.scenarios.eight import EightSettings, describe
+from swarm_loc_drivers.sim.scenarios.eight_steering import EightSteering
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.parameters.table import ParameterError, markdown_table, parameter_specs
 
 START = np.array([[0.1, 0.2, 0.3], [0.5, -0.2, 1.0]])
 
 
 @pytest.fixture
-def wishes(tmp_path: Path) -> WorldParameters:
+def parameters(tmp_path: Path) -> WorldParameters:
     save_swarm(describe(EightSettings(robots=2), START), tmp_path / "swarm.yaml")
     return WorldParameters(
         swarm_file=str(tmp_path / "swarm.yaml"), camera=CameraModel(width=64, height=48), world="w0"
     )
 
 
-def test_the_readme_has_all_parameters() -> None:
-    readme = Path(__file__).parents[2] / "README.md"
-    assert markdown_table(WorldParameters) in readme.read_text(encoding="utf-8")
+def test_the_page_has_all_parameters() -> None:
+    page = Path(__file__).parents[2] / "doc" / "epuck_world_node.md"
+    assert markdown_table(WorldParameters) in page.read_text(encoding="utf-8")
 
 
-def test_robots_begin_where_the_description_says(wishes: WorldParameters) -> None:
-    swarm, world = make_world(wishes)
+def test_robots_begin_where_the_description_says(parameters: WorldParameters) -> None:
+    swarm, world = make_world(parameters)
     assert [robot.name for robot in swarm.robots] == ["epuck1", "epuck2"]
     np.testing.assert_allclose(world.poses, START)
 
@@ -43,21 +43,21 @@ def test_the_worlds_that_there_are_can_be_chosen() -> None:
         spec.checked("w9")
 
 
-def test_robots_without_wifi_need_serial_ports(wishes: WorldParameters) -> None:
+def test_robots_without_wifi_need_serial_ports(parameters: WorldParameters) -> None:
     with pytest.raises(ParameterError, match="parameter model = 'epuck1' needs the parameter link_folder"):
-        make_world(replace(wishes, model="epuck1"))
+        make_world(replace(parameters, model="epuck1"))
 
 
-def test_a_family_without_a_markers_id_is_named(wishes: WorldParameters) -> None:
-    save_swarm(describe(EightSettings(robots=2), START, first_face_id=250), Path(wishes.swarm_file))
+def test_a_family_without_a_markers_id_is_named(parameters: WorldParameters) -> None:
+    save_swarm(describe(EightSettings(robots=2), START, first_face_id=250), Path(parameters.swarm_file))
     with pytest.raises(ParameterError, match=r"parameter family = 'aruco_mip_36h12': .* has ids 0 to 249"):
-        make_world(replace(wishes, family="aruco_mip_36h12"))
+        make_world(replace(parameters, family="aruco_mip_36h12"))
 
 
-def test_a_robot_without_a_start_is_named(wishes: WorldParameters) -> None:
-    save_swarm(describe(EightSettings(robots=2, start_known=False), START), Path(wishes.swarm_file))
+def test_a_robot_without_a_start_is_named(parameters: WorldParameters) -> None:
+    save_swarm(describe(EightSettings(robots=2, start_known=False), START), Path(parameters.swarm_file))
     with pytest.raises(ParameterError, match=r"parameter swarm_file = .* robot 'epuck1' has no start pose"):
-        make_world(wishes)
+        make_world(parameters)
 
 
 def test_the_cameras_parameters_are_among_the_worlds() -> None:

@@ -1,4 +1,4 @@
-"""A recording in memory: what the robots reported and saw, and where they truly were.
+"""A recording in memory: odometry, detections, other inputs and ground truth of a swarm.
 
 A fit runs the estimator over the same data a hundred times and looks at parts of it; reading the bag once is
 enough for that.
@@ -15,37 +15,32 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from swarm_loc_estimator.core.arrivals import (
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.description.swarm import Robot, Swarm
+from swarm_loc_estimator.core.inputs.messages import (
     NO_BRIGHTNESS,
     NO_FIXES,
     NO_ODOMETRY,
     BrightnessRows,
     DetectionRows,
     FixRows,
-    Messages,
     OdometryRows,
+    RawInputs,
     joined,
 )
-from swarm_loc_estimator.core.metrics import Track, interpolate
-from swarm_loc_estimator.core.screening import Screening
-from swarm_loc_estimator.core.settings import EstimatorSettings
-from swarm_loc_estimator.core.swarm import Robot, Swarm
-from swarm_loc_estimator.io.bags import BagReader, BagTopic
-from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
-from swarm_loc_estimator.io.ingest import Ingest
-from swarm_loc_estimator.io.inputs import InputKind
-from swarm_loc_estimator.io.truth import TruthReader
-
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
-Progress = Callable[[float, str], None]
+from swarm_loc_estimator.core.inputs.validation import InputValidator
+from swarm_loc_estimator.evaluation.recorded_bag import Progress, read_bag, unwatched
+from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.numerics.arrays import BoolArray, IntArray
+from swarm_loc_estimator.numerics.trajectory import Trajectory, interpolate
+from swarm_loc_estimator.parameters.errors import UserError
 
 _NONE = np.zeros(0, dtype=np.int64)
 START_GAP_NS = 500_000_000
 """A robot's true start is interpolated over no longer gap."""
 
 
-class CalibrationError(ValueError):
+class CalibrationError(UserError):
     """There is nothing to fit to; the message is one sentence."""
 
 
@@ -100,7 +95,7 @@ class Recording:
     name: str
     odometry: Rows
     detections: Rows
-    truth: Mapping[str, Track]
+    truth: Mapping[str, Trajectory]
     brightness: BrightnessRows = NO_BRIGHTNESS
     fixes: FixRows = NO_FIXES
     remarks: tuple[str, ...] = ()
@@ -142,66 +137,57 @@ class Recording:
         return replace(self, detections=replace(rows, data=data))
 
     @cached_property
-    def messages(self) -> Messages:
+    def messages(self) -> RawInputs:
         """What wheels and cameras said, in columns, in order of arrival."""
         odometry, detections, (begin_ns, end_ns) = self.odometry, self.detections, self.range_ns
         counts = [found.size for found in detections.data]
         columns = (detections.robot, detections.stamp_ns, detections.arrival_ns)
         robot, stamp_ns, arrival_ns = (np.repeat(column, counts) for column in columns)
-        return Messages(
+        return RawInputs(
             begin_ns,
             end_ns,
             OdometryRows(odometry.robot, odometry.stamp_ns, odometry.poses, odometry.arrival_ns),
             DetectionRows(robot, stamp_ns, detections.detections, arrival_ns),
         )
 
-    def track(self, robot: int) -> Track:
+    def track(self, robot: int) -> Trajectory:
         """A robot's raw odometry in the order of its stamps, each stamp once."""
         rows = np.flatnonzero(self.odometry.robot == robot)
         stamp_ns, first = np.unique(self.odometry.stamp_ns[rows], return_index=True)
-        return Track(stamp_ns, self.odometry.poses[rows[first]])
+        return Trajectory(stamp_ns, self.odometry.poses[rows[first]])
 
 
-def read_recording(bag: Path, swarm: Swarm, progress: Progress | None = None) -> Recording:
+def read_recording(bag: Path, swarm: Swarm, progress: Progress = unwatched) -> Recording:
     """Read a bag once.
 
     Args:
         bag: rosbag2 folder, .mcap or .db3 file.
         swarm: Whose messages are wanted.
-        progress: Called now and then with the share read and what is being done.
+        progress: Called now and then.
 
     Raises:
         BagError: Nothing in the bag can be read.
     """
-    ingest, truth = Ingest(swarm), TruthReader(swarm)
-    inputs, parts = len(ingest.topics), list[Messages]()
-    with BagReader(bag) as reader:
-        for batch in reader.batches([*ingest.handle_of, *truth.topics]):
-            is_input = batch.topic < inputs
-            parts += ingest.read(batch.chosen(is_input))
-            others = batch.chosen(~is_input)
-            truth.add(others._replace(topic=others.topic - inputs))
-            if progress is not None:
-                progress(reader.progress, "reading")
-        remarks = (*reader.losses, *_strangers(reader.topics, ingest))
-    screening = Screening(swarm, EstimatorSettings())
-    odometry = joined([NO_ODOMETRY, *(screening.screen(part).odometry for part in parts)])
+    parts: list[RawInputs] = []
+    summary = read_bag(bag, swarm, parts.append, progress)
+    validator = InputValidator(swarm, EstimatorSettings())
+    odometry = joined([NO_ODOMETRY, *(validator.validate(part).odometry for part in parts)])
     detections = [_per_message(part.detections) for part in parts]
-    tracks = {name: _each_stamp_once(track) for name, track in truth.tracks().items()}
+    unused = (f"{count} inputs are not used: {reason}." for reason, count in validator.drops.items())
     return Recording(
         bag.name,
         Rows(
             odometry.robot, odometry.stamp_ns, odometry.arrival_ns, tuple(map(tuple, odometry.pose.tolist()))
         ),
         _joined(detections),
-        tracks,
+        {name: _each_stamp_once(track) for name, track in summary.truth.items()},
         joined([NO_BRIGHTNESS, *(part.brightness for part in parts)]),
         joined([NO_FIXES, *(part.fixes for part in parts)]),
-        (*remarks, *(f"{count} inputs are not used: {reason}." for reason, count in screening.drops.items())),
+        (*summary.remarks, *unused),
     )
 
 
-def start_of(recording: Recording, robot: Robot, track: Track) -> tuple[float, float, float] | None:
+def start_of(recording: Recording, robot: Robot, track: Trajectory) -> tuple[float, float, float] | None:
     """The true pose where a robot's odometry begins; None when the ground truth does not tell."""
     truth = recording.truth.get(robot.name)
     if truth is None or not track.stamp_ns.size:
@@ -221,18 +207,10 @@ def started_at_truth(swarm: Swarm, recording: Recording) -> Swarm:
     return replace(swarm, robots=tuple(robots))
 
 
-def _strangers(topics: list[BagTopic], ingest: Ingest) -> list[str]:
-    """A sentence when there are inputs of robots that the swarm does not have."""
-    kinds = {kind.topic: kind.message_type for kind in InputKind}
-    names = [t.name for t in topics if kinds.get(t.name.rpartition("/")[2]) == t.type]
-    strange = sorted(set(names) - set(ingest.handle_of))
-    return [f"No robot of the swarm description has the topics {', '.join(strange)}."] if strange else []
-
-
-def _each_stamp_once(track: Track) -> Track:
+def _each_stamp_once(track: Trajectory) -> Trajectory:
     """The track with the first of the poses that share a stamp."""
     stamp_ns, first = np.unique(track.stamp_ns, return_index=True)
-    return Track(stamp_ns, track.pose[first])
+    return Trajectory(stamp_ns, track.pose[first])
 
 
 def _per_message(rows: DetectionRows) -> Rows:

@@ -1,4 +1,4 @@
-"""Sightings beside what the ground truth says they should have been."""
+"""Measured and true values of the sightings of each camera."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from swarm_loc_estimator.calibration.recording import BoolArray, IntArray, Recording
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.measurements import Kind
-from swarm_loc_estimator.core.metrics import Track, interpolate
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.sightings import SightingConverter
-from swarm_loc_estimator.core.swarm import CameraMount, Robot, SensorModel, Swarm
+from swarm_loc_estimator.calibration.recording import Recording
+from swarm_loc_estimator.core.description.swarm import CameraMount, Robot, SensorModel, Swarm
+from swarm_loc_estimator.core.filter.measurement_model import Kind
+from swarm_loc_estimator.core.inputs.camera import SightingConverter
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.numerics.trajectory import Trajectory, interpolate
 
 DENSE_GAP_NS = 200_000_000
 """Ground truth with longer gaps is not interpolated."""
@@ -23,7 +23,7 @@ OFFSET_REACH_NS = 250_000_000
 _SAME_NS = 3_000_000
 _SAME_VIEW_NS = 4_000_000_000
 """Sightings of a marker err alike for about this long."""
-_MOST = 2000
+_MAX_SIGHTINGS = 2000
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def sightings_of(recording: Recording, swarm: Swarm, observer: int) -> Sightings
         known[rows] &= other is not None and _dense_around(other, logged.stamp_ns[rows])
     known &= np.isnan(lone[:, 0]) | (logged.target < 0)  # a lone pose does not say when the picture was taken
     chosen = np.flatnonzero(known)
-    chosen = chosen[:: max(1, -(-chosen.size // _MOST))]
+    chosen = chosen[:: max(1, -(-chosen.size // _MAX_SIGHTINGS))]
     return replace(logged, lone=lone)[chosen]
 
 
@@ -145,7 +145,7 @@ def _ideal(robot: Robot) -> Robot:
     return replace(robot, camera=camera, sensor=SensorModel())
 
 
-def _observer_known(truth: Track, stamp_ns: IntArray) -> tuple[BoolArray, FloatArray]:
+def _observer_known(truth: Trajectory, stamp_ns: IntArray) -> tuple[BoolArray, FloatArray]:
     """Where the observer's pose is known (m,), and the poses (m, 3) that are known at the stamp only.
 
     A true pose that stands alone was found for the picture of that stamp, whenever it was taken.
@@ -158,7 +158,7 @@ def _observer_known(truth: Track, stamp_ns: IntArray) -> tuple[BoolArray, FloatA
     return known | same, lone
 
 
-def _dense_around(truth: Track, stamp_ns: IntArray) -> BoolArray:
+def _dense_around(truth: Trajectory, stamp_ns: IntArray) -> BoolArray:
     """Whether the ground truth is dense around stamps, wherever the time offset is looked for."""
     times = truth.stamp_ns
     first = np.searchsorted(times, stamp_ns - OFFSET_REACH_NS, side="right") - 1

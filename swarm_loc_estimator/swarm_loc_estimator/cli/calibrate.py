@@ -12,22 +12,18 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
-from swarm_loc_estimator.calibration.fit import EVALUATIONS, Options, calibrate
-from swarm_loc_estimator.calibration.picture import draw, text_of
-from swarm_loc_estimator.calibration.recording import CalibrationError, Recording, read_recording
-from swarm_loc_estimator.cli.arguments import number_in, yaml_to_write
-from swarm_loc_estimator.cli.ending import told_in_a_sentence
+from swarm_loc_estimator.calibration.motion_and_camera.fit import EVALUATIONS, Options, calibrate
+from swarm_loc_estimator.calibration.motion_and_camera.plots import draw, text_of
+from swarm_loc_estimator.calibration.recording import Recording, read_recording
+from swarm_loc_estimator.cli.arguments import add_bag, number_in, swarm_beside, yaml_to_write
+from swarm_loc_estimator.cli.errors import exit_with_message
 from swarm_loc_estimator.cli.progress import ProgressLine
-from swarm_loc_estimator.cli.replay import swarm_beside
-from swarm_loc_estimator.io.bag_file import BagError
-from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
-from swarm_loc_estimator.io.swarm_writer import save_swarm
-from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
 
 
-@told_in_a_sentence(BagError, SwarmFileError, CalibrationError, DefinitionsNotFoundError)
+@exit_with_message
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
@@ -54,8 +50,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="calibrate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("bag", type=Path, help="rosbag2 folder, .mcap or .db3 file with <robot>/ground_truth")
-    parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
+    add_bag(parser, " with <robot>/ground_truth")
     parser.add_argument("--out", type=yaml_to_write, required=True, help="swarm description to write")
     parser.add_argument("--plain", action="store_true", help="fit only noise, calibrate nothing")
     parser.add_argument(

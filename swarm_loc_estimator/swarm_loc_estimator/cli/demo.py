@@ -19,23 +19,19 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.cli.arguments import folder_to_write, number_in
-from swarm_loc_estimator.cli.ending import told_in_a_sentence
-from swarm_loc_estimator.cli.replay import swarm_beside
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.estimator import Status
-from swarm_loc_estimator.core.metrics import interpolate, pool, summarise
-from swarm_loc_estimator.core.swarm import Swarm
-from swarm_loc_estimator.io.bag_file import BagError
-from swarm_loc_estimator.io.report import write_report
-from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
-from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
-from swarm_loc_estimator.live import BagContent, LiveRun, play_live
-from swarm_loc_estimator.live_agreement import Agreement, compare_with_replay
-from swarm_loc_estimator.live_graph import LiveError
-from swarm_loc_estimator.nodes.pace import clock_step_ns
-from swarm_loc_estimator.nodes.recorder import Recorder, read_poses
-from swarm_loc_estimator.processes import GraphError
+from swarm_loc_estimator.cli.arguments import folder_to_write, number_in, swarm_beside
+from swarm_loc_estimator.cli.errors import exit_with_message
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.core.estimation.estimator import Status
+from swarm_loc_estimator.evaluation.metrics import pool, summarise
+from swarm_loc_estimator.evaluation.report.report import write_report
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.live.agreement import Agreement, compare_with_replay
+from swarm_loc_estimator.live.recorder import Recorder, read_poses
+from swarm_loc_estimator.live.run import BagContent, LiveRun, play_live
+from swarm_loc_estimator.nodes.playback import clock_step_ns
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.trajectory import interpolate
 
 BAG = Path("bags/eight_five_robots")
 RATE = 3.0
@@ -51,7 +47,7 @@ _REDRAW_S = 0.2
 _REDRAW_UNWATCHED_S = 5.0
 
 
-@told_in_a_sentence(BagError, SwarmFileError, DefinitionsNotFoundError, GraphError, LiveError)
+@exit_with_message
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)

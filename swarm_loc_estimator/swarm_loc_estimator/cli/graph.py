@@ -6,8 +6,11 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from swarm_loc_estimator.graph import GraphOptions, graph_nodes
-from swarm_loc_estimator.processes import GraphError, run_graph
+from swarm_loc_estimator.cli.arguments import number_in
+from swarm_loc_estimator.cli.errors import exit_with_message
+from swarm_loc_estimator.launching.graph import GraphOptions, graph_nodes
+from swarm_loc_estimator.launching.options import check_graph
+from swarm_loc_estimator.launching.processes import run_graph
 
 
 def parse(arguments: Sequence[str]) -> GraphOptions:
@@ -15,7 +18,9 @@ def parse(arguments: Sequence[str]) -> GraphOptions:
     parser = argparse.ArgumentParser(prog="graph", description=__doc__)
     parser.add_argument("swarm_file", metavar="SWARM_FILE", help="the swarm description")
     parser.add_argument("--bag", help="play this bag into the graph, which then runs on the bag's clock")
-    parser.add_argument("--rate", type=float, default=1.0, help="speed of the bag (default: 1)")
+    parser.add_argument(
+        "--rate", type=number_in(0.01, 1000.0), default=1.0, help="speed of the bag (default: 1)"
+    )
     parser.add_argument("--use-sim-time", action="store_true", help="take time from /clock without a bag")
     parser.add_argument("--params-file", dest="parameter_file", help="ROS parameter file for all nodes")
     return GraphOptions(**vars(parser.parse_args(arguments)))
@@ -26,10 +31,9 @@ def say(line: str) -> None:
     print(f"[graph] {line}\n", end="", flush=True)
 
 
+@exit_with_message
 def main() -> int:
     """Run until a node ends or Ctrl-C."""
-    try:
-        return run_graph(graph_nodes(parse(sys.argv[1:])), say)
-    except GraphError as error:
-        print(error, file=sys.stderr)
-        return 1
+    options = parse(sys.argv[1:])
+    check_graph(options)
+    return run_graph(graph_nodes(options), say)

@@ -14,18 +14,16 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from swarm_loc_estimator.cli.ending import told_in_a_sentence
+from swarm_loc_estimator.cli.errors import exit_with_message
 from swarm_loc_estimator.cli.progress import ProgressLine
-from swarm_loc_estimator.io.bag_file import BagError
-from swarm_loc_estimator.io.mrclam import MrclamError, read_dataset
-from swarm_loc_estimator.io.mrclam_bag import Delay, convert
-from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
+from swarm_loc_estimator.io.mrclam.bag import Delay, convert
+from swarm_loc_estimator.io.mrclam.dataset import read_dataset
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-@told_in_a_sentence(MrclamError, BagError, DefinitionsNotFoundError)
+@exit_with_message
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     parser = _parser()

@@ -1,4 +1,4 @@
-"""A progress line for commands."""
+"""Progress bar of commands, in a terminal."""
 
 from __future__ import annotations
 

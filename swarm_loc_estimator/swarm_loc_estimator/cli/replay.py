@@ -16,75 +16,55 @@ import argparse
 import csv
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from swarm_loc_estimator.cli.arguments import folder_to_write, number_in, yaml_to_write
-from swarm_loc_estimator.cli.ending import told_in_a_sentence
+from swarm_loc_estimator.cli.arguments import (
+    add_bag,
+    add_set,
+    folder_to_write,
+    number_in,
+    parameters_of,
+    swarm_beside,
+    yaml_to_write,
+)
+from swarm_loc_estimator.cli.errors import exit_with_message
 from swarm_loc_estimator.cli.progress import ProgressLine
-from swarm_loc_estimator.core.learned import learns
-from swarm_loc_estimator.core.settings import EstimatorSettings, SettingsError
-from swarm_loc_estimator.io.bag_file import BagError
-from swarm_loc_estimator.io.report import write_report
-from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
-from swarm_loc_estimator.io.swarm_writer import save_swarm
-from swarm_loc_estimator.io.typestore import DefinitionsNotFoundError
-from swarm_loc_estimator.replay import TICK_S, replay
-from swarm_loc_estimator.replay_result import ReplayResult
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.evaluation.replay import TICK_S, replay
+from swarm_loc_estimator.evaluation.report.report import write_report
+from swarm_loc_estimator.evaluation.result import ReplayResult
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
 
 _NOTHING_TO_LEARN = (
-    "--learned: the swarm description has no sigma of a camera, of odometry or of a landmark,"
-    " so there is nothing to learn; give for instance camera.yaw_sigma."
+    "--learned: the swarm description has no sigma of a camera, of odometry or of a landmark, and nothing"
+    " contradicted it, so there is nothing to learn; give for instance camera.yaw_sigma."
 )
 _COVARIANCE = ("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
 _COLUMNS = ("stamp_ns", "robot", "x_m", "y_m", "theta_rad", *_COVARIANCE)
 
 
-@told_in_a_sentence(BagError, SwarmFileError, SettingsError, DefinitionsNotFoundError)
+@exit_with_message
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
-    settings = read_settings(options.set)
+    settings = parameters_of(EstimatorSettings, options.set)
     swarm = load_swarm(options.swarm or swarm_beside(options.bag))
     with ProgressLine() as progress:
-        if options.learned and not learns(swarm):
-            print(_NOTHING_TO_LEARN, file=sys.stderr)
-            return 1
         result = replay(options.bag, swarm, settings, tick_s=options.tick, progress=progress)
         progress(1.0, "writing the report")
         files = write_report(result, options.out)
         write_poses(result, options.out / "poses.csv")
-        if options.learned and result.learned:
-            save_swarm(result.learned, options.learned, f"Learned from {result.title}.")
+        if options.learned and result.self_calibrated:
+            save_swarm(result.self_calibrated, options.learned, f"Learned from {result.title}.")
+    if options.learned and not result.self_calibrated:
+        print(_NOTHING_TO_LEARN, file=sys.stderr)
+        return 1
     print(files.text.read_text(encoding="utf-8"))
     print(f"Report:  {files.page}\nPicture: {files.overview}")
     return 0
-
-
-def swarm_beside(bag: Path) -> Path:
-    """The swarm description that belongs to a bag; raises BagError where there is none."""
-    if not bag.exists():
-        raise BagError(f"There is no bag '{bag}'.")
-    return (bag if bag.is_dir() else bag.parent) / "swarm.yaml"
-
-
-def read_settings(pairs: Sequence[str]) -> EstimatorSettings:
-    """Settings from texts such as `horizon_s=1.0`; raises SettingsError."""
-    kind_of = {name: type(value) for name, value in asdict(EstimatorSettings()).items()}
-    values: dict[str, Any] = {}
-    for pair in pairs:
-        name, _, text = pair.partition("=")
-        if name not in kind_of:
-            raise SettingsError(f"--set {pair}: '{name}' is no setting; there are {', '.join(kind_of)}.")
-        try:
-            values[name] = kind_of[name](text)
-        except ValueError:
-            wanted = "whole number" if kind_of[name] is int else "number"
-            raise SettingsError(f"--set {pair}: '{text}' is not a {wanted}.") from None
-    return EstimatorSettings(**values)
 
 
 def write_poses(result: ReplayResult, path: Path) -> None:
@@ -106,8 +86,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="replay", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("bag", type=Path, help="rosbag2 folder, .mcap or .db3 file")
-    parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
+    add_bag(parser)
     parser.add_argument("--out", type=folder_to_write, default="out/replay", help="folder for the report")
     parser.add_argument(
         "--learned", type=yaml_to_write, metavar="FILE", help="where to write what was learned"
@@ -115,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--tick", type=number_in(1e-3, 3600.0, "s"), default=TICK_S, help="seconds between outputs"
     )
-    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="estimator setting")
+    add_set(parser, "parameter of the estimator")
     return parser
 
 

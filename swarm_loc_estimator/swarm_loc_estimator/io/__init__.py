@@ -1,1 +1,1 @@
-"""Files and bytes: descriptions, bags, datasets, reports."""
+"""Files and bytes: swarm descriptions, bags, messages, datasets."""

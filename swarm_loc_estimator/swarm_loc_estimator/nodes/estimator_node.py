@@ -2,62 +2,57 @@
 
     ./run swarm_loc_estimator estimator_node --ros-args -p swarm_file:=swarm.yaml
 
-It subscribes to `<robot>/odom`, `<robot>/detections`, `<robot>/brightness` and `<robot>/fix` of the robots in
-the swarm description. It publishes `swarm/poses`, `<robot>/pose`, `/tf` (map to `<robot>/odom`, which no one
-else may publish), `/diagnostics`.
-Services: `~/reset`, `~/set_robot_pose`. Parameters: see `estimator_parameters.py` and the package's README.
+It subscribes to `<robot>/odom`, `<robot>/detections`, `<robot>/brightness`, `<robot>/fix` and
+`<robot>/initialpose` of the robots in the swarm description. It publishes `swarm/poses`, `<robot>/pose`,
+`/tf` (map to `<robot>/odom`, which no one else may publish), `/diagnostics`.
+Services: `~/reset`, `~/set_robot_pose`. Parameters: see `doc/estimator_node.md`.
 """
 
 from __future__ import annotations
 
 import math
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
-from rclpy.clock import Clock
+from rclpy.clock import Clock, JumpThreshold
 from rclpy.clock_type import ClockType
-from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.duration import Duration
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
-from swarm_loc_estimator.core.compiled import is_warm
-from swarm_loc_estimator.core.estimator import SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.core.settings import EstimatorSettings
-from swarm_loc_estimator.core.swarm import Swarm
-from swarm_loc_estimator.io.ingest import Ingest
-from swarm_loc_estimator.io.inputs import InputKind
-from swarm_loc_estimator.io.message_batch import MessageBatch
-from swarm_loc_estimator.io.swarm_file import load_swarm
-from swarm_loc_estimator.nodes.declare import declare_parameters
-from swarm_loc_estimator.nodes.estimator_health import Health, Report, TickCost, load_report, merged
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.core.estimation.contradictions import Contradiction, Kind
+from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.io.inputs.ingest import Ingest
+from swarm_loc_estimator.io.messages.message_batch import MessageBatch
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.nodes.estimator_diagnostics import (
+    Diagnostics,
+    Report,
+    TickCost,
+    add_contradictions,
+    load_report,
+    merged,
+    overload_report,
+)
+from swarm_loc_estimator.nodes.estimator_inputs import EstimatorInputs
 from swarm_loc_estimator.nodes.estimator_outputs import EstimateOutputs
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
 from swarm_loc_estimator.nodes.fusion_pace import FusionPace
-from swarm_loc_estimator.nodes.running import run_node, spin
-from swarm_loc_estimator.nodes.seating import REFUSALS, SeatRequestError, planar_seat
-from swarm_loc_estimator.nodes.warm_up import warm_up
-from swarm_loc_msgs.msg import BrightnessMatrix, MarkerDetectionArray
-from swarm_loc_msgs.srv import SetRobotPose
+from swarm_loc_estimator.nodes.set_pose import NO_CLOCK, PoseCommands
+from swarm_loc_estimator.nodes.warm_up import WARM_UP, warm_up
+from swarm_loc_estimator.numerics.jit import is_warm
+from swarm_loc_estimator.ros.running import ConfiguredNode, run_node
+from swarm_loc_estimator.ros.ticks import Ticks
+from swarm_loc_estimator.ros.topic_graph import TopicGraph
 
-INPUT_QOS = QoSProfile(depth=1000)
-"""Deep enough for a busy moment as long as the horizon; what is older would not be used anyway.
-
-More cannot be counted: Fast DDS tells of no message that a newer one replaces in this queue.
-"""
-
-_MESSAGE_CLASSES = {
-    InputKind.ODOMETRY: Odometry,
-    InputKind.DETECTIONS: MarkerDetectionArray,
-    InputKind.BRIGHTNESS: BrightnessMatrix,
-    InputKind.FIXES: PoseWithCovarianceStamped,
-}
-NO_CLOCK = "use_sim_time is true but no /clock has come"
+_BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
 _DIAGNOSTICS_PERIOD_S = 1.0
 _THROTTLE_S = 30.0
 _ORDINARY_DROPS = frozenset(
@@ -71,100 +66,81 @@ _ORDINARY_DROPS = frozenset(
         "odometry_too_old",
         "reset",
         "too_old",
-        "untied",
+        "not_localized",
     }
 )
 """Late, double or outlying data is a matter of course, and so is light of robots too far or too near."""
-_MOST_WITHOUT_CLOCK = 20_000
 _PATIENCE_S = 5.0
 """How long nothing may come before the log names what is missing."""
 
 CreateEstimator = Callable[[Swarm, EstimatorSettings], SwarmEstimator]
 
 
-class EstimatorNode(Node):
+class EstimatorNode(ConfiguredNode[EstimatorParameters]):
     """Receives, lets the core estimate once per tick, publishes.
 
     Args:
         create_estimator: Makes the estimator; tests hand in another one.
         node_arguments: Further arguments of `rclpy.node.Node`.
-
-    Raises:
-        ParameterError: A parameter cannot be used.
-        SwarmFileError: The swarm description cannot be used.
     """
 
     def __init__(self, create_estimator: CreateEstimator = SwarmEstimator, **node_arguments: Any) -> None:
-        super().__init__("estimator", **node_arguments)
-        self._wishes = declare_parameters(self, EstimatorParameters)
-        self._swarm = load_swarm(Path(self._wishes.swarm_file))
-        if not is_warm():
+        super().__init__("estimator", EstimatorParameters, **node_arguments)
+        self._swarm = load_swarm(Path(self.chosen.swarm_file))
+        if not is_warm(WARM_UP):
             self.get_logger().info("compiling the estimator for this machine: about a minute")
         warm_up()
-        self._estimator = create_estimator(self._swarm, self._wishes.settings)
-        self._ingest = Ingest(self._swarm, self._wishes.map_frame)
-        self._backlog: list[tuple[int, bytes, int]] = []
+        self._estimator = create_estimator(self._swarm, self.chosen.settings)
+        self._ingest = Ingest(self._swarm, self.chosen.map_frame)
         self._estimate: SwarmEstimate | None = None
         self._jumps = 0
-        self._pace = FusionPace(self._wishes.fusion_load, self._wishes.settings.horizon_s)
+        self._pace = FusionPace(self.chosen.fusion_load, self.chosen.settings.horizon_s)
         self._cost = TickCost()
-        self._health = Health(self._swarm, self._ingest, self._wishes.odom_frame, self._why_missing)
-        self._outputs = EstimateOutputs(self, self._swarm, self._wishes)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
+        self._diagnostics = self._create_diagnostics()
+        self._outputs = EstimateOutputs(self, self._swarm, self.chosen)
+        self._diagnostics_publisher = self.create_publisher(
+            DiagnosticArray, "/diagnostics", QoSProfile(depth=10)
+        )
         self._waiting_since_s = self._reported_s = time.monotonic()
         self._clock_runs = False
         self._has_said_missing = False
         self._known_drops: dict[str, int] = {}
         self._told_drops_s = -math.inf
-        self._offer_services()
-        self._subscribe()
+        self._overload = 0
+        self._known_rivals: list[str] = []
+        self._known_contradictions: set[tuple[str, Kind]] = set()
+        self._inputs = EstimatorInputs(self, self._ingest.topics, self._estimator.drop)
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        PoseCommands(self, self._swarm, self._estimator, self.chosen.map_frame)
         self._start_timers()
 
-    def _offer_services(self) -> None:
-        self.create_service(Trigger, "~/reset", self._on_reset)
-        self.create_service(SetRobotPose, "~/set_robot_pose", self._on_set_robot_pose)
+    @property
+    def subscriptions(self) -> Iterator[Subscription]:
+        """Those that an executor handles; the raw ones, the inputs, wait for the ticks."""
+        return (one for one in super().subscriptions if not one.raw)
 
-    def _subscribe(self) -> None:
-        """Listen to all robots. Raw bytes: building message objects would cost more than estimating."""
-        for handle, topic in enumerate(self._ingest.topics):
-            self.create_subscription(
-                _MESSAGE_CLASSES[topic.kind], topic.name, self._receiver(handle), INPUT_QOS, raw=True
-            )
-
-    def _receiver(self, handle: int) -> Callable[[bytes], None]:
-        """A callback that only keeps the message and the time; the next tick reads it."""
-        backlog, clock = self._backlog, self.get_clock()
-
-        def receive(data: bytes) -> None:
-            backlog.append((handle, data, clock.now().nanoseconds))
-
-        return receive
+    def _create_diagnostics(self) -> Diagnostics:
+        sole = ["swarm/poses", *(["/clock"] if self.get_clock().ros_time_is_active else [])]
+        return Diagnostics(self._swarm, self._ingest, self.chosen.odom_frame, TopicGraph(self), sole)
 
     def _start_timers(self) -> None:
-        self._timer = self.create_timer(self._wishes.tick_period_s, self._on_tick)
+        self._ticks = Ticks(self, self.chosen.tick_period_s, self._on_tick)
+        # what came before time goes back must not seem to come after
+        self._jumps_back = self.get_clock().create_jump_callback(_BACKWARDS, pre_callback=self._receive)
         # by a clock that runs also while simulated time stands still
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_DIAGNOSTICS_PERIOD_S, self._on_diagnostics, clock=steady)
         self.get_logger().info(
             f"ready: {len(self._swarm.robots)} robots and {len(self._swarm.landmarks)} landmarks"
-            f" of '{self._wishes.swarm_file}'"
+            f" of '{self.chosen.swarm_file}'"
         )
 
     def _on_tick(self) -> None:
-        if self._timer.time_until_next_call() > self._timer.timer_period_ns:
-            # Where several /clock messages were handled while a tick was due, the EventsExecutor calls once
-            # for each of them, and every call moves the timer on, in the end seconds ahead of time.
-            self._timer.reset()
-            return
         begin_s = time.perf_counter()
         now_ns = self.get_clock().now().nanoseconds
         if not now_ns:
-            self._limit_backlog()
             return
-        backlog = [(handle, data, arrival_ns or now_ns) for handle, data, arrival_ns in self._backlog]
-        self._backlog.clear()
-        for messages in self._ingest.read(MessageBatch.of(backlog)):
-            self._estimator.receive(messages)
+        self._receive()
         fuse = self._pace.is_due(begin_s, now_ns)  # large swarms: in between odometry leads on
         begin_cpu_s = time.thread_time()
         self._estimate = self._estimator.tick(now_ns, fuse=fuse)
@@ -174,12 +150,11 @@ class EstimatorNode(Node):
         self._outputs.publish(self._estimate)
         self._cost.note(time.perf_counter() - begin_s)
 
-    def _limit_backlog(self) -> None:
-        """Before the first /clock nothing can be placed in time; keep the newest."""
-        surplus = len(self._backlog) - _MOST_WITHOUT_CLOCK
-        if surplus > 0:
-            del self._backlog[:surplus]
-            self._estimator.drop("no_clock", surplus)
+    def _receive(self) -> None:
+        """Hand what has come to the estimator."""
+        batch = MessageBatch.of(self._inputs.take(self.get_clock().now().nanoseconds))
+        for messages in self._ingest.read(batch):
+            self._estimator.receive(messages)
 
     def _say_time_jumps(self) -> None:
         """The estimator itself begins anew when time has jumped back; say so, once per jump."""
@@ -194,12 +169,13 @@ class EstimatorNode(Node):
         if not self.get_clock().now().nanoseconds:
             reports = [Report("estimator", NO_CLOCK, warning=True)]
         else:
-            period_s, settings = self._wishes.tick_period_s, self._wishes.settings
+            period_s, settings = self.chosen.tick_period_s, self.chosen.settings
             load = load_report(cost, elapsed_s, period_s, settings.fusion_period_s)
             if load.warning:
                 self.get_logger().warning(load.message, throttle_duration_sec=_THROTTLE_S)
             reports = self._estimate_reports(load)
             self._warn_of_drops(now_s)
+            self._warn_of_rivals()
         self._say_what_is_missing(now_s)
         self._publish_diagnostics(reports)
 
@@ -209,10 +185,17 @@ class EstimatorNode(Node):
             return [Report("estimator", load.message, load.warning, load.values)]
         now_ns = self.get_clock().now().nanoseconds
         recent, drops = self._estimator.recent(), self._estimator.drops
-        *robots, whole = self._health.reports(now_ns, self._estimate, recent, drops)
+        reports = self._diagnostics.reports(now_ns, self._estimate, recent, drops)
+        contradictions = self._estimator.contradictions(now_ns)
+        add_contradictions(reports, contradictions)
+        self._warn_of_contradictions(contradictions)
+        *robots, whole = reports
+        overload = drops.get("overload", 0) - self._overload
+        self._overload += overload
         whole.values["time jumps"] = str(self._estimator.time_jumps)
         whole.values.update({name: str(count) for name, count in self._estimator.counters.items()})
-        return [*robots, merged([whole, load], "estimator")]
+        causes = [whole, load, *([overload_report(overload)] if overload else [])]
+        return [*robots, merged(causes, "estimator")]
 
     def _warn_of_drops(self, now_s: float) -> None:
         """Tell of data that is dropped for being wrong, not too often; what is not told now is told later."""
@@ -223,6 +206,20 @@ class EstimatorNode(Node):
             words = ", ".join(f"{count} {reason}" for reason, count in wrong.items())
             self.get_logger().warning(f"dropped so far: {words}")
 
+    def _warn_of_rivals(self) -> None:
+        """Tell of topics with too many publishers, once whenever these change."""
+        if self._diagnostics.rivals != self._known_rivals:
+            self._known_rivals = self._diagnostics.rivals
+            for sentence in self._known_rivals:
+                self.get_logger().warning(sentence)
+
+    def _warn_of_contradictions(self, contradictions: list[Contradiction]) -> None:
+        """Tell of each contradiction once, until it has gone."""
+        for one in contradictions:
+            if (one.about, one.kind) not in self._known_contradictions:
+                self.get_logger().warning(one.text)
+        self._known_contradictions = {(one.about, one.kind) for one in contradictions}
+
     def _say_what_is_missing(self, now_s: float) -> None:
         """Name what is waited for, after a while and once: first the clock, then the topics."""
         clock_runs = bool(self.get_clock().now().nanoseconds)
@@ -231,24 +228,15 @@ class EstimatorNode(Node):
         if self._has_said_missing or now_s < self._waiting_since_s + _PATIENCE_S:
             return
         self._has_said_missing = True
-        missing = self._health.missing_text() if clock_runs else NO_CLOCK
+        missing = self._diagnostics.missing_text() if clock_runs else NO_CLOCK
         if missing:
             self.get_logger().warning(f"waiting: {missing}")
-
-    def _why_missing(self, topic: str) -> str:
-        """What the graph knows about a topic on which nothing comes."""
-        publishers = self.get_publishers_info_by_topic(topic)
-        if not publishers:
-            return " (no publisher)"
-        if all(info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for info in publishers):
-            return " (published best effort, must be reliable)"
-        return ""
 
     def _publish_diagnostics(self, reports: list[Report]) -> None:
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
         message.status = [self._status_message(report) for report in reports]
-        self._diagnostics.publish(message)
+        self._diagnostics_publisher.publish(message)
 
     def _status_message(self, report: Report) -> DiagnosticStatus:
         name = self.get_name() if report.name == "estimator" else f"{self.get_name()}: {report.name}"
@@ -260,47 +248,11 @@ class EstimatorNode(Node):
         )
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._estimator.drop("reset", len(self._backlog))
-        self._backlog.clear()
+        self._estimator.drop("reset", len(self._inputs.take(self.get_clock().now().nanoseconds)))
         self._estimator.reset()
         response.success, response.message = True, "All robots begin anew at their configured starts."
         self.get_logger().info("reset by service: the estimator begins anew")
         return response
 
-    def _on_set_robot_pose(
-        self, request: SetRobotPose.Request, response: SetRobotPose.Response
-    ) -> SetRobotPose.Response:
-        try:
-            response.message = self._set_robot_pose(request)
-            response.success = True
-            self.get_logger().info(f"by service: {response.message}")
-        except SeatRequestError as error:
-            response.success, response.message = False, f"Nothing was changed: {error}"
-        return response
 
-    def _set_robot_pose(self, request: SetRobotPose.Request) -> str:
-        """Do what was asked, and say it."""
-        robot = self._swarm.index_of.get(request.robot)
-        now_ns = self.get_clock().now().nanoseconds
-        if robot is None:
-            raise SeatRequestError(f"there is no robot '{request.robot}' in the swarm description.")
-        if not now_ns:
-            raise SeatRequestError(f"{NO_CLOCK}.")
-        if request.forget:
-            self._estimator.forget(robot, now_ns)
-            return f"Robot '{request.robot}' waits for a fix."
-        pose, covariance = planar_seat(request.pose, self._swarm.robots[robot].start_sigma)
-        fault = self._estimator.seat(robot, now_ns, pose, covariance)
-        if fault:
-            raise SeatRequestError(REFUSALS[fault])
-        x, y, theta = pose
-        return f"Robot '{request.robot}' is at x {x:.3f} m, y {y:.3f} m, theta {theta:.3f} rad."
-
-
-def main() -> int:
-    """Run until SIGINT or SIGTERM; 1 when a parameter or the swarm description cannot be used."""
-    return run_node("estimator_node", EstimatorNode, spin)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+main = partial(run_node, "estimator_node", EstimatorNode)

@@ -1,15 +1,17 @@
-"""The topics that `estimator_node` publishes its poses on."""
+"""Publish estimates: swarm/poses, <robot>/pose, and transforms from map to <robot>/odom."""
 
 from __future__ import annotations
 
+import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_estimator.core.estimator import Status, SwarmEstimate
-from swarm_loc_estimator.core.swarm import Swarm
-from swarm_loc_estimator.io.outputs import PoseEncoder, SwarmPosesEncoder, TransformsEncoder
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate
+from swarm_loc_estimator.io.messages.encoders import encode_poses
+from swarm_loc_estimator.io.messages.outputs import SwarmPosesEncoder, TransformsEncoder
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
 from swarm_loc_msgs.msg import SwarmPoses
 
@@ -31,7 +33,7 @@ class EstimateOutputs:
         frame = parameters.map_frame
         self._swarm_poses = node.create_publisher(SwarmPoses, "swarm/poses", _RELIABLE)
         self._swarm_poses_encoder = SwarmPosesEncoder(names, frame)
-        self._pose_encoder = PoseEncoder(frame)
+        self._frame = frame
         self._robot_poses = [
             node.create_publisher(PoseWithCovarianceStamped, f"{name}/pose", _RELIABLE)
             for name in (names if parameters.publish_robot_poses else [])
@@ -52,6 +54,7 @@ class EstimateOutputs:
         # a large swarm's single topics cost most of all to publish, and are seldom heard
         heard = [k for k, one in enumerate(self._robot_poses) if located[k] and one.get_subscription_count()]
         if heard:
-            messages = self._pose_encoder.encode(e.stamp_ns, e.poses[heard], e.covariances[heard])
+            stamps_ns = np.full(len(heard), e.stamp_ns)
+            messages = encode_poses(self._frame, stamps_ns, e.poses[heard], e.covariances[heard])
             for robot, message in zip(heard, messages, strict=True):
                 self._robot_poses[robot].publish(message)

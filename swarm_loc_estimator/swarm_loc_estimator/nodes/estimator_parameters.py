@@ -1,12 +1,12 @@
-"""What a user may set about `estimator_node`."""
+"""ROS parameters of `estimator_node`. No ROS here."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from swarm_loc_estimator.core.number_spec import number
-from swarm_loc_estimator.core.settings import EstimatorSettings
-from swarm_loc_estimator.nodes.parameter_table import flag, text
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.parameters.number_spec import number
+from swarm_loc_estimator.parameters.table import flag, text
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""At which ticks a large swarm's measurements are fused. No ROS here, and no clock but those handed in."""
+"""Limit the load of fusion: the ticks at which measurements of a large swarm are fused. No ROS here."""
 
 from __future__ import annotations
 

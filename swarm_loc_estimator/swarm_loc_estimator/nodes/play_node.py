@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 import time
+from functools import partial
 from importlib import import_module
 from itertools import takewhile
 from pathlib import Path
@@ -16,56 +17,46 @@ from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.experimental.events_executor import EventsExecutor
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from swarm_loc_estimator.io.bags import BagReader, BagTopic, RawMessage
-from swarm_loc_estimator.nodes.declare import declare_parameters
-from swarm_loc_estimator.nodes.pace import STEP_S, PlayedSoFar, play
-from swarm_loc_estimator.nodes.parameter_table import ParameterError
+from swarm_loc_estimator.io.bags.reader import BagReader, BagTopic, RawMessage
+from swarm_loc_estimator.nodes.playback import STEP_S, PlayedSoFar, play
 from swarm_loc_estimator.nodes.player_parameters import PlayerParameters
 from swarm_loc_estimator.nodes.playing_qos import RELIABLE, playing_qos
-from swarm_loc_estimator.nodes.running import Stop, run_node
+from swarm_loc_estimator.parameters.table import ParameterError
+from swarm_loc_estimator.ros.running import ConfiguredNode, Stop, run_node
 
 _CLOCK = "clock"
 _POLL_S = 0.05
 _SETTLED_S = 0.5
 """A node's subscriptions are discovered one by one; no new one for so long, and all are there."""
 _SAY_EVERY_S = 5.0
-_LAST_WORDS = Duration(seconds=10)
+_LAST_WORDS_S = 10.0
+_AT_ONCE = Duration(nanoseconds=0)
 _RUN_ON_S = 0.25
 """The clock runs on for so long behind the last message, so that nodes that work by timers use it, too."""
 
 
-class PlayNode(Node):
-    """Publishes the messages of a bag at their times.
-
-    Args:
-        node_arguments: Further arguments of `rclpy.node.Node`.
-
-    Raises:
-        ParameterError: A parameter cannot be used.
-        BagError: There is nothing to play.
-    """
+class PlayNode(ConfiguredNode[PlayerParameters]):
+    """Publishes the messages of a bag at their times."""
 
     def __init__(self, **node_arguments: Any) -> None:
-        super().__init__("player", **node_arguments)
-        self._wishes = declare_parameters(self, PlayerParameters)
-        self._reader = BagReader(Path(self._wishes.bag))
+        super().__init__("player", PlayerParameters, **node_arguments)
+        self._reader = BagReader(Path(self.chosen.bag))
         first_ns, last_ns = self._reader.time_range_ns
-        self._begin_ns = first_ns + round(self._wishes.start_offset_s * 1e9)
+        self._begin_ns = first_ns + round(self.chosen.start_offset_s * 1e9)
         if self._begin_ns > last_ns:
             raise ParameterError(
-                f"parameter start_offset_s = {self._wishes.start_offset_s:g} must lie within the bag,"
+                f"parameter start_offset_s = {self.chosen.start_offset_s:g} must lie within the bag,"
                 f" which lasts {1e-9 * (last_ns - first_ns):g} s."
             )
         self._publisher_of: dict[str, Publisher] = {}
         for topic in self._chosen_topics():
             self._add_publisher(topic)
         self._clock_publisher = (
-            self.create_publisher(ClockMessage, "/clock", RELIABLE) if self._wishes.clock else None
+            self.create_publisher(ClockMessage, "/clock", RELIABLE) if self.chosen.clock else None
         )
         self._own_executor = EventsExecutor()
         self._own_executor.add_node(self)
@@ -78,9 +69,9 @@ class PlayNode(Node):
         while not stop.requested:
             played_before = self.so_far.messages
             self._play_once(stop)
-            if not self._wishes.loop or self.so_far.messages == played_before:
+            if not self.chosen.loop or self.so_far.messages == played_before:
                 break
-        self._wait_for_acknowledgements()
+        self._wait_for_acknowledgements(stop)
         if not stop.requested:
             self._run_clock_on()
         for loss in self._reader.losses:
@@ -97,11 +88,11 @@ class PlayNode(Node):
     def _chosen_topics(self) -> list[BagTopic]:
         """The topics to play; the bag's own /clock is not among them."""
         topics = {topic.name: topic for topic in self._reader.topics if topic.name != _CLOCK}
-        wanted = [name.lstrip("/") for name in self._wishes.topics]
+        wanted = [name.lstrip("/") for name in self.chosen.topics]
         for name in wanted:
             if name not in topics:
                 raise ParameterError(
-                    f"parameter topics names '{name}', but '{self._wishes.bag}' has: {', '.join(topics)}."
+                    f"parameter topics names '{name}', but '{self.chosen.bag}' has: {', '.join(topics)}."
                 )
         return [topics[name] for name in wanted or topics]
 
@@ -117,22 +108,16 @@ class PlayNode(Node):
         self._publisher_of[topic.name] = self.create_publisher(message_class, topic.name, qos)
 
     def _play_once(self, stop: Stop) -> None:
-        play(
-            takewhile(lambda _: not stop.requested, self._reader.messages(self._publisher_of)),
-            self._begin_ns,
-            self._wishes.rate,
-            self._publish,
-            self._publish_clock,
-            time.monotonic,
-            self._wait_until,
-            self.so_far,
-        )
+        messages = takewhile(lambda _: not stop.requested, self._reader.messages(self._publisher_of))
+        play(messages, self._begin_ns, self.chosen.rate, self, self.so_far)
 
-    def _publish(self, message: RawMessage) -> None:
+    def publish(self, message: RawMessage) -> None:
+        """Send a message of the bag out."""
         topic, _, _, data = message
         self._publisher_of[topic].publish(bytes(data))
 
-    def _publish_clock(self, now_ns: int) -> None:
+    def publish_clock(self, now_ns: int) -> None:
+        """Send /clock out, if it is wanted."""
         self._now_ns = now_ns
         if self._clock_publisher is not None:
             self._clock_publisher.publish(ClockMessage(clock=Time(nanoseconds=now_ns).to_msg()))
@@ -141,18 +126,22 @@ class PlayNode(Node):
         """Let time go on, at its own pace whatever the rate."""
         begin_s, begin_ns = time.monotonic(), self._now_ns
         for step in range(1, round(_RUN_ON_S / STEP_S) + 1):
-            self._wait_until(begin_s + step * STEP_S)
-            self._publish_clock(begin_ns + step * round(STEP_S * 1e9))
+            self.wait_until(begin_s + step * STEP_S)
+            self.publish_clock(begin_ns + step * round(STEP_S * 1e9))
 
-    def _wait_until(self, instant_s: float) -> None:
-        """Serve the node's parameters meanwhile."""
+    def now_s(self) -> float:
+        """The steady clock."""
+        return time.monotonic()
+
+    def wait_until(self, instant_s: float) -> None:
+        """Return when the steady clock has come to an instant; serve the node's parameters meanwhile."""
         self._own_executor.spin_once(timeout_sec=max(0.0, instant_s - time.monotonic()))
         while (left_s := instant_s - time.monotonic()) > 0.0:
             self._own_executor.spin_once(timeout_sec=left_s)
 
     def _wait_for_subscribers(self, stop: Stop) -> None:
         """Return once topics are heard as the user asked for, and no more come; say what is waited for."""
-        wanted = self._wishes.wait_for_subscribers
+        wanted = self.chosen.wait_for_subscribers
         said_s = changed_s = time.monotonic()
         heard, clock_heard = 0, False
         while wanted and not stop.requested:
@@ -168,18 +157,15 @@ class PlayNode(Node):
                 self.get_logger().info(f"waiting for subscribers: {heard} of {wanted} topics have one{clock}")
             self._own_executor.spin_once(timeout_sec=_POLL_S)
 
-    def _wait_for_acknowledgements(self) -> None:
-        """Stay until everyone has received the last message."""
-        publishers = self._publisher_of.items()
-        silent = [name for name, publisher in publishers if not publisher.wait_for_all_acked(_LAST_WORDS)]
-        if silent:
+    def _wait_for_acknowledgements(self, stop: Stop) -> None:
+        """Stay until everyone has received the last message, or somebody stops it."""
+        silent, end_s = self._publisher_of, time.monotonic() + _LAST_WORDS_S
+        while silent and not stop.requested and time.monotonic() < end_s:
+            silent = {name: one for name, one in silent.items() if not one.wait_for_all_acked(_AT_ONCE)}
+            if silent:
+                self._own_executor.spin_once(timeout_sec=_POLL_S)
+        if silent and not stop.requested:
             self.get_logger().warning(f"not everything was received on {', '.join(silent)}")
 
 
-def main() -> int:
-    """Play a bag; 1 when a parameter or the bag cannot be used."""
-    return run_node("play", PlayNode, PlayNode.run)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+main = partial(run_node, "play", PlayNode)

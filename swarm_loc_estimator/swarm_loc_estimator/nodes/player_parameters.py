@@ -1,11 +1,11 @@
-"""What a user may set about `play`."""
+"""ROS parameters of `play`. No ROS here."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from swarm_loc_estimator.core.number_spec import number
-from swarm_loc_estimator.nodes.parameter_table import flag, text, texts
+from swarm_loc_estimator.parameters.number_spec import number
+from swarm_loc_estimator.parameters.table import flag, text, texts
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The quality of service of what the player publishes: as recorded, else so that all can hear it."""
+"""QoS profiles of the player: as recorded, else reliable."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def playing_qos(topic: str, recorded: Sequence[Qos]) -> QoSProfile:
 
 
 def _profile(recorded: Qos) -> QoSProfile:
-    """A recorded profile; policies that are no more than a wish for some default become this player's."""
+    """A recorded profile; policies that only ask for some default become this player's."""
     latched = recorded.durability is QosDurability.TRANSIENT_LOCAL
     return QoSProfile(
         # of a latched topic, late subscribers get as much as they used to

@@ -1,24 +1,32 @@
-"""Have the estimator's inner loops compiled before data comes; messages would be lost meanwhile."""
+"""Compile the estimator before data comes; messages would be lost meanwhile. No ROS here."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.core.compiled import note_warm
-from swarm_loc_estimator.core.estimator import SwarmEstimator
-from swarm_loc_estimator.core.ir.brightness import expected
-from swarm_loc_estimator.core.robot_ir import IrMethod, RobotIr
-from swarm_loc_estimator.core.settings import EstimatorSettings
-from swarm_loc_estimator.core.sightings import CONTENT_POSE_TWO, CONTENT_POSITION
-from swarm_loc_estimator.core.swarm import Face, Landmark, Robot, Swarm
-from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
-from swarm_loc_estimator.io.ingest import Ingest
-from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
-from swarm_loc_estimator.io.message_batch import MessageBatch
-from swarm_loc_estimator.io.messages import encode_brightness, encode_detections, encode_fix, encode_odometry
+from swarm_loc_estimator.core.description.robot_ir import IrMethod, RobotIr
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.description.swarm import Face, Landmark, Robot, Swarm
+from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
+from swarm_loc_estimator.core.infrared.brightness import expected
+from swarm_loc_estimator.core.inputs.camera import CONTENT_POSE_TWO, CONTENT_POSITION
+from swarm_loc_estimator.io.inputs.ingest import Ingest
+from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.io.messages.encoders import (
+    encode_brightness,
+    encode_detections,
+    encode_fix,
+    encode_odometry,
+)
+from swarm_loc_estimator.io.messages.message_batch import MessageBatch
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.numerics.jit import note_warm
 
+WARM_UP = Path(__file__)
+"""What all compiled code that this module imports is remembered by, see `is_warm`."""
 _SECOND = 1_000_000_000
 _FIRST_LANDMARK = 10
 _LANDMARKS = 30  # three robots see more than are fused one by one where many may be fused together
@@ -32,7 +40,7 @@ def warm_up() -> None:
     """Run small estimators through all that they do: a minute unless `is_warm`, then a second."""
     for fusion_period_s in (0.0, 0.1):
         _run(EstimatorSettings(fusion_period_s=fusion_period_s))
-    note_warm()
+    note_warm(WARM_UP)
 
 
 def _run(settings: EstimatorSettings) -> None:

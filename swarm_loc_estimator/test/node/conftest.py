@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from node_world import SETTINGS, Robots, Ros, overrides, write_swarm
 
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
-
-
-@pytest.fixture
-def ros() -> Iterator[Ros]:
-    """ROS, for one test."""
-    ros = Ros()
-    yield ros
-    ros.close()
 
 
 @pytest.fixture

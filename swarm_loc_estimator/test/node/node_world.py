@@ -7,7 +7,6 @@ import math
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,14 +22,16 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from typing_extensions import Self
 
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.sightings import CONTENT_POSE
-from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
-from swarm_loc_estimator.io.messages import encode_detections, encode_odometry
+from swarm_loc_estimator.core.inputs.camera import CONTENT_POSE
+from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.io.messages.encoders import encode_detections, encode_odometry
+from swarm_loc_estimator.launching.processes import executable_path
+from swarm_loc_estimator.numerics import se2
 from swarm_loc_msgs.msg import MarkerDetectionArray, SwarmPose, SwarmPoses
 
 SECOND = 1_000_000_000
@@ -54,6 +55,8 @@ TRUE_POSES = {"alpha": (0.0, 0.0, 0.0), "beta": (0.0, 1.0, 0.0)}
 UNKNOWN_ID = 999
 SETTINGS = {"fusion_load": 1.0}
 """Every tick fuses, however fast the test lets time pass."""
+
+_RELIABLE = QoSProfile(depth=100)
 
 Poses = dict[str, tuple[float, float, float]]
 
@@ -113,6 +116,7 @@ class Ros:
         rclpy.init(args=[])
         self.executor = EventsExecutor()
         self.nodes: list[Node] = []
+        self._strangers: list[Node] = []
         self.tester = self.add(rclpy.create_node("tester"))
 
     def add(self, node: Any) -> Any:
@@ -120,6 +124,13 @@ class Ros:
         self.nodes.append(node)
         self.executor.add_node(node)
         return node
+
+    def stranger(self) -> Node:
+        """A node of another participant, as of another process; it only publishes."""
+        context = rclpy.Context()
+        rclpy.init(args=[], context=context)
+        self._strangers.append(rclpy.create_node("stranger", context=context))
+        return self._strangers[-1]
 
     def listen(self, message_class: type, topic: str) -> list[Any]:
         """All messages that come on a topic from now on."""
@@ -149,6 +160,9 @@ class Ros:
             node.destroy_node()
         self.executor.shutdown()
         rclpy.shutdown()
+        for stranger in self._strangers:
+            stranger.destroy_node()
+            stranger.context.shutdown()
 
 
 def overrides(**values: Any) -> list[Parameter]:
@@ -161,10 +175,12 @@ class Robots:
 
     Args:
         ros: Whose tester publishes.
+        qos: How odometry and sightings are published.
     """
 
-    def __init__(self, ros: Ros) -> None:
+    def __init__(self, ros: Ros, qos: QoSProfile = _RELIABLE) -> None:
         self._ros = ros
+        self._qos = qos
         self._clock: Publisher = ros.tester.create_publisher(Clock, "/clock", 10)
         self._odometry = {name: self._publisher(Odometry, f"{name}/odom") for name in TRUE_POSES}
         self._detections = {
@@ -173,7 +189,7 @@ class Robots:
         self.poses: list[SwarmPoses] = ros.listen(SwarmPoses, "swarm/poses")
 
     def _publisher(self, message_class: type, topic: str) -> Publisher:
-        return self._ros.tester.create_publisher(message_class, topic, 100)
+        return self._ros.tester.create_publisher(message_class, topic, self._qos)
 
     def wait_for_estimator(self) -> None:
         """Return once it hears all topics and is heard."""
@@ -218,6 +234,11 @@ class Robots:
         """Return once the time has come to every reliable subscription, whether it was handled or not."""
         assert self._clock.wait_for_all_acked(Duration(seconds=PATIENCE_S))
 
+    def wait_until_received(self) -> None:
+        """Return once all odometry and sightings are where the estimator takes them from."""
+        for publisher in (*self._odometry.values(), *self._detections.values()):
+            assert publisher.wait_for_all_acked(Duration(seconds=PATIENCE_S))
+
     def odometry(self, robot: str, data: bytes) -> None:
         """Publish serialized odometry."""
         self._odometry[robot].publish(data)
@@ -232,8 +253,9 @@ class Robots:
         return pose
 
     def located(self, robot: str) -> bool:
-        """Whether the last estimate says where a robot is."""
-        return bool(self.poses) and self.newest(robot).status == SwarmPose.STATUS_TRACKED
+        """Whether the last estimate says where a robot is, by sightings or by its configured start."""
+        located = (SwarmPose.STATUS_TRACKED, SwarmPose.STATUS_UNCONFIRMED)
+        return bool(self.poses) and self.newest(robot).status in located
 
 
 def stamp_ns(message: Any) -> int:
@@ -245,7 +267,7 @@ class Program:
     """An executable as a process of its own, its output in one file.
 
     Args:
-        name: Module below `nodes`.
+        name: Of the executable.
         log: Where its output goes.
         parameters: ROS parameters.
         arguments: Further ROS arguments.
@@ -261,7 +283,7 @@ class Program:
         package: str = "swarm_loc_estimator",
     ) -> None:
         self.log = log
-        command = [sys.executable, "-m", f"{package}.nodes.{name}", "--ros-args", *arguments]
+        command = [str(executable_path(package, name)), "--ros-args", *arguments]
         for key, value in parameters.items():
             command += ["-p", f"{key}:={value}"]
         with log.open("wb") as out:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
 from node_world import (
     STEP_NS,
     T0_NS,
@@ -25,14 +24,13 @@ from node_world import (
     stamp_ns,
 )
 from rcl_interfaces.msg import Log
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.arrivals import Messages
-from swarm_loc_estimator.core.estimator import SwarmEstimate
+from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate
+from swarm_loc_estimator.core.inputs.messages import RawInputs
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
+from swarm_loc_estimator.numerics import se2
 from swarm_loc_msgs.msg import SwarmPose
 from swarm_loc_msgs.srv import SetRobotPose
 
@@ -192,9 +190,10 @@ def test_a_seat_that_cannot_be_taken_is_refused_in_a_sentence(ros: Ros, robots: 
 
 def test_a_reset_counts_what_had_not_been_read_yet(ros: Ros, robots: Robots, node: EstimatorNode) -> None:
     heard = ros.listen(DiagnosticArray, "/diagnostics")
+    assert not node.get_clock().now().nanoseconds
     for step in range(3):
         robots.odometry("alpha", odometry_bytes("alpha", T0_NS + step))
-    ros.until(lambda: len(node._backlog) == 3)
+    robots.wait_until_received()
     assert ros.call(Trigger, "estimator/reset", Trigger.Request()).success
     robots.tell_time(T0_NS + STEP_NS)
     ros.until(lambda: heard and "dropped: reset" in report(heard, "estimator")[1])
@@ -221,8 +220,8 @@ def test_drops_of_a_second_kind_are_told_once_the_throttle_allows(
 
 
 def test_diagnostics_name_what_is_missing_and_why(ros: Ros, swarm_file: Any) -> None:
-    best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-    ros.tester.create_publisher(Odometry, "beta/odom", best_effort)
+    stranger = ros.stranger()  # one participant cannot have both types
+    stranger.create_publisher(PoseWithCovarianceStamped, "beta/odom", 1)
     heard = ros.listen(DiagnosticArray, "/diagnostics")
     ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(swarm_file))))
     ros.until(lambda: len(heard) > 1)
@@ -232,7 +231,7 @@ def test_diagnostics_name_what_is_missing_and_why(ros: Ros, swarm_file: Any) -> 
     assert (
         "nothing received on alpha/odom, alpha/detections, beta/detections (no publisher)" in status.message
     )
-    assert "beta/odom (published best effort, must be reliable)" in status.message
+    assert "beta/odom (published as geometry_msgs/msg/PoseWithCovarianceStamped)" in status.message
     status, _ = report(heard, "estimator: alpha")
     assert status.level == DiagnosticStatus.WARN
     assert "alpha/odom" in status.message
@@ -269,13 +268,17 @@ class StandIn:
         self.drops: dict[str, int] = {}
         self.counters: dict[str, int] = {}
 
-    def receive(self, messages: Messages) -> None:
+    def receive(self, messages: RawInputs) -> None:
         """Remember whose and when."""
         assert not messages.detections.robot.size
         assert not messages.dropped
         rows = messages.odometry
         assert np.all(rows.arrival_ns >= rows.stamp_ns)
         self.odometry += zip(rows.robot.tolist(), rows.stamp_ns.tolist(), strict=True)
+
+    def drop(self, reason: str, count: int) -> None:
+        """Nothing may go missing."""
+        assert not count, reason
 
     def tick(self, now_ns: int, *, fuse: bool) -> SwarmEstimate:
         """Always the same."""

@@ -11,7 +11,7 @@ from node_world import SETTINGS, STEP_NS, T0_NS, Poses, Program, Robots, Ros, ov
 from rclpy.parameter import Parameter
 
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
-from swarm_loc_estimator.nodes.parameter_table import ParameterError
+from swarm_loc_estimator.parameters.table import ParameterError
 
 
 def _program(tmp_path: Path, **parameters: object) -> Program:

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from swarm_loc_estimator.cli.demo import main
-from swarm_loc_estimator.core.estimator import Status
-from swarm_loc_estimator.core.metrics import interpolate
-from swarm_loc_estimator.graph import GraphOptions, graph_nodes
-from swarm_loc_estimator.io.bag_cut import copy_beginning
-from swarm_loc_estimator.io.swarm_file import load_swarm
-from swarm_loc_estimator.live import ESTIMATOR, PLAYER, play_live, read_bag
-from swarm_loc_estimator.live_agreement import compare_with_replay
-from swarm_loc_estimator.live_graph import LiveError, LiveGraph
-from swarm_loc_estimator.nodes.recorder import read_poses
+from swarm_loc_estimator.core.estimation.estimator import Status
+from swarm_loc_estimator.io.bags.cut import copy_beginning
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.launching.graph import GraphOptions, graph_nodes
+from swarm_loc_estimator.live.agreement import compare_with_replay
+from swarm_loc_estimator.live.graph import LiveError, LiveGraph
+from swarm_loc_estimator.live.recorder import read_poses
+from swarm_loc_estimator.live.run import ESTIMATOR, PLAYER, play_live, read_bag
+from swarm_loc_estimator.numerics.trajectory import interpolate
 
 DEMO = Path(__file__).parents[3] / "bags" / "eight_five_robots"
 SWARM_FILE = DEMO / "swarm.yaml"
@@ -44,8 +44,9 @@ def test_live_poses_are_those_of_replay(bag: Path, tmp_path: Path) -> None:
     assert np.nanmedian(compared.distance_m) < 1e-3
 
 
-def test_poses_come_back_after_the_estimator_was_killed(bag: Path, tmp_path: Path) -> None:
-    swarm = load_swarm(SWARM_FILE)
+def test_poses_come_back_after_the_estimator_was_killed(tmp_path: Path) -> None:
+    swarm, bag = load_swarm(SWARM_FILE), tmp_path / "bag"
+    copy_beginning(DEMO, bag, 7.0)
     content = read_bag(bag, swarm)
     options = GraphOptions(str(SWARM_FILE), bag=str(bag), rate=0.5)
     with LiveGraph(graph_nodes(options), tmp_path / "nodes.log") as graph:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -12,8 +13,8 @@ from rclpy.qos import QoSProfile
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
-from swarm_loc_estimator.io.bag_writer import BagWriter
-from swarm_loc_estimator.io.typestore import DETECTIONS, ODOMETRY
+from swarm_loc_estimator.io.bags.writer import BagWriter
+from swarm_loc_estimator.io.messages.typestore import DETECTIONS, ODOMETRY
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
 COUNT = 200
@@ -51,7 +52,7 @@ class Listener:
 
 
 def _player(bag: Path | str, tmp_path: Path, *arguments: str, **parameters: object) -> Program:
-    return Program("play_node", tmp_path / "log", {"bag": bag, **parameters}, arguments)
+    return Program("play", tmp_path / "log", {"bag": bag, **parameters}, arguments)
 
 
 def _clock(ros: Ros) -> list[int]:
@@ -135,3 +136,21 @@ def test_a_wrong_parameter_ends_the_player_with_one_sentence(
         (line,) = player.output.splitlines()
     assert line.startswith("play: ")
     assert sentence in line
+
+
+def test_a_player_that_is_stopped_does_not_wait_for_one_who_does_not_listen(
+    ros: Ros, bag: Path, tmp_path: Path, swarm_file: Path
+) -> None:
+    odometry, times = Listener(ros, Odometry, "alpha/odom"), _clock(ros)
+    with Program("estimator_node", tmp_path / "estimator", {"swarm_file": swarm_file}) as estimator:
+        estimator.wait_for("ready")
+        with _player(bag, tmp_path, rate=20, loop="true", wait_for_subscribers=3) as player:
+            ros.until(lambda: len(odometry.heard) > COUNT)
+            estimator.process.send_signal(signal.SIGSTOP)
+            heard = len(odometry.heard)
+            ros.until(lambda: len(odometry.heard) > heard + COUNT)
+            begin_s = time.monotonic()
+            assert player.end(signal.SIGINT) == 0
+            took_s = time.monotonic() - begin_s
+    assert times
+    assert took_s < 2.0

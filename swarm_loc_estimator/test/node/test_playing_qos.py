@@ -10,8 +10,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import QosDurability, QosReliability, QosTime
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from swarm_loc_estimator.io.bag_writer import RELIABLE
-from swarm_loc_estimator.io.typestore import ODOMETRY, typestore
+from swarm_loc_estimator.io.bags.writer import RELIABLE
+from swarm_loc_estimator.io.messages.typestore import ODOMETRY, typestore
 
 BEST_EFFORT = RELIABLE._replace(reliability=QosReliability.BEST_EFFORT, deadline=QosTime(0, 500_000_000))
 LATCHED = RELIABLE._replace(durability=QosDurability.TRANSIENT_LOCAL, depth=1)
@@ -39,7 +39,7 @@ def _bag(path: Path) -> Path:
 
 def test_topics_offer_what_was_recorded_and_else_what_all_can_hear(ros: Ros, tmp_path: Path) -> None:
     parameters = {"bag": _bag(tmp_path / "bag"), "wait_for_subscribers": len(TOPICS)}
-    with Program("play_node", tmp_path / "log", parameters):
+    with Program("play", tmp_path / "log", parameters):
         ros.until(lambda: all(ros.tester.count_publishers(name) for name in TOPICS))
         offered: dict[str, QoSProfile] = {
             name: ros.tester.get_publishers_info_by_topic(name)[0].qos_profile for name in TOPICS

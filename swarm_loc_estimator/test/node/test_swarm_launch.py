@@ -1,33 +1,41 @@
-"""The launch file starts the list of the `graph` command; runs where launch_ros is installed."""
+"""The launch file starts the list of the `graph` command, or says why not and ends with an error."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
-from node_world import module_at
 
-from swarm_loc_estimator.graph import GraphOptions, graph_nodes
+from swarm_loc_estimator.launching.graph import GraphOptions, graph_nodes
 
-launch = pytest.importorskip("launch")
-pytest.importorskip("launch_ros")
+pytest.importorskip("launch_ros.actions")
+from launch_world import end_of, nodes_of
 
 LAUNCH_FILE = Path(__file__).parents[2] / "launch" / "swarm.launch.py"
+BAG = Path(__file__).parents[3] / "bags" / "eight_one_robot_slow"
+USED = {"swarm_file": str(BAG / "swarm.yaml"), "bag": str(BAG)}
 
 
 def test_launch_arguments_become_the_graphs_nodes() -> None:
-    module = module_at(LAUNCH_FILE)
-    context = launch.LaunchContext()
-    chosen = {
-        "swarm_file": "swarm.yaml",
-        "bag": "eight",
-        "rate": "2.0",
-        "use_sim_time": "false",
-        "params_file": "",
-    }
-    context.launch_configurations.update(chosen)
+    started = nodes_of(LAUNCH_FILE, **USED, rate="2.0", use_sim_time="false", params_file="")
+    specs = graph_nodes(GraphOptions(USED["swarm_file"], bag=USED["bag"], rate=2.0))
+    assert started == [spec.executable for spec in specs]
 
-    actions = module.start_nodes(context)
 
-    specs = graph_nodes(GraphOptions("swarm.yaml", bag="eight", rate=2.0))
-    assert [action.node_executable for action in actions] == [spec.executable for spec in specs]
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"swarm_file": "missing.yaml"}, "missing.yaml"),
+        ({"bag": "missing"}, "missing"),
+        ({"params_file": "missing.yaml"}, "missing.yaml"),
+        ({"rate": "abc"}, "argument rate = 'abc' must be a number in [0.01, 1000]."),
+        ({"rate": "0"}, "argument rate = '0' must be a number in [0.01, 1000]."),
+    ],
+)
+def test_an_argument_that_cannot_be_used_ends_the_launch_with_an_error(
+    changed: dict[str, str], sentence: str
+) -> None:
+    status, said = end_of(LAUNCH_FILE, **{**USED, **changed})
+    assert status == 1
+    assert sentence in said
+    assert "process started" not in said

@@ -9,18 +9,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from swarm_loc_estimator.calibration.recording import Recording, Rows
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.metrics import Track
-from swarm_loc_estimator.core.odometry import OdometryTracks
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.swarm import CameraMount, Face, Landmark, Robot, Swarm
-from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.core.description.swarm import CameraMount, Face, Landmark, Robot, Swarm
+from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.numerics.trajectory import Trajectory
 
 SECOND = 1_000_000_000
 _MARGIN_S = 2.0
 _ODOMETRY_S, _TRUTH_S, _PICTURE_S = 0.05, 0.02, 0.25
 _VIEW = 0.6
 _FARTHEST = 5.0
+_FIRST_MARK = 100
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class World:
 def described(robots: tuple[Robot, ...]) -> Swarm:
     """What a user knows: names and markers, nothing of the models."""
     marks = tuple(
-        Landmark(100 + k, x, y, yaw=np.pi)
+        Landmark(_FIRST_MARK + k, x, y, yaw=np.pi)
         for k, (x, y) in enumerate(itertools.product(np.arange(-24.0, 24.1, 3.0).tolist(), repeat=2))
     )
     plain = tuple(Robot(r.name, r.type, faces=r.faces, camera=CameraMount()) for r in robots)
@@ -64,8 +65,9 @@ def robot(number: int, true: Robot) -> Robot:
 def record(world: World) -> tuple[Recording, Swarm]:
     """Simulate a recording and the swarm as its user would describe it."""
     swarm = described(world.robots)
+    marks = np.array([[mark.x, mark.y, mark.yaw or 0.0] for mark in swarm.landmarks])
     rng = np.random.default_rng(world.seed)
-    truth: dict[str, Track] = {}
+    truth: dict[str, Trajectory] = {}
     odometry, pictures = [], []
     for index, true in enumerate(world.robots):
         raw = _raw(rng, world.duration_s)
@@ -76,8 +78,9 @@ def record(world: World) -> tuple[Recording, Swarm]:
         ]
     for index, true in enumerate(world.robots):
         stamps = np.arange(3 * SECOND, int((world.duration_s - _MARGIN_S) * SECOND), int(_PICTURE_S * SECOND))
-        for stamp in stamps.tolist():
-            found = _seen(rng, world, swarm, truth[true.name], stamp, true)
+        relative = _marks_seen_from(truth[true.name], true, stamps, marks)
+        for stamp, places in zip(stamps.tolist(), relative, strict=True):
+            found = _seen(rng, world, places, true)
             if found.size:
                 pictures.append((index, stamp, stamp, found))
     return Recording("world", _rows(odometry), _rows(pictures), truth), swarm
@@ -89,7 +92,7 @@ def _rows(messages: Sequence[tuple[int, int, int, object]]) -> Rows:
     return Rows(columns[0], columns[1], columns[2], tuple(m[3] for m in ordered))
 
 
-def _raw(rng: np.random.Generator, duration_s: float) -> Track:
+def _raw(rng: np.random.Generator, duration_s: float) -> Trajectory:
     """Integrated commands that change every few seconds, in place now and then."""
     count = int(duration_s / _ODOMETRY_S)
     speed, turn_rate = np.zeros(count), np.zeros(count)
@@ -104,10 +107,10 @@ def _raw(rng: np.random.Generator, duration_s: float) -> Track:
     x = np.concatenate([[0.0], np.cumsum(speed * _ODOMETRY_S * np.cos(middle))])
     y = np.concatenate([[0.0], np.cumsum(speed * _ODOMETRY_S * np.sin(middle))])
     stamps = np.arange(count + 1) * int(_ODOMETRY_S * SECOND) + SECOND
-    return Track(stamps, np.column_stack([x, y, se2.wrap_angle(heading)]))
+    return Trajectory(stamps, np.column_stack([x, y, se2.wrap_angle(heading)]))
 
 
-def _truth(rng: np.random.Generator, true: Robot, raw: Track, world: World) -> Track:
+def _truth(rng: np.random.Generator, true: Robot, raw: Trajectory, world: World) -> Trajectory:
     """Where the robot truly goes, by its motion model."""
     tracks = OdometryTracks([true])
     zeros = np.zeros(raw.stamp_ns.size, dtype=np.int64)
@@ -117,40 +120,39 @@ def _truth(rng: np.random.Generator, true: Robot, raw: Track, world: World) -> T
     if world.turn_sigma:
         pose = _with_turn_noise(rng, pose, world.turn_sigma)
     pose[:, 2] = se2.wrap_angle(pose[:, 2])
-    return Track(stamps, pose)
+    return Trajectory(stamps, pose)
 
 
 def _with_turn_noise(rng: np.random.Generator, pose: FloatArray, sigma: float) -> FloatArray:
     """The path with a random walk in heading."""
     steps = se2.log(se2.between(pose[:-1], pose[1:]))
     steps[:, 2] += sigma * np.sqrt(_TRUTH_S) * rng.standard_normal(len(steps))
-    walked = [pose[0]]
-    for step in steps:
-        walked.append(se2.compose(walked[-1], se2.exp(step)))
-    return np.array(walked)
+    heading = pose[0, 2] + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
+    moved = se2.exp(steps)[:, :2]
+    cos, sin = np.cos(heading[:-1]), np.sin(heading[:-1])
+    away = np.column_stack([cos * moved[:, 0] - sin * moved[:, 1], sin * moved[:, 0] + cos * moved[:, 1]])
+    place = pose[0, :2] + np.concatenate([np.zeros((1, 2)), np.cumsum(away, axis=0)])
+    return np.column_stack([place, heading])
+
+
+def _marks_seen_from(truth: Trajectory, true: Robot, stamps_ns: IntArray, marks: FloatArray) -> FloatArray:
+    """Poses (p, m, 3) of marks (m, 3) before the robot's camera at the stamps (p,) of its pictures."""
+    camera = true.camera or CameraMount()
+    own = _at(truth, stamps_ns + round(true.sensor.time_offset_s * 1e9))
+    eye = se2.compose(own, [camera.x, camera.y, camera.yaw])
+    return se2.between(eye[:, None], marks)
 
 
 def _seen(
-    rng: np.random.Generator,
-    world: World,
-    swarm: Swarm,
-    truth: Track,
-    stamp_ns: int,
-    true: Robot,
+    rng: np.random.Generator, world: World, rel: FloatArray, true: Robot
 ) -> np.ndarray[tuple[int], np.dtype[np.void]]:
-    """Detections of one picture."""
-    camera = true.camera or CameraMount()
-    own = _at(truth, stamp_ns + round(true.sensor.time_offset_s * 1e9))
-    eye = se2.compose(own, [camera.x, camera.y, camera.yaw])
-    marks = np.array([[m.x, m.y, m.yaw or 0.0] for m in swarm.landmarks])
-    ids = np.array([m.id for m in swarm.landmarks])
-    rel = se2.between(np.broadcast_to(eye, marks.shape), marks)
+    """Detections of one picture, before which marks have poses (m, 3)."""
     distance, bearing = np.hypot(rel[:, 0], rel[:, 1]), np.arctan2(rel[:, 1], rel[:, 0])
-    near = (np.abs(bearing) < _VIEW) & (distance < _FARTHEST) & (distance > 0.3)
-    rows = np.zeros(int(near.sum()), DETECTION_DTYPE)
+    near = np.flatnonzero((np.abs(bearing) < _VIEW) & (distance < _FARTHEST) & (distance > 0.3))
+    rows = np.zeros(near.size, DETECTION_DTYPE)
     if not rows.size:
         return rows
-    rows["id"], rows["content"] = ids[near], 2 if world.posed else 1
+    rows["id"], rows["content"] = _FIRST_MARK + near, 2 if world.posed else 1
     s = true.sensor
     logged = (bearing[near] - s.bearing_offset) / s.bearing_scale
     logged += world.bearing_sigma * rng.standard_normal(rows.size)
@@ -171,8 +173,8 @@ def _facing(heading: float) -> FloatArray:
     return np.array([0.0, np.sin(half), 0.0, np.cos(half)])
 
 
-def _at(track: Track, stamp_ns: int) -> FloatArray:
-    row = int(np.clip(np.searchsorted(track.stamp_ns, stamp_ns), 1, track.stamp_ns.size - 1))
-    share = (stamp_ns - track.stamp_ns[row - 1]) / (track.stamp_ns[row] - track.stamp_ns[row - 1])
+def _at(track: Trajectory, stamps_ns: IntArray) -> FloatArray:
+    row = np.clip(np.searchsorted(track.stamp_ns, stamps_ns), 1, track.stamp_ns.size - 1)
+    share = (stamps_ns - track.stamp_ns[row - 1]) / (track.stamp_ns[row] - track.stamp_ns[row - 1])
     step = se2.log(se2.between(track.pose[row - 1], track.pose[row]))
-    return np.asarray(se2.compose(track.pose[row - 1], se2.exp(share * step)))
+    return se2.compose(track.pose[row - 1], se2.exp(share[:, None] * step))

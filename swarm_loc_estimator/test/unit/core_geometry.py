@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.swarm import CameraMount
+from swarm_loc_estimator.core.description.swarm import CameraMount
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 
 def homogeneous(

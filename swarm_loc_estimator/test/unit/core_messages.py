@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
-from swarm_loc_estimator.core.arrivals import DetectionRows, FixRows, Messages, OdometryRows
-from swarm_loc_estimator.core.estimator import SwarmEstimator
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.io.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
+from swarm_loc_estimator.core.inputs.messages import DetectionRows, FixRows, OdometryRows, RawInputs
+from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 SECOND = 10**9
 T0 = 1_000 * SECOND
@@ -23,10 +23,24 @@ def detection(marker_id: int, pose: FloatArray, content: int = POSE) -> NDArray[
     """A detection (1,) of a marker whose pose in the optical frame is (4, 4); its noise is the sensor's."""
     one = np.zeros(1, dtype=DETECTION_DTYPE)
     one["id"], one["content"], one["position"] = marker_id, content, pose[:3, 3]
-    one["orientation"] = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    one["orientation"] = quaternion(pose[:3, :3])
     one["alternative_position"], one["alternative_orientation"] = one["position"], one["orientation"]
     one["covariance"][0, 0, 0] = -1.0
     return one
+
+
+def quaternion(rotation: FloatArray) -> list[float]:
+    """The unit quaternion [x, y, z, w] of a rotation matrix (3, 3)."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
+    rows = (  # of 4 q q^T: each is the quaternion but for its length
+        (1.0 + xx - yy - zz, xy + yx, zx + xz, zy - yz),
+        (xy + yx, 1.0 - xx + yy - zz, yz + zy, xz - zx),
+        (zx + xz, yz + zy, 1.0 - xx - yy + zz, yx - xy),
+        (zy - yz, xz - zx, yx - xy, 1.0 + xx + yy + zz),
+    )
+    longest = max(range(4), key=lambda k: rows[k][k])
+    length = math.hypot(*rows[longest])
+    return [part / length for part in rows[longest]]
 
 
 def joined(detections: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
@@ -48,7 +62,7 @@ def give_fix(
         covariance=np.array([covariance], dtype=float),
         arrival_ns=np.array([now_ns]),
     )
-    estimator.receive(Messages(now_ns, now_ns, fixes=fix))
+    estimator.receive(RawInputs(now_ns, now_ns, fixes=fix))
 
 
 @dataclass(frozen=True)
@@ -62,10 +76,21 @@ class Event:
 
     def give(self, estimator: SwarmEstimator, now_ns: int) -> None:
         """Hand the message in."""
-        rows = 0 if self.pose is None else 1
-        poses = np.array([self.pose or ()], dtype=float).reshape(rows, 3)
-        robot, stamp_ns, arrival_ns = np.array([[self.robot], [self.stamp_ns], [now_ns]], dtype=np.int64)
-        odometry = OdometryRows(robot[:rows], stamp_ns[:rows], poses, arrival_ns[:rows])
-        each = np.zeros(self.detections.size, dtype=np.int64)
-        seen = DetectionRows(robot[each], stamp_ns[each], self.detections, arrival_ns[each])
-        estimator.receive(Messages(now_ns, now_ns, odometry, seen))
+        give(estimator, [(now_ns, self)])
+
+
+def give(estimator: SwarmEstimator, arrivals: Sequence[tuple[int, Event]]) -> None:
+    """Hand in messages (arrival, event) in order of their arrivals, as a node does at a tick."""
+    moved = [(e.robot, e.stamp_ns, now_ns, e.pose) for now_ns, e in arrivals if e.pose is not None]
+    seen = [(e.robot, e.stamp_ns, now_ns) for now_ns, e in arrivals for _ in range(e.detections.size)]
+    messages = RawInputs(arrivals[0][0], arrivals[-1][0])
+    if moved:
+        *columns, poses = zip(*moved, strict=True)
+        robot, stamp_ns, arrival_ns = np.array(columns, dtype=np.int64)
+        odometry = OdometryRows(robot, stamp_ns, np.array(poses, dtype=float), arrival_ns)
+        messages = messages._replace(odometry=odometry)
+    if seen:
+        robot, stamp_ns, arrival_ns = np.array(list(zip(*seen, strict=True)), dtype=np.int64)
+        detections = joined([event.detections for _, event in arrivals])
+        messages = messages._replace(detections=DetectionRows(robot, stamp_ns, detections, arrival_ns))
+    estimator.receive(messages)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable
 
-from core_messages import SECOND, Event
+from core_messages import SECOND, Event, give
 from core_world import World
 
-from swarm_loc_estimator.core.estimator import SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.core.fusion import Verdict
+from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.core.estimation.fusion import Verdict
 
 
 def play(
@@ -21,9 +21,11 @@ def play(
     waiting = sorted(events, key=lambda pair: pair[0])
     estimates, k = [], 0
     for now_ns in ticks_ns:
+        begin = k
         while k < len(waiting) and waiting[k][0] <= now_ns:
-            waiting[k][1].give(estimator, waiting[k][0])
             k += 1
+        if k > begin:
+            give(estimator, waiting[begin:k])
         estimates.append(estimator.tick(now_ns, fuse=now_ns not in resting_ns))
     return estimates
 

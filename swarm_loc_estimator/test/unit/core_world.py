@@ -8,12 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from core_geometry import homogeneous, marker_frame, seen
-from core_messages import POSE, POSITION, SECOND, T0, Event, detection, joined
+from core_messages import POSE, POSITION, SECOND, T0, Event, detection, joined, quaternion
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.swarm import (
+from swarm_loc_estimator.core.description.swarm import (
     CameraMount,
     Face,
     Landmark,
@@ -23,6 +21,7 @@ from swarm_loc_estimator.core.swarm import (
     StartSigma,
     Swarm,
 )
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 
 @dataclass(frozen=True)
@@ -321,7 +320,7 @@ def _sighting(rng: np.random.Generator, plan: Plan, marker_id: int, relative: Fl
     if rng.uniform() < plan.flips:
         noisy, flipped = flipped, noisy
     one = detection(marker_id, noisy, plan.content)
-    one["alternative_orientation"] = Rotation.from_matrix(flipped[:3, :3]).as_quat()
+    one["alternative_orientation"] = quaternion(flipped[:3, :3])
     return one
 
 

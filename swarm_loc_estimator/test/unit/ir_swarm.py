@@ -9,20 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.arrivals import BrightnessRows, FixRows, IntArray, Messages, OdometryRows
-from swarm_loc_estimator.core.estimator import SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.core.ir.brightness import expected
-from swarm_loc_estimator.core.ir.platform import IrGains, IrPlatform, PairGains
-from swarm_loc_estimator.core.robot_ir import RobotIr
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.settings import EstimatorSettings
-from swarm_loc_estimator.core.swarm import OdometryModel, Robot, StartSigma, Swarm
-from swarm_loc_estimator.io.bag_writer import BagWriter
-from swarm_loc_estimator.io.inputs import InputKind
-from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
-from swarm_loc_estimator.io.messages import encode_brightness, encode_fix, encode_odometry
-from swarm_loc_estimator.io.swarm_writer import save_swarm
+from swarm_loc_estimator.core.description.robot_ir import RobotIr
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot, StartSigma, Swarm
+from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.core.infrared.board import IrGains, IrPlatform, PairGains
+from swarm_loc_estimator.core.infrared.brightness import expected
+from swarm_loc_estimator.core.inputs.messages import BrightnessRows, FixRows, OdometryRows, RawInputs
+from swarm_loc_estimator.io.bags.writer import BagWriter
+from swarm_loc_estimator.io.inputs.topics import InputKind
+from swarm_loc_estimator.io.messages.encoders import encode_brightness, encode_fix, encode_odometry
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 
 SECOND = 10**9
 T0 = 1_000 * SECOND
@@ -204,12 +204,12 @@ def exchange(
     ]
 
 
-def messages(events: Sequence[Event], arrivals_ns: Sequence[int]) -> Messages:
+def messages(events: Sequence[Event], arrivals_ns: Sequence[int]) -> RawInputs:
     """Events as messages that arrived at some instants, not decreasing."""
     pairs = list(zip(events, arrivals_ns, strict=True))
     moves = [(e, at) for e, at in pairs if isinstance(e, Move)]
     places = [(e, at) for e, at in pairs if isinstance(e, Place)]
-    return Messages(
+    return RawInputs(
         arrivals_ns[0],
         arrivals_ns[-1],
         odometry=OdometryRows(

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from swarm_loc_estimator.core.ir.brightness import expected
-from swarm_loc_estimator.core.ir.platform import IrPlatform, PairGains
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
+from swarm_loc_estimator.core.infrared.board import IrPlatform, PairGains
+from swarm_loc_estimator.core.infrared.brightness import expected
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 RHO = 0.022
 ANGLES = np.radians([-30.0, -90.0, -150.0, 150.0, 90.0, 30.0])

@@ -13,9 +13,9 @@ from core_world import MOUNT, ODOMETRY, Plan, World, simulate
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core import fusion
-from swarm_loc_estimator.core.estimator import SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.core.settings import EstimatorSettings
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.estimation import fusion
+from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
 
 Arrival = tuple[int, Event]
 EXACT = EstimatorSettings(fusion_period_s=0.0)
@@ -164,7 +164,7 @@ def test_a_sighting_before_the_odometry_begins_is_untied_whenever_ticks_fall() -
     at_once = outcome(world, delayed(events, lambda _: 0.0), [T0, T0 + 2 * SECOND])
     often = outcome(world, delayed(events, lambda _: 0.0), ticks(T0, T0 + 2 * SECOND, 0.004))
     assert_same(at_once, often)
-    assert at_once.estimator.drops == {"untied": 1}
+    assert at_once.estimator.drops == {"not_localized": 1}
 
 
 @pytest.mark.parametrize("step_s", [0.05, 0.3, 0.9])
@@ -228,7 +228,7 @@ def _give_order(estimator: SwarmEstimator, number: int) -> None:
     if number:
         give_fix(estimator, 0, T0 + SECOND, pose, covariance, T0 + SECOND)
     else:
-        estimator.seat(0, T0 + SECOND, pose, covariance)
+        estimator.set_pose(0, T0 + SECOND, pose, covariance)
 
 
 def test_a_repeated_message_counts_once_and_two_sightings_of_a_marker_twice() -> None:
@@ -264,7 +264,7 @@ def test_late_orders_count_at_their_own_time() -> None:
             [a for a in arrivals if a[0] <= T0 + asked_s * SECOND],
             ticks(T0, T0 + int(asked_s * SECOND)),
         )
-        estimator.seat(0, T0 + SECOND, (0.5, 0.5, 1.0), 1e-6 * np.eye(3))
+        estimator.set_pose(0, T0 + SECOND, (0.5, 0.5, 1.0), 1e-6 * np.eye(3))
         rest = [a for a in arrivals if a[0] > T0 + asked_s * SECOND]
         last = play(estimator, rest, ticks(T0 + int(asked_s * SECOND), T0 + 3 * SECOND))[-1]
         results.append(Outcome(estimator, last))
@@ -299,4 +299,4 @@ def test_robots_that_wait_long_are_located_at_the_same_instant(seed: int, conten
     arrivals = delayed(world.events, lambda _: rng.uniform(0.0, 1.9))
     orderly = outcome(world, delayed(world.events, lambda _: 0.0), ticks(T0, T0 + 8 * SECOND, 0.25))
     assert_same(orderly, outcome(world, arrivals, ticks(T0, T0 + 8 * SECOND, 0.11)))
-    assert settled(orderly.estimator)["CLUE"] > 5
+    assert settled(orderly.estimator)["CONSTRAINT"] > 5

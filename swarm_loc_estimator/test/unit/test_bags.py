@@ -11,14 +11,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
+from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
-from swarm_loc_estimator.io.bag_writer import RELIABLE, BagWriter
-from swarm_loc_estimator.io.bags import BagError, BagReader, BagTopic, RawMessage
-from swarm_loc_estimator.io.message_batch import MessageBatch, merge_streams
-from swarm_loc_estimator.io.typestore import DETECTIONS, ODOMETRY, typestore
+from swarm_loc_estimator.io.bags.reader import BagError, BagReader, BagTopic, RawMessage
+from swarm_loc_estimator.io.bags.writer import RELIABLE, BagWriter
+from swarm_loc_estimator.io.messages.message_batch import MessageBatch, merge_streams
+from swarm_loc_estimator.io.messages.typestore import DETECTIONS, ODOMETRY, typestore
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -102,6 +103,13 @@ def test_written_bag_is_read_back_and_by_the_library_too(tmp_path: Path) -> None
         assert "child_frame_id" in odometry.msgdef.data
         assert "corners_px" in detections.msgdef.data
         assert odometry.digest.startswith("RIHS01_")
+        with (tmp_path / "bag" / "bag.mcap").open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+        assert summary is not None
+        assert [one.metadata["topic_type_hash"] for one in summary.channels.values()] == [
+            odometry.digest,
+            detections.digest,
+        ]
         assert odometry.ext.offered_qos_profiles[0].reliability.name == "RELIABLE"  # type: ignore[union-attr]
 
 
@@ -363,14 +371,14 @@ def peak_of_reading(path: Path) -> int:
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
 def test_memory_does_not_grow_with_the_bag(tmp_path: Path, storage: str) -> None:
     peaks = []
-    for count in (3000, 30000):
+    for count in (3000, 12000):  # all of the second together take three times what is allowed
         if storage == "mcap":
             path = tmp_path / f"{count}.mcap"
             write_mcap(path, some_messages(count))
         else:
             path = write_sqlite(tmp_path / str(count), some_messages(count))
         peaks.append(peak_of_reading(path))
-    assert peaks[1] < 2 * peaks[0] + 100_000
+    assert peaks[1] < 1.1 * peaks[0] + 50_000
 
 
 @given(st.lists(st.lists(st.lists(st.integers(0, 30), max_size=5), max_size=4), max_size=4))

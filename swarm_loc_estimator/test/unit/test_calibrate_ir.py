@@ -11,19 +11,19 @@ import pytest
 from ir_world import droplet, random_poses, readings_of
 from scipy.stats import chi2
 
-from swarm_loc_estimator.calibration.infrared import LEAST_EXCHANGES
+from swarm_loc_estimator.calibration.infrared.gains import MIN_EXCHANGES
 from swarm_loc_estimator.cli import calibrate_ir
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.ir.platform import IrGains, IrPlatform, PairGains
-from swarm_loc_estimator.core.robot_ir import RobotIr
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.swarm import Robot, Swarm
-from swarm_loc_estimator.io.bag_writer import BagWriter
-from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
-from swarm_loc_estimator.io.messages import encode_brightness, encode_pose_stamped
-from swarm_loc_estimator.io.swarm_file import load_swarm
-from swarm_loc_estimator.io.swarm_writer import save_swarm
-from swarm_loc_estimator.io.typestore import BRIGHTNESS, POSE_STAMPED
+from swarm_loc_estimator.core.description.robot_ir import RobotIr
+from swarm_loc_estimator.core.description.swarm import Robot, Swarm
+from swarm_loc_estimator.core.infrared.board import IrGains, IrPlatform, PairGains
+from swarm_loc_estimator.io.bags.writer import BagWriter
+from swarm_loc_estimator.io.messages.encoders import encode_brightness, encode_pose_stamped
+from swarm_loc_estimator.io.messages.typestore import BRIGHTNESS, POSE_STAMPED
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 BEGIN_NS, STEP_NS = 1_700_000_000_000_000_000, 1_000_000_000
 SPREAD = 0.1
@@ -186,8 +186,8 @@ def test_what_cannot_be_calibrated_is_said_in_one_sentence(
 ) -> None:
     bag, swarm = tmp_path / "bag", tmp_path / "other.yaml"
     robots = described(("a", "b"), droplet(SPREAD), "droplet")
-    recorded(bag, robots, LEAST_EXCHANGES - 1, 6)
-    few = f"{LEAST_EXCHANGES - 1} exchanges are too few, {LEAST_EXCHANGES} are the least"
+    recorded(bag, robots, MIN_EXCHANGES - 1, 6)
+    few = f"{MIN_EXCHANGES - 1} exchanges are too few, {MIN_EXCHANGES} are the least"
     assert f"recording 'bag': Platform droplet: {few}." in error_of(capsys, bag)
     assert "There is no bag" in error_of(capsys, tmp_path / "nowhere", "--swarm", bag / "swarm.yaml")
     assert "missing.yaml" in error_of(capsys, bag, "--swarm", tmp_path / "missing.yaml")
@@ -195,7 +195,7 @@ def test_what_cannot_be_calibrated_is_said_in_one_sentence(
     assert "no robot of the swarm description has an infrared" in error_of(capsys, bag, "--swarm", swarm)
     save_swarm(Swarm(tuple(described(("a", "b"), droplet(SPREAD), "droplet", first_id=50))), swarm)
     unknown = error_of(capsys, bag, "--swarm", swarm)
-    assert f"can be used: {2 * LEAST_EXCHANGES - 2} ir_unknown_id." in unknown
+    assert f"can be used: {2 * MIN_EXCHANGES - 2} ir_unknown_id." in unknown
     save_swarm(Swarm(tuple(described(("x", "y"), droplet(SPREAD), "droplet"))), swarm)
     sentence = "recording 'bag' holds no <robot>/brightness of this swarm that can be used."
     strangers = "No robot of the swarm description has the topics a/brightness, b/brightness."
@@ -248,5 +248,5 @@ def test_boards_whose_elements_do_not_differ_need_no_calibration(
     board = tmp_path / "board.yaml"
     board.write_text(exact.replace("element_sigma: 0.1", "element_sigma: 0.0"))
     robots = described(("a", "b"), load_ir_platform(str(board)), str(board))
-    recorded(tmp_path / "bag", robots, LEAST_EXCHANGES, 7)
+    recorded(tmp_path / "bag", robots, MIN_EXCHANGES, 7)
     assert "element_sigma of the platform is 0" in error_of(capsys, tmp_path / "bag")

@@ -12,9 +12,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.io import cdr
-from swarm_loc_estimator.io.messages import encode_detections, encode_odometry, encode_pose_stamped
-from swarm_loc_estimator.io.typestore import DETECTION, DETECTIONS, ODOMETRY, POSE_STAMPED, encode, typestore
+from swarm_loc_estimator.io.messages import cdr
+from swarm_loc_estimator.io.messages.encoders import encode_detections, encode_odometry, encode_pose_stamped
+from swarm_loc_estimator.io.messages.typestore import (
+    DETECTION,
+    DETECTIONS,
+    ODOMETRY,
+    POSE_STAMPED,
+    encode,
+    typestore,
+)
 
 FINITE = st.floats(-1e6, 1e6)
 ANGLE = st.floats(-3.1, 3.1)

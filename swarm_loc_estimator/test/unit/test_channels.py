@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core.arrivals import Messages
-from swarm_loc_estimator.core.estimator import Status, SwarmEstimator
-from swarm_loc_estimator.core.swarm import OdometryModel, Robot, Swarm
-from swarm_loc_estimator.io.cdr import CdrError, decode_brightness, decode_fix
-from swarm_loc_estimator.io.ingest import Ingest
-from swarm_loc_estimator.io.message_batch import MessageBatch
-from swarm_loc_estimator.io.messages import encode_brightness, encode_fix, encode_odometry
-from swarm_loc_estimator.io.typestore import BRIGHTNESS, POSE_WITH_COVARIANCE, typestore
+from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimator
+from swarm_loc_estimator.core.inputs.messages import RawInputs
+from swarm_loc_estimator.io.inputs.ingest import Ingest
+from swarm_loc_estimator.io.messages.cdr import CdrError, decode_brightness, decode_fix
+from swarm_loc_estimator.io.messages.encoders import encode_brightness, encode_fix, encode_odometry
+from swarm_loc_estimator.io.messages.message_batch import MessageBatch
+from swarm_loc_estimator.io.messages.typestore import BRIGHTNESS, POSE_WITH_COVARIANCE, typestore
 
 SECOND = 1_000_000_000
 T0 = 1_000 * SECOND
@@ -32,7 +32,7 @@ def big_endian(data: bytes, message_type: str) -> bytes:
     return bytes(store.serialize_cdr(message, message_type, little_endian=False))
 
 
-def read(*messages: tuple[str, bytes, int]) -> tuple[Messages, Ingest]:
+def read(*messages: tuple[str, bytes, int]) -> tuple[RawInputs, Ingest]:
     """Messages by topic and arrival."""
     ingest = Ingest(SWARM)
     batch = MessageBatch.of([(ingest.handle_of[topic], data, at) for topic, data, at in messages])

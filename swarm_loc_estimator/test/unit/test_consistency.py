@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -11,13 +12,16 @@ from core_run import on_time, play, ticks
 from core_world import MOUNT, ODOMETRY, Plan, World, simulate
 from scipy.stats import chi2
 
-from swarm_loc_estimator.core import fusion
-from swarm_loc_estimator.core.estimator import SwarmEstimator
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.settings import EstimatorSettings
-from swarm_loc_estimator.core.swarm import Swarm
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.core.estimation import fusion
+from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 SEEDS = range(6)
+
+world_of = lru_cache(maxsize=len(SEEDS))(simulate)
+"""For tests that let several estimators run over one world, and change nothing in it."""
 
 
 def errors(world: World, settings: EstimatorSettings, period_s: float) -> tuple[FloatArray, FloatArray]:
@@ -74,7 +78,7 @@ def test_errors_that_last_are_estimated_and_the_error_stays_chi_square_distribut
         trusted = (replace(robot, odometry=ODOMETRY, camera=MOUNT) for robot in world.swarm.robots)
         return replace(world.swarm, robots=tuple(trusted))
 
-    assert_estimated([simulate(plan, 200 + seed) for seed in SEEDS], trusting)
+    assert_estimated([world_of(plan, 200 + seed) for seed in SEEDS], trusting)
 
 
 @pytest.mark.parametrize("many", [5, 1000])
@@ -89,7 +93,7 @@ def test_landmarks_badly_surveyed_are_estimated_and_the_error_stays_chi_square_d
         trusted = (replace(mark, position_sigma=0.0, yaw_sigma=0.0) for mark in world.swarm.landmarks)
         return replace(world.swarm, landmarks=tuple(trusted))
 
-    assert_estimated([simulate(plan, 300 + seed) for seed in SEEDS], trusting)
+    assert_estimated([world_of(plan, 300 + seed) for seed in SEEDS], trusting)
 
 
 @pytest.mark.parametrize("fusion_period_s", [0.0, 0.2])
@@ -115,7 +119,7 @@ def rmse(speed: float, settings: EstimatorSettings, period_s: float = 0.25) -> f
     squared = []
     for seed in SEEDS:
         plan = Plan(2, 8.0, speed=speed, turn_rate=1.0, standing=(0, 1) if speed == 0.0 else ())
-        error, _ = errors(simulate(plan, seed), settings, period_s)
+        error, _ = errors(world_of(plan, seed), settings, period_s)
         squared.append(np.square(error[4:, :, :2]).sum(axis=-1))
     return float(np.sqrt(np.mean(squared)))
 

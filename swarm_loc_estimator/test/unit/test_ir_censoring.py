@@ -13,15 +13,15 @@ from ir_world import droplet, nees, pose_errors, random_poses, readings_of
 from scipy.integrate import quad
 from scipy.optimize import minimize
 
-from swarm_loc_estimator.core.ir.brightness import expected
-from swarm_loc_estimator.core.ir.closed_form import ClosedForm
-from swarm_loc_estimator.core.ir.cost import MEASURED, SATURATED, Pair, cost_of, new_scratch
-from swarm_loc_estimator.core.ir.gains import Exchanges, estimate_gains
-from swarm_loc_estimator.core.ir.information import information
-from swarm_loc_estimator.core.ir.likelihood import MaximumLikelihood
-from swarm_loc_estimator.core.ir.platform import PairGains
-from swarm_loc_estimator.core.ir.solution import IrEstimator, Outcome, ReadingsError
-from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.infrared.board import PairGains
+from swarm_loc_estimator.core.infrared.brightness import expected
+from swarm_loc_estimator.core.infrared.cramer_rao import information
+from swarm_loc_estimator.core.infrared.solution import IrEstimator, Outcome, ReadingsError
+from swarm_loc_estimator.core.infrared.solvers.closed_form import ClosedForm
+from swarm_loc_estimator.core.infrared.solvers.cost import MEASURED, SATURATED, Pair, cost_of, new_scratch
+from swarm_loc_estimator.core.infrared.solvers.gains import Exchanges, estimate_gains
+from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 LIMIT = 240.0
 ALIKE = MaximumLikelihood(droplet())

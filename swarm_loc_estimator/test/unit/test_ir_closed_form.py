@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from ir_world import ANGLES, RHO, droplet, emitter_20, random_poses, readings_of, sensor_19, units, wrapped
 
-from swarm_loc_estimator.core.ir.closed_form import ClosedForm
-from swarm_loc_estimator.core.ir.platform import IrGains, PairGains
-from swarm_loc_estimator.core.ir.solution import IrEstimator, Outcome
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
+from swarm_loc_estimator.core.infrared.board import IrGains, PairGains
+from swarm_loc_estimator.core.infrared.solution import IrEstimator, Outcome
+from swarm_loc_estimator.core.infrared.solvers.closed_form import ClosedForm
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 PRINTED = ("(1)", "(10)", "(11)", "(12)", "(18)", "wrap")
 

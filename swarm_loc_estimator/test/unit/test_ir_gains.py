@@ -5,16 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ir_world import droplet, nees, pose_errors, random_poses, readings_of
-from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.ir.gains import Exchanges, GainsError, GainsFit, estimate_gains
-from swarm_loc_estimator.core.ir.likelihood import MaximumLikelihood
-from swarm_loc_estimator.core.ir.platform import PairGains
-from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.core.infrared.board import PairGains
+from swarm_loc_estimator.core.infrared.solvers.gains import Exchanges, GainsError, GainsFit, estimate_gains
+from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 
 ROBOTS = 3
-
-IntArray = NDArray[np.int64]
 
 
 def recorded(

@@ -22,15 +22,15 @@ from ir_world import (
     wrapped,
 )
 
-from swarm_loc_estimator.core.ir.brightness import expected
-from swarm_loc_estimator.core.ir.cost import MEASURED, SATURATED, Pair, cost_of, new_scratch
-from swarm_loc_estimator.core.ir.curves import TabulatedCurve
-from swarm_loc_estimator.core.ir.information import information
-from swarm_loc_estimator.core.ir.likelihood import MaximumLikelihood
-from swarm_loc_estimator.core.ir.platform import IrGains, IrPlatform, PairGains
-from swarm_loc_estimator.core.ir.solution import IrEstimator, Outcome, ReadingsError
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
+from swarm_loc_estimator.core.infrared.board import IrGains, IrPlatform, PairGains
+from swarm_loc_estimator.core.infrared.brightness import expected
+from swarm_loc_estimator.core.infrared.cramer_rao import information
+from swarm_loc_estimator.core.infrared.curves import TabulatedCurve
+from swarm_loc_estimator.core.infrared.solution import IrEstimator, Outcome, ReadingsError
+from swarm_loc_estimator.core.infrared.solvers.cost import MEASURED, SATURATED, Pair, cost_of, new_scratch
+from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 ALIKE = MaximumLikelihood(droplet())
 DIFFERING = MaximumLikelihood(droplet(0.1))
@@ -151,11 +151,11 @@ def test_the_share_that_lasts_is_what_exchanges_with_other_noise_have_in_common(
     core = (np.abs(one) < 4.0 * np.sqrt(variances)).all(axis=1) & (other**2 < 16.0 * variances).all(axis=1)
     scaled = 1.0 / variances[core]  # every pair counts alike
     common = np.mean(one[core] * other[core] * scaled, axis=0) / np.mean(one[core] ** 2 * scaled, axis=0)
-    np.testing.assert_allclose(common, once.lasting[found][core].mean(axis=0), atol=0.12)
-    assert (once.lasting[found] > 0.0).all()
-    assert (once.lasting[found] <= 1.0).all()
+    np.testing.assert_allclose(common, once.systematic_share[found][core].mean(axis=0), atol=0.12)
+    assert (once.systematic_share[found] > 0.0).all()
+    assert (once.systematic_share[found] <= 1.0).all()
     exact = MaximumLikelihood(droplet()).solve(readings_of(droplet(), poses[:50], 18))
-    assert (exact.lasting[exact.outcomes == Outcome.FOUND] == 0.0).all()
+    assert (exact.systematic_share[exact.outcomes == Outcome.FOUND] == 0.0).all()
 
 
 def with_a_robot_between(poses: FloatArray, seed: int) -> tuple[FloatArray, FloatArray]:

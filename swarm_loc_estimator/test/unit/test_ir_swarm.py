@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ir_swarm import SECOND, Event, Light, Plan, Run, play, simulate, write_bag
 
-from swarm_loc_estimator.core.estimator import Status, SwarmEstimate
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.settings import EstimatorSettings
-from swarm_loc_estimator.io.swarm_file import load_swarm
-from swarm_loc_estimator.replay import replay
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate
+from swarm_loc_estimator.evaluation.replay import replay
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 SLOW = EstimatorSettings(horizon_s=4.0, fix_window_s=60.0)
 
@@ -69,7 +69,7 @@ def test_robots_that_stand_for_long_do_not_take_repeated_errors_for_news() -> No
 def test_robots_that_all_start_unknown_wait_however_much_they_hear() -> None:
     estimator, estimates = play(simulate(Plan(seconds=6.0), 0))
     assert (estimates[-1].status == Status.WAITING).all()
-    assert set(estimator.drops) == {"untied"}
+    assert set(estimator.drops) == {"not_localized"}
 
 
 def outcome(

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from core_geometry import planar, pose_of
 
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.measurements import (
+from swarm_loc_estimator.core.filter.measurement_model import (
     MEASUREMENT_DTYPE,
     NOBODY,
     Kind,
@@ -17,7 +16,8 @@ from swarm_loc_estimator.core.measurements import (
     innovation,
     predict,
 )
-from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 WHO = {"landmark": (0, NOBODY), "surveyed": (0, NOBODY), "robot": (0, 1), "fix": (NOBODY, 1)}
 """Observer and target; the place of the landmark "surveyed" is estimated."""

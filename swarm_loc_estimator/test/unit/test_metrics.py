@@ -7,32 +7,33 @@ import math
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.core import metrics
-from swarm_loc_estimator.core.metrics import MetricsError, Track
+from swarm_loc_estimator.evaluation import metrics
+from swarm_loc_estimator.evaluation.metrics import MetricsError
+from swarm_loc_estimator.numerics.trajectory import Trajectory, TrajectoryError, interpolate
 
 SECOND = 1_000_000_000
 
 
-def track(*rows: tuple[float, float, float, float]) -> Track:
+def track(*rows: tuple[float, float, float, float]) -> Trajectory:
     """Rows of time [s], x, y, theta."""
     table = np.array(rows, float).reshape(-1, 4)
-    return Track((table[:, 0] * SECOND).round().astype(np.int64), table[:, 1:])
+    return Trajectory((table[:, 0] * SECOND).round().astype(np.int64), table[:, 1:])
 
 
 def test_interpolation_follows_the_arc_and_the_shorter_turn() -> None:
     quarter = track((0, 1, 0, math.pi / 2), (1, 0, 1, math.pi))
-    poses, valid = metrics.interpolate(quarter, np.array([SECOND // 2]), SECOND)
+    poses, valid = interpolate(quarter, np.array([SECOND // 2]), SECOND)
     assert valid.all()
     np.testing.assert_allclose(poses[0], [math.sqrt(0.5), math.sqrt(0.5), 0.75 * math.pi], atol=1e-12)
     across = track((0, 0, 0, 3.1), (1, 0, 0, -3.1))
-    poses, _ = metrics.interpolate(across, np.array([SECOND // 2]), SECOND)
+    poses, _ = interpolate(across, np.array([SECOND // 2]), SECOND)
     assert abs(poses[0, 2]) == pytest.approx(math.pi)
 
 
 def test_no_extrapolation_and_no_long_gaps() -> None:
     known = track((1, 0, 0, 0), (2, 1, 0, 0), (4, 3, 0, 0))
     query = np.array([0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 4.5])
-    poses, valid = metrics.interpolate(known, (query * SECOND).astype(np.int64), SECOND)
+    poses, valid = interpolate(known, (query * SECOND).astype(np.int64), SECOND)
     assert valid.tolist() == [False, True, True, True, False, True, False]
     np.testing.assert_allclose(poses[valid][:, 0], [0.0, 0.5, 1.0, 3.0])
     assert np.isnan(poses[~valid]).all()
@@ -40,7 +41,7 @@ def test_no_extrapolation_and_no_long_gaps() -> None:
 
 def test_doubled_truth_stamps_do_no_harm() -> None:
     known = track((1, 0, 0, 0), (1, 0, 0, 0), (2, 1, 0, 0))
-    poses, valid = metrics.interpolate(known, np.array([1.0, 1.5]).astype(np.int64) * SECOND, SECOND)
+    poses, valid = interpolate(known, np.array([1.0, 1.5]).astype(np.int64) * SECOND, SECOND)
     assert valid.all()
     assert np.isfinite(poses).all()
 
@@ -91,7 +92,7 @@ def test_what_is_not_positive_definite_or_finite_is_not_hidden() -> None:
 
 
 def test_nothing_in_common() -> None:
-    empty = Track(np.empty(0, np.int64), np.empty((0, 3)))
+    empty = Trajectory(np.empty(0, np.int64), np.empty((0, 3)))
     for estimate, truth in ((empty, track((0, 0, 0, 0))), (track((0, 0, 0, 0)), empty), (empty, empty)):
         row = metrics.summarise(metrics.compare(estimate, None, truth))
         assert row.count == 0
@@ -104,8 +105,8 @@ def test_consistent_noise_has_nees_three_and_pools() -> None:
     count = 4000
     root = np.array([[0.1, 0, 0], [0.05, 0.2, 0], [0.02, -0.03, 0.1]])
     covariance = np.broadcast_to(root @ root.T, (count, 3, 3))
-    truth = Track(np.arange(count) * 10_000_000, rng.uniform(-3, 3, (count, 3)))
-    estimate = Track(truth.stamp_ns, truth.pose + rng.normal(size=(count, 3)) @ root.T)
+    truth = Trajectory(np.arange(count) * 10_000_000, rng.uniform(-3, 3, (count, 3)))
+    estimate = Trajectory(truth.stamp_ns, truth.pose + rng.normal(size=(count, 3)) @ root.T)
     errors = metrics.compare(estimate, covariance, truth)
     both = metrics.summarise(metrics.pool([errors, errors]))
     assert both.count == 2 * count
@@ -114,9 +115,9 @@ def test_consistent_noise_has_nees_three_and_pools() -> None:
 
 
 def test_wrong_shapes_are_refused() -> None:
-    with pytest.raises(MetricsError, match="do not fit poses"):
-        Track(np.zeros(2, np.int64), np.zeros((3, 3)))
-    with pytest.raises(MetricsError, match="go back in time"):
+    with pytest.raises(TrajectoryError, match="do not fit poses"):
+        Trajectory(np.zeros(2, np.int64), np.zeros((3, 3)))
+    with pytest.raises(TrajectoryError, match="go back in time"):
         track((1, 0, 0, 0), (0, 0, 0, 0))
     with pytest.raises(MetricsError, match="do not fit 1 poses"):
         metrics.compare(track((0, 0, 0, 0)), np.zeros((2, 3, 3)), track((0, 0, 0, 0)))

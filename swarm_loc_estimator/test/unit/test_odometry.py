@@ -10,12 +10,12 @@ from core_geometry import wrapped
 from core_messages import SECOND, T0
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.motion import DRIFT, NOISE
-from swarm_loc_estimator.core.odometry import OdometryTracks, TrackChange, TrackSample
-from swarm_loc_estimator.core.parameters import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.swarm import OdometryModel, Robot
+from swarm_loc_estimator.core.description.estimated_parameters import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
+from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot
+from swarm_loc_estimator.core.odometry.preintegration import OdometrySample
+from swarm_loc_estimator.core.odometry.tracks import OdometryTracks, TrackChange
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 PLAIN = OdometryModel(wheel_separation=0.1, wheel_noise=1e-4)
 STEP_NS = SECOND // 20
@@ -41,7 +41,7 @@ def stamps_until(seconds: float) -> NDArray[np.int64]:
     return T0 + STEP_NS * np.arange(round(seconds * 20) + 1, dtype=np.int64)
 
 
-def look(track: OdometryTracks, stamp_ns: int, robot: int = 0) -> TrackSample:
+def look(track: OdometryTracks, stamp_ns: int, robot: int = 0) -> OdometrySample:
     return track.at(np.array([robot]), np.array([stamp_ns]))
 
 
@@ -65,7 +65,7 @@ def test_headings_across_a_half_turn_are_followed() -> None:
 
 
 @pytest.mark.parametrize(("speed", "turn_rate"), [(0.2, 0.0), (0.2, 1.5), (0.0, 2.0)])
-def test_gathered_noise_is_that_of_sampled_wheels(speed: float, turn_rate: float) -> None:
+def test_preintegrated_noise_is_that_of_sampled_wheels(speed: float, turn_rate: float) -> None:
     """Wheels with covar(ds_r, ds_l) = diag(k |ds_r|, k |ds_l|); the error is taken in the track's frame."""
     track, stamps = tracks(), stamps_until(1.0)
     raw = arc(speed, turn_rate, (stamps - T0) * 1e-9)
@@ -86,14 +86,14 @@ def test_gathered_noise_is_that_of_sampled_wheels(speed: float, turn_rate: float
     x = pose[:, 0] - (cos * raw[-1, 0] - sin * raw[-1, 1])
     y = pose[:, 1] - (sin * raw[-1, 0] + cos * raw[-1, 1])
     sampled = np.cov(np.stack([x, y, turned]))
-    gathered = look(track, int(stamps[-1])).gathered[0, NOISE]
-    np.testing.assert_allclose(gathered, sampled, atol=0.05 * np.abs(gathered).max())
-    np.testing.assert_allclose(np.diag(gathered), np.diag(sampled), rtol=0.08, atol=2e-6)
+    covariance = look(track, int(stamps[-1])).covariance[0]
+    np.testing.assert_allclose(covariance, sampled, atol=0.05 * np.abs(covariance).max())
+    np.testing.assert_allclose(np.diag(covariance), np.diag(sampled), rtol=0.08, atol=2e-6)
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.7])
 @pytest.mark.parametrize("course", [0.0, math.pi / 3, math.pi / 2, -2.0, math.pi])
-def test_gathered_noise_is_that_of_sampled_steps_in_any_direction(course: float, heading: float) -> None:
+def test_preintegrated_noise_is_that_of_sampled_steps_in_any_direction(course: float, heading: float) -> None:
     """A robot that walks without turning: noise along and across its way and in heading."""
     model = replace(PLAIN, distance_noise=4e-4, lateral_noise=1e-4, distance_drift=2e-5, lateral_drift=1e-5)
     track, stamps, step = tracks(model), stamps_until(1.0), 0.01
@@ -118,9 +118,9 @@ def test_gathered_noise_is_that_of_sampled_steps_in_any_direction(course: float,
     x = pose[:, 0] - (cos * way[-1, 0] - sin * way[-1, 1])
     y = pose[:, 1] - (sin * way[-1, 0] + cos * way[-1, 1])
     sampled = np.cov(np.stack([x, y, turned]))
-    gathered = look(track, int(stamps[-1])).gathered[0, NOISE]
-    np.testing.assert_allclose(gathered[:2, :2], sampled[:2, :2], atol=0.05 * np.abs(sampled[:2, :2]).max())
-    np.testing.assert_allclose(gathered, sampled, atol=0.05 * np.abs(sampled).max())
+    covariance = look(track, int(stamps[-1])).covariance[0]
+    np.testing.assert_allclose(covariance[:2, :2], sampled[:2, :2], atol=0.05 * np.abs(sampled[:2, :2]).max())
+    np.testing.assert_allclose(covariance, sampled, atol=0.05 * np.abs(sampled).max())
 
 
 @pytest.mark.parametrize("course", [0.0, math.pi / 3, -math.pi / 2])
@@ -135,11 +135,9 @@ def test_a_step_sideways_is_calibrated_like_one_ahead(course: float) -> None:
     cos, sin = math.cos(course), math.sin(course)
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     np.testing.assert_allclose(other.pose[0], turn @ one.pose[0], atol=1e-12)
-    noise = turn @ one.gathered[0, NOISE] @ turn.T
-    np.testing.assert_allclose(other.gathered[0, NOISE], noise, atol=1e-12)
-    np.testing.assert_allclose(
-        other.gathered[0, DRIFT, :, 1], turn @ one.gathered[0, DRIFT, :, 1], atol=1e-12
-    )
+    noise = turn @ one.covariance[0] @ turn.T
+    np.testing.assert_allclose(other.covariance[0], noise, atol=1e-12)
+    np.testing.assert_allclose(other.jacobian[0, :, 1], turn @ one.jacobian[0, :, 1], atol=1e-12)
 
 
 def test_a_robot_without_odometry_stands_for_ever() -> None:
@@ -148,7 +146,8 @@ def test_a_robot_without_odometry_stands_for_ever() -> None:
     assert not track.begun(1, T0)
     sample = track.at(np.array([0, 1]), np.array([T0, T0]))
     assert not sample.pose[0].any()
-    assert not sample.gathered[0].any()
+    assert not sample.covariance[0].any()
+    assert not sample.jacobian[0].any()
     assert sample.silence_s.tolist() == [0.0, math.inf]
 
 
@@ -157,7 +156,7 @@ def test_noise_of_a_straight_drive_in_closed_form() -> None:
     feed(track, stamps, arc(0.3, 0.0, (stamps - T0) * 1e-9))
     k, d, length = PLAIN.wheel_noise, PLAIN.wheel_separation, 0.6
     heading = 2.0 * k * length / d**2
-    noise = look(track, int(stamps[-1])).gathered[0, NOISE]
+    noise = look(track, int(stamps[-1])).covariance[0]
     assert noise[0, 0] == pytest.approx(0.5 * k * length)
     assert noise[2, 2] == pytest.approx(heading)
     assert noise[1, 2] == pytest.approx(-heading * length / 2, rel=1e-9)  # lever arm about the track's origin
@@ -180,7 +179,7 @@ def test_any_order_and_batching_of_rows_gives_the_same_track(seed: int) -> None:
     for batch in np.array_split(conflicting, rng.integers(1, 30)):
         shuffled.extend(robots[batch], all_stamps[batch], rows[batch])
     who, when = np.repeat([0, 1], 80), np.tile(T0 + np.arange(80) * STEP_NS // 2 * 2 + 7_000_000, 2)
-    for name in ("pose", "raw", "gathered", "silence_s"):
+    for name in ("pose", "raw", "covariance", "jacobian", "silence_s"):
         np.testing.assert_allclose(
             getattr(shuffled.at(who, when), name), getattr(orderly.at(who, when), name), atol=1e-12
         )
@@ -212,7 +211,7 @@ def test_a_late_row_says_from_where_on_look_ups_change() -> None:
 @pytest.mark.parametrize("turn_rate", [0.0, 1.5])
 @pytest.mark.parametrize("timeout_s", [0.3, 1.0])
 @pytest.mark.parametrize("then", ["silence", "a row", "a jump"])
-def test_what_noise_is_gathered_between_any_two_instants_is_a_covariance(
+def test_what_noise_is_preintegrated_between_any_two_instants_is_a_covariance(
     timeout_s: float, turn_rate: float, then: str
 ) -> None:
     track, stamps = tracks(replace(PLAIN, timeout_s=timeout_s)), stamps_until(0.5)
@@ -224,7 +223,7 @@ def test_what_noise_is_gathered_between_any_two_instants_is_a_covariance(
         )
     instants = T0 + np.arange(0, 3 * SECOND, 30_000_000)
     sample = track.at(np.zeros(instants.size, dtype=np.int64), instants)
-    least = np.linalg.eigvalsh(np.diff(sample.gathered[:, NOISE], axis=0)).min()
+    least = np.linalg.eigvalsh(np.diff(sample.covariance, axis=0)).min()
     assert least > -1e-3 * PLAIN.wheel_noise  # the motion of a silent robot is not known better than a step's
 
 
@@ -236,8 +235,8 @@ def test_a_silent_robot_runs_on_for_its_timeout_and_then_may_be_anywhere() -> No
     assert soon.silence_s[0] == pytest.approx(0.05)
     assert late.silence_s[0] == pytest.approx(10.0)
     reach = PLAIN.max_speed * 10.0
-    np.testing.assert_allclose(np.diag(late.gathered[0, NOISE])[:2], reach**2 / 3, rtol=0.2)
-    assert late.gathered[0, NOISE, 2, 2] > 1.0
+    np.testing.assert_allclose(np.diag(late.covariance[0])[:2], reach**2 / 3, rtol=0.2)
+    assert late.covariance[0, 2, 2] > 1.0
 
 
 def test_a_row_after_a_silence_changes_nothing_more_than_a_timeout_before_it() -> None:
@@ -249,7 +248,8 @@ def test_a_row_after_a_silence_changes_nothing_more_than_a_timeout_before_it() -
     feed(track, np.array([T0 + 6 * SECOND]), np.array([[0.4, 0.2, 0.5]]))
     after = track.at(who, instants)
     np.testing.assert_array_equal(after.pose, before.pose)
-    np.testing.assert_array_equal(after.gathered, before.gathered)
+    np.testing.assert_array_equal(after.covariance, before.covariance)
+    np.testing.assert_array_equal(after.jacobian, before.jacobian)
 
 
 def test_a_jump_is_no_motion_but_makes_the_robot_unsure() -> None:
@@ -259,7 +259,7 @@ def test_a_jump_is_no_motion_but_makes_the_robot_unsure() -> None:
     assert feed(track, stamps, raw).jumps == 1
     assert look(track, int(stamps[-1])).pose[0, 0] == pytest.approx(0.1 - 0.005)
     assert look(track, int(stamps[-1])).raw[0, 0] == pytest.approx(4.1)
-    grown = look(track, int(stamps[10])).gathered[0, NOISE] - look(track, int(stamps[9])).gathered[0, NOISE]
+    grown = look(track, int(stamps[10])).covariance[0] - look(track, int(stamps[9])).covariance[0]
     assert math.sqrt(grown[0, 0]) > 0.02
     assert feed(track, stamps[[15]] + 1, raw[[15]]).jumps == 0  # one that comes late counts none again
 
@@ -276,7 +276,7 @@ def test_trimming_and_growing_keep_look_ups() -> None:
         trimmed.trim(now_ns - 2 * SECOND, now_ns - 4 * SECOND)
         when = now_ns - np.arange(0, 4 * SECOND, 230_000_000)
         who = np.zeros(when.size, dtype=np.int64)
-        for name in ("pose", "raw", "gathered", "silence_s"):
+        for name in ("pose", "raw", "covariance", "jacobian", "silence_s"):
             np.testing.assert_array_equal(
                 getattr(trimmed.at(who, when), name), getattr(kept.at(who, when), name)
             )
@@ -304,7 +304,7 @@ def test_a_track_begins_with_its_earliest_row_even_when_that_comes_late() -> Non
     np.testing.assert_allclose(look(track, T0 - SECOND).pose[0], [0.004, 0.0, 0.0])
 
 
-def test_gathered_drift_is_how_the_pose_moves_with_scales_and_bias() -> None:
+def test_preintegrated_drift_is_how_the_pose_moves_with_scales_and_bias() -> None:
     """Against tracks of robots whose motion is calibrated differently, by finite differences."""
     stamps, step = stamps_until(3.0), 1e-5
     model = replace(PLAIN, course_offset=0.1, axle_offset=-0.03)
@@ -324,4 +324,4 @@ def test_gathered_drift_is_how_the_pose_moves_with_scales_and_bias() -> None:
         poses = [look(track, at_ns, robot).pose[0] for robot in range(1, 7)]
         for k, parameter in enumerate((DISTANCE_SCALE, TURN_SCALE, TURN_BIAS)):
             moved = se2.log(se2.compose(poses[2 * k], se2.inverse(poses[2 * k + 1]))) / (2 * step)
-            np.testing.assert_allclose(here.gathered[0, DRIFT, :, parameter], moved, atol=2e-4)
+            np.testing.assert_allclose(here.jacobian[0, :, parameter], moved, atol=2e-4)

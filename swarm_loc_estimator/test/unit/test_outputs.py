@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
 
-from swarm_loc_estimator.io.outputs import PoseEncoder, SwarmPosesEncoder, TransformsEncoder
-from swarm_loc_estimator.io.typestore import typestore
+from swarm_loc_estimator.io.messages.encoders import encode_poses
+from swarm_loc_estimator.io.messages.outputs import SwarmPosesEncoder, TransformsEncoder
+from swarm_loc_estimator.io.messages.typestore import typestore
 
 STAMP_NS = 1_234_567_890_123_456_789
 NAMES = ["a", "robot17", "x" * 40]
@@ -53,8 +54,7 @@ def test_swarm_poses(frame: str) -> None:
 
 
 def test_robot_poses_are_sure_of_the_plane_but_not_beyond_doubt() -> None:
-    encoder = PoseEncoder("map")
-    messages = encoder.encode(STAMP_NS, POSES[:2], COVARIANCES[:2])
+    messages = encode_poses("map", np.full(2, STAMP_NS), POSES[:2], COVARIANCES[:2])
     for k, data in enumerate(messages):
         message = read(data, "geometry_msgs/msg/PoseWithCovarianceStamped")
         assert (stamp_ns(message), message.header.frame_id) == (STAMP_NS, "map")

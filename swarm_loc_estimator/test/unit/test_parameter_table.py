@@ -1,4 +1,4 @@
-"""One table of parameters makes the node's parameters and the README's."""
+"""One table of parameters makes the node's parameters and those of its page under doc/."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.cli.replay import read_settings
-from swarm_loc_estimator.core.settings import EstimatorSettings, SettingsError
+from swarm_loc_estimator.cli.arguments import parameters_of
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
-from swarm_loc_estimator.nodes.parameter_table import (
+from swarm_loc_estimator.nodes.player_parameters import PlayerParameters
+from swarm_loc_estimator.parameters.table import (
     ParameterError,
     ParameterSpec,
     choice,
@@ -18,14 +19,15 @@ from swarm_loc_estimator.nodes.parameter_table import (
     markdown_table,
     parameter_specs,
 )
-from swarm_loc_estimator.nodes.player_parameters import PlayerParameters
 
-README = Path(__file__).parents[2] / "README.md"
+DOC = Path(__file__).parents[2] / "doc"
 
 
-@pytest.mark.parametrize("cls", [EstimatorParameters, PlayerParameters])
-def test_the_readme_says_what_the_table_says(cls: type) -> None:
-    assert markdown_table(cls) in README.read_text(encoding="utf-8")
+@pytest.mark.parametrize(
+    ("page", "cls"), [("estimator_node.md", EstimatorParameters), ("play.md", PlayerParameters)]
+)
+def test_the_page_says_what_the_table_says(page: str, cls: type) -> None:
+    assert markdown_table(cls) in (DOC / page).read_text(encoding="utf-8")
 
 
 def test_defaults_make_the_default_object() -> None:
@@ -39,19 +41,26 @@ def test_every_setting_of_the_estimator_is_a_parameter() -> None:
 
 
 def test_settings_from_texts_are_whole_numbers_where_the_setting_is_one() -> None:
-    read = read_settings(["horizon_s=3", "lost_after=5"])
+    read = parameters_of(EstimatorSettings, ["horizon_s=3", "lost_after=5"])
     assert (read.horizon_s, type(read.horizon_s), read.lost_after, type(read.lost_after)) == (
         3.0,
         float,
         5,
         int,
     )
-    with pytest.raises(SettingsError, match=r"--set lost_after=2\.9: '2\.9' is not a whole number"):
-        read_settings(["lost_after=2.9"])
-    with pytest.raises(SettingsError, match="--set horizon_s=x: 'x' is not a number"):
-        read_settings(["horizon_s=x"])
-    with pytest.raises(SettingsError, match="'nothing' is no setting"):
-        read_settings(["nothing=1"])
+    for pair, said in (
+        ("lost_after=2.9", r"parameter lost_after = '2\.9' must be a whole number"),
+        ("horizon_s=x", "parameter horizon_s = 'x' must be a number"),
+        ("horizon_s=1e9", r"parameter horizon_s = 1000000000\.0 must lie in \[0\.05, 60\] s"),
+        ("nothing=1", "--set nothing=1: 'nothing' is no parameter; there are horizon_s, "),
+    ):
+        with pytest.raises(ParameterError, match=said):
+            parameters_of(EstimatorSettings, [pair])
+    with pytest.raises(ParameterError, match="'loop' is no parameter"):
+        parameters_of(PlayerParameters, ["loop=true"], {"bag": "x", "loop": True})
+    assert parameters_of(PlayerParameters, ["loop=true", "topics=a,b"], {"bag": "x"}) == PlayerParameters(
+        bag="x", loop=True, topics=("a", "b")
+    )
     with pytest.raises(ParameterError, match=r"lost_after = 2\.9 must be a whole number"):
         spec_of(EstimatorParameters, "lost_after").checked(2.9)
 

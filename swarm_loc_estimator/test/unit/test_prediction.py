@@ -4,12 +4,18 @@ import numpy as np
 import pytest
 from core_messages import SECOND, T0
 
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.odometry import OdometryTracks
-from swarm_loc_estimator.core.parameters import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE, ParameterTable
-from swarm_loc_estimator.core.prediction import advance, predicted
-from swarm_loc_estimator.core.state import SwarmState
-from swarm_loc_estimator.core.swarm import OdometryModel, Robot
+from swarm_loc_estimator.core.description.estimated_parameters import (
+    DISTANCE_SCALE,
+    TURN_BIAS,
+    TURN_SCALE,
+    ParameterTable,
+)
+from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot
+from swarm_loc_estimator.core.filter.prediction import predict, write_predicted
+from swarm_loc_estimator.core.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.numerics import se2
 
 BIAS_SIGMA, DISTANCE_SIGMA, TURN_SIGMA, BIAS_TIME_S = 0.005, 0.01, 0.005, 20.0
 STEP_NS = SECOND // 20
@@ -34,14 +40,18 @@ def drive(speed: float, turn_rate: float, seconds: float) -> tuple[OdometryTrack
         pose = se2.compose(pose, se2.exp(np.array([speed, 0.0, turn_rate]) * 0.05))
     for robot in range(2):
         tracks.extend(np.full(stamps.size, robot), stamps, np.array(raw))
-        state.enter(robot, np.array([0.3, -0.2, 1.0]), PRIOR, np.zeros((2, 3, 3)), T0)
+        state.initialize(robot, InitialPose(np.array([0.3, -0.2, 1.0]), PRIOR), Preintegrated.begin(T0))
     return tracks, state
+
+
+def preintegrated(tracks: OdometryTracks, robot: int, stamp_ns: int) -> Preintegrated:
+    sample = tracks.at(np.array([robot]), np.array([stamp_ns]))
+    return Preintegrated(stamp_ns, sample.covariance[0], sample.jacobian[0])
 
 
 def to(state: SwarmState, tracks: OdometryTracks, seconds: float, robot: int = 0) -> None:
     stamp_ns = T0 + round(seconds * 1e9)
-    gathered = tracks.at(np.array([robot]), np.array([stamp_ns])).gathered[0]
-    advance(state.arrays(), robot, gathered, stamp_ns)
+    predict(state.arrays(), robot, preintegrated(tracks, robot, stamp_ns))
 
 
 @pytest.mark.parametrize(("speed", "turn_rate"), [(0.1, 0.0), (0.1, 0.4)])
@@ -84,9 +94,9 @@ def test_the_read_out_is_what_the_prediction_would_be() -> None:
     state.parameter[0] = [0.02, 0.02, -0.01, 0.0, 0.0]
     to(state, tracks, 1.0)
     before = state.copy()
-    gathered = tracks.at(np.array([0]), np.array([T0 + 3 * SECOND])).gathered[0]
+    at = preintegrated(tracks, 0, T0 + 3 * SECOND)
     transform, covariance = np.empty(3), np.empty((3, 3))
-    predicted(state.arrays(), 0, gathered, T0 + 3 * SECOND, transform, covariance)
+    write_predicted(state.arrays(), 0, at, transform, covariance)
     np.testing.assert_array_equal(state.transform, before.transform)
     np.testing.assert_array_equal(state.filter.covariance, before.filter.covariance)
     to(state, tracks, 3.0)
@@ -128,14 +138,14 @@ def test_parameters_not_asked_for_have_no_columns() -> None:
     assert (table.column == -1).all()
 
 
-def test_losing_a_robot_forgets_its_parameters() -> None:
+def test_losing_a_robot_keeps_what_was_learned_of_its_sensors_and_not_how_that_depends_on_its_pose() -> None:
     tracks, state = drive(0.1, 0.3, 1.0)
     state.parameter[0] = [0.02, 0.02, -0.01, 0.0, 0.0]
     to(state, tracks, 1.0)
     assert state.filter.covariance[:3, 6:].any()
+    learned, variance = state.parameter[0].copy(), np.diag(state.filter.covariance)[6:].copy()
     state.lose(0)
     assert not state.filter.covariance[:3, 6:].any()
-    assert not state.parameter[0].any()
-    sigma = np.sqrt(np.diag(state.filter.covariance)[6:])
-    np.testing.assert_allclose(sigma, [BIAS_SIGMA, DISTANCE_SIGMA, TURN_SIGMA])
+    np.testing.assert_array_equal(state.parameter[0], learned)
+    np.testing.assert_array_equal(np.diag(state.filter.covariance)[6:], variance)
     assert (TURN_BIAS, DISTANCE_SCALE, TURN_SCALE) == (0, 1, 2)  # the order of sigma

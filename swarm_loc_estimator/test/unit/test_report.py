@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import struct
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -11,12 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.core.metrics import Track
-from swarm_loc_estimator.core.swarm import Landmark, Robot, Swarm
-from swarm_loc_estimator.io.report import write_report
-from swarm_loc_estimator.io.report_overview import plot_overview
-from swarm_loc_estimator.io.report_table import text_report
-from swarm_loc_estimator.replay_result import ReplayResult
+from swarm_loc_estimator.core.description.swarm import Landmark, Robot, Swarm
+from swarm_loc_estimator.evaluation.report.overview import plot_overview
+from swarm_loc_estimator.evaluation.report.report import write_report
+from swarm_loc_estimator.evaluation.report.table import text_report
+from swarm_loc_estimator.evaluation.result import ReplayResult
+from swarm_loc_estimator.numerics.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,7 +35,7 @@ def result_of(robots: int, ticks: int = 200, truths: int | None = None, title: s
     true[:, :, 0] = np.arange(robots)
     covariance = np.tile(0.01 * np.eye(3), (ticks, robots, 1, 1))
     pose = true + np.array([0.0, 0.3, 0.0])
-    truth = {f"r{k}": Track(stamp_ns, true[:, k]) for k in range(robots if truths is None else truths)}
+    truth = {f"r{k}": Trajectory(stamp_ns, true[:, k]) for k in range(robots if truths is None else truths)}
     return ReplayResult(
         title,
         swarm,
@@ -73,6 +74,22 @@ def png_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
+@pytest.fixture(scope="module")
+def report_of_two(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a report of two robots, with truth."""
+    folder = tmp_path_factory.mktemp("reports") / "new" / "folder"
+    write_report(result_of(2, title="<b>bag & more"), folder)
+    return folder
+
+
+@pytest.fixture
+def old_report(report_of_two: Path, tmp_path: Path) -> Path:
+    """A folder with a report that another one is to replace."""
+    shutil.copytree(report_of_two, tmp_path / "report")
+    assert {"paths.png", "errors.png"} <= {file.name for file in (tmp_path / "report").iterdir()}
+    return tmp_path / "report"
+
+
 def test_table_has_the_figures() -> None:
     text = text_report(result_of(2))
     rows = {line.split()[0]: line.split()[1:] for line in text.splitlines() if re.match(r"(r\d|all) ", line)}
@@ -94,10 +111,9 @@ def test_robots_that_wait_and_robots_without_truth(tmp_path: Path) -> None:
     write_report(result, tmp_path)
 
 
-def test_page_is_whole_and_needs_nothing_else(tmp_path: Path) -> None:
-    files = write_report(result_of(2, title="<b>bag & more"), tmp_path / "new" / "folder")
+def test_page_is_whole_and_needs_nothing_else(report_of_two: Path) -> None:
     page = Page()
-    html = files.page.read_text(encoding="utf-8")
+    html = (report_of_two / "report.html").read_text(encoding="utf-8")
     page.feed(html)
     assert page.open == []
     assert len(page.sources) == 3
@@ -125,10 +141,9 @@ def test_the_overview_ends_with_the_truth(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("robots", [1, 4, 12])
-def test_pictures_of_few_and_many_robots(tmp_path: Path, robots: int) -> None:
-    write_report(result_of(2, ticks=20), tmp_path)
-    files = write_report(result_of(robots, ticks=20), tmp_path)
-    assert (files.paths is not None) == (tmp_path / "paths.png").exists() == (robots == 4)
+def test_pictures_of_few_and_many_robots(old_report: Path, robots: int) -> None:
+    files = write_report(result_of(robots, ticks=20), old_report)
+    assert (files.paths is not None) == (old_report / "paths.png").exists() == (robots == 4)
     assert files.errors is not None
     for picture in filter(None, (files.overview, files.paths, files.errors)):
         width, height = png_size(picture)
@@ -136,11 +151,10 @@ def test_pictures_of_few_and_many_robots(tmp_path: Path, robots: int) -> None:
         assert 300 < width < 4000
 
 
-def test_without_truth_there_is_no_error_picture_and_that_is_said(tmp_path: Path) -> None:
-    write_report(result_of(2), tmp_path)
-    files = write_report(result_of(2, truths=0), tmp_path)
+def test_without_truth_there_is_no_error_picture_and_that_is_said(old_report: Path) -> None:
+    files = write_report(result_of(2, truths=0), old_report)
     assert files.errors is None
-    assert not (tmp_path / "errors.png").exists()
+    assert not (old_report / "errors.png").exists()
     assert "No ground truth to compare with" in files.text.read_text()
     assert "No ground truth to compare with" in files.page.read_text()
 

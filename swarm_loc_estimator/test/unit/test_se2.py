@@ -5,8 +5,8 @@ import pytest
 from core_geometry import planar, wrapped
 from scipy.linalg import expm
 
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.se2 import FloatArray
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 
 def poses(seed: int, *shape: int) -> FloatArray:

@@ -12,14 +12,21 @@ from core_run import on_time, play, ticks
 from core_world import Plan, World, simulate
 from scipy.stats import chi2
 
-from swarm_loc_estimator.core import fusion
-from swarm_loc_estimator.core.estimator import SwarmEstimator
-from swarm_loc_estimator.core.judgement import relative_motion
-from swarm_loc_estimator.core.measurements import MEASUREMENT_DTYPE, MeasurementColumns, predict
-from swarm_loc_estimator.core.odometry import OdometryTracks
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.core.sightings import SightingConverter
-from swarm_loc_estimator.core.swarm import CameraMount, Face, Landmark, OdometryModel, Robot, Swarm
+from swarm_loc_estimator.core.description.swarm import (
+    CameraMount,
+    Face,
+    Landmark,
+    OdometryModel,
+    Robot,
+    Swarm,
+)
+from swarm_loc_estimator.core.estimation import fusion
+from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
+from swarm_loc_estimator.core.filter.innovation import relative_motion
+from swarm_loc_estimator.core.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns, predict
+from swarm_loc_estimator.core.inputs.camera import SightingConverter
+from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 TIME_SIGMA_S = 0.04
 SEER = Robot("seer", camera=CameraMount(x=0.04))

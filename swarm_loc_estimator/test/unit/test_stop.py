@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-running = pytest.importorskip("swarm_loc_estimator.nodes.running", exc_type=ImportError)
+running = pytest.importorskip("swarm_loc_estimator.ros.running", exc_type=ImportError)
 
 
 def test_only_the_first_signal_interrupts() -> None:

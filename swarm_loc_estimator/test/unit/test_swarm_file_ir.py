@@ -6,15 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.core.ir.platform import IrGains
-from swarm_loc_estimator.core.robot_ir import IrMethod, RobotIr
-from swarm_loc_estimator.core.swarm import Swarm
-from swarm_loc_estimator.io import ir_platform_file
-from swarm_loc_estimator.io.ir_platform_file import load_ir_platform
-from swarm_loc_estimator.io.swarm_file import SwarmFileError, load_swarm
-from swarm_loc_estimator.io.swarm_writer import save_swarm
+from swarm_loc_estimator.core.description.robot_ir import IrMethod, RobotIr
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.core.infrared.board import IrGains
+from swarm_loc_estimator.io.swarm import board_file as ir_platform_file
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.io.swarm.swarm_file import SwarmFileError, load_swarm
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
 
-PACKAGED_DROPLET = Path(ir_platform_file.__file__).parents[1] / "config" / "ir" / "droplet.yaml"
+PACKAGED_DROPLET = Path(ir_platform_file.__file__).parents[2] / "config" / "ir" / "droplet.yaml"
 IR = """\
 fileversion: 1
 types:

@@ -1,1 +1,1 @@
-"""What detectors read and write besides pictures themselves. No ROS here."""
+"""Images and detections as messages and in bags. No ROS here."""

@@ -1,4 +1,4 @@
-"""A camera's messages in, its detections out, whether they come live or from a bag.
+"""Detector of one camera: CameraInfo and images in, serialized detections out, live or from a bag.
 
 Messages are those of rclpy or of a bag's type store: the fields have the same names.
 """
@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.io.messages import encode_detections
-from swarm_loc_vision.core.camera import Camera, CameraError
-from swarm_loc_vision.core.detector import MarkerDetector
-from swarm_loc_vision.core.gray import ImageError, decoded_image, gray_image
-from swarm_loc_vision.core.rows import detection_rows
+from swarm_loc_estimator.io.messages.encoders import encode_detections
+from swarm_loc_vision.core.detection.detector import MarkerDetector
+from swarm_loc_vision.core.detection.rows import detection_rows
+from swarm_loc_vision.core.imaging.camera import Camera, CameraError
+from swarm_loc_vision.core.imaging.gray import ImageError, decoded_image, gray_image
 
 Gray = NDArray[np.uint8]
 CreateDetector = Callable[[Camera], MarkerDetector]
@@ -30,18 +30,19 @@ class CameraDetector:
 
     Args:
         create: Makes the detector for a camera.
-        gray_of: Reads a picture's message, see `TRANSPORTS`.
+        gray_of: Reads an image's message, see `TRANSPORTS`.
         ambiguity: See `rows.detection_rows`.
 
     Attributes:
-        pictures: How many came.
+        images: How many came.
         markers: How many were found in them.
-        drops: Pictures and calibrations that were dropped, and markers without a pose, by reason.
+        misfits: How many of these had corners that fit no square by far.
+        drops: Images and calibrations that were dropped, markers without a pose, and candidates, by reason.
         trouble: What is wrong with the calibration, a sentence; empty: nothing.
     """
 
     def __init__(self, create: CreateDetector, gray_of: Callable[[Any], Gray], ambiguity: float) -> None:
-        self.pictures = self.markers = 0
+        self.images = self.markers = self.misfits = 0
         self.drops: Counter[str] = Counter()
         self.trouble = ""
         self._create = create
@@ -52,14 +53,14 @@ class CameraDetector:
 
     @property
     def is_calibrated(self) -> bool:
-        """Whether pictures can be used."""
+        """Whether images can be used."""
         return self._camera is not None
 
     def calibrate(self, message: Any) -> None:
         """Take over a sensor_msgs/CameraInfo; the detector is made anew only when it has changed.
 
         Raises:
-            CameraError: The camera is not calibrated; its pictures are dropped from now on.
+            CameraError: The camera is not calibrated; its images are dropped from now on.
         """
         try:
             camera = camera_of(message)
@@ -71,12 +72,12 @@ class CameraDetector:
             self._camera, self._detector = camera, self._create(camera)
 
     def detect(self, message: Any) -> bytes:
-        """The serialized swarm_loc_msgs/MarkerDetectionArray of a picture, with its stamp and frame.
+        """The serialized swarm_loc_msgs/MarkerDetectionArray of an image, with its stamp and frame.
 
         Raises:
-            ImageError: The picture was dropped, and counted.
+            ImageError: The image was dropped, and counted.
         """
-        self.pictures += 1
+        self.images += 1
         try:
             detector, gray = self._usable(message)
         except ImageError as error:
@@ -85,12 +86,14 @@ class CameraDetector:
         detections = detector.detect(gray)
         rows = detection_rows(detections, self._ambiguity)
         self.drops["no_pose"] += len(detections) - len(rows)
+        self.drops.update(detections.dropped)
         self.markers += len(rows)
+        self.misfits += detections.misfits
         stamp = message.header.stamp
         return encode_detections(message.header.frame_id, stamp.sec * _SECOND + stamp.nanosec, rows)
 
     def _usable(self, message: Any) -> tuple[MarkerDetector, Gray]:
-        """The detector and a picture for it."""
+        """The detector and an image for it."""
         if self._detector is None or self._camera is None:
             raise ImageError("no_calibration", self.trouble or "no camera_info has come yet.")
         gray = self._gray_of(message)
@@ -98,7 +101,7 @@ class CameraDetector:
         if (width, height) != (self._camera.width, self._camera.height):
             raise ImageError(
                 "size",
-                f"the picture has {width} x {height} pixels, but the camera is calibrated for"
+                f"the image has {width} x {height} pixels, but the camera is calibrated for"
                 f" {self._camera.width} x {self._camera.height}.",
             )
         return self._detector, gray
@@ -108,12 +111,12 @@ def camera_of(message: Any) -> Camera:
     """The camera that a sensor_msgs/CameraInfo describes.
 
     Raises:
-        CameraError: It is not calibrated, or its pictures are cut or binned.
+        CameraError: It is not calibrated, or its images are cut or binned.
     """
     roi = message.roi
     is_cut = (roi.width, roi.height) not in ((0, 0), (message.width, message.height))
     if is_cut or max(message.binning_x, message.binning_y) > 1:
-        raise CameraError("the camera's pictures are cut or binned; only whole ones can be read.")
+        raise CameraError("the camera's images are cut or binned; only whole ones can be read.")
     return Camera.from_matrix(
         (message.width, message.height),
         np.reshape(message.k, (3, 3)),
@@ -123,7 +126,7 @@ def camera_of(message: Any) -> Camera:
 
 
 def gray_of_image(message: Any) -> Gray:
-    """The picture of a sensor_msgs/Image.
+    """The image of a sensor_msgs/Image.
 
     Raises:
         ImageError: It cannot be read.
@@ -139,7 +142,7 @@ def gray_of_image(message: Any) -> Gray:
 
 
 def gray_of_compressed(message: Any) -> Gray:
-    """The picture of a sensor_msgs/CompressedImage.
+    """The image of a sensor_msgs/CompressedImage.
 
     Raises:
         ImageError: It cannot be read.
@@ -149,10 +152,10 @@ def gray_of_compressed(message: Any) -> Gray:
 
 @dataclass(frozen=True)
 class Transport:
-    """A way that pictures come, as image_transport has it.
+    """A way that images come, as image_transport has it.
 
     Attributes:
-        suffix: Of the topic, behind that of the pictures as they are.
+        suffix: Of the topic, behind that of the images as they are.
         message_type: Of its messages.
         gray_of: Reads one of them.
     """

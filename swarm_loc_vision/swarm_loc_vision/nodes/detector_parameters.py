@@ -1,4 +1,4 @@
-"""What a user may set about `marker_detector_node`, and the detector that follows from it. No ROS here."""
+"""Parameters of `marker_detector_node`, and the detector that they describe. No ROS here."""
 
 from __future__ import annotations
 
@@ -8,29 +8,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.swarm import CameraMount, Robot, Swarm
-from swarm_loc_estimator.io.swarm_file import load_swarm
-from swarm_loc_estimator.nodes.parameter_table import ParameterError, choice, text, texts
-from swarm_loc_vision.core.bodies import robot_body, up_of
-from swarm_loc_vision.core.camera import Camera
-from swarm_loc_vision.core.detector import MarkerDetector
-from swarm_loc_vision.core.families import Family, families, family_named
-from swarm_loc_vision.core.selection import SelectionError, parse_ids, parse_lengths
-from swarm_loc_vision.core.settings import DetectorSettings
+from swarm_loc_estimator.core.description.swarm import CameraMount, Robot, Swarm
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.numerics.arrays import IntArray
+from swarm_loc_estimator.parameters.table import ParameterError, choice, text, texts
+from swarm_loc_vision.core.decoding.families import Family, families, family_named
+from swarm_loc_vision.core.detection.detector import MarkerDetector
+from swarm_loc_vision.core.detection.selection import SelectionError, parse_ids, parse_lengths
+from swarm_loc_vision.core.detection.settings import DetectorSettings
+from swarm_loc_vision.core.imaging.camera import Camera
+from swarm_loc_vision.core.pose.bodies import robot_body, up_of
 from swarm_loc_vision.io.camera_detector import TRANSPORTS, CreateDetector
-
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class DetectorParameters:
     """Parameters of `marker_detector_node`; those of the detector itself are its settings."""
 
-    image_transport: str = choice(
-        "raw", tuple(TRANSPORTS), "how pictures come: as they are, or as JPEG or PNG"
-    )
+    image_transport: str = choice("raw", tuple(TRANSPORTS), "how images come: as they are, or as JPEG or PNG")
     family: str = choice("artoolkit_bch_thin", tuple(families()), "kind of marker")
     ids: tuple[str, ...] = texts("ids in use, such as 5 or 0-31; empty: those of swarm_file, or else all")
     lengths: tuple[str, ...] = texts(
@@ -45,64 +41,67 @@ class DetectorParameters:
     )
 
 
-def detector_maker(wishes: DetectorParameters) -> CreateDetector:
+def detector_maker(parameters: DetectorParameters) -> CreateDetector:
     """What makes the detector once the camera is known.
 
     Raises:
         ParameterError: A parameter cannot be used.
         SwarmFileError: The swarm description cannot be used.
     """
-    family = family_named(wishes.family)
-    swarm = load_swarm(Path(wishes.swarm_file)) if wishes.swarm_file else Swarm()
-    robot = _robot(wishes, swarm)
-    ids = _ids(wishes, swarm, family)
-    lengths = _lengths(wishes, swarm, family)
+    family = family_named(parameters.family)
+    swarm = load_swarm(Path(parameters.swarm_file)) if parameters.swarm_file else Swarm()
+    robot = _robot(parameters, swarm)
+    ids = _ids(parameters, swarm, family)
+    lengths = _lengths(parameters, swarm, family)
     up = up_of((robot.camera if robot else None) or CameraMount())
     bodies = [robot_body(other) for other in swarm.robots if other is not robot]
 
     def create(camera: Camera) -> MarkerDetector:
-        return MarkerDetector(wishes.settings, [(family, ids)], camera, lengths=lengths, up=up, bodies=bodies)
+        return MarkerDetector(
+            parameters.settings, [(family, ids)], camera, lengths=lengths, up=up, bodies=bodies
+        )
 
     return create
 
 
-def _robot(wishes: DetectorParameters, swarm: Swarm) -> Robot | None:
+def _robot(parameters: DetectorParameters, swarm: Swarm) -> Robot | None:
     """Whose camera it is."""
-    if not wishes.robot:
+    if not parameters.robot:
         return None
-    if not wishes.swarm_file:
-        raise ParameterError(f"parameter robot = '{wishes.robot}' needs the parameter swarm_file, too.")
-    if wishes.robot not in swarm.index_of:
+    if not parameters.swarm_file:
+        raise ParameterError(f"parameter robot = '{parameters.robot}' needs the parameter swarm_file, too.")
+    if parameters.robot not in swarm.index_of:
         known = ", ".join(swarm.index_of)
-        raise ParameterError(f"parameter robot = '{wishes.robot}' must be a robot of the swarm: {known}.")
-    return swarm.robots[swarm.index_of[wishes.robot]]
+        raise ParameterError(f"parameter robot = '{parameters.robot}' must be a robot of the swarm: {known}.")
+    return swarm.robots[swarm.index_of[parameters.robot]]
 
 
-def _ids(wishes: DetectorParameters, swarm: Swarm, family: Family) -> IntArray | None:
+def _ids(parameters: DetectorParameters, swarm: Swarm, family: Family) -> IntArray | None:
     """The ids in use; None: all."""
     count = len(family.words)
-    if wishes.ids:
-        ids: IntArray = _selected("ids", wishes.ids, parse_ids, count)
+    if parameters.ids:
+        ids: IntArray = _selected("ids", parameters.ids, parse_ids, count)
         return ids
     if not swarm.owner_of:
         return None
     unknown = [marker_id for marker_id in swarm.owner_of if marker_id >= count]
     if unknown:
         raise ParameterError(
-            f"{wishes.swarm_file} has marker id {unknown[0]}, but {family.name} has only 0 to {count - 1}."
+            f"{parameters.swarm_file} has marker id {unknown[0]},"
+            f" but {family.name} has only 0 to {count - 1}."
         )
     return np.array(sorted(swarm.owner_of), np.int64)
 
 
-def _lengths(wishes: DetectorParameters, swarm: Swarm, family: Family) -> dict[int, float]:
+def _lengths(parameters: DetectorParameters, swarm: Swarm, family: Family) -> dict[int, float]:
     """Sides by id: those of the swarm, or those that the parameter says."""
-    if wishes.lengths and wishes.swarm_file:
+    if parameters.lengths and parameters.swarm_file:
         raise ParameterError(
             "parameter lengths cannot be given along with swarm_file, which has the size of each marker."
         )
-    if wishes.swarm_file:
+    if parameters.swarm_file:
         return {marker_id: owner.marker.size for marker_id, owner in swarm.owner_of.items()}
-    lengths: dict[int, float] = _selected("lengths", wishes.lengths, parse_lengths, len(family.words))
+    lengths: dict[int, float] = _selected("lengths", parameters.lengths, parse_lengths, len(family.words))
     return lengths
 
 

@@ -1,8 +1,7 @@
-"""The marker detector node over DDS: pictures in, detections out, and one counted drop for each bad one."""
+"""The marker detector node over DDS: images in, detections out, and one counted drop for each bad one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +11,18 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from node_world import Ros, overrides
 from rcl_interfaces.msg import Log
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-from vision_bench.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
 
-from swarm_loc_estimator.nodes.parameter_table import ParameterError
+from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
+from swarm_loc_estimator.parameters.table import ParameterError
 from swarm_loc_msgs.msg import MarkerDetection, MarkerDetectionArray
-from swarm_loc_vision.core.families import family_named
+from swarm_loc_vision.core.decoding.families import family_named
 from swarm_loc_vision.nodes import marker_detector_node
 from swarm_loc_vision.nodes.marker_detector_node import MarkerDetectorNode
 
 FAMILY = "aruco_mip_36h12"
-PICTURE, TRUTHS = random_scene(np.random.default_rng(4), family_named(FAMILY), 8, Look())
+IMAGE, TRUTHS = random_scene(np.random.default_rng(4), family_named(FAMILY), 8, Look())
 FRAME = "epuck1/camera_optical_frame"
 
 
@@ -32,7 +31,7 @@ def image(number: int, encoding: str = "mono8", channels: int = 1) -> Image:
     message = Image(height=HEIGHT, width=WIDTH, encoding=encoding, step=channels * WIDTH)
     message.header.frame_id = FRAME
     message.header.stamp.sec = number
-    message.data = np.repeat(PICTURE[..., None], channels, axis=2).tobytes()
+    message.data = np.repeat(IMAGE[..., None], channels, axis=2).tobytes()
     return message
 
 
@@ -41,7 +40,7 @@ def compressed(number: int, how: str = "jpeg", suffix: str = ".jpg") -> Compress
     message = CompressedImage(format=how)
     message.header.frame_id = FRAME
     message.header.stamp.sec = number
-    message.data = cv2.imencode(suffix, PICTURE)[1].tobytes()
+    message.data = cv2.imencode(suffix, IMAGE)[1].tobytes()
     return message
 
 
@@ -57,7 +56,7 @@ def camera_info(**changes: Any) -> CameraInfo:
 class Camera:
     """A camera's driver, heard by a node, and what the node says."""
 
-    def __init__(self, ros: Ros, **parameters: Any) -> None:
+    def __init__(self, ros: Ros, qos: QoSProfile = qos_profile_sensor_data, **parameters: Any) -> None:
         self._ros = ros
         node = MarkerDetectorNode(parameter_overrides=overrides(family=FAMILY, **parameters))
         ros.add(node)
@@ -67,8 +66,8 @@ class Camera:
             if parameters.get("image_transport") == "compressed"
             else (Image, "image_raw")
         )
-        self._image = tester.create_publisher(kind, topic, qos_profile_sensor_data)
-        self._info = tester.create_publisher(CameraInfo, "camera_info", qos_profile_sensor_data)
+        self._image = tester.create_publisher(kind, topic, qos)
+        self._info = tester.create_publisher(CameraInfo, "camera_info", qos)
         self.detections: list[MarkerDetectionArray] = ros.listen(MarkerDetectionArray, "detections")
         self._diagnostics: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
         ros.until(lambda: self._image.get_subscription_count() and self._info.get_subscription_count())
@@ -92,13 +91,13 @@ class Camera:
         return {pair.key: pair.value for pair in self.status().values}
 
     def see(self, message: Image | CompressedImage) -> MarkerDetectionArray:
-        """Publish a picture until its detections come; large best-effort messages may get lost."""
+        """Publish an image until its detections come; large best-effort messages may get lost."""
         stamp = message.header.stamp.sec
         self._publish_until(message, lambda: any(d.header.stamp.sec == stamp for d in self.detections))
         return next(d for d in self.detections if d.header.stamp.sec == stamp)
 
     def see_dropped(self, message: Image | CompressedImage, reason: str) -> None:
-        """Publish a picture until it is counted as dropped."""
+        """Publish an image until it is counted as dropped."""
         self._publish_until(message, lambda: f"dropped: {reason}" in self.values())
 
     def _publish_until(self, message: Image | CompressedImage, condition: Any) -> None:
@@ -111,14 +110,13 @@ class Camera:
         self._ros.until(happened)
 
 
-@pytest.fixture
-def ros() -> Iterator[Ros]:
-    ros = Ros()
-    yield ros
-    ros.close()
+@pytest.fixture(autouse=True)
+def _frequent_diagnostics(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the node say at once what the tests wait for."""
+    monkeypatch.setattr(marker_detector_node, "_DIAGNOSTICS_PERIOD_S", 0.05)
 
 
-def test_pictures_become_detections_with_their_stamp_and_frame(ros: Ros) -> None:
+def test_images_become_detections_with_their_stamp_and_frame(ros: Ros) -> None:
     camera = Camera(ros)
     camera.calibrate(camera_info(), "image_raw")
     for number, (encoding, channels) in enumerate((("mono8", 1), ("rgb8", 3)), start=1):
@@ -139,9 +137,18 @@ def test_pictures_become_detections_with_their_stamp_and_frame(ros: Ros) -> None
     assert camera.status().level == DiagnosticStatus.OK
 
 
+@pytest.mark.parametrize("durability", [DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL])
+@pytest.mark.parametrize("reliability", [ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE])
+def test_cameras_that_publish_in_any_way_are_heard(
+    ros: Ros, reliability: ReliabilityPolicy, durability: DurabilityPolicy
+) -> None:
+    camera = Camera(ros, QoSProfile(depth=5, reliability=reliability, durability=durability))
+    camera.calibrate(camera_info(), "image_raw")
+    assert camera.see(image(1)).detections
+
+
 def test_a_camera_that_falls_silent_is_told_each_time(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(marker_detector_node, "_PATIENCE_S", 0.3)
-    monkeypatch.setattr(marker_detector_node, "_DIAGNOSTICS_PERIOD_S", 0.1)
     silence = "nothing has come on /image_raw for "
     logged: list[Log] = ros.listen(Log, "/rosout")
     camera = Camera(ros)
@@ -166,7 +173,19 @@ def test_without_calibration_there_are_no_detections(ros: Ros) -> None:
     assert camera.see(image(2)).detections
 
 
-def test_bad_pictures_are_dropped_and_counted(ros: Ros) -> None:
+def test_markers_that_fit_no_square_are_told(ros: Ros) -> None:
+    camera = Camera(ros)
+    camera.calibrate(camera_info(d=[0.4, 0.0, 0.0, 0.0, 0.0]), "image_raw")
+    told = "markers fit no square: is camera_info that of this camera?"
+    camera._publish_until(image(1), lambda: camera.status().message.endswith(told))
+    assert camera.status().level == DiagnosticStatus.WARN
+    assert int(camera.values()["markers that fit no square"]) > 0
+    camera.calibrate(camera_info(), "detecting")
+    camera._publish_until(image(2), lambda: any(d.header.stamp.sec == 2 for d in camera.detections))
+    ros.until(lambda: camera.status().message == "detecting")
+
+
+def test_bad_images_are_dropped_and_counted(ros: Ros) -> None:
     camera = Camera(ros)
     camera.calibrate(camera_info(), "image_raw")
     wrong_encoding, small, short = image(1), image(2), image(3)
@@ -178,11 +197,11 @@ def test_bad_pictures_are_dropped_and_counted(ros: Ros) -> None:
     dropped = int(camera.values()["dropped: size"])
     camera._publish_until(short, lambda: int(camera.values()["dropped: size"]) > dropped)
     assert not camera.detections
-    assert float(camera.values()["CPU time per picture [ms]"]) > 0.0  # bad ones cost time as well
+    assert float(camera.values()["CPU time per image [ms]"]) > 0.0  # bad ones cost time as well
     assert camera.see(image(4)).detections  # and nothing else has stopped
 
 
-def test_compressed_pictures_are_read_and_bad_ones_dropped_and_counted(ros: Ros) -> None:
+def test_compressed_images_are_read_and_bad_ones_dropped_and_counted(ros: Ros) -> None:
     camera = Camera(ros, image_transport="compressed")
     camera.calibrate(camera_info(), "nothing has come on /image_raw/compressed")
     assert not ros.tester.get_subscriptions_info_by_topic("/image_raw")
@@ -198,7 +217,7 @@ def test_compressed_pictures_are_read_and_bad_ones_dropped_and_counted(ros: Ros)
     count = len(camera.detections)
     cut, small = compressed(4), compressed(6)
     cut.data = cut.data[: len(cut.data) // 2]
-    small.data = cv2.imencode(".jpg", PICTURE[:100])[1].tobytes()
+    small.data = cv2.imencode(".jpg", IMAGE[:100])[1].tobytes()
     camera.see_dropped(cut, "corrupt")
     camera.see_dropped(compressed(5, "h264"), "encoding")
     camera.see_dropped(small, "size")
@@ -206,7 +225,7 @@ def test_compressed_pictures_are_read_and_bad_ones_dropped_and_counted(ros: Ros)
     assert camera.see(compressed(7)).detections  # and nothing else has stopped
 
 
-def test_who_renames_the_pictures_renames_the_compressed_ones(ros: Ros) -> None:
+def test_who_renames_the_images_renames_the_compressed_ones(ros: Ros) -> None:
     arguments = ["--ros-args", "-r", "image_raw:=front/image", "-p", "image_transport:=compressed"]
     ros.add(MarkerDetectorNode(cli_args=arguments))
     (subscription,) = ros.tester.get_subscriptions_info_by_topic("/front/image/compressed")
@@ -244,6 +263,6 @@ def test_a_swarm_that_does_not_fit_stops_at_start(ros: Ros, tmp_path: Path) -> N
         ({"ids": ["1"], "lengths": ["1:0.08"]}, "lengths cannot be given along with swarm_file"),
         ({"robot": "b"}, "must be a robot of the swarm: a"),
     ):
-        wishes = overrides(family=FAMILY, swarm_file=str(path), **parameters)
+        overridden = overrides(family=FAMILY, swarm_file=str(path), **parameters)
         with pytest.raises(ParameterError, match=words):
-            ros.add(MarkerDetectorNode(parameter_overrides=wishes))
+            ros.add(MarkerDetectorNode(parameter_overrides=overridden))

@@ -7,16 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from vision_bench.scenes import CAMERA, project
 
-from swarm_loc_estimator.core.swarm import CameraMount, Face, Robot
-from swarm_loc_vision.core.bodies import Seen, robot_body, solve_bodies, up_of
-from swarm_loc_vision.core.pose import marker_poses, square
+from bench.vision.scenes import CAMERA, project
+from swarm_loc_estimator.core.description.swarm import CameraMount, Face, Robot
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_vision.core.pose.bodies import Seen, robot_body, solve_bodies, up_of
+from swarm_loc_vision.core.pose.pose import marker_poses, square
 
-FloatArray = NDArray[np.float64]
 INTRINSICS = np.array([CAMERA[0, 0], CAMERA[1, 1], CAMERA[0, 2], CAMERA[1, 2]])
 LENGTH, SIGMA_PX = 0.03, 0.1
 FACES = tuple(
@@ -44,7 +43,7 @@ def sighting(seed: int, body_shift: float = 0.0, sigma: float = 0.0) -> tuple[Se
     count = len(facing)
     covariance = np.tile(SIGMA_PX**2 * np.eye(8), (count, 1, 1))
     lengths = np.full(count, LENGTH)
-    poses = marker_poses(np.stack(corners), covariance, lengths, INTRINSICS)
+    poses, _ = marker_poses(np.stack(corners), covariance, lengths, INTRINSICS)
     return Seen(np.array(facing), np.stack(corners), covariance, lengths, poses), rotation, position
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swarm_loc_vision.core.camera import Camera, CameraError
+from swarm_loc_vision.core.imaging.camera import Camera, CameraError
 
 PLUMB_BOB = (-0.28, 0.09, 1e-3, -5e-4, -0.01)
 RATIONAL = (0.3, -0.1, 1e-3, 5e-4, 0.02, 0.6, -0.05, 0.01)
@@ -51,6 +51,17 @@ def test_raw_pixels_are_opencvs(distortion: tuple[float, ...], model: str) -> No
     raw = one.to_raw(ideal_pixels(one))
     assert raw == pytest.approx(expected.reshape(-1, 2), abs=1e-6)
     assert one.to_ideal(raw) == pytest.approx(ideal_pixels(one), abs=0.2)
+
+
+@pytest.mark.parametrize("distortion", [(), (-0.02, 0.01, -0.003, 0.0005), (0.05, -0.01, 0.0, 0.0)])
+def test_what_a_fisheye_sees_far_off_its_axis_has_no_ideal_pixel(distortion: tuple[float, ...]) -> None:
+    one = Camera(1600, 1600, 500.0, 500.0, 800.0, 800.0, distortion, "equidistant")
+    angles = np.radians([40.0, 70.0, 79.0, 81.0, 86.0, 90.0, 95.0, 105.0])
+    k = np.pad(distortion, (0, 4 - len(distortion)))
+    radius = angles * (1.0 + sum(k[i] * angles ** (2 * i + 2) for i in range(4)))
+    ideal = one.to_ideal(np.column_stack([800.0 + 500.0 * radius, np.full(8, 800.0)]))
+    assert np.arctan((ideal[:3, 0] - 800.0) / 500.0) == pytest.approx(angles[:3], abs=1e-6)
+    assert np.isnan(ideal[3:]).all()
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""A bag of pictures made a bag of detections: what is found, what it replays to, and what is dropped."""
+"""A bag of images made a bag of detections: what is found, what it replays to, and what is dropped."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.metrics import interpolate, pool, summarise
-from swarm_loc_estimator.core.se2 import FloatArray
-from swarm_loc_estimator.io.bag_cut import copy_beginning
-from swarm_loc_estimator.io.bag_writer import BagWriter
-from swarm_loc_estimator.io.bags import BagReader
-from swarm_loc_estimator.io.cdr import decode_detections
-from swarm_loc_estimator.io.swarm_file import load_swarm
-from swarm_loc_estimator.replay import replay
-from swarm_loc_estimator.replay_result import ReplayResult
+from swarm_loc_estimator.evaluation.metrics import pool, summarise
+from swarm_loc_estimator.evaluation.replay import replay
+from swarm_loc_estimator.evaluation.result import ReplayResult
+from swarm_loc_estimator.io.bags.cut import copy_beginning
+from swarm_loc_estimator.io.bags.reader import BagReader
+from swarm_loc_estimator.io.bags.writer import BagWriter
+from swarm_loc_estimator.io.messages.cdr import decode_detections
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.trajectory import interpolate
 from swarm_loc_vision.cli.detect import main
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_pictures"
@@ -27,8 +28,8 @@ SWARM = load_swarm(DESCRIPTION)
 BEGINNING_S = 2.5
 GAP_NS = 200_000_000
 TO_EDGE = 0.47
-"""Of the picture, in focal lengths, less what hidden errors of the world may shift a marker by."""
-MOST_OBLIQUE, ROBOT_M = math.radians(60.0), 0.08
+"""Of the image, in focal lengths, less what hidden errors of the world may shift a marker by."""
+MAX_OBLIQUE, ROBOT_M = math.radians(60.0), 0.08
 CAMERA_INFO, IMAGE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/CompressedImage"
 Messages = list[tuple[str, str, int, bytes]]
 
@@ -59,7 +60,7 @@ def write(bag: Path, content: Messages) -> None:
 
 
 def in_view(pose: FloatArray, other: FloatArray) -> set[int]:
-    """Landmarks that a robot at a pose (3,) sees well inside its picture, and not behind the other one."""
+    """Landmarks that a robot at a pose (3,) sees well inside its image, and not behind the other one."""
     other_x, other_y, _ = se2.between(pose, other)
     seen = set()
     for mark in SWARM.landmarks:
@@ -68,7 +69,7 @@ def in_view(pose: FloatArray, other: FloatArray) -> set[int]:
         oblique = abs(se2.wrap_angle(yaw - towards - math.pi))
         aside = abs(x * other_y - y * other_x) / math.hypot(x, y)
         is_hidden = aside < ROBOT_M and 0.0 < other_x < x
-        if abs(towards) < math.atan(TO_EDGE) and oblique < MOST_OBLIQUE and not is_hidden:
+        if abs(towards) < math.atan(TO_EDGE) and oblique < MAX_OBLIQUE and not is_hidden:
             seen.add(mark.id)
     return seen
 
@@ -103,7 +104,7 @@ def test_the_detections_locate_the_robots(replayed: ReplayResult) -> None:
     assert np.isfinite(replayed.pose[-1]).all()
 
 
-def test_the_same_pictures_give_the_same_bytes(detected: Path, tmp_path: Path) -> None:
+def test_the_same_images_give_the_same_bytes(detected: Path, tmp_path: Path) -> None:
     copy_beginning(BAG, tmp_path / "beginning", BEGINNING_S)
     shutil.copyfile(BAG / "swarm.yaml", tmp_path / "beginning" / "swarm.yaml")
     for part in ("one", "two"):
@@ -119,19 +120,19 @@ def test_the_same_pictures_give_the_same_bytes(detected: Path, tmp_path: Path) -
     assert [m for m in messages(detected) if not m[0].endswith("detections")] == kept
 
 
-def test_pictures_of_other_topics_are_kept(tmp_path: Path) -> None:
+def test_images_of_other_topics_are_kept(tmp_path: Path) -> None:
     own = [message for message in messages(BAG) if message[0].startswith("epuck1/")]
     info = next(message for message in own if message[1] == CAMERA_INFO)
     _, kind, log_ns, data = next(message for message in own if message[1] == IMAGE)
-    picture = ("epuck1/image_raw/compressed", kind, log_ns, data)
+    image = ("epuck1/image_raw/compressed", kind, log_ns, data)
     others = [(name, kind, log_ns, data) for name in ("epuck1/image_rect/compressed", "overhead/compressed")]
-    write(tmp_path / "bag", [info, picture, *others])
+    write(tmp_path / "bag", [info, image, *others])
     assert main([str(tmp_path / "bag"), "--output", str(tmp_path / "out")]) == 0
     left = messages(tmp_path / "out")
     assert [message for message in left if message[0] != "epuck1/detections"] == [info, *others]
 
 
-def test_bad_pictures_are_counted_and_the_others_read(
+def test_bad_images_are_counted_and_the_others_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     own = [message for message in messages(BAG) if message[0].startswith("epuck1/")]
@@ -143,9 +144,8 @@ def test_bad_pictures_are_counted_and_the_others_read(
     write(tmp_path / "bag", [early, *infos, cut, endless, whole])
     assert main([str(tmp_path / "bag"), "--output", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
-    assert (
-        "in 4 pictures, dropped: corrupt 2, dropped: corrupt calibration 1, dropped: no_calibration 1" in said
-    )
+    dropped = "dropped: corrupt 2, dropped: corrupt calibration 1, dropped: no_calibration 1"
+    assert f"markers (0 fit no square) in 4 images, {dropped}" in said
     assert [m[2] for m in messages(tmp_path / "out") if m[0] == "epuck1/detections"] == [whole[2]]
 
 
@@ -153,12 +153,12 @@ def test_bad_pictures_are_counted_and_the_others_read(
     ("arguments", "words"),
     [
         (["nowhere"], "There is no bag"),
-        ([str(BAG.parent / "eight_one_robot_slow")], "holds no pictures"),
+        ([str(BAG.parent / "eight_one_robot_slow")], "holds no images"),
         ([str(BAG), "--set", "familie=qr"], "'familie' is no parameter; there are family, ids"),
         ([str(BAG), "--set", "robot=epuck1"], "'robot' is no parameter"),
         ([str(BAG), "--set", "family=qr"], "family = 'qr' must be one of"),
         ([str(BAG), "--set", "ids=5,x"], "parameter ids: 'x'"),
-        ([str(BAG), "--set", "least_side_px=much"], "least_side_px = 'much' must be a number"),
+        ([str(BAG), "--set", "min_side_px=much"], "min_side_px = 'much' must be a number"),
         ([str(BAG), "--swarm", "nowhere.yaml"], "nowhere.yaml"),
     ],
 )

@@ -1,9 +1,10 @@
-"""The whole detector on rendered pictures and, where they are at hand, on photographs."""
+"""The whole detector on rendered images and, where they are at hand, on photographs."""
 
 from __future__ import annotations
 
 import json
 import math
+import tracemalloc
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -13,16 +14,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from vision_bench.peers import own_detector
-from vision_bench.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, random_scene
 
-from swarm_loc_estimator.core.sightings import CONTENT_POSE, CONTENT_POSE_TWO
-from swarm_loc_vision.core.camera import Camera
-from swarm_loc_vision.core.detector import Detections, MarkerDetector
-from swarm_loc_vision.core.draw import draw_marker
-from swarm_loc_vision.core.families import Family, family_named, packed
-from swarm_loc_vision.core.rows import detection_rows
-from swarm_loc_vision.core.settings import DetectorSettings
+from bench.vision.negatives import black_squares
+from bench.vision.peers import own_detector
+from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, random_scene
+from swarm_loc_estimator.core.inputs.camera import CONTENT_POSE, CONTENT_POSE_TWO
+from swarm_loc_vision.core.decoding.draw import draw_marker
+from swarm_loc_vision.core.decoding.families import Family, family_named, packed
+from swarm_loc_vision.core.detection.detector import Detections, MarkerDetector
+from swarm_loc_vision.core.detection.rows import detection_rows
+from swarm_loc_vision.core.detection.settings import DetectorSettings
+from swarm_loc_vision.core.imaging.camera import Camera
 
 PHOTOS = Path(__file__).resolve().parents[4] / "shared" / "data" / "photos"
 Gray = NDArray[np.uint8]
@@ -44,8 +46,8 @@ def match(detections: Detections, truths: list[Truth]) -> list[tuple[int, Truth]
 )
 def test_markers_of_all_families_are_found_where_they_are(name: str) -> None:
     family = family_named(name)
-    picture, truths = random_scene(np.random.default_rng(5), family, 15, Look())
-    detections = own_detector(family).detect(picture)
+    image, truths = random_scene(np.random.default_rng(5), family, 15, Look())
+    detections = own_detector(family).detect(image)
     truths = [truth for truth in truths if truth.side_px > 3.0 * family.side and truth.incidence < 1.0]
     pairs = match(detections, truths)
     assert len(pairs) == len(truths) >= 6
@@ -57,10 +59,10 @@ def test_markers_of_all_families_are_found_where_they_are(name: str) -> None:
 def test_corners_and_poses_are_as_sure_as_they_say() -> None:
     family, nees = family_named("aruco_mip_36h12"), []
     for seed in range(6):
-        picture, truths = random_scene(np.random.default_rng(seed), family, 15, Look())
+        image, truths = random_scene(np.random.default_rng(seed), family, 15, Look())
         detector = own_detector(family)
         detector._lengths = {truth.marker_id: truth.length for truth in truths}
-        detections = detector.detect(picture)
+        detections = detector.detect(image)
         poses = detections.poses
         assert poses is not None
         for row, truth in match(detections, truths):
@@ -97,22 +99,22 @@ def test_a_distorting_lens_does_not_matter() -> None:
 
 def test_only_ids_in_use_are_found() -> None:
     family = family_named("artoolkit_bch_thin")
-    picture, truths = random_scene(np.random.default_rng(8), family, 12, Look())
+    image, truths = random_scene(np.random.default_rng(8), family, 12, Look())
     used = np.array([truths[0].marker_id, truths[1].marker_id])
-    detections = MarkerDetector(DetectorSettings(), [(family, used)]).detect(picture)
+    detections = MarkerDetector(DetectorSettings(), [(family, used)]).detect(image)
     assert sorted(detections.id.tolist()) == sorted(used.tolist())
     assert detections.poses is None
 
 
-def half_in_shadow(picture: Gray) -> Gray:
+def half_in_shadow(image: Gray) -> Gray:
     """Stripes of shadow, as of blinds, each as wide as three markers or so."""
     u = np.arange(WIDTH)
-    return np.asarray(picture * np.where(np.sin(u / 45.0) > 0.0, 1.0, 0.45), np.uint8)
+    return np.asarray(image * np.where(np.sin(u / 45.0) > 0.0, 1.0, 0.45), np.uint8)
 
 
-def as_jpeg(picture: Gray) -> Gray:
+def as_jpeg(image: Gray) -> Gray:
     """At a quality of 60."""
-    data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 60])[1]
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 60])[1]
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
@@ -121,18 +123,18 @@ def as_jpeg(picture: Gray) -> Gray:
     [
         (half_in_shadow, 0.85),
         (as_jpeg, 0.95),
-        (lambda picture: (picture * 0.12).astype(np.uint8), 0.95),
-        (lambda picture: np.clip(picture * 1.6, 0, 255).astype(np.uint8), 0.95),
-        (lambda picture: cv2.GaussianBlur(picture, (0, 0), 1.5), 0.85),
+        (lambda image: (image * 0.12).astype(np.uint8), 0.95),
+        (lambda image: np.clip(image * 1.6, 0, 255).astype(np.uint8), 0.95),
+        (lambda image: cv2.GaussianBlur(image, (0, 0), 1.5), 0.85),
     ],
     ids=["shadows", "jpeg", "dark", "bright", "out of focus"],
 )
 def test_bad_light_and_bad_cameras_hide_few_markers(change: Callable[[Gray], Gray], share: float) -> None:
     family, found, shown = family_named("apriltag_36h11"), 0, 0
     for seed in range(3):
-        picture, truths = random_scene(np.random.default_rng(seed), family, 15, Look())
+        image, truths = random_scene(np.random.default_rng(seed), family, 15, Look())
         truths = [truth for truth in truths if truth.side_px > 24.0]
-        detections = own_detector(family).detect(change(picture))
+        detections = own_detector(family).detect(change(image))
         found += len(match(detections, truths))
         shown += len(truths)
     assert shown > 30
@@ -156,26 +158,43 @@ def test_crowded_markers_and_those_with_part_of_the_border_covered_are_found() -
     assert len(np.intersect1d(detector.detect(sheet).id, ids)) > 0.95 * len(ids)
 
 
+def test_black_squares_with_a_speck_of_light_are_none() -> None:
+    assert not any(black_squares(60).values())
+
+
+def test_an_image_full_of_squares_takes_little_memory_and_counts_what_it_drops() -> None:
+    tile = np.full((14, 14), 225, np.uint8)
+    tile[2:11, 2:11] = 25
+    detector = own_detector(family_named("apriltag_36h11"))
+    tracemalloc.start()
+    detections = detector.detect(np.tile(tile, (77, 137)))
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(detections) == 0
+    assert detections.dropped["too_many_candidates"] > 10_000
+    assert most < 100_000_000
+
+
 def test_inverted_markers_are_none() -> None:
     family = family_named("apriltag_36h11")
-    picture, _ = random_scene(np.random.default_rng(1), family, 15, Look(clutter=0))
-    assert len(own_detector(family).detect(255 - picture)) == 0
+    image, _ = random_scene(np.random.default_rng(1), family, 15, Look(clutter=0))
+    assert len(own_detector(family).detect(255 - image)) == 0
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (7, 5), (33, 41), (960, 1277)])
-def test_empty_pictures_of_any_size_show_nothing(shape: tuple[int, int]) -> None:
+def test_empty_images_of_any_size_show_nothing(shape: tuple[int, int]) -> None:
     detector = own_detector(family_named("artoolkit_bch_thin"))
     noise = np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8)
-    for picture in (np.zeros(shape, np.uint8), np.full(shape, 255, np.uint8), noise):
-        detections = detector.detect(picture)
+    for image in (np.zeros(shape, np.uint8), np.full(shape, 255, np.uint8), noise):
+        detections = detector.detect(image)
         assert len(detections) == 0
         assert len(detection_rows(detections, 16.0)) == 0
 
 
 def test_rows_hold_what_was_found() -> None:
     family = family_named("aruco_mip_36h12")
-    picture, _ = random_scene(np.random.default_rng(2), family, 15, Look())
-    detections = own_detector(family).detect(picture)
+    image, _ = random_scene(np.random.default_rng(2), family, 15, Look())
+    detections = own_detector(family).detect(image)
     assert detections.poses is not None
     have_two = np.isfinite(detections.poses.chi2[:, 1])
     assert have_two.any()
@@ -214,8 +233,8 @@ def photo_family(dictionary: str) -> Family:
 def test_photographs(file: str) -> None:
     manifest = json.loads((PHOTOS / "manifest.json").read_text(encoding="utf-8"))
     (entry,) = [entry for entry in manifest if entry["file"] == file]
-    picture = np.asarray(cv2.imread(str(PHOTOS / file), cv2.IMREAD_GRAYSCALE), np.uint8)
-    detections = MarkerDetector(DetectorSettings(), [(photo_family(entry["dict"]), None)]).detect(picture)
+    image = np.asarray(cv2.imread(str(PHOTOS / file), cv2.IMREAD_GRAYSCALE), np.uint8)
+    detections = MarkerDetector(DetectorSettings(), [(photo_family(entry["dict"]), None)]).detect(image)
     assert not Counter(entry["ids"]) - Counter(detections.id.tolist())
     assert set(detections.id.tolist()) <= set(entry["ids"])
     for marker_id, corners in entry.get("corners", {}).items():

@@ -1,4 +1,4 @@
-"""The words of the families, and their pictures."""
+"""The words of the families, and their images."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from swarm_loc_vision.core.draw import draw_marker
-from swarm_loc_vision.core.families import families, family_named, packed, rotated
+from swarm_loc_vision.core.decoding.draw import draw_marker
+from swarm_loc_vision.core.decoding.families import families, family_named, packed, rotated
 
 BCH = family_named("artoolkit_bch_thin")
 
@@ -61,13 +61,13 @@ def test_opencv_reads_what_is_drawn(name: str, dictionary: int, first_corner: in
         assert np.ravel(corners[0])[2 * first_corner : 2 * first_corner + 2] == pytest.approx([16, 16], abs=1)
 
 
-def test_sizes_of_pictures_and_borders() -> None:
+def test_sizes_of_images_and_borders() -> None:
     thin, thick = family_named("artoolkit_bch_thin"), family_named("artoolkit_bch_thick")
     assert draw_marker(thin, 0, 5, 1).shape == (50, 50)
     assert draw_marker(thick, 0, 5, 0).shape == (60, 60)
-    picture = draw_marker(thick, 3, 1, 1)
-    assert (picture[0] == 255).all()
-    assert (picture[1:4, 1:-1] == 0).all()
+    image = draw_marker(thick, 3, 1, 1)
+    assert (image[0] == 255).all()
+    assert (image[1:4, 1:-1] == 0).all()
     assert thin.side - 6 == 0.125 * 2 * thin.side
     assert thick.side - 6 == 0.25 * 2 * thick.side
 

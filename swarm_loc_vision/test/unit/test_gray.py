@@ -1,4 +1,4 @@
-"""Encodings of pictures."""
+"""Encodings of images."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swarm_loc_vision.core.gray import ImageError, decoded_image, gray_image
+from swarm_loc_vision.core.imaging.gray import ImageError, Pixels, decoded_image, gray_image
 
 WIDTH, HEIGHT = 14, 10
 SHADES = np.linspace(10, 240, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH).astype(np.uint8)
@@ -35,8 +35,8 @@ def wide(order: str) -> NDArray[np.uint8]:
 def test_encodings(encoding: str, data: NDArray[np.uint8], expected: NDArray[np.uint8]) -> None:
     rows = np.ascontiguousarray(data).reshape(HEIGHT, -1)
     padded = np.pad(rows, ((0, 0), (0, 5)))  # cameras may leave bytes at the end of rows
-    for picture in (rows, padded):
-        gray = gray_image(encoding, WIDTH, HEIGHT, picture.shape[1], picture.tobytes())
+    for image in (rows, padded):
+        gray = gray_image(encoding, WIDTH, HEIGHT, image.shape[1], image.tobytes())
         assert (gray == expected).all()
         assert gray.flags.writeable
         assert gray.flags.c_contiguous
@@ -45,6 +45,13 @@ def test_encodings(encoding: str, data: NDArray[np.uint8], expected: NDArray[np.
 def test_big_endian() -> None:
     gray = gray_image("mono16", WIDTH, HEIGHT, 2 * WIDTH, wide(">").tobytes(), is_bigendian=True)
     assert (gray == SHADES).all()
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 16])
+def test_16_bit_images_show_the_highest_bits_that_any_pixel_uses(bits: int) -> None:
+    pixels = (SHADES.astype(np.uint32) << bits >> 8).astype("<u2")
+    assert (gray_image("mono16", WIDTH, HEIGHT, 2 * WIDTH, pixels.tobytes()) == SHADES).all()
+    assert (decoded_image("mono16; png compressed", file_of(pixels, ".png")) == SHADES).all()
 
 
 def test_bayer_of_a_gray_scene_is_gray() -> None:
@@ -64,13 +71,13 @@ def test_bayer_of_a_gray_scene_is_gray() -> None:
         ("mono8", 0, 0, 0, "size"),
     ],
 )
-def test_what_is_no_picture_is_refused(encoding: str, width: int, step: int, size: int, reason: str) -> None:
+def test_what_is_no_image_is_refused(encoding: str, width: int, step: int, size: int, reason: str) -> None:
     with pytest.raises(ImageError) as caught:
         gray_image(encoding, width, HEIGHT, step, bytes(size))
     assert caught.value.reason == reason
 
 
-def file_of(pixels: NDArray[np.uint8], suffix: str) -> bytes:
+def file_of(pixels: Pixels, suffix: str) -> bytes:
     return cv2.imencode(suffix, pixels, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
 
 
@@ -86,11 +93,11 @@ def file_of(pixels: NDArray[np.uint8], suffix: str) -> bytes:
         ("mono16; png compressed mono16", ".png", SHADES.astype(np.uint16) * 257, SHADES, 0),
     ],
 )
-def test_compressed_pictures(
+def test_compressed_images(
     how: str, suffix: str, pixels: NDArray[np.uint8], expected: NDArray[np.uint8], tolerance: int
 ) -> None:
     data = file_of(np.ascontiguousarray(pixels), suffix)
-    for padded in (data, data + bytes(7)):  # cameras may send more bytes than the picture has
+    for padded in (data, data + bytes(7)):  # cameras may send more bytes than the image has
         gray = decoded_image(how, np.frombuffer(padded, np.uint8))
         assert gray.shape == SHADES.shape
         assert np.abs(gray.astype(int) - expected).max() <= tolerance
@@ -98,7 +105,7 @@ def test_compressed_pictures(
         assert gray.flags.c_contiguous
 
 
-def test_a_picture_is_not_turned_by_what_its_exif_says() -> None:
+def test_an_image_is_not_turned_by_what_its_exif_says() -> None:
     turned = bytes.fromhex("45786966000049492a00080000000100120103000100000006000000000000000000")
     data = file_of(SHADES, ".jpg")
     data = data[:2] + b"\xff\xe1" + (len(turned) + 2).to_bytes(2, "big") + turned + data[2:]
@@ -106,7 +113,7 @@ def test_a_picture_is_not_turned_by_what_its_exif_says() -> None:
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_a_compressed_picture_cut_off_anywhere_is_refused(suffix: str) -> None:
+def test_a_compressed_image_cut_off_anywhere_is_refused(suffix: str) -> None:
     data = file_of(SHADES, suffix)
     end = data.rfind(b"IEND") if suffix == ".png" else len(data) - 1
     for length in range(0, end, 3):
@@ -127,7 +134,7 @@ def test_a_compressed_picture_cut_off_anywhere_is_refused(suffix: str) -> None:
         ("jpeg", np.random.default_rng(0).bytes(999), "corrupt"),
     ],
 )
-def test_what_is_no_compressed_picture_is_refused(how: str, data: bytes, reason: str) -> None:
+def test_what_is_no_compressed_image_is_refused(how: str, data: bytes, reason: str) -> None:
     with pytest.raises(ImageError) as caught:
         decoded_image(how, data)
     assert caught.value.reason == reason

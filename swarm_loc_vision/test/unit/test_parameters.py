@@ -1,4 +1,4 @@
-"""What the parameters say: in the README, and about the detector that follows from them."""
+"""What the parameters say: on the node's page, and about the detector that follows from them."""
 
 from __future__ import annotations
 
@@ -6,33 +6,33 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from vision_bench.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
 
-from swarm_loc_estimator.core.swarm import Face, Landmark, Robot, Swarm
-from swarm_loc_estimator.io.swarm_writer import save_swarm
-from swarm_loc_estimator.nodes.parameter_table import markdown_table
-from swarm_loc_vision.core.camera import Camera
-from swarm_loc_vision.core.families import family_named
+from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
+from swarm_loc_estimator.core.description.swarm import Face, Landmark, Robot, Swarm
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.parameters.table import markdown_table
+from swarm_loc_vision.core.decoding.families import family_named
+from swarm_loc_vision.core.imaging.camera import Camera
 from swarm_loc_vision.nodes.detector_parameters import DetectorParameters, detector_maker
 
-README = Path(__file__).parents[2] / "README.md"
+PAGE = Path(__file__).parents[2] / "doc" / "marker_detector_node.md"
 FAMILY = "aruco_mip_36h12"
 
 
-def test_the_readme_says_what_the_table_says() -> None:
-    assert markdown_table(DetectorParameters) in README.read_text(encoding="utf-8")
+def test_the_page_says_what_the_table_says() -> None:
+    assert markdown_table(DetectorParameters) in PAGE.read_text(encoding="utf-8")
 
 
 def test_every_marker_of_the_swarm_has_its_own_size(tmp_path: Path) -> None:
-    picture, truths = random_scene(np.random.default_rng(4), family_named(FAMILY), 8, Look())
+    image, truths = random_scene(np.random.default_rng(4), family_named(FAMILY), 8, Look())
     first, *others = truths
     robot = Robot("a", faces=(Face("front", first.marker_id, yaw=0.0, size=first.length),))
     marks = tuple(Landmark(one.marker_id, yaw=0.0, size=one.length) for one in others)
     save_swarm(Swarm((robot,), marks), tmp_path / "swarm.yaml")
-    wishes = DetectorParameters(family=FAMILY, swarm_file=str(tmp_path / "swarm.yaml"))
-    detector = detector_maker(wishes)(Camera.from_matrix((WIDTH, HEIGHT), CAMERA, ()))
+    parameters = DetectorParameters(family=FAMILY, swarm_file=str(tmp_path / "swarm.yaml"))
+    detector = detector_maker(parameters)(Camera.from_matrix((WIDTH, HEIGHT), CAMERA, ()))
 
-    detections = detector.detect(picture)
+    detections = detector.detect(image)
 
     assert detections.poses is not None
     found = dict(zip(detections.id.tolist(), detections.poses.position[:, 0, 2].tolist(), strict=True))

@@ -6,26 +6,25 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from vision_bench.scenes import facing, project
 
-from swarm_loc_vision.core.pose import Poses, Upright, _equations, _Sight, marker_poses, square
+from bench.vision.scenes import facing, project
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_vision.core.pose.pose import Poses, Upright, _equations, _Sight, marker_poses, square
 
-FloatArray = NDArray[np.float64]
 INTRINSICS = np.array([1000.0, 1000.0, 639.5, 479.5])
 LENGTH, SIGMA_PX = 0.05, 0.05
 UP = np.array([0.0, -1.0, 0.0])
 
 
-def random_markers(count: int, seed: int, least_incidence: float = 0.0) -> tuple[FloatArray, FloatArray]:
+def random_markers(count: int, seed: int, min_incidence: float = 0.0) -> tuple[FloatArray, FloatArray]:
     """Rotations (N, 3, 3) and positions (N, 3) before the camera."""
     rng = np.random.default_rng(seed)
     position = rng.uniform(0.4, 1.2, (count, 1)) * np.column_stack(
         [rng.uniform(-0.5, 0.5, (count, 2)), np.ones(count)]
     )
     azimuth, roll = rng.uniform(-3.0, 3.0, (2, count))
-    incidence = rng.uniform(least_incidence, 1.1, count)
+    incidence = rng.uniform(min_incidence, 1.1, count)
     rotation = [facing(a, i, r, at) for a, i, r, at in zip(azimuth, incidence, roll, position, strict=True)]
     return np.stack(rotation), position
 
@@ -50,7 +49,7 @@ def corners_of(rotation: FloatArray, position: FloatArray, noise_px: float = 0.0
 def solve(corners: FloatArray, upright: Upright | None = None) -> Poses:
     count = len(corners)
     covariance = np.tile(SIGMA_PX**2 * np.eye(8), (count, 1, 1))
-    return marker_poses(corners, covariance, np.full(count, LENGTH), INTRINSICS, upright)
+    return marker_poses(corners, covariance, np.full(count, LENGTH), INTRINSICS, upright)[0]
 
 
 def turn_errors(found: FloatArray, true: FloatArray) -> FloatArray:
@@ -73,7 +72,7 @@ def test_an_axis_aligned_rectangle_has_a_pose() -> None:
 
 
 def test_errors_are_as_large_as_the_covariance_says() -> None:
-    rotation, position = random_markers(600, 1, least_incidence=0.5)
+    rotation, position = random_markers(600, 1, min_incidence=0.5)
     poses = solve(corners_of(rotation, position, SIGMA_PX))
     error = np.hstack([poses.position[:, 0] - position, turn_errors(poses.rotation[:, 0], rotation)])
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(poses.covariance[:, 0]), error)
@@ -114,8 +113,23 @@ def test_knowing_that_markers_stand_upright_makes_them_surer() -> None:
     assert turns[1] <= turns[0]
 
 
+def test_corners_that_fit_no_square_are_told_and_solved_as_if_all_were_as_unsure() -> None:
+    count, lengths = 300, np.full(300, LENGTH)
+    rotation, position = random_markers(count, 5, min_incidence=0.5)
+    corners = corners_of(rotation, position, 20.0 * SIGMA_PX)
+    claimed = np.tile(np.diag([1.0, 0.01] * 4) * SIGMA_PX**2, (count, 1, 1))
+    poses, is_misfit = marker_poses(corners, claimed, lengths, INTRINSICS)
+    plain = solve(corners)
+    assert is_misfit.mean() > 0.95
+    error, plain_error = (p.position[is_misfit, 0] - position[is_misfit] for p in (poses, plain))
+    assert np.linalg.norm(error) < 1.1 * np.linalg.norm(plain_error)
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(poses.covariance[is_misfit, 0, :3, :3]), error)
+    assert np.median(nees) < 2.5 * 2.37  # of chi square with 3 degrees of freedom
+    assert not marker_poses(corners_of(rotation, position), claimed, lengths, INTRINSICS)[1].any()
+
+
 def test_the_gradient_is_that_of_the_cost() -> None:
-    rotation, position = random_markers(1, 4, least_incidence=0.4)
+    rotation, position = random_markers(1, 4, min_incidence=0.4)
     points, pixels = square(LENGTH), corners_of(rotation, position, 1.0)[0]
     covariance = SIGMA_PX**2 * (np.eye(8) + 0.3 * np.ones((8, 8)))
     weights = np.asarray(np.linalg.inv(covariance)[None], np.float64)

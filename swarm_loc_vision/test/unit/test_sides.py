@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtr
 
-from swarm_loc_vision.core.camera import Camera
-from swarm_loc_vision.core.decoder import Dictionary
-from swarm_loc_vision.core.edges import Corners, refine, refine_read
-from swarm_loc_vision.core.families import family_named
-from swarm_loc_vision.core.sampling import LENS_SIZE
-from swarm_loc_vision.core.side_pixels import INNER, side_pixels
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_vision.core.decoding.decoder import Dictionary
+from swarm_loc_vision.core.decoding.families import family_named
+from swarm_loc_vision.core.detection.edges import Corners, refine, refine_read
+from swarm_loc_vision.core.detection.side_pixels import INNER, side_pixels
+from swarm_loc_vision.core.imaging.camera import Camera
+from swarm_loc_vision.core.imaging.lens import LENS_SIZE
 
-FloatArray = NDArray[np.float64]
 FAMILY = family_named("artoolkit_bch_thin")
 INK, PAPER = 30.0, 200.0
 SIZE_PX = 96
@@ -36,16 +38,16 @@ def shares(begin: float, cell: float, blur: float, motion: float, cover: float =
 
     def integral(x: FloatArray) -> FloatArray:
         z = x / blur
-        return np.asarray(blur * (z * norm.cdf(z) + norm.pdf(z)))
+        return np.asarray(blur * (z * ndtr(z) + np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)))
 
-    moved = motion * (np.arange(32) - 15.5) / 32.0
+    moved = np.unique(motion * (np.arange(32) - 15.5) / 32.0)
     below = np.mean(
         [integral(pixels + 0.5 - edges - m) - integral(pixels - 0.5 - edges - m) for m in moved], 0
     )
     return np.asarray(below[:, :-1] - below[:, 1:])
 
 
-def picture(
+def rendered(
     at: tuple[float, float],
     cell: float,
     blur: float = 0.5,
@@ -82,7 +84,7 @@ def test_edges_along_rows_and_columns_are_found_wherever_they_lie(
     at: tuple[float, float], cell: float, blur: float, marker_id: int, shift: tuple[float, float]
 ) -> None:
     true = corners_of(at, cell)
-    found = fitted(picture(at, cell, blur, seed=marker_id), true + np.array(shift), marker_id)
+    found = fitted(rendered(at, cell, blur, seed=marker_id), true + np.array(shift), marker_id)
     assert found.corners[0] == pytest.approx(true, abs=0.02)
 
 
@@ -94,10 +96,10 @@ def test_corners_are_as_sure_as_they_say(cell: float, motion: float) -> None:
         at = tuple(rng.uniform(20.0, 21.0, 2).tolist())
         true = corners_of(at, cell)
         near = true + rng.normal(0.0, 0.1, (4, 2))
-        found = fitted(picture(at, cell, 0.5, motion, noise=2.5, seed=marker_id), near, marker_id)
+        found = fitted(rendered(at, cell, 0.5, motion, noise=2.5, seed=marker_id), near, marker_id)
         error = (found.corners[0] - true).ravel()
         nees.append(error @ np.linalg.solve(found.covariance[0], error))
-    # 8 were the noise all that there is; what it leaves out is there for worse pictures than these
+    # 8 were the noise all that there is; what it leaves out is there for worse images than these
     assert 1.0 < np.mean(nees) < 9.0
     assert np.max(nees) < 40.0
 
@@ -105,7 +107,7 @@ def test_corners_are_as_sure_as_they_say(cell: float, motion: float) -> None:
 def test_motion_makes_the_sides_across_it_less_sure() -> None:
     at = (20.3, 20.6)
     still, moving = (
-        np.diag(fitted(picture(at, 6.0, motion=motion, noise=1.0), corners_of(at, 6.0), 0).covariance[0])
+        np.diag(fitted(rendered(at, 6.0, motion=motion, noise=1.0), corners_of(at, 6.0), 0).covariance[0])
         for motion in (0.0, 6.0)
     )
     assert (moving[::2] > 3.0 * still[::2]).all()
@@ -117,9 +119,9 @@ def test_a_covered_side_is_less_sure(cover: float) -> None:
     at, cell, marker_id = (20.3, 20.6), 6.0, 100
     assert strips(marker_id)[0, 3].sum() >= 3
     true = corners_of(at, cell)
-    free = fitted(picture(at, cell, noise=1.0, seed=marker_id), true, marker_id)
+    free = fitted(rendered(at, cell, noise=1.0, seed=marker_id), true, marker_id)
     seen = true + cover * cell * np.array([[1.0, 0.0], [0.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
-    covered = fitted(picture(at, cell, noise=1.0, seed=marker_id, cover=cover), seen, marker_id)
+    covered = fitted(rendered(at, cell, noise=1.0, seed=marker_id, cover=cover), seen, marker_id)
     left = [0, 3]
     error = np.abs(covered.corners[0] - true)[left, 0]
     sigma, usual = (np.sqrt(np.diag(found.covariance[0]))[[0, 6]] for found in (covered, free))
@@ -130,7 +132,7 @@ def test_a_covered_side_is_less_sure(cover: float) -> None:
 
 def test_what_cannot_be_fitted_keeps_what_the_profiles_say() -> None:
     at, cell, marker_id = (20.3, 20.3), 5.0, 100
-    image = picture(at, cell, seed=marker_id)
+    image = rendered(at, cell, seed=marker_id)
     far_off = corners_of(at, cell) + np.array([2.0, 0.0])  # too far for the fit, not for the profiles
     found = fitted(image, far_off, marker_id)
     assert found.contrast[0] > 0.0

@@ -1,1 +1,1 @@
-"""What simulated cameras show: exact area coverage of planar patches, motion blur, noise. No ROS."""
+"""Rendered cameras: exact area coverage of planar patches, motion blur, sensor noise. No ROS."""

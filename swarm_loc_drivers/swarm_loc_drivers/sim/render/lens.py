@@ -1,25 +1,26 @@
-"""A camera's optics and sensor, as calibrated: what turns directions into pixels and light into counts."""
+"""Camera model: intrinsics, optics and sensor noise of a simulated camera."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.number_spec import number
-
-FloatArray = NDArray[np.float64]
+from swarm_loc_drivers.io.calibration_file import CameraCalibration
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.parameters.number_spec import number
+from swarm_loc_vision.core.imaging.camera import Camera
 
 _REACH_MARGIN = 1.1
 
 
 @dataclass(frozen=True)
 class CameraModel:
-    """A global-shutter camera; the principal point is the middle of the picture.
+    """A global-shutter camera; the principal point is the middle of the image.
 
     The auto-exposure keeps white at `white_level`: a shorter exposure means less blur and more noise.
     """
@@ -41,52 +42,45 @@ class CameraModel:
     read_noise: float = number(
         12.0, "1", 0.0, 1e3, "noise of the read-out, one standard deviation [electrons]"
     )
-    white_level: float = number(210.0, "1", 1.0, 255.0, "count of white in the middle of the picture")
+    white_level: float = number(210.0, "1", 1.0, 255.0, "count of white in the middle of the image")
+
+    @cached_property
+    def camera(self) -> Camera:
+        """Its calibration."""
+        focal_px = 0.5 * self.width / math.tan(0.5 * self.field_of_view)
+        middle = 0.5 * (self.width - 1), 0.5 * (self.height - 1)
+        distortion = (self.k1, self.k2, self.p1, self.p2, self.k3)
+        return Camera(self.width, self.height, focal_px, focal_px, *middle, distortion)
 
     @property
-    def focal_px(self) -> float:
-        """Focal length [px]."""
-        return 0.5 * self.width / math.tan(0.5 * self.field_of_view)
+    def calibration(self) -> CameraCalibration:
+        """The content of its sensor_msgs/CameraInfo; images are not rectified."""
+        camera = self.camera
+        k = camera.matrix
+        return CameraCalibration(
+            camera.width,
+            camera.height,
+            camera.model,
+            camera.distortion,
+            tuple(k.ravel().tolist()),
+            tuple(np.eye(3).ravel().tolist()),
+            tuple(np.column_stack([k, np.zeros(3)]).ravel().tolist()),
+        )
 
-    @property
-    def matrix(self) -> FloatArray:
-        """K (3, 3) of camera_info [px]."""
-        f = self.focal_px
-        centre = 0.5 * (self.width - 1), 0.5 * (self.height - 1)
-        return np.array([[f, 0.0, centre[0]], [0.0, f, centre[1]], [0.0, 0.0, 1.0]])
-
-    @property
-    def distortion(self) -> FloatArray:
-        """k1, k2, p1, p2, k3 (5,) of camera_info, model plumb_bob."""
-        return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
-
-    def camera_info(self) -> dict[str, Any]:
-        """The fields of sensor_msgs/CameraInfo that calibrate it."""
-        k = self.matrix
-        return {
-            "height": self.height,
-            "width": self.width,
-            "distortion_model": "plumb_bob",
-            "d": self.distortion,
-            "k": k.reshape(9),
-            "r": np.eye(3).reshape(9),
-            "p": np.column_stack([k, np.zeros(3)]).reshape(12),
-        }
-
-    def constants(self, focal_scale: float = 1.0) -> FloatArray:
+    def lens(self, focal_scale: float = 1.0) -> FloatArray:
         """The constants of `raster.project` for a camera whose true focal length is off by a factor."""
-        k = self.matrix
-        border = np.array([[u, v] for u in (0, self.width) for v in (0, self.height)], dtype=float)
-        directions = cv2.undistortPoints(border[:, None] - 0.5, k, self.distortion)[:, 0]
-        reach = _REACH_MARGIN * float(np.linalg.norm(directions, axis=1).max()) / focal_scale
-        f = focal_scale * self.focal_px
-        return np.array([f, f, k[0, 2], k[1, 2], *self.distortion, reach])
+        camera = self.camera
+        border = np.array([[u, v] for u in (0, self.width) for v in (0, self.height)], dtype=float) - 0.5
+        # not by `to_ideal`, which knows nothing of corners that the distortion's model never gets to
+        tangents = cv2.undistortPoints(border[:, None], camera.matrix, np.array(camera.distortion))[:, 0]
+        reach = _REACH_MARGIN * float(np.linalg.norm(tangents, axis=1).max()) / focal_scale
+        true = replace(camera, fx=focal_scale * camera.fx, fy=focal_scale * camera.fy)
+        return np.append(true.lens, reach)
 
     def electrons(self) -> NDArray[np.float32]:
         """What white leaves in each pixel (height, width) during the exposure."""
         v, u = np.mgrid[: self.height, : self.width]
-        k = self.matrix
-        tan2 = ((u - k[0, 2]) ** 2 + (v - k[1, 2]) ** 2) / self.focal_px**2
+        tan2 = ((u - self.camera.cx) ** 2 + (v - self.camera.cy) ** 2) / self.camera.fx**2
         light = 1.0 - self.vignetting * (1.0 - 1.0 / (1.0 + tan2) ** 2)
         electrons: NDArray[np.float32] = (self.white_flux * self.exposure_s * light).astype(np.float32)
         return electrons

@@ -1,12 +1,6 @@
-"""Planar patches into pixels by exact area coverage: a pixel's value is the mean over its whole square.
+"""Rasterize planar patches by exact area coverage: a pixel's value is the mean over its whole square.
 
-A boundary does not paint an area, it notes by how much the picture changes across it: in every row that it
-crosses it leaves signed shares of that change, and the running sum along the row is the exact mean over every
-pixel (box filter). Boundaries simply add up. So nested patches need no order, a picture averaged over an
-exposure costs more boundaries but no more pixels, and nothing is sampled: no aliasing, no bias.
-
-Pixel (0, 0) is the square around the image point (0, 0), as OpenCV counts. All compiled code of the renderer
-stands in this one file, so that the compiler's cache notices every change.
+Pixel (0, 0) is the square around the image point (0, 0), as OpenCV counts.
 """
 
 from __future__ import annotations
@@ -15,22 +9,20 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.compiled import compiled
+from swarm_loc_drivers.sim.render.clipping import CORNERS, ball_in_view, cut, move
+from swarm_loc_drivers.sim.render.coverage import Changes, Layer, add_straight
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_vision.core.imaging.lens import CX, CY, FX, FY, LENS_KIND, LENS_SIZE, STRAIGHT, distorted
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-Image = NDArray[np.float32]
-Changes = NDArray[np.float32]
-"""(height, width + 2): changes along each row of a picture (height, width)."""
+REACH = LENS_SIZE
+"""Behind the constants of a lens, the radius at distance 1 up to which they hold."""
 
-FX, FY, CX, CY, K1, K2, P1, P2, K3, REACH = range(10)
-"""Places of a lens' constants: OpenCV's, and the radius at distance 1 up to which they hold."""
-
-_NEAR = 0.004  # [m] in front of the camera; what is nearer is cut off
 _CHORD_PX = 4.0  # in 1280 columns, 60 degrees and a distortion of -0.3 it leaves its arc by 0.004 px at most
-_CORNERS = 12  # a quadrangle cut by five planes has at most nine
+
+Motion = tuple[FloatArray, FloatArray]
+"""Rotations (K, 3, 3) and shifts (K, 3) [m] from some frame to the optical one, at K instants."""
 
 
 class Patches(NamedTuple):
@@ -57,65 +49,12 @@ class Patches(NamedTuple):
 
 @compiled
 def project(lens: FloatArray, x: float, y: float) -> tuple[float, float]:
-    """Pixel of the direction (x, y, 1); beyond the lens' reach the picture goes on straight."""
+    """Pixel of the direction (x, y, 1); beyond the lens' reach the image goes on straight."""
     radius = math.sqrt(x * x + y * y)
     near = 1.0 if radius <= lens[REACH] else lens[REACH] / radius
     a, b = near * x, near * y
-    r2 = a * a + b * b
-    radial = 1.0 + r2 * (lens[K1] + r2 * (lens[K2] + r2 * lens[K3]))
-    u = a * radial + 2.0 * lens[P1] * a * b + lens[P2] * (r2 + 2.0 * a * a) + (x - a)
-    v = b * radial + lens[P1] * (r2 + 2.0 * b * b) + 2.0 * lens[P2] * a * b + (y - b)
-    return lens[FX] * u + lens[CX], lens[FY] * v + lens[CY]
-
-
-@compiled
-def _add_in_row(row: Changes, width: int, left: float, right: float, change: float) -> None:
-    """A piece of boundary inside one row, from column `left` to `right` >= `left`."""
-    if left >= width:
-        return
-    if right <= 0.0:
-        row[0] += change
-        return
-    if left < 0.0:
-        outside = change * -left / (right - left)
-        row[0] += outside
-        change -= outside
-        left = 0.0
-    if right > width:
-        change *= (width - left) / (right - left)
-        right = float(width)
-    first, last = int(left), math.ceil(right)
-    if last <= first + 1:
-        share = 0.5 * (left + right) - first
-        row[first] += change * (1.0 - share)
-        row[first + 1] += change * share
-        return
-    before = 0.0
-    for column in range(first, last):
-        begin, end = max(float(column), left), min(column + 1.0, right)
-        middle = 0.5 * (begin + end)
-        behind = (end - begin) * (middle - left) / (right - left) + (column + 1.0 - end)
-        row[column] += change * (behind - before)
-        before = behind
-    row[last] += change * (1.0 - before)
-
-
-@compiled
-def _add_straight(changes: Changes, x0: float, y0: float, x1: float, y1: float, change: float) -> None:
-    """A straight boundary between two points, counted in pixels from the corner of the first one."""
-    if y1 < y0:
-        x0, y0, x1, y1, change = x1, y1, x0, y0, -change
-    height, width = changes.shape[0], changes.shape[1] - 2
-    if y1 <= 0.0 or y0 >= height or y0 == y1:
-        return
-    slope = (x1 - x0) / (y1 - y0)
-    top, bottom = max(y0, 0.0), min(y1, float(height))
-    x = x0 + slope * (top - y0)
-    for line in range(int(top), math.ceil(bottom)):
-        low, high = max(float(line), top), min(line + 1.0, bottom)
-        x_next = x0 + slope * (high - y0)
-        _add_in_row(changes[line], width, min(x, x_next), max(x, x_next), change * (high - low))
-        x = x_next
+    u, v = distorted(lens, a, b)
+    return lens[FX] * (u + (x - a)) + lens[CX], lens[FY] * (v + (y - b)) + lens[CY]
 
 
 @compiled
@@ -127,7 +66,7 @@ def _add_boundary(
     change: float,
     box: FloatArray,
 ) -> None:
-    """The picture changes by `change` to the left of the line from `start` to `end`, seen in the picture.
+    """The image changes by `change` to the left of the line from `start` to `end`, seen in the image.
 
     Args:
         changes: Where it is noted.
@@ -141,74 +80,14 @@ def _add_boundary(
     bx, by = end[0] / end[2], end[1] / end[2]
     u0, v0 = project(lens, ax, ay)
     u1, v1 = project(lens, bx, by)
-    straight = lens[K1] == 0.0 and lens[K2] == 0.0 and lens[P1] == 0.0 and lens[P2] == 0.0 and lens[K3] == 0.0
-    pieces = 1 if straight else math.ceil(math.hypot(u1 - u0, v1 - v0) / _CHORD_PX)
+    pieces = 1 if lens[LENS_KIND] == STRAIGHT else math.ceil(math.hypot(u1 - u0, v1 - v0) / _CHORD_PX)
     for piece in range(1, pieces + 1):
         share = piece / pieces
         u, v = (u1, v1) if piece == pieces else project(lens, ax + share * (bx - ax), ay + share * (by - ay))
-        _add_straight(changes, u0 + 0.5, v0 + 0.5, u + 0.5, v + 0.5, change)
+        add_straight(changes, u0 + 0.5, v0 + 0.5, u + 0.5, v + 0.5, change)
         box[0], box[1] = min(box[0], u), min(box[1], v)
         box[2], box[3] = max(box[2], u), max(box[3], v)
         u0, v0 = u, v
-
-
-@compiled
-def _inside(plane: int, reach: float, point: FloatArray) -> float:
-    """How far a point lies inside one of the five planes around what is drawn; negative outside."""
-    x, y, z = float(point[0]), float(point[1]), float(point[2])
-    if plane == 0:
-        return z - _NEAR
-    if plane == 1:
-        return reach * z - x
-    if plane == 2:
-        return reach * z + x
-    if plane == 3:
-        return reach * z - y
-    return reach * z + y
-
-
-@compiled
-def _blend(target: FloatArray, here: FloatArray, there: FloatArray, share: float) -> None:
-    """Write the point (3,) that lies `share` of the way from `here` to `there`."""
-    for axis in range(3):
-        target[axis] = here[axis] + share * (there[axis] - here[axis])
-
-
-@compiled
-def _cut(polygon: FloatArray, count: int, spare: FloatArray, reach: float) -> int:
-    """Cut a convex polygon, its first `count` rows, by the five planes; its new number of corners."""
-    for plane in range(5):
-        outside = 0
-        for i in range(count):
-            if _inside(plane, reach, polygon[i]) < 0.0:
-                outside += 1
-        if outside == 0:
-            continue
-        if outside == count:
-            return 0
-        kept = 0
-        for i in range(count):
-            here, there = polygon[i], polygon[(i + 1) % count]
-            a, b = _inside(plane, reach, here), _inside(plane, reach, there)
-            if a >= 0.0:
-                _blend(spare[kept], here, here, 0.0)
-                kept += 1
-            if (a >= 0.0) != (b >= 0.0):
-                _blend(spare[kept], here, there, a / (a - b))
-                kept += 1
-        count = kept
-        for i in range(count):
-            _blend(polygon[i], spare[i], spare[i], 0.0)
-    return count
-
-
-@compiled
-def _move(rotation: FloatArray, shift: FloatArray, point: FloatArray, moved: FloatArray) -> None:
-    """Rotate and shift a point (3,) into `moved`."""
-    for axis in range(3):
-        moved[axis] = shift[axis]
-        for k in range(3):
-            moved[axis] += rotation[axis, k] * point[k]
 
 
 @compiled
@@ -225,38 +104,24 @@ def _in_view(
         towards += patches.normal[surface, axis] * (centre[axis] - to_camera)
     if towards >= 0.0:
         return False
-    _move(rotation, shift, centre, spare[0])
-    slack = patches.radius[surface] * math.sqrt(1.0 + reach * reach)
-    for plane in range(5):  # noqa: SIM110 - the compiler knows no generators
-        if _inside(plane, reach, spare[0]) < -slack:
-            return False
-    return True
+    move(rotation, shift, centre, spare[0])
+    return ball_in_view(spare[0], patches.radius[surface], reach)
 
 
 @compiled
-def draw(
-    changes: Changes,
-    covers: Changes,
-    patches: Patches,
-    lens: FloatArray,
-    rotations: FloatArray,
-    shifts: FloatArray,
-    weight: float,
-    box: FloatArray,
-) -> None:
+def draw(layer: Layer, patches: Patches, lens: FloatArray, motion: Motion, weight: float) -> None:
     """Note the boundaries of patches as a camera sees them during its exposure.
 
     Args:
-        changes: Of the brightness, added to.
-        covers: Of what hides the background, added to.
-        patches: What is drawn; fronts must not overlap in the picture except where nested.
+        layer: Added to.
+        patches: What is drawn; fronts must not overlap in the image except where nested.
         lens: Constants of `project`.
-        rotations: (K, 3, 3) from the patches' frame to the optical one, at K instants of the exposure.
-        shifts: (K, 3) likewise [m].
+        motion: From the frame of the patches, at K instants of the exposure.
         weight: Share of the light that comes this way.
-        box: (4,) left, top, right and bottom [px] of what was drawn, extended.
     """
-    polygon, spare = np.empty((_CORNERS, 3)), np.empty((_CORNERS, 3))
+    changes, covers, box = layer
+    rotations, shifts = motion
+    polygon, spare = np.empty((CORNERS, 3)), np.empty((CORNERS, 3))
     reach, share = lens[REACH], weight / len(rotations)
     for instant in range(len(rotations)):
         rotation, shift = rotations[instant], shifts[instant]
@@ -265,68 +130,10 @@ def draw(
                 continue
             for index in range(patches.first[surface], patches.first[surface + 1]):
                 for i in range(4):
-                    _move(rotation, shift, patches.corners[index, i], polygon[i])
-                count = _cut(polygon, 4, spare, reach)
+                    move(rotation, shift, patches.corners[index, i], polygon[i])
+                count = cut(polygon, 4, spare, reach)
                 for i in range(count):
                     start, end = polygon[i], polygon[(i + 1) % count]
                     _add_boundary(changes, lens, start, end, -share * patches.change[index], box)
                     if patches.cover[index] != 0.0:
                         _add_boundary(covers, lens, start, end, -share * patches.cover[index], box)
-
-
-@compiled
-def fill(picture: Image, changes: Changes, before: float) -> None:
-    """Sum changes up into a picture that begins with `before` at the left; the changes become zero."""
-    for line in range(picture.shape[0]):
-        value = before
-        for column in range(picture.shape[1]):
-            value += changes[line, column]
-            picture[line, column] = value
-        for column in range(changes.shape[1]):
-            changes[line, column] = 0.0
-
-
-@compiled
-def lay_over(picture: Image, changes: Changes, covers: Changes, box: FloatArray) -> None:
-    """Put what was drawn inside `box` over a picture; its changes become zero."""
-    height, width = picture.shape
-    left, top = max(int(box[0]) - 1, 0), max(int(box[1]) - 1, 0)
-    right, bottom = min(max(int(box[2]) + 3, 0), width), min(int(box[3]) + 3, height)
-    for line in range(top, bottom):
-        value, cover = 0.0, 0.0
-        for column in range(left, right):
-            value += changes[line, column]
-            cover += covers[line, column]
-            picture[line, column] = picture[line, column] * (1.0 - cover) + value
-        for column in range(left, right + 2):
-            changes[line, column] = covers[line, column] = 0.0
-
-
-@compiled
-def expose(
-    picture: Image,
-    frame: NDArray[np.uint8],
-    electrons: Image,
-    read_noise: float,
-    gain: float,
-    noise: Image,
-    offset: IntArray,
-) -> None:
-    """Turn light into counts, with the noise of photons and of the read-out.
-
-    Args:
-        picture: (height, width) brightness of what is seen [1].
-        frame: (height, width), written.
-        electrons: (height, width) that white leaves in each pixel.
-        read_noise: [electrons].
-        gain: Counts per electron.
-        noise: (K,) numbers of unit variance.
-        offset: (height,) where each row begins in them, at most K - width.
-    """
-    floor = np.float32(read_noise * read_noise)
-    for line in range(picture.shape[0]):
-        row = noise[offset[line] :]
-        for column in range(picture.shape[1]):
-            signal = max(picture[line, column] * electrons[line, column], np.float32(0.0))
-            count = (signal + math.sqrt(signal + floor) * row[column]) * np.float32(gain) + np.float32(0.5)
-            frame[line, column] = np.uint8(min(max(count, np.float32(0.0)), np.float32(255.0)))

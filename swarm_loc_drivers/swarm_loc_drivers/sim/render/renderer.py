@@ -1,4 +1,4 @@
-"""Pictures of an arena with robots, as their cameras take them."""
+"""Render images of an arena with robots: projection, motion blur, defocus, sensor."""
 
 from __future__ import annotations
 
@@ -11,20 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from swarm_loc_estimator.core import se2
-from swarm_loc_estimator.core.swarm import CameraMount
-
-from .lens import CameraModel
-from .raster import CX, CY, FX, REACH, Patches, draw, expose, fill, lay_over, project
-from .scene import ROOM
-
-FloatArray = NDArray[np.float64]
-Motion = tuple[FloatArray, FloatArray]
-"""Rotations (K, 3, 3) and shifts (K, 3) [m] from some frame to the optical one, at K instants."""
+from swarm_loc_drivers.sim.render.coverage import Layer, empty_box, fill, lay_over
+from swarm_loc_drivers.sim.render.lens import CameraModel
+from swarm_loc_drivers.sim.render.raster import REACH, Motion, Patches, draw, project
+from swarm_loc_drivers.sim.render.scene import ROOM
+from swarm_loc_drivers.sim.render.sensor import expose
+from swarm_loc_estimator.core.description.swarm import CameraMount
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_vision.core.imaging.lens import CX, CY, FX
 
 STEP_PX = 1.0
-"""A picture is drawn at as many instants of its exposure as keep the motion between them below this."""
-MOST_INSTANTS = 256
+"""An image is drawn at as many instants of its exposure as keep the motion between them below this."""
+MAX_INSTANTS = 256
 
 _OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """From x forward, y left, z up to x right, y down, z forward."""
@@ -53,7 +52,7 @@ class Scene:
 
 
 @dataclass
-class Eye:
+class RobotCamera:
     """One robot's camera as it truly is.
 
     Attributes:
@@ -71,7 +70,7 @@ class Eye:
     lens: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
-        self.lens = self.model.constants(self.focal_scale)
+        self.lens = self.model.lens(self.focal_scale)
         mount = self.mount
         turned = Rotation.from_euler("ZYX", [mount.yaw, mount.pitch, mount.roll]).as_matrix()
         self._turn: FloatArray = _OPTICAL @ turned.T
@@ -87,7 +86,7 @@ class Eye:
 
 
 class Renderer:
-    """Draws pictures of one scene; all cameras share its buffers, so use it from one thread.
+    """Draws images of one scene; all cameras share its buffers, so use it from one thread.
 
     Args:
         scene: What is seen.
@@ -97,48 +96,47 @@ class Renderer:
     def __init__(self, scene: Scene, model: CameraModel) -> None:
         self._scene, self._model = scene, model
         self._board_centres = np.array([board.centre[0] for board in scene.boards]).reshape(-1, 3)
-        self._picture = np.zeros((model.height, model.width), np.float32)
-        self._changes = np.zeros((model.height, model.width + 2), np.float32)
-        self._covers = np.zeros_like(self._changes)
+        self._image = np.zeros((model.height, model.width), np.float32)
+        changes = np.zeros((model.height, model.width + 2), np.float32)
+        self._layer = Layer(changes, np.zeros_like(changes), empty_box())
         self._electrons = model.electrons()
         self._noise = np.random.default_rng(0).standard_normal(_NOISE_LENGTH, dtype=np.float32)
 
-    def light(self, eye: Eye, poses: FloatArray) -> NDArray[np.float32]:
+    def light(self, camera: RobotCamera, poses: FloatArray) -> NDArray[np.float32]:
         """The brightness of every pixel (height, width), without noise; overwritten by the next call.
 
         What covers something else while it moves is averaged over the exposure before it is laid over what
-        it covers: exact but for the picture's blurred rims in front of other blurred rims.
+        it covers: exact but for the image's blurred rims in front of other blurred rims.
 
         Args:
-            eye: The camera.
+            camera: The camera.
             poses: (K, N, 3) of all robots in map, at the middles of K equal parts of the exposure.
         """
-        seen_from = poses[:, eye.robot]
-        of_map = eye.view(se2.inverse(seen_from))
-        of_robots = eye.view(se2.between(seen_from[:, None], poses))
-        self._draw(self._scene.backdrop, eye, of_map, _no_box())
-        fill(self._picture, self._changes, ROOM)
-        for part, motion in self._far_to_near(eye.robot, poses, of_map, of_robots):
-            box = _no_box()
-            self._draw(part, eye, motion, box)
-            lay_over(self._picture, self._changes, self._covers, box)
+        seen_from = poses[:, camera.robot]
+        of_map = camera.view(se2.inverse(seen_from))
+        of_robots = camera.view(se2.between(seen_from[:, None], poses))
+        fill(self._image, self._drawn(self._scene.backdrop, camera, of_map).changes, ROOM)
+        for part, motion in self._far_to_near(camera.robot, poses, of_map, of_robots):
+            lay_over(self._image, self._drawn(part, camera, motion))
         self._defocus()
-        return self._picture
+        return self._image
 
-    def _draw(self, patches: Patches, eye: Eye, motion: Motion, box: FloatArray) -> None:
-        """Note the boundaries of patches; with a narrow blur by light that comes three ways."""
+    def _drawn(self, patches: Patches, camera: RobotCamera, motion: Motion) -> Layer:
+        """The boundaries of patches, noted; with a narrow blur by light that comes three ways."""
+        layer = self._layer._replace(box=empty_box())
         ways = _NARROW_WAYS if self._blur_is_narrow else _ONE_WAY
         for shift_px, weight in ways:
-            lens = eye.lens.copy()
+            lens = camera.lens.copy()
             lens[[CX, CY]] += shift_px
-            draw(self._changes, self._covers, patches, lens, *motion, weight, box)
+            draw(layer, patches, lens, motion, weight)
+        return layer
 
     @property
     def _blur_is_narrow(self) -> bool:
         return _NARROW_VARIANCE < self._model.focus_sigma_px**2 < _WIDE_VARIANCE
 
     def _defocus(self) -> None:
-        """Blur the picture as the optics do.
+        """Blur the image as the optics do.
 
         Light is blurred before it falls into pixels. A blur that is wide against them comes out the same when
         pixels are blurred afterwards; with a narrow one edges would seem to lie up to 0.03 px aside, one way
@@ -148,38 +146,38 @@ class Renderer:
         if self._blur_is_narrow:
             side = 0.5 * (sigma**2 - _NARROW_VARIANCE)
             kernel = np.array([side, 1.0 - 2.0 * side, side])
-            cv2.sepFilter2D(self._picture, -1, kernel, kernel, dst=self._picture)
+            cv2.sepFilter2D(self._image, -1, kernel, kernel, dst=self._image)
         elif sigma > 0.0:
-            cv2.GaussianBlur(self._picture, (0, 0), sigma, dst=self._picture)
+            cv2.GaussianBlur(self._image, (0, 0), sigma, dst=self._image)
 
-    def frame(self, eye: Eye, poses: FloatArray, rng: np.random.Generator) -> NDArray[np.uint8]:
-        """The picture (height, width) that the sensor reports; arguments as for `light`."""
-        light = self.light(eye, poses)
+    def frame(self, camera: RobotCamera, poses: FloatArray, rng: np.random.Generator) -> NDArray[np.uint8]:
+        """The image (height, width) that the sensor reports; arguments as for `light`."""
+        light = self.light(camera, poses)
         model = self._model
         frame = np.empty(light.shape, np.uint8)
         offset = rng.integers(0, _NOISE_LENGTH - model.width, model.height)
         expose(light, frame, self._electrons, model.read_noise, model.gain, self._noise, offset)
         return frame
 
-    def instants(self, eye: Eye, begin: FloatArray, end: FloatArray) -> int:
+    def instants(self, camera: RobotCamera, begin: FloatArray, end: FloatArray) -> int:
         """At how many instants of an exposure `light` needs the poses.
 
         Args:
-            eye: The camera.
+            camera: The camera.
             begin: (N, 3) poses of all robots in map when the shutter opens.
             end: Likewise when it closes.
         """
         poses = np.stack([begin, end])
-        seen_from = poses[:, eye.robot]
-        rotation, shift = eye.view(se2.inverse(seen_from))
+        seen_from = poses[:, camera.robot]
+        rotation, shift = camera.view(se2.inverse(seen_from))
         boards = self._board_centres @ np.swapaxes(rotation, 1, 2) + shift[:, None]
-        robots = eye.view(se2.between(seen_from[:, None], poses))[1]
-        moved = float(eye.lens[FX] * np.abs(se2.wrap_angle(end[eye.robot, 2] - begin[eye.robot, 2])))
+        robots = camera.view(se2.between(seen_from[:, None], poses))[1]
+        moved = float(camera.lens[FX] * np.abs(se2.wrap_angle(end[camera.robot, 2] - begin[camera.robot, 2])))
         things = np.concatenate([boards, robots], axis=1)
-        in_view = (things[..., 2] > _CLOSEST) & (np.abs(things[..., 0]) < eye.lens[REACH] * things[..., 2])
+        in_view = (things[..., 2] > _CLOSEST) & (np.abs(things[..., 0]) < camera.lens[REACH] * things[..., 2])
         for before, after in things[:, in_view.all(axis=0)].swapaxes(0, 1).tolist():
-            moved = max(moved, math.dist(_pixel(eye.lens, before), _pixel(eye.lens, after)))
-        return max(1, min(math.ceil(moved / STEP_PX), MOST_INSTANTS))
+            moved = max(moved, math.dist(_pixel(camera.lens, before), _pixel(camera.lens, after)))
+        return max(1, min(math.ceil(moved / STEP_PX), MAX_INSTANTS))
 
     def _far_to_near(
         self, own: int, poses: FloatArray, of_map: Motion, of_robots: Motion
@@ -204,8 +202,3 @@ class Renderer:
 def _pixel(lens: FloatArray, place: Sequence[float]) -> tuple[float, float]:
     """Pixel of a place in the optical frame."""
     return project(lens, place[0] / place[2], place[1] / place[2])
-
-
-def _no_box() -> FloatArray:
-    """The box of nothing: left, top, right, bottom."""
-    return np.array([math.inf, math.inf, -math.inf, -math.inf])

@@ -12,9 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from .raster import Patches
-
-FloatArray = NDArray[np.float64]
+from swarm_loc_drivers.sim.render.raster import Patches
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 BLACK, WHITE = 0.05, 0.85
 ROOM = 0.30

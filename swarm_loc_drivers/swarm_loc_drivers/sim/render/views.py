@@ -1,4 +1,4 @@
-"""Where markers truly lie in a picture, and what hides them: what detections are compared with."""
+"""Ground truth of detections: where markers lie in an image, and which are occluded."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core import se2
-
-from .raster import Patches, project
-from .renderer import Eye, Motion, Scene
-
-FloatArray = NDArray[np.float64]
+from swarm_loc_drivers.sim.render.raster import Motion, Patches, project
+from swarm_loc_drivers.sim.render.renderer import RobotCamera, Scene
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 _CLOSEST = 0.01
 """What is nearer to the camera's plane is not projected [m]."""
@@ -28,7 +26,7 @@ class Views(NamedTuple):
     Attributes:
         id: (M,) of the marker.
         corners: (M, 4, 2) of the black square, clockwise from the marker's own upper left [px].
-        margin: (M,) how far inside the picture its sheet lies, negative where it is cut off [px].
+        margin: (M,) how far inside the image its sheet lies, negative where it is cut off [px].
         incidence: (M,) angle between its normal and the line of sight [rad].
         hidden: (M,) whether a robot stands before a part of its sheet.
     """
@@ -41,7 +39,7 @@ class Views(NamedTuple):
 
     @property
     def side_px(self) -> FloatArray:
-        """(M,) square roots of the squares' areas in the picture [px]."""
+        """(M,) square roots of the squares' areas in the image [px]."""
         x, y = np.moveaxis(self.corners, -1, 0)
         area = 0.5 * np.sum(x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1), axis=1)
         side: FloatArray = np.sqrt(np.abs(area))
@@ -60,7 +58,7 @@ def views_of(
     scene: Scene,
     faces: Sequence[Sequence[Patches]],
     ids: NDArray[np.uint32],
-    eye: Eye,
+    camera: RobotCamera,
     poses: FloatArray,
 ) -> Views:
     """The markers that look at a camera, of whatever size, in view or outside.
@@ -69,12 +67,14 @@ def views_of(
         scene: Its boards are markers.
         faces: Of each robot the markers on it, in its base_link.
         ids: Of all boards, and then of the faces of robot after robot.
-        eye: The camera.
+        camera: The camera.
         poses: (N, 3) of all robots in map.
     """
-    own = poses[eye.robot]
-    of_robots = [eye.view(se2.between(own, pose)) for pose in poses]
-    markers = _in_optical_frame(scene.boards, faces, ids, [eye.view(se2.inverse(own)), *of_robots], eye.robot)
+    own = poses[camera.robot]
+    of_robots = [camera.view(se2.between(own, pose)) for pose in poses]
+    markers = _in_optical_frame(
+        scene.boards, faces, ids, [camera.view(se2.inverse(own)), *of_robots], camera.robot
+    )
     centre = markers.corners[:, _SQUARE].mean(axis=1)
     right, down = (markers.corners[:, _SQUARE, k] - markers.corners[:, _SQUARE, 0] for k in (1, 3))
     normal = np.cross(down, right)
@@ -82,11 +82,11 @@ def views_of(
     cosine /= np.linalg.norm(centre, axis=1) * np.linalg.norm(normal, axis=1)
     kept = (cosine > 0.0) & (markers.corners[..., 2].min(axis=(1, 2)) > _CLOSEST)
     markers = _Seen(*(column[kept] for column in markers))
-    pixels = _pixels(eye, markers.corners)
+    pixels = _pixels(camera, markers.corners)
     outlines = {
-        robot: _outline(eye, scene.robots[robot], of_robots[robot])
+        robot: _outline(camera, scene.robots[robot], of_robots[robot])
         for robot in range(len(poses))
-        if robot != eye.robot
+        if robot != camera.robot
     }
     distance = [float(motion[1][2]) for motion in of_robots]
     hidden = [
@@ -97,7 +97,7 @@ def views_of(
         )
         for owner, depth, sheet in zip(markers.owner, centre[kept][:, 2], pixels[:, _SHEET], strict=True)
     ]
-    size = np.array([eye.model.width, eye.model.height])
+    size = np.array([camera.model.width, camera.model.height])
     sheet = pixels[:, _SHEET]
     margin = np.minimum(sheet + 0.5, size - 0.5 - sheet).min(axis=(1, 2))
     return Views(
@@ -122,19 +122,19 @@ def _in_optical_frame(
     return _Seen(ids[others], owner[others], np.reshape(corners, (-1, 2, 4, 3))[others])
 
 
-def _pixels(eye: Eye, points: FloatArray) -> FloatArray:
+def _pixels(camera: RobotCamera, points: FloatArray) -> FloatArray:
     """(..., 2) of points (..., 3) before the camera, as they are drawn."""
-    pixels = [project(eye.lens, x / z, y / z) for x, y, z in points.reshape(-1, 3).tolist()]
+    pixels = [project(camera.lens, x / z, y / z) for x, y, z in points.reshape(-1, 3).tolist()]
     return np.reshape(np.array(pixels, float), (*points.shape[:-1], 2))
 
 
-def _outline(eye: Eye, robot: Sequence[Patches], motion: Motion) -> FloatArray:
-    """Convex hull (H, 2) of a robot in the picture [px]; empty behind the camera."""
+def _outline(camera: RobotCamera, robot: Sequence[Patches], motion: Motion) -> FloatArray:
+    """Convex hull (H, 2) of a robot in the image [px]; empty behind the camera."""
     corners = np.concatenate([part.corners.reshape(-1, 3) for part in robot]) @ motion[0].T + motion[1]
     before = corners[corners[:, 2] > _CLOSEST]
     if len(before) < len(corners):
         return np.zeros((0, 2))
-    return np.asarray(cv2.convexHull(_pixels(eye, before).astype(np.float32))[:, 0], float)
+    return np.asarray(cv2.convexHull(_pixels(camera, before).astype(np.float32))[:, 0], float)
 
 
 def _overlap(outline: FloatArray, sheet: FloatArray) -> bool:

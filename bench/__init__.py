@@ -1,0 +1,10 @@
+"""Benchmarks: each prints a table, draws it under out/ and leaves its figures in out/bench/.
+
+`make bench-NAME` runs `python -m bench.NAME`: bench/NAME.py, or bench/NAME/__main__.py.
+"""
+
+import os
+
+# CPU seconds are those of one core; idle BLAS threads burn time in spinning. Must be set before numpy loads.
+for _library in ("OPENBLAS", "OMP", "MKL"):
+    os.environ.setdefault(f"{_library}_NUM_THREADS", "1")

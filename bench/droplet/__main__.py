@@ -1,0 +1,300 @@
+"""Range, bearing and heading of Droplets from brightness matrices, beside what theory allows.
+
+    make bench-droplet
+    make bench-droplet ARGS="--poses 500 --live 0 --replays 1"
+
+Bearings and headings are uniform, readings have one count of noise and saturate at 255. "closed form" are
+the Droplet paper's equations, corrected, on the power that suits; "likelihood" uses all readings of both
+powers. Beside it stands the Cramer-Rao bound, which no unbiased estimate betters. "mismatch" are robots whose
+elements differ by 10 %, before and after their gains were calibrated from 200 exchanges of the two, poses
+unknown and known. At the end a swarm of 20 is localized through infrared, see bench/droplet_swarm.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.common import Cell, new_plot, save_plot, table, write_figures
+from bench.droplet import swarm as droplet_swarm
+from swarm_loc_estimator.core.infrared.board import IrPlatform, PairGains
+from swarm_loc_estimator.core.infrared.brightness import expected
+from swarm_loc_estimator.core.infrared.cramer_rao import information
+from swarm_loc_estimator.core.infrared.solution import IrEstimator, IrSolutions, Outcome
+from swarm_loc_estimator.core.infrared.solvers.closed_form import ClosedForm
+from swarm_loc_estimator.core.infrared.solvers.gains import Exchanges, estimate_gains
+from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.se2 import wrap_angle
+
+CENTIMETRES = (6, 8, 10, 12, 13, 14, 15, 16, 18, 20, 24, 28)
+POSES, LIVE, REPLAYS = 12000, 2, 6
+MISMATCH, CALIBRATION, COUPLES = 0.1, 200, 12
+"""How much elements of each of so many couples of robots differ, and their exchanges to calibrate with."""
+DIAMETER_CM = 4.4
+"""Within which the paper finds all ranges (section V)."""
+_TIMED, _REPEATS = 200, 20
+_SEED = 3
+_UNITS = np.array([100.0, np.degrees(1.0), np.degrees(1.0)])
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of one estimator at some ranges.
+
+    Attributes:
+        mean: (3,) mean absolute error [cm, deg, deg].
+        rms: (3,) likewise root mean square.
+        worst: (3,) largest.
+        nees: Ideally 3.
+        found: Share of poses that there are.
+        within: Share of ranges that err by less than the robot's diameter.
+    """
+
+    mean: FloatArray
+    rms: FloatArray
+    worst: FloatArray
+    nees: float
+    found: float
+    within: float
+
+    @classmethod
+    def of(cls, solutions: IrSolutions, poses: FloatArray) -> Errors:
+        """Of solutions for true poses (k, 3)."""
+        found = solutions.outcomes == Outcome.FOUND
+        errors = solutions.poses[found] - poses[found]
+        errors[:, 1:] = wrap_angle(errors[:, 1:])
+        solved = np.linalg.solve(solutions.covariances[found], errors[..., None])[..., 0]
+        size = np.abs(errors) * _UNITS
+        return cls(
+            size.mean(axis=0),
+            np.sqrt(np.mean(size**2, axis=0)),
+            size.max(axis=0),
+            float(np.mean(np.sum(errors * solved, axis=1))),
+            float(found.mean()),
+            float(np.mean(size[:, 0] < DIAMETER_CM)),
+        )
+
+
+def random_poses(rng: np.random.Generator, count: int, low_cm: float, high_cm: float) -> FloatArray:
+    """(count, 3), all uniform."""
+    angles = rng.uniform(-np.pi, np.pi, (count, 2))
+    return np.column_stack([0.01 * rng.uniform(low_cm, high_cm, count), angles])
+
+
+def readings_of(
+    platform: IrPlatform, poses: FloatArray, rng: np.random.Generator, gains: PairGains | None = None
+) -> FloatArray:
+    """Readings (k, modes, n, n) with noise, cut at saturation."""
+    bright = expected(platform, poses, gains)
+    noisy = bright + platform.noise * rng.standard_normal(bright.shape)
+    return np.asarray(np.minimum(noisy, platform.saturation))
+
+
+def accuracy(poses_each: int) -> dict[str, float]:
+    """Both estimators at all ranges, of elements that are alike; prints, draws, and returns figures."""
+    platform = replace(load_ir_platform("droplet"), element_sigma=0.0)
+    estimators: dict[str, IrEstimator] = {
+        "closed_form": ClosedForm(platform),
+        "ml": MaximumLikelihood(platform),
+    }
+    figures: dict[str, float] = {}
+    rows: list[list[Cell]] = []
+    curves: dict[str, list[FloatArray]] = {"closed_form": [], "ml": [], "bound": []}
+    ratios = []
+    for centimetres in CENTIMETRES:
+        rng = np.random.default_rng([centimetres, _SEED])
+        poses = random_poses(rng, poses_each, centimetres, centimetres)
+        readings = readings_of(platform, poses, rng)
+        bound = np.diagonal(np.linalg.inv(information(platform, poses)), axis1=1, axis2=2)
+        limit = np.sqrt(np.mean(bound, axis=0)) * _UNITS
+        row: list[Cell] = [centimetres]
+        for name, estimator in estimators.items():
+            errors = Errors.of(estimator.solve(readings), poses)
+            figures |= named(f"{name}.r{centimetres}", errors.mean)
+            figures[f"{name}.r{centimetres}.nees"] = errors.nees
+            row += [*map(float, errors.mean), errors.nees]
+            curves[name].append(errors.rms)
+        ratio = curves["ml"][-1] / limit
+        figures[f"ml.r{centimetres}.rmse_over_crb"] = float(ratio.max())
+        rows.append([*row, float(errors.worst[0]), *map(float, ratio)])
+        curves["bound"].append(limit)
+        ratios.append(ratio)
+        print(f"\rat {centimetres:2} cm", end="", flush=True)
+    head = [
+        "R cm",
+        "closed cm",
+        "deg",
+        "deg",
+        "NEES",
+        "ml cm",
+        "deg",
+        "deg",
+        "NEES",
+        "worst cm",
+        "rms/CRB",
+        "",
+        "",
+    ]
+    print("\rmean errors of range, bearing, heading\n" + table(head, rows))
+    draw({name: np.array(curve) for name, curve in curves.items()}, np.array(ratios))
+    return figures | over_all_ranges(platform, estimators, poses_each)
+
+
+def over_all_ranges(platform: IrPlatform, estimators: dict[str, IrEstimator], count: int) -> dict[str, float]:
+    """What holds for all ranges together."""
+    rng = np.random.default_rng(7)
+    far, near = random_poses(rng, count, 16, 28), random_poses(rng, 3 * count, 6, 28)
+    closed = Errors.of(estimators["closed_form"].solve(readings_of(platform, far, rng)), far)
+    likely = Errors.of(estimators["ml"].solve(readings_of(platform, near, rng)), near)
+    figures = {
+        "closed_form.within_diameter_16_28": closed.within,
+        "ml.worst_range_cm": float(likely.worst[0]),
+        "ml.found_6_28": likely.found,
+        "ml.nees_6_28": likely.nees,
+    }
+    print(
+        f"closed form within one diameter of {DIAMETER_CM} cm, 16-28 cm: {100.0 * closed.within:.2f} %"
+        f" (the paper: always); likelihood, 6-28 cm: worst range {likely.worst[0]:.2f} cm,"
+        f" NEES {likely.nees:.2f}, found {100.0 * likely.found:.2f} %"
+    )
+    return figures
+
+
+def mismatch(poses_each: int) -> dict[str, float]:
+    """The likelihood at 20 cm of elements that differ: unknown, calibrated, and known gains."""
+    platform = load_ir_platform("droplet")
+    estimator = MaximumLikelihood(platform)
+    cases: dict[str, list[Errors]] = {}
+    for couple in range(COUPLES):
+        rng = np.random.default_rng([20, couple])
+        factors = np.exp(MISMATCH * rng.standard_normal((2, 2, platform.n)))
+        poses = random_poses(rng, poses_each, 20, 20)
+        known = pairs(factors, np.zeros(poses_each, dtype=np.int64))
+        readings = readings_of(platform, poses, rng, known)
+        gains: dict[str, PairGains | None] = {"mismatch": None, "mismatch_true_gains": known}
+        for name, poses_known in (("mismatch_calibrated", False), ("mismatch_calibrated_with_poses", True)):
+            fit = estimate_gains(platform, 2, recorded(platform, factors, rng, known=poses_known))
+            gains[name] = PairGains.of([fit.gains[0]] * poses_each, [fit.gains[1]] * poses_each)
+        for name, one in gains.items():
+            cases.setdefault(name, []).append(Errors.of(estimator.solve(readings, one), poses))
+        print(f"\rmismatch: robots {couple + 1} of {COUPLES}", end="", flush=True)
+    figures: dict[str, float] = {}
+    rows: list[list[Cell]] = []
+    for name, ones in cases.items():
+        mean = np.mean([one.mean for one in ones], axis=0)
+        nees = float(np.mean([one.nees for one in ones]))
+        rows.append([name, *map(float, mean), nees])
+        figures |= named(f"ml.{name}.r20", mean)
+        figures[f"ml.{name}.r20.nees"] = nees
+    print("\r" + table(["20 cm, elements differ by 10 %", "cm", "deg", "deg", "NEES"], rows))
+    return figures
+
+
+def named(prefix: str, mean: FloatArray) -> dict[str, float]:
+    """Figures of mean errors (3,)."""
+    units = ("range_cm", "bearing_deg", "heading_deg")
+    return {f"{prefix}.{unit}": float(value) for unit, value in zip(units, mean, strict=True)}
+
+
+def pairs(factors: FloatArray, receiver: NDArray[np.int64]) -> PairGains:
+    """Exact gains of exchanges of two robots, from (2, 2, n) of sensors and emitters of each."""
+    return PairGains(factors[0, receiver], factors[1, 1 - receiver], np.zeros((len(receiver), 4)))
+
+
+def recorded(
+    platform: IrPlatform, factors: FloatArray, rng: np.random.Generator, *, known: bool
+) -> Exchanges:
+    """Exchanges of two robots to calibrate with."""
+    receiver = rng.integers(0, 2, CALIBRATION)
+    poses = random_poses(rng, CALIBRATION, 8, 28)
+    readings = readings_of(platform, poses, rng, pairs(factors, receiver))
+    saturation = np.full(readings.shape[:2], platform.saturation)
+    told = poses if known else np.full_like(poses, np.nan)
+    return Exchanges(receiver, 1 - receiver, readings, saturation, told)
+
+
+def times() -> dict[str, float]:
+    """Microseconds per solve, of one pair at a time and of many: the best of many tries."""
+    figures: dict[str, float] = {}
+    rows: list[list[Cell]] = []
+    alike, differing = (replace(load_ir_platform("droplet"), element_sigma=s) for s in (0.0, MISMATCH))
+    rng = np.random.default_rng(3)
+    readings = readings_of(alike, random_poses(rng, _TIMED, 6, 28), rng)
+    solvers: dict[str, IrEstimator] = {
+        "closed_form": ClosedForm(alike),
+        "ml": MaximumLikelihood(alike),
+        "ml.gains_unknown": MaximumLikelihood(differing),
+    }
+    for name, estimator in solvers.items():
+        single = best_time(estimator, np.split(readings, _TIMED))
+        many = best_time(estimator, [readings])
+        figures |= {f"{name}.us_per_solve": single, f"{name}.us_per_solve_of_many": many}
+        rows.append([name, single, many])
+    print(table(["microseconds per solve", "one pair a call", f"{_TIMED} pairs a call"], rows))
+    return figures
+
+
+def best_time(estimator: IrEstimator, calls: Sequence[FloatArray]) -> float:
+    """Microseconds per pair of the fastest of some runs through all calls."""
+    runs = []
+    for _ in range(_REPEATS):
+        begun = time.perf_counter()
+        for readings in calls:
+            estimator.solve(readings)
+        runs.append(time.perf_counter() - begun)
+    return 1e6 * min(runs) / sum(len(readings) for readings in calls)
+
+
+def draw(curves: dict[str, FloatArray], ratios: FloatArray) -> None:
+    """Errors by range beside the bound."""
+    figure, axes = new_plot(4, width=4.2, height=3.8)
+    names = {
+        "closed_form": ("closed form", "C3"),
+        "ml": ("likelihood", "C0"),
+        "bound": ("Cramer-Rao bound", "0.4"),
+    }
+    for place, unit in zip(range(3), ("range [cm]", "bearing [deg]", "heading [deg]"), strict=True):
+        for name, (label, colour) in names.items():
+            style = "--" if name == "bound" else "-"
+            axes[place].plot(
+                CENTIMETRES, curves[name][:, place], style, color=colour, label=label, marker="."
+            )
+        axes[place].set(xlabel="distance [cm]", ylabel=f"rms error of {unit}", yscale="log")
+    axes[0].axhline(DIAMETER_CM, color="C2", linewidth=1.0, label="the paper's bound")
+    axes[0].legend()
+    for place, label in enumerate(("range", "bearing", "heading")):
+        axes[3].plot(CENTIMETRES, ratios[:, place], marker=".", label=label)
+    axes[3].axhline(1.0, color="0.4", linestyle="--")
+    axes[3].set(xlabel="distance [cm]", ylabel="likelihood's rms error / bound", ylim=(0.8, 1.3))
+    axes[3].legend()
+    print(f"plot: {save_plot(figure, 'droplet')}")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument(
+        "--poses", type=int, default=POSES, help="per range; of mismatch a twelfth per couple"
+    )
+    parser.add_argument("--live", type=int, default=LIVE, help="runs of the swarm over the whole graph")
+    parser.add_argument("--replays", type=int, default=REPLAYS, help="bags of the swarm")
+    options = parser.parse_args(arguments)
+    figures = accuracy(options.poses)
+    figures |= mismatch(options.poses // COUPLES)
+    figures |= times()
+    if options.live or options.replays:
+        figures |= droplet_swarm.measure(range(1, options.live + 1), range(1, options.replays + 1))
+    print(f"figures: {write_figures('droplet', figures)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,296 @@
+"""A swarm of 20 Droplets on a table, 2 of them seen by a tracker, all others located by infrared alone.
+
+    make bench-droplet_swarm
+    make bench-droplet_swarm ARGS="--live 2 --replays 8"
+
+Nobody's start is known, every element has a gain of its own (10 %), steps are longer or shorter than the
+robots believe (8 %), every other robot wanders. "live" is the whole graph: emulated firmware on
+pseudo-terminals, drivers, DDS, the estimator node. "replay" is the same swarm as a bag, matrices 150-300 ms
+late and one in twenty lost, through the estimator's core; "calibrated" is a replay with gains that were found
+without ground truth (`calibrate_ir`) in another minute of the same robots. Errors are those of poses from a
+time on when the swarm has found itself.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from matplotlib.axes import Axes
+from matplotlib.patches import Ellipse
+from numpy.typing import NDArray
+
+from bench.common import OUT, Cell, new_plot, save_plot, table, write_figures
+from swarm_loc_drivers.sim.recording.droplet_bag import write_droplet_bag
+from swarm_loc_drivers.sim.scenarios.droplet_run import (
+    FIXED,
+    TURN_S,
+    DropletRunSettings,
+    simulate_droplets,
+)
+from swarm_loc_drivers.sim.scenarios.droplet_table import DropletSwarmSettings, describe_droplets, starts
+from swarm_loc_estimator.calibration.infrared.gains import calibrate_infrared
+from swarm_loc_estimator.calibration.recording import read_recording
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.evaluation.metrics import pool, summarise
+from swarm_loc_estimator.evaluation.replay import replay
+from swarm_loc_estimator.evaluation.result import ReplayResult
+from swarm_loc_estimator.evaluation.truth import read_truth
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.launching.graph import NodeSpec, ParameterValue
+from swarm_loc_estimator.live.graph import START_PATIENCE_S, LiveGraph
+from swarm_loc_estimator.live.recorder import read_history, read_poses
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+ROBOTS = 20
+DURATION_S, SETTLED_S = 90.0, 45.0
+CALIBRATED, CALIBRATION_S = 3, 60.0
+"""So many of the bags are replayed once more, calibrated."""
+_ELSEWHERE = 1000
+WORLD = "d1"
+DRIVER_PROCESSES = 2
+_SILENCE_PATIENCE_S = 60.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Mean errors of one run.
+
+    Attributes:
+        name: Of the run.
+        position_cm: [cm].
+        heading_deg: [deg].
+        nees: Ideally 3.
+        worst_cm: Largest error of a position [cm].
+        located_s: When the last robot was located, from the start [s].
+        located: Share of poses that there are.
+    """
+
+    name: str
+    position_cm: float
+    heading_deg: float
+    nees: float
+    worst_cm: float
+    located_s: float
+    located: float
+
+
+def outcome_of(result: ReplayResult) -> Outcome:
+    """Mean errors from when the swarm should have settled."""
+    begin_ns = int(result.stamp_ns[0])
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(result.pose).all(axis=-1))
+    since_s = (result.stamp_ns - begin_ns) * 1e-9
+    first_s = [float(since_s[known[:, robot]].min(initial=np.inf)) for robot in range(known.shape[1])]
+    settled = result.stamp_ns >= begin_ns + SETTLED_S * 1e9
+    whole = summarise(pool(list(result.chosen(settled).errors.values())))
+    return Outcome(
+        result.title,
+        100.0 * whole.position_mean,
+        float(np.degrees(whole.heading_mean)),
+        whole.nees,
+        100.0 * whole.position_max,
+        max(first_s),
+        float(known[settled].mean()),
+    )
+
+
+def replayed(seed: int, folder: Path) -> ReplayResult:
+    """The swarm as a bag through the estimator's core."""
+    bag = _bag(folder / f"replay{seed}", seed, DURATION_S)
+    return replace(replay(bag, load_swarm(bag / "swarm.yaml")), title=f"replay {seed}")
+
+
+def replayed_calibrated(seed: int, folder: Path) -> ReplayResult:
+    """The same bag, its robots calibrated from another one."""
+    other = _bag(folder / f"calibration{seed}", seed, CALIBRATION_S, seed + _ELSEWHERE)
+    swarm = load_swarm(other / "swarm.yaml")
+    recording = read_recording(other, swarm)
+    done = calibrate_infrared(recording, swarm, lambda _share, _what: None, with_truth=False)
+    return replace(replay(folder / f"replay{seed}", done.swarm), title=f"replay {seed} calibrated")
+
+
+def _bag(folder: Path, boards: int, duration_s: float, seed: int | None = None) -> Path:
+    """A bag of robots with such boards, whose motion another seed may fix."""
+    motion = boards if seed is None else seed
+    settings = DropletRunSettings(motion, duration_s, ROBOTS, WORLD, boards=boards)
+    write_droplet_bag(simulate_droplets(settings), folder, "Of the benchmark.", motion)
+    return folder
+
+
+def lived(seed: int, folder: Path, log: Path) -> ReplayResult:
+    """The swarm in the whole graph."""
+    known_swarm = _write_swarms(seed, folder)
+    truth: dict[str, list[bytes]] = {robot.name: [] for robot in known_swarm.robots}
+    with LiveGraph(_nodes(seed, folder, known_swarm), log) as graph:
+        recorder = graph.recorder
+        for name, messages in truth.items():
+            keep = partial(list.append, messages)
+            recorder.create_subscription(PoseStamped, f"{name}/ground_truth", keep, 100, raw=True)
+        graph.wait_for(lambda: bool(recorder.raw), "publish poses", START_PATIENCE_S)
+        begin_ns = read_poses(recorder.raw[0]).stamp_ns
+        told = [0.0]
+
+        def is_over() -> bool:
+            """Whether enough time has passed; tell how far it is now and then."""
+            now_s = (read_poses(recorder.raw[-1]).stamp_ns - begin_ns) * 1e-9
+            if now_s > told[0] + 5.0:
+                told[0] = now_s
+                print(f"\rlive {seed}: {now_s:.0f} of {DURATION_S:.0f} s", end="", flush=True)
+            return now_s >= DURATION_S
+
+        graph.wait_for(is_over, "go on publishing poses", _SILENCE_PATIENCE_S)
+        print()
+        drops = dict(recorder.drops)
+    tracks = read_truth(known_swarm, truth)
+    return ReplayResult(f"live {seed}", known_swarm, *read_history(recorder.raw)[:3], tracks, drops)
+
+
+def _write_swarms(seed: int, folder: Path) -> Swarm:
+    """Write the swarm as the world knows it, and as the estimator does, which is returned: without starts."""
+    platform = load_ir_platform("droplet")
+    for known, name in ((True, "world.yaml"), (False, "swarm.yaml")):
+        settings = DropletSwarmSettings(seed, ROBOTS, start_known=known)
+        swarm = describe_droplets(settings, starts(settings), platform, (None,) * ROBOTS)
+        save_swarm(swarm, folder / name)
+    return swarm
+
+
+def _nodes(seed: int, folder: Path, swarm: Swarm) -> list[NodeSpec]:
+    """Estimator, world, drivers and steering."""
+    drivers = "swarm_loc_drivers"
+    time: dict[str, ParameterValue] = {"use_sim_time": True}
+    known: dict[str, ParameterValue] = {"swarm_file": str(folder / "swarm.yaml"), **time}
+    real: dict[str, ParameterValue] = {"swarm_file": str(folder / "world.yaml"), "seed": seed}
+    fixed = [swarm.robots[robot].name for robot in FIXED]
+    world: dict[str, ParameterValue] = {**real, "link_folder": str(folder), "world": WORLD, "fixed": fixed}
+    table: dict[str, ParameterValue] = {
+        **known,
+        "link_folder": str(folder),
+        "parts": DRIVER_PROCESSES,
+        "turn_s": TURN_S,
+    }
+    return [
+        NodeSpec("swarm_loc_estimator", "estimator_node", "estimator", parameters=known),
+        NodeSpec(drivers, "droplet_world_node", "droplet_world", parameters=world),
+        *(
+            NodeSpec(drivers, "droplet_fleet_node", f"table{part}", parameters={**table, "part": part})
+            for part in range(DRIVER_PROCESSES)
+        ),
+        NodeSpec(drivers, "droplet_steering_node", "steering", parameters={**real, **time}),
+    ]
+
+
+def measure(live: Sequence[int], replays: Sequence[int]) -> dict[str, float]:
+    """Run the swarm live and as bags, print a table, draw, and return the figures.
+
+    Args:
+        live: Seeds of the runs over the whole graph.
+        replays: Seeds of the bags.
+    """
+    results: list[ReplayResult] = []
+    with tempfile.TemporaryDirectory() as work:
+        for seed in live:
+            folder = Path(work) / f"live{seed}"
+            folder.mkdir()
+            results.append(lived(seed, folder, OUT / "droplet_swarm" / f"live{seed}.log"))
+        for seed in replays:
+            results.append(replayed(seed, Path(work)))
+            print(f"\rreplay {seed} of {len(replays)}", end="", flush=True)
+        for seed in replays[:CALIBRATED]:
+            results.append(replayed_calibrated(seed, Path(work)))
+            print(f"\rreplay {seed}, calibrated", end="", flush=True)
+    print()
+    outcomes = [outcome_of(result) for result in results]
+    report(outcomes)
+    print(f"plot: {draw(results[0])}")
+    plain = len(live) + len(replays)
+    return figures_of(outcomes[: len(live)], outcomes[len(live) : plain], outcomes[plain:])
+
+
+def report(outcomes: Sequence[Outcome]) -> None:
+    """Print the table."""
+    head = ["run", "position cm", "heading deg", "NEES", "worst cm", "all located s", "located"]
+    rows: list[list[Cell]] = [
+        [
+            one.name,
+            one.position_cm,
+            one.heading_deg,
+            one.nees,
+            one.worst_cm,
+            one.located_s,
+            one.located,
+        ]
+        for one in outcomes
+    ]
+    print(table(head, rows))
+
+
+def figures_of(
+    live: Sequence[Outcome], replays: Sequence[Outcome], calibrated: Sequence[Outcome]
+) -> dict[str, float]:
+    """Means over the runs; those of the whole graph where there are any."""
+    figures: dict[str, float] = {}
+    for prefix, ones in (
+        ("swarm20", live or replays),
+        ("swarm20.replay", replays),
+        ("swarm20.calibrated", calibrated),
+    ):
+        for name in ("position_cm", "heading_deg", "nees", "located"):
+            if ones:
+                figures[f"{prefix}.{name}"] = float(np.mean([getattr(one, name) for one in ones]))
+    return figures
+
+
+def draw(result: ReplayResult) -> Path:
+    """Where the robots ended and were believed to be, and errors over time."""
+    figure, (place, course) = new_plot(2, width=5.4, height=4.4)
+    for index, (name, track) in enumerate(result.truth.items()):
+        true, believed = track.pose[-1], result.pose[-1, index]
+        place.plot(*(100.0 * track.pose[:, :2].T), color="0.8", linewidth=1.0)
+        x, y = (100.0 * true[:2]).tolist()
+        place.add_patch(Ellipse((x, y), 4.4, 4.4, fill=False, color="0.5"))
+        place.annotate(name.removeprefix("droplet"), (x, y), fontsize=7, ha="center", va="center")
+        if np.isfinite(believed).all():
+            _draw_pose(place, believed, result.covariance[-1, index])
+        errors = result.errors[name]
+        since_s = (errors.stamp_ns - result.stamp_ns[0]) * 1e-9
+        course.plot(since_s, 100.0 * errors.position, color="C0", linewidth=0.8, alpha=0.6)
+    place.set(xlabel="x [cm]", ylabel="y [cm]", title="robots, believed poses, 3 sigma", aspect="equal")
+    course.set(xlabel="time [s]", ylabel="position error [cm]", yscale="log", title=result.title)
+    course.axvline(SETTLED_S, color="0.5", linewidth=1.0, linestyle=":")
+    return save_plot(figure, "droplet_swarm")
+
+
+def _draw_pose(axes: Axes, pose: FloatArray, covariance: FloatArray) -> None:
+    """A believed pose and its uncertainty."""
+    values, vectors = np.linalg.eigh(covariance[:2, :2])
+    width, height = 600.0 * np.sqrt(np.maximum(values, 0.0))
+    angle = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
+    x, y = (100.0 * pose[:2]).tolist()
+    axes.add_patch(Ellipse((x, y), width, height, angle=angle, color="C1", alpha=0.5))
+    dx, dy = 2.2 * np.cos(pose[2]), 2.2 * np.sin(pose[2])
+    axes.plot([x, x + dx], [y, y + dy], color="C3", linewidth=1.2)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--live", type=int, default=2, help="runs over the whole graph")
+    parser.add_argument("--replays", type=int, default=6, help="bags")
+    options = parser.parse_args(arguments)
+    figures = measure(range(1, options.live + 1), range(1, options.replays + 1))
+    print(f"figures: {write_figures('droplet_swarm', figures)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

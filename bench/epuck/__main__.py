@@ -1,0 +1,315 @@
+"""The e-puck paper's experiments on simulated worlds, many seeds each.
+
+    make bench-epuck
+    make bench-epuck ARGS="--worlds 24"
+
+W0 has the printed sigmas as white noise; a dense block of twenty shows what sightings between robots are
+worth to those who never see a landmark. W2 has hidden systematic errors that together look like the paper's
+experiment: unknown yaw and scale of every camera, a badly surveyed map, late stamps, turns that slip. There
+"paper" is the paper's own filter (closest stored state, printed sigmas, no gate), and "selfcal" estimates
+yaw, scale, slip and the map along with the poses. Errors are those of poses ten times a second as they come
+out, while sightings are still 150-300 ms late. "rendered" is W2 with five robots through everything there is:
+rendered pictures, the marker detector, emulated firmware, drivers, the whole graph over DDS, with "selfcal"
+live and beside it the same data through the paper's filter. At the end the marker detector sees the same
+pictures as others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.common import Cell, new_plot, save_plot, table, write_figures
+from bench.epuck.rendered_report import rendered_worlds
+from bench.epuck.rendered_report import report as report_rendered
+from bench.simulated_run import errors_of, mean_nees, run_core
+from bench.vision import report as vision_report
+from swarm_loc_drivers.sim.common.error_model import W0, W2, W2_FAST, ErrorModel
+from swarm_loc_drivers.sim.scenarios.dense import DenseSettings, blind_robots, simulate_dense
+from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.description.swarm import Robot, Swarm
+from swarm_loc_estimator.live.graph import LiveError
+
+if TYPE_CHECKING:
+    from swarm_loc_drivers.sim.common.record import SimulatedRun
+
+SLOW, FAST = 0.06, 0.08
+W0_SEEDS, DENSE_SEEDS, WORLDS, FAST_WORLDS = 6, 3, 24, 8
+VISION_SEEDS, VISION_FRAMES = 3, 10
+RENDERED_SEEDS, RENDERED_S = 3, 60.0
+TICK_NS = 100_000_000
+SETTLING_S = 10.0
+LAPS_S = 108.0
+PAPER_STATE_PERIOD_S = 1.0 / 7.5
+_PROCESSES = 2
+
+_ASIDE_M, _ASIDE = 0.3, 0.5
+"""How far from the optical axis markers are [m], [rad] in the worse half of a picture.
+
+A focal length that is not known stretches distances, which is estimated, but also moves what is aside.
+"""
+
+PAPER = {
+    "w2.paper.robots1": (2.90, 1.86),
+    "w2.paper.robots5": (2.02, 1.56),
+}
+"""Mean errors [cm], [deg] that the paper reports for its robots, one and five (section VI)."""
+
+Prepare = Callable[[Swarm], Swarm]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row of the report.
+
+    Attributes:
+        name: Of its figures.
+        robots: How many drive the eight; 0: the dense block.
+        seeds: Of the worlds.
+        world: Hidden imperfections.
+        speed: [m/s].
+        filter: How the swarm is described and what the estimator does, of `FILTERS`.
+        relative: Whether sightings between robots are used.
+    """
+
+    name: str
+    robots: int
+    seeds: int
+    world: ErrorModel
+    speed: float = SLOW
+    filter: str = "white"
+    relative: bool = True
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Mean errors of one world: position [cm], heading [deg], and NEES."""
+
+    position_cm: float
+    heading_deg: float
+    nees: float
+
+
+def as_described(swarm: Swarm) -> Swarm:
+    """The swarm as the world describes it."""
+    return swarm
+
+
+def papers_own(swarm: Swarm) -> Swarm:
+    """The paper's settings: printed sigmas, k_s = 2e-4 m for each wheel (errata, reading A), no gate."""
+    robots = (
+        replace(
+            robot,
+            odometry=replace(robot.odometry, wheel_noise=2e-4),
+            sensor=replace(robot.sensor, gate_probability=1.0),
+        )
+        for robot in swarm.robots
+    )
+    return replace(swarm, robots=tuple(robots))
+
+
+def self_calibrating(swarm: Swarm) -> Swarm:
+    """What a careful user knows of such robots and maps: sizes of the systematic errors, not their values."""
+    landmarks = (replace(mark, position_sigma=0.02, yaw_sigma=0.03) for mark in swarm.landmarks)
+    return Swarm(tuple(_self_calibrating(robot) for robot in swarm.robots), tuple(landmarks))
+
+
+def _self_calibrating(robot: Robot) -> Robot:
+    camera, spread_s = robot.camera, W2.exposure_early_s
+    return replace(
+        robot,
+        faces=tuple(replace(face, position_sigma=W2.face_position_sigma) for face in robot.faces),
+        odometry=replace(robot.odometry, turn_scale_sigma=0.1, distance_scale_sigma=0.01),
+        camera=camera and replace(camera, yaw_sigma=0.03),
+        sensor=replace(
+            robot.sensor,
+            forward_sigma=0.01,
+            left_sigma=0.01,
+            heading_sigma=0.12,
+            distance_scale_sigma=0.03,
+            residual_position_sigma=W2.scale_sigma * _ASIDE_M,
+            residual_heading_sigma=W2.scale_sigma * _ASIDE,
+            time_offset_s=-0.5 * spread_s,
+            time_sigma_s=spread_s / math.sqrt(12.0),
+        ),
+    )
+
+
+FILTERS: dict[str, tuple[Prepare, EstimatorSettings]] = {
+    "white": (as_described, EstimatorSettings()),
+    "paper": (papers_own, EstimatorSettings(state_period_s=PAPER_STATE_PERIOD_S, max_doubt=1e9)),
+    "selfcal": (self_calibrating, EstimatorSettings()),
+}
+
+
+def cases(worlds: int) -> list[Case]:
+    """All rows, the long ones first."""
+    rows = [
+        Case(f"{name}.{kind}.robots{robots}", robots, count, world, speed, kind)
+        for name, world, speed, count in (
+            ("w2", W2, SLOW, worlds),
+            ("w2fast", W2_FAST, FAST, min(worlds, FAST_WORLDS)),
+        )
+        for robots in (5, 1)
+        for kind in ("paper", "selfcal")
+    ]
+    rows += [
+        Case(f"w0.blind20.{kind}", 0, min(worlds, DENSE_SEEDS), W0, relative=kind == "relative")
+        for kind in ("relative", "absolute")
+    ]
+    return rows + [Case(f"w0.robots{robots}", robots, min(worlds, W0_SEEDS), W0) for robots in (5, 1)]
+
+
+def simulate(case: Case, seed: int) -> SimulatedRun:
+    """The case's world."""
+    if case.robots == 0:
+        run = simulate_dense(DenseSettings(seed=seed, errors=case.world))
+    else:
+        run = simulate_eight(
+            EightSettings(
+                seed=seed, duration_s=LAPS_S, robots=case.robots, speed=case.speed, errors=case.world
+            )
+        )
+    prepare = FILTERS[case.filter][0]
+    run = replace(run, swarm=prepare(run.swarm))
+    if case.relative:
+        return run
+    return run.masked(np.isin(run.sightings["marker_id"], [mark.id for mark in run.swarm.landmarks]))
+
+
+def outcome(task: tuple[Case, int]) -> tuple[str, Outcome]:
+    """Run a case in one world."""
+    case, seed = task
+    run = simulate(case, seed)
+    stamp_ns = np.arange(run.start_ns + TICK_NS, run.end_ns + 1, TICK_NS)
+    result = run_core(run, stamp_ns, FILTERS[case.filter][1], TICK_NS)
+    settled = stamp_ns >= run.start_ns + SETTLING_S * 1e9
+    robots = np.arange(len(run.swarm.robots)) if case.robots else blind_robots()
+    errors = errors_of(result.poses, run, stamp_ns)[settled][:, robots]
+    covariances = result.covariances[settled][:, robots]
+    located = ~np.isnan(errors[..., 0])
+    errors, covariances = errors[located], covariances[located]
+    return case.name, Outcome(
+        100.0 * float(np.mean(np.hypot(errors[:, 0], errors[:, 1]))),
+        float(np.degrees(np.mean(np.abs(errors[:, 2])))),
+        mean_nees(errors, covariances),
+    )
+
+
+def measure(rows: Sequence[Case]) -> dict[str, list[Outcome]]:
+    """Run all cases in all their worlds, telling how far it is."""
+    tasks = [(case, seed) for case in rows for seed in range(1, case.seeds + 1)]
+    results: dict[str, list[Outcome]] = {case.name: [] for case in rows}
+    with ProcessPoolExecutor(_PROCESSES, get_context("spawn")) as pool:
+        for done, (name, one) in enumerate(pool.map(outcome, tasks), start=1):
+            results[name].append(one)
+            print(f"\r{done} of {len(tasks)} runs, {name:24}", end="", flush=True)
+    print()
+    return results
+
+
+def report(results: dict[str, list[Outcome]]) -> dict[str, float]:
+    """Print the table, draw the plot, and return the figures."""
+    rows: list[list[Cell]] = []
+    figures: dict[str, float] = {}
+    for name, ones in results.items():
+        position = np.array([one.position_cm for one in ones])
+        values = {
+            "position_cm": float(position.mean()),
+            "heading_deg": float(np.mean([one.heading_deg for one in ones])),
+            "nees": float(np.mean([one.nees for one in ones])),
+        }
+        figures |= {f"{name}.{key}": value for key, value in values.items()}
+        low, high = np.percentile(position, [10, 90])
+        paper_cm, paper_deg = PAPER.get(name, (None, None))
+        rows.append(
+            [
+                name,
+                len(ones),
+                values["position_cm"],
+                f"{low:.2f}-{high:.2f}",
+                paper_cm,
+                values["heading_deg"],
+                paper_deg,
+                values["nees"],
+            ]
+        )
+    head = ["case", "worlds", "position cm", "10-90 %", "paper cm", "heading deg", "paper deg", "NEES"]
+    print(table(head, rows))
+    draw(results)
+    return figures
+
+
+def draw(results: dict[str, list[Outcome]]) -> None:
+    """Every world's errors, case by case."""
+    figure, (position, heading) = new_plot(2, width=6.4, height=4.4)
+    names = list(results)
+    rng = np.random.default_rng(0)
+    for axes, values, unit in (
+        (position, [[one.position_cm for one in results[name]] for name in names], "position error [cm]"),
+        (heading, [[one.heading_deg for one in results[name]] for name in names], "heading error [deg]"),
+    ):
+        for k, ones in enumerate(values):
+            axes.plot(ones, k + rng.uniform(-0.15, 0.15, len(ones)), ".", color="C0", alpha=0.6)
+            axes.plot(np.mean(ones), k, "D", color="C1")
+        axes.set(xlabel=f"mean {unit}, one dot per world, diamond: all", xlim=(0.0, None))
+        axes.set_yticks(range(len(names)), names if axes is position else [""] * len(names))
+        axes.invert_yaxis()
+    for k, name in enumerate(names):
+        for axes, value in zip((position, heading), PAPER.get(name, ()), strict=False):
+            axes.plot(value, k, "|", color="C3", markersize=18, markeredgewidth=2)
+    position.plot([], [], "|", color="C3", markersize=12, label="the paper's robots")
+    position.legend()
+    print(f"plot: {save_plot(figure, 'epuck')}")
+
+
+def measure_rendered(count: int) -> dict[str, float]:
+    """The figures of so many worlds through the whole graph.
+
+    Raises:
+        LiveError: A node has ended, or nothing goes on.
+    """
+    if not count:
+        return {}
+    paper, settings = FILTERS["paper"]
+    worlds = rendered_worlds(range(1, count + 1), RENDERED_S, self_calibrating, paper, settings)
+    return report_rendered(worlds, SETTLING_S)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument(
+        "--worlds", type=int, default=WORLDS, help="how many of W2, and at most of the others"
+    )
+    parser.add_argument(
+        "--rendered", type=int, default=RENDERED_SEEDS, help="how many worlds through the whole graph"
+    )
+    options = parser.parse_args(arguments)
+    try:
+        figures = measure_rendered(options.rendered)
+    except LiveError as error:
+        print(f"\n{error}", file=sys.stderr)
+        return 1
+    rows = cases(options.worlds)
+    outcome((replace(rows[-1], robots=2), 1))  # compiles what is not compiled yet
+    figures |= report(measure(rows))
+    print("markers in pictures ...", flush=True)
+    seen = vision_report.measure(range(VISION_SEEDS), VISION_FRAMES)
+    print(f"{seen.tables()}\nplot: {vision_report.plot(seen.scores)}")
+    figures |= seen.figures()
+    print(f"figures: {write_figures('epuck', figures)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,83 @@
+"""Whether poses told as tracked are so, whatever fails: faults in five simulated e-pucks on the eight.
+
+Each scenario puts one fault into a run of a minute; see `scenarios.py`. A robot-second is misleading when the
+robot is told as tracked with an error beyond 5 sigma and 2 cm. In `kidnapped` no data can tell of the fault
+before the robot has seen something, and that has arrived; this time is left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from bench.common import Cell, new_plot, save_plot, table, write_figures
+from bench.integrity.scenarios import SCENARIOS
+from bench.integrity.scoring import Score, score
+
+_PLOTS_PER_FILE = 5
+_COLUMNS = ("scenario", "misleading", "worst seed", "tracked", "RMSE [cm]", "NEES", "recovery [s]")
+
+
+def main() -> None:
+    """Print the table, write the figures, draw the errors."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=5, help="runs of each scenario")
+    parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=list(SCENARIOS))
+    arguments = parser.parse_args()
+    scores = {name: _runs(name, arguments.seeds) for name in arguments.scenarios}
+    print(table(_COLUMNS, [_row(name, runs) for name, runs in scores.items()]))
+    figures = {key: value for name, runs in scores.items() for key, value in _figures(name, runs).items()}
+    print(write_figures("integrity", figures))
+    print(*_plots(scores), sep="\n")
+
+
+def _runs(name: str, seeds: int) -> list[Score]:
+    runs = []
+    for seed in range(1, seeds + 1):
+        runs.append(score(SCENARIOS[name](seed)))
+        print(f"{name} seed {seed}: misleading {runs[-1].misleading_share:.4f}", flush=True)
+    return runs
+
+
+def _figures(name: str, runs: Sequence[Score]) -> dict[str, float]:
+    """Means over the seeds; recovery is that of the worst."""
+    figures = {
+        f"{name}.misleading_share": float(np.mean([one.misleading_share for one in runs])),
+        f"{name}.tracked_share": float(np.mean([one.tracked_share for one in runs])),
+        f"{name}.position_cm": 100.0 * float(np.sqrt(np.mean([one.position_m**2 for one in runs]))),
+        f"{name}.nees": float(np.mean([one.nees for one in runs])),
+    }
+    recovery_s = max(one.recovery_s for one in runs)
+    return figures if math.isnan(recovery_s) else {**figures, f"{name}.recovery_s": recovery_s}
+
+
+def _row(name: str, runs: Sequence[Score]) -> list[Cell]:
+    figures, worst = _figures(name, runs), max(one.misleading_share for one in runs)
+    share, tracked, position, nees = (
+        figures[f"{name}.{key}"] for key in ("misleading_share", "tracked_share", "position_cm", "nees")
+    )
+    return [name, share, worst, f"{tracked:.4f}", position, nees, figures.get(f"{name}.recovery_s")]
+
+
+def _plots(scores: Mapping[str, Sequence[Score]]) -> list[Path]:
+    """Errors of all robots over time, a plot per scenario, misleading ones marked."""
+    names, files = list(scores), []
+    for first in range(0, len(names), _PLOTS_PER_FILE):
+        some = names[first : first + _PLOTS_PER_FILE]
+        figure, axes = new_plot(len(some), width=3.4)
+        for axis, name in zip(axes, some, strict=True):
+            for one in scores[name]:
+                axis.semilogy(one.time_s, 100.0 * one.error_m, color="0.6", linewidth=0.5)
+                ticks, robots = np.nonzero(one.misleading)
+                axis.semilogy(one.time_s[ticks], 100.0 * one.error_m[ticks, robots], "r.", markersize=3)
+            axis.set(title=name, xlabel="time [s]", ylabel="error [cm]", ylim=(0.01, 300.0))
+        files.append(save_plot(figure, f"integrity-{first // _PLOTS_PER_FILE + 1}"))
+    return files
+
+
+if __name__ == "__main__":
+    main()

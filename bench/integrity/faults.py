@@ -1,0 +1,215 @@
+"""Faults put into simulated runs: odometry that lies, false sightings, geometry that is not as described."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from swarm_loc_drivers.sim.common.markers import observe_markers
+from swarm_loc_drivers.sim.common.record import (
+    FRAME_DTYPE,
+    ODOMETRY_DTYPE,
+    SIGHTING_DTYPE,
+    Records,
+    SimulatedRun,
+)
+from swarm_loc_drivers.sim.common.trajectories import Trajectories
+from swarm_loc_drivers.sim.scenarios.eight import VIEW, EightSettings, camera_exposures, drive_eight
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
+
+SwarmChange = Callable[[Swarm], Swarm]
+TruthChange = Callable[[Trajectories], Trajectories]
+SightingSource = Callable[[IntArray, Trajectories], FloatArray]
+"""Values (k, 3) of false sightings at stamps (k,)."""
+
+_LATENESS_NS = 50_000_000
+
+
+def simulate(
+    settings: EightSettings,
+    as_it_is: SwarmChange | None = None,
+    moved: TruthChange | None = None,
+) -> SimulatedRun:
+    """The eight, where the world may differ from its description.
+
+    Args:
+        settings: Of the run.
+        as_it_is: Makes the swarm that the cameras see of the one that is described.
+        moved: Changes where robots are without their odometry noticing.
+    """
+    rng = np.random.default_rng(settings.seed)
+    swarm, truth, odometry = drive_eight(rng, settings)
+    if moved:
+        truth = moved(truth)
+    exposures = camera_exposures(rng, settings.robots, truth)
+    seen = as_it_is(swarm) if as_it_is else swarm
+    frames, sightings = observe_markers(rng, seen, truth, exposures, VIEW, settings.errors)
+    return SimulatedRun(swarm, truth, odometry, frames, sightings)
+
+
+def seconds(run: SimulatedRun, stamp_ns: IntArray) -> FloatArray:
+    """Time since the run began (k,) [s]."""
+    since: FloatArray = (stamp_ns - run.start_ns).astype(np.float64) * 1e-9
+    return since
+
+
+def rescaled_odometry(run: SimulatedRun, robot: int, scale: float) -> SimulatedRun:
+    """Odometry of a robot whose wheels are larger or smaller than described."""
+    odometry = run.odometry.copy()
+    rows = np.flatnonzero(odometry["robot"] == robot)
+    rows = rows[np.argsort(odometry["stamp_ns"][rows], kind="stable")]
+    pose = odometry["pose"][rows]
+    steps = se2.exp(scale * se2.log(se2.between(pose[:-1], pose[1:])))
+    for row, step, before in zip(rows[1:], steps, rows, strict=False):
+        odometry["pose"][row] = se2.compose(odometry["pose"][before], step)
+    return replace(run, odometry=odometry)
+
+
+def restarted_driver(run: SimulatedRun, robot: int, begin_s: float, end_s: float) -> SimulatedRun:
+    """Neither odometry nor images of a robot for a while, and odometry from zero behind it."""
+    time_s, mine = seconds(run, run.odometry["stamp_ns"]), run.odometry["robot"] == robot
+    kept = ~(mine & (time_s >= begin_s) & (time_s < end_s))
+    odometry = run.odometry[kept].copy()
+    after = np.flatnonzero((mine & (time_s >= end_s))[kept])
+    first = odometry["pose"][after[np.argmin(odometry["stamp_ns"][after])]].copy()
+    odometry["pose"][after] = se2.between(first, odometry["pose"][after])
+    frame_s = seconds(run, run.frames["stamp_ns"])
+    dark = (run.frames["robot"] == robot) & (frame_s >= begin_s) & (frame_s < end_s)
+    return replace(run, odometry=odometry).masked(~np.repeat(dark, run.frames["count"]))
+
+
+def second_odometry(run: SimulatedRun, robot: int, begin_s: float, rate_hz: float) -> SimulatedRun:
+    """A second publisher on a robot's odometry, which says that it stands somewhere else."""
+    stamps_ns = _stamps(run, begin_s, run.duration_s - 1.0, rate_hz)
+    rows = np.zeros(stamps_ns.size, ODOMETRY_DTYPE)
+    rows["robot"], rows["stamp_ns"], rows["arrival_ns"] = robot, stamps_ns, stamps_ns + _LATENESS_NS
+    rows["pose"] = (0.4, -0.3, 1.0)
+    both = np.concatenate([run.odometry, rows])
+    return replace(run, odometry=both[np.argsort(both["arrival_ns"], kind="stable")])
+
+
+def false_sightings(
+    run: SimulatedRun, sight: tuple[int, int], span_s: tuple[float, float], source: SightingSource
+) -> SimulatedRun:
+    """More sightings at 30 Hz, of what is not there.
+
+    Args:
+        run: What else is seen.
+        sight: Who sees (index), and the id of which marker.
+        span_s: From when to when.
+        source: What is seen.
+    """
+    stamps_ns = _stamps(run, *span_s, 30.0)
+    found = np.zeros(stamps_ns.size, SIGHTING_DTYPE)
+    found["marker_id"], found["value"] = sight[1], source(stamps_ns, run.truth)
+    frames = np.zeros(stamps_ns.size, FRAME_DTYPE)
+    frames["robot"], frames["stamp_ns"], frames["arrival_ns"] = sight[0], stamps_ns, stamps_ns + _LATENESS_NS
+    frames["first"], frames["count"] = np.arange(stamps_ns.size), 1
+    return merged_frames(run, (run.frames, run.sightings), (frames, found))
+
+
+def changed_cameras(before: SimulatedRun, after: SimulatedRun, robot: int, at_s: float) -> SimulatedRun:
+    """What a run shows, but from an instant on with a robot's images of another run."""
+    old = ~(_from(before, robot, at_s))
+    new = _from(after, robot, at_s)
+    return merged_frames(before, *(_some_frames(run, rows) for run, rows in ((before, old), (after, new))))
+
+
+def merged_frames(run: SimulatedRun, *parts: tuple[Records, Records]) -> SimulatedRun:
+    """A run with the frames and sightings of some parts in order of arrival."""
+    frames = np.concatenate([part[0] for part in parts])
+    offsets = np.cumsum([0, *(len(part[1]) for part in parts[:-1])])
+    first = np.concatenate([part[0]["first"] + offset for part, offset in zip(parts, offsets, strict=True)])
+    order = np.argsort(frames["arrival_ns"], kind="stable")
+    frames, first = frames[order], first[order]
+    rows = np.concatenate(
+        [begin + np.arange(count) for begin, count in zip(first, frames["count"], strict=True)]
+    )
+    frames["first"] = np.cumsum(frames["count"]) - frames["count"]
+    sightings = np.concatenate([part[1] for part in parts])[rows.astype(np.int64)]
+    return replace(run, frames=frames, sightings=sightings)
+
+
+def busiest_landmark(run: SimulatedRun) -> int:
+    """The id of the landmark that is seen most often."""
+    landmarks = {mark.id for mark in run.swarm.landmarks}
+    ids, counts = np.unique(run.sightings["marker_id"], return_counts=True)
+    seen: dict[int, int] = dict(zip(ids.tolist(), counts.tolist(), strict=True))
+    return max(landmarks, key=lambda marker_id: seen.get(marker_id, 0))
+
+
+def moved_landmark(swarm: Swarm, marker_id: int, step: Sequence[float]) -> Swarm:
+    """A swarm one of whose landmarks is elsewhere by `step` (2,) [m]."""
+    return Swarm(
+        swarm.robots,
+        tuple(
+            replace(mark, x=mark.x + step[0], y=mark.y + step[1]) if mark.id == marker_id else mark
+            for mark in swarm.landmarks
+        ),
+    )
+
+
+def turned_camera(swarm: Swarm, robot: int, yaw: float) -> Swarm:
+    """A swarm in which a robot's camera is turned to the left [rad]."""
+    robots = list(swarm.robots)
+    camera = robots[robot].camera
+    robots[robot] = replace(robots[robot], camera=camera and replace(camera, yaw=camera.yaw + yaw))
+    return Swarm(tuple(robots), swarm.landmarks)
+
+
+def kidnapped(robot: int, at_s: float) -> TruthChange:
+    """A robot is taken to the opposite place of the eight, and drives on there as if nothing had happened."""
+
+    def change(truth: Trajectories) -> Trajectories:
+        poses = truth.poses.copy()
+        since = truth.stamp_ns - truth.stamp_ns[0] >= at_s * 1e9
+        poses[since, robot] = se2.compose(np.array([0.0, 0.0, math.pi]), poses[since, robot])
+        return replace(truth, poses=poses)
+
+    return change
+
+
+def next_sighting_s(run: SimulatedRun, robot: int, at_s: float) -> float:
+    """When the first image of a robot from an instant on that shows a marker has arrived [s]."""
+    frames = run.frames[_from(run, robot, at_s) & (run.frames["count"] > 0)]
+    return float(seconds(run, frames["arrival_ns"]).min(initial=run.duration_s))
+
+
+def wrong_starts(run: SimulatedRun, rng: np.random.Generator) -> SimulatedRun:
+    """All robots but the last stand elsewhere than their description says."""
+    robots = [
+        replace(robot, start=_elsewhere(rng, robot.start)) if k + 1 < len(run.swarm.robots) else robot
+        for k, robot in enumerate(run.swarm.robots)
+    ]
+    return replace(run, swarm=Swarm(tuple(robots), run.swarm.landmarks))
+
+
+def _elsewhere(
+    rng: np.random.Generator, start: tuple[float, float, float] | None
+) -> tuple[float, float, float]:
+    x, y, theta = start or (0.0, 0.0, 0.0)
+    dx, dy, turn = rng.uniform([-0.8, -0.5, -3.0], [0.8, 0.5, 3.0]).tolist()
+    return x + dx, y + dy, float(se2.wrap_angle(theta + turn))
+
+
+def _from(run: SimulatedRun, robot: int, at_s: float) -> BoolArray:
+    mine: BoolArray = (run.frames["robot"] == robot) & (seconds(run, run.frames["stamp_ns"]) >= at_s)
+    return mine
+
+
+def _some_frames(run: SimulatedRun, kept: BoolArray) -> tuple[Records, Records]:
+    """Some of the frames (F,), with their sightings."""
+    frames = run.frames[kept].copy()
+    sightings = run.sightings[np.repeat(kept, run.frames["count"])]
+    frames["first"] = np.cumsum(frames["count"]) - frames["count"]
+    return frames, sightings
+
+
+def _stamps(run: SimulatedRun, begin_s: float, end_s: float, rate_hz: float) -> IntArray:
+    stamps: IntArray = run.start_ns + (np.arange(begin_s, end_s, 1.0 / rate_hz) * 1e9).astype(np.int64)
+    return stamps

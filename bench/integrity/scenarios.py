@@ -1,0 +1,165 @@
+"""The scenarios: each a fault in five e-pucks on the eight, sixty seconds, seeded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bench.integrity import faults
+from swarm_loc_drivers.sim.common.error_model import W0, W2, ErrorModel
+from swarm_loc_drivers.sim.common.record import SimulatedRun
+from swarm_loc_drivers.sim.common.trajectories import Trajectories
+from swarm_loc_drivers.sim.scenarios.eight import EightSettings
+from swarm_loc_estimator.core.description.swarm import SensorModel
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+
+DURATION_S = 60.0
+FAULT_S = (15.0, 45.0)
+_FACE = 20
+"""A marker of the second robot."""
+
+DETECTOR = SensorModel(forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.06)
+"""What the marker detector says of its own noise."""
+CLEAN = replace(W0, forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.06, described=DETECTOR)
+SYSTEMATIC = replace(W2, forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.06, described=DETECTOR)
+"""The systematic errors of w2, described as if there were none."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A run with something wrong in it.
+
+    Attributes:
+        run: The run.
+        ends_s: When it is over, and the estimate should come right again; None: it lasts.
+        about: Whose it is, where it is not obvious.
+        hidden_s: From when to when nothing that has arrived can tell of it.
+    """
+
+    run: SimulatedRun
+    ends_s: float | None = None
+    hidden_s: tuple[float, float] | None = None
+    about: str = ""
+
+
+def settings_of(seed: int, errors: ErrorModel) -> EightSettings:
+    """Five robots for a minute."""
+    return EightSettings(seed=seed, duration_s=DURATION_S, errors=errors)
+
+
+def _clean_w0(seed: int) -> Fault:
+    return Fault(faults.simulate(settings_of(seed, W0)))
+
+
+def _clean(seed: int) -> Fault:
+    return Fault(faults.simulate(settings_of(seed, CLEAN)))
+
+
+def _w2_on_w0_file(seed: int) -> Fault:
+    return Fault(faults.simulate(settings_of(seed, SYSTEMATIC)))
+
+
+def _hidden_in_noise(seed: int) -> Fault:
+    return Fault(faults.simulate(settings_of(seed, W2)))
+
+
+def _driver_restart(seed: int) -> Fault:
+    begin_s = 17.3 + 2.7 * seed % 20.0
+    end_s = begin_s + (1.2, 1.6, 2.0, 3.0, 6.0)[seed % 5]
+    return Fault(faults.restarted_driver(_clean(seed).run, 0, begin_s, end_s), end_s)
+
+
+def _estimator_restart_moved(seed: int) -> Fault:
+    return Fault(faults.wrong_starts(_clean(seed).run, np.random.default_rng([seed, 1])), 0.0)
+
+
+def _kidnapped(seed: int) -> Fault:
+    at_s = 20.0 + 3.1 * seed % 15.0
+    run = faults.simulate(settings_of(seed, CLEAN), moved=faults.kidnapped(0, at_s))
+    seen_s = faults.next_sighting_s(run, 0, at_s)
+    return Fault(run, seen_s, (at_s, seen_s))
+
+
+def _false_sightings(seed: int) -> Fault:
+    value = np.random.default_rng([seed, 2]).uniform([0.2, -0.15, -3.0], [0.5, 0.15, 3.0])
+    run = faults.false_sightings(
+        _clean(seed).run, (0, _FACE), FAULT_S, lambda stamps, _: np.tile(value, (stamps.size, 1))
+    )
+    return Fault(run, FAULT_S[1])
+
+
+def _moved_landmark(seed: int) -> Fault:
+    angle = np.random.default_rng([seed, 3]).uniform(0.0, 2.0 * math.pi)
+    which, step = faults.busiest_landmark(_clean(seed).run), (0.2 * math.cos(angle), 0.2 * math.sin(angle))
+    moved = faults.simulate(settings_of(seed, CLEAN), lambda swarm: faults.moved_landmark(swarm, which, step))
+    return Fault(moved, about=f"landmark {which}")
+
+
+def _wrong_scale(seed: int) -> Fault:
+    return Fault(faults.rescaled_odometry(_clean(seed).run, 0, 1.1))
+
+
+def _turned_camera(seed: int) -> Fault:
+    settings = settings_of(seed, CLEAN)
+    turned = faults.simulate(settings, lambda swarm: faults.turned_camera(swarm, 0, math.radians(10.0)))
+    return Fault(faults.changed_cameras(faults.simulate(settings), turned, 0, FAULT_S[0]))
+
+
+def _two_odometry_sources(seed: int) -> Fault:
+    return Fault(faults.second_odometry(_clean(seed).run, 0, FAULT_S[0], 20.0))
+
+
+def _odometry_flood(seed: int) -> Fault:
+    return Fault(faults.second_odometry(_clean(seed).run, 0, FAULT_S[0], 1000.0))
+
+
+def _creeping_spoof(seed: int, observers: int = 1) -> Fault:
+    rng, run = np.random.default_rng([seed, 4]), _clean(seed).run
+    for k, (observer, target) in enumerate(((0, 1), (2, 3))[:observers]):
+        sight = (observer, _FACE + 10 * (target - 1))
+        source = _creeping(run, rng, observer, target)
+        run = faults.false_sightings(run, sight, (FAULT_S[0] + k, FAULT_S[1]), source)
+    return Fault(run, FAULT_S[1])
+
+
+def _creeping(
+    run: SimulatedRun, rng: np.random.Generator, observer: int, target: int
+) -> faults.SightingSource:
+    """Sightings that are true at first and then walk away at 2 cm/s."""
+    camera, face = run.swarm.robots[observer].camera, run.swarm.robots[target].faces[0]
+    assert camera is not None  # noqa: S101
+    angle = rng.uniform(0.0, 2.0 * math.pi)
+
+    def source(stamps_ns: IntArray, truth: Trajectories) -> FloatArray:
+        poses = truth.all_at(stamps_ns)
+        sensor = se2.compose(poses[:, observer], np.array([camera.x, camera.y, camera.yaw]))
+        marker = se2.compose(poses[:, target], np.array([face.x, face.y, face.yaw]))
+        way = 0.02 * (faults.seconds(run, stamps_ns) - FAULT_S[0])
+        marker[:, 0] += way * math.cos(angle)
+        marker[:, 1] += way * math.sin(angle)
+        noise = rng.standard_normal(marker.shape) * [0.005, 0.002, 0.06]
+        return se2.between(sensor, marker) + noise
+
+    return source
+
+
+SCENARIOS: Mapping[str, Callable[[int], Fault]] = {
+    "clean_w0": _clean_w0,
+    "w2_on_w0_file": _w2_on_w0_file,
+    "driver_restart": _driver_restart,
+    "estimator_restart_moved": _estimator_restart_moved,
+    "kidnapped": _kidnapped,
+    "false_sightings": _false_sightings,
+    "moved_landmark": _moved_landmark,
+    "wrong_scale": _wrong_scale,
+    "turned_camera": _turned_camera,
+    "two_odometry_sources": _two_odometry_sources,
+    "odometry_flood": _odometry_flood,
+    "creeping_spoof": _creeping_spoof,
+    "creeping_spoof_two": lambda seed: _creeping_spoof(seed, 2),
+    "hidden_in_noise": _hidden_in_noise,
+}

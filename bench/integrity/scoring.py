@@ -1,0 +1,101 @@
+"""How honest an estimate is: what is told as tracked and is not so, and how soon a fault is over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bench.integrity.faults import seconds
+from bench.integrity.scenarios import Fault
+from bench.simulated_run import errors_of, inputs_between
+from swarm_loc_estimator.core.estimation.contradictions import Kind
+from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimator
+from swarm_loc_estimator.evaluation.metrics import nees
+from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray
+
+TICK_NS = 100_000_000
+_MISLEADING_SIGMAS = 5.0
+_MISLEADING_M = 0.02
+_RIGHT_M = 0.05
+_SETTLED_S = 1.0
+_STEADY_TICKS = 30
+
+
+@dataclass(frozen=True)
+class Score:
+    """One run of a scenario.
+
+    Attributes:
+        misleading_share: Of robot-seconds told as tracked with an error beyond 5 sigma and 2 cm.
+        tracked_share: Of robot-seconds after the first second.
+        position_m: RMSE while tracked, after the first second.
+        nees: Mean normalised error squared of the same, 3 is ideal.
+        recovery_s: From the fault's end until each robot is right and tracked for 3 s; NaN: it has no end.
+        time_s: (T,) of the ticks.
+        error_m: (T, N) distance from the truth; NaN where not located.
+        misleading: (T, N) whether misleading.
+        told: What was said to be contradicted, by name and kind.
+    """
+
+    misleading_share: float
+    tracked_share: float
+    position_m: float
+    nees: float
+    recovery_s: float
+    time_s: FloatArray
+    error_m: FloatArray
+    misleading: BoolArray
+    told: frozenset[tuple[str, Kind]] = frozenset()
+
+
+def score(fault: Fault) -> Score:
+    """Run the core over a fault, ticking ten times a second."""
+    run = fault.run
+    tick_ns = np.arange(run.start_ns + TICK_NS, run.end_ns + 1, TICK_NS)
+    estimator, estimates = SwarmEstimator(run.swarm), []
+    told: set[tuple[str, Kind]] = set()
+    for now_ns, inputs in zip(tick_ns.tolist(), inputs_between(run, tick_ns), strict=True):
+        estimator.receive(inputs)
+        estimates.append(estimator.tick(now_ns))
+        told |= {(one.about, one.kind) for one in estimator.contradictions(now_ns)}
+    error = errors_of(np.array([one.poses for one in estimates]), run, tick_ns)
+    covariance = np.array([one.covariances for one in estimates])
+    tracked = np.array([one.status for one in estimates]) == Status.TRACKED
+    found = scored(seconds(run, tick_ns), error, covariance, tracked, fault)
+    return replace(found, told=frozenset(told))
+
+
+def scored(
+    time_s: FloatArray, error: FloatArray, covariance: FloatArray, tracked: BoolArray, fault: Fault
+) -> Score:
+    """Score estimates minus truth (T, N, 3), their covariances (T, N, 3, 3), and who is tracked (T, N)."""
+    distance: FloatArray = np.hypot(error[..., 0], error[..., 1])
+    squared = np.full(distance.shape, np.nan)
+    located = np.isfinite(distance)
+    position, spread = error[located][:, :2], covariance[located][:, :2, :2]
+    squared[located] = np.einsum("ki,kij,kj->k", position, np.linalg.inv(spread), position)
+    misleading = tracked & (distance > _MISLEADING_M) & (squared > _MISLEADING_SIGMAS**2)
+    knowable = np.ones(time_s.size, dtype=bool)
+    if fault.hidden_s is not None:
+        knowable = (time_s < fault.hidden_s[0]) | (time_s >= fault.hidden_s[1])
+    used = tracked & (time_s > _SETTLED_S)[:, None] & knowable[:, None]
+    return Score(
+        misleading_share=float(misleading[knowable].mean()),
+        tracked_share=float(tracked[time_s > _SETTLED_S].mean()),
+        position_m=float(np.sqrt(np.mean(distance[used] ** 2))),
+        nees=float(np.mean(nees(error[used], covariance[used]))),
+        recovery_s=_recovery_s(time_s, tracked & (distance < _RIGHT_M), fault),
+        time_s=time_s,
+        error_m=distance,
+        misleading=misleading,
+    )
+
+
+def _recovery_s(time_s: FloatArray, right: BoolArray, fault: Fault) -> float:
+    """How long the slowest robot takes to be right for good."""
+    if fault.ends_s is None:
+        return float("nan")
+    begin = int(np.searchsorted(time_s, fault.ends_s))
+    steady = [np.convolve(one[begin:], np.ones(_STEADY_TICKS), "valid") >= _STEADY_TICKS for one in right.T]
+    return max(float(np.argmax(one)) if one.any() else float(time_s.size) for one in steady) * TICK_NS * 1e-9

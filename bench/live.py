@@ -1,0 +1,111 @@
+"""The live graph beside replay: do poses that come over DDS agree with those of the same bag replayed?
+
+    make bench-live
+    make bench-live ARGS="--mrclam FOLDER"
+
+The demo's bag at its own speed and, where the data are, the first five minutes of MRCLAM set 1 at ten times
+theirs. A live pose cannot know what is still on its way, so differences come from the newest messages;
+"equal" is the share of poses that are the same to a micrometre, "settled" those when nothing was on its way.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from bench.common import OUT, new_plot, save_plot, table, write_figures
+from swarm_loc_estimator.evaluation.metrics import pool, summarise
+from swarm_loc_estimator.evaluation.result import ReplayResult
+from swarm_loc_estimator.io.bags.cut import copy_beginning
+from swarm_loc_estimator.io.mrclam.bag import Delay, convert
+from swarm_loc_estimator.io.mrclam.dataset import read_dataset
+from swarm_loc_estimator.live.agreement import Agreement, compare_with_replay
+from swarm_loc_estimator.live.run import LiveRun, play_live
+
+ROOT = OUT.parent
+DEMO_BAG = ROOT / "bags" / "eight_five_robots"
+MRCLAM_SET = ROOT.parent / "shared" / "data" / "mrclam" / "MRCLAM_Dataset1"
+MRCLAM_S, MRCLAM_RATE = 300.0, 10.0
+
+Outcome = tuple[LiveRun, Agreement]
+
+
+def run_bag(bag: Path, swarm_file: Path, rate: float) -> Outcome:
+    """Play a bag live and compare with its replay."""
+    live = play_live(bag, swarm_file, log=OUT / "live" / f"{bag.name}.log", rate=rate)
+    return live, compare_with_replay(live, bag)
+
+
+def run_mrclam(folder: Path, work: Path, duration_s: float, rate: float) -> Outcome:
+    """The first part of an MRCLAM set."""
+    whole, part = work / "whole", work / f"{folder.name}_beginning"
+    convert(read_dataset(folder), whole, Delay(0, 0, 0), lambda _share, _what: None)
+    copy_beginning(whole, part, duration_s)
+    return run_bag(part, whole / "swarm.yaml", rate)
+
+
+def figures_of(outcome: Outcome) -> dict[str, float]:
+    """All figures of one bag."""
+    live, compared = outcome
+    figures = {
+        "lost_messages": float(live.lost),
+        "estimator_core": live.estimator_core,
+        "pose_age_ms": 1e3 * float(np.percentile(live.age_s, 95.0)),
+        "position_rmse_m": _rmse(live.result),
+        "replay_position_rmse_m": _rmse(compared.replayed),
+        "difference_rms_m": compared.rms_m,
+        "equal_share": compared.equal_share,
+        "settled_difference_max_m": compared.settled_max_m,
+        "settled_stamps": float(compared.settled.sum()),
+    }
+    return {name: value for name, value in figures.items() if np.isfinite(value)}
+
+
+def _rmse(result: ReplayResult) -> float:
+    return summarise(pool(list(result.errors.values()))).position_rmse
+
+
+def draw(outcomes: dict[str, Outcome]) -> None:
+    """How many poses differ by how much."""
+    figure, (axis,) = new_plot(1, width=6.0)
+    for name, (_, compared) in outcomes.items():
+        distance = np.sort(compared.distance_m[np.isfinite(compared.distance_m)])
+        share = np.arange(1, distance.size + 1) / distance.size
+        axis.plot(np.maximum(distance, 1e-9), share, label=name)
+    axis.set(xscale="log", xlabel="live to replayed position [m]", ylabel="share of poses", ylim=(0.0, 1.02))
+    axis.legend(loc="lower right")
+    print(f"plot: {save_plot(figure, 'live')}")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--rate", type=float, default=1.0, help="speed of the demo's bag")
+    parser.add_argument("--mrclam", type=Path, default=MRCLAM_SET, help="folder of an MRCLAM set")
+    parser.add_argument("--mrclam-rate", type=float, default=MRCLAM_RATE, help="its speed")
+    parser.add_argument("--mrclam-seconds", type=float, default=MRCLAM_S, help="how much of it")
+    options = parser.parse_args(arguments)
+    print(f"{DEMO_BAG.name} ...", flush=True)
+    outcomes = {"demo": run_bag(DEMO_BAG, DEMO_BAG / "swarm.yaml", options.rate)}
+    if options.mrclam.is_dir():
+        print(f"{options.mrclam.name} ...", flush=True)
+        with tempfile.TemporaryDirectory() as work:
+            outcomes["mrclam"] = run_mrclam(
+                options.mrclam, Path(work), options.mrclam_seconds, options.mrclam_rate
+            )
+    else:
+        print(f"'{options.mrclam}' is not here: MRCLAM is left out")
+    results = {name: figures_of(outcome) for name, outcome in outcomes.items()}
+    keys = list(dict.fromkeys(key for figures in results.values() for key in figures))
+    print(table(["figure", *results], [[key, *(f.get(key) for f in results.values())] for key in keys]))
+    draw(outcomes)
+    flat = {f"{name}.{key}": value for name, figures in results.items() for key, value in figures.items()}
+    print(f"figures: {write_figures('live', flat)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,236 @@
+"""What the MRCLAM benchmark computes, each job in a process of its own: fits, runs and their errors."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bench.common import OUT
+from bench.mrclam.sets import (
+    import_set,
+    load,
+    transferred,
+    unknown_start,
+    with_two_seeing,
+    without_robots,
+    without_sightings,
+)
+from swarm_loc_estimator.calibration.motion_and_camera.fit import Options, calibrate
+from swarm_loc_estimator.calibration.recording import Recording
+from swarm_loc_estimator.calibration.rerun import rerun
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.evaluation.metrics import Errors, pool
+from swarm_loc_estimator.evaluation.replay import replay
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
+
+MODELS = ("plain", "calibrated")
+ONLINE = "landmarks_robots"
+"""The column with everything that there is."""
+SMOOTHER = "smoother"
+WORK = OUT / "mrclam"
+TICK_S, BLIND_TICK_S = 0.1, 0.5
+EARLY_S = 600.0
+"""What has been published is about the first minutes."""
+_REPLAYS = 3
+_SHARE_PRINTED = 0.1
+
+
+@dataclass(frozen=True)
+class Job:
+    """One thing to compute.
+
+    Attributes:
+        number: Of the set.
+        model: "plain" or "calibrated".
+        column: What is run.
+        seeing: For blind_robots, which two robots see landmarks.
+    """
+
+    number: int
+    model: str
+    column: str
+    seeing: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Errors in a form that adds up over runs: counts, and means of squares by count.
+
+    Attributes:
+        count: Of poses.
+        position: Sum of squared position errors [m^2].
+        heading: Sum of squared heading errors [rad^2].
+        nees: Sum of the normalised ones.
+        nees_count: Of these.
+        early: Mean position error over the first minutes as published [m].
+    """
+
+    count: int
+    position: float
+    heading: float
+    nees: float
+    nees_count: int
+    early: float = math.nan
+
+    def __add__(self, other: Sums) -> Sums:
+        return Sums(
+            self.count + other.count,
+            self.position + other.position,
+            self.heading + other.heading,
+            self.nees + other.nees,
+            self.nees_count + other.nees_count,
+        )
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """The figures by name."""
+        return {
+            "position_rmse_m": math.sqrt(self.position / self.count),
+            "heading_rmse_deg": math.degrees(math.sqrt(self.heading / self.count)),
+            "nees": self.nees / self.nees_count,
+        }
+
+
+@dataclass(frozen=True)
+class Done:
+    """What became of a job.
+
+    Attributes:
+        job: Which.
+        sums: Its errors; None where there is nothing to compare with.
+        failure: Why it has failed, in a sentence; "" where it has not.
+    """
+
+    job: Job
+    sums: Sums | None
+    failure: str = ""
+
+
+@dataclass(frozen=True)
+class Results:
+    """All that the benchmark reports.
+
+    Attributes:
+        figures: By name, such as set1.calibrated.smoother.nees.
+        early: Mean errors of the first minutes by set and model [m].
+        failures: Sentences by set, model and column.
+    """
+
+    figures: dict[str, float]
+    early: dict[tuple[int, str], float]
+    failures: dict[tuple[int, str, str], str]
+
+
+def collected(all_done: Iterable[Done]) -> Results:
+    """Errors pooled over the jobs of a column; a job that has failed leaves its column without figures."""
+    totals: dict[tuple[int, str, str], Sums] = {}
+    failures: dict[tuple[int, str, str], str] = {}
+    for done in all_done:
+        key = (done.job.number, done.job.model, done.job.column)
+        if done.failure:
+            failures[key] = done.failure
+        elif done.sums is not None:
+            totals[key] = totals[key] + done.sums if key in totals else done.sums
+    figures = {
+        f"set{number}.{model}.{column}.{name}": value
+        for (number, model, column), sums in sorted(totals.items())
+        for name, value in sums.figures.items()
+        if math.isfinite(value)
+    }
+    early = {(k, model): sums.early for (k, model, column), sums in totals.items() if column == ONLINE}
+    return Results(figures, early, failures)
+
+
+def bag_of(number: int) -> Path:
+    """Where a set lies as a bag."""
+    return WORK / f"set{number}"
+
+
+def prepare(number: int, folder: Path) -> tuple[int, tuple[str, ...]]:
+    """Import a set."""
+    return number, import_set(folder, bag_of(number))
+
+
+def fit(number: int, model: str) -> tuple[str, str]:
+    """Fit a model to a set and keep it as a file; returns what came out in a line."""
+    recording, swarm = load(bag_of(number))
+    printed = 0.0
+
+    def progress(share: float, what: str) -> None:
+        nonlocal printed
+        if share >= printed:
+            print(f"fit {model}, {share:.0%}: {what}", flush=True)
+            printed = share + _SHARE_PRINTED
+
+    done = calibrate(recording, swarm, Options(plain=model == "plain"), progress)
+    save_swarm(done.swarm, WORK / f"{model}.yaml", f"{model}: fitted to set {number}")
+    numbers = ", ".join(f"{name} {value:.3g}" for name, value in done.noise.items())
+    return model, f"{model} fitted to set {number}: {numbers}"
+
+
+def run(job: Job) -> Done:
+    """Run one job."""
+    recording, own = load(bag_of(job.number))
+    swarm = transferred(load_swarm(WORK / f"{job.model}.yaml"), own)
+    if job.column == SMOOTHER:
+        return smoothed(job, recording, swarm)
+    if job.seeing is not None:
+        masked = with_two_seeing(recording, swarm, job.seeing)
+        seeing = {swarm.robots[index].name for index in job.seeing}
+        errors = rerun(masked, swarm, BLIND_TICK_S).errors
+        return Done(job, sums_of({name: one for name, one in errors.items() if name not in seeing}))
+    cases: dict[str, Callable[[], tuple[Recording, Swarm]]] = {
+        "odometry": lambda: (without_sightings(recording), swarm),
+        "landmarks": lambda: (without_robots(recording, swarm), swarm),
+        "unknown_start": lambda: (recording, unknown_start(swarm)),
+        ONLINE: lambda: (recording, swarm),
+    }
+    return Done(job, sums_of(rerun(*cases[job.column](), TICK_S).errors))
+
+
+def sums_of(errors: Mapping[str, Errors]) -> Sums | None:
+    """Errors of robots, by name, pooled; None without any."""
+    pooled = pool([*errors.values()])
+    if not pooled.stamp_ns.size:
+        return None
+    early = pooled.stamp_ns <= pooled.stamp_ns.min() + EARLY_S * 1e9
+    return Sums(
+        pooled.stamp_ns.size,
+        float(np.sum(pooled.position**2)),
+        float(np.sum(pooled.error[:, 2] ** 2)),
+        float(np.nansum(pooled.nees)),
+        int(np.sum(~np.isnan(pooled.nees))),
+        float(pooled.position[early].mean()),
+    )
+
+
+def smoothed(job: Job, recording: Recording, swarm: Swarm) -> Done:
+    """Errors of the offline limit; why, where it cannot be found."""
+    from bench.mrclam.smoother import SmootherError, smooth  # noqa: PLC0415 # only benchmarks require gtsam
+
+    try:
+        return Done(job, sums_of(smooth(recording, rerun(recording, swarm, TICK_S))))
+    except SmootherError as error:
+        return Done(job, None, str(error))
+
+
+def jobs_of(number: int, swarm: Swarm) -> list[Job]:
+    """Everything to run on a set, long jobs first."""
+    robots = len(swarm.robots)
+    pairs = [*itertools.combinations(range(robots), 2)] if robots > 2 else []
+    columns = ("smoother", "landmarks_robots", "unknown_start", "landmarks", "odometry")
+    jobs = [Job(number, model, column) for column in columns for model in MODELS]
+    return jobs + [Job(number, model, "blind_robots", pair) for model in MODELS for pair in pairs]
+
+
+def speed_factor(number: int) -> float:
+    """How much faster than its own time a set replays from its bag, best of a few."""
+    bag = bag_of(number)
+    swarm = transferred(load_swarm(WORK / "calibrated.yaml"), load_swarm(bag / "swarm.yaml"))
+    return max(replay(bag, swarm).speed_factor for _ in range(_REPLAYS))

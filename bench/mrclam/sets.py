@@ -1,0 +1,116 @@
+"""The sets of the MRCLAM benchmark: where they are, as bags, and what a run leaves out of them."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from dataclasses import fields, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.calibration.recording import Recording, read_recording
+from swarm_loc_estimator.core.description.swarm import CameraMount, OdometryModel, Robot, SensorModel, Swarm
+from swarm_loc_estimator.io.mrclam.bag import Delay, convert
+from swarm_loc_estimator.io.mrclam.dataset import read_dataset
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.parameters.errors import UserError
+
+
+class NoSetsError(UserError):
+    """There is nothing to run; the message is one sentence."""
+
+
+def find_sets(folder: Path) -> dict[int, Path]:
+    """Number -> folder of every set; a folder that is a set itself counts by the number in its name."""
+    if not folder.is_dir():
+        raise NoSetsError(
+            f"There is no folder '{folder}'; name one that holds MRCLAM_Dataset<k> folders: make bench-mrclam"
+            ' ARGS="FOLDER".'
+        )
+    own = [folder] if any(folder.glob("Robot*_Odometry.dat")) else []
+    found = own or sorted(path.parent for path in folder.glob("*/Robot1_Odometry.dat"))
+    found = found or sorted({path.parent for path in folder.glob("*/Robot*_Odometry.dat")})
+    sets: dict[int, Path] = {}
+    for path in found:
+        number = re.search(r"(\d+)$", path.name)
+        sets[int(number[1]) if number else len(sets) + 1] = path
+    if not sets:
+        raise NoSetsError(f"'{folder}' holds no MRCLAM set: no Robot<number>_Odometry.dat in it or below.")
+    return dict(sorted(sets.items()))
+
+
+def import_set(folder: Path, bag: Path) -> tuple[str, ...]:
+    """Write a set as a bag, replacing what is there; returns what there is to say about it."""
+    if bag.exists():
+        shutil.rmtree(bag)
+    bag.parent.mkdir(parents=True, exist_ok=True)
+    return convert(read_dataset(folder), bag, Delay(), lambda _share, _what: None).remarks
+
+
+@lru_cache(maxsize=2)
+def load(bag: Path) -> tuple[Recording, Swarm]:
+    """A set in memory."""
+    swarm = load_swarm(bag / "swarm.yaml")
+    return read_recording(bag, swarm), swarm
+
+
+def transferred(fitted: Swarm, swarm: Swarm) -> Swarm:
+    """Another set's swarm with the models that were fitted, robot by name; unknown robots get the mean."""
+    by_name = {robot.name: robot for robot in fitted.robots}
+    mean = _mean(fitted.robots)
+    return replace(swarm, robots=tuple(_with_models(r, by_name.get(r.name, mean)) for r in swarm.robots))
+
+
+def without_robots(recording: Recording, swarm: Swarm) -> Recording:
+    """The recording as if robots had not been seen."""
+    ids = np.array([landmark.id for landmark in swarm.landmarks])
+    return recording.masked(lambda _, found: np.isin(found["id"], ids))
+
+
+def without_sightings(recording: Recording) -> Recording:
+    """The recording as if nothing had been seen."""
+    return recording.masked(lambda _, found: np.zeros(found.size, dtype=bool))
+
+
+def with_two_seeing(recording: Recording, swarm: Swarm, seeing: tuple[int, int]) -> Recording:
+    """The recording as if only two robots could see landmarks; everybody sees robots."""
+    ids = np.array([landmark.id for landmark in swarm.landmarks])
+
+    def keep(robot: int, found: NDArray[np.void]) -> NDArray[np.bool_]:
+        kept: NDArray[np.bool_] = np.full(found.size, robot in seeing) | ~np.isin(found["id"], ids)
+        return kept
+
+    return recording.masked(keep)
+
+
+def unknown_start(swarm: Swarm) -> Swarm:
+    """The swarm with no robot's start known."""
+    return replace(swarm, robots=tuple(replace(robot, start=None) for robot in swarm.robots))
+
+
+def _with_models(robot: Robot, fitted: Robot) -> Robot:
+    return replace(
+        robot,
+        odometry=fitted.odometry,
+        response=fitted.response,
+        camera=fitted.camera,
+        sensor=fitted.sensor,
+    )
+
+
+def _mean(robots: tuple[Robot, ...]) -> Robot:
+    """A robot with the mean of all models."""
+
+    def mean_of(models: list[Any], cls: type) -> Any:
+        return cls(**{f.name: float(np.mean([getattr(m, f.name) for m in models])) for f in fields(cls)})
+
+    return replace(
+        robots[0],
+        odometry=mean_of([robot.odometry for robot in robots], OdometryModel),
+        camera=mean_of([robot.camera or CameraMount() for robot in robots], CameraMount),
+        sensor=mean_of([robot.sensor for robot in robots], SensorModel),
+    )

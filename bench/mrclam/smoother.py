@@ -1,0 +1,329 @@
+"""The offline limit: gtsam's batch solution of a recording with the estimator's own models and noise.
+
+A filter knows the past, a smoother also the future: no online estimate can be as good. Each robot has a pose
+at every stamp at which it sees or is seen, and at every stamp at which the result is compared; and a bias of
+its turn rate, where its model has one, that steps a few times within its time constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.calibration.recording import Recording
+from swarm_loc_estimator.core.description.estimated_parameters import TURN_BIAS
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.core.filter.measurement_model import (
+    MeasurementArray,
+    MeasurementColumns,
+    innovation,
+    predict_one,
+)
+from swarm_loc_estimator.core.inputs.validation import InputValidator
+from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.evaluation.metrics import Errors, compare
+from swarm_loc_estimator.evaluation.result import ReplayResult
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.numerics.trajectory import Trajectory
+
+_FLOOR = np.diag([1e-10, 1e-10, 1e-10])
+"""A robot that stands gathers no noise; a factor needs some."""
+_UNKNOWN = np.array([30.0, 30.0, 10.0])
+_BEND = 3.0
+"""From this many sigmas on a sighting counts less and less (Cauchy), where the filter has its gate."""
+_NEES_POSES = 400
+"""Marginal covariances are slow; the NEES is taken over about so many poses of each robot."""
+_MAX_ROUNDS = 25
+_SETTLED = 1e-4
+"""Share of the error by which the last round may still lessen it."""
+_SHORTEST_STEP = 1e-3
+_BIAS_STEP = 0.1
+"""A bias is constant for this share of its time constant."""
+
+
+class SmootherError(Exception):
+    """There is no solution; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class _Nodes:
+    """The poses to solve for; the position in these arrays is the key.
+
+    Attributes:
+        stamps_ns: Per robot, ascending.
+        compared: Per robot, which of them are compared with the truth.
+        first: (N,) key of each robot's first pose.
+        initial: (V, 3) where to begin.
+    """
+
+    stamps_ns: list[IntArray]
+    compared: list[IntArray]
+    first: IntArray
+    initial: FloatArray
+
+    def keys(self, robots: IntArray, stamps_ns: IntArray) -> IntArray:
+        """The keys (m,) of poses that exist; -1 for nobody."""
+        keys = np.full(robots.size, -1)
+        for robot, stamps in enumerate(self.stamps_ns):
+            rows = robots == robot
+            keys[rows] = self.first[robot] + np.searchsorted(stamps, stamps_ns[rows])
+        return keys
+
+
+def smooth(recording: Recording, online: ReplayResult) -> Mapping[str, Errors]:
+    """Solve a whole recording; returns the errors of robots with ground truth, by name.
+
+    Args:
+        recording: What was reported and seen, and the truth to compare with.
+        online: What the estimator made of it; its swarm has the models, its poses are where to begin and
+            its stamps those of the comparison.
+
+    Raises:
+        SmootherError: There is no solution, or it does not settle.
+    """
+    try:
+        return _smooth(recording, online)
+    except RuntimeError as error:  # as gtsam says that a system is indeterminate
+        raise SmootherError(f"gtsam: {' '.join(str(error).split('.')[0].split())}.") from error
+
+
+def _smooth(recording: Recording, online: ReplayResult) -> Mapping[str, Errors]:
+    """Like `smooth`, with gtsam's own errors."""
+    swarm = online.swarm
+    tracks, measured = _tracks_and_measurements(recording, swarm)
+    estimates = [online.track(index) for index in range(len(swarm.robots))]
+    measured = measured[_within(measured, estimates)]
+    nodes = _nodes(tracks, estimates, measured)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for key, pose in enumerate(nodes.initial.tolist()):
+        values.insert(key, gtsam.Pose2(*pose))
+    _add_motion(graph, values, swarm, tracks, nodes)
+    _add_sightings(graph, measured, nodes)
+    return _errors(recording, swarm, nodes, _solved(graph, values), graph)
+
+
+def _tracks_and_measurements(recording: Recording, swarm: Swarm) -> tuple[OdometryTracks, MeasurementArray]:
+    """All odometry, calibrated, and all sightings of known markers (m,)."""
+    valid = InputValidator(swarm, EstimatorSettings()).validate(recording.messages)
+    tracks = OdometryTracks(swarm.robots)
+    tracks.extend(valid.odometry.robot, valid.odometry.stamp_ns, valid.odometry.pose)
+    return tracks, valid.measurements
+
+
+def _solved(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+    """The best values by Gauss-Newton from values near them.
+
+    gtsam's own optimizers let go of the interpreter's lock, which each factor written in Python then waits
+    for: they take a hundred times as long.
+    """
+    error = graph.error(values)
+    for _ in range(_MAX_ROUNDS):
+        step, share = graph.linearize(values).optimize(), 1.0
+        stepped = values.retract(step)
+        found = graph.error(stepped)
+        while found > error and share > _SHORTEST_STEP:
+            share *= 0.3
+            stepped = values.retract(_scaled(step, share))
+            found = graph.error(stepped)
+        if found > error:
+            return values
+        values, settled, error = stepped, error - found < _SETTLED * error, found
+        if settled:
+            return values
+    raise SmootherError(f"the batch solution has not settled after {_MAX_ROUNDS} rounds.")
+
+
+def _scaled(step: gtsam.VectorValues, share: float) -> gtsam.VectorValues:
+    """A part of a step."""
+    scaled = gtsam.VectorValues()
+    for key in range(step.size()):
+        scaled.insert(key, share * step.at(key))
+    return scaled
+
+
+def _within(measured: MeasurementArray, estimates: list[Trajectory]) -> NDArray[np.bool_]:
+    """Which measurements (m,) were taken while the online estimate knew both robots."""
+    inside = np.ones(measured.size, dtype=bool)
+    for name in ("observer", "target"):
+        for robot, track in enumerate(estimates):
+            rows = measured[name] == robot
+            stamps = measured["stamp_ns"][rows]
+            first_ns, last_ns = (track.stamp_ns[0], track.stamp_ns[-1]) if track.stamp_ns.size else (1, 0)
+            inside[rows] &= (stamps >= first_ns) & (stamps <= last_ns)
+    return inside
+
+
+def _nodes(tracks: OdometryTracks, estimates: list[Trajectory], measured: MeasurementArray) -> _Nodes:
+    """A pose of each robot at every stamp that matters, at first by odometry from the last online one."""
+    stamps_ns, compared, initial = [], [], [np.zeros((0, 3))]
+    for robot, track in enumerate(estimates):
+        seen = [measured["stamp_ns"][measured[name] == robot] for name in ("observer", "target")]
+        stamps = np.unique(np.concatenate([track.stamp_ns, *seen]))
+        stamps_ns.append(stamps)
+        compared.append(np.searchsorted(stamps, track.stamp_ns))
+        if not stamps.size:
+            continue
+        before = np.searchsorted(track.stamp_ns, stamps, side="right") - 1
+        who = np.full(stamps.size, robot)
+        moved = se2.between(tracks.at(who, track.stamp_ns[before]).pose, tracks.at(who, stamps).pose)
+        initial.append(se2.compose(track.pose[before], moved))
+    sizes = np.array([stamps.size for stamps in stamps_ns])
+    return _Nodes(stamps_ns, compared, np.cumsum(sizes) - sizes, np.concatenate(initial))
+
+
+def _add_motion(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    swarm: Swarm,
+    tracks: OdometryTracks,
+    nodes: _Nodes,
+) -> None:
+    """Starts and odometry as factors, and the biases in which odometry errs."""
+    for index, (robot, stamps) in enumerate(zip(swarm.robots, nodes.stamps_ns, strict=True)):
+        if not stamps.size:
+            continue
+        first = int(nodes.first[index])
+        graph.add(gtsam.PriorFactorPose2(first, gtsam.Pose2(*nodes.initial[first]), _start_noise(robot)))
+        biases = _add_biases(graph, values, robot.odometry, stamps)
+        sample = tracks.at(np.full(stamps.size, index), stamps)
+        moved = se2.between(sample.pose[:-1], sample.pose[1:])
+        to_body = se2.adjoint(se2.inverse(sample.pose[1:]))
+        covariance = to_body @ np.diff(sample.covariance, axis=0) @ np.swapaxes(to_body, 1, 2) + _FLOOR
+        drift = (to_body @ np.diff(sample.jacobian, axis=0))[:, :, TURN_BIAS]
+        for step, motion in enumerate(moved.tolist()):
+            model, key = gtsam.noiseModel.Gaussian.Covariance(covariance[step]), first + step
+            if biases.size:
+                drifting = _Drifting(gtsam.Pose2(*motion), drift[step])
+                graph.add(gtsam.CustomFactor(model, [key, key + 1, int(biases[step])], drifting))
+            else:
+                graph.add(gtsam.BetweenFactorPose2(key, key + 1, gtsam.Pose2(*motion), model))
+
+
+def _start_noise(robot: Robot) -> gtsam.noiseModel.Base:
+    """How sure the first online pose is: as the start is, a moment before; or not at all."""
+    if robot.start is None:
+        return gtsam.noiseModel.Diagonal.Sigmas(_UNKNOWN)
+    s = robot.start_sigma
+    return gtsam.noiseModel.Diagonal.Sigmas(np.array([s.x + 0.01, s.y + 0.01, s.theta]))
+
+
+def _add_biases(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, model: OdometryModel, stamps_ns: IntArray
+) -> IntArray:
+    """A Gauss-Markov chain of a robot's biases, if any; returns the key (m - 1,) of each step's."""
+    sigma, step_ns = model.turn_bias_sigma, _BIAS_STEP * model.turn_bias_time_s * 1e9
+    if not sigma:
+        return np.zeros(0, dtype=np.int64)
+    kept = np.exp(-_BIAS_STEP)
+    keys: IntArray = values.size() + ((stamps_ns[:-1] - stamps_ns[0]) // step_ns).astype(np.int64)
+    anew = gtsam.noiseModel.Isotropic.Sigma(1, sigma * np.sqrt(1.0 - kept**2))
+    for key in range(int(keys[0]), int(keys[-1]) + 1):
+        values.insert(key, np.zeros(1))
+        if key == keys[0]:
+            graph.add(gtsam.PriorFactorVector(key, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, sigma)))
+        else:
+            graph.add(gtsam.CustomFactor(anew, [key - 1, key], _Fading(kept)))
+    return keys
+
+
+def _add_sightings(graph: gtsam.NonlinearFactorGraph, measured: MeasurementArray, nodes: _Nodes) -> None:
+    """Sightings as factors at their own stamps, with the estimator's prediction."""
+    columns = MeasurementColumns.of(measured)
+    observers = nodes.keys(measured["observer"], measured["stamp_ns"]).tolist()
+    targets = nodes.keys(measured["target"], measured["stamp_ns"]).tolist()
+    bend = gtsam.noiseModel.mEstimator.Cauchy.Create(_BEND)
+    size = 2 + measured["has_heading"]
+    for k in range(measured.size):
+        gaussian = gtsam.noiseModel.Gaussian.Covariance(measured["covariance"][k, : size[k], : size[k]])
+        model = gtsam.noiseModel.Robust.Create(bend, gaussian)
+        keys = [observers[k]] if targets[k] < 0 else [observers[k], targets[k]]
+        graph.add(gtsam.CustomFactor(model, keys, _Sighting(columns, k, int(size[k]))))
+
+
+class _Fading:
+    """A bias minus what the one before left."""
+
+    def __init__(self, kept: float) -> None:
+        self._kept = kept
+
+    def __call__(
+        self, factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        before, after = (values.atVector(key) for key in factor.keys())  # noqa: SIM118 # a method of gtsam
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = np.array([[-self._kept]]), np.eye(1)
+        return np.asarray(after - self._kept * before)
+
+
+class _Drifting:
+    """True minus reported motion of a step, the latter with a bias, as in gtsam's BetweenFactor."""
+
+    def __init__(self, moved: gtsam.Pose2, drift: FloatArray) -> None:
+        self._moved, self._drift = moved, drift
+
+    def __call__(
+        self, factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        begin, end, bias = factor.keys()
+        moved = values.atPose2(begin).between(values.atPose2(end))
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray(-moved.inverse().AdjointMap())
+            jacobians[1] = np.asfortranarray(np.eye(3))
+            jacobians[2] = np.asfortranarray(-self._drift[:, None])
+        apart = self._moved.localCoordinates(moved)
+        return np.asarray(apart - self._drift * values.atVector(bias)[0])
+
+
+class _Sighting:
+    """Predicted minus measured of one sighting, and its Jacobians by the poses in their own frames."""
+
+    def __init__(self, columns: MeasurementColumns, k: int, size: int) -> None:
+        self._columns, self._k, self._size = columns, k, size
+
+    def __call__(
+        self, factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        found = [values.atPose2(key) for key in factor.keys()]  # noqa: SIM118 # a method of gtsam
+        unmoved = (0.0, 0.0, 0.0)  # of a landmark as it was surveyed
+        poses = np.array([*((pose.x(), pose.y(), pose.theta()) for pose in found), unmoved])
+        value, jacobian, error = np.zeros(3), np.zeros((3, 5)), np.zeros(3)
+        predict_one(self._columns, self._k, poses[0], poses[1], np.zeros(2), value, jacobian)
+        innovation(self._columns, self._k, self._columns.value[self._k], value, error)
+        if jacobians is not None:
+            signs = (-1.0, 1.0)
+            for place, pose in enumerate(found):
+                by_own_frame = signs[place] * jacobian[:, :3] @ pose.AdjointMap()
+                jacobians[place] = np.asfortranarray(by_own_frame[: self._size])
+        return -error[: self._size]
+
+
+def _errors(
+    recording: Recording,
+    swarm: Swarm,
+    nodes: _Nodes,
+    solution: gtsam.Values,
+    graph: gtsam.NonlinearFactorGraph,
+) -> dict[str, Errors]:
+    """Errors at the stamps of the online poses; normalised ones at some of them."""
+    marginals = gtsam.Marginals(graph, solution)
+    errors = {}
+    for index, robot in enumerate(swarm.robots):
+        truth, rows = recording.truth.get(robot.name), nodes.compared[index]
+        if truth is None or not rows.size:
+            continue
+        keys = (nodes.first[index] + rows).tolist()
+        poses = np.array([[p.x(), p.y(), p.theta()] for p in (solution.atPose2(key) for key in keys)])
+        covariance = np.full((rows.size, 3, 3), np.nan)
+        for row in range(0, rows.size, max(1, rows.size // _NEES_POSES)):
+            to_map = solution.atPose2(keys[row]).rotation().matrix()
+            turned = np.eye(3)
+            turned[:2, :2] = to_map
+            covariance[row] = turned @ marginals.marginalCovariance(keys[row]) @ turned.T
+        errors[robot.name] = compare(Trajectory(nodes.stamps_ns[index][rows], poses), covariance, truth)
+    return errors

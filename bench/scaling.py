@@ -1,0 +1,165 @@
+"""How far one core carries: simulated swarms of growing size, beside filterpy and gtsam on the same data.
+
+The swarm is a grid with about three neighbours in view of each robot (`sim.scenarios.grid`):
+odometry at 20 Hz, cameras at 7.5 Hz, 150-300 ms late. Everybody gives all poses ten times a second and uses
+new measurements five times a second, as the live node does with a large swarm. Measured is CPU time of this
+process per simulated second, without reading messages; the optimum is gtsam's batch solution of all data that
+have arrived by the same moment. At the end a hundred robots are played into the live graph in real time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.common import OUT, new_plot, save_plot, table, write_figures
+from bench.peers import filterpy_ekf, gtsam_batch, gtsam_lag
+from bench.simulated_run import errors_of, mean_nees, position_rmse, run_core
+from swarm_loc_drivers.sim.recording.bag import write_bag
+from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.live.run import play_live
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from swarm_loc_drivers.sim.common.record import SimulatedRun
+
+LIVE_ROBOTS = 100
+SIZES = (5, 20, 50, 100, 200, 300)
+LARGEST_FOR_BATCH = 50
+DURATION_S = 20.0
+PEER_ROBOT_SECONDS = 1500.0
+"""Peers get the first part of a large swarm's run: their cost per second does not change with its length."""
+SETTLING_S = 3.0
+"""Errors count from here on."""
+TICK_NS = 100_000_000
+FUSE_NS = 200_000_000
+
+
+def measure(robots: int, duration_s: float, seed: int, settings: EstimatorSettings) -> dict[str, float]:
+    """All figures of one size."""
+    run = simulate_grid(GridSettings(robots=robots, seed=seed, duration_s=duration_s))
+    tick_ns = ticks(run)
+    core = run_core(run, tick_ns, settings, FUSE_NS)
+    settled = tick_ns >= run.start_ns + SETTLING_S * 1e9
+    errors = errors_of(core.poses, run, tick_ns)[settled]
+    figures = {
+        "cpu_s_per_s": core.cpu_s / run.duration_s,
+        "position_rmse_mm": 1e3 * position_rmse(errors),
+        "heading_rmse_deg": float(np.degrees(np.sqrt(np.mean(errors[..., 2] ** 2)))),
+        "nees": mean_nees(errors, core.covariances[settled]),
+    }
+    part = first_part(run, min(duration_s, max(2.0, PEER_ROBOT_SECONDS / robots)))
+    for name, peer in (("filterpy", filterpy_ekf), ("gtsam", gtsam_lag)):
+        figures[f"{name}_cpu_s_per_s"] = peer.solve(part, ticks(part)).cpu_s / part.duration_s
+    if robots <= LARGEST_FOR_BATCH:
+        chosen = np.flatnonzero(settled)[:: max(1, int(settled.sum()) * robots // 240)]
+        best = gtsam_batch.solve(run, tick_ns[chosen])
+        optimum = position_rmse(errors_of(best.poses, run, tick_ns[chosen]))
+        reached = position_rmse(errors_of(core.poses[chosen], run, tick_ns[chosen]))
+        figures["position_rmse_ratio_to_batch"] = reached / optimum
+    return figures
+
+
+def measure_live(duration_s: float, seed: int) -> dict[str, float]:
+    """A large swarm through the live graph: messages lost, the estimator's load, the poses' age."""
+    run = simulate_grid(GridSettings(robots=LIVE_ROBOTS, seed=seed, duration_s=duration_s))
+    with tempfile.TemporaryDirectory() as work:
+        bag = Path(work, f"grid{LIVE_ROBOTS}")
+        write_bag(run, bag, "A simulated grid.")
+        live = play_live(bag, bag / "swarm.yaml", log=OUT / "scaling" / "nodes.log")
+    return {
+        "lost_messages": float(live.lost),
+        "estimator_core": live.estimator_core,
+        "pose_age_ms": 1e3 * float(np.percentile(live.age_s, 95.0)),
+    }
+
+
+def ticks(run: SimulatedRun) -> NDArray[np.int64]:
+    """When all poses are asked for (K,)."""
+    return np.arange(run.start_ns + TICK_NS, run.end_ns + 1, TICK_NS)
+
+
+def first_part(run: SimulatedRun, duration_s: float) -> SimulatedRun:
+    """The run as if it had ended after `duration_s`."""
+    end_ns = run.start_ns + round(duration_s * 1e9)
+    kept = run.truth.stamp_ns <= end_ns
+    truth = replace(run.truth, stamp_ns=run.truth.stamp_ns[kept], poses=run.truth.poses[kept])
+    odometry = run.odometry[run.odometry["arrival_ns"] <= end_ns]
+    frames = run.frames[run.frames["arrival_ns"] <= end_ns]
+    return replace(
+        run, truth=truth, odometry=odometry, frames=frames, sightings=run.sightings[: frames["count"].sum()]
+    )
+
+
+def draw(results: dict[int, dict[str, float]]) -> None:
+    """CPU time and consistency against swarm size."""
+    figure, (speed, quality) = new_plot(2)
+    sizes = list(results)
+    names = (("", "this estimator"), ("filterpy_", "filterpy EKF"), ("gtsam_", "gtsam fixed-lag smoother"))
+    for prefix, label in names:
+        speed.plot(sizes, [results[n][f"{prefix}cpu_s_per_s"] for n in sizes], "o-", label=label)
+    speed.axhline(1.0, color="0.5", linestyle=":", label="real time")
+    speed.set(xscale="log", yscale="log", xlabel="robots", ylabel="CPU seconds per second")
+    speed.legend()
+    quality.plot(sizes, [results[n]["nees"] / 3.0 for n in sizes], "o-", label="NEES / 3")
+    with_batch = [n for n in sizes if "position_rmse_ratio_to_batch" in results[n]]
+    ratios = [results[n]["position_rmse_ratio_to_batch"] for n in with_batch]
+    quality.plot(with_batch, ratios, "s-", label="position RMSE / batch optimum")
+    quality.axhline(1.0, color="0.5", linestyle=":")
+    quality.set(xscale="log", xlabel="robots", ylim=(0.5, 1.5))
+    quality.legend()
+    print(f"plot: {save_plot(figure, 'scaling')}")
+
+
+def report(results: dict[int, dict[str, float]], live: dict[str, float]) -> None:
+    """Print the tables, draw the plot and write the figures."""
+    keys = {
+        "cpu_s_per_s": "CPU s/s",
+        "filterpy_cpu_s_per_s": "filterpy s/s",
+        "gtsam_cpu_s_per_s": "gtsam s/s",
+        "position_rmse_mm": "RMSE mm",
+        "heading_rmse_deg": "RMSE deg",
+        "position_rmse_ratio_to_batch": "RMSE / batch",
+        "nees": "NEES",
+    }
+    rows = [[robots, *(figures.get(key) for key in keys)] for robots, figures in results.items()]
+    print(table(["robots", *keys.values()], rows))
+    print(f"\n{LIVE_ROBOTS} robots over DDS")
+    print(table(["messages lost", "estimator core", "pose age ms (95 %)"], [list(live.values())]))
+    draw(results)
+    flat = {
+        f"n{robots}.{key}": value for robots, figures in results.items() for key, value in figures.items()
+    }
+    flat |= {f"live{LIVE_ROBOTS}.{key}": value for key, value in live.items()}
+    print(f"figures: {write_figures('scaling', flat)}")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--robots", type=int, nargs="+", default=SIZES, help="swarm sizes")
+    parser.add_argument("--duration", type=float, default=DURATION_S, help="simulated time [s]")
+    parser.add_argument("--seed", type=int, default=1, help="of the simulation")
+    options = parser.parse_args(arguments)
+    settings = EstimatorSettings()
+    warm_up = simulate_grid(GridSettings(robots=4, duration_s=2.0))
+    run_core(warm_up, ticks(warm_up), settings, FUSE_NS)  # compiles what is not compiled yet
+    results = {}
+    for robots in options.robots:
+        print(f"{robots} robots ...", flush=True)
+        results[robots] = measure(robots, options.duration, options.seed, settings)
+    print(f"{LIVE_ROBOTS} robots over DDS, in real time ...", flush=True)
+    report(results, measure_live(options.duration, options.seed))
+
+
+if __name__ == "__main__":
+    main()

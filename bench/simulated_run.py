@@ -1,0 +1,88 @@
+"""A simulated run through the estimator, and its errors, the same for all benchmarks."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from swarm_loc_drivers.sim.recording.detections import as_detections
+from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
+from swarm_loc_estimator.core.inputs.messages import DetectionRows, OdometryRows, RawInputs, chosen
+from swarm_loc_estimator.evaluation.metrics import nees
+from swarm_loc_estimator.evaluation.runner import ListedSchedule, Runner
+from swarm_loc_estimator.numerics import se2
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from swarm_loc_drivers.sim.common.record import SimulatedRun
+    from swarm_loc_estimator.core.description.settings import EstimatorSettings
+    from swarm_loc_estimator.numerics.arrays import FloatArray
+
+
+@dataclass(frozen=True)
+class CoreResult:
+    """What the estimator made of a run.
+
+    Attributes:
+        cpu_s: [s].
+        poses: (K, N, 3) at every tick.
+        covariances: (K, N, 3, 3).
+    """
+
+    cpu_s: float
+    poses: FloatArray
+    covariances: FloatArray
+
+
+def run_core(
+    run: SimulatedRun, tick_ns: NDArray[np.int64], settings: EstimatorSettings, fuse_ns: int
+) -> CoreResult:
+    """Feed a run in order of arrival to the estimator, and tick it; it fuses at multiples of `fuse_ns`."""
+    runner = Runner(SwarmEstimator(run.swarm, settings), ListedSchedule(tick_ns), fuse_ns)
+    parts = inputs_between(run, tick_ns)
+    begun = time.process_time()
+    for inputs in parts:
+        runner.take(inputs)
+    cpu_s = time.process_time() - begun
+    result = runner.result("run", (run.start_ns, run.end_ns), {}, {})
+    return CoreResult(cpu_s, result.pose, result.covariance)
+
+
+def inputs_between(run: SimulatedRun, tick_ns: NDArray[np.int64]) -> list[RawInputs]:
+    """What a run's robots have sent that arrived since the tick before, for each tick."""
+    rows, frames = run.odometry, run.frames
+    names = ("robot", "stamp_ns", "arrival_ns")
+    robot, stamp_ns, arrival_ns = (rows[name].astype(np.int64) for name in names)
+    odometry = OdometryRows(robot, stamp_ns, rows["pose"].copy(), arrival_ns)
+    robot, stamp_ns, arrival_ns = (
+        np.repeat(frames[name].astype(np.int64), frames["count"]) for name in names
+    )
+    seen = DetectionRows(robot, stamp_ns, as_detections(run), arrival_ns)
+    parts, begin = [], [0, 0]
+    for now_ns in tick_ns.tolist():
+        ends = [int(np.searchsorted(p.arrival_ns, now_ns, side="right")) for p in (odometry, seen)]
+        first, second = (slice(a, b) for a, b in zip(begin, ends, strict=True))
+        parts.append(RawInputs(now_ns, now_ns, chosen(odometry, first), chosen(seen, second)))
+        begin = ends
+    return parts
+
+
+def errors_of(poses: FloatArray, run: SimulatedRun, stamp_ns: NDArray[np.int64]) -> FloatArray:
+    """Errors x, y, theta (K, N, 3) of poses at stamps (K,)."""
+    errors: FloatArray = poses - run.truth.all_at(stamp_ns)
+    errors[..., 2] = se2.wrap_angle(errors[..., 2])
+    return errors
+
+
+def position_rmse(errors: FloatArray) -> float:
+    """Root mean square of the distance [m]."""
+    return float(np.sqrt(np.mean(np.sum(errors[..., :2] ** 2, axis=-1))))
+
+
+def mean_nees(errors: FloatArray, covariances: FloatArray) -> float:
+    """Mean normalised error squared of errors (..., 3) with covariances (..., 3, 3); 3 is ideal."""
+    return float(np.mean(nees(errors.reshape(-1, 3), covariances.reshape(-1, 3, 3))))

@@ -1,0 +1,46 @@
+"""Faults are named, and nobody is told as tracked who is elsewhere; with seeds that no figure comes from."""
+
+from __future__ import annotations
+
+import pytest
+
+from bench.integrity.scenarios import SCENARIOS
+from bench.integrity.scoring import score
+from swarm_loc_estimator.core.estimation.contradictions import Kind
+
+SEED = 23
+
+
+@pytest.mark.parametrize(
+    ("scenario", "about", "kind"),
+    [
+        ("false_sightings", "epuck1", Kind.SIGHTINGS),
+        ("turned_camera", "epuck1", Kind.DESCRIPTION),
+        ("two_odometry_sources", "epuck1", Kind.ODOMETRY),
+    ],
+)
+def test_a_fault_is_named_and_misleads_nobody(scenario: str, about: str, kind: Kind) -> None:
+    found = score(SCENARIOS[scenario](SEED))
+    assert found.misleading_share <= 0.001
+    assert (about, kind) in found.told
+
+
+def test_a_landmark_that_was_moved_is_named() -> None:
+    fault = SCENARIOS["moved_landmark"](SEED)
+    found = score(fault)
+    assert found.misleading_share <= 0.001
+    assert (fault.about, Kind.DESCRIPTION) in found.told
+
+
+def test_starts_that_are_wrong_give_way_and_nothing_is_said_where_nothing_is_wrong() -> None:
+    moved, clean = (score(SCENARIOS[name](SEED)) for name in ("estimator_restart_moved", "clean_w0"))
+    assert moved.misleading_share <= 0.001
+    assert moved.recovery_s <= 3.0
+    assert not clean.told
+    assert clean.tracked_share == 1.0
+
+
+def test_a_kidnapped_robot_comes_back() -> None:
+    found = score(SCENARIOS["kidnapped"](SEED))
+    assert found.misleading_share <= 0.6 / 300.0  # two more images, up to 0.3 s late, of 300 robot-seconds
+    assert found.recovery_s <= 3.0

@@ -1,0 +1,125 @@
+"""The MRCLAM benchmark finds sets, hides what a run must not see, and carries models over by robot name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.common import save_plot, write_figures
+from bench.mrclam import __main__ as mrclam
+from bench.mrclam import report as reporting
+from bench.mrclam.jobs import MODELS, Done, Job, Sums, collected, jobs_of
+from bench.mrclam.sets import (
+    NoSetsError,
+    find_sets,
+    transferred,
+    unknown_start,
+    with_two_seeing,
+    without_robots,
+    without_sightings,
+)
+from swarm_loc_estimator.calibration.recording import Recording, Rows
+from swarm_loc_estimator.core.description.swarm import Face, Landmark, Robot, SensorModel, Swarm
+from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
+
+SWARM = Swarm(
+    tuple(Robot(f"robot{k}", "create", faces=(Face("body", k),), start=(0.0, 0.0, 0.0)) for k in (1, 2, 3)),
+    (Landmark(10), Landmark(11, 1.0)),
+)
+
+
+def seen(*observations: tuple[int, list[int]]) -> Recording:
+    """A recording in which robots (by index) see ids."""
+    found = []
+    for _, ids in observations:
+        rows = np.zeros(len(ids), DETECTION_DTYPE)
+        rows["id"] = ids
+        found.append(rows)
+    stamps = np.arange(len(found), dtype=np.int64)
+    robots = np.array([robot for robot, _ in observations], dtype=np.int64)
+    none = np.zeros(0, dtype=np.int64)
+    return Recording("r", Rows(none, none, none, ()), Rows(robots, stamps, stamps, tuple(found)), {})
+
+
+def ids_of(recording: Recording) -> list[list[int]]:
+    """What is seen, picture by picture."""
+    return [found["id"].tolist() for found in recording.detections.data]
+
+
+def test_masks_hide_what_they_say() -> None:
+    recording = seen((0, [10, 2]), (1, [11, 1, 3]), (2, [10, 11]))
+    assert ids_of(without_robots(recording, SWARM)) == [[10], [11], [10, 11]]
+    assert ids_of(without_sightings(recording)) == [[], [], []]
+    assert ids_of(with_two_seeing(recording, SWARM, (0, 2))) == [[10, 2], [1, 3], [10, 11]]
+    assert ids_of(recording) == [[10, 2], [11, 1, 3], [10, 11]]
+
+
+def test_models_go_by_name_and_strangers_get_the_mean() -> None:
+    fitted = Swarm(
+        tuple(replace(SWARM.robots[k], sensor=SensorModel(range_offset=0.1 * (k + 1))) for k in (0, 1))
+    )
+    found = transferred(fitted, SWARM).robots
+    assert [robot.sensor.range_offset for robot in found] == pytest.approx([0.1, 0.2, 0.15])
+    assert [robot.name for robot in found] == ["robot1", "robot2", "robot3"]
+    assert all(robot.start == (0.0, 0.0, 0.0) for robot in found)
+    assert all(robot.start is None for robot in unknown_start(SWARM).robots)
+
+
+def test_sets_are_found_by_their_numbers(tmp_path: Path) -> None:
+    for number in (2, 7):
+        (tmp_path / f"MRCLAM_Dataset{number}").mkdir()
+        (tmp_path / f"MRCLAM_Dataset{number}" / "Robot2_Odometry.dat").touch()
+    assert list(find_sets(tmp_path)) == [2, 7]
+    assert list(find_sets(tmp_path / "MRCLAM_Dataset7")) == [7]
+
+
+def test_a_folder_without_sets_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(NoSetsError, match="holds no MRCLAM set"):
+        find_sets(tmp_path)
+    assert mrclam.main([str(tmp_path / "nowhere")]) == 1
+    assert "There is no folder" in capsys.readouterr().err
+
+
+def test_sums_add_up_to_pooled_figures() -> None:
+    pooled = Sums(1, 0.01, 0.0, 3.0, 1) + Sums(3, 0.03, 0.0, 9.0, 3)
+    assert pooled.figures == pytest.approx({"position_rmse_m": 0.1, "heading_rmse_deg": 0.0, "nees": 3.0})
+    assert len(jobs_of(1, SWARM)) == 2 * (5 + 3)
+
+
+def test_set_1_is_fitted_to_wherever_it_lies() -> None:
+    sets, elsewhere = {2: Path("b"), 7: Path("c")}, Path("nowhere")
+    assert mrclam.chosen_to_fit({1: Path("a"), **sets}, None, elsewhere) == (1, Path("a"))
+    assert mrclam.chosen_to_fit(sets, None, elsewhere) == (2, Path("b"))
+    assert mrclam.chosen_to_fit(sets, 7, elsewhere) == (7, Path("c"))
+    with pytest.raises(NoSetsError, match="--fit 5: there is no such set, only 2, 7"):
+        mrclam.chosen_to_fit(sets, 5, elsewhere)
+
+
+def test_set_1_of_another_folder_is_fitted_to_where_the_own_has_none(tmp_path: Path) -> None:
+    (tmp_path / "MRCLAM_Dataset1").mkdir()
+    (tmp_path / "MRCLAM_Dataset1" / "Robot1_Odometry.dat").touch()
+    assert mrclam.chosen_to_fit({7: Path("c")}, None, tmp_path) == (1, tmp_path / "MRCLAM_Dataset1")
+    assert mrclam.chosen_to_fit({1: Path("a")}, None, tmp_path) == (1, Path("a"))
+
+
+def test_a_job_that_fails_leaves_the_figures_of_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sums = Sums(1, 0.01, np.radians(2.0) ** 2, 3.0, 1, 0.05)
+    all_done = [Done(job, sums) for job in jobs_of(1, SWARM) if job.column != "smoother"]
+    all_done += [Done(Job(1, model, "smoother"), None, "gtsam: no solution.") for model in MODELS]
+    results = collected(all_done)
+    assert results.figures["set1.plain.landmarks_robots.position_rmse_m"] == pytest.approx(0.1)
+    assert not any("smoother" in name for name in results.figures)
+    results.figures["set1.replay.speed_factor"] = 100.0
+    monkeypatch.setattr(reporting, "write_figures", partial(write_figures, folder=tmp_path))
+    monkeypatch.setattr(reporting, "save_plot", partial(save_plot, folder=tmp_path))
+    reporting.report(results, [1])
+    shown = capsys.readouterr().out
+    assert shown.count("0.1000/2.00/3.0") == 2 * 5
+    assert "set 1 plain, smoother failed: gtsam: no solution." in shown
+    assert "set1.plain.odometry.nees" in (tmp_path / "mrclam.json").read_text(encoding="utf-8")

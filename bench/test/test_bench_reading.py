@@ -1,0 +1,42 @@
+"""All readers must find the same before their speed is compared."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from bench import reading
+from swarm_loc_estimator.io.bags.cut import copy_beginning
+from swarm_loc_estimator.io.messages.typestore import DETECTIONS, ODOMETRY
+
+
+@pytest.fixture
+def second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The first second of the demo's bag."""
+    monkeypatch.setattr(reading, "REPEATS", 1)
+    copy_beginning(reading.DEMO, tmp_path / "second", 1.0)
+    return tmp_path / "second"
+
+
+def test_a_second_of_the_demo_is_measured_with_all_readers(second: Path) -> None:
+    results = {kind: reading.measure(second, kind, times=2) for kind in (ODOMETRY, DETECTIONS)}
+    reading.report(results, second)
+    figures = json.loads((second / "bench" / "reading.json").read_text(encoding="utf-8"))
+    readers = {"mcap.this", "mcap.mcap", "mcap.rosbags", "sqlite3.this", "sqlite3.rosbags"}
+    assert {key.partition(".")[2].rpartition(".")[0] for key in figures} == readers
+    assert all(value > 0.0 for value in figures.values())
+    assert (second / "reading.png").exists()
+
+
+def test_a_reader_that_finds_something_else_is_not_compared(
+    second: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def forgetful(recording: reading.Recording) -> reading.Figures:
+        found = reading.with_rosbags(recording)
+        return found._replace(numbers=found.numbers[1:])
+
+    monkeypatch.setitem(reading.READERS["mcap"], "forgetful", forgetful)
+    with pytest.raises(RuntimeError, match=r"forgetful reads something else from .* as mcap"):
+        reading.measure(second, ODOMETRY, times=1)

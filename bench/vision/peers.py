@@ -1,0 +1,95 @@
+"""Marker detectors behind one interface: an image in, ids and corners out, in one convention."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.vision.scenes import CAMERA, HEIGHT, WIDTH
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_vision.core.decoding.families import Family, family_named
+from swarm_loc_vision.core.detection.detector import Detections, MarkerDetector
+from swarm_loc_vision.core.detection.settings import DetectorSettings
+from swarm_loc_vision.core.imaging.camera import Camera
+
+Gray = NDArray[np.uint8]
+
+FAMILY = "apriltag_36h11"
+"""The one that all of them read."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """Markers of an image: ids (N,), and corners (N, 4, 2) clockwise from the upper left of the upright tag.
+
+    A pixel's centre has whole coordinates.
+    """
+
+    ids: NDArray[np.int64]
+    corners: FloatArray
+
+
+Peer = Callable[[Gray], Found]
+
+
+def own_detector(family: Family, **numbers: float) -> MarkerDetector:
+    """This package's, with all ids and the scenes' camera."""
+    camera = Camera.from_matrix((WIDTH, HEIGHT), CAMERA, ())
+    return MarkerDetector(DetectorSettings(**numbers), [(family, None)], camera)
+
+
+def as_found(detections: Detections) -> Found:
+    """Its result in the common form."""
+    return Found(detections.id, detections.corners)
+
+
+def stock() -> Peer:
+    """cv2.aruco as it comes, with its sub-pixel refinement."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    detector = cv2.aruco.ArucoDetector(dictionary, parameters)
+
+    def detect(gray: Gray) -> Found:
+        corners, ids, _ = detector.detectMarkers(gray)
+        stacked = np.array(corners, np.float64).reshape(-1, 4, 2)
+        found: Any = ids  # (N, 1) in 4.x, (N,) in 5.0, None in both
+        flat = np.array([] if found is None else found, np.int64).ravel()
+        return Found(flat, np.roll(stacked, 2, axis=1))  # OpenCV's tags are upside down
+
+    return detect
+
+
+def pupil(decimate: float) -> Peer:
+    """AprilTag's own detector; its pixel centres are at halves."""
+    module = importlib.import_module("pupil_apriltags")
+    module.Detector.__del__ = lambda _: None  # it frees its families twice: the process would end in a crash
+    detector = module.Detector(families="tag36h11", nthreads=1, quad_decimate=decimate)
+
+    def detect(gray: Gray) -> Found:
+        found = detector.detect(gray)
+        corners = [tag.corners[::-1] - 0.5 for tag in found]
+        return Found(
+            np.array([tag.tag_id for tag in found], np.int64), np.array(corners, float).reshape(-1, 4, 2)
+        )
+
+    return detect
+
+
+def all_peers() -> dict[str, Peer]:
+    """By name; pupil-apriltags only where it is installed."""
+    detector = own_detector(family_named(FAMILY))
+    peers: dict[str, Peer] = {
+        "own": lambda gray: as_found(detector.detect(gray)),
+        "cv2.aruco": stock(),
+    }
+    if importlib.util.find_spec("pupil_apriltags"):
+        peers |= {"pupil 1": pupil(1.0), "pupil 2": pupil(2.0)}
+    return peers

@@ -1,0 +1,149 @@
+"""Report of the detector's benchmark: tables, a plot, and figures `vision.*` and `bch.*`."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bench.common import Cell, new_plot, save_plot, table
+from bench.vision.bch import BchFigures, measure_bch
+from bench.vision.comparison import (
+    BLURS_PX,
+    INCIDENCES,
+    MARKERS,
+    SIDES_PX,
+    Score,
+    Scores,
+    compare,
+    share_flipped,
+)
+from bench.vision.negatives import black_squares, random_squares
+
+BLACK_SQUARES = 1000
+_BINS = {"side_px": SIDES_PX, "incidence": INCIDENCES, "blur": BLURS_PX}
+
+
+@dataclass(frozen=True)
+class VisionResult:
+    """All that was measured.
+
+    Attributes:
+        scores: Kind of image -> detector -> score.
+        bch: The ids of the paper's markers.
+        squares: Random squares that were shown.
+        square_ids: Ids read from them, all false.
+        black_square_ids: Black squares with a speck that were read as an id, by family and number of ids.
+    """
+
+    scores: Scores
+    bch: BchFigures
+    squares: int
+    square_ids: int
+    black_square_ids: dict[str, int]
+
+    def figures(self) -> dict[str, float]:
+        """Figures by name."""
+        own = {kind: scores["own"] for kind, scores in self.scores.items()}
+        stock_ms = [score for scores in self.scores.values() for score in scores["cv2.aruco"].ms]
+        own_ms = [ms for score in own.values() for ms in score.ms]
+        return {
+            "vision.recall_still": own["still"].recall,
+            "vision.recall_motion": own["motion"].recall,
+            "vision.corner_px": own["still"].corner_rms(),
+            "vision.ms_per_frame": float(np.median(own_ms)),
+            "vision.stock_ms_per_frame": float(np.median(stock_ms)),
+            "vision.false_ids": float(sum(score.false_ids for score in own.values()) + self.square_ids),
+            "vision.black_square_false_ids": float(sum(self.black_square_ids.values())),
+            "bch.ids_right": float(self.bch.ids_right),
+            "bch.us_per_candidate": self.bch.us_per_candidate,
+        }
+
+    def tables(self) -> str:
+        """All tables as text."""
+        whole: list[list[Cell]] = [
+            [
+                kind,
+                name,
+                len(score.truths),
+                score.recall,
+                score.corner_rms(),
+                share_flipped(score),
+                score.false_ids,
+                float(np.median(score.ms)),
+            ]
+            for kind, scores in self.scores.items()
+            for name, score in scores.items()
+        ]
+        columns = ["images", "detector", "markers", "recall", "corner px", "flips", "false ids", "ms/frame"]
+        parts = [table(columns, whole)]
+        parts += [_binned(self.scores, name, edges) for name, edges in _BINS.items()]
+        parts.append(f"{self.squares} random squares: {self.square_ids} read as an id")
+        parts.append(
+            table(
+                [f"of {BLACK_SQUARES} black squares with a speck", "read as an id"],
+                [*self.black_square_ids.items()],
+            )
+        )
+        return "\n\n".join(parts)
+
+
+def measure(seeds: Sequence[int], frames: int) -> VisionResult:
+    """Measure everything; one thread.
+
+    Args:
+        seeds: One run of images each.
+        frames: Images of each kind per seed.
+    """
+    return VisionResult(
+        compare(seeds, frames),
+        measure_bch(),
+        *random_squares(seeds, frames, MARKERS),
+        black_squares(BLACK_SQUARES),
+    )
+
+
+def _binned(scores: Scores, name: str, edges: Sequence[float]) -> str:
+    """Recall by an attribute of the markers."""
+    spans = list(itertools.pairwise(edges))
+    shown = np.degrees(edges) if name == "incidence" else np.array(edges)
+    columns = [
+        f"recall by {name}",
+        "detector",
+        *(f"{low:.3g}-{high:.3g}" for low, high in itertools.pairwise(shown)),
+    ]
+    rows = [
+        [kind, detector, *(_or_none(score, name, low, high) for low, high in spans)]
+        for kind, of_kind in scores.items()
+        for detector, score in of_kind.items()
+        if name != "blur" or kind == "motion"
+    ]
+    return table(columns, rows)
+
+
+def _or_none(score: Score, name: str, low: float, high: float) -> float | None:
+    """Recall between two values; None where there are no markers."""
+    recall = score.recall_within(score.of_truths(name), low, high)
+    return None if np.isnan(recall) else recall
+
+
+def plot(scores: Scores, name: str = "vision") -> Path:
+    """Recall by size and under blur as out/NAME.png; returns the file."""
+    figure, (by_side, by_blur) = new_plot(2)
+    for axes, kind, attribute, edges in (
+        (by_side, "still", "side_px", (*SIDES_PX[:-1], 160.0)),
+        (by_blur, "motion", "blur", BLURS_PX),
+    ):
+        middle = [0.5 * (low + high) for low, high in itertools.pairwise(edges)]
+        for detector, score in scores[kind].items():
+            values = score.of_truths(attribute)
+            recall = [score.recall_within(values, *span) for span in itertools.pairwise(edges)]
+            axes.plot(middle, recall, "o-", label=detector)
+        axes.set_ylim(0.0, 1.02)
+    by_side.set(xlabel="side of the marker [px]", ylabel="recall", xscale="log", title="still")
+    by_blur.set(xlabel="blur [px]", ylabel="recall", title="moving")
+    by_side.legend()
+    return save_plot(figure, name)

@@ -1,0 +1,88 @@
+"""Hardware of Droplets: infrared elements, directions of motion, gaits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+BAUD_RATE = 115_200
+ELEMENTS = 6
+RADIUS_M = 0.022
+FULL_POWER = 256
+"""Of the infrared emitters; 0 is dark."""
+
+TURN_CLOCKWISE, TURN_COUNTERCLOCKWISE = 6, 7
+WALKS = range(6)
+"""Direction d walks towards d times 60 degrees clockwise from the front."""
+DIRECTIONS = range(8)
+
+_TICK_S = 1.024e-3
+_ON_TICKS, _OFF_TICKS, _TRIMS_PER_TICK = 20, 40, 32
+_UNCALIBRATED = 0xFFFF - 1000
+"""An EEPROM that was never written holds 0xFFFF; the firmware calls all that is near it uncalibrated."""
+_UNCALIBRATED_WALK_MM, _UNCALIBRATED_TURN_DEG = 600, 2000
+"""What the firmware then reckons with, per 1000 steps."""
+
+
+@dataclass(frozen=True)
+class DropletModel:
+    """How Droplets differ.
+
+    Attributes:
+        name: As users write it.
+        directions: The motions that it can make.
+    """
+
+    name: str
+    directions: tuple[int, ...]
+
+
+DROPLET = DropletModel("droplet", tuple(DIRECTIONS))
+AUDIO_DROPLET = DropletModel("audio_droplet", (0, 3, TURN_CLOCKWISE, TURN_COUNTERCLOCKWISE))
+"""It has a speaker in the place of one motor."""
+DROPLET_MODELS = {model.name: model for model in (DROPLET, AUDIO_DROPLET)}
+
+
+class Gait(NamedTuple):
+    """What one step of a direction does.
+
+    Attributes:
+        step_s: How long it takes [s].
+        forward: [m].
+        left: [m].
+        turn: To the left [rad].
+    """
+
+    step_s: float
+    forward: float
+    left: float
+    turn: float
+
+    @property
+    def velocity(self) -> tuple[float, float, float]:
+        """Mean velocity: forward [m/s], to the left [m/s], turning to the left [rad/s]."""
+        return self.forward / self.step_s, self.left / self.step_s, self.turn / self.step_s
+
+
+def gait(direction: int, trims: Sequence[int], per_kilostep: int) -> Gait | None:
+    """The gait of a direction; None where no motor turns.
+
+    In a step the motors of the direction run one after the other, 20 ticks each and a trim, and pause for 40.
+
+    Args:
+        direction: 0 to 7.
+        trims: Of the three motors, in 1/32 ticks, signed by their sense of rotation; 0: does not turn.
+        per_kilostep: Calibrated path [mm] or turn [deg] of 1000 steps.
+    """
+    ticks = sum(_ON_TICKS + _OFF_TICKS + abs(trim) / _TRIMS_PER_TICK for trim in trims if trim)
+    if not ticks:
+        return None
+    if per_kilostep > _UNCALIBRATED:
+        per_kilostep = _UNCALIBRATED_WALK_MM if direction in WALKS else _UNCALIBRATED_TURN_DEG
+    if direction not in WALKS:
+        turn = math.radians(per_kilostep * 1e-3)
+        return Gait(ticks * _TICK_S, 0.0, 0.0, -turn if direction == TURN_CLOCKWISE else turn)
+    bearing, path = -direction * math.pi / 3.0, per_kilostep * 1e-6
+    return Gait(ticks * _TICK_S, path * math.cos(bearing), path * math.sin(bearing), 0.0)

@@ -1,0 +1,96 @@
+"""Hardware of e-puck and e-puck2: stepper motors, counters, proximity sensors, image buffers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+STEPS_PER_TURN = 1000
+"""20 steps of the motor by a gear of 50:1."""
+
+PROXIMITY_BEARINGS = tuple(math.radians(-d) for d in (17.0, 46.0, 90.0, 151.0, -151.0, -90.0, -46.0, -17.0))
+"""Directions of ps0..ps7 in base_link [rad], positive to the left; the robot numbers them clockwise."""
+
+PROXIMITY_RADIUS_M = 0.035
+"""Distance of the proximity sensors from the middle of the robot."""
+
+_COUNTER_SPAN = 1 << 16
+_AROUND_IMAGE = 11
+"""Two speeds before an image, its header of 3 bytes, and two speeds after it."""
+
+
+@dataclass(frozen=True)
+class EpuckModel:
+    """How one generation turns a commanded speed into steps.
+
+    A timer of `timer_hz` makes a step every whole number of its ticks, so few rates are possible at high
+    speeds: an e-puck told 600 steps/s makes 625.
+
+    Attributes:
+        name: As users write it.
+        max_command: Larger commands are clamped silently [steps/s].
+        timer_hz: Frequency of the timer [1/s].
+        answer_buffer: Bytes that an answer by the serial protocol may have; more overrun the robot's memory.
+        largest_setting: Bytes of pixels that the firmware lets a camera be set to.
+        zooms: Those of the camera; of another one the firmware makes the last of these without saying so.
+    """
+
+    name: str
+    max_command: int
+    timer_hz: int
+    answer_buffer: int
+    largest_setting: int
+    zooms: tuple[int, ...]
+
+    @property
+    def largest_image(self) -> int:
+        """Bytes of pixels that can be sent, with their header and the speeds around them."""
+        return self.answer_buffer - _AROUND_IMAGE
+
+    def rate(self, command: int) -> float:
+        """The rate [steps/s] that a commanded speed [steps/s] really makes."""
+        speed = min(abs(command), self.max_command)
+        if speed == 0:
+            return 0.0
+        return math.copysign(self.timer_hz / (self.timer_hz // speed), command)
+
+    @property
+    def max_rate(self) -> float:
+        """The fastest rate [steps/s]."""
+        return self.rate(self.max_command)
+
+    def command_for(self, rate: float) -> int:
+        """The command [steps/s] whose true rate comes closest to a finite wanted one [steps/s]."""
+        wanted = min(abs(rate), self.max_rate)
+        candidates = {0, math.floor(wanted), math.ceil(wanted)}
+        if wanted >= 1.0:
+            ticks = self.timer_hz / wanted
+            candidates |= {math.floor(self.timer_hz / n) for n in (math.floor(ticks), math.ceil(ticks))}
+        allowed = {min(command, self.max_command) for command in candidates}
+        best = min(allowed, key=lambda command: (abs(self.rate(command) - wanted), command))
+        return best if rate >= 0.0 else -best
+
+
+EPUCK1 = EpuckModel(
+    "epuck1",
+    max_command=1000,
+    timer_hz=10_000,
+    answer_buffer=3456,
+    largest_setting=3456,
+    zooms=tuple(range(1, 9)),
+)
+EPUCK2 = EpuckModel(
+    "epuck2", max_command=1100, timer_hz=50_000, answer_buffer=4139, largest_setting=4136, zooms=(1, 2, 4)
+)
+EPUCK_MODELS = {model.name: model for model in (EPUCK1, EPUCK2)}
+
+
+def as_counter(steps: int) -> int:
+    """The signed 16-bit counter that a robot sends for its steps."""
+    return (steps + _COUNTER_SPAN // 2) % _COUNTER_SPAN - _COUNTER_SPAN // 2
+
+
+def unwrapped_difference(before: int, after: int, expected: float) -> int:
+    """Steps between two counters of 16 bits: of all that they allow, the number closest to the expected."""
+    surplus = as_counter(after - before - round(expected))
+    return round(expected) + surplus

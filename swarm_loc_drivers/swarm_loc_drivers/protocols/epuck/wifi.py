@@ -1,0 +1,216 @@
+"""The e-puck2's WiFi stream: commands of 21 bytes one way, images and sensor values the other.
+
+Messages of the robot are an id byte and a payload of fixed length, without checksum. A place in the stream
+counts as the begin of a message when the id is known and the values are such as the sensors can give; a
+image, which can be anything, counts when a message follows it and none lies within it.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+PORT = 1000
+COMMAND_SIZE = 21
+COMMAND_ID = 0x80
+WIDTH, HEIGHT = 160, 120
+IMAGE_SIZE = 2 * WIDTH * HEIGHT
+
+IMAGE_ID, SENSORS_ID, NOTHING_ID = 1, 2, 3
+
+_CAMERA_ON, _SENSORS_ON = 1, 2
+_COMMAND = struct.Struct("<BBB2h14x")
+
+SENSORS_DTYPE = np.dtype(
+    [
+        ("acceleration", "<i2", 3),
+        ("acceleration_polar", "<f4", 3),  # magnitude, orientation [deg], inclination [deg]
+        ("gyro", "<i2", 3),
+        ("magnetic_field", "<f4", 3),  # [uT]
+        ("temperature", "i1"),  # [deg C]
+        ("proximity", "<u2", 8),
+        ("ambient", "<u2", 8),
+        ("tof", "<u2"),  # [mm]
+        ("microphones", "<u2", 4),
+        ("left_counter", "<i2"),
+        ("right_counter", "<i2"),
+        ("battery", "<u2"),  # 819.2 per volt
+        ("sd_card", "u1"),
+        ("remote_control", "u1", 3),
+        ("selector", "u1"),
+        ("ground", "<u2", 3),
+        ("ground_ambient", "<u2", 3),
+        ("button", "u1"),
+        ("spare", "u1"),
+    ]
+)
+"""The 104 bytes of sensor values."""
+
+_ADC_MAX = 4095
+_SELECTOR_MAX = 15
+_SIZES = {IMAGE_ID: IMAGE_SIZE, SENSORS_ID: SENSORS_DTYPE.itemsize, NOTHING_ID: 0}
+_BAD, _UNDECIDED = 0, -1
+
+
+@dataclass(frozen=True)
+class Command:
+    """What the robot is told; LEDs and sound stay off.
+
+    Attributes:
+        left: Speed of the left wheel [steps/s].
+        right: Speed of the right wheel [steps/s].
+        camera: Whether images are to be streamed.
+        sensors: Whether sensor values are to be streamed.
+    """
+
+    left: int
+    right: int
+    camera: bool
+    sensors: bool
+
+    def encode(self) -> bytes:
+        """The 21 bytes."""
+        streams = _CAMERA_ON * self.camera | _SENSORS_ON * self.sensors
+        return _COMMAND.pack(COMMAND_ID, streams, 0, self.left, self.right)
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message of the robot.
+
+    Attributes:
+        id: IMAGE_ID, SENSORS_ID or NOTHING_ID.
+        payload: Pixels (RGB565), sensor values (SENSORS_DTYPE), or nothing.
+        stamp_ns: When its first byte came [ns].
+    """
+
+    id: int
+    payload: bytes
+    stamp_ns: int
+
+    @property
+    def sensors(self) -> np.void:
+        """The payload as a record of SENSORS_DTYPE."""
+        record: np.void = np.frombuffer(self.payload, SENSORS_DTYPE)[0]
+        return record
+
+
+def plausible(payload: bytes) -> bool:
+    """Whether 104 bytes can be sensor values: converters have 12 bits, numbers are finite."""
+    values: NDArray[np.void] = np.frombuffer(payload, SENSORS_DTYPE)
+    (record,) = values
+    converted = (record["proximity"], record["ambient"], record["microphones"])
+    return bool(
+        record["selector"] <= _SELECTOR_MAX
+        and record["button"] <= 1
+        and all(np.all(value <= _ADC_MAX) for value in converted)
+        and np.isfinite(record["acceleration_polar"]).all()
+        and np.isfinite(record["magnetic_field"]).all()
+    )
+
+
+class StreamParser:
+    """Cuts the stream into messages; after lost or foreign bytes it finds the next sensor values.
+
+    Attributes:
+        skipped: Bytes that belonged to no message.
+        resyncs: How often messages did not follow each other.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self._offset = 0
+        self._arrivals: deque[tuple[int, int]] = deque()
+        self._synced = True
+        self._searched = 0
+        self.skipped = 0
+        self.resyncs = 0
+
+    def feed(self, data: bytes, stamp_ns: int) -> list[Message]:
+        """Take bytes that came at `stamp_ns`; the messages that are complete with them."""
+        self._arrivals.append((self._offset + len(self._buffer), stamp_ns))
+        self._buffer += data
+        self._drop(0)
+        messages = []
+        while (length := self._verdict()) != _UNDECIDED:
+            if length == _BAD:
+                self._skip_to_candidate()
+            else:
+                self._synced = True
+                messages.append(self._taken(length))
+        return messages
+
+    def _verdict(self) -> int:
+        """Length of the message that the buffer begins with; _BAD if none, _UNDECIDED without more bytes."""
+        if not self._synced and self._buffer and self._buffer[0] != SENSORS_ID:
+            return _BAD
+        length = self._length_at(0)
+        is_image = self._image_begins_at(0)
+        if length > 0 and (is_image or not self._synced):
+            following = self._length_at(length)
+            if following <= 0 and not self._image_begins_at(length):
+                length = following
+        if length == _UNDECIDED and is_image and self._holds_sensor_values():
+            return _BAD
+        return length
+
+    def _length_at(self, begin: int) -> int:
+        """Length of the message at a place of the buffer, or _BAD or _UNDECIDED."""
+        if begin >= len(self._buffer):
+            return _UNDECIDED
+        kind = self._buffer[begin]
+        if kind not in _SIZES:
+            return _BAD
+        end = begin + 1 + _SIZES[kind]
+        if end > len(self._buffer):
+            return _UNDECIDED
+        if kind == SENSORS_ID and not plausible(bytes(self._buffer[begin + 1 : end])):
+            return _BAD
+        return end - begin
+
+    def _image_begins_at(self, begin: int) -> bool:
+        """Whether there is the id of an image; waiting for its end would tell no more."""
+        return begin < len(self._buffer) and self._buffer[begin] == IMAGE_ID
+
+    def _holds_sensor_values(self) -> bool:
+        """Whether two messages of sensor values in a row lie within an image: then its end was lost."""
+        size = 1 + _SIZES[SENSORS_ID]
+        last = len(self._buffer) - 2 * size
+        candidate = self._buffer.find(SENSORS_ID, max(1, self._searched))
+        while 0 <= candidate <= last:
+            after = candidate + size
+            if (
+                self._buffer[after] == SENSORS_ID
+                and min(self._length_at(candidate), self._length_at(after)) > 0
+            ):
+                return True
+            candidate = self._buffer.find(SENSORS_ID, candidate + 1)
+        self._searched = max(0, last)
+        return False
+
+    def _skip_to_candidate(self) -> None:
+        """Drop the first byte, and all until one that sensor values could begin with."""
+        self.resyncs += self._synced
+        self._synced = False
+        candidate = self._buffer.find(SENSORS_ID, 1)
+        dropped = candidate if candidate > 0 else len(self._buffer)
+        self.skipped += dropped
+        self._drop(dropped)
+
+    def _taken(self, length: int) -> Message:
+        """The first message, removed from the buffer."""
+        message = Message(self._buffer[0], bytes(self._buffer[1:length]), self._arrivals[0][1])
+        self._drop(length)
+        return message
+
+    def _drop(self, count: int) -> None:
+        """Remove the first bytes, and the arrivals that no byte of the buffer came with."""
+        del self._buffer[:count]
+        self._offset += count
+        self._searched = max(0, self._searched - count)
+        while len(self._arrivals) > 1 and self._arrivals[1][0] <= self._offset:
+            self._arrivals.popleft()

@@ -1,0 +1,1 @@
+"""What all simulated worlds share: motion, sensors, errors, transport."""

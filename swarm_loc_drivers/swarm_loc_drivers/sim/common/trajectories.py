@@ -1,0 +1,63 @@
+"""Ground-truth trajectories of many robots on one common clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from swarm_loc_estimator.numerics import se2
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """Poses of N robots at T common stamps; between two stamps a robot keeps its twist.
+
+    Attributes:
+        stamp_ns: (T,) int64, evenly spaced.
+        poses: (T, N, 3), x [m], y [m], theta [rad] in map.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    poses: NDArray[np.float64]
+
+    def at(self, robot: NDArray[np.integer] | int, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The pose (..., 3) of each `robot` at each `stamp_ns` (broadcast together).
+
+        Raises:
+            ValueError: A stamp lies outside the simulated time.
+        """
+        index, share = self._locate(stamp_ns)
+        return _interpolate(self.poses[index, robot], self.poses[index + 1, robot], share)
+
+    def all_at(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The poses (M, N, 3) of all robots at stamps (M,).
+
+        Raises:
+            ValueError: A stamp lies outside the simulated time.
+        """
+        index, share = self._locate(stamp_ns)
+        return _interpolate(self.poses[index], self.poses[index + 1], share[:, None])
+
+    def _locate(self, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Index of the stamp before each time, and how far on it is to the next one, in [0, 1]."""
+        stamp_ns = np.asarray(stamp_ns, dtype=np.int64)
+        if stamp_ns.size and (stamp_ns.min() < self.stamp_ns[0] or stamp_ns.max() > self.stamp_ns[-1]):
+            raise ValueError(
+                f"stamps {stamp_ns.min()}..{stamp_ns.max()} ns leave the simulated time "
+                f"{self.stamp_ns[0]}..{self.stamp_ns[-1]} ns."
+            )
+        step_ns = int(self.stamp_ns[1] - self.stamp_ns[0])
+        index = np.minimum((stamp_ns - self.stamp_ns[0]) // step_ns, len(self.stamp_ns) - 2)
+        return index, (stamp_ns - self.stamp_ns[index]) / step_ns
+
+
+def _interpolate(
+    before: NDArray[np.float64], after: NDArray[np.float64], share: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The pose (..., 3) that lies `share` (...) of the way along the constant twist between two poses."""
+    return se2.compose(before, se2.exp(share[..., None] * se2.log(se2.between(before, after))))

@@ -1,0 +1,126 @@
+"""A world of Droplets with the drivers' own sessions at their consoles, all in simulated time in one thread.
+
+The bytes are those that go over the cable, they just take no time. So runs are as they are live, and the same
+every time.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+from swarm_loc_drivers.core.droplet.commanded_motion import CommandedMotion, MotionNoise
+from swarm_loc_drivers.core.droplet.exchange import Brightness
+from swarm_loc_drivers.core.droplet.mover import DropletMover
+from swarm_loc_drivers.core.droplet.session import DropletSession, SessionSettings
+from swarm_loc_drivers.core.odometry_state import OdometryState
+from swarm_loc_drivers.core.velocity_command import Velocity, VelocityCommand
+from swarm_loc_drivers.protocols.droplet.console import TERMINATOR
+from swarm_loc_drivers.sim.common.link_host import ConsoleFirmware
+from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, Print
+from swarm_loc_drivers.sim.droplet.world import DropletWorld, SimulatedDroplet
+
+_TIMEOUT_S = 1.0
+STRIDE_S = 2.0
+
+
+class Cable:
+    """A robot, its console, and the session that talks to it.
+
+    Args:
+        world: Where the robot lives.
+        robot: Its index.
+        settings: Of the session.
+        noise: How the session believes that robots err.
+        publish: Gets the matrices of exchanges.
+
+    Attributes:
+        session: The conversation.
+        counts: What happened in it.
+    """
+
+    def __init__(
+        self,
+        world: DropletWorld,
+        robot: int,
+        settings: SessionSettings,
+        noise: MotionNoise,
+        publish: Callable[[Brightness], None],
+    ) -> None:
+        self.counts: Counter[str] = Counter()
+        self._world = world
+        self._body = SimulatedDroplet(world, robot)
+        self._firmware: ConsoleFirmware = DropletFirmware(self._body)
+        self._command = VelocityCommand(
+            _TIMEOUT_S, lambda: world.now_ns, self.counts, lambda: 1e-9 * world.now_ns
+        )
+        self._motion = CommandedMotion(noise)
+        mover = DropletMover(self._command, self._motion, STRIDE_S)
+        self.session = DropletSession(settings, mover, (), publish, self.counts)
+
+    def set_velocity(self, velocity: Velocity) -> None:
+        """Have the robot move so for a while."""
+        self._command.set(velocity)
+
+    def print_with(self, print_matrix: Print) -> None:
+        """Have the robot begin anew with another program of its user, who prints matrices so."""
+        self._firmware = DropletFirmware(self._body, print_matrix)
+
+    def wire(self, between: Callable[[ConsoleFirmware], ConsoleFirmware]) -> ConsoleFirmware:
+        """Put something between firmware and session; what the firmware was before."""
+        firmware = self._firmware
+        self._firmware = between(firmware)
+        return firmware
+
+    def enter(self, line: str) -> None:
+        """Type a line at the console, past the session."""
+        self._firmware.receive(line.encode() + TERMINATOR)
+
+    def odometry(self) -> OdometryState:
+        """Where the robot is believed to be."""
+        return self._motion.state(self._world.now_ns)
+
+    def step(self) -> None:
+        """Hand bytes to and fro until both ends are silent."""
+        data = self._firmware.stream()
+        while not self.session.ended:
+            output = self.session.step(data, self._world.now_ns)
+            if not output:
+                return
+            data = self._firmware.receive(output)
+            if not data:
+                return
+
+
+class Loose:
+    """A robot without a cable, which is reached by infrared only.
+
+    Args:
+        world: Where the robot lives.
+        robot: Its index.
+    """
+
+    def __init__(self, world: DropletWorld, robot: int) -> None:
+        self._firmware = DropletFirmware(SimulatedDroplet(world, robot))
+
+    def step(self) -> None:
+        """Let it work; nobody reads what it prints."""
+        self._firmware.stream()
+
+
+def run(
+    world: DropletWorld, robots: Sequence[Cable | Loose], steps: int, control: Callable[[], None]
+) -> None:
+    """Let time pass.
+
+    Args:
+        world: The world.
+        robots: All of its robots.
+        steps: How many steps of the world.
+        control: Called after every step; sets velocities, keeps records.
+    """
+    for _ in range(steps):
+        world.step()
+        for robot in robots:
+            robot.step()
+        control()

@@ -1,0 +1,227 @@
+"""One world of Droplets, stepped in simulated time: motors shake, robots creep and veer, infrared flashes.
+
+What happens is fixed by the seed and by when the robots are told what.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from swarm_loc_drivers.protocols.droplet.hardware import DIRECTIONS, ELEMENTS, WALKS, Gait, gait
+from swarm_loc_drivers.sim.common.body import Command, Measured
+from swarm_loc_drivers.sim.common.world_error import WorldError
+from swarm_loc_drivers.sim.droplet.infrared import DropletInfrared, InfraredSettings
+from swarm_loc_drivers.sim.droplet.light import DropletLight
+from swarm_loc_estimator.core.infrared.board import IrPlatform
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+STEP_NS = 5_000_000
+NEAR_POWER = 40
+"""Of the emitters, at which the board's near model holds."""
+_WALK_TRIMS, _TURN_TRIMS = (0, 5, -5), (5, 5, 5)
+_WALK_MM, _TURN_DEG = 300, 1200
+"""Per 1000 steps: 2.4 mm/s and 6.4 deg/s, as real Droplets were logged."""
+_MOTION, _GAINS, _INFRARED = range(3)
+"""Streams of random numbers."""
+
+
+@dataclass(frozen=True)
+class DropletErrors:
+    """How Droplets err; all sigmas are one standard deviation.
+
+    Attributes:
+        scale_sigma: Of each robot's and each direction's steps, relative.
+        veer_sigma: Of each robot's and each direction's turn per metre walked [rad/m].
+        walk_noise: Variance along and across of a walk per metre [m^2/m].
+        veer_noise: Variance of the heading per metre walked [rad^2/m].
+        turn_noise: Variance of a turn per radian [rad^2/rad].
+        gain_sigma: Of each sensor and each emitter, relative.
+        infrared: How infrared fails.
+    """
+
+    scale_sigma: float
+    veer_sigma: float
+    walk_noise: float
+    veer_noise: float
+    turn_noise: float
+    gain_sigma: float
+    infrared: InfraredSettings
+
+
+_LINK = InfraredSettings(reach=0.30, loss=0.05, ambient=6.0, ambient_walk=0.1)
+D0 = DropletErrors(0.0, 0.0, 1e-4, 0.02, 1e-3, 0.0, _LINK)
+"""White noise only."""
+D1 = DropletErrors(0.08, 0.5, 1e-4, 0.02, 1e-3, 0.1, _LINK)
+"""Robots that are not calibrated: steps of their own length, a drift to one side, elements of their own."""
+DROPLET_WORLDS = {"d0": D0, "d1": D1}
+
+
+@dataclass(frozen=True)
+class DropletWorldSettings:
+    """How a world is.
+
+    Attributes:
+        seed: Fixes its systematic errors and its noise.
+        errors: Which errors there are.
+        platform: The infrared board of all robots.
+        start_ns: First moment.
+        boards: Fixes the gains of the elements instead of `seed`.
+    """
+
+    seed: int
+    errors: DropletErrors
+    platform: IrPlatform
+    start_ns: int
+    boards: int | None = None
+
+
+class DropletWorld:
+    """Droplets on a floor.
+
+    Args:
+        ids: (N,) of the robots, 1 to 65535, each once.
+        start: (N, 3) where they begin, in map.
+        settings: How the world is.
+
+    Raises:
+        WorldError: The robots cannot be simulated.
+    """
+
+    def __init__(self, ids: Sequence[int], start: FloatArray, settings: DropletWorldSettings) -> None:
+        _check(ids, settings.platform)
+        self._errors = settings.errors
+        self._rng = self._random(settings.seed, _MOTION)
+        count = len(ids)
+        self.ids = np.array(ids, dtype=np.int64)
+        self.now_ns = settings.start_ns
+        self.poses: FloatArray = np.array(start, dtype=float)
+        """(N, 3) where the robots truly are now, in map."""
+        self._twists = np.zeros((count, 3))
+        self._true = self._true_velocities(count)
+        rng = self._random(settings.seed if settings.boards is None else settings.boards, _GAINS)
+        gains = np.exp(settings.errors.gain_sigma * rng.standard_normal((2, count, ELEMENTS)))
+        self.gains: FloatArray = gains
+        """(2, N, n) true factors of sensors and emitters."""
+        self.infrared = DropletInfrared(
+            settings.platform,
+            DropletLight(settings.platform, gains, NEAR_POWER),
+            self.ids,
+            settings.errors.infrared,
+            self._random(settings.seed, _INFRARED),
+            settings.start_ns,
+        )
+
+    def step(self) -> None:
+        """Go on by STEP_NS."""
+        if self._twists.any():
+            self._creep(STEP_NS * 1e-9)
+        self.now_ns += STEP_NS
+        self.infrared.step(self.now_ns, self.poses)
+
+    def _creep(self, step_s: float) -> None:
+        """Those move whose motors run."""
+        path = step_s * np.hypot(self._twists[:, 0], self._twists[:, 1])
+        walk = self._errors.walk_noise * path
+        heading = self._errors.veer_noise * path
+        heading += self._errors.turn_noise * step_s * np.abs(self._twists[:, 2])
+        noise = np.sqrt(np.stack([walk, walk, heading], axis=-1))
+        noise *= self._rng.standard_normal(noise.shape)
+        self.poses = se2.compose(self.poses, se2.exp(self._twists * step_s + noise))
+
+    def move(self, robot: int, direction: int | None) -> None:
+        """A robot's motors run."""
+        self._twists[robot] = 0.0 if direction is None else self._true[robot, direction]
+
+    def _true_velocities(self, count: int) -> FloatArray:
+        """(N, directions, 3) what the robots really do when they are told a direction."""
+        scale = 1.0 + self._errors.scale_sigma * self._rng.standard_normal((count, len(DIRECTIONS)))
+        veer = self._errors.veer_sigma * self._rng.standard_normal((count, len(DIRECTIONS)))
+        told = np.array([nominal_gait(direction).velocity for direction in DIRECTIONS])
+        true: FloatArray = scale[..., None] * told
+        true[..., 2] += veer * np.hypot(true[..., 0], true[..., 1])
+        return true
+
+    @staticmethod
+    def _random(seed: int, stream: int) -> np.random.Generator:
+        return np.random.default_rng([seed, stream])
+
+
+def trims(direction: int) -> tuple[int, int, int]:
+    """What the robots' memory holds: two motors walk, three turn."""
+    return _WALK_TRIMS if direction in WALKS else _TURN_TRIMS
+
+
+def length(direction: int) -> int:
+    """Likewise per 1000 steps [mm or deg]."""
+    return _WALK_MM if direction in WALKS else _TURN_DEG
+
+
+def nominal_gait(direction: int) -> Gait:
+    """What a step does by the robot's own calibration."""
+    one = gait(direction, trims(direction), length(direction))
+    assert one is not None  # noqa: S101 - motors turn in every direction
+    return one
+
+
+class SimulatedDroplet:
+    """One robot of a world as its firmware finds it; see `DropletBody`.
+
+    Args:
+        world: Where it lives.
+        robot: Its index.
+    """
+
+    trims = tuple(trims(direction) for direction in DIRECTIONS)
+    lengths = tuple(length(direction) for direction in DIRECTIONS)
+
+    def __init__(self, world: DropletWorld, robot: int) -> None:
+        self._world, self._robot = world, robot
+        self.robot_id = int(world.ids[robot])
+
+    def move(self, direction: int | None) -> None:
+        """Run the motors."""
+        self._world.move(self._robot, direction)
+
+    def infrared_status(self) -> int:
+        """What keeps infrared busy."""
+        return self._world.infrared.status(self._robot)
+
+    def send(self, line: str, target: int) -> None:
+        """Send a command."""
+        self._world.infrared.send(self._robot, line, target, self._world.poses)
+
+    def emit(self, power: int) -> None:
+        """Begin an exchange."""
+        self._world.infrared.emit(self._robot, power, self._world.poses)
+
+    def heard(self) -> Sequence[Command | Measured]:
+        """What has come since the last call."""
+        everybody = self._world.infrared.heard
+        heard = everybody[self._robot]
+        if heard:
+            everybody[self._robot] = []
+        return heard
+
+    def deaf_until_ns(self) -> int:
+        """When the firmware has time again [ns]."""
+        return self._world.infrared.deaf_until_ns[self._robot]
+
+    @property
+    def now_ns(self) -> int:
+        """The world's time [ns]."""
+        return self._world.now_ns
+
+
+def _check(ids: Sequence[int], platform: IrPlatform) -> None:
+    """Raise what cannot be simulated."""
+    wrong = [robot for robot in ids if not 0 < robot <= 0xFFFF]
+    if wrong:
+        raise WorldError(f"id {wrong[0]} must lie in [1, 65535].")
+    if len(set(ids)) < len(ids):
+        raise WorldError("two robots have one id.")
+    if platform.n != ELEMENTS:
+        raise WorldError(f"the board has {platform.n} elements, but a Droplet has {ELEMENTS}.")

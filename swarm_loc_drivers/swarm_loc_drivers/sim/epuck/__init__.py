@@ -1,0 +1,1 @@
+"""Simulated e-pucks."""

@@ -1,0 +1,235 @@
+"""One world of e-pucks, stepped in simulated time: motors turn wheels, wheels slip, cameras look.
+
+What happens is fixed by the seed and by when the robots are told what; images are drawn only when somebody
+wants to see them, and look the same whenever that is.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_drivers.core.epuck.wheels import WheelGeometry
+from swarm_loc_drivers.sim.common.differential_drive import Drive, LastingNoise, roll
+from swarm_loc_drivers.sim.common.error_model import ErrorModel
+from swarm_loc_drivers.sim.common.hidden_geometry import hidden_geometry
+from swarm_loc_drivers.sim.common.trajectories import Trajectories
+from swarm_loc_drivers.sim.common.world_error import WorldError, start_of
+from swarm_loc_drivers.sim.epuck.proximity import proximity_values
+from swarm_loc_drivers.sim.render.camera_rig import Arena, CameraRig
+from swarm_loc_drivers.sim.render.lens import CameraModel
+from swarm_loc_drivers.sim.render.views import Views
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+GrayImage = NDArray[np.uint8]
+
+STEP_NS = 5_000_000
+_SLIP_S = 0.05
+"""How long a slip of a wheel lasts: 3 mm of its way at 0.06 m/s."""
+_KEPT_NS = 400_000_000
+"""So long an image can still be drawn after its camera has taken the next one."""
+_PHASES, _EXPOSURES, _SENSOR, _PROXIMITY = range(4)
+"""Streams of random numbers, each a function of the seed, the stream, and what it is for."""
+
+
+@dataclass(frozen=True)
+class EpuckWorldSettings:
+    """How a world is.
+
+    Attributes:
+        seed: Fixes its systematic errors and its noise.
+        errors: Which errors there are; those of sightings themselves (noise, flips) are up to the images.
+        arena: What is built around the robots.
+        camera: Of all robots, as calibrated.
+        wheels: Of all robots.
+        camera_rate_hz: [1/s].
+        start_ns: First moment.
+    """
+
+    seed: int
+    errors: ErrorModel
+    arena: Arena
+    camera: CameraModel
+    wheels: WheelGeometry
+    camera_rate_hz: float
+    start_ns: int
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """An image that a camera has taken.
+
+    Attributes:
+        robot: Index of the robot.
+        number: Counts the robot's images.
+        stamp_ns: When its camera says it was taken.
+        middle_ns: When it was taken: the middle of the exposure.
+    """
+
+    robot: int
+    number: int
+    stamp_ns: int
+    middle_ns: int
+
+
+class EpuckWorld:
+    """The robots of a swarm in their arena.
+
+    Args:
+        swarm: As described; every robot needs a start pose and a camera, every marker a heading.
+        settings: How the world is.
+
+    Raises:
+        WorldError: The swarm cannot be simulated.
+    """
+
+    def __init__(self, swarm: Swarm, settings: EpuckWorldSettings) -> None:
+        check_swarm(swarm)
+        self._settings = settings
+        self._drive = Drive(
+            settings.wheels.wheel_separation, settings.errors.wheel_noise, settings.errors.turn_slip
+        )
+        rng = np.random.default_rng(settings.seed)
+        truth = hidden_geometry(rng, swarm, settings.errors)
+        self._rig = CameraRig(swarm, truth, settings.arena, settings.camera, settings.seed)
+        count = len(swarm.robots)
+        self._slip = LastingNoise(rng, (count, 2), STEP_NS * 1e-9, _SLIP_S)
+        self.now_ns = settings.start_ns
+        self.poses: FloatArray = np.array([robot.start for robot in swarm.robots], dtype=float)
+        """(N, 3) where the robots truly are now, in map."""
+        self.rates: FloatArray = np.zeros((count, 2))
+        """(N, 2) of the left and the right wheel, as commanded [steps/s]."""
+        self.steps: FloatArray = np.zeros((count, 2))
+        """(N, 2) that the left and the right motor have done since the start."""
+        self._period_ns = round(1e9 / settings.camera_rate_hz)
+        early_ns = round(1e9 * settings.errors.exposure_early_s)
+        remembered_ns = self._period_ns + early_ns + 2 * self._half_exposure_ns + _KEPT_NS
+        self._past = deque([(self.now_ns, self.poses)], maxlen=remembered_ns // STEP_NS)
+        first_ns = settings.start_ns + early_ns + self._half_exposure_ns
+        phases = self._random(_PHASES).integers(0, self._period_ns, count)
+        self._first_ns: list[int] = (first_ns + phases).tolist()
+        self._next = [self._exposure(robot, 0) for robot in range(count)]
+        self.newest: list[Exposure | None] = [None] * count
+        """The last image that each camera has taken."""
+
+    def step(self) -> list[Exposure]:
+        """Go on by STEP_NS; the images that have been taken meanwhile, by stamp."""
+        step_s = STEP_NS * 1e-9
+        left, right = (self._settings.wheels.metres_per_step * self.rates).T
+        noise = np.sqrt(self._drive.wheel_noise) * self._slip.next()
+        turn_rate = (right - left) / self._drive.wheel_separation
+        self.poses = roll(self.poses, 0.5 * (left + right), turn_rate, self._drive, step_s, noise)
+        self.steps += self.rates * step_s
+        self.now_ns += STEP_NS
+        self._past.append((self.now_ns, self.poses))
+        taken = [self._take(robot) for robot in range(len(self._next)) if self._is_due(self._next[robot])]
+        return sorted(taken, key=lambda exposure: exposure.stamp_ns)
+
+    def image(self, exposure: Exposure) -> GrayImage:
+        """Draw what a camera took (height, width).
+
+        Raises:
+            ValueError: It was taken too long ago.
+        """
+        track = Trajectories(
+            np.array([stamp_ns for stamp_ns, _ in self._past]), np.array([poses for _, poses in self._past])
+        )
+        rng = self._random(_SENSOR, exposure.robot, exposure.number)
+        return self._rig.take(exposure.robot, exposure.middle_ns, track, rng)
+
+    def views(self, robot: int, poses: FloatArray) -> Views:
+        """Where markers lie in a robot's images when all robots stand at `poses` (N, 3); for evaluation."""
+        return self._rig.views(robot, poses)
+
+    def proximity(self, robot: int) -> NDArray[np.int64]:
+        """Raw values (8,) of a robot's proximity sensors now."""
+        rng = self._random(_PROXIMITY, robot, self.now_ns)
+        return proximity_values(self.poses, robot, self._settings.arena.size, rng)
+
+    def _take(self, robot: int) -> Exposure:
+        """Note the image that was due, and when the next one is."""
+        exposure = self._next[robot]
+        self.newest[robot] = exposure
+        self._next[robot] = self._exposure(robot, exposure.number + 1)
+        return exposure
+
+    def exposure_of(self, robot: int, stamp_ns: int) -> Exposure:
+        """The image that a camera stamps so, at any time: which one it is, and when it is truly taken."""
+        return self._exposure(robot, round((stamp_ns - self._first_ns[robot]) / self._period_ns))
+
+    def _exposure(self, robot: int, number: int) -> Exposure:
+        """An image; it is taken before its stamp as the world has it."""
+        stamp_ns = self._first_ns[robot] + number * self._period_ns
+        early_s = self._settings.errors.exposure_early_s * self._random(_EXPOSURES, robot, number).random()
+        return Exposure(robot, number, stamp_ns, stamp_ns - round(1e9 * early_s))
+
+    def _is_due(self, exposure: Exposure) -> bool:
+        """Whether its shutter has closed and its camera has stamped it."""
+        return self.now_ns >= max(exposure.stamp_ns, exposure.middle_ns + self._half_exposure_ns)
+
+    def _random(self, *what: int) -> np.random.Generator:
+        """Random numbers of their own for one purpose."""
+        return np.random.default_rng([self._settings.seed, *what])
+
+    @property
+    def _half_exposure_ns(self) -> int:
+        return round(0.5e9 * self._settings.camera.exposure_s)
+
+
+class SimulatedEpuck:
+    """One robot of a world as its firmware finds it; see `EpuckBody`.
+
+    Args:
+        world: Where it lives.
+        robot: Its index.
+    """
+
+    def __init__(self, world: EpuckWorld, robot: int) -> None:
+        self._world, self._robot = world, robot
+        self._drawn: tuple[int, GrayImage] | None = None
+
+    def set_wheel_speeds(self, left: float, right: float) -> None:
+        """Turn the wheels at these rates [steps/s] until the next call."""
+        self._world.rates[self._robot] = left, right
+
+    def wheel_steps(self) -> tuple[int, int]:
+        """Whole steps done since the start, left and right."""
+        left, right = self._world.steps[self._robot].tolist()
+        return int(left), int(right)
+
+    def proximity(self) -> NDArray[np.int64]:
+        """Raw values, ps0..ps7 clockwise from the front."""
+        return self._world.proximity(self._robot)
+
+    def image(self) -> tuple[GrayImage, int] | None:
+        """The newest image (height, width) and its stamp [ns]; None before the first."""
+        newest = self._world.newest[self._robot]
+        if newest is None:
+            return None
+        if self._drawn is None or self._drawn[0] != newest.stamp_ns:
+            self._drawn = newest.stamp_ns, self._world.image(newest)
+        return self._drawn[1], newest.stamp_ns
+
+    @property
+    def now_ns(self) -> int:
+        """The world's time [ns]."""
+        return self._world.now_ns
+
+
+def check_swarm(swarm: Swarm) -> None:
+    """Make sure that nothing is lacking.
+
+    Raises:
+        WorldError: What a robot or a marker lacks.
+    """
+    for robot in swarm.robots:
+        start_of(robot)
+        if robot.camera is None:
+            raise WorldError(f"robot '{robot.name}' has no camera, and a simulated e-puck has one.")
+    for marker_id, owner in swarm.owner_of.items():
+        if owner.marker.yaw is None:
+            raise WorldError(f"marker {marker_id} has no yaw, and a simulated marker looks somewhere.")

@@ -1,0 +1,1 @@
+"""Scenarios of simulated swarms: eight, grid, dense crowd, table of Droplets."""

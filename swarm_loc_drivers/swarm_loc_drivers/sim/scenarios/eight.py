@@ -1,0 +1,179 @@
+"""Five e-pucks driving the paper's eight among twenty wall markers.
+
+The geometry fits the text of "Vision-based Localization for a Swarm of Ground Mini-Robots": a lemniscate of
+half-width 0.60 m in an arena of 2.4 m by 1.6 m with a marker every 0.4 m of wall; five faces per robot,
+cameras at 7.5 Hz.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from swarm_loc_drivers.sim.common.camera import Exposures, View, schedule_exposures
+from swarm_loc_drivers.sim.common.differential_drive import Controller, Drive, drive, report_odometry
+from swarm_loc_drivers.sim.common.error_model import W0, ErrorModel
+from swarm_loc_drivers.sim.common.markers import observe_markers
+from swarm_loc_drivers.sim.common.record import Records, SimulatedRun
+from swarm_loc_drivers.sim.common.trajectories import Trajectories
+from swarm_loc_drivers.sim.common.transport import ODOMETRY_LATENESS
+from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
+from swarm_loc_estimator.core.description.swarm import (
+    CameraMount,
+    Face,
+    Landmark,
+    OdometryModel,
+    Robot,
+    StartSigma,
+    Swarm,
+)
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+HALF_WIDTH = 0.60
+ARENA = (2.4, 1.6)
+WALL_MARKER_PITCH = 0.4
+MARKER_HEIGHT = 0.08
+FACE_DISTANCE = 0.033
+FACE_NAMES = ("front_left", "left", "back", "right", "front_right")
+CAMERA = CameraMount(x=0.03, z=0.08)
+VIEW = View(field_of_view=math.radians(60.0), nearest=0.12, farthest=1.5, incidence=math.radians(65.0))
+WHEEL_SEPARATION = 0.053
+CAMERA_RATE_HZ = 7.5
+START_NS = 1_000 * 10**9
+STEP_NS = 5_000_000
+
+_FIRST_FACE_ID, _FIRST_LANDMARK_ID = 10, 100
+_ACROSS_GAIN = 25.0
+_HEADING_GAIN = 10.0
+_CATCH_UP_GAIN = 0.5
+
+
+@dataclass(frozen=True)
+class EightSettings:
+    """What to simulate.
+
+    Attributes:
+        seed: Two runs with the same settings are identical.
+        duration_s: [s].
+        robots: How many, evenly spread over the eight; 5 or another odd number never meet in its middle.
+        speed: [m/s].
+        errors: The imperfections.
+        odometry_rate_hz: 20, 25, 40 or 50 are multiples of the simulation's step.
+        start_known: Whether the description tells where each robot starts.
+    """
+
+    seed: int = 1
+    duration_s: float = 54.0
+    robots: int = 5
+    speed: float = 0.06
+    errors: ErrorModel = W0
+    odometry_rate_hz: float = 20.0
+    start_known: bool = True
+
+
+def simulate_eight(settings: EightSettings) -> SimulatedRun:
+    """Drive the eight and record what the sensors say."""
+    rng = np.random.default_rng(settings.seed)
+    swarm, truth, odometry = drive_eight(rng, settings)
+    exposures = camera_exposures(rng, settings.robots, truth)
+    frames, sightings = observe_markers(rng, swarm, truth, exposures, VIEW, settings.errors)
+    return SimulatedRun(swarm, truth, odometry, frames, sightings)
+
+
+def camera_exposures(rng: np.random.Generator, robots: int, truth: Trajectories) -> Exposures:
+    """When the cameras look; not before images may be older than their stamps."""
+    return schedule_exposures(
+        rng, robots, CAMERA_RATE_HZ, int(truth.stamp_ns[0]) + 200_000_000, int(truth.stamp_ns[-1])
+    )
+
+
+def drive_eight(rng: np.random.Generator, settings: EightSettings) -> tuple[Swarm, Trajectories, Records]:
+    """Drive the eight; results as of `drive_robots`."""
+    path = Lemniscate(HALF_WIDTH)
+    offset = np.arange(settings.robots) * path.length / settings.robots
+    start, _ = path.at(offset)
+    return drive_robots(rng, settings, start, follow(path, offset, settings.speed, STEP_NS * 1e-9))
+
+
+def drive_robots(
+    rng: np.random.Generator,
+    settings: EightSettings,
+    start: FloatArray,
+    control: Controller,
+    first_face_id: int = _FIRST_FACE_ID,
+) -> tuple[Swarm, Trajectories, Records]:
+    """Drive robots from `start` (N, 3): the swarm as described, where it went, and its odometry."""
+    steps = round(settings.duration_s * 1e9 / STEP_NS)
+    stamp_ns = START_NS + STEP_NS * np.arange(steps + 1, dtype=np.int64)
+    model = Drive(WHEEL_SEPARATION, settings.errors.wheel_noise, settings.errors.turn_slip)
+    driven = drive(rng, start, control, model, step_s=STEP_NS * 1e-9, steps=steps)
+    truth = Trajectories(stamp_ns, driven.truth)
+    every = round(1e9 / settings.odometry_rate_hz / STEP_NS)
+    odometry = report_odometry(rng, stamp_ns, driven.reported, every, ODOMETRY_LATENESS)
+    return describe(settings, start, first_face_id), truth, odometry
+
+
+def describe(settings: EightSettings, start: FloatArray, first_face_id: int = _FIRST_FACE_ID) -> Swarm:
+    """The swarm as its owner would describe it; `start` is (N, 3) in map, each robot has ten ids."""
+    odometry = OdometryModel(wheel_separation=WHEEL_SEPARATION, wheel_noise=settings.errors.wheel_noise)
+    robots = tuple(
+        Robot(
+            name=f"epuck{index + 1}",
+            type="epuck",
+            odometry=odometry,
+            camera=CAMERA,
+            sensor=settings.errors.described,
+            faces=faces(first_face_id + 10 * index),
+            start=rounded(pose) if settings.start_known else None,
+            start_sigma=StartSigma(),
+        )
+        for index, pose in enumerate(start)
+    )
+    return Swarm(robots, wall_markers())
+
+
+def faces(first_id: int) -> tuple[Face, ...]:
+    """Five markers around a robot; the camera looks out to the front between two of them."""
+    directions = [math.radians(angle) for angle in (36.0, 108.0, 180.0, -108.0, -36.0)]
+    places = [(FACE_DISTANCE * math.cos(yaw), FACE_DISTANCE * math.sin(yaw), yaw) for yaw in directions]
+    return tuple(
+        Face(name, first_id + k, x, y, MARKER_HEIGHT, yaw)
+        for k, (name, (x, y, yaw)) in enumerate(zip(FACE_NAMES, map(rounded, places), strict=True))
+    )
+
+
+def rounded(pose: Sequence[float] | FloatArray) -> tuple[float, float, float]:
+    """A pose x, y, theta as people write it down, to the micrometre."""
+    x, y, theta = (round(float(value), 6) for value in pose)
+    return x, y, theta
+
+
+def wall_markers() -> tuple[Landmark, ...]:
+    """The landmarks: one every 0.4 m along each wall, facing inwards."""
+    half_x, half_y = 0.5 * ARENA[0], 0.5 * ARENA[1]
+    along_x = np.arange(-half_x + 0.5 * WALL_MARKER_PITCH, half_x, WALL_MARKER_PITCH)
+    along_y = np.arange(-half_y + 0.5 * WALL_MARKER_PITCH, half_y, WALL_MARKER_PITCH)
+    places = [(x, -half_y, 0.5 * math.pi) for x in along_x] + [(half_x, y, math.pi) for y in along_y]
+    places += [(x, half_y, -0.5 * math.pi) for x in along_x[::-1]] + [
+        (-half_x, y, 0.0) for y in along_y[::-1]
+    ]
+    return tuple(
+        Landmark(_FIRST_LANDMARK_ID + k, x, y, MARKER_HEIGHT, yaw)
+        for k, (x, y, yaw) in enumerate(map(rounded, places))
+    )
+
+
+def follow(path: Lemniscate, offset: FloatArray, speed: float, step_s: float) -> Controller:
+    """Keeps N robots on the path, robot i at length `offset[i]` [m] plus speed [m/s] times time."""
+
+    def control(step: int, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        target, curvature = path.at(offset + speed * step * step_s)
+        error = se2.between(pose, target)
+        forward = speed + _CATCH_UP_GAIN * error[:, 0]
+        return forward, speed * (curvature + _ACROSS_GAIN * error[:, 1] + _HEADING_GAIN * error[:, 2])
+
+    return control

@@ -1,0 +1,21 @@
+"""The pages under doc/ have the parameters of the steering nodes, which stand in the nodes' own modules."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from swarm_loc_drivers.nodes.droplet.droplet_steering_node import DropletSteeringParameters
+from swarm_loc_drivers.nodes.epuck.eight_steering_node import SteeringParameters
+from swarm_loc_estimator.parameters.table import markdown_table
+
+DOC = Path(__file__).parents[2] / "doc"
+
+
+@pytest.mark.parametrize(
+    ("page", "parameters"),
+    [("epuck_world_node.md", SteeringParameters), ("droplet_world_node.md", DropletSteeringParameters)],
+)
+def test_the_page_says_what_the_table_says(page: str, parameters: type) -> None:
+    assert markdown_table(parameters) in (DOC / page).read_text(encoding="utf-8")

@@ -1,0 +1,104 @@
+"""What the Droplets' tests share: small worlds without errors, their robots' firmware and sessions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from swarm_loc_drivers.core.droplet.commanded_motion import MotionNoise
+from swarm_loc_drivers.core.droplet.exchange import Brightness, PollingSettings
+from swarm_loc_drivers.core.droplet.session import SessionSettings
+from swarm_loc_drivers.core.droplet.tdma import TdmaSettings
+from swarm_loc_drivers.protocols.droplet.hardware import DROPLET, ELEMENTS, FULL_POWER
+from swarm_loc_drivers.sim.droplet.infrared import InfraredSettings
+from swarm_loc_drivers.sim.droplet.lockstep import Cable, Loose, run
+from swarm_loc_drivers.sim.droplet.world import (
+    NEAR_POWER,
+    STEP_NS,
+    DropletErrors,
+    DropletWorld,
+    DropletWorldSettings,
+)
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+SECOND = 1_000_000_000
+START_NS = 1_000 * SECOND
+IDS = (0x0029, 0x6B6F, 0xDF64)
+TRIANGLE = np.array([[0.0, 0.0, 0.3], [0.12, 0.02, 2.0], [0.03, 0.14, -1.0]])
+LINK = InfraredSettings(reach=0.30, loss=0.0, ambient=0.0, ambient_walk=0.0)
+IDEAL = DropletErrors(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, LINK)
+QUIET = replace(load_ir_platform("droplet"), noise=1e-9)
+POWERS = (FULL_POWER, NEAR_POWER)
+NOISE = MotionNoise(walk_noise=1e-3, veer_noise=0.1, turn_noise=0.01)
+
+
+def world_of(
+    start: FloatArray = TRIANGLE,
+    errors: DropletErrors = IDEAL,
+    ids: Sequence[int] = IDS,
+    seed: int = 1,
+    **platform: float,
+) -> DropletWorld:
+    """A world whose sensors read exactly what they should unless `platform` says otherwise."""
+    settings = DropletWorldSettings(seed, errors, replace(QUIET, **platform), START_NS)  # type: ignore[arg-type]
+    return DropletWorld(ids[: len(start)], start, settings)
+
+
+def asking(
+    *partners: int, period_s: float = 0.0, retries: int = 5, powers: Sequence[int] = POWERS
+) -> PollingSettings:
+    """Ask these partners."""
+    return PollingSettings(partners, period_s, retries, tuple(powers), least_brightness=5)
+
+
+def taking_turns(turn: int, turns: int = 3, powers: Sequence[int] = POWERS) -> TdmaSettings:
+    """Emit in this turn."""
+    return TdmaSettings(turn, turns, 1.0, tuple(powers), ())
+
+
+def session_settings(exchanges: PollingSettings | TdmaSettings) -> SessionSettings:
+    """A whole Droplet."""
+    return SessionSettings(DROPLET, ELEMENTS, 0.3, exchanges)
+
+
+class Lab:
+    """Robots, the first of them at cables, in simulated time.
+
+    Args:
+        world: The robots.
+        exchanges: Of each that has a cable.
+
+    Attributes:
+        cables: Of these.
+        found: Per cable the matrices that came.
+    """
+
+    def __init__(self, world: DropletWorld, *exchanges: PollingSettings | TdmaSettings) -> None:
+        self.world = world
+        self.found: list[list[Brightness]] = [[] for _ in exchanges]
+        self.cables = [
+            Cable(world, robot, session_settings(one), NOISE, self.found[robot].append)
+            for robot, one in enumerate(exchanges)
+        ]
+        loose = [Loose(world, robot) for robot in range(len(exchanges), len(world.ids))]
+        self._robots: list[Cable | Loose] = [*self.cables, *loose]
+        self.control: Callable[[], None] = lambda: None
+
+    def run(self, seconds: float) -> None:
+        """Let time pass."""
+        run(self.world, self._robots, round(seconds * SECOND / STEP_NS), self.control)
+
+    def until(self, condition: Callable[[], object], seconds: float = 60.0) -> None:
+        """Let time pass until something is so."""
+        end_ns = self.world.now_ns + seconds * SECOND
+        while not condition():
+            assert self.world.now_ns < end_ns, [cable.counts for cable in self.cables]
+            self.run(STEP_NS / SECOND)
+
+    def connected(self) -> Lab:
+        """Itself, when all sessions know their robots."""
+        self.until(lambda: all(cable.session.connected for cable in self.cables))
+        return self

@@ -1,0 +1,1 @@
+"""The fit of gains of infrared sensors and emitters."""

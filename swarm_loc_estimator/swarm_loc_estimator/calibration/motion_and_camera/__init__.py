@@ -1,0 +1,1 @@
+"""The fit of odometry, cameras and noise to ground truth."""

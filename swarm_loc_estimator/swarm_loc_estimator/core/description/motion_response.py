@@ -1,0 +1,50 @@
+"""Motion response: what share of a reported motion is true, for odometry that is a command or that slips."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+
+class MotionResponseError(ValueError):
+    """A response that contradicts itself; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class MotionResponse:
+    """How much of the reported speed and turn rate is true, for odometry that is a command or that slips.
+
+    Between the points of the grid the shares are interpolated, beyond it they are those of its border.
+
+    Attributes:
+        speeds: (V,) reported speeds [m/s], ascending, from 0 on.
+        turn_rates: (W,) reported turn rates [rad/s], ascending, from 0 on; their sign does not matter.
+        speed_share: (V, W) true speed per reported speed.
+        turn_share: (V, W) true turn rate per reported turn rate.
+
+    Raises:
+        MotionResponseError: Sizes do not fit, an axis does not ascend, or a share is not in [0, 10].
+    """
+
+    speeds: tuple[float, ...]
+    turn_rates: tuple[float, ...]
+    speed_share: tuple[tuple[float, ...], ...]
+    turn_share: tuple[tuple[float, ...], ...]
+
+    def __post_init__(self) -> None:
+        for name in ("speeds", "turn_rates"):
+            axis = getattr(self, name)
+            ascends = all(low < high for low, high in itertools.pairwise(axis))
+            if not axis or not all(0.0 <= v <= 1e3 for v in axis) or not ascends:
+                raise MotionResponseError(
+                    f"response.{name} is {list(axis)} but must ascend within [0, 1000]."
+                )
+        for name in ("speed_share", "turn_share"):
+            table = getattr(self, name)
+            if len(table) != len(self.speeds) or any(len(row) != len(self.turn_rates) for row in table):
+                raise MotionResponseError(
+                    f"response.{name} must have {len(self.speeds)} rows, one per speed,"
+                    f" of {len(self.turn_rates)} numbers, one per turn rate."
+                )
+            if not all(0.0 <= v <= 10.0 for row in table for v in row):
+                raise MotionResponseError(f"response.{name} must hold numbers in [0, 10] only.")

@@ -1,0 +1,68 @@
+"""Settings of the estimator, apart from the swarm itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from swarm_loc_estimator.parameters.errors import UserError
+from swarm_loc_estimator.parameters.number_spec import number, number_specs
+
+
+class SettingsError(UserError):
+    """A setting outside its range; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class EstimatorSettings:
+    """How measurements are buffered, judged and given up on; each number with its range beside it.
+
+    Raises:
+        SettingsError: A value is out of range.
+    """
+
+    horizon_s: float = number(
+        2.0, "s", 0.05, 60.0, "data up to this late count at their own time; older are dropped"
+    )
+    fusion_period_s: float = number(
+        0.2,
+        "s",
+        0.0,
+        1.0,
+        "where a large swarm has many measurements in such a period, they are fused together; 0: never",
+    )
+    state_period_s: float = number(
+        0.0,
+        "s",
+        0.0,
+        1.0,
+        "period of stored states, measurements count at the closest (e-puck paper V-B); 0: exact",
+    )
+    future_tolerance_s: float = number(
+        0.1, "s", 0.0, 10.0, "stamps further ahead of the clock than this are dropped"
+    )
+    jump_back_s: float = number(
+        0.5, "s", 0.0, 3600.0, "a clock that goes back by more than this resets the filter"
+    )
+    lost_after: int = number(
+        12, "1", 2, 1_000_000, "so many gated measurements in a row and the robot counts as lost"
+    )
+    lost_sigma: float = number(
+        1.0, "m", 0.01, 1e3, "a position less sure than this and the robot counts as lost"
+    )
+    lost_heading_sigma: float = number(0.3, "rad", 0.01, 10.0, "likewise a heading less sure than this")
+    max_doubt: float = number(
+        10.0,
+        "1",
+        2.0,
+        1e9,
+        "how much must speak against a robot or landmark until what describes it is estimated; 1e9: never",
+    )
+    fix_window_s: float = number(
+        20.0, "s", 0.1, 600.0, "a waiting robot is located from sightings no older than this"
+    )
+
+    def __post_init__(self) -> None:
+        for name, spec in number_specs(type(self)).items():
+            value = getattr(self, name)
+            if not spec.allows(value):
+                raise SettingsError(f"parameter {name} = {value} must lie in {spec.range_text}.")

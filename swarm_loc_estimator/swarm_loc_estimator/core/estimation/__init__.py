@@ -1,0 +1,1 @@
+"""The estimator over time: delayed and out-of-sequence measurements, estimates."""

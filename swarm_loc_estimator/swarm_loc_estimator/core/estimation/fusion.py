@@ -1,0 +1,260 @@
+"""Steps of the joint EKF: robots are initialized and lost, measurements fused in order or together."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.core.filter import sequential_update
+from swarm_loc_estimator.core.filter.batch_update import (
+    assess_all,
+    confirm_all,
+    count_all_gated,
+    evaluate_all,
+    predict_all,
+)
+from swarm_loc_estimator.core.filter.belief import correct
+from swarm_loc_estimator.core.filter.correlated_noise import record_constraint, record_pair
+from swarm_loc_estimator.core.filter.innovation import InnovationBatch, new_batch
+from swarm_loc_estimator.core.filter.integrity import WELL_CONFIRMED, LossLimits, is_elsewhere
+from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray, MeasurementColumns
+from swarm_loc_estimator.core.filter.sequential_update import update_in_order
+from swarm_loc_estimator.core.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.core.initialization.initializer import Initializer
+from swarm_loc_estimator.core.inputs.messages import chosen
+from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray
+
+_PAIRS_PER_ROBOT = 32
+"""A robot remembers what so many others have told it by infrared."""
+_CONTRADICTED_DESCRIPTION = 2
+"""When so many robots and landmarks are contradicted, so is all that was concluded from them."""
+_MAX_ROBOTS_OPENED = 30
+"""With more robots only those are estimated anew that are contradicted: all would cost too much."""
+_MANY = 64
+"""From so many measurements on, one update with all of them costs less than one each, at any swarm size."""
+
+
+class Verdict(IntEnum):
+    """What became of a measurement."""
+
+    OPEN = sequential_update.OPEN  # not looked at yet
+    USED = sequential_update.USED
+    GATED = sequential_update.GATED  # its innovation is too unlikely
+    CONSTRAINT = 3  # kept to locate a robot that waits
+    NOT_LOCALIZED = 4  # neither side is located, or a robot has sent no odometry
+
+
+class Fusion:
+    """The steps of the filter over one swarm.
+
+    Args:
+        swarm: Who takes part.
+        settings: Limits for giving a robot up.
+        tracks: The robots' odometry.
+    """
+
+    def __init__(self, swarm: Swarm, settings: EstimatorSettings, tracks: OdometryTracks) -> None:
+        self._tracks = tracks
+        self._limits = LossLimits(
+            settings.lost_sigma, settings.lost_heading_sigma, settings.lost_after, settings.max_doubt
+        )
+        self._together = settings.fusion_period_s > 0.0
+        self._starts = {
+            i: (
+                np.array(r.start),
+                np.diag(np.square([r.start_sigma.x, r.start_sigma.y, r.start_sigma.theta])),
+            )
+            for i, r in enumerate(swarm.robots)
+            if r.start is not None
+        }
+        self._initializer = Initializer(tracks, settings.fix_window_s)
+        self._table = ParameterTable.of(swarm.robots, swarm.landmarks)
+        self._pairs = _PAIRS_PER_ROBOT if any(robot.ir is not None for robot in swarm.robots) else 0
+
+    def new_state(self) -> SwarmState:
+        """Nothing is known yet."""
+        return SwarmState(self._table, self._pairs)
+
+    def with_starts(self, state: SwarmState, stamp_ns: int) -> SwarmState:
+        """The state, together with those robots at their starts about whom there was no measurement yet."""
+        ready = [robot for robot in self._starts if self._may_start(state, robot, stamp_ns)]
+        if ready:
+            state = state.copy()
+            for robot in ready:
+                self._initialize_at_start(state, robot)
+        return state
+
+    def _may_start(self, state: SwarmState, robot: int, stamp_ns: int) -> bool:
+        """Whether the robot may start at its configured pose: its odometry has begun by `stamp_ns`."""
+        return (
+            bool(state.start_pending[robot]) and robot in self._starts and self._tracks.begun(robot, stamp_ns)
+        )
+
+    def _initialize_at_start(self, state: SwarmState, robot: int) -> None:
+        start, covariance = self._starts[robot]
+        begin_ns, pose = self._tracks.arrays.begin_ns[robot], self._tracks.arrays.begin_pose[robot]
+        initial = InitialPose(se2.compose(start, se2.inverse(pose)), se2.error_covariance(start, covariance))
+        state.initialize(robot, initial, Preintegrated.begin(int(begin_ns)))
+
+    def _initialize_measured(self, state: SwarmState, measurements: MeasurementArray) -> bool:
+        """Initialize robots at their starts with the first measurement (m,) about them; whether any was.
+
+        Not before: only a measurement about a robot is computed again when its first odometry arrives late.
+        """
+        initialized = False
+        for side in ("observer", "target"):
+            new = np.append(state.start_pending, False)[measurements[side]]  # NOBODY (-1) finds the last
+            for robot, stamp_ns in zip(measurements[side][new], measurements["stamp_ns"][new], strict=True):
+                if self._may_start(state, int(robot), int(stamp_ns)):
+                    self._initialize_at_start(state, int(robot))
+                    initialized = True
+        return initialized
+
+    def step(
+        self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        """Fuse measurements into the state.
+
+        One after the other, each at its exact stamp; or, where many share a period of `fusion_period_s`,
+        together: each is related to the poses at its own stamp, but the noise gathered between the stamps
+        is taken at their mean per robot.
+
+        Args:
+            state: Changed in place.
+            measurements: (m,) in order of their stamps.
+            verdicts: (m,) written, of `Verdict`.
+            nis: (m,) normalised innovations squared, written; NaN where there is none.
+        """
+        nis[:] = np.nan
+        many = measurements.size >= _MANY
+        if self._together and many and np.all(measurements["kind"] < Kind.SET_POSE):
+            self._fuse_together(state, measurements, verdicts, nis)
+        else:
+            self._fuse_in_order(state, measurements, verdicts, nis)
+
+    def _fuse_in_order(
+        self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        columns = MeasurementColumns.of(measurements)
+        k = 0
+        while True:
+            k, reason, robot = update_in_order(
+                columns, k, self._tracks.arrays, state.arrays(), self._limits, verdicts, nis
+            )
+            if reason == sequential_update.FINISHED:
+                return
+            if reason == sequential_update.LOST:
+                state.lose(robot)
+                continue
+            if reason == sequential_update.CONTRADICTED:
+                self._open(state, robot, int(measurements["stamp_ns"][k]))
+                continue
+            one = measurements[k : k + 1]
+            if one["kind"][0] >= Kind.SET_POSE:
+                verdicts[k] = self._apply_command(state, one)
+            elif self._initialize_measured(state, one):
+                continue
+            else:
+                verdicts[k] = self._note(state, one)
+            k += 1
+
+    def _fuse_together(
+        self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        self._initialize_measured(state, measurements)
+        known = np.append(state.tracked, True)  # NOBODY (-1) finds the last
+        tied = known[measurements["observer"]] & known[measurements["target"]]
+        rows = np.flatnonzero(tied)
+        if rows.size:
+            batch, lost = self._predict(state, measurements[rows])
+            good = ~(lost[measurements["observer"][rows]] | lost[measurements["target"][rows]])
+            tied[rows[~good]] = False
+            rows = rows[good]
+            verdicts[rows], nis[rows] = self._update(state, measurements[rows], chosen(batch, good))
+        for k in np.flatnonzero(~tied):
+            verdicts[k] = self._note(state, measurements[k : k + 1])
+
+    def _predict(
+        self, state: SwarmState, measurements: MeasurementArray
+    ) -> tuple[InnovationBatch, BoolArray]:
+        """Predict the robots involved to the mean of their measurements; those too uncertain leave.
+
+        Returns:
+            A batch (m,) with poses and motion, and (N + 1,) whether each robot, and nobody, was lost.
+        """
+        batch, lost = new_batch(measurements.size), np.zeros(state.tracked.size + 1, dtype=bool)
+        columns = MeasurementColumns.of(measurements)
+        predict_all(columns, self._tracks.arrays, state.arrays(), self._limits, batch, lost[:-1])
+        for robot in np.flatnonzero(lost):
+            state.lose(int(robot))
+        return batch, lost
+
+    def _update(
+        self, state: SwarmState, measurements: MeasurementArray, batch: InnovationBatch
+    ) -> tuple[NDArray[np.uint8], FloatArray]:
+        """Hold measurements (m,) against one belief, use those that pass; return verdicts and their NIS."""
+        fields, passed = MeasurementColumns.of(measurements), batch.passed
+        evaluate_all(fields, state.arrays(), batch)
+        systematic = (measurements["systematic_share"] > 0.0).any(axis=1)
+        looks = (batch.distance, batch.whitened, batch.unexplained)
+        contradicted = assess_all(fields, state.arrays(), self._limits, looks, passed)
+        lost = confirm_all(fields, state.arrays(), passed)
+        for k in np.flatnonzero(passed & systematic).tolist():
+            record_pair(fields, k, state.arrays(), batch.variance[k], batch.noise[k])
+        if passed.any():
+            used = chosen(batch, passed)
+            correction = state.filter.update(used.columns, used.jacobian, used.innovation, used.noise)
+            correct(state.arrays(), correction)
+        lost |= count_all_gated(fields, state.arrays(), passed, self._limits)
+        for robot in np.flatnonzero(lost):
+            state.lose(int(robot))
+        for source in np.flatnonzero(contradicted).tolist():
+            self._open(state, source, int(measurements["stamp_ns"][-1]))
+        return np.where(passed, Verdict.USED, Verdict.GATED).astype(np.uint8), batch.nis
+
+    def _note(self, state: SwarmState, one: MeasurementArray) -> Verdict:
+        """Keep a measurement (1,) as a constraint if it ties a waiting robot to something located."""
+        if not self._initializer.note(state, one):
+            return Verdict.NOT_LOCALIZED
+        record_constraint(MeasurementColumns.of(one), 0, state.arrays())
+        return Verdict.CONSTRAINT
+
+    def _open(self, state: SwarmState, source: int, stamp_ns: int) -> None:
+        """Estimate what a contradicted robot or landmark was described by, or locate the robot anew."""
+        robots = state.tracked.size
+        if source < robots and is_elsewhere(state.integrity, source, stamp_ns):
+            state.lose(source)
+            return
+        poses = se2.compose(
+            state.transform, self._tracks.at(np.arange(robots), np.full(robots, stamp_ns)).pose
+        )
+        alone = len(state.contradicted | {source}) < _CONTRADICTED_DESCRIPTION
+        if alone or len(state.contradicted) >= _CONTRADICTED_DESCRIPTION or robots > _MAX_ROBOTS_OPENED:
+            state.open(source, poses[min(source, robots - 1)])
+        else:
+            state.contradicted |= {source}
+            state.open_all(poses)
+
+    def _apply_command(self, state: SwarmState, command: MeasurementArray) -> Verdict:
+        """Set the pose of a robot or forget it, as the command (1,) says."""
+        robot, stamp_ns = int(command["target"][0]), int(command["stamp_ns"][0])
+        if command["kind"][0] == Kind.FORGET:
+            state.lose(robot)
+            return Verdict.USED
+        if not self._tracks.begun(robot, stamp_ns):
+            return Verdict.NOT_LOCALIZED
+        track = self._tracks.at(command["target"], command["stamp_ns"])
+        pose, covariance = command["value"][0], command["covariance"][0]
+        transform = se2.compose(pose, se2.inverse(track.pose[0]))
+        at = Preintegrated(stamp_ns, track.covariance[0], track.jacobian[0])
+        initial = InitialPose(transform, se2.error_covariance(pose, covariance))
+        state.initialize(robot, initial, at, WELL_CONFIRMED)
+        return Verdict.USED

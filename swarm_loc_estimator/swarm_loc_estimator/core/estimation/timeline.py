@@ -1,0 +1,221 @@
+"""Out-of-sequence measurements: checkpoints, to which the filter goes back when something comes late.
+
+The state after some of the steps is kept (checkpoints). What arrives late takes the filter back to the
+checkpoint before it, and everything since is computed again; so the result is that of an orderly arrival.
+The e-puck paper's buffer (V-B) assigns a measurement to the closest stored state: `state_period_s` does that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.estimation.fusion import Verdict
+from swarm_loc_estimator.core.estimation.measurement_buffer import MeasurementBuffer
+from swarm_loc_estimator.core.filter.measurement_model import MeasurementArray
+from swarm_loc_estimator.core.filter.state import SwarmState
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.jit import compiled
+
+Step = Callable[[SwarmState, MeasurementArray, NDArray[np.uint8], FloatArray], None]
+
+_CHECKPOINTS = 40
+_FORGOTTEN_AT_ONCE = 4
+_BEFORE_ALL = np.iinfo(np.int64).min
+
+
+@dataclass(frozen=True)
+class _Checkpoint:
+    """The state after the step `key`."""
+
+    key: int
+    state: SwarmState
+
+
+class Timeline:
+    """Buffered measurements with their verdicts, and the newest state.
+
+    Args:
+        settings: Horizon, and how stamps are grouped into steps.
+        step: Fuses the measurements of one step into a state, see `Fusion.step`.
+        state: Where to begin.
+        reach_ns: How far before its stamp late odometry may change what measurements meant, and they may
+            count; they are kept so much longer than the horizon.
+    """
+
+    def __init__(self, settings: EstimatorSettings, step: Step, state: SwarmState, reach_ns: int) -> None:
+        self._step = step
+        self._horizon_ns = round(settings.horizon_s * 1e9)
+        self._state_period_ns = round(settings.state_period_s * 1e9)
+        self._fusion_period_ns = round(settings.fusion_period_s * 1e9)
+        self._kept_ns = self._horizon_ns + reach_ns
+        self._spacing_ns = self._kept_ns // _CHECKPOINTS
+        self.restart(state)
+
+    def restart(self, state: SwarmState) -> None:
+        """Drop all measurements and go on from `state`."""
+        self.state = state
+        self._head_key = _BEFORE_ALL
+        self._checkpoints = [_Checkpoint(_BEFORE_ALL, state.copy())]
+        self._new: list[MeasurementArray] = []
+        self._withdrawn: list[MeasurementArray] = []
+        self._redo_from_ns: int | None = None
+        self._buffer = MeasurementBuffer()
+        self.settled: NDArray[np.int64] = np.zeros(len(Verdict), dtype=np.int64)
+        self.duplicates = 0
+        self.too_old = 0
+
+    @property
+    def measurements(self) -> MeasurementArray:
+        """Those within the horizon (m,), in order."""
+        return self._buffer.measurements
+
+    @property
+    def verdicts(self) -> NDArray[np.uint8]:
+        """(m,) what became of them, of `Verdict`."""
+        return self._buffer.verdicts
+
+    @property
+    def nis(self) -> FloatArray:
+        """(m,) their normalised innovations squared."""
+        return self._buffer.nis
+
+    def add(self, measurements: MeasurementArray) -> None:
+        """Take measurements (m,) in; they count from the next `advance` on."""
+        if measurements.size:
+            self._new.append(measurements)
+
+    def withdraw(self, measurements: MeasurementArray) -> None:
+        """Take back measurements (m,) that were added, as if they had never come."""
+        if measurements.size:
+            self._withdrawn.append(measurements)
+
+    @property
+    def waiting(self) -> int:
+        """How many measurements wait for the next `advance`."""
+        return sum(measurements.size for measurements in self._new)
+
+    def invalidate(self, changed_from_ns: NDArray[np.int64]) -> None:
+        """Have the steps computed again whose robots' tracks have changed.
+
+        Args:
+            changed_from_ns: (N,) per robot the instant after which its track changed.
+        """
+        rows = self._buffer.measurements
+        first = _first_touched(self._buffer.stamp_ns, rows["observer"], rows["target"], changed_from_ns)
+        if first < len(self._buffer):
+            self._redo_from(int(self._buffer.stamp_ns[first]))
+
+    def verdict_counts(self) -> NDArray[np.int64]:
+        """How many measurements got each verdict since the start (len(Verdict),)."""
+        return self.settled + np.bincount(self.verdicts, minlength=len(Verdict))
+
+    def advance(self, now_ns: int) -> None:
+        """Compute all steps that new or changed data touch, and let go of what lies beyond the horizon."""
+        if self._new:
+            self._merge(now_ns - self._horizon_ns)
+        if self._withdrawn:
+            self._remove(now_ns - self._horizon_ns)
+        if self._redo_from_ns is not None:
+            self._compute_from(self._key(self._redo_from_ns))
+            self._redo_from_ns = None
+        self._forget_before(self._key(now_ns - self._kept_ns))
+
+    def _key(self, stamp_ns: int) -> int:
+        """The step that a stamp belongs to, as the stamp at which the step begins."""
+        return stamp_ns - stamp_ns % self._fusion_period_ns if self._fusion_period_ns else stamp_ns
+
+    def _count_until(self, key: int) -> int:
+        """How many measurements belong to steps up to `key`."""
+        if key == _BEFORE_ALL:
+            return 0
+        return int(self._buffer.stamp_ns.searchsorted(key + max(self._fusion_period_ns, 1)))
+
+    def _redo_from(self, stamp_ns: int) -> None:
+        """Have the steps from that of a stamp on computed at the next `advance`."""
+        self._redo_from_ns = stamp_ns if self._redo_from_ns is None else min(stamp_ns, self._redo_from_ns)
+
+    def _merge(self, oldest_ns: int) -> None:
+        """Sort new measurements in."""
+        count, new = self.waiting, self._not_older(self._new, oldest_ns)
+        self._new = []
+        self.too_old += count - new.size
+        merged = self._buffer.merge(new)
+        self.duplicates += merged.duplicates
+        if merged.first_ns is not None:
+            self._redo_from(merged.first_ns)
+
+    def _remove(self, oldest_ns: int) -> None:
+        """Take withdrawn measurements out, unless what replaces them has just been refused as too old."""
+        gone, self._withdrawn = self._not_older(self._withdrawn, oldest_ns), []
+        first_ns = self._buffer.remove(gone)
+        if first_ns is not None:
+            self._redo_from(first_ns)
+
+    def _not_older(self, parts: list[MeasurementArray], oldest_ns: int) -> MeasurementArray:
+        """Measurements (m,) of some parts whose own stamps are not older than an instant.
+
+        Where stored states are wanted, they come with the stamps of the closest ones.
+        """
+        rows, period = parts[0] if len(parts) == 1 else np.concatenate(parts), self._state_period_ns
+        fresh = rows["stamp_ns"] >= oldest_ns
+        if not fresh.all():
+            rows = rows[fresh]
+        if period:
+            rows = rows.copy()
+            rows["stamp_ns"] = (rows["stamp_ns"] + period // 2) // period * period
+        return rows
+
+    def _compute_from(self, key: int) -> None:
+        """Go back to before step `key`, if it is not ahead, and do all steps that are due."""
+        if key <= self._head_key:
+            while self._checkpoints[-1].key >= key:
+                self._checkpoints.pop()
+            self._head_key = self._checkpoints[-1].key
+            self.state = self._checkpoints[-1].state.copy()
+        buffer, begin = self._buffer, self._count_until(self._head_key)
+        while begin < len(buffer):
+            end = self._end_of_steps(begin)
+            rows = slice(begin, end)
+            self._step(self.state, buffer.measurements[rows], buffer.verdicts[rows], buffer.nis[rows])
+            self._head_key = self._key(int(buffer.stamp_ns[end - 1]))
+            if self._head_key - max(self._checkpoints[-1].key, -(2**62)) >= self._spacing_ns:
+                self._checkpoints.append(_Checkpoint(self._head_key, self.state.copy()))
+            begin = end
+
+    def _end_of_steps(self, begin: int) -> int:
+        """Where those steps end that are computed together with the one at `begin`, up to a checkpoint."""
+        stamps_ns, length_ns = self._buffer.stamp_ns, self._fusion_period_ns or self._spacing_ns
+        next_ns = (int(stamps_ns[begin]) // length_ns + 1) * length_ns
+        return stamps_ns.size if stamps_ns[-1] < next_ns else int(stamps_ns.searchsorted(next_ns))
+
+    def _forget_before(self, key: int) -> None:
+        """Keep one checkpoint before step `key` and only the measurements after it."""
+        older = 0
+        while older < len(self._checkpoints) and self._checkpoints[older].key < key:
+            older += 1
+        if older < _FORGOTTEN_AT_ONCE:
+            return
+        del self._checkpoints[: older - 1]
+        passed = self._count_until(self._checkpoints[0].key)
+        self.settled += np.bincount(self.verdicts[:passed], minlength=len(Verdict))
+        self._buffer.drop_first(passed)
+
+
+@compiled
+def _first_touched(
+    stamps_ns: NDArray[np.int64],
+    observers: NDArray[np.int64],
+    targets: NDArray[np.int64],
+    changed_from_ns: NDArray[np.int64],
+) -> int:
+    """The first measurement (of m, by stamp) of a robot whose track (of N) changed before it; m when none."""
+    for k in range(np.searchsorted(stamps_ns, changed_from_ns.min(), side="right"), stamps_ns.size):
+        for robot in (observers[k], targets[k]):
+            if robot >= 0 and stamps_ns[k] > changed_from_ns[robot]:
+                return k
+    return stamps_ns.size

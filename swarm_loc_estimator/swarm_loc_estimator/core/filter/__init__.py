@@ -1,0 +1,1 @@
+"""The joint EKF: state, prediction, measurement model, gating, updates."""

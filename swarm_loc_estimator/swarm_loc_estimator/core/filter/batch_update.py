@@ -1,0 +1,126 @@
+"""Batch update: many measurements of one period held against one belief, and used together."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from swarm_loc_estimator.core.filter.belief import BeliefArrays, to_map
+from swarm_loc_estimator.core.filter.innovation import InnovationBatch, evaluate, relative_motion
+from swarm_loc_estimator.core.filter.integrity import (
+    LossLimits,
+    assess,
+    confirm,
+    count_gated,
+    is_set_aside,
+    is_uncertain,
+)
+from swarm_loc_estimator.core.filter.measurement_model import MeasurementColumns
+from swarm_loc_estimator.core.filter.prediction import predict
+from swarm_loc_estimator.core.odometry.preintegration import Preintegrated, TrackArrays, look_up, new_sample
+from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.small_matrix import add_scaled, assign
+
+
+@compiled
+def predict_all(
+    measurements: MeasurementColumns,
+    tracks: TrackArrays,
+    belief: BeliefArrays,
+    limits: LossLimits,
+    batch: InnovationBatch,
+    uncertain: BoolArray,
+) -> None:
+    """Predict every robot involved to the mean of its measurements.
+
+    Args:
+        measurements: (m,) between robots that are located.
+        tracks: Odometry.
+        belief: Changed in place.
+        limits: Beyond which a robot is given up.
+        batch: (m,) its `pose` and `motion` are written; nobody's pose is not.
+        uncertain: (N,) written: robots involved that no longer know where they are.
+    """
+    robots, sample = belief.tracked.size, new_sample(1)
+    covariance, jacobian = np.zeros((robots, 3, 3)), np.zeros((robots, 3, 3))
+    times, stamps = np.zeros(robots), np.zeros(robots)
+    for k in range(measurements.stamp_ns.size):
+        sides = (measurements.observer[k], measurements.target[k])
+        for i in range(2):
+            robot = sides[i]
+            if robot >= 0:
+                look_up(tracks, robot, measurements.stamp_ns[k], sample, 0)
+                assign(batch.pose[k, i], sample.pose[0])
+                times[robot] += 1.0
+                stamps[robot] += measurements.stamp_ns[k] - measurements.stamp_ns[0]
+                add_scaled(covariance[robot], sample.covariance[0], 1.0)
+                add_scaled(jacobian[robot], sample.jacobian[0], 1.0)
+    for robot in range(robots):
+        if times[robot] > 0.0:
+            mean_ns = measurements.stamp_ns[0] + round(stamps[robot] / times[robot])
+            to = Preintegrated(mean_ns, np.zeros((3, 3)), np.zeros((3, 3)))
+            add_scaled(to.covariance, covariance[robot], 1.0 / times[robot])
+            add_scaled(to.jacobian, jacobian[robot], 1.0 / times[robot])
+            predict(belief, robot, to)
+    for k in range(measurements.stamp_ns.size):
+        sides = (measurements.observer[k], measurements.target[k])
+        for i in range(2):
+            robot = sides[i]
+            if robot >= 0:
+                to_map(belief, robot, batch.pose[k, i])
+                uncertain[robot] |= is_uncertain(belief, robot, batch.pose[k, i], limits)
+        if measurements.landmark[k] > 0:
+            assign(batch.pose[k, 1], belief.landmark[measurements.landmark[k] - 1])
+        relative_motion(measurements, k, tracks, batch.pose[k], batch.motion[k])
+
+
+@compiled
+def evaluate_all(measurements: MeasurementColumns, belief: BeliefArrays, batch: InnovationBatch) -> None:
+    """Evaluate the innovations of all measurements (m,) against one belief, see `evaluate`."""
+    for k in range(measurements.stamp_ns.size):
+        evaluate(measurements, k, belief, batch, k)
+
+
+@compiled
+def assess_all(
+    measurements: MeasurementColumns,
+    belief: BeliefArrays,
+    limits: LossLimits,
+    looks: tuple[FloatArray, FloatArray, BoolArray],
+    passed: BoolArray,
+) -> BoolArray:
+    """Assess all measurements (m,); return which robots and landmarks (N + L,) are contradicted.
+
+    Those of pairs set aside do not pass.
+    """
+    contradicted = np.zeros(belief.integrity.doubt.size, dtype=np.bool_)
+    for k in range(passed.size):
+        source = assess(measurements, k, belief, limits, (looks[0][k], looks[1][k], looks[2][k]))
+        if source >= 0:
+            contradicted[source] = True
+        passed[k] &= not is_set_aside(measurements, k, belief)
+    return contradicted
+
+
+@compiled
+def confirm_all(measurements: MeasurementColumns, belief: BeliefArrays, passed: BoolArray) -> BoolArray:
+    """Hold all measurements (m,) against poses that were assumed; return which robots (N,) are elsewhere."""
+    lost = np.zeros(belief.tracked.size, dtype=np.bool_)
+    for k in range(passed.size):
+        robot = confirm(measurements, k, belief, passed[k])
+        if robot >= 0:
+            lost[robot] = True
+    return lost
+
+
+@compiled
+def count_all_gated(
+    measurements: MeasurementColumns, belief: BeliefArrays, passed: BoolArray, limits: LossLimits
+) -> BoolArray:
+    """Count the gated of all measurements (m,); return whether each robot (N,) has had too many in a row."""
+    lost = np.zeros(belief.tracked.size, dtype=np.bool_)
+    for k in range(passed.size):
+        robot = count_gated(measurements, k, belief, passed[k], limits)
+        if robot >= 0:
+            lost[robot] = True
+    return lost

@@ -1,0 +1,57 @@
+"""Gating: the Mahalanobis distance of an innovation, and a heading that is robust to flips."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import gammaincinv
+
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.small_matrix import cholesky3, solve3
+
+_STUDENT_DOF = 4.0
+
+
+def gate_threshold(probability: ArrayLike) -> FloatArray:
+    """The squared distance of two components that good measurements exceed with 1 - probability."""
+    threshold: FloatArray = 2.0 * gammaincinv(1.0, np.asarray(probability, dtype=float))
+    return threshold
+
+
+@compiled
+def squared_distance(innovation: FloatArray, covariance: FloatArray) -> float:
+    """Normalised innovation squared of an innovation (3,) under its covariance (3, 3)."""
+    weighted = np.empty(3)
+    solve3(cholesky3(covariance), innovation, weighted)
+    distance: float = innovation[0] * weighted[0] + innovation[1] * weighted[1] + innovation[2] * weighted[2]
+    return distance
+
+
+@compiled
+def position_distance(innovation: FloatArray, covariance: FloatArray) -> float:
+    """Normalised square of the first two components, on which alone the gate decides.
+
+    The heading has no vote: the planar ambiguity of a square marker flips it in otherwise good sightings.
+    """
+    a, b, d = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    x, y = innovation[0], innovation[1]
+    distance: float = (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
+    return distance
+
+
+@compiled
+def soften_heading(innovation: FloatArray, covariance: FloatArray, noise: FloatArray) -> None:
+    """Enlarge the heading's part of `noise` (3, 3) where its innovation is unlikely: flips count little.
+
+    Student's t with 4 degrees of freedom instead of a normal; `covariance` (3, 3) is the innovation's.
+    """
+    normalised = innovation[2] * innovation[2] / covariance[2, 2]
+    factor = (_STUDENT_DOF + normalised) / (_STUDENT_DOF + 1.0)
+    if factor > 1.0:
+        scale = np.sqrt(factor)
+        noise[0, 2] *= scale
+        noise[1, 2] *= scale
+        noise[2, 0] *= scale
+        noise[2, 1] *= scale
+        noise[2, 2] *= factor

@@ -1,0 +1,214 @@
+"""Innovations: measurements linearised about the belief and gated."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.core.description.estimated_parameters import CAMERA_SCALE, CAMERA_YAW
+from swarm_loc_estimator.core.filter.belief import BeliefArrays
+from swarm_loc_estimator.core.filter.correlated_noise import inflate_noise
+from swarm_loc_estimator.core.filter.gating import position_distance, soften_heading, squared_distance
+from swarm_loc_estimator.core.filter.innovation_covariance import add_uncertainty
+from swarm_loc_estimator.core.filter.integrity import is_unexplained, noise_of_frequent_looks
+from swarm_loc_estimator.core.filter.measurement_model import MeasurementColumns, innovation, predict_one
+from swarm_loc_estimator.core.odometry.preintegration import TrackArrays, rate_at
+from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.small_matrix import assign, assign_matrix
+
+DEPENDS_ON = 8
+"""Filter columns that a measurement depends on: both bodies, observer first, yaw and scale of the camera."""
+
+
+class InnovationBatch(NamedTuple):
+    """Measurements (m,) held against one belief.
+
+    Attributes:
+        pose: (m, 2, 3) observers and targets in `map` at the stamps, or by what a landmark is moved.
+        motion: (m, 3) how fast xi_target - xi_observer changes by driving [1/s], see `relative_motion`.
+        columns: (m, DEPENDS_ON) what each depends on.
+        jacobian: (m, 3, DEPENDS_ON) of the innovation.
+        innovation: (m, 3) measured minus predicted.
+        noise: (m, 3, 3) covariances of the measurements, as they are used.
+        variance: (m, 3) of what was to be expected.
+        distance: (m,) squared Mahalanobis distance of the position, on which the gate decides.
+        whitened: (m, 2) position innovation over its standard deviation.
+        unexplained: (m,) whether the innovation is larger than a wrong description can explain.
+        passed: (m,) whether the gate lets it through.
+        nis: (m,) normalised innovation squared.
+    """
+
+    pose: FloatArray
+    motion: FloatArray
+    columns: IntArray
+    jacobian: FloatArray
+    innovation: FloatArray
+    noise: FloatArray
+    variance: FloatArray
+    distance: FloatArray
+    whitened: FloatArray
+    unexplained: BoolArray
+    passed: BoolArray
+    nis: FloatArray
+
+
+@compiled
+def new_batch(count: int) -> InnovationBatch:
+    """Room for `count` measurements."""
+    return InnovationBatch(
+        np.zeros((count, 2, 3)),
+        np.zeros((count, 3)),
+        np.zeros((count, DEPENDS_ON), dtype=np.int64),
+        np.zeros((count, 3, DEPENDS_ON)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3, 3)),
+        np.zeros((count, 3)),
+        np.zeros(count),
+        np.zeros((count, 2)),
+        np.zeros(count, dtype=np.bool_),
+        np.zeros(count, dtype=np.bool_),
+        np.zeros(count),
+    )
+
+
+@compiled
+def evaluate(
+    measurements: MeasurementColumns, k: int, belief: BeliefArrays, batch: InnovationBatch, row: int
+) -> None:
+    """Linearise measurement k about the belief and gate it; of two planar solutions the likelier counts.
+
+    Args:
+        measurements: (m,).
+        k: Which one.
+        belief: Not changed.
+        batch: Its `pose` and `motion` are read, all others written.
+        row: Where in the batch.
+    """
+    columns, jacobian, difference = batch.columns[row], batch.jacobian[row], batch.innovation[row]
+    pose, motion, noise, variances = batch.pose[row], batch.motion[row], batch.noise[row], batch.variance[row]
+    bodies = _body_columns(measurements, k, belief)
+    camera, camera_columns = _camera(belief, measurements.observer[k])
+    predicted, chain = np.empty(3), np.empty((3, 5))
+    predict_one(measurements, k, pose[0], pose[1], camera, predicted, chain)
+    _write_jacobian(chain, bodies, camera_columns, columns, jacobian)
+    s = np.empty((3, 3))
+    assign_matrix(noise, measurements.covariance[k])
+    if measurements.stamp_variance[k] > 0.0:
+        _add_stamp_noise(chain, motion, measurements.stamp_variance[k], noise)
+    assign_matrix(s, noise)
+    add_uncertainty(belief.covariance, bodies, camera_columns, chain, s)
+    for i in range(3):
+        variances[i] = s[i, i] - noise[i, i]
+    innovation(measurements, k, measurements.value[k], predicted, difference)
+    if measurements.has_alternative[k]:
+        other = np.empty(3)
+        innovation(measurements, k, measurements.alternative[k], predicted, other)
+        if squared_distance(other, s) < squared_distance(difference, s):
+            assign(difference, other)
+    batch.distance[row] = position_distance(difference, s)
+    batch.passed[row] = batch.distance[row] <= measurements.gate[k]
+    for i in range(2):
+        batch.whitened[row, i] = difference[i] / math.sqrt(s[i, i])
+    batch.unexplained[row] = is_unexplained(measurements.kind[k], difference, predicted)
+    if measurements.has_heading[k]:
+        before = noise[:, 2].copy()
+        soften_heading(difference, s, noise)
+        for i in range(3):
+            s[i, 2] += noise[i, 2] - before[i]
+            if i < 2:
+                s[2, i] = s[i, 2]
+    inflate_noise(measurements, k, belief, variances, noise)
+    scale = noise_of_frequent_looks(measurements, k, belief)
+    for i in range(3):
+        for j in range(3):
+            noise[i, j] *= scale
+    batch.nis[row] = squared_distance(difference, s)
+
+
+@compiled
+def relative_motion(
+    measurements: MeasurementColumns, k: int, tracks: TrackArrays, pose: FloatArray, motion: FloatArray
+) -> None:
+    """Write how fast xi_target - xi_observer (3,) of measurement k changes by both robots' driving [1/s].
+
+    Zero where the stamp is exact, and it does not matter.
+
+    Args:
+        measurements: (m,).
+        k: Which one.
+        tracks: Odometry.
+        pose: (2, 3) of observer and target in `map`.
+        motion: Written.
+    """
+    motion.fill(0.0)
+    if measurements.stamp_variance[k] == 0.0:
+        return
+    rate, sides = np.empty(3), (measurements.observer[k], measurements.target[k])
+    for i in range(2):
+        if sides[i] >= 0:
+            rate_at(tracks, sides[i], measurements.stamp_ns[k], rate)
+            cos, sin, sign = np.cos(pose[i, 2]), np.sin(pose[i, 2]), 2.0 * i - 1.0
+            # the body's own velocity, seen from the origin of map
+            motion[0] += sign * (cos * rate[0] - sin * rate[1] + rate[2] * pose[i, 1])
+            motion[1] += sign * (sin * rate[0] + cos * rate[1] - rate[2] * pose[i, 0])
+            motion[2] += sign * rate[2]
+
+
+@compiled
+def _camera(belief: BeliefArrays, observer: int) -> tuple[FloatArray, IntArray]:
+    """Yaw and scale (2,) of an observer's camera, and their columns (2,); -1: has none."""
+    camera, columns = np.zeros(2), np.full(2, -1)
+    if observer >= 0:
+        camera[0] = belief.parameter[observer, CAMERA_YAW]
+        camera[1] = belief.parameter[observer, CAMERA_SCALE]
+        columns[0] = belief.table.column[observer, CAMERA_YAW]
+        columns[1] = belief.table.column[observer, CAMERA_SCALE]
+    return camera, columns
+
+
+@compiled
+def _write_jacobian(
+    chain: FloatArray,
+    bodies: tuple[int, int],
+    camera_columns: IntArray,
+    columns: IntArray,
+    jacobian: FloatArray,
+) -> None:
+    """Write the Jacobian of an innovation (3, DEPENDS_ON) by the state's columns (DEPENDS_ON,).
+
+    Columns of nobody do not matter: their Jacobian is zero.
+    """
+    for j in range(3):
+        columns[j], columns[3 + j] = max(bodies[0], 0) + j, max(bodies[1], 0) + j
+        for i in range(3):
+            jacobian[i, j] = -chain[i, j] if bodies[0] >= 0 else 0.0
+            jacobian[i, 3 + j] = chain[i, j] if bodies[1] >= 0 else 0.0
+    for j in range(2):
+        columns[6 + j] = max(camera_columns[j], 0)
+        for i in range(3):
+            jacobian[i, 6 + j] = chain[i, 3 + j] if camera_columns[j] >= 0 else 0.0
+
+
+@compiled
+def _add_stamp_noise(chain: FloatArray, motion: FloatArray, variance: float, noise: FloatArray) -> None:
+    """Add to `noise` (3, 3) what a stamp of such variance does to a value that changes by `motion` (3,)."""
+    change = np.zeros(3)
+    for i in range(3):
+        for j in range(3):
+            change[i] += chain[i, j] * motion[j]
+    for i in range(3):
+        for j in range(3):
+            noise[i, j] += variance * change[i] * change[j]
+
+
+@compiled
+def _body_columns(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> tuple[int, int]:
+    """The first of the three columns of the observer and of the target of measurement k; -1: has none."""
+    observer, target = measurements.observer[k], measurements.target[k]
+    first = 3 * target if target >= 0 else -1
+    if measurements.landmark[k] > 0:
+        first = belief.table.survey_column[measurements.landmark[k] - 1]
+    return (3 * observer if observer >= 0 else -1), first

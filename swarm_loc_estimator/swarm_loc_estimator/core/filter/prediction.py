@@ -1,0 +1,206 @@
+"""Prediction of one robot along its odometry track.
+
+A robot's pose is X = T O with the track O. Between two instants T gathers noise, and drifts with the
+parameters z of the robot's motion (`core/description/estimated_parameters.py`):
+
+    T <- T exp((D2 - D1) z) = exp(A z) T,    P <- F P F^T + Ad(T) (G2 - G1) Ad(T)^T,    A = Ad(T) (D2 - D1).
+
+The right-invariant error does not change by the move itself, whatever z is, but by the error of z:
+xi <- xi + Ad(exp(A z / 2)) A dz, which is F. So what moves all robots and landmarks alike is never taken for
+observed. The turn rate's bias is a first-order Gauss-Markov process: it decays, and between the instants it
+was what it was on average.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.core.description.estimated_parameters import DRIVES, TURN_BIAS
+from swarm_loc_estimator.core.filter.belief import BeliefArrays
+from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.se2_scalar import adjoint_of, carry, moved_by_twist
+from swarm_loc_estimator.numerics.small_matrix import assign, assign_matrix, cholesky3
+
+
+class _Drift(NamedTuple):
+    """How a robot's parameters move its pose from where its belief stands to another instant.
+
+    Attributes:
+        twist: (3,) T is moved by exp(twist).
+        drive: (3, DRIVES) the error of the pose there per error of each parameter before.
+        left: Share of the turn bias that is left.
+        gained: Variance that its mean over the time gained, in units of its column of `drive`, squared.
+        shared: Covariance that the mean gained with the bias there, in those units.
+    """
+
+    twist: FloatArray
+    drive: FloatArray
+    left: float
+    gained: float
+    shared: float
+
+
+@compiled
+def predict(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
+    """Predict a robot, in place, to an instant."""
+    added, first = np.empty((3, 3)), 3 * robot
+    if not _new_noise(belief, robot, to.covariance, added):
+        return
+    if _has_drives(belief, robot):
+        drift = _new_drift(belief, robot, to)
+        _move(drift.twist, belief.transform[robot])
+        _drive(belief, robot, drift)
+    for i in range(3):
+        for j in range(3):
+            belief.covariance[first + i, first + j] += added[i, j]
+    assign_matrix(belief.preintegrated_covariance[robot], to.covariance)
+    assign_matrix(belief.preintegrated_jacobian[robot], to.jacobian)
+    belief.predicted_to_ns[robot] = max(to.stamp_ns, belief.predicted_to_ns[robot])
+
+
+@compiled
+def write_predicted(
+    belief: BeliefArrays, robot: int, to: Preintegrated, transform: FloatArray, covariance: FloatArray
+) -> None:
+    """Write T (3,) and the covariance (3, 3) of its error where `predict` would take them; change nothing."""
+    added, first = np.empty((3, 3)), 3 * robot
+    assign(transform, belief.transform[robot])
+    assign_matrix(covariance, belief.covariance[first : first + 3, first : first + 3])
+    if not _new_noise(belief, robot, to.covariance, added):
+        return
+    if _has_drives(belief, robot):
+        drift = _new_drift(belief, robot, to)
+        _move(drift.twist, transform)
+        columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))
+        count = _own(belief, robot, drift, columns, weight)
+        _block(belief.covariance, columns, weight, count, drift, covariance)
+    for i in range(3):
+        for j in range(3):
+            covariance[i, j] += added[i, j]
+
+
+@compiled
+def _new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, added: FloatArray) -> bool:
+    """Write Ad(T) (G2 - G1) Ad(T)^T (3, 3) and return True; or leave it when that is no covariance.
+
+    The latter happens only when odometry comes so late that more was assumed of a silence beyond the horizon.
+    """
+    before = belief.preintegrated_covariance[robot]
+    difference, work, rounding = np.empty((3, 3)), np.empty((3, 3)), 1e-12
+    for i in range(3):
+        rounding += 1e-9 * abs(noise[i, i] - before[i, i])
+    for i in range(3):
+        for j in range(3):
+            difference[i, j] = noise[i, j] - before[i, j]
+            work[i, j] = difference[i, j] + (rounding if i == j else 0.0)
+    factor = cholesky3(work)
+    if not math.isfinite(factor[0, 0] + factor[1, 1] + factor[2, 2]):
+        return False
+    carry(belief.transform[robot], difference, added)
+    return True
+
+
+@compiled
+def _has_drives(belief: BeliefArrays, robot: int) -> bool:
+    """Whether any parameter of the robot's motion is estimated."""
+    estimated = False
+    for m in range(DRIVES):
+        estimated = estimated or belief.table.column[robot, m] >= 0
+    return estimated
+
+
+@compiled
+def _new_drift(belief: BeliefArrays, robot: int, to: Preintegrated) -> _Drift:
+    """How the pose moves until an instant."""
+    x = max(0, to.stamp_ns - belief.predicted_to_ns[robot]) * 1e-9 / belief.table.turn_bias_time_s[robot]
+    left, variance = math.exp(-x), belief.table.sigma[robot, TURN_BIAS] ** 2
+    reach = -math.expm1(-x)  # of the bias now, over the time, in units of its time constant
+    # of what arises meanwhile; a series where the closed form would be rounding
+    spread = 2.0 * x - 3.0 + 4.0 * left - left * left if x > 1e-2 else x**3 * (2.0 / 3.0 - 0.5 * x)
+    gained, shared = spread / max(reach, 1e-12) ** 2, (1.0 - left) ** 2 / max(reach, 1e-12)
+    out = _Drift(np.zeros(3), np.zeros((3, DRIVES)), left, variance * gained, variance * shared)
+    adjoint, before = adjoint_of(belief.transform[robot]), belief.preintegrated_jacobian[robot]
+    for m in range(DRIVES):
+        mean = reach / x if m == TURN_BIAS and x > 1e-9 else 1.0
+        for i in range(3):
+            for a in range(3):
+                out.drive[i, m] += adjoint[i][a] * (to.jacobian[a, m] - before[a, m]) * mean
+            out.twist[i] += out.drive[i, m] * belief.parameter[robot, m]
+    pose, column = np.zeros(3), np.empty(3)
+    _move(0.5 * out.twist, pose)
+    half = adjoint_of(pose)
+    for m in range(DRIVES):
+        for i in range(3):
+            column[i] = out.drive[i, m]
+        for i in range(3):
+            out.drive[i, m] = half[i][0] * column[0] + half[i][1] * column[1] + half[i][2] * column[2]
+    return out
+
+
+@compiled
+def _own(belief: BeliefArrays, robot: int, drift: _Drift, columns: IntArray, weight: FloatArray) -> int:
+    """Write which columns (3 + DRIVES,) the pose's error comes from, with what weight; return how many."""
+    count = 0
+    for m in range(3 + DRIVES):
+        column = 3 * robot + m if m < 3 else belief.table.column[robot, m - 3]
+        if column >= 0:
+            columns[count] = column
+            for i in range(3):
+                weight[i, count] = drift.drive[i, m - 3] if m >= 3 else (1.0 if i == m else 0.0)
+            count += 1
+    return count
+
+
+@compiled
+def _block(
+    p: FloatArray, columns: IntArray, weight: FloatArray, count: int, drift: _Drift, out: FloatArray
+) -> None:
+    """Write the covariance (3, 3) of the pose's error after the drift."""
+    for i in range(3):
+        for j in range(i + 1):
+            total = drift.gained * drift.drive[i, TURN_BIAS] * drift.drive[j, TURN_BIAS]
+            for a in range(count):
+                for b in range(count):
+                    total += weight[i, a] * p[columns[a], columns[b]] * weight[j, b]
+            out[i, j] = out[j, i] = total
+
+
+@compiled
+def _drive(belief: BeliefArrays, robot: int, drift: _Drift) -> None:
+    """Apply a drift to the covariance of the pose's error with everything, and let the bias decay."""
+    first, p, size = 3 * robot, belief.covariance, belief.covariance.shape[0]
+    columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))
+    rows, block = np.zeros((3, size)), np.empty((3, 3))
+    count = _own(belief, robot, drift, columns, weight)
+    _block(p, columns, weight, count, drift, block)
+    for i in range(3):
+        for a in range(count):
+            for j in range(size):
+                rows[i, j] += weight[i, a] * p[columns[a], j]
+    bias = belief.table.column[robot, TURN_BIAS]
+    if bias >= 0:
+        belief.parameter[robot, TURN_BIAS] *= drift.left
+        for j in range(size):
+            p[bias, j] *= drift.left
+            p[j, bias] *= drift.left
+        p[bias, bias] += belief.table.sigma[robot, TURN_BIAS] ** 2 * (1.0 - drift.left**2)
+        for i in range(3):
+            rows[i, bias] = drift.left * rows[i, bias] + drift.shared * drift.drive[i, TURN_BIAS]
+    for i in range(3):
+        for j in range(size):
+            p[first + i, j] = p[j, first + i] = rows[i, j]
+    for i in range(3):
+        for j in range(3):
+            p[first + i, first + j] = block[i, j]
+
+
+@compiled
+def _move(twist: FloatArray, transform: FloatArray) -> None:
+    """Move a transform (3,), in place, by exp(twist)."""
+    x, y, theta = moved_by_twist(twist[0], twist[1], twist[2], transform[0], transform[1], transform[2])
+    transform[0], transform[1], transform[2] = x, y, theta

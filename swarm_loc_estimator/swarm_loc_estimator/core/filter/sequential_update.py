@@ -1,0 +1,97 @@
+"""Sequential update: predict two robots, evaluate one innovation, correct all, measurement by measurement."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.filter.belief import BeliefArrays, correct, to_map
+from swarm_loc_estimator.core.filter.correlated_noise import record_pair
+from swarm_loc_estimator.core.filter.covariance import update_one
+from swarm_loc_estimator.core.filter.innovation import evaluate, new_batch, relative_motion
+from swarm_loc_estimator.core.filter.integrity import (
+    LossLimits,
+    assess,
+    confirm,
+    count_gated,
+    is_set_aside,
+    is_uncertain,
+)
+from swarm_loc_estimator.core.filter.measurement_model import SET_POSE, MeasurementColumns
+from swarm_loc_estimator.core.filter.prediction import predict
+from swarm_loc_estimator.core.odometry.preintegration import Preintegrated, TrackArrays, look_up, new_sample
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.small_matrix import assign
+
+OPEN, USED, GATED = 0, 1, 2
+"""Verdicts, see `fusion.Verdict`."""
+
+FINISHED, NOT_LOCALIZED, LOST, CONTRADICTED = 0, 1, 2, 3
+"""Why `update_in_order` came back: all done, a measurement not between robots located, a robot given up, a
+robot or landmark contradicted."""
+
+
+@compiled
+def update_in_order(
+    measurements: MeasurementColumns,
+    begin: int,
+    tracks: TrackArrays,
+    belief: BeliefArrays,
+    limits: LossLimits,
+    verdicts: NDArray[np.uint8],
+    nis: FloatArray,
+) -> tuple[int, int, int]:
+    """Fuse measurements one after the other, each at its exact stamp, linearised at the newest belief.
+
+    Args:
+        measurements: (m,) in order of their stamps.
+        begin: The first one to fuse.
+        tracks: Odometry.
+        belief: Changed in place.
+        limits: Beyond which a robot is given up.
+        verdicts: (m,) written.
+        nis: (m,) normalised innovations squared, written.
+
+    Returns:
+        The first measurement not dealt with, why, and the robot or landmark that it is about.
+    """
+    batch, sample = new_batch(1), new_sample(2)
+    pose = batch.pose[0]
+    for k in range(begin, measurements.stamp_ns.size):
+        sides = (measurements.observer[k], measurements.target[k])
+        for side in sides:
+            if measurements.kind[k] >= SET_POSE or (side >= 0 and not belief.tracked[side]):
+                return k, NOT_LOCALIZED, -1
+        for i in range(2):
+            if sides[i] >= 0:
+                look_up(tracks, sides[i], measurements.stamp_ns[k], sample, i)
+                to = Preintegrated(measurements.stamp_ns[k], sample.covariance[i], sample.jacobian[i])
+                predict(belief, sides[i], to)
+                assign(pose[i], sample.pose[i])
+                to_map(belief, sides[i], pose[i])
+                if is_uncertain(belief, sides[i], pose[i], limits):
+                    return k, LOST, sides[i]
+        if measurements.landmark[k] > 0:
+            assign(pose[1], belief.landmark[measurements.landmark[k] - 1])
+        relative_motion(measurements, k, tracks, pose, batch.motion[0])
+        evaluate(measurements, k, belief, batch, 0)
+        look = (batch.distance[0], batch.whitened[0], batch.unexplained[0])
+        contradicted = assess(measurements, k, belief, limits, look)
+        if contradicted >= 0:
+            return k, CONTRADICTED, contradicted
+        passed, nis[k] = batch.passed[0] and not is_set_aside(measurements, k, belief), batch.nis[0]
+        verdicts[k] = USED if passed else GATED
+        contradicted = confirm(measurements, k, belief, passed)
+        if contradicted >= 0:
+            return k + 1, LOST, contradicted
+        if passed:
+            noise, jacobian = batch.noise[0], batch.jacobian[0]
+            record_pair(measurements, k, belief, batch.variance[0], noise)
+            correct(
+                belief, update_one(belief.covariance, batch.columns[0], jacobian, batch.innovation[0], noise)
+            )
+        lost = count_gated(measurements, k, belief, passed, limits)
+        if lost >= 0:
+            return k + 1, LOST, lost
+    return measurements.stamp_ns.size, FINISHED, -1

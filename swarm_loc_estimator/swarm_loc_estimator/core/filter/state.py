@@ -1,0 +1,253 @@
+"""The filter's state at one instant: enough to go on from there, so a copy is a checkpoint."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.description.estimated_parameters import PARAMETERS, ParameterTable
+from swarm_loc_estimator.core.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
+from swarm_loc_estimator.core.filter.covariance import DenseFilter
+from swarm_loc_estimator.core.filter.integrity import new_integrity
+from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.numerics.se2 import error_covariance
+
+_DOUBTED_POSE_SIGMA = (0.02, 0.02, 0.03)
+"""By how much less certain the pose of a contradicted robot becomes [m], [m], [rad]."""
+_REOPENED_POSE_SIGMA = (0.06, 0.06, 0.12)
+"""How certain poses are that rest on a description that is not so."""
+_ALONE: IntArray = np.zeros(0, dtype=np.int64)
+_NO_SHARES: FloatArray = np.zeros((0, 3, 3))
+
+
+class InitialPose(NamedTuple):
+    """Where the track of a robot lies that is to be initialized.
+
+    Its error is one of its own, and a share of those of what it was located by.
+
+    Attributes:
+        transform: (3,) T, from `map` to the track's frame.
+        covariance: (3, 3) of the part of its right-invariant error that is its own.
+        columns: (s,) first filter columns of the others' errors.
+        shares: (s, 3, 3) how they enter its own.
+    """
+
+    transform: FloatArray
+    covariance: FloatArray
+    columns: IntArray = _ALONE
+    shares: FloatArray = _NO_SHARES
+
+
+class SwarmState:
+    """Joint belief over all robots.
+
+    Args:
+        table: Which parameters are estimated besides the poses.
+        pairs: Of how many others each robot remembers what it has measured.
+
+    Attributes:
+        transform: (N, 3) T, from `map` to the frame of the robot's odometry track.
+        parameter: (N, PARAMETERS) see `core/description/estimated_parameters.py`.
+        landmark: (L, 3) by what each landmark is moved from its surveyed place, in `map`.
+        filter: Covariance of the errors: robot i has columns 3i..3i+2 for its pose, right-invariant, and
+            those of the table for its parameters; landmarks have those of the table.
+        predicted_to_ns: (N,) the instant to which the robot is predicted.
+        preintegrated_covariance: (N, 3, 3) of its track at that instant; likewise preintegrated_jacobian.
+        tracked: (N,) whether the robot is part of the estimate.
+        start_pending: (N,) whether the robot may still be initialized at its configured start.
+        last_fix_ns: (N,) newest accepted measurement tied to a landmark or an absolute fix.
+        integrity: What the newest measurements say of all this.
+        contradicted: Robots, and landmarks as N + l, that are estimated anew because they were contradicted.
+        pair_robot: (N, pairs) whom each has measured; -1: nobody.
+        pair_stamp_ns: (N, pairs) when last.
+        pair_history: (N, pairs, 3, 3) what was measured, see `correlated_noise.py`.
+        constraints: Per robot that is not tracked, sightings which may locate it (see `initializer.py`).
+        next_attempt_ns: (N,) before this instant nothing more is made of its constraints.
+    """
+
+    def __init__(self, table: ParameterTable, pairs: int = 0) -> None:
+        robots = table.column.shape[0]
+        self._table = table
+        self.transform: FloatArray = np.zeros((robots, 3))
+        self.parameter: FloatArray = np.zeros((robots, PARAMETERS))
+        landmarks = table.survey_column.size
+        self.landmark: FloatArray = np.zeros((landmarks, 3))
+        self.filter = DenseFilter(table.filter_size)
+        estimated = table.column >= 0
+        self.filter.place(table.column[estimated], np.diag(table.sigma[estimated] ** 2))
+        for first, survey in zip(table.survey_column, table.survey, strict=True):
+            if first >= 0:
+                self.filter.place(first + np.arange(3), survey)
+        self.predicted_to_ns: NDArray[np.int64] = np.zeros(robots, dtype=np.int64)
+        self.preintegrated_covariance: FloatArray = np.zeros((robots, 3, 3))
+        self.preintegrated_jacobian: FloatArray = np.zeros((robots, 3, 3))
+        self.tracked: NDArray[np.bool_] = np.zeros(robots, dtype=bool)
+        self.start_pending: NDArray[np.bool_] = np.ones(robots, dtype=bool)
+        self.last_fix_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
+        self.integrity = new_integrity(robots, landmarks)
+        self.contradicted: frozenset[int] = frozenset()
+        self.pair_robot: NDArray[np.int64] = np.full((robots, pairs), -1)
+        self.pair_stamp_ns: NDArray[np.int64] = np.full((robots, pairs), NEVER_NS)
+        self.pair_history: FloatArray = np.zeros((robots, pairs, 3, 3))
+        self.constraints: dict[int, NDArray[np.void]] = {}
+        self.next_attempt_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
+
+    def copy(self) -> SwarmState:
+        """An independent copy."""
+        other = SwarmState.__new__(SwarmState)
+        for name, value in vars(self).items():
+            # a table never changes; the arrays inside `constraints` are replaced, never written to
+            setattr(other, name, value if name in {"_table", "integrity", "contradicted"} else value.copy())
+        other.integrity = IntegrityArrays(*(column.copy() for column in self.integrity))
+        return other
+
+    def arrays(self) -> BeliefArrays:
+        """Views for compiled code."""
+        return BeliefArrays(
+            self.transform,
+            self.filter.covariance,
+            self.parameter,
+            self.landmark,
+            self._table,
+            self.predicted_to_ns,
+            self.preintegrated_covariance,
+            self.preintegrated_jacobian,
+            self.tracked,
+            self.last_fix_ns,
+            self.integrity,
+            self.pair_robot,
+            self.pair_stamp_ns,
+            self.pair_history,
+        )
+
+    def initialize(self, robot: int, initial: InitialPose, at: Preintegrated, confirmations: int = 0) -> None:
+        """Take the robot into the estimate.
+
+        Args:
+            robot: Its index.
+            initial: Where its track lies.
+            at: The instant, and what its track has preintegrated by then.
+            confirmations: How many sightings agree with that.
+        """
+        if self.tracked[robot]:
+            self._forget_pairs(robot)
+        self.transform[robot] = initial.transform
+        self._isolate(robot, initial.covariance)
+        others = (initial.columns[:, None] + np.arange(3)).reshape(-1)
+        mapping = initial.shares.transpose(1, 0, 2).reshape(3, -1)
+        self.filter.relate(robot_columns(np.array([robot]))[0], others, mapping)
+        self.predicted_to_ns[robot] = at.stamp_ns
+        self.preintegrated_covariance[robot] = at.covariance
+        self.preintegrated_jacobian[robot] = at.jacobian
+        self.tracked[robot] = True
+        self.start_pending[robot] = False
+        self._trust(robot, confirmations)
+        self.constraints.pop(robot, None)
+
+    def lose(self, robot: int) -> None:
+        """Take the robot out of the estimate; it waits for a fix."""
+        self._isolate(robot, np.eye(3))
+        self._forget_pairs(robot)
+        self.tracked[robot] = False
+        self.start_pending[robot] = False
+        self._trust(robot, 0)
+
+    def open(self, source: int, pose: FloatArray) -> None:
+        """Estimate what a contradicted robot or landmark was described by, or estimate it anew.
+
+        Args:
+            source: The robot, or N plus the landmark.
+            pose: (3,) of the robot in `map`, which becomes less certain, too.
+        """
+        robots = self.tracked.size
+        self.contradicted |= {source}
+        self.integrity.doubt[source] = 0.0
+        self.integrity.evidence[self.integrity.source == source] = 0.0
+        if source < robots:
+            self.integrity.evidence[source] = 0.0
+        if source >= robots:
+            self._use_table(self._table.with_landmark(source - robots))
+            self.filter.add(
+                self.landmark_column(source - robots) + np.arange(3), self._table.survey[source - robots]
+            )
+            return
+        self._use_table(self._table.with_robot(source))
+        estimated = np.flatnonzero(self._table.column[source] >= 0)
+        sigma = self._table.sigma[source, estimated]
+        self.filter.add(self._table.column[source, estimated], np.diag(sigma**2))
+        doubt = error_covariance(pose, np.diag(np.square(_DOUBTED_POSE_SIGMA)))
+        self.filter.add(robot_columns(np.array([source]))[0], doubt)
+
+    def open_all(self, poses: FloatArray) -> None:
+        """Estimate everything that may be estimated anew, since what is believed rests on what is not so.
+
+        Args:
+            poses: (N, 3) of the robots in `map`, which stay where they are believed to be.
+        """
+        robots, landmarks = self.tracked.size, self.landmark.shape[0]
+        table = self._table
+        for robot in range(robots):
+            table = table.with_robot(robot)
+        for landmark in range(landmarks):
+            table = table.with_landmark(landmark)
+        self._use_table(table)
+        self.parameter[:], self.landmark[:], self.filter.covariance[:] = 0.0, 0.0, 0.0
+        for robot in range(robots):
+            sigma = np.diag(np.square(_REOPENED_POSE_SIGMA))
+            covariance = error_covariance(poses[robot], sigma) if self.tracked[robot] else np.eye(3)
+            self.filter.add(robot_columns(np.array([robot]))[0], covariance)
+            estimated = np.flatnonzero(table.column[robot] >= 0)
+            self.filter.add(table.column[robot, estimated], np.diag(table.sigma[robot, estimated] ** 2))
+        for first, survey in zip(table.survey_column, table.survey, strict=True):
+            self.filter.add(first + np.arange(3), survey)
+        self.integrity.doubt[:], self.integrity.evidence[:] = 0.0, 0.0
+
+    def _use_table(self, table: ParameterTable) -> None:
+        """Go on with more columns; the new ones are exact as yet."""
+        self.filter.grow(table.filter_size - self._table.filter_size)
+        self._table = table
+
+    def _trust(self, robot: int, confirmations: int) -> None:
+        """Forget what was held against a robot that begins anew."""
+        self.integrity.gated_in_a_row[robot] = 0
+        self.integrity.doubt[robot] = 0.0
+        self.integrity.confirmations[robot] = confirmations
+        self.integrity.source[robot] = -1
+        self.integrity.evidence[self.integrity.source == robot] = 0.0
+
+    def _forget_pairs(self, robot: int) -> None:
+        """Forget what the robot has measured, and others of it: its errors now are others."""
+        for gone in (self.pair_robot == robot, np.s_[robot]):
+            self.pair_robot[gone], self.pair_stamp_ns[gone] = -1, NEVER_NS
+
+    def _isolate(self, robot: int, covariance: FloatArray) -> None:
+        """Give the pose this covariance (3, 3); what was learned of the robot's sensors stays."""
+        self.filter.place(robot_columns(np.array([robot]))[0], covariance)
+        columns = self._table.column[robot, self._table.column[robot] >= 0]
+        self.filter.place(columns, np.diag(np.diag(self.filter.covariance)[columns]))
+
+    def parameter_sigma(self, robot: int) -> FloatArray:
+        """Standard deviations (PARAMETERS,) of a robot's parameters; zero of those not estimated."""
+        column = self._table.column[robot]
+        variance = np.where(column >= 0, np.diag(self.filter.covariance)[column], 0.0)
+        sigma: FloatArray = np.sqrt(variance)
+        return sigma
+
+    def landmark_covariance(self, landmark: int) -> FloatArray:
+        """Covariance (3, 3) of the right-invariant error of a landmark that is estimated."""
+        own = self.landmark_column(landmark) + np.arange(3)
+        covariance: FloatArray = self.filter.covariance[np.ix_(own, own)]
+        return covariance
+
+    def landmark_column(self, landmark: int) -> int:
+        """First filter column of the error of a landmark that is estimated."""
+        return int(self._table.survey_column[landmark])
+
+
+def robot_columns(robots: NDArray[np.int64]) -> IntArray:
+    """Filter columns (k, 3) of robots (k,)."""
+    columns: IntArray = 3 * robots[:, None] + np.arange(3)
+    return columns

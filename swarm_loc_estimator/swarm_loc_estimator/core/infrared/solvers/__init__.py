@@ -1,0 +1,1 @@
+"""Relative poses and gains from brightness matrices."""

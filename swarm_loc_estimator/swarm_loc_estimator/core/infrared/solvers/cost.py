@@ -1,0 +1,270 @@
+"""The negative log likelihood of readings, with gradient and Hessian by pose and gains.
+
+What is sought is the pose and, where elements differ by an unknown amount, every sensor's and emitter's
+log-gain, which has a prior. A measured reading is its expectation plus Gaussian noise. A saturated one says
+only that expectation plus noise is at saturation or above, which has the probability of a normal tail. One
+that shows no light where some is expected may be blocked by another robot.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.infrared.board import IrModel
+from swarm_loc_estimator.core.infrared.brightness import predict_brightness
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.jit import compiled
+
+MISSING, MEASURED, SATURATED = 0, 1, 2
+
+_TAIL = -6.0
+"""Below, the normal distribution is asymptotic [sigma]."""
+DARK = 4.0
+"""Only darker readings can be blocked ones [sigma]."""
+_BELIEVED = 2.0
+"""A reading that costs less is no blocked one."""
+
+
+class Pair(NamedTuple):
+    """The readings of one pair of robots.
+
+    Attributes:
+        readings: (modes, n, n) [count].
+        saturation: (modes,) from where on they are SATURATED [count].
+        kinds: (modes, n, n) MISSING, MEASURED or SATURATED.
+        sensor: (n,) gains of the receiver's sensors.
+        emitter: (n,) gains of the transmitter's emitters.
+        prior: (2, 2) of sensors and emitters: what weighs every log-gain's square, and the share of their
+            common part that this weight leaves free; weights of zero: gains are exact.
+        nearest: The least range to seek [m].
+        farthest: The largest.
+    """
+
+    readings: FloatArray
+    saturation: FloatArray
+    kinds: NDArray[np.int8]
+    sensor: FloatArray
+    emitter: FloatArray
+    prior: FloatArray
+    nearest: float
+    farthest: float
+
+
+class Scratch(NamedTuple):
+    """Room to work in; P unknowns are the log-gains of n sensors and n emitters, if sought, and the pose.
+
+    The pose comes last, so that the last rows of the Hessian's factor are those of the pose alone.
+
+    Attributes:
+        expected: (modes, n, n).
+        slopes: (3, modes, n, n).
+        at: (P,) the best so far.
+        trial: (P,).
+        factors: (2, n) sensors' and emitters' gains.
+        gradients: (2, P) of the cost at the best so far, or at the trial.
+        hessians: (2, P, P) likewise, by Gauss-Newton; lower triangles.
+        factor: (P, P) lower triangle.
+        step: (P,).
+        tally: (2,) squares of what is left of priors and of the readings that cannot be blocked ones, and the
+            degrees of freedom of these.
+        of_gains: (3,) the part of the pose's variances that is the unknown gains'.
+        root: (3, 3) inverse of the pose's part of the factor, lower triangle.
+    """
+
+    expected: FloatArray
+    slopes: FloatArray
+    at: FloatArray
+    trial: FloatArray
+    factors: FloatArray
+    gradients: FloatArray
+    hessians: FloatArray
+    factor: FloatArray
+    step: FloatArray
+    tally: FloatArray
+    of_gains: FloatArray
+    root: FloatArray
+
+
+@compiled
+def new_scratch(modes: int, n: int, gains: bool) -> Scratch:
+    """Room for a platform, with or without gains to seek."""
+    size = 3 + 2 * n if gains else 3
+    return Scratch(
+        np.empty((modes, n, n)),
+        np.empty((3, modes, n, n)),
+        np.zeros(size),
+        np.zeros(size),
+        np.empty((2, n)),
+        np.empty((2, size)),
+        np.empty((2, size, size)),
+        np.empty((size, size)),
+        np.empty(size),
+        np.empty(2),
+        np.zeros(3),
+        np.zeros((3, 3)),
+    )
+
+
+@compiled
+def cost_of(
+    model: IrModel, pair: Pair, at: FloatArray, room: Scratch, gradient: FloatArray, hessian: FloatArray
+) -> float:
+    """The cost at some place; writes its gradient and Hessian there."""
+    size, modes, n = at.size, pair.readings.shape[0], pair.readings.shape[1]
+    predict_brightness(model, at[size - 3], at[size - 2], at[size - 1], room.expected, room.slopes)
+    sought = size > 3
+    for i in range(n):
+        room.factors[0, i] = pair.sensor[i] * (math.exp(at[i]) if sought else 1.0)
+        room.factors[1, i] = pair.emitter[i] * (math.exp(at[n + i]) if sought else 1.0)
+    for p in range(size):
+        gradient[p] = 0.0
+        for q in range(p + 1):
+            hessian[p, q] = 0.0
+    cost = _add_prior(pair, at, gradient, hessian) if sought else 0.0
+    squares, sure = 2.0 * cost, 0
+    for m in range(modes):
+        for i in range(n):
+            for j in range(n):
+                kind = pair.kinds[m, i, j]
+                if kind == MISSING:
+                    continue
+                factor = room.factors[0, i] * room.factors[1, j]
+                expected = factor * room.expected[m, i, j]
+                limit = pair.saturation[m]
+                one, pull, weight, blocked = _of_reading(model, kind, pair.readings[m, i, j], limit, expected)
+                cost += one
+                if not blocked:
+                    squares += 2.0 * one
+                    sure += 1 if kind == MEASURED else 0
+                if weight == 0.0:
+                    continue
+                a = factor * room.slopes[0, m, i, j]
+                b = factor * room.slopes[1, m, i, j]
+                c = factor * room.slopes[2, m, i, j]
+                _add_by_pose(pull, weight, a, b, c, gradient, hessian)
+                if sought:
+                    _add_by_gains(pull, weight, expected, i, n + j, gradient, hessian)
+                    _add_by_both(weight * expected, a, b, c, i, n + j, hessian)
+    room.tally[0], room.tally[1] = squares, sure - 3.0
+    return cost
+
+
+@compiled
+def _of_reading(
+    model: IrModel, kind: int, reading: float, limit: float, expected: float
+) -> tuple[float, float, float, bool]:
+    """The cost of a reading, its two derivatives by the expectation, and whether it may be a blocked one.
+
+    Args:
+        model: The platform.
+        kind: MEASURED or SATURATED.
+        reading: [count].
+        limit: From where on it is SATURATED [count].
+        expected: At this pose with these gains [count].
+    """
+    spread = model.relative_noise * (reading if kind == MEASURED else limit)
+    weight = 1.0 / (model.noise * model.noise + spread * spread)
+    if kind == SATURATED:
+        per_sigma = math.sqrt(weight)
+        cost, pull, weight = _of_saturated(per_sigma, (expected - limit) * per_sigma)
+        return cost, pull, weight, False
+    if model.blocked < math.inf and reading < min(DARK * model.noise, expected):
+        cost, pull, weight = _of_dark(weight, expected - reading, model.blocked)
+        return cost, pull, weight, True
+    pull = weight * (expected - reading)
+    return 0.5 * pull * (expected - reading), pull, weight, False
+
+
+@compiled
+def _add_by_pose(
+    pull: float, weight: float, a: float, b: float, c: float, gradient: FloatArray, hessian: FloatArray
+) -> None:
+    """Add a reading whose slopes by range, bearing and heading are a, b and c."""
+    x = gradient.size - 3
+    gradient[x] += pull * a
+    gradient[x + 1] += pull * b
+    gradient[x + 2] += pull * c
+    hessian[x, x] += weight * a * a
+    hessian[x + 1, x] += weight * a * b
+    hessian[x + 1, x + 1] += weight * b * b
+    hessian[x + 2, x] += weight * a * c
+    hessian[x + 2, x + 1] += weight * b * c
+    hessian[x + 2, x + 2] += weight * c * c
+
+
+@compiled
+def _add_by_gains(
+    pull: float, weight: float, slope: float, i: int, j: int, gradient: FloatArray, hessian: FloatArray
+) -> None:
+    """Add a reading by the log-gains i of its sensor and j of its emitter; by both it has the same slope."""
+    gradient[i] += pull * slope
+    gradient[j] += pull * slope
+    both = weight * slope * slope
+    hessian[i, i] += both
+    hessian[j, j] += both
+    hessian[j, i] += both
+
+
+@compiled
+def _add_by_both(weight: float, a: float, b: float, c: float, i: int, j: int, hessian: FloatArray) -> None:
+    """Add what couples the pose to the log-gains i and j, by its slopes a, b and c."""
+    row = hessian.shape[0] - 3
+    for slope in (a, b, c):
+        mixed = weight * slope
+        hessian[row, i] += mixed
+        hessian[row, j] += mixed
+        row += 1
+
+
+@compiled
+def _add_prior(pair: Pair, at: FloatArray, gradient: FloatArray, hessian: FloatArray) -> float:
+    """Add the priors of log-gains: independent errors, and one common to all of a side."""
+    n, cost = pair.sensor.size, 0.0
+    for side in range(2):
+        weight, common = pair.prior[side, 0], pair.prior[side, 1]
+        first, total = side * n, 0.0
+        for p in range(first, first + n):
+            total += at[p]
+        for p in range(first, first + n):
+            pull = weight * (at[p] - common * total)
+            cost += 0.5 * pull * at[p]
+            gradient[p] += pull
+            hessian[p, p] += weight * (1.0 - common)
+            for q in range(first, p):
+                hessian[p, q] -= weight * common
+    return cost
+
+
+@compiled
+def _of_dark(weight: float, less: float, blocked: float) -> tuple[float, float, float]:
+    """The cost of a reading that shows no light and should, and its derivatives by the expectation.
+
+    It may be blocked by something in between: the more it is below expectation, the less it counts, and its
+    cost ends at a limit.
+    """
+    pull = weight * less
+    cost = 0.5 * pull * less
+    if cost < _BELIEVED:
+        return cost, pull, weight
+    seen = math.exp((_BELIEVED - cost) / blocked)
+    return _BELIEVED + blocked * (1.0 - seen), seen * pull, seen * weight
+
+
+@compiled
+def _of_saturated(per_sigma: float, z: float) -> tuple[float, float, float]:
+    """The cost of a saturated reading, and its derivatives by the expectation, z sigmas beyond saturation."""
+    if z > -_TAIL:
+        return 0.0, 0.0, 0.0
+    if z > _TAIL:
+        share = 0.5 * math.erfc(-z / math.sqrt(2.0))
+        hazard = math.exp(-0.5 * z * z) / (math.sqrt(2.0 * math.pi) * share)
+        cost = -math.log(share)
+    else:
+        series = 1.0 - 1.0 / (z * z) + 3.0 / (z * z * z * z)
+        hazard = -z / series
+        cost = 0.5 * z * z + math.log(-z * math.sqrt(2.0 * math.pi) / series)
+    return cost, -hazard * per_sigma, max(hazard * (hazard + z), 0.0) * per_sigma * per_sigma

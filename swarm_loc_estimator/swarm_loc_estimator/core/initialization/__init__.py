@@ -1,0 +1,1 @@
+"""The first pose of a robot whose start is unknown."""

@@ -1,0 +1,1 @@
+"""Odometry tracks, preintegrated between any two instants."""

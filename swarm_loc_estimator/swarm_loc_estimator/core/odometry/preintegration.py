@@ -1,0 +1,400 @@
+"""Preintegration of odometry: calibrated poses along a track, with their covariance and Jacobian."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.description.swarm import OdometryModel
+from swarm_loc_estimator.core.odometry.process_noise import (
+    OdometryStep,
+    add_silence,
+    add_step_jacobian,
+    add_step_noise,
+)
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.se2_scalar import wrap
+from swarm_loc_estimator.numerics.small_matrix import add_scaled, assign, assign_matrix
+
+UNCHANGED_NS = np.iinfo(np.int64).max
+BEFORE_ALL_NS = np.iinfo(np.int64).min
+
+_CONTRADICTORY_NS = 1_000_000_000
+"""Two jumps within such a time, and odometry tells nothing until it has been smooth for as long."""
+
+MODEL_DTYPE = np.dtype([(f.name, np.float64) for f in fields(OdometryModel)])
+"""The numbers of an `OdometryModel` as a record."""
+
+
+class Preintegrated(NamedTuple):
+    """What the steps of a track have added up to by an instant, in the track's frame.
+
+    Attributes:
+        stamp_ns: The instant.
+        covariance: (3, 3) G of the pose's right-invariant error.
+        jacobian: (3, 3) D, by how much the pose moves per unit of each parameter of the motion.
+    """
+
+    stamp_ns: int
+    covariance: FloatArray
+    jacobian: FloatArray
+
+    @classmethod
+    def begin(cls, stamp_ns: int) -> Preintegrated:
+        """Where a track begins: nothing yet."""
+        return cls(stamp_ns, np.zeros((3, 3)), np.zeros((3, 3)))
+
+
+class OdometrySample(NamedTuple):
+    """Tracks looked up at some instants (m,).
+
+    Attributes:
+        pose: (m, 3) calibrated odometry pose O, heading not wrapped.
+        raw: (m, 3) the pose that the driver reported, interpolated likewise.
+        covariance: (m, 3, 3) preintegrated by then, see `Preintegrated`.
+        jacobian: (m, 3, 3) likewise.
+        silence_s: (m,) how long after the newest message of its robot the instant lies; 0 within the track.
+    """
+
+    pose: FloatArray
+    raw: FloatArray
+    covariance: FloatArray
+    jacobian: FloatArray
+    silence_s: FloatArray
+
+
+class TrackArrays(NamedTuple):
+    """The rows of all tracks and the models behind them, as compiled code reads them.
+
+    Attributes:
+        filled: (N,) rows in use per robot.
+        stamp_ns: (N, capacity) instants, calibrated for delay.
+        raw: (N, capacity, 3) poses as reported, headings unwrapped.
+        pose: (N, capacity, 3) calibrated poses O, headings unwrapped.
+        covariance: (N, capacity, 3, 3) preintegrated until the row, see `Preintegrated`.
+        jacobian: (N, capacity, 3, 3) likewise; its columns are those of `estimated_parameters`.
+        rate: (N, capacity, 3) calibrated velocity forward and left [m/s] and turn rate [rad/s] at the row,
+            behind the lag.
+        known_ns: (N, capacity) until when the motion is known: the row's own instant, but for jumps.
+        jump_ns: (N, capacity, 2) the instants of the last two jumps, the last one first.
+        delay_ns: (N,) delay of the stamps.
+        model: (N,) records of the numbers of `OdometryModel`.
+        response: (N, 2, V, W) shares of speed and of turn rate of `MotionResponse`.
+        response_speed: (N, V) speeds of its grid, filled up with infinity.
+        response_turn_rate: (N, W) turn rates likewise.
+        begin_ns: (N,) instant of the very first row.
+        begin_pose: (N, 3) the pose there, where nothing is preintegrated yet.
+        stands: (N,) whether the robot has no odometry and never moves from where its track begins.
+    """
+
+    filled: IntArray
+    stamp_ns: IntArray
+    raw: FloatArray
+    pose: FloatArray
+    covariance: FloatArray
+    jacobian: FloatArray
+    rate: FloatArray
+    known_ns: IntArray
+    jump_ns: IntArray
+    delay_ns: IntArray
+    model: NDArray[np.void]
+    response: FloatArray
+    response_speed: FloatArray
+    response_turn_rate: FloatArray
+    begin_ns: IntArray
+    begin_pose: FloatArray
+    stands: NDArray[np.bool_]
+
+
+@compiled
+def new_sample(count: int) -> OdometrySample:
+    """Room for `count` look-ups."""
+    return OdometrySample(
+        np.zeros((count, 3)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3, 3)),
+        np.zeros((count, 3, 3)),
+        np.zeros(count),
+    )
+
+
+@compiled
+def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample, k: int) -> None:
+    """Write where the track of a robot is at an instant, in row k of a sample.
+
+    Within a step the motion is an arc of constant twist. Past the newest row the last twist goes on, less and
+    less sure; after `timeout_s` the motion since that row counts as unknown. Before the first row the robot
+    stands.
+    """
+    count = tracks.filled[robot]
+    out.silence_s[k] = 0.0
+    if count == 0:
+        out.pose[k].fill(0.0)
+        out.raw[k].fill(0.0)
+        out.covariance[k].fill(0.0)
+        out.jacobian[k].fill(0.0)
+        out.silence_s[k] = 0.0 if tracks.stands[robot] else math.inf
+        return
+    stamps, timeout_ns = tracks.stamp_ns[robot, :count], tracks.model[robot].timeout_s * 1e9
+    row = max(0, np.searchsorted(stamps, stamp_ns, side="right") - 1)
+    if row + 1 < count and stamps[row + 1] - stamps[row] <= timeout_ns:
+        elapsed = max(0, stamp_ns - stamps[row])
+        _along_step(tracks, robot, row, elapsed / (stamps[row + 1] - stamps[row]), out, k)
+        return
+    silence_ns = max(0, stamp_ns - stamps[row])
+    if row > 0 and silence_ns <= timeout_ns and stamps[row] - stamps[row - 1] <= timeout_ns:
+        fraction = 1.0 + silence_ns / (stamps[row] - stamps[row - 1])
+        _along_step(tracks, robot, row - 1, fraction, out, k)
+    else:
+        assign(out.pose[k], tracks.pose[robot, row])
+        assign(out.raw[k], tracks.raw[robot, row])
+        assign_matrix(out.covariance[k], tracks.covariance[robot, row])
+        assign_matrix(out.jacobian[k], tracks.jacobian[robot, row])
+    unknown = silence_ns > timeout_ns
+    out.silence_s[k] = silence_s = silence_ns * 1e-9
+    model, pose, rate = tracks.model[robot], tracks.pose[robot, row], tracks.rate[robot, row]
+    add_silence(model, silence_s, unknown, pose, rate, out.covariance[k])
+
+
+@compiled
+def rate_at(tracks: TrackArrays, robot: int, stamp_ns: int, rate: FloatArray) -> None:
+    """Write the velocity forward and left [m/s] and the turn rate [rad/s] (3,) of base_link at an instant.
+
+    Before the first row, and where the motion is unknown, it is zero.
+    """
+    rate.fill(0.0)
+    count = tracks.filled[robot]
+    stamps, timeout_ns = tracks.stamp_ns[robot, :count], tracks.model[robot].timeout_s * 1e9
+    row = min(np.searchsorted(stamps, stamp_ns, side="right"), count - 1)
+    if row < 1 or stamp_ns < stamps[0]:
+        return
+    if max(stamps[row], stamp_ns) - stamps[row - 1] > timeout_ns:
+        return
+    before, after = tracks.pose[robot, row - 1], tracks.pose[robot, row]
+    duration_s = (stamps[row] - stamps[row - 1]) * 1e-9
+    turn = after[2] - before[2]
+    cos, sin = math.cos(before[2] + 0.5 * turn), math.sin(before[2] + 0.5 * turn)
+    dx, dy = after[0] - before[0], after[1] - before[1]
+    rate[0], rate[1] = (cos * dx + sin * dy) / duration_s, (cos * dy - sin * dx) / duration_s
+    rate[2] = turn / duration_s
+
+
+@compiled
+def _along_step(
+    tracks: TrackArrays, robot: int, row: int, fraction: float, out: OdometrySample, k: int
+) -> None:
+    """Write what `look_up` does at a fraction of the step from a row to the next, or beyond it."""
+    _interpolate(tracks.pose[robot, row], tracks.pose[robot, row + 1], fraction, out.pose[k])
+    _interpolate(tracks.raw[robot, row], tracks.raw[robot, row + 1], fraction, out.raw[k])
+    for i in range(3):
+        for j in range(3):
+            for table, target in ((tracks.covariance, out.covariance), (tracks.jacobian, out.jacobian)):
+                before, after = table[robot, row, i, j], table[robot, row + 1, i, j]
+                target[k, i, j] = before + fraction * (after - before)
+
+
+@compiled
+def look_up_all(tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray) -> OdometrySample:
+    """Look up m robots at m instants; see `look_up`."""
+    out = new_sample(robots.size)
+    for k in range(robots.size):
+        look_up(tracks, robots[k], stamps_ns[k], out, k)
+    return out
+
+
+@compiled
+def _interpolate(start: FloatArray, end: FloatArray, fraction: float, out: FloatArray) -> None:
+    """The pose on the arc of constant twist from `start` to `end`; a `fraction` past 1 runs on."""
+    turn = end[2] - start[2]
+    back = -0.5 * (1.0 - fraction) * turn
+    cos, sin = math.cos(back), math.sin(back)
+    dx, dy = end[0] - start[0], end[1] - start[1]
+    out[0] = start[0] + fraction * (cos * dx - sin * dy)
+    out[1] = start[1] + fraction * (sin * dx + cos * dy)
+    out[2] = start[2] + fraction * turn
+
+
+@compiled
+def continue_tracks(
+    tracks: TrackArrays,
+    oldest_ns: int,
+    robots: IntArray,
+    stamps_ns: IntArray,
+    raw: FloatArray,
+    changed_from_ns: IntArray,
+) -> int:
+    """Append rows (k,) in their order, if all are newer than what their tracks hold and not too old.
+
+    Stamps are as reported, not calibrated for delay. Writes (N,) after which instant each track changes.
+
+    Returns:
+        How many rows are jumps; -1, and nothing is changed, when some are not new, or there is no room.
+    """
+    newest, filled = np.empty(tracks.filled.size, dtype=np.int64), tracks.filled.copy()
+    for robot in range(newest.size):
+        newest[robot] = tracks.stamp_ns[robot, filled[robot] - 1] if filled[robot] else BEFORE_ALL_NS
+        changed_from_ns[robot] = UNCHANGED_NS
+    delayed = np.empty(robots.size, dtype=np.int64)
+    for k in range(robots.size):
+        robot = robots[k]
+        delayed[k] = stamps_ns[k] + tracks.delay_ns[robot]
+        filled[robot] += 1
+        if (
+            stamps_ns[k] < oldest_ns
+            or delayed[k] <= newest[robot]
+            or filled[robot] > tracks.stamp_ns.shape[1]
+        ):
+            return -1
+        if changed_from_ns[robot] == UNCHANGED_NS:
+            changed_from_ns[robot] = newest[robot]
+        newest[robot] = delayed[k]
+    return integrate(tracks, robots, delayed, raw, np.ones(robots.size, dtype=np.bool_))[1]
+
+
+@compiled
+def integrate(
+    tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray, raw: FloatArray, new: NDArray[np.bool_]
+) -> tuple[int, int]:
+    """Append rows sorted by robot and stamp; return how many were duplicates, how many new ones jumps."""
+    duplicates, jumps = 0, 0
+    for k in range(robots.size):
+        robot = robots[k]
+        row = tracks.filled[robot]
+        if row and stamps_ns[k] <= tracks.stamp_ns[robot, row - 1]:
+            duplicates += 1
+            continue
+        tracks.stamp_ns[robot, row] = stamps_ns[k]
+        assign(tracks.raw[robot, row], raw[k])
+        if row == 0:  # a track begins where its driver says
+            assign(tracks.pose[robot, 0], raw[k])
+            tracks.covariance[robot, 0].fill(0.0)
+            tracks.jacobian[robot, 0].fill(0.0)
+            assign(tracks.rate[robot, 0], np.zeros(3))
+            assign(tracks.begin_pose[robot], raw[k])
+            tracks.begin_ns[robot] = tracks.known_ns[robot, 0] = stamps_ns[k]
+            tracks.jump_ns[robot, 0, 0] = tracks.jump_ns[robot, 0, 1] = BEFORE_ALL_NS // 2
+        else:
+            before = tracks.raw[robot, row - 1, 2]
+            tracks.raw[robot, row, 2] = before + wrap(raw[k, 2] - before)
+            jumped = _integrate_step(tracks, robot, row)
+            jumps += jumped and new[k]
+        tracks.filled[robot] = row + 1
+    return duplicates, jumps
+
+
+@compiled
+def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
+    """Fill a row from the row before and its raw pose; return whether no robot can drive so fast."""
+    model = tracks.model[robot]
+    before, after = tracks.raw[robot, row - 1], tracks.raw[robot, row]
+    duration_s = (tracks.stamp_ns[robot, row] - tracks.stamp_ns[robot, row - 1]) * 1e-9
+    turn = after[2] - before[2]
+    middle = before[2] + 0.5 * turn
+    dx, dy = after[0] - before[0], after[1] - before[1]
+    # half a robot's width of slack: stamps jitter
+    jump = math.hypot(dx, dy) > model.max_speed * duration_s + 0.5 * model.wheel_separation
+    start, rate = tracks.pose[robot, row - 1], tracks.rate[robot, row]
+    covariance, jacobian = tracks.covariance[robot, row], tracks.jacobian[robot, row]
+    assign_matrix(covariance, tracks.covariance[robot, row - 1])
+    assign_matrix(jacobian, tracks.jacobian[robot, row - 1])
+    stamp_ns, known_ns = tracks.stamp_ns[robot, row], tracks.known_ns[robot, row - 1]
+    jumps_ns = tracks.jump_ns[robot, row]
+    jumps_ns[0], jumps_ns[1] = tracks.jump_ns[robot, row - 1, 0], tracks.jump_ns[robot, row - 1, 1]
+    if jump:
+        jumps_ns[0], jumps_ns[1] = stamp_ns, jumps_ns[0]
+    # one jump is a driver that has started again; several are two of them that contradict each other
+    contradictory = stamp_ns - jumps_ns[1] < _CONTRADICTORY_NS
+    if jump or contradictory or duration_s > model.timeout_s:  # where it went is unknown
+        assign(tracks.pose[robot, row], start)
+        assign(rate, np.zeros(3))
+        before_s, now_s = (tracks.stamp_ns[robot, row - 1] - known_ns) * 1e-9, (stamp_ns - known_ns) * 1e-9
+        add_silence(model, now_s, True, start, rate, covariance)
+        if before_s > 0.0:  # it has grown so far already
+            known = np.zeros((3, 3))
+            add_silence(model, before_s, True, start, rate, known)
+            add_scaled(covariance, known, -1.0)
+        tracks.known_ns[robot, row] = known_ns if contradictory else stamp_ns
+        return bool(jump)
+    tracks.known_ns[robot, row] = stamp_ns
+    reported = (
+        math.cos(middle) * dx + math.sin(middle) * dy,
+        math.cos(middle) * dy - math.sin(middle) * dx,
+        turn,
+    )
+    before_rate = tracks.rate[robot, row - 1]
+    forward, left, turn = _true_motion(tracks, robot, reported, duration_s, before_rate, rate)
+    # the way of the axle, then that of base_link ahead of it
+    cos, sin = math.cos(model.course_offset), math.sin(model.course_offset)
+    way_x, way_y = cos * forward - sin * left, sin * forward + cos * left + model.axle_offset * turn
+    middle = start[2] + 0.5 * turn
+    cos, sin = math.cos(middle), math.sin(middle)
+    step_x, step_y = cos * way_x - sin * way_y, sin * way_x + cos * way_y
+    tracks.pose[robot, row, 0] = start[0] + step_x
+    tracks.pose[robot, row, 1] = start[1] + step_y
+    tracks.pose[robot, row, 2] = start[2] + turn
+    changed = abs(rate[2] - before_rate[2])
+    x, y = start[0] + 0.5 * step_x, start[1] + 0.5 * step_y
+    step = OdometryStep(forward, left, turn, changed, duration_s, x, y, middle)
+    add_step_noise(model, step, covariance)
+    add_step_jacobian(model, step, jacobian)
+    return False
+
+
+@compiled
+def _true_motion(
+    tracks: TrackArrays,
+    robot: int,
+    reported: tuple[float, float, float],
+    duration_s: float,
+    before_rate: FloatArray,
+    rate: FloatArray,
+) -> tuple[float, float, float]:
+    """Calibrated way forward and left and turn of a reported step; writes their rates (3,) at its end."""
+    model = tracks.model[robot]
+    speed = math.hypot(reported[0], reported[1]) / duration_s
+    speed_share, turn_share = _response(tracks, robot, speed, abs(reported[2]) / duration_s)
+    scale, turn_scale = model.distance_scale * speed_share, model.turn_scale * turn_share
+    true_rate = (
+        scale * reported[0] / duration_s,
+        scale * reported[1] / duration_s,
+        turn_scale * reported[2] / duration_s,
+    )
+    remaining, mean = 0.0, 0.0  # of what is left to follow: at the end, and on average over the step
+    if model.lag_s > 0.0:
+        remaining = math.exp(-duration_s / model.lag_s)
+        mean = (1.0 - remaining) * model.lag_s / duration_s
+    moved = np.empty(3)
+    for k in range(3):
+        behind = before_rate[k] - true_rate[k]
+        rate[k] = true_rate[k] + remaining * behind
+        moved[k] = (true_rate[k] + mean * behind) * duration_s
+    return moved[0], moved[1], moved[2]
+
+
+@compiled
+def _response(tracks: TrackArrays, robot: int, speed: float, turn_rate: float) -> tuple[float, float]:
+    """Shares of speed and turn rate that are true, bilinear in the grid of the robot's response."""
+    i, a = _bracket(tracks.response_speed[robot], speed)
+    j, b = _bracket(tracks.response_turn_rate[robot], turn_rate)
+    table = tracks.response[robot]
+    ii, jj = min(i + 1, table.shape[1] - 1), min(j + 1, table.shape[2] - 1)
+    shares = np.empty(2)
+    for k in range(2):
+        low = table[k, i, j] * (1.0 - b) + table[k, i, jj] * b
+        high = table[k, ii, j] * (1.0 - b) + table[k, ii, jj] * b
+        shares[k] = low * (1.0 - a) + high * a
+    return shares[0], shares[1]
+
+
+@compiled
+def _bracket(axis: FloatArray, value: float) -> tuple[int, float]:
+    """The interval of an ascending axis nearest to the value, and how far in the value lies (0 to 1)."""
+    i = max(0, min(np.searchsorted(axis, value, side="right") - 1, axis.size - 1))
+    if i + 1 == axis.size or math.isinf(axis[i + 1]):
+        return i, 0.0
+    return i, min(1.0, max(0.0, (value - axis[i]) / (axis[i + 1] - axis[i])))

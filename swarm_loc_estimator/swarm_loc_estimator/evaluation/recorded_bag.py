@@ -1,0 +1,83 @@
+"""Read a bag of a swarm once: raw inputs in order of arrival, and ground truth apart from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.core.inputs.messages import RawInputs
+from swarm_loc_estimator.evaluation.truth import TruthReader
+from swarm_loc_estimator.io.bags.reader import BagReader, BagTopic
+from swarm_loc_estimator.io.inputs.ingest import Ingest
+from swarm_loc_estimator.io.inputs.topics import InputKind
+from swarm_loc_estimator.numerics.trajectory import Trajectory
+
+Progress = Callable[[float, str], None]
+"""Takes the share done, 0 to 1, and what is being done."""
+
+
+def unwatched(_share: float, _what: str) -> None:
+    """Progress that nobody watches."""
+
+
+@dataclass(frozen=True)
+class BagSummary:
+    """What is known of a bag beside its inputs.
+
+    Attributes:
+        range_ns: First and last log time.
+        truth: Robot name -> ground truth; robots without are missing.
+        received: Messages for the estimator by kind of topic.
+        remarks: What could not be read or used, one sentence each.
+    """
+
+    range_ns: tuple[int, int]
+    truth: Mapping[str, Trajectory]
+    received: Mapping[str, int]
+    remarks: tuple[str, ...]
+
+
+def read_bag(bag: Path, swarm: Swarm, take: Callable[[RawInputs], None], progress: Progress) -> BagSummary:
+    """Read a bag once.
+
+    Args:
+        bag: rosbag2 folder, .mcap or .db3 file.
+        swarm: Whose messages are wanted.
+        take: Is handed the inputs, one stretch of time after the other.
+        progress: Called now and then.
+
+    Raises:
+        BagError: Nothing in the bag can be read.
+    """
+    ingest, truth = Ingest(swarm), TruthReader(swarm)
+    count = len(ingest.topics)
+    with BagReader(bag) as reader:
+        range_ns = reader.time_range_ns
+        for batch in reader.batches([*ingest.handle_of, *truth.topics]):
+            is_input = batch.topic < count
+            for inputs in ingest.read(batch.chosen(is_input)):
+                take(inputs)
+            others = batch.chosen(~is_input)
+            truth.add(others._replace(topic=others.topic - count))
+            progress(reader.progress, "reading")
+        remarks = (*reader.losses, *_strangers(reader.topics, ingest), *_missing(ingest), *truth.remarks())
+        return BagSummary(range_ns, truth.tracks(), ingest.received(), remarks)
+
+
+def _missing(ingest: Ingest) -> list[str]:
+    """One sentence for every input that the bag does not have."""
+    return [
+        f"The bag holds no message on {topic.name}."
+        for topic, statistics in zip(ingest.topics, ingest.statistics, strict=True)
+        if topic.expected and not statistics.received
+    ]
+
+
+def _strangers(topics: Iterable[BagTopic], ingest: Ingest) -> list[str]:
+    """A sentence when there are inputs of robots that the swarm does not have."""
+    kinds = {kind.topic: kind.message_type for kind in InputKind}
+    names = [t.name for t in topics if kinds.get(t.name.rpartition("/")[2]) == t.type]
+    strange = sorted(set(names) - set(ingest.handle_of))
+    return [f"No robot of the swarm description has the topics {', '.join(strange)}."] if strange else []

@@ -1,0 +1,1 @@
+"""The topics of the estimator, and the way from raw messages to its columns."""

@@ -1,0 +1,162 @@
+"""Decode the raw messages of one kind of input to the columns that the estimator takes.
+
+A new kind of input is a member of `InputKind`, columns in `core/inputs/messages.py`, and a channel here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.inputs.messages import (
+    BrightnessRows,
+    DetectionRows,
+    FixRows,
+    OdometryRows,
+    chosen,
+)
+from swarm_loc_estimator.io.inputs.topics import InputKind
+from swarm_loc_estimator.io.messages.cdr import (
+    BrightnessMessage,
+    FixMessage,
+    decode_brightness,
+    decode_fix,
+    decode_odometry,
+)
+from swarm_loc_estimator.io.messages.message_batch import MessageBatch
+from swarm_loc_estimator.io.messages.streams import DetectionReader, EachReader, PoseReader
+from swarm_loc_estimator.numerics.arrays import IntArray
+
+HEADING_UNKNOWN = math.pi**2
+"""A heading with such a variance [rad^2] or more was not measured: all headings there are vary by less."""
+FOREIGN_FRAME = "fix_frame"
+"""Why a fix that is not in `map` is dropped."""
+
+
+class Read(NamedTuple):
+    """What messages (n,) hold.
+
+    Attributes:
+        rows: A tuple of columns of `core/inputs/messages.py`.
+        stamp_ns: (n,) their stamps.
+        valid: (n,) whether the bytes were a whole message of the type.
+        dropped: Reason -> how many were whole and yet are not among the rows.
+    """
+
+    rows: tuple[NDArray[Any], ...]
+    stamp_ns: IntArray
+    valid: NDArray[np.bool_]
+    dropped: Mapping[str, int] = MappingProxyType({})
+
+
+class Channel(Protocol):
+    """All topics of one kind."""
+
+    def frame_id(self, topic: int) -> str:
+        """Frame of the newest message on a topic, "" before the first."""
+
+    def read(self, batch: MessageBatch, robot: IntArray) -> Read:
+        """Read messages (n,) in order of arrival, which came on the topics of robots (n,)."""
+
+
+class _OdometryChannel:
+    """See `OdometryRows`."""
+
+    def __init__(self, topics: int, _map_frame: str) -> None:
+        self._reader = PoseReader(topics, decode_odometry, names=2)
+
+    def frame_id(self, topic: int) -> str:
+        return self._reader.frame_ids[topic]
+
+    def read(self, batch: MessageBatch, robot: IntArray) -> Read:
+        found = self._reader.read(batch)
+        rows = OdometryRows(robot, found.stamp_ns, found.pose, batch.log_ns)
+        return Read(rows if found.valid.all() else chosen(rows, found.valid), found.stamp_ns, found.valid)
+
+
+class _DetectionChannel:
+    """See `DetectionRows`."""
+
+    def __init__(self, topics: int, _map_frame: str) -> None:
+        self._reader = DetectionReader(topics)
+
+    def frame_id(self, topic: int) -> str:
+        return self._reader.frame_ids[topic]
+
+    def read(self, batch: MessageBatch, robot: IntArray) -> Read:
+        found = self._reader.read(batch)
+        columns = (robot, found.stamp_ns, batch.log_ns)
+        robots, stamps_ns, arrivals_ns = (np.repeat(column, found.count) for column in columns)
+        return Read(
+            DetectionRows(robots, stamps_ns, found.detection, arrivals_ns), found.stamp_ns, found.valid
+        )
+
+
+class _BrightnessChannel:
+    """See `BrightnessRows`."""
+
+    def __init__(self, topics: int, _map_frame: str) -> None:
+        self._reader = EachReader(topics, decode_brightness)
+
+    def frame_id(self, topic: int) -> str:
+        return self._reader.frame_ids[topic]
+
+    def read(self, batch: MessageBatch, robot: IntArray) -> Read:
+        found = self._reader.read(batch)
+        messages: list[BrightnessMessage] = found.messages
+        readings = np.empty(len(messages), dtype=object)
+        for k, message in enumerate(messages):
+            readings[k] = message.readings
+
+        def column(name: str) -> IntArray:
+            return np.array([getattr(message, name) for message in messages], dtype=np.int64)
+
+        rows = BrightnessRows(
+            robot=robot[found.valid],
+            stamp_ns=found.stamp_ns[found.valid],
+            receiver=column("receiver"),
+            transmitter=column("transmitter"),
+            n=column("n"),
+            power=column("power"),
+            saturation=column("saturation"),
+            readings=readings,
+            arrival_ns=batch.log_ns[found.valid],
+        )
+        return Read(rows, found.stamp_ns, found.valid)
+
+
+class _FixChannel:
+    """See `FixRows`; no heading was measured where its variance is no number, not positive, or very large."""
+
+    def __init__(self, topics: int, map_frame: str) -> None:
+        self._reader = EachReader(topics, decode_fix)
+        self._map_frame = map_frame
+
+    def frame_id(self, topic: int) -> str:
+        return self._reader.frame_ids[topic]
+
+    def read(self, batch: MessageBatch, robot: IntArray) -> Read:
+        found = self._reader.read(batch)
+        messages: list[FixMessage] = found.messages
+        pose = np.array([message.pose for message in messages], dtype=float).reshape(-1, 3)
+        covariance = np.array([message.covariance for message in messages]).reshape(-1, 3, 3)
+        pose[~((covariance[:, 2, 2] > 0.0) & (covariance[:, 2, 2] < HEADING_UNKNOWN)), 2] = np.nan
+        stamp_ns, arrival_ns = found.stamp_ns[found.valid], batch.log_ns[found.valid]
+        rows = FixRows(robot[found.valid], stamp_ns, pose, covariance, arrival_ns)
+        at_home = np.array([m.frame_id == self._map_frame for m in messages], dtype=bool)
+        foreign = {FOREIGN_FRAME: int(np.sum(~at_home))}
+        return Read(chosen(rows, at_home), found.stamp_ns, found.valid, foreign)
+
+
+CHANNELS: dict[InputKind, Callable[[int, str], Channel]] = {
+    InputKind.ODOMETRY: _OdometryChannel,
+    InputKind.DETECTIONS: _DetectionChannel,
+    InputKind.BRIGHTNESS: _BrightnessChannel,
+    InputKind.FIXES: _FixChannel,
+}
+"""How each kind is read; made from the number of topics and the name of the frame `map`."""

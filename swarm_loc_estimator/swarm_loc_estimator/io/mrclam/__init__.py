@@ -1,0 +1,1 @@
+"""The UTIAS multi-robot cooperative localization and mapping dataset."""

@@ -1,0 +1,1 @@
+"""Swarm descriptions and infrared boards as YAML files."""

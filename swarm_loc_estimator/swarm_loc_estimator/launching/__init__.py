@@ -1,0 +1,1 @@
+"""Graphs of nodes as data, as processes and as launch actions."""

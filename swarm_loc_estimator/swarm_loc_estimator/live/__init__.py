@@ -1,0 +1,1 @@
+"""The live graph as child processes, recorded and compared with replay."""

@@ -1,0 +1,83 @@
+"""Compare the poses of the live graph with those of a replay of the same bag."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.evaluation.replay import replay
+from swarm_loc_estimator.evaluation.result import ReplayResult
+from swarm_loc_estimator.live.run import LiveRun
+from swarm_loc_estimator.nodes.playback import clock_step_ns
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+_TRANSPORT_S = 0.01
+"""Longest that a message is on its way between two processes of a machine that is not overloaded."""
+_EQUAL_M = 1e-6
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Live poses beside those of a replay at the same stamps.
+
+    A live estimator cannot know what is still on its way when it gives a pose: up to a step of the player's
+    clock and the transport. Only at settled stamps do both know the same, and the poses must be equal.
+
+    Attributes:
+        replayed: The replay.
+        distance_m: (T, N) between the positions; NaN where neither is located, infinite where one is not.
+        turn_rad: (T, N) between the headings, likewise, without sign.
+        settled: (T,) whether nothing was on its way.
+    """
+
+    replayed: ReplayResult
+    distance_m: FloatArray
+    turn_rad: FloatArray
+    settled: NDArray[np.bool_]
+
+    @property
+    def equal_share(self) -> float:
+        """Share of the poses that are the same to a micrometre."""
+        return float(np.mean(self.distance_m[~np.isnan(self.distance_m)] < _EQUAL_M))
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square distance of all robots that both had located [m]."""
+        return float(np.sqrt(np.mean(self.distance_m[np.isfinite(self.distance_m)] ** 2)))
+
+    @property
+    def settled_max_m(self) -> float:
+        """Largest distance at settled stamps [m]; NaN when there are none."""
+        chosen = self.distance_m[self.settled]
+        return float(np.nanmax(chosen)) if chosen.size else float("nan")
+
+
+def compare_with_replay(live: LiveRun, bag: Path, settings: EstimatorSettings | None = None) -> Agreement:
+    """Replay a bag at the very stamps of live poses.
+
+    Args:
+        live: What came out of the live graph.
+        bag: What was played into it.
+        settings: Those of the live estimator.
+    """
+    replayed = replay(bag, live.result.swarm, settings, stamp_ns=live.result.stamp_ns)
+    difference = live.result.pose - replayed.pose
+    located = np.isfinite(live.result.pose).all(axis=2)
+    one_only = located != np.isfinite(replayed.pose).all(axis=2)
+    turn = np.where(one_only, np.inf, np.abs(se2.wrap_angle(difference[..., 2])))
+    distance = np.where(one_only, np.inf, np.hypot(difference[..., 0], difference[..., 1]))
+    return Agreement(replayed, distance, turn, _settled(live))
+
+
+def _settled(live: LiveRun) -> NDArray[np.bool_]:
+    """(T,) whether all messages sent before a stamp were sent long enough before it to have arrived."""
+    way_ns = clock_step_ns(live.rate) + round(_TRANSPORT_S * live.rate * 1e9)
+    behind = np.searchsorted(live.arrival_ns, live.result.stamp_ns, side="right")
+    newest_ns = np.concatenate([[np.iinfo(np.int64).min // 2], live.arrival_ns])[behind]
+    settled: NDArray[np.bool_] = live.result.stamp_ns > newest_ns + way_ns
+    return settled

@@ -1,0 +1,194 @@
+"""Play a bag into the live graph over DDS, and record the poses that it publishes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.evaluation.result import ReplayResult
+from swarm_loc_estimator.evaluation.truth import TruthReader
+from swarm_loc_estimator.io.bags.reader import BagReader
+from swarm_loc_estimator.io.inputs.topics import input_topics
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.launching.graph import GraphOptions, graph_nodes
+from swarm_loc_estimator.live.graph import START_PATIENCE_S, LiveError, LiveGraph, cpu_seconds
+from swarm_loc_estimator.live.recorder import Recorder, read_history, read_poses
+from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.trajectory import Trajectory
+
+ESTIMATOR, PLAYER = "estimator", "player"
+_SILENCE_PATIENCE_S = 30.0
+_END_PATIENCE_S = 10.0
+
+
+@dataclass(frozen=True)
+class LiveRun:
+    """What came out of a live graph.
+
+    Attributes:
+        result: Poses as received, ground truth of the bag, what the estimator dropped.
+        arrival_ns: (M,) increasing, when the messages for the estimator had arrived in the bag; the player
+            has published all of them.
+        rate: Speed at which the bag was played.
+        status: (T, N) of `SwarmPose.status`.
+        received: Those that the estimator took in.
+        estimator_core: CPU time of the estimator's process per second while the bag played.
+        age_s: (A,) time of reception minus stamp of poses, in the bag's time, of those that came when it was
+            known here.
+    """
+
+    result: ReplayResult
+    arrival_ns: NDArray[np.int64]
+    rate: float
+    status: NDArray[np.uint8]
+    received: int
+    estimator_core: float
+    age_s: FloatArray
+
+    @property
+    def sent(self) -> int:
+        """Messages for the estimator that were published."""
+        return len(self.arrival_ns)
+
+    @property
+    def lost(self) -> int:
+        """Messages that went missing on the way."""
+        return self.sent - self.received
+
+
+@dataclass(frozen=True)
+class BagContent:
+    """What is known of a bag before it is played.
+
+    Attributes:
+        begin_ns: First log time.
+        end_ns: Last one.
+        arrival_ns: (M,) increasing, log times of the messages for the estimator.
+        truth: Robot name -> ground truth.
+        remarks: What could not be read, one sentence each.
+    """
+
+    begin_ns: int
+    end_ns: int
+    arrival_ns: NDArray[np.int64]
+    truth: Mapping[str, Trajectory]
+    remarks: tuple[str, ...]
+
+
+Watch = Callable[[Recorder, BagContent], None]
+
+
+def read_bag(bag: Path, swarm: Swarm) -> BagContent:
+    """Read what evaluation needs of a bag.
+
+    Raises:
+        BagError: Nothing in the bag can be read.
+    """
+    truth, inputs = TruthReader(swarm), [topic.name for topic in input_topics(swarm)]
+    arrivals = [np.zeros(0, dtype=np.int64)]
+    with BagReader(bag) as reader:
+        begin_ns, end_ns = reader.time_range_ns
+        for batch in reader.batches([*truth.topics, *inputs]):
+            is_truth = batch.topic < len(truth.topics)
+            truth.add(batch.chosen(is_truth))
+            arrivals.append(batch.log_ns[~is_truth])
+        tracks = truth.tracks()
+        remarks = (*reader.losses, *truth.remarks())
+    return BagContent(begin_ns, end_ns, np.concatenate(arrivals), tracks, remarks)
+
+
+def play_live(
+    bag: Path,
+    swarm_file: Path,
+    *,
+    log: Path,
+    rate: float = 1.0,
+    parameter_file: Path | None = None,
+    watch: Watch = lambda _recorder, _content: None,
+) -> LiveRun:
+    """Play a whole bag into a live graph and collect the poses that come out.
+
+    Args:
+        bag: rosbag2 folder, .mcap or .db3 file.
+        swarm_file: Description of the swarm in it.
+        log: File for the nodes' output.
+        rate: Speed, 1 for real time.
+        parameter_file: ROS parameter file for the nodes.
+        watch: Called about once per event while the bag plays, to show progress.
+
+    Raises:
+        LiveError: The graph did not play to the end.
+        GraphError: An executable is missing.
+        BagError: Nothing in the bag can be read.
+        SwarmFileError: The description cannot be used.
+    """
+    swarm = load_swarm(swarm_file)
+    content = read_bag(bag, swarm)
+    parameters = None if parameter_file is None else str(parameter_file)
+    options = GraphOptions(str(swarm_file), bag=str(bag), rate=rate, parameter_file=parameters)
+    with LiveGraph(graph_nodes(options), log) as graph:
+        recorder, estimator, player = graph.recorder, graph.process(ESTIMATOR), graph.process(PLAYER)
+
+        def has_ended() -> bool:
+            watch(recorder, content)
+            return player.poll() is not None
+
+        graph.wait_for(lambda: bool(recorder.raw), "publish poses", START_PATIENCE_S)
+        cpu_s, wall_s = cpu_seconds(estimator.pid), time.monotonic()
+        graph.wait_for(has_ended, "go on publishing poses", _SILENCE_PATIENCE_S, needed=[ESTIMATOR])
+        played_s = time.monotonic() - wall_s
+        core = (cpu_seconds(estimator.pid) - cpu_s) / played_s
+        if player.returncode:
+            raise LiveError(f"The player ended with status {player.returncode}; see {log}.")
+        _wait_for_the_rest(graph, len(content.arrival_ns), content.end_ns)
+    history = read_history(recorder.raw)
+    result = ReplayResult(
+        f"{bag.name}, live at {rate:g} x",
+        swarm,
+        *history[:3],
+        truth=content.truth,
+        counters=dict(recorder.drops),
+        remarks=content.remarks,
+        data_s=(content.end_ns - content.begin_ns) * 1e-9,
+        wall_s=played_s,
+    )
+    age_s = _ages(np.array(recorder.received_ns, dtype=np.int64), result.stamp_ns)
+    return LiveRun(result, content.arrival_ns, rate, history.status, recorder.inputs, core, age_s)
+
+
+def _ages(received_ns: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> FloatArray:
+    """Ages of poses at reception [s], where that time is known; before the first /clock it is zero."""
+    known = received_ns > 0
+    return (received_ns - stamp_ns)[known].astype(np.float64) * 1e-9
+
+
+def _wait_for_the_rest(graph: LiveGraph, sent: int, end_ns: int) -> None:
+    """Wait for poses of the bag's end, and for what the estimator then says of its inputs."""
+    recorder, last_ns = graph.recorder, end_ns - round(EstimatorParameters().tick_period_s * 1e9)
+    graph.wait_for(
+        lambda: read_poses(recorder.raw[-1]).stamp_ns > last_ns,
+        "publish poses of the bag's end",
+        _END_PATIENCE_S,
+        needed=[ESTIMATOR],
+    )
+    told: dict[int, int] = {}  # how many inputs by the n-th diagnostics
+
+    def has_all() -> bool:
+        """Whether everything has been taken in, or no more is."""
+        told[recorder.diagnostics] = recorder.inputs
+        before = told.get(recorder.diagnostics - 1)
+        return recorder.inputs in (sent, before)
+
+    graph.wait_for(
+        has_all,
+        "publish diagnostics",
+        _END_PATIENCE_S,
+        needed=[ESTIMATOR],
+    )

@@ -1,0 +1,300 @@
+"""Diagnostics of the estimator: robots, inputs, drops and load. No ROS here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.core.description.swarm import Robot, Swarm
+from swarm_loc_estimator.core.estimation.contradictions import Contradiction
+from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate
+from swarm_loc_estimator.core.estimation.fusion import Verdict
+from swarm_loc_estimator.core.filter.measurement_model import MeasurementArray
+from swarm_loc_estimator.io.inputs.ingest import Ingest, InputStatistics
+from swarm_loc_estimator.io.inputs.topics import InputKind, InputTopic
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+_SHOWN_NAMES = 8
+_FULL_LOAD = 0.95
+_PATIENCE_S, _PATIENCE_PERIODS = 10.0, 5.0
+"""An expected input that is silent for longer than so many seconds and of its mean periods may have died."""
+
+
+@dataclass
+class Report:
+    """One status of /diagnostics.
+
+    Attributes:
+        name: Whose.
+        message: One sentence.
+        warning: Whether something is wrong.
+        values: Figures with their units.
+    """
+
+    name: str
+    message: str
+    warning: bool = False
+    values: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class TickCost:
+    """What the ticks since the last report cost.
+
+    Attributes:
+        count: How many.
+        sum_s: Together.
+        max_s: The longest.
+    """
+
+    count: int = 0
+    sum_s: float = 0.0
+    max_s: float = 0.0
+
+    def note(self, seconds: float) -> None:
+        """Count one tick."""
+        self.count += 1
+        self.sum_s += seconds
+        self.max_s = max(self.max_s, seconds)
+
+
+Recent = tuple[MeasurementArray, NDArray[np.uint8], FloatArray]
+
+
+def add_contradictions(reports: Sequence[Report], contradictions: Sequence[Contradiction]) -> None:
+    """Warn of contradictions in the reports of the robots that they are about, the others in the last one."""
+    report_of = {report.name: report for report in reports}
+    for one in contradictions:
+        report = report_of.get(one.about, reports[-1])
+        report.message = f"{report.message}; {one.text}" if report.warning else one.text
+        report.warning = True
+
+
+class Graph(Protocol):
+    """What the ROS graph knows of publishers, see `ros/topic_graph.py`."""
+
+    def rivals(self, topic: str) -> list[str]:
+        """The nodes that publish a topic, if there is more than one."""
+
+    def why_missing(self, topic: str, message_type: str) -> str:
+        """Why nothing comes on a topic, such as " (no publisher)"."""
+
+
+class Diagnostics:
+    """Makes the reports, once per interval.
+
+    Args:
+        swarm: The robots.
+        ingest: What came in; each of its topics should have one publisher.
+        odom_frame: Name below the robot's of the frame that its odometry should be in.
+        graph: Who publishes.
+        sole: Further topics that should have one publisher.
+
+    Attributes:
+        rivals: One sentence for each topic that has more publishers, at the newest reports.
+    """
+
+    def __init__(
+        self, swarm: Swarm, ingest: Ingest, odom_frame: str, graph: Graph, sole: Sequence[str]
+    ) -> None:
+        self.rivals: list[str] = []
+        self._swarm = swarm
+        self._ingest = ingest
+        self._odom_frame = odom_frame
+        self._graph = graph
+        self._sole = sole
+        self._inputs_of: list[list[tuple[int, InputTopic]]] = [[] for _ in swarm.robots]
+        for handle, topic in enumerate(ingest.topics):
+            self._inputs_of[topic.robot].append((handle, topic))
+        self._was_located = np.zeros(len(swarm.robots), dtype=bool)
+        self._received = [0] * len(ingest.topics)
+        self._reported_ns: int | None = None
+
+    def missing(self) -> list[InputTopic]:
+        """The expected topics on which nothing has come yet."""
+        pairs = zip(self._ingest.topics, self._ingest.statistics, strict=True)
+        return [topic for topic, statistics in pairs if topic.expected and not statistics.received]
+
+    def missing_text(self) -> str:
+        """The missing topics in words, by cause; "" when there are none."""
+        by_cause: dict[str, list[str]] = {}
+        for topic in self.missing():
+            by_cause.setdefault(self._why_missing(topic), []).append(topic.name)
+        return "; ".join(f"nothing received on {_listed(names)}{cause}" for cause, names in by_cause.items())
+
+    def reports(
+        self, now_ns: int, estimate: SwarmEstimate, recent: Recent, drops: Mapping[str, int]
+    ) -> list[Report]:
+        """One per robot, then the swarm's inputs and drops; begins a new interval.
+
+        Args:
+            now_ns: The node's time.
+            estimate: The newest.
+            recent: The estimator's measurements with verdicts and normalised innovations squared.
+            drops: Data not used, by reason.
+        """
+        elapsed_s = (now_ns - self._reported_ns) * 1e-9 if self._reported_ns is not None else 0.0
+        self._reported_ns = now_ns
+        used, nis = _used_per_robot(recent, len(self._swarm.robots))
+        common = self._rivals_on(self._sole)
+        self.rivals = common.copy()
+        reports = []
+        for index, robot in enumerate(self._swarm.robots):
+            report = self._robot_report(index, robot, estimate, now_ns, elapsed_s)
+            report.values["measurements used"] = str(used[index])
+            report.values["NIS mean"] = _figure(nis[index])
+            reports.append(report)
+        self._was_located |= estimate.status != Status.WAITING
+        troubles = [*common, *filter(None, [self.missing_text()])]
+        values = {f"dropped: {reason}": str(count) for reason, count in drops.items()}
+        summary = {int(status): int(np.sum(estimate.status == status)) for status in Status}
+        words = ", ".join(f"{summary[status]} {status.name.lower()}" for status in Status if summary[status])
+        reports.append(Report("estimator", "; ".join(troubles) or words, bool(troubles), values))
+        return reports
+
+    def _why_missing(self, topic: InputTopic) -> str:
+        return self._graph.why_missing(topic.name, topic.kind.message_type)
+
+    def _rivals_on(self, topics: Sequence[str]) -> list[str]:
+        """One sentence for each of the topics that several nodes publish."""
+        found = {topic: self._graph.rivals(topic) for topic in topics}
+        some = {topic: names for topic, names in found.items() if names}
+        return [f"{topic} has {len(names)} publishers: {_listed(names)}" for topic, names in some.items()]
+
+    def _robot_report(
+        self, index: int, robot: Robot, estimate: SwarmEstimate, now_ns: int, elapsed_s: float
+    ) -> Report:
+        """State and inputs of one robot."""
+        troubles = self._rivals_on([topic.name for _, topic in self._inputs_of[index]])
+        self.rivals += troubles
+        values: dict[str, str] = {}
+        for handle, topic in self._inputs_of[index]:
+            troubles += self._input_troubles(handle, topic, robot, now_ns)
+            if topic.expected or self._ingest.statistics[handle].received:
+                values.update(self._input_values(handle, topic, now_ns, elapsed_s))
+        status = Status(int(estimate.status[index]))
+        if status is Status.WAITING and not troubles:
+            lost = "lost, " if self._was_located[index] else ""
+            troubles.append(f"{lost}waiting for a sighting or a fix that locates it")
+        values["status"] = status.name.lower()
+        values["fix age [s]"] = _figure(estimate.fix_age_s[index])
+        sigma = np.sqrt(np.diagonal(estimate.covariances[index]))
+        values["sigma x [m]"], values["sigma y [m]"] = _figure(sigma[0]), _figure(sigma[1])
+        values["sigma theta [rad]"] = _figure(sigma[2])
+        return Report(robot.name, "; ".join(troubles) or status.name.lower(), bool(troubles), values)
+
+    def _input_troubles(self, handle: int, topic: InputTopic, robot: Robot, now_ns: int) -> list[str]:
+        """What is wrong with an input, in words."""
+        statistics = self._ingest.statistics[handle]
+        if not statistics.received:
+            return [f"nothing received on {topic.name}{self._why_missing(topic)}"] if topic.expected else []
+        if statistics.last_arrival_ns is None:
+            return [f"no message on {topic.name} is a {topic.kind.message_type}"]
+        troubles, found = [], self._ingest.frame_id(handle)
+        silent_s = (now_ns - statistics.last_arrival_ns) * 1e-9
+        if silent_s > _patience_s(topic, robot, statistics):
+            troubles.append(f"{topic.name} is silent for {silent_s:.1f} s")
+        map_frame, odom_frame = self._ingest.map_frame, f"{robot.name}/{self._odom_frame}"
+        if topic.kind is InputKind.FIXES and found != map_frame:
+            troubles.append(f"{topic.name} is in frame '{found}' but must be in '{map_frame}'")
+        if topic.kind is InputKind.ODOMETRY and found != odom_frame:
+            troubles.append(
+                f"{topic.name} is in frame '{found}' but transforms are published for '{odom_frame}'"
+            )
+        return troubles
+
+    def _input_values(self, handle: int, topic: InputTopic, now_ns: int, elapsed_s: float) -> dict[str, str]:
+        """Figures of an input over the interval; begins its next one."""
+        statistics, name = self._ingest.statistics[handle], topic.kind.topic
+        arrived = statistics.received - self._received[handle]
+        self._received[handle] = statistics.received
+        arrival_ns, count = statistics.last_arrival_ns, statistics.late_count
+        values = {
+            f"{name} received": str(statistics.received),
+            f"{name} malformed": str(statistics.malformed),
+            f"{name} rate [1/s]": _figure(arrived / elapsed_s if elapsed_s > 0.0 else None),
+            f"{name} age [s]": _figure(None if arrival_ns is None else (now_ns - arrival_ns) * 1e-9),
+            f"{name} lateness mean [s]": _figure(statistics.late_sum_ns * 1e-9 / count if count else None),
+            f"{name} lateness max [s]": _figure(
+                None if statistics.late_max_ns is None else statistics.late_max_ns * 1e-9
+            ),
+        }
+        statistics.restart()
+        return values
+
+
+def load_report(cost: TickCost, elapsed_s: float, period_s: float, fusion_period_s: float) -> Report:
+    """What the ticks cost, and what to do when that is too much.
+
+    Args:
+        cost: The ticks of the interval.
+        elapsed_s: Length of the interval by the wall clock.
+        period_s: Parameter tick_period_s.
+        fusion_period_s: Parameter fusion_period_s.
+    """
+    load = cost.sum_s / elapsed_s if elapsed_s > 0.0 else 0.0
+    values = {
+        "ticks": str(cost.count),
+        "tick mean [ms]": _figure(1e3 * cost.sum_s / cost.count if cost.count else None),
+        "tick max [ms]": _figure(1e3 * cost.max_s),
+        "load [1]": _figure(load),
+    }
+    if load < _FULL_LOAD:
+        return Report("load", f"ticks take {100.0 * load:.0f} % of the time", values=values)
+    advice = (
+        f"a tick takes {1e3 * cost.sum_s / cost.count:.0f} ms, more than its share: raise fusion_period_s"
+        f" (now {fusion_period_s:g} s) or tick_period_s (now {period_s:g} s)"
+    )
+    return Report("load", advice, warning=True, values=values)
+
+
+def overload_report(count: int) -> Report:
+    """Says that messages come faster than they are used.
+
+    Args:
+        count: How many were dropped for it in the interval.
+    """
+    return Report("overload", f"{count} messages were dropped: more come than can be used", warning=True)
+
+
+def merged(reports: Sequence[Report], name: str) -> Report:
+    """Several reports as one; the sentences of those that warn come first."""
+    warnings = [report.message for report in reports if report.warning]
+    values = {key: value for report in reports for key, value in report.values.items()}
+    return Report(name, "; ".join(warnings or [report.message for report in reports]), bool(warnings), values)
+
+
+def _patience_s(topic: InputTopic, robot: Robot, statistics: InputStatistics) -> float:
+    """How long an input may be silent; detectors and infrared boards have periods of their own."""
+    if topic.kind is InputKind.ODOMETRY:
+        return robot.odometry.timeout_s
+    if not topic.expected:
+        return math.inf
+    return max(_PATIENCE_S, _PATIENCE_PERIODS * 1e-9 * (statistics.mean_period_ns or 0.0))
+
+
+def _used_per_robot(recent: Recent, robots: int) -> tuple[list[int], list[float]]:
+    """How many measurements from each robot's camera were used lately, and their mean NIS (NaN for none)."""
+    measurements, verdicts, nis = recent
+    mine = (verdicts == Verdict.USED) & (measurements["received_from"] >= 0) & np.isfinite(nis)
+    observers = measurements["received_from"][mine]
+    count = np.bincount(observers, minlength=robots)
+    total = np.bincount(observers, nis[mine], minlength=robots)
+    mean = np.divide(total, count, out=np.full(robots, np.nan), where=count > 0)
+    return count.tolist(), mean.tolist()
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Names for people, not too many."""
+    more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
+    return ", ".join(names[:_SHOWN_NAMES]) + more
+
+
+def _figure(value: float | None) -> str:
+    """A number for people; "-" when there is none."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:.4g}"

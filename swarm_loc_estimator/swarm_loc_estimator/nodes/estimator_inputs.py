@@ -1,0 +1,105 @@
+"""Subscribe to the inputs of the estimator, and take what has come when a tick asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+
+from swarm_loc_estimator.io.inputs.topics import InputKind, InputTopic
+from swarm_loc_msgs.msg import BrightnessMatrix, MarkerDetectionArray
+
+DEPTH = 1000
+"""So many messages of a topic wait for a tick at most: a busy moment as long as the horizon."""
+_MAX_PER_TAKE = 5000
+"""What a tick may take of all topics, so that none takes long."""
+_MIN_PER_TOPIC = 10
+
+_MESSAGE_CLASSES = {
+    InputKind.ODOMETRY: Odometry,
+    InputKind.DETECTIONS: MarkerDetectionArray,
+    InputKind.BRIGHTNESS: BrightnessMatrix,
+    InputKind.FIXES: PoseWithCovarianceStamped,
+}
+_LOST = {ReliabilityPolicy.RELIABLE: "overload", ReliabilityPolicy.BEST_EFFORT: "lost"}
+"""Why messages are missing between two others of a publisher."""
+
+
+class EstimatorInputs:
+    """All inputs, as raw bytes: building message objects would cost more than estimating.
+
+    The messages wait in the middleware, which keeps the newest of each topic, and not in the executor, which
+    would enter each of them into a queue without bound. What is missing is known by the publishers' numbers.
+
+    Args:
+        node: Has the subscriptions; no executor may handle them.
+        topics: What to subscribe to; their index is their handle.
+        drop: Is told of messages that went missing: reason and count.
+    """
+
+    def __init__(self, node: Node, topics: Sequence[InputTopic], drop: Callable[[str, int], None]) -> None:
+        self._node = node
+        self._topics = topics
+        self._drop = drop
+        self._newest: list[int | None] = [None] * len(topics)
+        self._looked_ns = 0
+        self._quota = max(_MIN_PER_TOPIC, _MAX_PER_TAKE // len(topics))
+        self._subscriptions = [self._subscribe(k, ReliabilityPolicy.RELIABLE) for k in range(len(topics))]
+
+    def take(self, now_ns: int) -> list[tuple[int, bytes, int]]:
+        """Messages as handle, bytes and arrival, in order of arrival; what is too much now comes next time.
+
+        Args:
+            now_ns: The node's time. By simulated time, all arrive now.
+        """
+        taken = []
+        for handle, subscription in enumerate(self._subscriptions):
+            take, message_class = subscription.handle.take_message, subscription.msg_type
+            for _ in range(self._quota):
+                message = take(message_class, True)
+                if message is None:
+                    break
+                data, info = message
+                self._count_gap(handle, info["publication_sequence_number"])
+                taken.append((info["received_timestamp"], handle, data))
+        taken.sort(key=lambda one: one[0])
+        # time must not seem to go back to where it was looked at before
+        begin_ns = now_ns if self._node.get_clock().ros_time_is_active else self._looked_ns
+        self._looked_ns = now_ns
+        return [(handle, data, min(max(at_ns, begin_ns), now_ns)) for at_ns, handle, data in taken]
+
+    def _count_gap(self, handle: int, number: int | None) -> None:
+        """Count what is missing between the newest message and this one, if one publisher numbers them."""
+        before, self._newest[handle] = self._newest[handle], number
+        if before is None or number is None or number <= before + 1:
+            return
+        if len(self._node.get_publishers_info_by_topic(self._topics[handle].name)) == 1:
+            self._drop(_LOST[self._subscriptions[handle].qos_profile.reliability], number - before - 1)
+
+    def _subscribe(self, handle: int, reliability: ReliabilityPolicy) -> Subscription:
+        topic = self._topics[handle]
+        return self._node.create_subscription(
+            _MESSAGE_CLASSES[topic.kind],
+            topic.name,
+            lambda _: None,
+            QoSProfile(depth=DEPTH, reliability=reliability),
+            raw=True,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=partial(self._follow, handle)),
+        )
+
+    def _follow(self, handle: int, _event: object) -> None:
+        """Subscribe anew, best effort: that hears every publisher, but what is lost is not sent again."""
+        before = self._subscriptions[handle]
+        if before.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
+            return
+        self._subscriptions[handle] = self._subscribe(handle, ReliabilityPolicy.BEST_EFFORT)
+        self._node.destroy_subscription(before)
+        self._node.get_logger().info(
+            f"{self._topics[handle].name} is published best effort: what is lost on the way is not sent again"
+        )

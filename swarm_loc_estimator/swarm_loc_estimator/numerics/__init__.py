@@ -1,0 +1,1 @@
+"""Planar geometry and small matrices, for arrays and inside compiled code."""

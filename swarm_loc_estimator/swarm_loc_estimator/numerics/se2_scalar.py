@@ -1,0 +1,56 @@
+"""Planar rigid transforms on single numbers, for use inside compiled code; see `se2` for arrays of them."""
+
+from __future__ import annotations
+
+import math
+
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.jit import compiled
+
+
+@compiled
+def wrap(angle: float) -> float:
+    """An angle [rad] in [-pi, pi)."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@compiled
+def composed(
+    ax: float, ay: float, atheta: float, bx: float, by: float, btheta: float
+) -> tuple[float, float, float]:
+    """The pose b, given in frame a, in the frame that a is given in; heading not wrapped."""
+    cos, sin = math.cos(atheta), math.sin(atheta)
+    return ax + cos * bx - sin * by, ay + sin * bx + cos * by, atheta + btheta
+
+
+@compiled
+def moved_by_twist(
+    rho_x: float, rho_y: float, phi: float, x: float, y: float, theta: float
+) -> tuple[float, float, float]:
+    """exp(twist) composed with a pose, heading wrapped."""
+    if abs(phi) < 1e-4:
+        a, b = 1.0 - phi * phi / 6.0, 0.5 * phi
+    else:
+        a, b = math.sin(phi) / phi, (1.0 - math.cos(phi)) / phi
+    ex, ey, etheta = composed(a * rho_x - b * rho_y, b * rho_x + a * rho_y, phi, x, y, theta)
+    return ex, ey, wrap(etheta)
+
+
+@compiled
+def adjoint_of(transform: FloatArray) -> tuple[tuple[float, ...], ...]:
+    """Ad(T) of a transform (3,), see `se2.adjoint`."""
+    cos, sin = math.cos(transform[2]), math.sin(transform[2])
+    return (cos, -sin, transform[1]), (sin, cos, -transform[0]), (0.0, 0.0, 1.0)
+
+
+@compiled
+def carry(transform: FloatArray, matrix: FloatArray, out: FloatArray) -> None:
+    """Write Ad(T) M Ad(T)^T (3, 3), of a transform (3,) and the covariance M (3, 3) of an error behind it."""
+    adjoint = adjoint_of(transform)
+    for i in range(3):
+        a, b, c = adjoint[i]
+        x = a * matrix[0, 0] + b * matrix[1, 0] + c * matrix[2, 0]
+        y = a * matrix[0, 1] + b * matrix[1, 1] + c * matrix[2, 1]
+        z = a * matrix[0, 2] + b * matrix[1, 2] + c * matrix[2, 2]
+        for j in range(3):
+            out[i, j] = x * adjoint[j][0] + y * adjoint[j][1] + z * adjoint[j][2]

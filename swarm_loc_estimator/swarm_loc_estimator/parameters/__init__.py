@@ -1,0 +1,1 @@
+"""Numbers with units and ranges, and tables of them: what users may set."""

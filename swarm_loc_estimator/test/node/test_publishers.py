@@ -1,0 +1,170 @@
+"""Publishers as they come: best effort, more of them than should be, of another type; and other clocks."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from node_world import (
+    PATIENCE_S,
+    STEP_NS,
+    T0_NS,
+    Program,
+    Robots,
+    Ros,
+    odometry_bytes,
+    overrides,
+)
+from rcl_interfaces.msg import Log, ParameterType
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import SetParameters
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+
+from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
+
+FLOOD = """
+import sys
+import rclpy
+from nav_msgs.msg import Odometry
+rclpy.init()
+node = rclpy.create_node("flood")
+publisher = node.create_publisher(Odometry, sys.argv[1], 10)
+data = bytes.fromhex(sys.argv[2])
+while True:
+    publisher.publish(data)
+"""
+FLOOD_S = 4.0
+MEGABYTE = 1 << 20
+
+
+def newest(heard: list[DiagnosticArray], name: str) -> DiagnosticStatus:
+    """The newest diagnostics of one name."""
+    (status,) = [status for status in heard[-1].status if status.name == name]
+    return status
+
+
+def test_best_effort_publishers_are_heard_and_named(ros: Ros, swarm_file: Path) -> None:
+    log = ros.listen(Log, "/rosout")
+    ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(swarm_file), use_sim_time=True)))
+    ros.until(lambda: any("ready" in entry.msg for entry in log))
+    robots = Robots(ros, QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT))
+    robots.wait_for_estimator()
+    robots.run(T0_NS, 20)
+    assert robots.located("alpha")
+    assert robots.located("beta")
+    ros.until(lambda: sum("published best effort" in entry.msg for entry in log) == 4)
+
+
+def test_publishers_that_should_not_be_are_named_once_per_change(ros: Ros, robots: Robots) -> None:
+    log, heard = ros.listen(Log, "/rosout"), ros.listen(DiagnosticArray, "/diagnostics")
+    others = ros.add(Node("other"))
+    second = others.create_publisher(Odometry, "alpha/odom", 10)
+    robots.run(T0_NS, 4)
+    sentence = "alpha/odom has 2 publishers: /other, /tester"
+    ros.until(lambda: heard and sentence in newest(heard, "estimator: alpha").message)
+    assert newest(heard, "estimator: alpha").level == DiagnosticStatus.WARN
+    count = len(heard)
+    ros.until(lambda: len(heard) > count + 1)
+    assert sum(entry.msg == sentence for entry in log) == 1
+    others.destroy_publisher(second)
+    ros.until(lambda: "publishers" not in newest(heard, "estimator: alpha").message)
+
+
+def test_a_second_estimator_and_a_second_clock_are_named(ros: Ros, robots: Robots, swarm_file: Path) -> None:
+    heard = ros.listen(DiagnosticArray, "/diagnostics")
+    ros.add(Node("other")).create_publisher(Clock, "/clock", 10)
+    parameters = overrides(swarm_file=str(swarm_file), use_sim_time=True)
+    ros.add(EstimatorNode(namespace="copy", parameter_overrides=parameters))
+    ros.add(EstimatorNode(parameter_overrides=parameters))
+    robots.run(T0_NS, 4)
+    ros.until(lambda: heard and "/clock has 2" in newest(heard, "estimator").message)
+    message = newest(heard, "estimator").message
+    assert "swarm/poses has 2 publishers: /estimator, /estimator" in message
+    assert "/clock has 2 publishers: /other, /tester" in message
+
+
+def test_the_clock_cannot_be_changed_while_the_node_runs(ros: Ros, robots: Robots) -> None:
+    robots.run(T0_NS, 2)
+    parameter = ParameterMessage(name="use_sim_time")
+    parameter.value.type = ParameterType.PARAMETER_BOOL
+    response = ros.call(
+        SetParameters, "estimator/set_parameters", SetParameters.Request(parameters=[parameter])
+    )
+    (result,) = response.results
+    assert (result.successful, result.reason) == (
+        False,
+        "use_sim_time is read at the start only: start the node anew.",
+    )
+    robots.run(T0_NS + 2 * STEP_NS, 2)
+
+
+def test_a_pose_estimate_of_rviz_sets_a_robot(ros: Ros, robots: Robots) -> None:
+    log = ros.listen(Log, "/rosout")
+    publisher = ros.tester.create_publisher(PoseWithCovarianceStamped, "beta/initialpose", 1)
+    robots.tell_time(T0_NS)
+    for name in ("alpha", "beta"):
+        robots.odometry(name, odometry_bytes(name, T0_NS))
+    robots.tell_time(T0_NS + STEP_NS)
+    ros.until(lambda: robots.located("alpha") and publisher.get_subscription_count())
+    assert not robots.located("beta")
+
+    pose = PoseWithCovarianceStamped()
+    pose.header.frame_id = "odom"
+    pose.pose.pose.position.x = 3.0
+    pose.pose.covariance[0] = pose.pose.covariance[7] = 0.25
+    pose.pose.covariance[35] = 0.07
+    publisher.publish(pose)
+    ros.until(lambda: any("in frame 'odom' but must be in 'map'" in entry.msg for entry in log))
+    pose.header.frame_id = "map"
+    publisher.publish(pose)
+    ros.until(lambda: any("by beta/initialpose: Robot 'beta' is at x 3.000 m" in entry.msg for entry in log))
+    robots.tell_time(T0_NS + 2 * STEP_NS)
+    ros.until(lambda: robots.located("beta"))
+    assert robots.newest("beta").x == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_flood_is_dropped_and_counted_memory_stays_and_a_signal_ends_the_node(
+    ros: Ros, tmp_path: Path, swarm_file: Path, number: signal.Signals
+) -> None:
+    heard = ros.listen(DiagnosticArray, "/diagnostics")
+    now_ns = time.time_ns()
+    command = [sys.executable, "-c", FLOOD, "alpha/odom", odometry_bytes("alpha", now_ns).hex()]
+    with Program("estimator_node", tmp_path / "log", {"swarm_file": swarm_file}) as program:
+        program.wait_for("ready")
+        flood = subprocess.Popen(command)
+        try:
+            ros.until(lambda: heard and "dropped: overload" in values(newest(heard, "estimator")))
+            assert "more come than can be used" in newest(heard, "estimator").message
+            before, begin_s = resident_bytes(program.process.pid), time.monotonic()
+            ros.until(lambda: time.monotonic() > begin_s + FLOOD_S)
+            grown = resident_bytes(program.process.pid) - before
+            begin_s = time.monotonic()
+            status = program.end(number)
+            took_s = time.monotonic() - begin_s
+        finally:
+            flood.kill()
+            flood.wait(PATIENCE_S)
+        assert status == 0
+        assert "Traceback" not in program.output
+    assert grown < 5 * MEGABYTE
+    assert took_s < 2.0
+
+
+def values(status: DiagnosticStatus) -> dict[str, str]:
+    return {pair.key: pair.value for pair in status.values}
+
+
+def resident_bytes(pid: int) -> int:
+    """Memory of a process."""
+    return int(Path("/proc", str(pid), "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")

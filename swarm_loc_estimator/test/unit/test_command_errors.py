@@ -1,0 +1,57 @@
+"""How commands end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from swarm_loc_estimator.cli import calibrate, calibrate_ir, replay
+from swarm_loc_estimator.cli.arguments import folder_to_write
+from swarm_loc_estimator.cli.errors import exit_with_message
+from swarm_loc_estimator.parameters.errors import UserError
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "words"),
+    [
+        (UserError("This is wrong."), 1, "This is wrong.\n"),
+        (OSError(28, "No space left on device", "out/x.yaml"), 1, "out/x.yaml cannot be used: No space left"),
+        (OSError("cannot mmap an empty file"), 1, "A file cannot be used: cannot mmap an empty file."),
+        (KeyboardInterrupt(), 130, ""),
+    ],
+)
+def test_what_goes_wrong_ends_a_command_with_a_sentence(
+    error: BaseException, status: int, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    @exit_with_message
+    def main() -> int:
+        raise error
+
+    assert main() == status
+    said = capsys.readouterr().err
+    assert said.startswith(words)
+    assert said.count("\n") == bool(words)
+
+
+def test_faults_of_the_program_are_not_hidden() -> None:
+    @exit_with_message
+    def main() -> int:
+        raise KeyError
+
+    with pytest.raises(KeyError):
+        main()
+
+
+@pytest.mark.parametrize("main", [replay.main, calibrate.main, calibrate_ir.main])
+def test_a_bag_that_is_not_there_is_said(
+    main: Callable[[list[str]], int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(tmp_path / "nope"), "--out", str(tmp_path / "out.yaml")]) == 1
+    assert capsys.readouterr().err == f"There is no bag '{tmp_path / 'nope'}'.\n"
+
+
+def test_folders_are_not_made_before_there_is_anything_to_write(tmp_path: Path) -> None:
+    assert folder_to_write(str(tmp_path / "a" / "b")) == tmp_path / "a" / "b"
+    assert not (tmp_path / "a").exists()

@@ -1,0 +1,53 @@
+"""The pages under doc/ have all numbers of a swarm description and all options of the commands."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from swarm_loc_estimator.cli import calibrate, calibrate_ir, import_mrclam, replay
+from swarm_loc_estimator.core.description.swarm import (
+    CameraMount,
+    Face,
+    Landmark,
+    OdometryModel,
+    SensorModel,
+    StartSigma,
+)
+from swarm_loc_estimator.parameters.number_spec import number_specs
+
+DOC = Path(__file__).parents[2] / "doc"
+SWARM_DESCRIPTION = (DOC / "swarm_description.md").read_text(encoding="utf-8")
+COMMANDS = (DOC / "commands.md").read_text(encoding="utf-8")
+
+
+def table_of(cls: type, *required: str) -> str:
+    """The numbers of a dataclass as a table of Markdown."""
+    lines = ["| Key | Default | Range | Meaning |", "|---|---|---|---|"]
+    defaults = {f.name: "null" if f.default is None else f"{f.default:g}" for f in fields(cls) if f.metadata}
+    for name, spec in number_specs(cls).items():
+        default = "required" if name in required else f"`{defaults[name]}`"
+        lines.append(f"| `{name}` | {default} | {spec.range_text} | {spec.doc} |")
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("cls", [OdometryModel, CameraMount, SensorModel, Face, StartSigma])
+def test_every_number_of_a_robot_has_its_place(cls: type) -> None:
+    assert table_of(cls) in SWARM_DESCRIPTION
+
+
+def test_every_number_of_a_landmark_has_its_place() -> None:
+    assert table_of(Landmark, "x", "y") in SWARM_DESCRIPTION
+
+
+@pytest.mark.parametrize("command", [replay, calibrate, calibrate_ir, import_mrclam])
+def test_every_option_of_a_command_has_its_place(command: object, capsys: pytest.CaptureFixture[str]) -> None:
+    main: Callable[[list[str]], int] = command.main  # type: ignore[attr-defined]
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    options = set(re.findall(r"(?<!\S)\[?--([a-z-]+)", capsys.readouterr().out)) - {"help"}
+    assert {option for option in options if f"`--{option}" not in COMMANDS} == set()

@@ -1,0 +1,182 @@
+"""What /diagnostics says, from figures alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate
+from swarm_loc_estimator.core.estimation.fusion import Verdict
+from swarm_loc_estimator.core.filter.measurement_model import MEASUREMENT_DTYPE
+from swarm_loc_estimator.io.inputs.ingest import Ingest
+from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.io.messages.encoders import encode_detections, encode_odometry
+from swarm_loc_estimator.io.messages.message_batch import MessageBatch
+from swarm_loc_estimator.nodes.estimator_diagnostics import Diagnostics, Recent, TickCost, load_report
+
+SECOND = 1_000_000_000
+SWARM = Swarm((Robot("a", odometry=OdometryModel(timeout_s=1.0)), Robot("b", camera=None)))
+
+
+class Graph:
+    """Knows the publishers that a test says."""
+
+    def __init__(self) -> None:
+        self.publishers: dict[str, list[str]] = {}
+
+    def rivals(self, topic: str) -> list[str]:
+        """Those of the topic."""
+        return self.publishers.get(topic, [])
+
+    def why_missing(self, topic: str, message_type: str) -> str:
+        """The robot's name is why."""
+        assert "/msg/" in message_type
+        return f" (why {topic[0]})"
+
+
+class World:
+    """Diagnostics of a swarm of two, fed by hand."""
+
+    def __init__(self) -> None:
+        self.ingest = Ingest(SWARM)
+        self.graph = Graph()
+        self.diagnostics = Diagnostics(SWARM, self.ingest, "odom", self.graph, ["swarm/poses"])
+        self.reports = self.diagnostics.reports
+
+    def detections(self, now_ns: int) -> None:
+        """A picture of robot a without any marker."""
+        data = encode_detections("a/camera_optical_frame", now_ns, np.zeros(0, DETECTION_DTYPE))
+        list(self.ingest.read(MessageBatch.of([(self.ingest.handle_of["a/detections"], data, now_ns)])))
+
+    def odometry(self, robot: str, stamp_ns: int, now_ns: int, frame: str | None = None) -> None:
+        """One message."""
+        (data,) = encode_odometry(
+            frame or f"{robot}/odom",
+            "base",
+            np.array([stamp_ns]),
+            np.zeros((1, 3)),
+            np.zeros((1, 3)),
+            np.eye(6),
+            np.eye(6),
+        )
+        list(self.ingest.read(MessageBatch.of([(self.ingest.handle_of[f"{robot}/odom"], data, now_ns)])))
+
+
+def estimate(now_ns: int, *status: Status) -> SwarmEstimate:
+    n = len(status)
+    return SwarmEstimate(
+        now_ns,
+        np.zeros((n, 3)),
+        np.tile(4.0 * np.eye(3), (n, 1, 1)),
+        np.zeros((n, 3)),
+        np.array(status, np.uint8),
+        np.zeros(n),
+    )
+
+
+def recent(*rows: tuple[int, Verdict, float]) -> Recent:
+    """Measurements: who sent it, what was thought of it, its NIS."""
+    measurements = np.zeros(len(rows), MEASUREMENT_DTYPE)
+    measurements["received_from"] = [row[0] for row in rows]
+    return (
+        measurements,
+        np.array([row[1] for row in rows], np.uint8),
+        np.array([row[2] for row in rows], dtype=float),
+    )
+
+
+def test_missing_topics_are_grouped_by_cause() -> None:
+    world = World()
+    assert [topic.name for topic in world.diagnostics.missing()] == ["a/odom", "a/detections", "b/odom"]
+    assert world.diagnostics.missing_text() == (
+        "nothing received on a/odom, a/detections (why a); nothing received on b/odom (why b)"
+    )
+    world.odometry("b", 0, 0)
+    assert "b/odom" not in world.diagnostics.missing_text()
+
+
+def test_topics_with_too_many_publishers_are_named_where_they_belong() -> None:
+    world = World()
+    tracked = estimate(0, Status.TRACKED, Status.TRACKED)
+    world.odometry("b", 0, 0)
+    world.graph.publishers = {"swarm/poses": ["/one", "/two"], "b/odom": ["/player", "/player"]}
+    a, b, whole = world.reports(0, tracked, recent(), {})
+    assert "publishers" not in a.message
+    assert (b.warning, b.message) == (True, "b/odom has 2 publishers: /player, /player")
+    assert whole.message.startswith("swarm/poses has 2 publishers: /one, /two; nothing received")
+    assert world.diagnostics.rivals == [whole.message.partition(";")[0], b.message]
+    world.graph.publishers = {}
+    _, b, _ = world.reports(0, tracked, recent(), {})
+    assert (b.warning, world.diagnostics.rivals) == (False, [])
+
+
+def test_rates_and_lateness_are_those_of_the_interval() -> None:
+    world = World()
+    both = (Status.TRACKED, Status.TRACKED)
+    world.odometry("b", 1 * SECOND, 2 * SECOND)
+    world.reports(10 * SECOND, estimate(10 * SECOND, *both), recent(), {})
+    for k in range(4):
+        world.odometry("b", 10 * SECOND, 10 * SECOND + k * SECOND // 2)
+    _, b, _ = world.reports(12 * SECOND, estimate(12 * SECOND, *both), recent(), {})
+    assert b.values["odom received"] == "5"
+    assert b.values["odom rate [1/s]"] == "2"
+    assert b.values["odom age [s]"] == "0.5"
+    assert b.values["odom lateness mean [s]"] == "0.75"
+    assert b.values["odom lateness max [s]"] == "1.5"
+    assert b.values["sigma x [m]"] == "2"
+    assert (b.warning, b.message) == (False, "tracked")
+
+
+def test_a_robot_is_told_apart_as_waiting_lost_silent_or_in_a_foreign_frame() -> None:
+    world = World()
+    world.odometry("b", 0, 0)
+    _, b, whole = world.reports(0, estimate(0, Status.TRACKED, Status.WAITING), recent(), {"gated": 3})
+    assert (b.warning, b.message) == (True, "waiting for a sighting or a fix that locates it")
+    assert whole.values == {"dropped: gated": "3"}
+    world.reports(0, estimate(0, Status.TRACKED, Status.TRACKED), recent(), {})
+    _, b, _ = world.reports(0, estimate(0, Status.TRACKED, Status.WAITING), recent(), {})
+    assert b.message == "lost, waiting for a sighting or a fix that locates it"
+    now_ns = 5 * SECOND
+    _, b, _ = world.reports(now_ns, estimate(now_ns, Status.TRACKED, Status.STALE), recent(), {})
+    assert b.message == "b/odom is silent for 5.0 s"
+    world.odometry("b", now_ns, now_ns, frame="odom")
+    _, b, _ = world.reports(now_ns, estimate(now_ns, Status.TRACKED, Status.TRACKED), recent(), {})
+    assert b.message == "b/odom is in frame 'odom' but transforms are published for 'b/odom'"
+
+
+@pytest.mark.parametrize(("period_s", "patience_s"), [(0.05, 10.0), (1.0, 10.0), (60.0, 300.0)])
+def test_a_detector_that_falls_silent_is_named_as_soon_as_its_period_allows(
+    period_s: float, patience_s: float
+) -> None:
+    world, last_ns = World(), round(3 * period_s * SECOND)
+    for k in range(4):
+        world.detections(round(k * period_s * SECOND))
+    for late_s, message in (
+        (-0.1, "tracked"),
+        (0.1, f"a/detections is silent for {patience_s + 0.1:.1f} s"),
+    ):
+        now_ns = last_ns + round((patience_s + late_s) * SECOND)
+        world.odometry("a", now_ns, now_ns)
+        status = estimate(now_ns, Status.TRACKED, Status.TRACKED)
+        assert world.reports(now_ns, status, recent(), {})[0].message == message
+
+
+def test_nis_is_the_mean_of_what_was_used() -> None:
+    rows = recent(
+        (0, Verdict.USED, 2.0), (0, Verdict.USED, 4.0), (0, Verdict.GATED, 900.0), (-1, Verdict.USED, 7.0)
+    )
+    a, b, _ = World().diagnostics.reports(0, estimate(0, Status.TRACKED, Status.TRACKED), rows, {})
+    assert (a.values["measurements used"], a.values["NIS mean"]) == ("2", "3")
+    assert (b.values["measurements used"], b.values["NIS mean"]) == ("0", "-")
+
+
+@pytest.mark.parametrize(("tick_s", "warning"), [(0.002, False), (0.06, True)])
+def test_ticks_that_take_all_the_time_name_what_helps(tick_s: float, warning: bool) -> None:
+    cost = TickCost()
+    for _ in range(16):
+        cost.note(tick_s)
+    report = load_report(cost, elapsed_s=1.0, period_s=0.05, fusion_period_s=0.0)
+    assert report.warning == warning
+    assert ("fusion_period_s" in report.message) == warning
+    assert report.values["tick mean [ms]"] == f"{1e3 * tick_s:.4g}"

@@ -1,0 +1,360 @@
+"""Initialization: constraints against transform chains, alignments against the truth behind them."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from core_geometry import nees, planar, pose_of
+from core_messages import SECOND, T0
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
+from swarm_loc_estimator.core.description.swarm import Landmark, Robot
+from swarm_loc_estimator.core.filter.belief import BeliefArrays
+from swarm_loc_estimator.core.filter.measurement_model import (
+    MEASUREMENT_DTYPE,
+    NOBODY,
+    Kind,
+    MeasurementArray,
+)
+from swarm_loc_estimator.core.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.core.initialization import alignment, initializer
+from swarm_loc_estimator.core.initialization.constraints import (
+    CONSTRAINT_DTYPE,
+    NO_CONSTRAINTS,
+    THE_MAP,
+    ConstraintArray,
+    OtherSide,
+    Waiting,
+    refreshed,
+    with_constraint,
+)
+from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+SEEDS = st.integers(0, 10**6)
+SIGMA, TURN_SIGMA = 0.01, 0.05
+NO_NOISE = np.zeros((3, 3))
+EXACT = np.zeros(2)
+LONG_NS = 3600 * SECOND
+ORIGIN = OtherSide(1, -1, np.zeros(3), np.zeros(3), NO_NOISE)
+"""Robot 1 at the origin."""
+
+
+def any_pose(rng: np.random.Generator) -> FloatArray:
+    return np.array([*rng.uniform(-2, 2, 2), rng.uniform(-3, 3)])
+
+
+def sighting(
+    rng: np.random.Generator, sees: bool, kind: Kind, camera: FloatArray
+) -> tuple[MeasurementArray, FloatArray]:
+    """What robot 0, at a random place, sees of a robot 1 at the origin, or is seen as; and where it is.
+
+    The camera (2,) is turned and stretches distances.
+    """
+    robot, sensor, marker = any_pose(rng), any_pose(rng), any_pose(rng)
+    turned = np.add(sensor, [0.0, 0.0, camera[0]])
+    observer, target = (planar(robot), np.eye(3)) if sees else (np.eye(3), planar(robot))
+    seen = pose_of(np.linalg.inv(observer @ planar(turned)) @ target @ planar(marker))
+    seen[:2] *= 1.0 + camera[1]
+    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
+    one["observer"], one["target"] = (0, 1) if sees else (1, 0)
+    one["kind"], one["sensor"], one["marker"], one["stamp_ns"], one["has_heading"] = (
+        kind,
+        sensor,
+        marker,
+        T0,
+        1,
+    )
+    one["value"] = (
+        seen if kind == Kind.CARTESIAN else [math.hypot(*seen[:2]), math.atan2(seen[1], seen[0]), seen[2]]
+    )
+    one["covariance"] = np.diag([4e-4, 1e-4, 1e-2])
+    return one, robot
+
+
+@settings(max_examples=40)
+@given(
+    seed=SEEDS,
+    sees=st.booleans(),
+    kind=st.sampled_from([Kind.CARTESIAN, Kind.POLAR]),
+    yaw=st.floats(-0.2, 0.2),
+    stretch=st.floats(-0.2, 0.2),
+)
+def test_a_constraint_lies_on_the_map_where_the_true_transform_puts_it(
+    seed: int, sees: bool, kind: Kind, yaw: float, stretch: float
+) -> None:
+    rng, camera = np.random.default_rng(seed), np.array([yaw, stretch])
+    one, robot = sighting(rng, sees, kind, camera)
+    transform = any_pose(rng)
+    track = pose_of(np.linalg.inv(planar(transform)) @ planar(robot))
+    one["has_alternative"], one["alternative"] = 1, one["value"] + [0.0, 0.0, 0.7]
+    (constraint,) = with_constraint(NO_CONSTRAINTS, one, camera, Waiting(0, track, NO_NOISE), ORIGIN, LONG_NS)
+    place = planar(transform) @ [constraint["local_x"], constraint["local_y"], 1.0]
+    np.testing.assert_allclose(place[:2], [constraint["map_x"], constraint["map_y"]], atol=1e-9)
+    off = np.array([constraint["turn"], constraint["other_turn"]]) - transform[2]
+    np.testing.assert_allclose(np.cos(off), [1.0, math.cos(0.7)], atol=1e-9)
+    assert (constraint["marker_id"], constraint["other"], constraint["landmark"]) == (0, 1, -1)
+
+
+@pytest.mark.parametrize("sees", [True, False])
+@pytest.mark.parametrize("kind", [Kind.CARTESIAN, Kind.POLAR])
+def test_a_constraint_is_as_unsure_as_sampled_sightings_and_located_robots(kind: Kind, sees: bool) -> None:
+    rng = np.random.default_rng(int(kind) + 2 * sees)
+    camera = np.array([0.1, 0.3])
+    one, robot = sighting(rng, sees, kind, camera)
+    spread = np.diag([1e-4, 2e-4, 3e-4])
+    samples, value = [], one["value"].copy()
+    for _ in range(4000):
+        one["value"] = value + rng.multivariate_normal(np.zeros(3), one["covariance"][0])
+        base = rng.multivariate_normal(np.zeros(3), spread)
+        other = OtherSide(1, -1, base, base, NO_NOISE)
+        (constraint,) = refreshed(
+            with_constraint(NO_CONSTRAINTS, one, camera, Waiting(0, robot, NO_NOISE), other, LONG_NS),
+            belief_of(base, spread),
+        )
+        samples.append([constraint[name] for name in ("local_x", "local_y", "map_x", "map_y")])
+    sampled = np.cov(np.array(samples).T)
+    local, there = (
+        np.array(
+            [
+                [constraint[f"{side}_xx"], constraint[f"{side}_xy"]],
+                [constraint[f"{side}_xy"], constraint[f"{side}_yy"]],
+            ]
+        )
+        for side in ("local", "map")
+    )
+    tolerance = 0.12 * np.abs(sampled).max()
+    np.testing.assert_allclose(local, sampled[:2, :2], atol=tolerance)
+    np.testing.assert_allclose(there, sampled[2:, 2:], atol=tolerance)
+
+
+def belief_of(transform: FloatArray, spread: FloatArray) -> BeliefArrays:
+    """Of robots 0, which waits, and 1, which is believed to be at `transform` with an error like `spread`."""
+    state = SwarmState(ParameterTable.of([Robot("a"), Robot("b")]))
+    state.initialize(1, InitialPose(transform, spread), Preintegrated.begin(T0))
+    return state.arrays()
+
+
+def test_a_constraint_moves_with_what_is_believed_of_the_robot_on_the_other_side() -> None:
+    """As if that had been known when it was noted; its track since makes it less sure."""
+    rng = np.random.default_rng(3)
+    then, now, spread, drift = any_pose(rng), any_pose(rng), np.diag([1e-4, 2e-4, 3e-4]), 1e-4 * np.eye(3)
+    one, robot = sighting(rng, True, Kind.CARTESIAN, EXACT)
+    track = any_pose(rng)
+    constraints = [
+        refreshed(
+            with_constraint(
+                NO_CONSTRAINTS,
+                one,
+                EXACT,
+                Waiting(0, robot, NO_NOISE),
+                OtherSide(1, -1, se2.compose(transform, track), transform, noise),
+                LONG_NS,
+            ),
+            belief_of(now, spread),
+        )[0]
+        for transform, noise in ((then, NO_NOISE), (now, NO_NOISE), (then, drift))
+    ]
+    for name in ("local_x", "map_x", "map_y", "map_xx", "map_xy", "map_yy", "turn_variance"):
+        np.testing.assert_allclose(constraints[0][name], constraints[1][name], atol=1e-12)
+    assert math.cos(constraints[0]["turn"] - constraints[1]["turn"]) == pytest.approx(1.0)
+    assert constraints[2]["turn_variance"] == pytest.approx(constraints[0]["turn_variance"] + 1e-4)
+    assert constraints[2]["map_xx"] > constraints[0]["map_xx"] + 0.9e-4
+    np.testing.assert_array_equal(constraints[2]["shared"], spread)
+
+
+def test_constraints_of_a_robot_that_was_lost_do_not_count() -> None:
+    one, robot = sighting(np.random.default_rng(0), True, Kind.CARTESIAN, EXACT)
+    constraints = with_constraint(NO_CONSTRAINTS, one, EXACT, Waiting(0, robot, NO_NOISE), ORIGIN, LONG_NS)
+    assert refreshed(constraints, SwarmState(ParameterTable.of([Robot("a"), Robot("b")])).arrays()).size == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_enters_errs_as_those_do_that_it_was_located_by(seed: int) -> None:
+    """The joint covariance against sampling: two robots that err alike in part, a third that both see."""
+    rng = np.random.default_rng(seed)
+    robots = [Robot(name, stands=True) for name in "abc"]
+    true = np.array([[0.3, 0.1, 0.4], [-0.2, 0.4, -1.0], [0.1, -0.3, 2.0]])
+    half = 0.02 * rng.standard_normal((6, 6))
+    prior, noise = half @ half.T, np.diag([0.01, 0.01, 0.02]) ** 2
+    errors, believed, count = [], [], 300
+    for _ in range(count):
+        state, waiting = (
+            SwarmState(ParameterTable.of(robots)),
+            initializer.Initializer(OdometryTracks(robots), 20.0),
+        )
+        drawn = rng.multivariate_normal(np.zeros(6), prior).reshape(2, 3)
+        for robot in range(2):
+            estimate = se2.compose(se2.exp(-drawn[robot]), true[robot])
+            state.initialize(robot, InitialPose(estimate, np.eye(3)), Preintegrated.begin(T0))
+        state.filter.covariance[:6, :6] = prior
+        for k in range(6):
+            waiting.note(state, sight_of(rng, true, k % 2, noise, T0 + k * SECOND))
+        assert state.tracked[2]
+        errors.append(se2.log(se2.compose(true, se2.inverse(state.transform))).ravel())
+        believed.append(state.filter.covariance.copy())
+    claimed, sampled = np.mean(believed, axis=0), np.array(errors).T @ np.array(errors) / count
+    normal = [e @ np.linalg.solve(covariance, e) for e, covariance in zip(errors, believed, strict=True)]
+    assert 0.75 < np.mean(normal) / 9.0 < 1.15  # sampled to 0.03; what scatters by chance counts as unsure
+    scale = np.sqrt(np.diag(claimed))
+    np.testing.assert_allclose(sampled / np.outer(scale, scale), claimed / np.outer(scale, scale), atol=0.3)
+
+
+def sight_of(
+    rng: np.random.Generator, true: FloatArray, observer: int, noise: FloatArray, stamp_ns: int
+) -> MeasurementArray:
+    """What a robot at true[observer] measures of the third, by range, bearing and heading."""
+    x, y, heading = se2.between(true[observer], true[2]) + rng.multivariate_normal(np.zeros(3), noise)
+    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
+    one["stamp_ns"], one["observer"], one["target"] = stamp_ns, observer, 2
+    one["kind"], one["has_heading"] = Kind.POLAR, 1
+    distance, bearing = math.hypot(x, y), math.atan2(y, x)
+    one["value"] = [distance, bearing, heading]
+    cos, sin = math.cos(bearing), math.sin(bearing)
+    to_polar = np.array([[cos, sin, 0.0], [-sin / distance, cos / distance, 0.0], [0.0, 0.0, 1.0]])
+    one["covariance"] = to_polar @ noise @ to_polar.T
+    return one
+
+
+def constraints_of(
+    rng: np.random.Generator, transform: FloatArray, marks: FloatArray, headings: Sequence[float] = ()
+) -> ConstraintArray:
+    """Noisy constraints (k,), .1 s apart, of marks (k, 2) in map; headings off by so much where given."""
+    constraints = np.zeros(len(marks), dtype=CONSTRAINT_DTYPE)
+    local = (np.linalg.inv(planar(transform)) @ np.column_stack([marks, np.ones(len(marks))]).T)[:2]
+    local += SIGMA * rng.standard_normal(local.shape)
+    constraints["stamp_ns"] = T0 + np.arange(len(marks)) * SECOND // 10
+    constraints["local_x"], constraints["local_y"] = local
+    constraints["map_x"], constraints["map_y"] = marks.T
+    constraints["local_xx"] = constraints["local_yy"] = SIGMA**2
+    constraints["turn"] = constraints["other_turn"] = math.nan
+    constraints["turn_variance"] = TURN_SIGMA**2
+    if headings:
+        constraints["turn"] = transform[2] + headings + TURN_SIGMA * rng.standard_normal(len(marks))
+    return constraints
+
+
+@settings(max_examples=60)
+@given(seed=SEEDS, count=st.integers(5, 20), wrong=st.floats(0.0, 0.35))
+def test_the_fix_is_the_truth_also_among_wrong_constraints(seed: int, count: int, wrong: float) -> None:
+    rng = np.random.default_rng(seed)
+    transform = any_pose(rng)
+    angles = 2.0 * np.pi * (np.arange(count) * 0.381966) + rng.uniform(0, 6)
+    constraints = constraints_of(rng, transform, np.column_stack([np.cos(angles), np.sin(angles)]))
+    bad = rng.permutation(count)[: int(wrong * count)]
+    constraints["map_x"][bad] += rng.choice([-1.0, 1.0], bad.size) * rng.uniform(0.5, 2.0, bad.size)
+    found = alignment.align(constraints, NO_NOISE)
+    assert found is not None
+    assert np.abs(found.transform[:2] - transform[:2]).max() < 0.2
+    assert nees(error_of(found.transform, transform), found.covariance) < 45.0
+
+
+def error_of(transform: FloatArray, truth: FloatArray) -> FloatArray:
+    """The right-invariant error (3,), to first order."""
+    error: FloatArray = pose_of(planar(truth) @ np.linalg.inv(planar(transform)))
+    return error
+
+
+@settings(max_examples=30)
+@given(seed=SEEDS)
+def test_the_fix_moves_with_the_map(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    transform, moved = any_pose(rng), any_pose(rng)
+    marks = rng.uniform(-1, 1, (8, 2))
+    constraints = constraints_of(rng, transform, marks, headings=[0.0] * 8)
+    elsewhere = constraints.copy()
+    elsewhere["map_x"], elsewhere["map_y"] = (planar(moved) @ np.column_stack([marks, np.ones(8)]).T)[:2]
+    elsewhere["turn"] += moved[2]
+    a, b = (alignment.align(some, NO_NOISE) for some in (constraints, elsewhere))
+    assert a is not None
+    assert b is not None
+    np.testing.assert_allclose(planar(b.transform), planar(moved) @ planar(a.transform), atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_one_heading_against_two_of_one_marker_leaves_the_robot_waiting(seed: int) -> None:
+    """Two mirrored headings without their second solutions; the points say nothing, as they are all one."""
+    rng = np.random.default_rng(seed)
+    constraints = constraints_of(rng, any_pose(rng), np.tile([0.5, 0.3], (3, 1)), headings=[0.9, 0.0, 0.9])
+    assert alignment.align(constraints, NO_NOISE) is None
+
+
+def many_constraints(stamps_s: FloatArray, markers: Sequence[int], window_s: float) -> ConstraintArray:
+    """What is kept of sightings of all markers at each stamp."""
+    one, constraints = np.zeros(1, dtype=MEASUREMENT_DTYPE), NO_CONSTRAINTS
+    one["target"], one["covariance"] = NOBODY, np.eye(3)
+    for seconds in stamps_s:
+        for marker in markers:
+            one["stamp_ns"], one["marker_id"] = T0 + round(seconds * 1e9), marker
+            constraints = with_constraint(
+                constraints, one, EXACT, Waiting(0, np.zeros(3), NO_NOISE), THE_MAP, round(window_s * 1e9)
+            )
+    return constraints
+
+
+@settings(max_examples=30)
+@given(seed=SEEDS, markers=st.integers(1, 6))
+def test_constraints_kept_are_few_and_spread_over_time_and_markers(seed: int, markers: int) -> None:
+    steps = np.random.default_rng(seed).uniform(0.05, 0.2, 200)
+    stamps_s = np.cumsum(steps)
+    constraints = many_constraints(stamps_s, range(markers), 15.0)
+    age_s = (constraints["stamp_ns"][-1] - constraints["stamp_ns"]) * 1e-9
+    last_20_s = stamps_s[-1] - stamps_s[-math.ceil(20 / markers)]
+    assert constraints.size == 20
+    assert (np.diff(constraints["stamp_ns"]) >= 0).all()
+    assert age_s.max() <= 15.0
+    for marker in range(markers):
+        of_marker = age_s[constraints["marker_id"] == marker]
+        assert of_marker.min() < 0.25
+        assert of_marker.max() > 2.0 * last_20_s
+    assert np.mean(age_s < 5.0) > 0.4  # a robot moved by hand meanwhile is soon outvoted
+
+
+def test_attempts_become_rarer_but_never_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracks, robots = OdometryTracks([Robot("a")]), [Robot("a")]
+    tracks.extend(np.zeros(2, dtype=np.int64), np.array([T0, T0 + 20 * SECOND]), np.zeros((2, 3)))
+    attempts: list[int] = []
+    monkeypatch.setattr(
+        initializer, "align", lambda constraints, _: attempts.append(int(constraints["stamp_ns"][-1]))
+    )
+    state, waiting = SwarmState(ParameterTable.of(robots)), initializer.Initializer(tracks, 20.0)
+    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
+    one["target"], one["covariance"] = NOBODY, np.eye(3)
+    stamps = T0 + np.arange(0, 10 * SECOND, SECOND // 30)  # every fourth one is a constraint
+    for one["stamp_ns"][0] in stamps:
+        assert waiting.note(state, one)
+    assert attempts[0] == stamps[8]
+    gaps_s = np.diff(attempts) * 1e-9
+    assert gaps_s[:3].max() < 0.15
+    assert gaps_s.max() <= 0.3 + 4 / 30
+    assert len(attempts) < 10 / 0.3 + 25
+    assert stamps[-1] - attempts[-1] < 4 * SECOND // 10
+
+
+def test_a_landmark_that_is_estimated_is_where_the_belief_has_it() -> None:
+    """It is as unsure as that, and a robot located by it is no surer."""
+    mark = Landmark(1, 3.0, -2.0, 0.0, 0.4, position_sigma=0.05, yaw_sigma=0.1)
+    tracks, state = OdometryTracks([Robot("a")]), SwarmState(ParameterTable.of([Robot("a")], [mark]))
+    tracks.extend(np.zeros(2, dtype=np.int64), np.array([T0, T0 + SECOND]), np.zeros((2, 3)))
+    state.landmark[0] = moved = np.array([0.3, 0.1, 0.2])
+    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
+    one["target"], one["landmark"], one["marker"], one["has_heading"] = NOBODY, 1, [3.0, -2.0, 0.4], 1
+    one["covariance"] = np.diag([1e-6, 1e-6, 1e-4])
+    one["value"] = [1.0, 0.0, 0.0]
+    waiting = initializer.Initializer(tracks, 20.0)
+    for one["stamp_ns"][0] in T0 + np.arange(20) * (SECOND // 20):
+        waiting.note(state, one)
+    assert state.tracked[0]
+    place = pose_of(planar(moved) @ planar(np.array([3.0, -2.0, 0.4])) @ planar(np.array([-1.0, 0.0, 0.0])))
+    np.testing.assert_allclose(state.transform[0], place, atol=1e-3)
+    located, survey = (
+        np.diag(se2.pose_covariance(place, error))
+        for error in (state.filter.covariance[:3, :3], state.landmark_covariance(0))
+    )
+    assert (survey < located).all()
+    assert (located < 3.0 * survey).all()

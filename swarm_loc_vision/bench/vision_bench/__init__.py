@@ -1,1 +1,0 @@
-"""What the marker detector achieves, beside cv2.aruco and pupil-apriltags; run by `bench/epuck.py`."""

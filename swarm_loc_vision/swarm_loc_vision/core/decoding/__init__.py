@@ -1,0 +1,1 @@
+"""Marker families, ids and their codes."""

@@ -1,0 +1,165 @@
+"""Convert images of any encoding or compression to 8-bit gray."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from cv2.typing import MatLike
+from numpy.typing import NDArray
+
+Gray = NDArray[np.uint8]
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+class ImageError(ValueError):
+    """An image that cannot be used; the message is one sentence.
+
+    Attributes:
+        reason: In one word, for counting.
+    """
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+@dataclass(frozen=True)
+class _Encoding:
+    """How pixels lie in memory, and how they become gray."""
+
+    channels: int
+    to_gray: Callable[[Pixels], Pixels]
+    bytes_per_channel: int = 1
+
+
+def _converted(code: int) -> Callable[[Pixels], Pixels]:
+    """By a conversion of OpenCV."""
+
+    def convert(pixels: Pixels) -> Pixels:
+        return np.asarray(cv2.cvtColor(pixels, code), np.uint8)
+
+    return convert
+
+
+def _highest_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
+    """The highest 8 bits that any pixel uses: cameras of 10 or 12 bits may leave the upper ones empty."""
+    surplus = max(int(pixels.max()).bit_length() - 8, 0)
+    return (pixels >> surplus).astype(np.uint8)
+
+
+_PLAIN = _Encoding(1, lambda pixels: pixels[..., 0])
+_WIDE = _Encoding(1, lambda pixels: _highest_bits(pixels[..., 0]), 2)
+_ENCODINGS = {
+    "mono8": _PLAIN,
+    "8UC1": _PLAIN,
+    "mono16": _WIDE,
+    "16UC1": _WIDE,
+    "rgb8": _Encoding(3, _converted(cv2.COLOR_RGB2GRAY)),
+    "bgr8": _Encoding(3, _converted(cv2.COLOR_BGR2GRAY)),
+    "8UC3": _Encoding(3, _converted(cv2.COLOR_BGR2GRAY)),
+    "rgba8": _Encoding(4, _converted(cv2.COLOR_RGBA2GRAY)),
+    "bgra8": _Encoding(4, _converted(cv2.COLOR_BGRA2GRAY)),
+    "bayer_rggb8": _Encoding(1, _converted(cv2.COLOR_BayerBG2GRAY)),
+    "bayer_bggr8": _Encoding(1, _converted(cv2.COLOR_BayerRG2GRAY)),
+    "bayer_gbrg8": _Encoding(1, _converted(cv2.COLOR_BayerGR2GRAY)),
+    "bayer_grbg8": _Encoding(1, _converted(cv2.COLOR_BayerGB2GRAY)),
+    "yuv422": _Encoding(2, lambda pixels: pixels[..., 1]),
+    "uyvy": _Encoding(2, lambda pixels: pixels[..., 1]),
+    "yuv422_yuy2": _Encoding(2, lambda pixels: pixels[..., 0]),
+    "yuyv": _Encoding(2, lambda pixels: pixels[..., 0]),
+}
+"""By the names of sensor_msgs/image_encodings."""
+
+
+@dataclass(frozen=True)
+class _Compression:
+    """How the bytes of a compressed image begin, and what stands at the end of a whole one.
+
+    Attributes:
+        name: As formats tell it.
+        begin: First bytes.
+        data: What comes before pixels; the end is looked for behind its last occurrence.
+        end: Comes behind all pixels.
+    """
+
+    name: str
+    begin: bytes
+    data: bytes
+    end: bytes
+
+    def is_whole(self, data: bytes) -> bool:
+        """Whether bytes begin and end as such an image; cameras may add bytes behind it."""
+        return data.startswith(self.begin) and data.rfind(self.end) > data.rfind(self.data) > 0
+
+
+_JPEG = _Compression("jpeg", b"\xff\xd8\xff", b"\xff\xda", b"\xff\xd9")
+_PNG = _Compression("png", b"\x89PNG\r\n\x1a\n", b"IDAT", b"IEND")
+_COMPRESSIONS = {"jpeg": _JPEG, "jpg": _JPEG, "png": _PNG}
+_COMPRESSED_DEPTH = "compressedDepth"
+"""Of image_transport's formats the one whose bytes are no plain image."""
+
+
+def gray_image(
+    encoding: str, width: int, height: int, step: int, data: object, *, is_bigendian: bool = False
+) -> Gray:
+    """An image (height, width) of brightness.
+
+    Args:
+        encoding: Of sensor_msgs/Image.
+        width: Of the image [px].
+        height: Likewise.
+        step: Bytes from row to row.
+        data: The bytes.
+        is_bigendian: Byte order of 16-bit pixels.
+
+    Raises:
+        ImageError: Unknown encoding (`encoding`), or the bytes are not those of such an image (`size`).
+    """
+    known = _ENCODINGS.get(encoding)
+    if known is None:
+        raise ImageError("encoding", f"the encoding '{encoding}' is not one of {', '.join(_ENCODINGS)}.")
+    raw = np.frombuffer(data, np.uint8)  # type: ignore[call-overload] # whatever has a buffer
+    row = width * known.channels * known.bytes_per_channel
+    if width < 1 or height < 1 or step < row or raw.size < step * (height - 1) + row:
+        raise ImageError(
+            "size",
+            f"{raw.size} bytes, {step} a row, are no image of {width} x {height} pixels in '{encoding}'.",
+        )
+    rows = np.lib.stride_tricks.as_strided(raw, (height, row), (step, 1))
+    pixels: Pixels = np.ascontiguousarray(rows)
+    if known.bytes_per_channel == 2:
+        pixels = pixels.view(">u2" if is_bigendian else "<u2")
+    gray = np.ascontiguousarray(known.to_gray(pixels.reshape(height, width, known.channels)), np.uint8)
+    return gray if gray.flags.writeable else gray.copy()  # read-only ones would be compiled for once more
+
+
+def decoded_image(how: str, data: object) -> Gray:
+    """A compressed image as brightness (height, width), as it lies in the file: not turned by its EXIF.
+
+    Args:
+        how: `format` of sensor_msgs/CompressedImage, such as `jpeg` or `bgr8; jpeg compressed bgr8`.
+        data: The bytes.
+
+    Raises:
+        ImageError: The format is unknown (`encoding`), or the bytes are no whole image of it (`corrupt`).
+    """
+    known = next((_COMPRESSIONS[name] for name in _COMPRESSIONS if name in how.lower()), None)
+    if known is None or _COMPRESSED_DEPTH in how:
+        raise ImageError("encoding", f"the format '{how}' is not one of {', '.join(_COMPRESSIONS)}.")
+    raw = np.frombuffer(data, np.uint8)  # type: ignore[call-overload] # whatever has a buffer
+    gray = _decoded(raw) if known.is_whole(raw.tobytes()) else None
+    if gray is None:
+        raise ImageError("corrupt", f"{raw.size} bytes are no whole image in '{known.name}'.")
+    return _highest_bits(gray)
+
+
+def _decoded(raw: NDArray[np.uint8]) -> MatLike | None:
+    """What OpenCV makes of the bytes; None: nothing, be it that the image would be too large."""
+    try:
+        return cv2.imdecode(raw, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        return None

@@ -1,0 +1,1 @@
+"""Poses of markers and of bodies that carry several."""

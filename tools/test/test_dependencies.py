@@ -1,0 +1,61 @@
+"""Each package names in its package.xml what it imports."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+KEYS = {
+    "PIL": "python3-pil",
+    "cv2": "python3-opencv",
+    "rosbags": "python3-rosbags-pip",
+    "ruamel": "python3-ruamel.yaml",
+    # rosdep has no keys of these three: they come with this one
+    **dict.fromkeys(("lz4", "mcap", "zstandard"), "mcap-ros2-support"),
+} | {
+    module: f"python3-{module.replace('_', '-')}"
+    for module in (
+        "hypothesis",
+        "matplotlib",
+        "numba",
+        "numpy",
+        "pytest",
+        "scipy",
+        "serial",
+        "typing_extensions",
+    )
+}
+"""What rosdep calls modules that are no ROS packages."""
+HERE = {"_typeshed", "bench", "workspace"} | {path.stem for path in ROOT.glob("swarm_loc_*/test/**/*.py")}
+"""Of the type checker, or of this workspace and in none of its packages."""
+
+
+def imported(package: Path, folders: Iterable[str]) -> set[str]:
+    """Dependencies of the code in some folders, but not on itself or the standard library."""
+    files = [path for folder in folders for path in (package / folder).rglob("*.py")]
+    names: set[str] = set()
+    for node in (node for path in files for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))):
+        if isinstance(node, ast.Import):
+            names |= {one.name for one in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            names.add(node.module or "")
+    modules = {name.partition(".")[0] for name in names}
+    return {KEYS.get(module, module) for module in modules - {package.name} - HERE - sys.stdlib_module_names}
+
+
+def declared(package: Path, kind: str) -> set[str]:
+    """Dependencies of one kind in package.xml."""
+    return set(re.findall(f"<{kind}>(.+)</{kind}>", (package / "package.xml").read_text(encoding="utf-8")))
+
+
+@pytest.mark.parametrize("name", ["swarm_loc_estimator", "swarm_loc_vision", "swarm_loc_drivers"])
+def test_what_is_imported_is_declared(name: str) -> None:
+    package = ROOT / name
+    assert imported(package, [name, "launch"]) == declared(package, "exec_depend")
+    assert imported(package, ["test"]) <= declared(package, "exec_depend") | declared(package, "test_depend")

@@ -1,0 +1,84 @@
+"""The project's own files parse and name what exists: workflow, hooks, citation, container."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+from typing import Any
+
+import pytest
+from ruamel.yaml import YAML
+
+from workspace.layout import PACKAGES, ROOT
+
+
+def read_yaml(name: str) -> Any:
+    return YAML(typ="safe").load((ROOT / name).read_text(encoding="utf-8"))
+
+
+def make_targets() -> set[str]:
+    return set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+
+
+def test_the_workflow_runs_what_continuous_integration_runs() -> None:
+    (job,) = read_yaml(".github/workflows/ci.yml")["jobs"].values()
+    assert job["runs-on"] == "ubuntu-24.04"
+    lines = [step["run"] for step in job["steps"] if "run" in step]
+    assert lines[-1] == ".ci/run"
+    assert os.access(ROOT / ".ci" / "run", os.X_OK)
+    packages = {"cmake", "g++", "make", "python3-venv", "python3-dev"}
+    assert packages <= set(shlex.split(lines[0]))
+
+
+def test_hooks_are_the_lint_of_the_makefile() -> None:
+    (repository,) = read_yaml(".pre-commit-config.yaml")["repos"]
+    assert repository["repo"] == "local"
+    entries = {hook["id"]: shlex.split(hook["entry"]) for hook in repository["hooks"]}
+    assert set(entries) == {"ruff-check", "ruff-format", "mypy"}
+    for entry in entries.values():
+        known = entry[1] in make_targets() if entry[0] == "make" else os.access(ROOT / entry[0], os.X_OK)
+        assert known, entry
+
+
+def test_the_citation_has_what_the_format_requires() -> None:
+    citation = read_yaml("CITATION.cff")
+    assert citation["cff-version"] == "1.2.0"
+    assert citation["message"]
+    for one in (citation, *citation["references"]):
+        assert one["title"]
+        assert one["authors"]
+        assert one["type"]
+        assert all("name" in person or "family-names" in person for person in one["authors"])
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_the_citation_has_version_and_license_of_the_packages(package: str) -> None:
+    citation = read_yaml("CITATION.cff")
+    manifest = (ROOT / package / "package.xml").read_text(encoding="utf-8")
+    assert f"<version>{citation['version']}</version>" in manifest
+    assert f"<license>{citation['license']}</license>" in manifest
+
+
+def test_every_paper_of_the_citation_stands_in_the_readme() -> None:
+    readme = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split()).lower()
+    papers = [paper["title"].partition(":")[0].lower() for paper in read_yaml("CITATION.cff")["references"]]
+    assert [title for title in papers if title not in readme] == []
+
+
+def test_the_container_starts_what_there_is() -> None:
+    lines = (ROOT / "Dockerfile").read_text(encoding="utf-8").splitlines()
+    said = {word: line for line in lines for word, _, _ in [line.partition(" ")] if word.isupper()}
+    assert said["FROM"] == "FROM ros:jazzy"
+    assert said["COPY"].split()[-2:] == [".", "."]
+    assert "make setup" in said["RUN"]
+    assert "setup" in make_targets()
+    assert '"./run"]' in said["ENTRYPOINT"]
+    assert os.access(ROOT / "run", os.X_OK)
+
+
+def test_what_a_host_has_made_stays_out_of_the_container() -> None:
+    ignored = (ROOT / ".dockerignore").read_text(encoding="utf-8").split()
+    made = [line.rstrip("/") for line in (ROOT / ".gitignore").read_text(encoding="utf-8").splitlines()]
+    folders = [line for line in made if line and not line.startswith("#")]
+    assert [name for name in folders if name not in ignored and f"**/{name}" not in ignored] == []

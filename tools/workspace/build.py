@@ -1,0 +1,151 @@
+"""The packages, built by colcon under `.workspace`, each again only when what colcon copies has changed."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+from workspace import install, tf2_msgs
+from workspace.layout import LOGS, PACKAGES, ROOT, STATE, VENV_PYTHON, WorkspaceError
+from workspace.progress import run_logged, say
+from workspace.stamps import Stamp, digest, write_whole
+
+BUILD = STATE / "build"
+INSTALL = STATE / "install"
+OVERLAY = STATE / "overlay.json"
+"""What the built packages prepend to environment variables: name -> entries."""
+
+COPIED = (
+    "package.xml",
+    "CMakeLists.txt",
+    "setup.py",
+    "setup.cfg",
+    "resource/*",
+    "msg/*",
+    "srv/*",
+    "action/*",
+)
+"""Files of a package that end up in a build as they were then; all others are linked."""
+LINKED_ONE_BY_ONE = "launch/*"
+
+
+def ensure() -> None:
+    """Make sure that all packages are built as their sources are.
+
+    Raises:
+        WorkspaceError: A package does not build.
+    """
+    env = install.base_environment()
+    sources = {name: ROOT / name for name in PACKAGES}
+    if not tf2_msgs.is_installed(env):
+        sources["tf2_msgs"] = STATE / "tf2_msgs"
+    inputs = {name: _inputs(name) for name in sources}
+    stamps = {name: Stamp(STATE / "stamps" / name) for name in sources}
+    stale = [name for name in sources if stamps[name].read() != inputs[name]]
+    if not stale and OVERLAY.exists():
+        return
+    OVERLAY.unlink(missing_ok=True)
+    for name in stale:
+        stamps[name].clear()
+        shutil.rmtree(BUILD / name, ignore_errors=True)
+        shutil.rmtree(INSTALL / name, ignore_errors=True)
+    if "tf2_msgs" in stale:
+        tf2_msgs.write(sources["tf2_msgs"])
+    _colcon_build({name: sources[name] for name in stale}, env)
+    _mend_first_lines()
+    for name in stale:
+        stamps[name].write(inputs[name])
+    write_whole(OVERLAY, json.dumps(_prepended(), indent=1))
+
+
+def compile_estimator() -> None:
+    """Have the estimator's inner loops compiled, which its first run would otherwise spend a minute on.
+
+    Raises:
+        WorkspaceError: The estimator does not run.
+    """
+    sources = (ROOT / "swarm_loc_estimator" / "swarm_loc_estimator").rglob("*.py")
+    inputs = digest(sources, str(ROOT), install.identity())
+    stamp = Stamp(STATE / "stamps" / "compiled")
+    if stamp.read() == inputs:
+        return
+    say("  compiling the estimator, about a minute")
+    program = "from swarm_loc_estimator.nodes.warm_up import warm_up; warm_up()"
+    status, output = run_logged([VENV_PYTHON, "-c", program], "compile.log", lambda _: None, environment())
+    if status:
+        reason = output.strip().splitlines()[-1:] or ["no output"]
+        raise WorkspaceError(
+            f"The estimator does not start: {reason[0]} (whole output: {LOGS / 'compile.log'})."
+        )
+    stamp.write(inputs)
+
+
+def environment() -> dict[str, str]:
+    """The environment with ROS 2 and this workspace's packages in it."""
+    env = install.base_environment()
+    for name, entries in json.loads(OVERLAY.read_text(encoding="utf-8")).items():
+        env[name] = os.pathsep.join([*entries, *filter(None, [env.get(name)])])
+    return env
+
+
+def _inputs(name: str) -> str:
+    """The hash of all that a build of a package depends on."""
+    facts = [str(ROOT), install.identity()]
+    if name == "tf2_msgs":
+        return digest([], *facts, *tf2_msgs.FILES.values())
+    folder = ROOT / name
+    names = [path.name for path in sorted(folder.glob(LINKED_ONE_BY_ONE))]
+    return digest(_copied(folder), *facts, *names)
+
+
+def _copied(folder: Path) -> Iterator[Path]:
+    return (path for pattern in COPIED for path in folder.glob(pattern) if path.is_file())
+
+
+def _colcon_build(sources: dict[str, Path], env: dict[str, str]) -> None:
+    if not sources:
+        return
+    say(f"  building {', '.join(sources)}")
+    command: list[str | Path] = [VENV_PYTHON, "-m", "colcon", "--log-base", LOGS / "colcon"]
+    command += ["build", "--symlink-install"]
+    command += ["--build-base", BUILD, "--install-base", INSTALL, "--paths", *sources.values()]
+    status, output = run_logged(command, "build.log", _colcon_status, env, ROOT)
+    if status:
+        failed = ", ".join(re.findall(r"^Failed\s+<<< (\S+)", output, re.MULTILINE)) or "the packages"
+        raise WorkspaceError(f"colcon could not build {failed}: the reason stands in {LOGS / 'build.log'}.")
+
+
+def _colcon_status(line: str) -> str | None:
+    match = re.match(r"(Starting >>>|Finished <<<) (\S+)", line)
+    return f"{match[1].split()[0].lower()} {match[2]}" if match else None
+
+
+def _mend_first_lines() -> None:
+    """Let executables find Python by PATH where its own path has a space, which a first line cannot hold."""
+    if " " not in str(VENV_PYTHON):
+        return
+    for script in INSTALL.glob("*/lib/swarm_loc_*/*"):
+        first, _, rest = script.read_text(encoding="utf-8").partition("\n")
+        if first == f'#!"{VENV_PYTHON}"':
+            script.write_text(f"#!/usr/bin/env python3\n{rest}", encoding="utf-8")
+
+
+def _prepended() -> dict[str, list[str]]:
+    """What sourcing the built packages prepends to environment variables, found by doing it in an empty one.
+
+    colcon's own local_setup scripts do the same, but not in a folder with a space.
+    """
+    listing: list[str | Path] = [VENV_PYTHON, INSTALL / "_local_setup_util_sh.py", "sh"]
+    exports = subprocess.run(listing, capture_output=True, text=True, check=True).stdout
+    source = ["bash", "-c", 'eval "$1" && env -0', "bash", exports]
+    bare = {"PATH": os.environ["PATH"]}
+    variables = subprocess.run(source, env=bare, capture_output=True, text=True, check=True).stdout
+    found = dict(entry.split("=", 1) for entry in variables.split("\0") if entry)
+    found["PATH"] = found["PATH"].removesuffix(bare["PATH"])
+    lists = {name: value.split(os.pathsep) for name, value in found.items() if name.endswith("PATH")}
+    return {name: list(filter(None, lists[name])) for name in sorted(lists) if any(lists[name])}
