@@ -14,7 +14,7 @@ from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
 from swarm_loc_estimator.core.estimation.estimator import Status
 from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.live.graph import LiveGraph
-from swarm_loc_estimator.live.recorder import read_poses
+from swarm_loc_estimator.live.recorder import Poses, read_poses
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
 PATIENCE_S = 100.0
@@ -47,12 +47,15 @@ def test_robots_are_located_by_what_their_cameras_see(tmp_path: Path) -> None:
         recorder.create_subscription(PoseStamped, "epuck1/ground_truth", on_truth, 1000)
         recorder.create_subscription(MarkerDetectionArray, "epuck1/detections", seen.append, 1000)
 
+        def poses_with_truth() -> list[Poses]:
+            return [one for one in map(read_poses, recorder.raw) if min(truth) <= one.stamp_ns <= max(truth)]
+
         def has_driven() -> bool:
             return bool(truth) and float(np.linalg.norm(list(truth.values())[-1] - start[0, :2])) > 0.1
 
         graph.wait_for(has_driven, "drive", PATIENCE_S)
-    poses = [one for one in map(read_poses, recorder.raw) if min(truth) <= one.stamp_ns <= max(truth)][-20:]
-    assert len(poses) == 20
+        graph.wait_for(lambda: len(poses_with_truth()) >= 20, "be located", PATIENCE_S)
+    poses = poses_with_truth()[-20:]
     assert (poses[-1].status == Status.TRACKED).all()
     stamps, places = np.array(list(truth)), np.array(list(truth.values()))
     errors = [
