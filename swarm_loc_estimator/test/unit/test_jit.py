@@ -30,7 +30,8 @@ note_warm(here)
 
 def run(folder: Path, cache: Path) -> list[str]:
     env = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
-    command = [sys.executable, str(folder / "using.py")]
+    # Without byte code: Python takes that of a source of the same second and size for its own.
+    command = [sys.executable, "-B", str(folder / "using.py")]
     return subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout.split()
 
 
