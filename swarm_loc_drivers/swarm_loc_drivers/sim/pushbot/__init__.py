@@ -1,0 +1,1 @@
+"""Simulated PushBots: floor plans, their motion, and what they measure."""
