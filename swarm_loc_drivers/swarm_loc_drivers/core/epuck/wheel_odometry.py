@@ -7,16 +7,13 @@ between readings some may come that were held up on the way: for a while the who
 
 from __future__ import annotations
 
-import math
 from collections import Counter, deque
 from typing import NamedTuple
 
-import numpy as np
-
+from swarm_loc_drivers.core.dead_reckoning import DeadReckoning
 from swarm_loc_drivers.core.epuck.wheels import WheelGeometry
-from swarm_loc_drivers.core.odometry_state import OdometryState, carried_on
+from swarm_loc_drivers.core.odometry_state import OdometryState
 from swarm_loc_drivers.protocols.epuck.hardware import as_counter, unwrapped_difference
-from swarm_loc_estimator.numerics.arrays import FloatArray
 
 Rates = tuple[float, float]
 
@@ -27,9 +24,6 @@ _DELAY_NS = 500_000_000
 _MIN_PERIOD_NS = 4_000_000
 """No robot answers so fast: readings that come closer together were held up on the way."""
 _ROUNDING_STEPS = 2
-_STEP_VARIANCE = 1.0 / 12.0
-"""Of a counter that has cut off the fraction of a step."""
-_FORWARD_TURN = np.ix_((0, 2), (0, 2))
 
 
 class _Told(NamedTuple):
@@ -51,10 +45,8 @@ class WheelOdometry:
 
     def __init__(self, geometry: WheelGeometry, wheel_noise: float, counts: Counter[str]) -> None:
         self._geometry = geometry
-        self._wheel_noise = wheel_noise
         self._counts = counts
-        self._pose = (0.0, 0.0, 0.0)
-        self._covariance = np.zeros((3, 3))
+        self._reckoning = DeadReckoning(geometry.wheel_separation, wheel_noise, geometry.metres_per_step)
         self._last: tuple[int, int, int] | None = None
         self._rates: Rates = (0.0, 0.0)
         self._held: Rates = (0.0, 0.0)  # since the last reading; through a gap the robot goes on with them
@@ -82,7 +74,7 @@ class WheelOdometry:
         right, last = as_counter(self._right_sign * right), self._last
         if last is None:
             self._restart(stamp_ns, left, right)
-            return self._state(stamp_ns, 0.0, 0.0, 0.0)
+            return self._reckoning.state(stamp_ns, 0.0, 0.0, 0.0)
         if 0 <= stamp_ns - last[0] < _MIN_PERIOD_NS:
             return None
         has_jumped = stamp_ns < last[0]
@@ -109,7 +101,7 @@ class WheelOdometry:
             self._doubtful = True
             return None
         self._restart(stamp_ns, left, right)
-        return self._state(stamp_ns, *paths, elapsed_s)
+        return self._reckoning.state(stamp_ns, *paths, elapsed_s)
 
     def _steps(self, left: int, right: int, elapsed_s: float, right_sign: int = 1) -> tuple[int, int]:
         """Steps since the last reading, the closest to what the wheels were told that the counters allow."""
@@ -152,45 +144,12 @@ class WheelOdometry:
         )
 
     def _advance(self, left_steps: int, right_steps: int) -> tuple[float, float]:
-        """Move by the wheels' steps, an arc, and add its noise about its middle; the wheels' paths [m]."""
+        """Move by the wheels' steps; their paths [m]."""
         left, right = (steps * self._geometry.metres_per_step for steps in (left_steps, right_steps))
-        x, y, theta = self._pose
-        turn = (right - left) / self._geometry.wheel_separation
-        half = 0.5 * turn
-        chord = 0.5 * (left + right) * (math.sin(half) / half if half else 1.0)
-        forward = np.array([math.cos(theta + half), math.sin(theta + half)])
-        dx, dy = (chord * forward).tolist()
-        self._pose = (x + dx, y + dy, (theta + turn + math.pi) % (2.0 * math.pi) - math.pi)
-        self._covariance = carried_on(self._covariance, dx, dy)
-        effect = np.array([[forward[0], -0.5 * dy], [forward[1], 0.5 * dx], [0.0, 1.0]])
-        self._covariance += effect @ self._twist_noise(abs(left), abs(right), self._wheel_noise) @ effect.T
+        self._reckoning.advance(left, right)
         return left, right
-
-    def _twist_noise(self, left: float, right: float, scale: float) -> FloatArray:
-        """Covariance (2, 2) of path and turn when the wheels' paths have the variances scale * left, right.
-
-        covar(ds_r, ds_l) = diag(k |ds_r|, k |ds_l|) of Siegwart and Nourbakhsh, as the estimator has it.
-        """
-        separation = self._geometry.wheel_separation
-        both = 0.5 * (right - left) / separation
-        return scale * np.array([[0.25 * (left + right), both], [both, (left + right) / separation**2]])
 
     def _forget_motion(self, longest_s: float) -> None:
         """The robot went nobody knows where, at most as fast as it was told."""
         rate = max(abs(rate) for limit in self._limits() for rate in limit)
-        reach = rate * self._geometry.metres_per_step * longest_s
-        turned = min(2.0 * reach / self._geometry.wheel_separation, math.pi)
-        self._covariance += np.diag([reach**2, reach**2, turned**2]) / 3.0
-
-    def _state(self, stamp_ns: int, left: float, right: float, elapsed_s: float) -> OdometryState:
-        """What is published; `left` and `right` are the wheels' last paths [m]."""
-        cut_off = _STEP_VARIANCE * self._geometry.metres_per_step**2
-        (along, _), (_, turned) = self._twist_noise(1.0, 1.0, cut_off).tolist()
-        covariance = self._covariance + np.diag([along, along, turned])
-        twist, twist_noise = np.zeros(3), np.zeros((3, 3))
-        if elapsed_s > 0.0:
-            turned_rad = (right - left) / self._geometry.wheel_separation
-            twist = np.array([0.5 * (left + right), 0.0, turned_rad]) / elapsed_s
-            noise = self._twist_noise(abs(left), abs(right), self._wheel_noise)
-            twist_noise[_FORWARD_TURN] = (noise + self._twist_noise(2.0, 2.0, cut_off)) / elapsed_s**2
-        return OdometryState(stamp_ns, np.array(self._pose), covariance, twist, twist_noise)
+        self._reckoning.forget_motion(rate * self._geometry.metres_per_step * longest_s)

@@ -1,0 +1,60 @@
+"""Hardware and firmware generations of the PushBot: an eDVS4337 board with two geared motors.
+
+Sources: the firmware (EDVSBoardOS of eDVS4337, its first public revision and version 0.7.1) and the board's
+user guide.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+SENSOR_PX = 128
+"""Rows and columns of the event camera."""
+MAX_VELOCITY = 100
+"""Velocities beyond it are clamped silently [1]."""
+VELOCITY_PERIOD_S = 0.021
+"""A wheel at velocity v makes v ticks in so long: a counter from 20 to 0, once a millisecond."""
+MAX_TICK_RATE = MAX_VELOCITY / VELOCITY_PERIOD_S
+"""[ticks/s]."""
+TICK_SPAN = 1 << 32
+"""Wheel ticks are sent as signed integers of 32 bits."""
+BAUD_RATE = 4_000_000
+"""After every reset [bit/s]."""
+
+TIMESTAMPS = {"none": 0, "delta": -1, "16": 2, "24": 3, "32": 4}
+"""Timestamps of events as users name them: bytes of each; -1: difference to the last one, 1 to 4 bytes."""
+
+
+@dataclass(frozen=True)
+class FirmwareGeneration:
+    """What differs between firmwares.
+
+    Attributes:
+        name: For people.
+        tick_bit: Number of the sensor that the wheel ticks are; tells the generation, see `??S`.
+        formats: Timestamps as users name them -> digit of the command `!E`.
+        sensor_prefix: What `!S+` needs before its mask.
+        has_decay: Whether velocities can be told so that the robot stops by itself when it hears no more.
+    """
+
+    name: str
+    tick_bit: int
+    formats: dict[str, int]
+    sensor_prefix: str
+    has_decay: bool
+
+
+FIRST_FIRMWARE = FirmwareGeneration(
+    "first", 24, {"none": 0, "16": 1, "24": 2, "delta": 3}, ",", has_decay=False
+)
+"""The first public revision: `!S+,mask,period`, no 32-bit timestamps, no decaying velocities."""
+SECOND_FIRMWARE = FirmwareGeneration(
+    "second", 28, {"none": 0, "delta": 1, "16": 2, "24": 3, "32": 4}, "", has_decay=True
+)
+"""Version 0.7 and later."""
+GENERATIONS = {one.name: one for one in (FIRST_FIRMWARE, SECOND_FIRMWARE)}
+
+
+def tick_difference(before: int, after: int) -> int:
+    """Ticks from one reading to the next of a counter of 32 bits that wraps."""
+    return (after - before + TICK_SPAN // 2) % TICK_SPAN - TICK_SPAN // 2
