@@ -1,0 +1,1 @@
+"""Identification of anonymous robots from above."""

@@ -1,0 +1,107 @@
+"""Random motion: two images as in the paper, and chains over more, also in a dense arena."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from bench.aerial import printed
+from bench.aerial.rates import SWARMS, Results
+from bench.aerial.worlds import PERIOD_NS, Conditions, World, picture_of, simulate
+from swarm_loc_estimator.core.identification.anchors import Scale
+from swarm_loc_estimator.core.identification.chain import ChainModel, Chains
+from swarm_loc_estimator.core.identification.own_motion import own_displacement, relation
+from swarm_loc_estimator.core.identification.random_motion import identify_by_way
+
+_PAPERS = ChainModel(detection_probability=0.999, absent=1e-3, entering=1e-3, false_detections=0.01)
+"""All robots are on each image, and nothing else."""
+_UNKNOWN = replace(_PAPERS, scale=Scale(1.0, 0.5))
+"""The scale anywhere from a half to one and a half, more or less."""
+_ROBOTS_PER_WORLD = 5
+_DENSE = (7, 9, 13)
+"""Numbers of images of the dense arena; the last one is told as the figure."""
+
+
+def measure(results: Results, worlds: int, seed: int) -> None:
+    """All success rates of random motion; robots of one world share the error of its scale."""
+    for n in SWARMS:
+        _pairs(results, n, worlds, np.random.default_rng([seed, 3, n]))
+        _chained(results, n, max(10, worlds // 2), np.random.default_rng([seed, 4, n]))
+    for images in _DENSE:
+        conditions = Conditions(SWARMS[-1], images, (4.0, 4.0))
+        rng = np.random.default_rng([seed, 5, images])
+        right, trials, _ = _rate(conditions, _PAPERS, max(10, worlds // 5), rng)
+        name = "dense.n50.last_picture.success"
+        results.count(
+            name if images == _DENSE[-1] else f"dense.n50.images{images}.last_picture.success", right, trials
+        )
+
+
+def _pairs(results: Results, n: int, worlds: int, rng: np.random.Generator) -> None:
+    """Two images: as printed, by the way alone, and with the scale unknown over four images."""
+    right = right_printed = trials = 0
+    for _ in range(worlds):
+        world = simulate(Conditions(n, 2), rng)
+        for robot in range(min(n, _ROBOTS_PER_WORLD)):
+            first, second = world.images
+            own = complex(world.own[1, robot] - world.own[0, robot])
+            true = (world.place_of(robot, 0), world.place_of(robot, 1))
+            right += identify_by_way(first, second, own)[:2] == true
+            misfit = printed.angle_misfits(first, second, own, 1.0)
+            best = np.unravel_index(misfit.argmin(), misfit.shape)
+            right_printed += (int(best[0]), int(best[1])) == true
+            trials += 1
+    results.count(f"random.n{n}.success", right, trials)
+    results.count(f"random.n{n}.printed.success", right_printed, trials)
+
+
+def _chained(results: Results, n: int, worlds: int, rng: np.random.Generator) -> None:
+    """Four images with the scale known and not, five for the largest swarm."""
+    right, trials, spent_us = _rate(Conditions(n, 4), _PAPERS, worlds, rng)
+    results.count(f"chained4.n{n}.success", right, trials)
+    results.values[f"chained4.n{n}.us_per_robot_picture"] = spent_us
+    conditions = Conditions(n, 4, scale_sigma=0.2)
+    results.count(f"random.n{n}.scale_unknown.success", *_rate(conditions, _UNKNOWN, worlds, rng)[:2])
+    if n == SWARMS[-1]:
+        results.count(f"chained5.n{n}.success", *_rate(Conditions(n, 5), _PAPERS, worlds, rng)[:2])
+
+
+def _rate(
+    conditions: Conditions, model: ChainModel, worlds: int, rng: np.random.Generator
+) -> tuple[int, int, float]:
+    """How many robots find themselves in the last image, of how many, and the time per image [us]."""
+    right, trials, spent_s = 0, 0, 0.0
+    for _ in range(worlds):
+        world = simulate(conditions, rng)
+        for robot in range(min(conditions.robots, _ROBOTS_PER_WORLD)):
+            begin_s = time.perf_counter()
+            chains = followed(world, robot, conditions, model)
+            spent_s += time.perf_counter() - begin_s
+            right += int(np.argmax(chains.probabilities)) == world.place_of(robot, conditions.images - 1)
+            trials += 1
+    return right, trials, 1e6 * spent_s / trials / conditions.images
+
+
+def followed(world: World, robot: int, conditions: Conditions, model: ChainModel) -> Chains:
+    """The chains of a robot over all images of a world."""
+    chains = Chains(model)
+    for k, positions in enumerate(world.images):
+        picture = picture_of(positions, conditions.sigma)
+        chains = chains.advanced(picture, world.track(robot, k), k * PERIOD_NS)
+    return chains
+
+
+def heading_error(seed: int) -> float:
+    """The largest error of the closed form's heading without noise [rad]."""
+    rng = np.random.default_rng([seed, 6])
+    worst = 0.0
+    for _ in range(1000):
+        heading, scale = rng.uniform(-np.pi, np.pi), rng.uniform(0.1, 100.0)
+        own = complex(own_displacement(rng.uniform(0.1, 0.5, 100), rng.uniform(-0.35, 0.35, 100), 0.1))
+        if abs(own) < 1e-3:
+            continue
+        found = relation(scale * np.exp(1j * heading) * own, own)
+        worst = max(worst, abs(float(np.angle(np.exp(1j * (found.heading - heading))))))
+    return worst
