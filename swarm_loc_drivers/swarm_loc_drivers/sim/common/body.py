@@ -100,3 +100,32 @@ class DropletBody(Protocol):
     @property
     def now_ns(self) -> int:
         """The world's time [ns]."""
+
+
+class Blinking(NamedTuple):
+    """A light that is lit in the first part of each period; a period of 0: it is dark.
+
+    Attributes:
+        period_us: [us].
+        lit_us: [us].
+    """
+
+    period_us: int = 0
+    lit_us: int = 0
+
+
+class PushbotBody(Protocol):
+    """Motors, wheel encoders, lights and clock of one PushBot; called by the thread that steps the world."""
+
+    def set_duties(self, left: float, right: float) -> None:
+        """Drive the motors by shares of the battery's voltage in [-1, 1]; 0 brakes, and it lasts."""
+
+    def wheel_ticks(self) -> tuple[int, int]:
+        """Return the quadrature counts of the wheels since power-on, left and right."""
+
+    def set_lights(self, laser: Blinking, rear: Blinking, front: Blinking) -> None:
+        """Let laser pointer and LEDs blink until the next call."""
+
+    @property
+    def now_ns(self) -> int:
+        """The world's time [ns]."""

@@ -96,6 +96,34 @@ class _PtyPort:
         os.close(self._slave)
 
 
+class _FlowControlledPort(_PtyPort):
+    """A pseudo-terminal with RTS/CTS: what the client does not take waits, and the firmware waits with it."""
+
+    def __init__(self, firmware: StreamFirmware, link: Path | None) -> None:
+        super().__init__(_Quiet(firmware), link)
+        self._unsent = b""
+
+    def on_cycle(self) -> None:
+        self._unsent = self._unsent or self._firmware.stream()
+        with contextlib.suppress(BlockingIOError):
+            while self._unsent:
+                self._unsent = self._unsent[os.write(self._master, self._unsent) :]
+
+
+class _Quiet:
+    """A firmware that answers as it streams."""
+
+    def __init__(self, firmware: StreamFirmware) -> None:
+        self._firmware = firmware
+
+    def receive(self, data: bytes) -> bytes:
+        self._firmware.receive(data)
+        return b""
+
+    def stream(self) -> bytes:
+        return self._firmware.stream()
+
+
 class _TcpPort:
     """A TCP server for one client at a time; the next one waits, and sending waits for the client."""
 
@@ -181,6 +209,12 @@ class FirmwareHost:
             The path for a driver.
         """
         port = _PtyPort(firmware, link)
+        self._add(port)
+        return link or port.path
+
+    def serve_flow_controlled(self, firmware: StreamFirmware, link: Path | None = None) -> Path:
+        """The same with RTS/CTS: nothing is lost when the client takes its time, the firmware waits."""
+        port = _FlowControlledPort(firmware, link)
         self._add(port)
         return link or port.path
 

@@ -1,0 +1,201 @@
+"""Events of a simulated event camera: blinking spots, edges that move, noise; refractory pixels, one bus.
+
+A pixel tells when the logarithm of its brightness has changed by its threshold. A light that is switched on
+makes each pixel of its image send a burst, the longer the brighter, one event after each refractory time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_drivers.protocols.pushbot.hardware import SENSOR_PX
+from swarm_loc_drivers.sim.common.body import Blinking
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.parameters.number_spec import number
+
+_REACH_PX = 4
+"""Half the width of the part of the image that a spot is computed in."""
+_WINDOW = np.arange(-_REACH_PX, _REACH_PX + 1)
+_MAX_BURST = 6
+_LATENCY_US = 20.0
+_DIM_LATENCY_US = 60.0
+"""Of a pixel that is as bright as its surroundings; brighter ones are faster."""
+_US = 1e-6
+
+_Raw = tuple[IntArray, IntArray, IntArray, FloatArray]
+"""Columns, rows, polarity bits and times [us] of events, in no order."""
+
+
+@dataclass(frozen=True)
+class CameraNoise:
+    """How far an event camera is from an ideal one."""
+
+    noise_rate: float = number(
+        1.0, "1/s", 0.0, 100.0, "noise events of each pixel of an event camera per second"
+    )
+    blur: float = number(0.8, "px", 0.3, 2.0, "standard deviation of the image of a point")
+    threshold: float = number(0.5, "1", 0.1, 2.0, "change of the logarithm of brightness that makes an event")
+    mismatch: float = number(
+        0.05, "1", 0.0, 0.5, "standard deviation of the pixels' thresholds, of their mean"
+    )
+    jitter: float = number(15.0, "us", 0.0, 200.0, "standard deviation of the time of an event")
+    refractory: float = number(50.0, "us", 1.0, 1000.0, "time in which a pixel that has told stays silent")
+
+
+class Spot(NamedTuple):
+    """The image of a light during a step.
+
+    Attributes:
+        begin: Its column and row at the begin of the step [px].
+        end: Likewise at the end.
+        amplitude: Its brightness in the middle over that of the surroundings [1].
+        blinking: How it blinks; periods begin at whole multiples since the world's time zero.
+    """
+
+    begin: tuple[float, float]
+    end: tuple[float, float]
+    amplitude: float
+    blinking: Blinking
+
+
+class CameraEvents(NamedTuple):
+    """Events in order (N,): column, row [px], the polarity bit 0 where it became brighter, time [us]."""
+
+    x: IntArray
+    y: IntArray
+    polarity: IntArray
+    time_us: IntArray
+
+    def words(self) -> NDArray[np.uint16]:
+        """As the camera's bus has them: `0yyyyyyy pxxxxxxx`."""
+        return (self.y << 8 | self.polarity << 7 | self.x).astype(np.uint16)
+
+
+class EventCamera:
+    """One sensor of 128 x 128 pixels.
+
+    Args:
+        noise: How far it is from an ideal one.
+        rng: Source of all that is random.
+    """
+
+    def __init__(self, noise: CameraNoise, rng: np.random.Generator) -> None:
+        self._noise = noise
+        self._rng = rng
+        spread = rng.standard_normal((SENSOR_PX, SENSOR_PX)) * noise.mismatch
+        self._threshold = noise.threshold * np.exp(spread)
+        self._told_us = np.full(2 * SENSOR_PX * SENSOR_PX, -1e9)
+        self._bus_us = 0
+        self._later: _Raw = (np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+
+    def look(self, begin_us: int, end_us: int, spots: Sequence[Spot], edges: FloatArray) -> CameraEvents:
+        """What it tells of a step.
+
+        Args:
+            begin_us: Begin of the step [us].
+            end_us: Its end.
+            spots: Images of lights.
+            edges: (E, 3) upright edges: column at the begin, at the end [px], brightness left minus right.
+        """
+        parts = [self._noise_events(begin_us, end_us), self._edge_events(begin_us, end_us, edges)]
+        parts += [self._later, *(self._spot_events(begin_us, end_us, spot) for spot in spots)]
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        is_later = columns[3] >= end_us
+        self._later = _columns(columns, is_later)
+        x, y, polarity, time_us = _columns(columns, ~is_later)
+        is_inside = (x >= 0) & (x < SENSOR_PX) & (y >= 0) & (y < SENSOR_PX)
+        x, y, polarity, time_us = (column[is_inside] for column in (x, y, polarity, time_us))
+        told = self._without_refractory(x, y, polarity, time_us)
+        x, y, polarity, time_us = (column[told] for column in (x, y, polarity, time_us))
+        return CameraEvents(x, y, polarity, self._on_the_bus(time_us))
+
+    def _noise_events(self, begin_us: int, end_us: int) -> _Raw:
+        rng = self._rng
+        count = rng.poisson(self._noise.noise_rate * SENSOR_PX**2 * (end_us - begin_us) * _US)
+        x, y = rng.integers(0, SENSOR_PX, (2, count))
+        return x, y, rng.integers(0, 2, count), rng.uniform(begin_us, end_us, count)
+
+    def _edge_events(self, begin_us: int, end_us: int, edges: FloatArray) -> _Raw:
+        """Columns that edges sweep over; a pixel tells of an edge as often as its contrast allows."""
+        rng = self._rng
+        first, last = np.floor(edges[:, 0]).astype(int), np.floor(edges[:, 1]).astype(int)
+        crossed = np.minimum(np.abs(last - first), SENSOR_PX)
+        edge = np.repeat(np.arange(len(edges)), crossed)
+        step = np.arange(len(edge)) - np.repeat(np.cumsum(crossed) - crossed, crossed)
+        ahead = np.sign(last - first)[edge]
+        column = first[edge] + np.where(ahead > 0, step + 1, -step)
+        share = (column - edges[edge, 0]) / (edges[edge, 1] - edges[edge, 0])
+        tells = rng.random((len(edge), SENSOR_PX)) < np.minimum(1.0, np.abs(edges[edge, 2]))[:, None]
+        which, row = np.nonzero(tells)
+        at_us = begin_us + share[which] * (end_us - begin_us) + rng.normal(0.0, 300.0, len(which))
+        polarity = (edges[edge, 2] * ahead < 0.0)[which].astype(int)
+        return column[which], row, polarity, np.clip(at_us, begin_us, end_us)
+
+    def _spot_events(self, begin_us: int, end_us: int, spot: Spot) -> _Raw:
+        """Bursts at each time that a light is switched."""
+        switched_us, is_off = _switches(begin_us, end_us, spot.blinking)
+        share = ((switched_us - begin_us) / (end_us - begin_us))[:, None]
+        u, v = (np.array(spot.begin) + share * (np.array(spot.end) - np.array(spot.begin))).T
+        x = np.rint(u).astype(int)[:, None, None] + _WINDOW[None, None, :]
+        y = np.rint(v).astype(int)[:, None, None] + _WINDOW[None, :, None]
+        x, y = np.broadcast_arrays(x, y)
+        square = (x - u[:, None, None]) ** 2 + (y - v[:, None, None]) ** 2
+        bright = spot.amplitude * np.exp(-0.5 * square / self._noise.blur**2)
+        threshold = self._threshold[np.clip(y, 0, SENSOR_PX - 1), np.clip(x, 0, SENSOR_PX - 1)]
+        strength = np.log1p(bright) / threshold + self._rng.normal(0.0, 0.15, x.shape)
+        burst = np.clip(np.floor(strength), 0, _MAX_BURST).astype(int).ravel()
+        pixel = np.repeat(np.arange(burst.size), burst)
+        number_in_burst = np.arange(len(pixel)) - np.repeat(np.cumsum(burst) - burst, burst)
+        latency = _LATENCY_US + _DIM_LATENCY_US / (1.0 + bright.ravel()[pixel])
+        switch = pixel // (len(_WINDOW) ** 2)
+        at_us = switched_us[switch] + latency + 1.1 * number_in_burst * self._noise.refractory
+        at_us += self._rng.normal(0.0, self._noise.jitter, len(pixel))
+        return x.ravel()[pixel], y.ravel()[pixel], is_off[switch].astype(int), at_us
+
+    def _without_refractory(
+        self, x: IntArray, y: IntArray, polarity: IntArray, time_us: FloatArray
+    ) -> IntArray:
+        """Which events pixels tell, in the order of time: after one of a polarity they rest."""
+        pixel = (polarity * SENSOR_PX + y) * SENSOR_PX + x
+        order = np.lexsort((time_us, pixel))
+        sorted_pixel, sorted_us = pixel[order], time_us[order]
+        before = np.empty_like(sorted_us)
+        before[1:] = sorted_us[:-1]
+        begins = np.ones(len(order), bool)
+        begins[1:] = sorted_pixel[1:] != sorted_pixel[:-1]
+        before[begins] = self._told_us[sorted_pixel[begins]]
+        tells = sorted_us - before >= self._noise.refractory
+        self._told_us[sorted_pixel[tells]] = sorted_us[tells]
+        told: IntArray = order[tells]
+        return told[np.argsort(time_us[told], kind="stable")]
+
+    def _on_the_bus(self, time_us: FloatArray) -> IntArray:
+        """Times as the board takes them (N,): one event a microsecond, and never before the last."""
+        place = np.arange(len(time_us))
+        wanted = np.floor(time_us).astype(np.int64) - place
+        if len(wanted):
+            wanted[0] = max(wanted[0], self._bus_us + 1)
+        taken: IntArray = np.maximum.accumulate(wanted) + place
+        self._bus_us = int(taken[-1]) if len(taken) else self._bus_us
+        return taken
+
+
+def _columns(columns: Sequence[NDArray[Any]], chosen: NDArray[np.bool_]) -> _Raw:
+    """Some of the events."""
+    x, y, polarity, time_us = (column[chosen] for column in columns)
+    return x, y, polarity, time_us
+
+
+def _switches(begin_us: int, end_us: int, blinking: Blinking) -> tuple[IntArray, NDArray[np.bool_]]:
+    """Times within a step at which a light is switched on or off (N,), and whether off."""
+    period, lit = blinking
+    if not 0 < lit < period:
+        return np.zeros(0, np.int64), np.zeros(0, bool)
+    on = period * np.arange(-(-begin_us // period), -(-end_us // period))
+    off = lit + period * np.arange(-((lit - begin_us) // period), -((lit - end_us) // period))
+    return np.concatenate([on, off]), np.repeat([False, True], [len(on), len(off)])

@@ -1,0 +1,1 @@
+"""Emulated firmware of PushBots, after EDVSBoardOS of the eDVS4337."""

@@ -1,0 +1,217 @@
+"""One world of PushBots, stepped in simulated time: motors, slipping wheels, walls, lasers, event cameras.
+
+What happens is fixed by the seed and by when the robots are told what.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_drivers.core.pushbot.settings import WheelGeometry
+from swarm_loc_drivers.sim.common.body import Blinking
+from swarm_loc_drivers.sim.common.differential_drive import Drive, LastingNoise, roll
+from swarm_loc_drivers.sim.common.world_error import WorldError
+from swarm_loc_drivers.sim.pushbot import optics
+from swarm_loc_drivers.sim.pushbot.drivetrain import Drivetrain
+from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise, EventCamera, Spot
+from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan
+from swarm_loc_drivers.sim.pushbot.ray_casting import clearance, is_visible, ray_distance
+from swarm_loc_estimator.core.description.swarm import Pose2
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+STEP_NS = 5_000_000
+_MS_PER_STEP = 5
+_MAX_SPOT_M = 5.0
+"""Beyond it no pixel notices the laser."""
+_SLIP_S = 0.05
+_CONTRAST = 0.6
+"""Share of the pixels along an upright edge that notice it."""
+BODY_RADIUS_M = 0.07
+
+
+@dataclass(frozen=True)
+class PushbotWorldSettings:
+    """How a world is.
+
+    Attributes:
+        seed: Fixes how the robots are put together, and all noise.
+        plan: The hall.
+        wheels: Of all robots.
+        wheel_noise: Variance of a wheel's path per metre it rolls [m^2/m].
+        turn_slip: Share of every turn that the ticks tell and the floor does not [1].
+        camera: How far event cameras are from ideal ones.
+        start_ns: First moment.
+    """
+
+    seed: int
+    plan: FloorPlan
+    wheels: WheelGeometry
+    wheel_noise: float = 2e-5
+    turn_slip: float = 0.02
+    camera: CameraNoise = field(default_factory=CameraNoise)
+    start_ns: int = 1_000_000_000
+
+
+class StepsAlong(Protocol):
+    """A firmware that lives in the world's time."""
+
+    def millisecond(self) -> None:
+        """A millisecond has passed."""
+
+    def see(self, words: NDArray[np.uint16], times_us: NDArray[np.int64]) -> None:
+        """The camera has seen events; see `PushbotFirmware.see`."""
+
+
+class PushbotWorld:
+    """Robots in a hall.
+
+    Args:
+        starts: Where they begin.
+        settings: How the world is.
+
+    Raises:
+        WorldError: A robot begins within a wall or another robot.
+    """
+
+    def __init__(self, starts: list[Pose2], settings: PushbotWorldSettings) -> None:
+        self._settings = settings
+        rng = np.random.default_rng(settings.seed)
+        count = len(starts)
+        self.now_ns = settings.start_ns
+        self.poses: FloatArray = np.array(starts, dtype=float).reshape(count, 3)
+        """(N, 3) where the robots truly are, in map."""
+        self.drivetrain = Drivetrain(count, 1e-3)
+        self.optics = [optics.assembled(rng) for _ in range(count)]
+        """How the robots were put together; for evaluation."""
+        self.lights = [(Blinking(), Blinking(), Blinking()) for _ in range(count)]
+        """Laser, rear and front LED of each robot."""
+        self.firmwares: list[StepsAlong | None] = [None] * count
+        self._cameras = [EventCamera(settings.camera, one) for one in rng.spawn(count)]
+        self._slip = LastingNoise(rng, (count, 2), STEP_NS * 1e-9, _SLIP_S)
+        self._drive = Drive(settings.wheels.wheel_separation, settings.wheel_noise, settings.turn_slip)
+        self._corners = np.unique(settings.plan.walls.reshape(-1, 2), axis=0)
+        self._contrast = rng.choice([-_CONTRAST, _CONTRAST], len(self._corners))
+        for robot in range(count):
+            if self._is_blocked(robot, self.poses):
+                raise WorldError(f"robot {robot + 1} of the swarm begins within a wall or another robot.")
+
+    def step(self) -> None:
+        """Go on by STEP_NS."""
+        done = np.zeros_like(self.drivetrain.ticks)
+        for _ in range(_MS_PER_STEP):
+            self.now_ns += STEP_NS // _MS_PER_STEP
+            for firmware in self.firmwares:
+                if firmware is not None:
+                    firmware.millisecond()
+            done += self.drivetrain.step()
+        before = self.poses
+        self.poses = self._rolled(done)
+        for robot in range(len(self.poses)):
+            self._look(robot, before)
+
+    def distance(self, robot: int, poses: FloatArray) -> float:
+        """From a robot's camera to what its laser hits when all stand at `poses` (N, 3) [m]."""
+        x, y = optics.camera_place(poses[robot])
+        others = np.delete(poses[:, :2], robot, axis=0)
+        return float(ray_distance(self._settings.plan.walls, others, BODY_RADIUS_M, x, y, poses[robot, 2]))
+
+    def _rolled(self, ticks: FloatArray) -> FloatArray:
+        """Where the robots come; who would run into something turns its wheels in vain."""
+        step_s = STEP_NS * 1e-9
+        left, right = (self._settings.wheels.metres_per_tick * ticks / step_s).T
+        noise = np.sqrt(self._drive.wheel_noise) * self._slip.next()
+        turn_rate = (right - left) / self._drive.wheel_separation
+        poses = roll(self.poses, 0.5 * (left + right), turn_rate, self._drive, step_s, noise)
+        for robot in range(len(poses)):
+            if self._is_blocked(robot, poses):
+                poses[robot, :2] = self.poses[robot, :2]
+        return poses
+
+    def _is_blocked(self, robot: int, poses: FloatArray) -> bool:
+        others = np.delete(poses[:, :2], robot, axis=0)
+        x, y, _ = poses[robot]
+        return bool(clearance(self._settings.plan.walls, others, BODY_RADIUS_M, x, y) < BODY_RADIUS_M)
+
+    def _look(self, robot: int, before: FloatArray) -> None:
+        """What a robot's camera has seen since all stood at `before` (N, 3)."""
+        firmware = self.firmwares[robot]
+        if firmware is None:
+            return
+        spots = self._laser_spot(robot, before) + self._led_spots(robot, before)
+        begin_us = (self.now_ns - STEP_NS) // 1000
+        edges = self._edges(before[robot], self.poses[robot])
+        seen = self._cameras[robot].look(begin_us, self.now_ns // 1000, spots, edges)
+        firmware.see(seen.words(), seen.time_us)
+
+    def _laser_spot(self, robot: int, before: FloatArray) -> list[Spot]:
+        begin, end = self.distance(robot, before), self.distance(robot, self.poses)
+        laser = self.lights[robot][0]
+        if not laser.period_us or max(begin, end) > _MAX_SPOT_M or min(begin, end) <= 0.0:
+            return []
+        spot = self.optics[robot].spot
+        return [Spot(spot(begin), spot(end), optics.spot_brightness(end), laser)]
+
+    def _led_spots(self, robot: int, before: FloatArray) -> list[Spot]:
+        """The LEDs of other robots, where no wall is between."""
+        spots = []
+        x, y = optics.camera_place(self.poses[robot])
+        for other in range(len(self.poses)):
+            for blinking, front in zip(self.lights[other][1:], (False, True), strict=True):
+                if other == robot or not blinking.period_us:
+                    continue
+                begin = optics.led_pixel(before[robot], before[other], front=front)
+                end = optics.led_pixel(self.poses[robot], self.poses[other], front=front)
+                place = optics.led_place(self.poses[other], front=front)
+                if begin and end and is_visible(self._settings.plan.walls, x, y, *place):
+                    spots.append(Spot(begin[:2], end[:2], optics.led_brightness(end[2]), blinking))
+        return spots
+
+    def _edges(self, before: FloatArray, after: FloatArray) -> FloatArray:
+        """Corners of walls as upright edges (E, 3) in the image, at the begin and the end of a step."""
+        columns = []
+        for pose in (before, after):
+            x, y = self._corners.T - np.array(optics.camera_place(pose))[:, None]
+            ahead = x * np.cos(pose[2]) + y * np.sin(pose[2])
+            left = y * np.cos(pose[2]) - x * np.sin(pose[2])
+            with np.errstate(divide="ignore", invalid="ignore"):
+                columns.append(
+                    np.where(ahead > 0.05, optics.CENTRE_PX - optics.FOCAL_PX * left / ahead, np.nan)
+                )
+        edges = np.column_stack([*columns, self._contrast])
+        near = (np.abs(edges[:, :2] - optics.CENTRE_PX) < 2.0 * optics.CENTRE_PX).all(axis=1)
+        chosen: FloatArray = edges[near]
+        return chosen
+
+
+class SimulatedPushbot:
+    """One robot of a world as its firmware finds it; see `PushbotBody`.
+
+    Args:
+        world: Where it lives.
+        robot: Its index.
+    """
+
+    def __init__(self, world: PushbotWorld, robot: int) -> None:
+        self._world, self._robot = world, robot
+
+    def set_duties(self, left: float, right: float) -> None:
+        """See `PushbotBody.set_duties`."""
+        self._world.drivetrain.duties[self._robot] = left, right
+
+    def wheel_ticks(self) -> tuple[int, int]:
+        """See `PushbotBody.wheel_ticks`."""
+        left, right = np.floor(self._world.drivetrain.ticks[self._robot]).tolist()
+        return int(left), int(right)
+
+    def set_lights(self, laser: Blinking, rear: Blinking, front: Blinking) -> None:
+        """See `PushbotBody.set_lights`."""
+        self._world.lights[self._robot] = laser, rear, front
+
+    @property
+    def now_ns(self) -> int:
+        """The world's time [ns]."""
+        return self._world.now_ns

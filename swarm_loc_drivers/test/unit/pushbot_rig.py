@@ -1,0 +1,125 @@
+"""A session and an emulated PushBot in one world, without threads and without a clock."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from swarm_loc_drivers.core.odometry_state import OdometryState
+from swarm_loc_drivers.core.pushbot.event_packets import EventPacket
+from swarm_loc_drivers.core.pushbot.session import PushbotSession
+from swarm_loc_drivers.core.pushbot.settings import PushbotSettings, WheelGeometry, WheelTicks
+from swarm_loc_drivers.core.pushbot.wheel_odometry import PushbotOdometry
+from swarm_loc_drivers.core.robot_driver import SessionError
+from swarm_loc_drivers.protocols.pushbot.commands import Lights
+from swarm_loc_drivers.protocols.pushbot.hardware import SECOND_FIRMWARE, FirmwareGeneration
+from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
+from swarm_loc_drivers.sim.pushbot.firmware.pushbot_firmware import PushbotFirmware
+from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, outline
+from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldSettings, SimulatedPushbot
+from swarm_loc_drivers.transports.link import Address
+from swarm_loc_estimator.numerics import se2
+
+GEOMETRY = WheelGeometry(metres_per_tick=1e-4, wheel_separation=0.085)
+HALL = FloorPlan("hall", outline([(-2.0, -2.0, 3.0, 2.0)], []), np.zeros((1, 2)))
+
+
+def pushbot_settings(**changed: Any) -> PushbotSettings:
+    """Settings for tests."""
+    values: dict[str, Any] = {
+        "address": Address(device="/dev/none"),
+        "baud_rate": 4_000_000,
+        "geometry": GEOMETRY,
+        "wheel_noise": 2e-5,
+        "command_timeout_s": 0.5,
+        "reply_timeout_s": 0.3,
+        "tick_period_s": 0.02,
+        "timestamps": "24",
+        "on_bit": 0,
+        "packet_period_s": 0.005,
+        "lights": Lights(laser=450.0, leds=1000.0),
+    }
+    return PushbotSettings(**(values | changed))
+
+
+class PushbotWire:
+    """The two ends, and what each has said.
+
+    Attributes:
+        velocities: What the robot is told [ticks per 21 ms].
+        hears: Whether the robot's bytes arrive; likewise `is_heard` those of the host.
+    """
+
+    def __init__(
+        self, settings: PushbotSettings, generation: FirmwareGeneration = SECOND_FIRMWARE, seed: int = 1
+    ) -> None:
+        world = PushbotWorldSettings(
+            seed=seed,
+            plan=HALL,
+            wheels=GEOMETRY,
+            wheel_noise=0.0,
+            turn_slip=0.0,
+            camera=CameraNoise(noise_rate=0.5),
+        )
+        self.world = PushbotWorld([(0.0, 0.0, 0.0)], world)
+        self.firmware = PushbotFirmware(SimulatedPushbot(self.world, 0), generation)
+        self.world.firmwares[0] = self.firmware
+        self.counts: Counter[str] = Counter()
+        self.velocities = (0, 0)
+        self.hears = self.is_heard = True
+        self.sent = b""
+        self.ticks: list[WheelTicks] = []
+        self.packets: list[EventPacket] = []
+        self.states: list[OdometryState] = []
+        self.errors: list[str] = []
+        self._settings = settings
+        self._odometry = PushbotOdometry(GEOMETRY, settings.wheel_noise, self.counts)
+        self.session = self._begin()
+
+    def _begin(self) -> PushbotSession:
+        self._odometry.restart()
+        return PushbotSession(self._settings, lambda: self.velocities, self.counts)
+
+    @property
+    def speed(self) -> float:
+        """How fast the wheels turn now, the faster one [share of full voltage]."""
+        return float(np.abs(self.world.drivetrain.duties).max())
+
+    def run(self, seconds: float) -> None:
+        """Let time pass; a session that fails is followed by the next one."""
+        end_ns = self.world.now_ns + round(seconds * 1e9)
+        while self.world.now_ns < end_ns and not self.session.ended:
+            self.step()
+
+    def step(self) -> None:
+        """A step of the world, and what comes of it."""
+        self.world.step()
+        data = self.firmware.stream()
+        try:
+            output = self.session.step(
+                data if self.hears else b"", self.world.now_ns, self.world.now_ns * 1e-9
+            )
+        except SessionError as error:
+            self.errors.append(str(error))
+            is_ending, output = self.session.ending, b""
+            self.session = self._begin()
+            self.session.ending = is_ending
+        self.sent += output
+        if self.is_heard:
+            self.firmware.receive(output)
+        found, self.session.found = self.session.found, []
+        for one in found:
+            if isinstance(one, EventPacket):
+                self.packets.append(one)
+            else:
+                self.ticks.append(one)
+                state = self._odometry.update(one)
+                self.states += [state] if state is not None else []
+
+    def odometry_error(self) -> tuple[float, float]:
+        """By how much the odometry is wrong at the end [m, rad]."""
+        dx, dy, turn = se2.between(self.world.poses[0], self.states[-1].pose)
+        return math.hypot(dx, dy), abs(turn)

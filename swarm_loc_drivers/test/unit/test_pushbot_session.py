@@ -1,0 +1,195 @@
+"""Conversations with emulated PushBots: handshake, streams, stalls, and wheels that must not run away."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pushbot_rig import PushbotWire, pushbot_settings
+
+from swarm_loc_drivers.protocols.pushbot import commands
+from swarm_loc_drivers.protocols.pushbot.hardware import FIRST_FIRMWARE, SECOND_FIRMWARE, FirmwareGeneration
+from swarm_loc_estimator.io.messages.event_encoding import ENCODING, decode_events
+
+FORMATS = [(one, name) for one in (FIRST_FIRMWARE, SECOND_FIRMWARE) for name in ("", *one.formats)]
+
+
+def streaming(
+    settings_of: dict[str, object] | None = None, generation: FirmwareGeneration = SECOND_FIRMWARE
+) -> PushbotWire:
+    """A robot that is connected."""
+    wire = PushbotWire(pushbot_settings(**(settings_of or {})), generation)
+    wire.run(0.5)
+    assert wire.session.connected
+    return wire
+
+
+@pytest.mark.parametrize(
+    ("generation", "timestamps"), FORMATS, ids=lambda one: getattr(one, "name", one or "off")
+)
+def test_every_format_of_every_firmware_streams(generation: FirmwareGeneration, timestamps: str) -> None:
+    wire = streaming({"timestamps": timestamps}, generation)
+    wire.velocities = (20, 30)
+    wire.run(0.5)
+    wire.velocities = (0, 0)
+    wire.run(0.3)
+    assert not wire.errors
+    assert wire.session.generation is generation
+    assert bool(wire.packets) == bool(timestamps)
+    assert len(wire.ticks) == pytest.approx(0.8 / 0.02 + 0.5 / 0.02, abs=5)
+    distance, angle = wire.odometry_error()
+    assert distance < 2e-4
+    assert angle < 2 * 1e-4 / 0.085
+    assert not {"corrupt_events", "skipped_bytes", "refused_commands", "other_lines"} & set(wire.counts)
+
+
+def test_events_carry_the_time_at_which_they_were_made() -> None:
+    """The laser is switched at known instants, which the stamps must show."""
+    wire = streaming()
+    wire.run(0.5)
+    packet = wire.packets[-10]
+    events = decode_events(packet.data, ENCODING, (128, 128))
+    near = (np.abs(events.x - 64) < 6) & (events.y > 64) & events.is_on
+    phase_ns = (packet.stamp_ns + events.time_ns[near]) % 2_222_000
+    # latency of the pixel, bursts of six, and the wire: nothing of it lasts a millisecond
+    assert np.percentile(phase_ns, 10) < 300_000
+    assert np.percentile(phase_ns, 90) < 1_000_000
+
+
+def test_ticks_among_events_are_stamped_by_the_boards_clock() -> None:
+    """Steps of the world are 5 ms; the ticks come every 20 ms of the board's own."""
+    wire = streaming()
+    wire.run(1.0)
+    stamps = np.diff([one.stamp_ns for one in wire.ticks[5:]])
+    assert stamps.mean() == pytest.approx(20e6, rel=0.01)
+
+
+def test_a_firmware_without_such_timestamps_is_named() -> None:
+    wire = PushbotWire(pushbot_settings(timestamps="32"), FIRST_FIRMWARE)
+    wire.run(0.5)
+    assert "has no timestamps '32', only none, 16, 24, delta" in wire.errors[0]
+
+
+def test_a_board_that_is_no_pushbot_is_named() -> None:
+    wire = PushbotWire(pushbot_settings())
+    say = wire.firmware.board.say
+    wire.firmware.board.say = lambda text: say(text.replace(" 28 268435456 MOTOR SENSORS 2\n", ""))  # type: ignore[method-assign]
+    wire.run(0.5)
+    assert "no wheels" in wire.errors[0]
+
+
+def test_a_robot_that_does_not_answer_is_named() -> None:
+    wire = PushbotWire(pushbot_settings())
+    wire.hears = False
+    wire.run(8.0)
+    assert wire.errors == ["the robot does not answer R"]
+
+
+@pytest.mark.parametrize("generation", [FIRST_FIRMWARE, SECOND_FIRMWARE], ids=lambda one: one.name)
+def test_wheels_stand_at_the_end(generation: FirmwareGeneration) -> None:
+    wire = streaming(generation=generation)
+    wire.velocities = (60, 60)
+    wire.run(0.5)
+    assert wire.speed > 0.3
+    wire.session.ending = True
+    wire.run(0.1)
+    assert wire.session.ended
+    assert wire.speed == 0.0
+    assert wire.world.lights[0][0].period_us == 0
+    assert not wire.firmware.board.is_streaming
+
+
+def test_a_robot_that_hears_and_is_not_heard_is_stopped() -> None:
+    wire = streaming()
+    wire.velocities = (60, 60)
+    wire.run(0.5)
+    wire.hears = False
+    wire.run(0.5)
+    assert wire.errors == ["the robot tells no wheel ticks any more"]
+    assert wire.speed == 0.0
+
+
+def test_a_robot_that_hears_nothing_stops_by_itself() -> None:
+    """The velocity holds a second and then decays by a unit each tenth of a second."""
+    wire = streaming()
+    wire.velocities = (20, 20)
+    wire.run(0.5)
+    wire.is_heard = False
+    wire.run(1.2 + 2.0 + 0.3)
+    assert wire.speed < 0.02
+
+
+def test_a_velocity_is_told_again_before_it_decays() -> None:
+    wire = streaming()
+    wire.velocities = (30, 30)
+    wire.run(4.0)
+    rates = np.diff([one.left for one in wire.ticks[-20:]]) / 0.02
+    assert rates.mean() == pytest.approx(30 / 0.021, rel=0.02)
+
+
+def test_a_robot_that_was_reset_is_set_up_anew() -> None:
+    wire = streaming()
+    wire.velocities = (40, 40)
+    wire.run(0.5)
+    before = wire.states[-1].pose
+    wire.firmware.receive(commands.RESET)
+    wire.step()
+    assert wire.errors == ["the robot has been reset"]
+    assert wire.speed == 0.0
+    wire.velocities = (0, 0)
+    wire.run(1.0)
+    assert wire.session.connected
+    # what it rolled out while its ticks began anew is all that is missing
+    assert np.linalg.norm(wire.states[-1].pose - before) < 0.03
+
+
+def test_a_stall_of_the_link_loses_events_and_nothing_else() -> None:
+    """Nobody takes its bytes for a while: its ring overflows, its ticks and its clock go on."""
+    wire = streaming({"reply_timeout_s": 1.0, "lights": commands.Lights(450.0, 0.0)})
+    wire.velocities = (20, 20)
+    wire.run(0.5)
+    for _ in range(100):
+        wire.world.step()
+    wire.run(0.5)
+    wire.velocities = (0, 0)
+    wire.run(0.3)
+    assert not wire.errors
+    assert wire.firmware.board.ring.dropped > 1000
+    assert wire.odometry_error()[0] < 2e-4
+    last = wire.packets[-1]
+    assert abs(wire.world.now_ns - last.stamp_ns) < 20_000_000
+    assert "corrupt_events" not in wire.counts
+
+
+def test_a_long_stall_blocks_the_robot_and_the_driver_resets_it() -> None:
+    """When its text has no room the main loop waits: motors keep their duty, and no command is obeyed."""
+    wire = streaming()
+    wire.velocities = (40, 40)
+    wire.run(0.5)
+    for _ in range(1000):
+        wire.world.step()
+        if not wire.firmware.board.is_blocked:
+            wire.firmware.board.say("-S0 7400\n" * 20)
+    assert wire.firmware.board.is_blocked
+    wire.firmware.receive(commands.BRAKE)
+    assert wire.speed > 0.1
+    wire.velocities = (0, 0)
+    wire.run(1.0)
+    assert wire.speed == 0.0
+
+
+def test_lines_that_are_no_ticks_are_counted() -> None:
+    wire = streaming()
+    wire.firmware.receive(b"!X\nx\n?S1\n")
+    wire.run(0.1)
+    assert wire.counts["refused_commands"] == 2
+    assert wire.counts["other_lines"] == 1
+
+
+def test_polarity_is_a_choice() -> None:
+    on, off = streaming({"on_bit": 0}), streaming({"on_bit": 1})
+    for wire, other in ((on, off),):
+        wire.run(0.2)
+        other.run(0.2)
+        one = decode_events(wire.packets[-1].data, ENCODING, (128, 128))
+        two = decode_events(other.packets[-1].data, ENCODING, (128, 128))
+        np.testing.assert_array_equal(one.is_on, ~two.is_on)
