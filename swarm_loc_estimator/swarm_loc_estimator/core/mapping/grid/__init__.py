@@ -1,0 +1,1 @@
+"""Grids: occupancy and visits."""

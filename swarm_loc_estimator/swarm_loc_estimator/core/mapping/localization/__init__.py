@@ -1,0 +1,1 @@
+"""Where a new scan was made: alignment, loop closure, relocalization."""

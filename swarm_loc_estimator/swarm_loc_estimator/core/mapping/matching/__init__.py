@@ -1,0 +1,1 @@
+"""Beams of one scan against the lines of another."""

@@ -1,0 +1,1 @@
+"""The pose graph: stops as nodes, constraints, Gauss-Newton."""

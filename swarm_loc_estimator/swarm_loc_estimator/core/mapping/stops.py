@@ -1,0 +1,145 @@
+"""From a stream of readings to stops: where a robot stands and turns, and how it drives from one to the next."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.core.mapping.readings import Readings
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.se2 import wrap_angle
+
+MIN_TURN = 0.5
+"""A robot that has not turned so much [rad] has not looked around: it drives on."""
+_STAND_SPEED = 0.02
+"""A robot that drives slower than this stands [m/s]."""
+_DEPARTED = 0.01
+"""A robot that is further than this from where it came has left [m]."""
+_MAX_READINGS = 4096
+"""Of more at one stop, every second one is left out."""
+_REST_NS, _REST_TURN = 1_000_000_000, 0.01
+"""A robot that turns less than this in such a time rests [rad]."""
+_DRIVES, _STANDS, _ARRIVES = 0, 1, 2
+
+
+class Stop:
+    """Where a robot stands, or stood.
+
+    Args:
+        arrival: (3,) pose by odometry when it came.
+
+    Attributes:
+        arrival: Likewise.
+        departure: (3,) pose by odometry at the last reading.
+        stamp_ns: (n,) of its readings.
+        turn: (n,) turn by odometry since it came [rad].
+        inverse: (n,) inverse distances [1/m].
+        sigma: Of an inverse distance [1/m].
+    """
+
+    def __init__(self, arrival: FloatArray) -> None:
+        self.arrival = self.departure = arrival
+        self.stamp_ns: IntArray = np.zeros(0, dtype=np.int64)
+        self.turn = np.zeros(0)
+        self.inverse = np.zeros(0)
+        self.sigma = math.inf
+
+    def extend(self, readings: Readings) -> None:
+        """Add readings made here."""
+        headings = np.concatenate([self.departure[2:], readings.odometry[:, 2]])
+        turned = self.turn[-1] if len(self.turn) else 0.0
+        self.turn = np.concatenate([self.turn, turned + np.cumsum(wrap_angle(np.diff(headings)))])
+        self.stamp_ns = np.concatenate([self.stamp_ns, readings.stamp_ns])
+        self.inverse = np.concatenate([self.inverse, readings.inverse])
+        self.departure, self.sigma = readings.odometry[-1], readings.sigma
+        if len(self.turn) > _MAX_READINGS:
+            self.turn, self.stamp_ns, self.inverse = (
+                np.concatenate([one[:-1:2], one[-1:]]) for one in (self.turn, self.stamp_ns, self.inverse)
+            )
+
+    @property
+    def turned(self) -> float:
+        """The largest turn by odometry there was [rad]."""
+        return float(np.abs(self.turn).max(initial=0.0))
+
+    def completed(self, full: float) -> int:
+        """After how many readings the robot had turned by `full` [rad], or looked around and rested; 0: not yet."""
+        return _completed(self.stamp_ns, self.turn, full)
+
+    def turn_at(self, stamp_ns: int) -> float:
+        """Turn by odometry at an instant during the stop [rad]."""
+        since = (self.stamp_ns - self.stamp_ns[0]) * 1e-9
+        return float(np.interp((stamp_ns - self.stamp_ns[0]) * 1e-9, since, self.turn))
+
+
+class Run(NamedTuple):
+    """Readings that belong together.
+
+    Attributes:
+        stands: Whether the robot stands.
+        arrives: Whether it has just come.
+        readings: These.
+    """
+
+    stands: bool
+    arrives: bool
+    readings: Readings
+
+
+class MotionTracker:
+    """Tells standing from driving for one robot."""
+
+    def __init__(self) -> None:
+        self._state = np.full(5, np.nan)  # anchor x, y; position before x, y; whether it stands
+        self._before_ns = 0
+
+    def runs(self, readings: Readings) -> Iterator[Run]:
+        """Cut readings (n,) where the robot comes or leaves."""
+        labels = _labels(readings.stamp_ns, readings.odometry, self._state, self._before_ns)
+        self._before_ns = int(readings.stamp_ns[-1])
+        changes = (labels[1:] == _ARRIVES) | ((labels[1:] == _DRIVES) != (labels[:-1] == _DRIVES))
+        bounds = [0, *(np.flatnonzero(changes) + 1).tolist(), len(labels)]
+        for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
+            part = slice(begin, end)
+            chosen = Readings(
+                readings.stamp_ns[part], readings.odometry[part], readings.inverse[part], readings.sigma
+            )
+            yield Run(bool(labels[begin] != _DRIVES), bool(labels[begin] == _ARRIVES), chosen)
+
+
+@compiled
+def _labels(stamp_ns: IntArray, odometry: FloatArray, state: FloatArray, before_ns: int) -> IntArray:
+    """Whether a robot drives, stands or arrives at each reading; the state goes on."""
+    labels = np.zeros(len(stamp_ns), dtype=np.int64)
+    for k in range(len(stamp_ns)):
+        x, y = odometry[k, 0], odometry[k, 1]
+        elapsed_s = (stamp_ns[k] - before_ns) * 1e-9
+        step = math.hypot(x - state[2], y - state[3])
+        if state[4] == 1.0 and math.hypot(x - state[0], y - state[1]) <= _DEPARTED:
+            labels[k] = _STANDS
+        elif math.isnan(state[4]) or (state[4] == 0.0 and step < _STAND_SPEED * elapsed_s):
+            labels[k] = _ARRIVES
+            state[0], state[1], state[4] = x, y, 1.0
+        else:
+            labels[k] = _DRIVES
+            state[4] = 0.0
+        state[2], state[3] = x, y
+        before_ns = stamp_ns[k]
+    return labels
+
+
+@compiled
+def _completed(stamp_ns: IntArray, turn: FloatArray, full: float) -> int:
+    """See `Stop.completed`."""
+    furthest, rest_turn, rest_ns = 0.0, math.inf, 0
+    for k in range(len(turn)):
+        furthest = max(furthest, abs(turn[k]))
+        if abs(turn[k] - rest_turn) > _REST_TURN:
+            rest_turn, rest_ns = turn[k], stamp_ns[k]
+        if furthest >= full or (furthest >= MIN_TURN and stamp_ns[k] - rest_ns >= _REST_NS):
+            return k + 1
+    return 0
