@@ -199,7 +199,7 @@ def _elapsed(stamp: int, state: IntArray, stamp_bytes: int) -> int:
     if state[_STARTED] == 0:
         return 0
     span = 1 << (8 * stamp_bytes)
-    forward = (stamp - state[_RAW]) % span
+    forward = (stamp - int(state[_RAW])) % span
     return forward - span if stamp_bytes > 2 and 2 * forward > span else forward
 
 

@@ -109,9 +109,9 @@ class EventCamera:
         self._later = _columns(columns, is_later)
         x, y, polarity, time_us = _columns(columns, ~is_later)
         is_inside = (x >= 0) & (x < SENSOR_PX) & (y >= 0) & (y < SENSOR_PX)
-        x, y, polarity, time_us = (column[is_inside] for column in (x, y, polarity, time_us))
+        x, y, polarity, time_us = _columns((x, y, polarity, time_us), is_inside)
         told = self._without_refractory(x, y, polarity, time_us)
-        x, y, polarity, time_us = (column[told] for column in (x, y, polarity, time_us))
+        x, y, polarity, time_us = _columns((x, y, polarity, time_us), told)
         return CameraEvents(x, y, polarity, self._on_the_bus(time_us))
 
     def _noise_events(self, begin_us: int, end_us: int) -> _Raw:
@@ -185,7 +185,7 @@ class EventCamera:
         return taken
 
 
-def _columns(columns: Sequence[NDArray[Any]], chosen: NDArray[np.bool_]) -> _Raw:
+def _columns(columns: Sequence[NDArray[Any]], chosen: NDArray[Any]) -> _Raw:
     """Some of the events."""
     x, y, polarity, time_us = (column[chosen] for column in columns)
     return x, y, polarity, time_us

@@ -56,7 +56,7 @@ class EventRing:
             data = _fixed(self._words[:count], self._times[:count], stamp_bytes)
         else:
             deltas = np.diff(self._times[:due], prepend=self._last) & 0xFFFFFFFF
-            sizes = 3 + sum((deltas >= limit).astype(np.int64) for limit in _DELTA_LIMITS)
+            sizes = 3 + np.searchsorted(_DELTA_LIMITS, deltas, side="right")
             count = int(np.searchsorted(np.cumsum(sizes), max_bytes, side="right"))
             data = _differences(self._words[:count], deltas[:count], sizes[:count])
             self._last = int(self._times[count - 1]) if count else self._last
