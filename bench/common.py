@@ -81,3 +81,16 @@ def _text(cell: Cell) -> str:
     if cell is None:
         return "-"
     return f"{cell:.3g}" if isinstance(cell, float) else str(cell)
+
+
+class ProgressLine:
+    """A line that tells how far something is."""
+
+    def __init__(self, what: str) -> None:
+        self._what, self._told = what, ""
+
+    def __call__(self, text: str) -> None:
+        """Tell how far it is, when that has changed."""
+        if text != self._told:
+            print(f"\r{self._what}: {text:32}", end="", flush=True)
+            self._told = text

@@ -7,48 +7,31 @@ as a bag. Nothing is drawn onto true poses: errors are those of what sees, drive
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
-from rclpy.time import Time
 from sensor_msgs.msg import Image
 
+from bench.live_listener import TYPE_OF, Listener, Say
 from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
 from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
 from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
 from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.evaluation.result import ReplayResult
-from swarm_loc_estimator.evaluation.truth import read_truth
 from swarm_loc_estimator.io.bags.writer import BagWriter
-from swarm_loc_estimator.io.messages.cdr import DetectionArrayMessage, decode_detections, decode_pose_stamped
+from swarm_loc_estimator.io.messages.cdr import DetectionArrayMessage, decode_detections
 from swarm_loc_estimator.io.messages.encoders import UNKNOWN_COVARIANCE, encode_detections
-from swarm_loc_estimator.io.messages.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED
 from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.live.graph import START_PATIENCE_S, LiveError, LiveGraph, cpu_seconds
-from swarm_loc_estimator.live.recorder import read_history, read_poses
-from swarm_loc_msgs.msg import MarkerDetectionArray
+from swarm_loc_estimator.live.graph import LiveGraph, cpu_seconds
+from swarm_loc_estimator.live.recorder import read_history
 
 ROBOTS = 5
 WORLD = "w2"
 _SILENCE_PATIENCE_S = 120.0
 _PICTURES_S = 1.5
-_MOVED_M = 0.002
-_DEPTH = 1000
-_TOPICS: dict[str, tuple[type, str]] = {
-    "odom": (Odometry, ODOMETRY),
-    "detections": (MarkerDetectionArray, DETECTIONS),
-    "ground_truth": (PoseStamped, POSE_STAMPED),
-}
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -93,69 +76,22 @@ class RenderedRun:
         return (self.end_ns - self.begin_ns) * 1e-9
 
 
-@dataclass
-class _Listener:
-    """Keeps what is sent in the graph.
-
-    Attributes:
-        graph: Whose recorder listens.
-        names: Of the robots.
-        looked_at: The robot whose pictures are kept.
-        kept: Robot and topic -> times of arrival in the graph's time [ns], and messages.
-        pictures: Robot and stamp -> picture.
-    """
-
-    graph: LiveGraph
-    names: Sequence[str]
-    looked_at: str = ""
-    kept: dict[tuple[str, str], tuple[list[int], list[bytes]]] = field(default_factory=dict)
-    pictures: dict[tuple[str, int], Image] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        recorder = self.graph.recorder
-        for name in self.names:
-            for topic, (kind, _) in _TOPICS.items():
-                arrivals, data = self.kept.setdefault((name, topic), ([], []))
-                keep = partial(self._keep, arrivals, data)
-                recorder.create_subscription(kind, f"{name}/{topic}", keep, _DEPTH, raw=True)
-
-    def _keep(self, arrivals: list[int], messages: list[bytes], data: bytes) -> None:
-        arrivals.append(self.graph.recorder.get_clock().now().nanoseconds)
-        messages.append(data)
-
-    def listen_to_camera(self, name: str) -> None:
-        """Keep a robot's pictures, too, from here on: they are large."""
-
-        def keep(message: Image) -> None:
-            self.pictures[name, Time.from_msg(message.header.stamp).nanoseconds] = message
-
-        self.graph.recorder.create_subscription(Image, f"{name}/image_raw", keep, 1)
-        self.looked_at = name
-
-    def newest_truth(self, name: str) -> tuple[int, NDArray[np.float64]] | None:
-        """Stamp and place (2,) of a robot, and None before the first."""
-        messages = self.kept[name, "ground_truth"][1]
-        if not messages:
-            return None
-        truth = decode_pose_stamped(messages[-1])
-        return truth.stamp_ns, np.array(truth.pose[:2])
-
-    def write(self, folder: Path, *, with_noise: bool) -> None:
-        """Everything as a bag, in order of arrival; detections tell of their noise, or do not know it."""
-        rows = [
-            (
-                arrival_ns,
-                f"{name}/{topic}",
-                data if with_noise or topic != "detections" else _without_noise(data),
-            )
-            for (name, topic), kept in self.kept.items()
-            for arrival_ns, data in zip(*kept, strict=True)
-        ]
-        with BagWriter(folder, compress=True) as bag:
-            for name, topic in self.kept:
-                bag.add_topic(f"{name}/{topic}", _TOPICS[topic][1])
-            for arrival_ns, topic, data in sorted(rows, key=lambda row: row[0]):
-                bag.write(topic, arrival_ns, data)
+def _write(listener: Listener, folder: Path, *, with_noise: bool) -> None:
+    """Everything as a bag, in order of arrival; detections tell of their noise, or do not know it."""
+    rows = [
+        (
+            arrival_ns,
+            f"{name}/{topic}",
+            data if with_noise or topic != "detections" else _without_noise(data),
+        )
+        for (name, topic), kept in listener.kept.items()
+        for arrival_ns, data in zip(*kept, strict=True)
+    ]
+    with BagWriter(folder, compress=True) as bag:
+        for name, topic in listener.kept:
+            bag.add_topic(f"{name}/{topic}", TYPE_OF[topic])
+        for arrival_ns, topic, data in sorted(rows, key=lambda row: row[0]):
+            bag.write(topic, arrival_ns, data)
 
 
 def _without_noise(data: bytes) -> bytes:
@@ -193,14 +129,14 @@ def run_rendered(swarm: Swarm, seed: int, duration_s: float, folder: Path, say: 
     options = SimulationOptions(str(swarm_file), world=WORLD, seed=seed)
     nodes = simulation_nodes(options, names, str(links))
     with LiveGraph(nodes, folder / "nodes.log") as graph:
-        listener = _Listener(graph, names)
-        begin_ns = _wait_until_they_drive(graph, listener, say)
+        listener = Listener(graph, names)
+        begin_ns = listener.wait_until_they_drive(say)
         processes = {node.full_name: graph.process(node.full_name).pid for node in nodes}
         used_s = {name: cpu_seconds(pid) for name, pid in processes.items()}
 
         def is_over() -> bool:
             """Whether they have driven long enough; tell how far it is."""
-            now_s = (_now_ns(listener) - begin_ns) * 1e-9
+            now_s = (listener.now_ns - begin_ns) * 1e-9
             if now_s > duration_s - _PICTURES_S and not listener.looked_at:
                 listener.listen_to_camera(names[0])
             say(f"{min(now_s, duration_s):.0f} of {duration_s:.0f} simulated s")
@@ -208,8 +144,8 @@ def run_rendered(swarm: Swarm, seed: int, duration_s: float, folder: Path, say: 
 
         graph.wait_for(is_over, "go on driving", _SILENCE_PATIENCE_S)
         cpu_s = {name: cpu_seconds(pid) - used_s[name] for name, pid in processes.items()}
-    listener.write(folder / "bag", with_noise=True)
-    listener.write(folder / "described_bag", with_noise=False)
+    _write(listener, folder / "bag", with_noise=True)
+    _write(listener, folder / "described_bag", with_noise=False)
     live, age_s = _lived(listener, swarm, begin_ns)
     return RenderedRun(
         seed=seed,
@@ -224,42 +160,19 @@ def run_rendered(swarm: Swarm, seed: int, duration_s: float, folder: Path, say: 
     )
 
 
-def _wait_until_they_drive(graph: LiveGraph, listener: _Listener, say: Say) -> int:
-    """When the robots began to drive [ns]."""
-    starts: list[NDArray[np.float64]] = []
-    deadline_s = time.monotonic() + START_PATIENCE_S
-
-    def has_begun() -> bool:
-        say("starting")
-        newest = listener.newest_truth(listener.names[0])
-        if newest is None:
-            return False
-        starts.append(newest[1])
-        if time.monotonic() > deadline_s:
-            raise LiveError(f"The robots have not begun to drive within {START_PATIENCE_S:.0f} s.")
-        return float(np.linalg.norm(newest[1] - starts[0])) > _MOVED_M
-
-    graph.wait_for(has_begun, "begin to drive", START_PATIENCE_S)
-    return _now_ns(listener)
-
-
-def _now_ns(listener: _Listener) -> int:
-    """How far the graph is, by its poses."""
-    return read_poses(listener.graph.recorder.raw[-1]).stamp_ns
-
-
-def _lived(listener: _Listener, swarm: Swarm, begin_ns: int) -> tuple[ReplayResult, NDArray[np.float64]]:
+def _lived(listener: Listener, swarm: Swarm, begin_ns: int) -> tuple[ReplayResult, NDArray[np.float64]]:
     """The poses as they came out, and the truth; and how old they were then (A,) [s]."""
     recorder = listener.graph.recorder
     history = read_history(recorder.raw)
     driving = history.stamp_ns >= begin_ns
-    truth = read_truth(swarm, {name: listener.kept[name, "ground_truth"][1] for name in listener.names})
-    live = ReplayResult("rendered, live", swarm, *history[:3], truth, dict(recorder.drops)).chosen(driving)
+    live = ReplayResult(
+        "rendered, live", swarm, *history[:3], listener.truth(swarm), dict(recorder.drops)
+    ).chosen(driving)
     age_ns = np.array(recorder.received_ns, dtype=np.int64) - history.stamp_ns
     return live, age_ns[driving].astype(np.float64) * 1e-9
 
 
-def _seen(listener: _Listener, name: str, begin_ns: int) -> list[DetectionArrayMessage]:
+def _seen(listener: Listener, name: str, begin_ns: int) -> list[DetectionArrayMessage]:
     """What a robot's camera saw while it drove."""
     decoded = map(decode_detections, listener.kept[name, "detections"][1])
     return [one for one in decoded if one.stamp_ns >= begin_ns]

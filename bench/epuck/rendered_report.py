@@ -14,7 +14,7 @@ from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from bench.common import OUT, Cell, new_plot, save_plot, table
+from bench.common import OUT, Cell, ProgressLine, new_plot, save_plot, table
 from bench.epuck.rendered import RenderedRun, run_rendered, starting_swarm
 from bench.epuck.seen import Seen, count_seen
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
@@ -71,7 +71,7 @@ def rendered_worlds(
     for count, seed in enumerate(seeds, start=1):
         folder = OUT / "epuck_rendered" / f"seed{seed}"
         shutil.rmtree(folder, ignore_errors=True)
-        say = _Line(f"rendered world {count} of {len(seeds)}")
+        say = ProgressLine(f"rendered world {count} of {len(seeds)}")
         run = run_rendered(describe(swarm), seed, duration_s, folder, say)
         say("looking at what was seen")
         papers = replay(run.described_bag, paper(swarm), settings)
@@ -79,18 +79,6 @@ def rendered_worlds(
         say("done")
         print()
     return worlds
-
-
-class _Line:
-    """A line that tells how far something is."""
-
-    def __init__(self, what: str) -> None:
-        self._what, self._told = what, ""
-
-    def __call__(self, text: str) -> None:
-        if text != self._told:
-            print(f"\r{self._what}: {text:32}", end="", flush=True)
-            self._told = text
 
 
 def errors_within(result: ReplayResult, begin_ns: int, end_ns: int) -> ErrorSummary:

@@ -67,13 +67,13 @@ def _hidden_in_noise(seed: int) -> Fault:
     return Fault(faults.simulate(settings_of(seed, W2)))
 
 
-def _driver_restart(seed: int) -> Fault:
+def _driver_gap(seed: int) -> Fault:
     begin_s = 17.3 + 2.7 * seed % 20.0
     end_s = begin_s + (1.2, 1.6, 2.0, 3.0, 6.0)[seed % 5]
     return Fault(faults.restarted_driver(_clean(seed).run, 0, begin_s, end_s), end_s)
 
 
-def _estimator_restart_moved(seed: int) -> Fault:
+def _wrong_starts(seed: int) -> Fault:
     return Fault(faults.wrong_starts(_clean(seed).run, np.random.default_rng([seed, 1])), 0.0)
 
 
@@ -150,8 +150,8 @@ def _creeping(
 SCENARIOS: Mapping[str, Callable[[int], Fault]] = {
     "clean_w0": _clean_w0,
     "w2_on_w0_file": _w2_on_w0_file,
-    "driver_restart": _driver_restart,
-    "estimator_restart_moved": _estimator_restart_moved,
+    "driver_gap": _driver_gap,
+    "wrong_starts": _wrong_starts,
     "kidnapped": _kidnapped,
     "false_sightings": _false_sightings,
     "moved_landmark": _moved_landmark,

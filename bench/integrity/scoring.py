@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +20,23 @@ _MISLEADING_SIGMAS = 5.0
 _MISLEADING_M = 0.02
 _RIGHT_M = 0.05
 _SETTLED_S = 1.0
-_STEADY_TICKS = 30
+_STEADY_S = 3.0
+
+
+class Estimated(NamedTuple):
+    """What an estimator said, and how wrong it was.
+
+    Attributes:
+        time_s: (T,) since the run began [s].
+        error: (T, N, 3) estimate minus truth; NaN where not located.
+        covariance: (T, N, 3, 3).
+        tracked: (T, N) who is told as tracked.
+    """
+
+    time_s: FloatArray
+    error: FloatArray
+    covariance: FloatArray
+    tracked: BoolArray
 
 
 @dataclass(frozen=True)
@@ -62,14 +79,16 @@ def score(fault: Fault) -> Score:
     error = errors_of(np.array([one.poses for one in estimates]), run, tick_ns)
     covariance = np.array([one.covariances for one in estimates])
     tracked = np.array([one.status for one in estimates]) == Status.TRACKED
-    found = scored(seconds(run, tick_ns), error, covariance, tracked, fault)
+    estimated = Estimated(seconds(run, tick_ns), error, covariance, tracked)
+    found = scored(estimated, fault.ends_s, fault.hidden_s)
     return replace(found, told=frozenset(told))
 
 
 def scored(
-    time_s: FloatArray, error: FloatArray, covariance: FloatArray, tracked: BoolArray, fault: Fault
+    estimated: Estimated, ends_s: float | None = None, hidden_s: tuple[float, float] | None = None
 ) -> Score:
-    """Score estimates minus truth (T, N, 3), their covariances (T, N, 3, 3), and who is tracked (T, N)."""
+    """Score estimates, see `Fault` for the times."""
+    time_s, error, covariance, tracked = estimated
     distance: FloatArray = np.hypot(error[..., 0], error[..., 1])
     squared = np.full(distance.shape, np.nan)
     located = np.isfinite(distance)
@@ -77,25 +96,27 @@ def scored(
     squared[located] = np.einsum("ki,kij,kj->k", position, np.linalg.inv(spread), position)
     misleading = tracked & (distance > _MISLEADING_M) & (squared > _MISLEADING_SIGMAS**2)
     knowable = np.ones(time_s.size, dtype=bool)
-    if fault.hidden_s is not None:
-        knowable = (time_s < fault.hidden_s[0]) | (time_s >= fault.hidden_s[1])
+    if hidden_s is not None:
+        knowable = (time_s < hidden_s[0]) | (time_s >= hidden_s[1])
     used = tracked & (time_s > _SETTLED_S)[:, None] & knowable[:, None]
     return Score(
         misleading_share=float(misleading[knowable].mean()),
         tracked_share=float(tracked[time_s > _SETTLED_S].mean()),
         position_m=float(np.sqrt(np.mean(distance[used] ** 2))),
         nees=float(np.mean(nees(error[used], covariance[used]))),
-        recovery_s=_recovery_s(time_s, tracked & (distance < _RIGHT_M), fault),
+        recovery_s=_recovery_s(time_s, tracked & (distance < _RIGHT_M), ends_s),
         time_s=time_s,
         error_m=distance,
         misleading=misleading,
     )
 
 
-def _recovery_s(time_s: FloatArray, right: BoolArray, fault: Fault) -> float:
+def _recovery_s(time_s: FloatArray, right: BoolArray, ends_s: float | None) -> float:
     """How long the slowest robot takes to be right for good."""
-    if fault.ends_s is None:
+    if ends_s is None:
         return float("nan")
-    begin = int(np.searchsorted(time_s, fault.ends_s))
-    steady = [np.convolve(one[begin:], np.ones(_STEADY_TICKS), "valid") >= _STEADY_TICKS for one in right.T]
-    return max(float(np.argmax(one)) if one.any() else float(time_s.size) for one in steady) * TICK_NS * 1e-9
+    begin = int(np.searchsorted(time_s, ends_s))
+    needed = round(_STEADY_S / float(np.median(np.diff(time_s))))
+    steady = [np.convolve(one[begin:], np.ones(needed), "valid") >= needed for one in right.T]
+    since_s = time_s[begin:] - ends_s
+    return max(float(since_s[np.argmax(one)]) if one.any() else float(time_s[-1]) for one in steady)

@@ -33,7 +33,7 @@ def test_a_landmark_that_was_moved_is_named() -> None:
 
 
 def test_starts_that_are_wrong_give_way_and_nothing_is_said_where_nothing_is_wrong() -> None:
-    moved, clean = (score(SCENARIOS[name](SEED)) for name in ("estimator_restart_moved", "clean_w0"))
+    moved, clean = (score(SCENARIOS[name](SEED)) for name in ("wrong_starts", "clean_w0"))
     assert moved.misleading_share <= 0.001
     assert moved.recovery_s <= 3.0
     assert not clean.told

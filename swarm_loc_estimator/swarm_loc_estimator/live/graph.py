@@ -81,10 +81,14 @@ class LiveGraph:
         """The process of a node, by its full name."""
         return self._children[name].process
 
-    def restart(self, name: str) -> None:
-        """Kill a node and start it anew."""
+    def kill(self, name: str) -> None:
+        """Kill a node."""
         self.process(name).kill()
         self.process(name).wait()
+
+    def restart(self, name: str) -> None:
+        """Start a node anew; kill it first, if it still runs."""
+        self.kill(name)
         self._start(self._nodes[name])
 
     def wait_for(

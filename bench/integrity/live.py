@@ -1,0 +1,136 @@
+"""Faults of processes in the live graph: a driver or the estimator is killed, and starts again.
+
+Five emulated e-pucks drive the eight in a rendered world, with all nodes that `simulate` starts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bench.integrity.scoring import Estimated, Score, scored
+from bench.live_listener import Listener, Say
+from swarm_loc_drivers.sim.common.error_model import W0
+from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
+from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
+from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.core.estimation.estimator import Status
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.live.graph import LiveGraph
+from swarm_loc_estimator.live.recorder import read_history
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.trajectory import DEFAULT_GAP_NS, interpolate
+
+_ROBOTS = 5
+_BEFORE_S, _AFTER_S = 8.0, 10.0
+_PATIENCE_S = 120.0
+_ESTIMATOR = "estimator"
+
+
+@dataclass(frozen=True)
+class _Live:
+    """A graph that runs, and what is heard of it."""
+
+    graph: LiveGraph
+    listener: Listener
+    nodes: frozenset[str]
+
+    def now_s(self) -> float:
+        """How far the world is, by its newest truth [s]."""
+        newest = self.listener.newest_truth(self.listener.names[0])
+        return newest[0] * 1e-9 if newest else 0.0
+
+    def go_on(self, duration_s: float, without: str = "") -> None:
+        """Let the world go on; `without` names a node that is not there."""
+        until_s = self.now_s() + duration_s
+        self.graph.wait_for(
+            lambda: self.now_s() >= until_s, "go on driving", _PATIENCE_S, self.nodes - {without}
+        )
+
+
+Break = Callable[[_Live, float], float]
+"""Breaks something of a graph for some time [s], mends it, and returns when it was mended [s]."""
+
+
+def _driver_restart(live: _Live, away_s: float) -> float:
+    """Kill a driver; mended when odometry comes again."""
+    robot = live.listener.names[0]
+    driver, odometry = f"{robot}/epuck_driver", live.listener.kept[robot, "odom"][0]
+    live.graph.kill(driver)
+    live.go_on(away_s, without=driver)
+    received = len(odometry)
+    live.graph.restart(driver)
+    live.graph.wait_for(lambda: len(odometry) > received, "send odometry again", _PATIENCE_S)
+    return odometry[received] * 1e-9
+
+
+def _estimator_restart_moved(live: _Live, away_s: float) -> float:
+    """Kill the estimator: when it begins anew, the robots are not at their starts; mended with its poses."""
+    raw = live.graph.recorder.raw
+    live.graph.kill(_ESTIMATOR)
+    live.go_on(away_s, without=_ESTIMATOR)
+    received = len(raw)
+    live.graph.restart(_ESTIMATOR)
+    live.graph.wait_for(lambda: len(raw) > received, "publish poses again", _PATIENCE_S)
+    return live.listener.now_ns * 1e-9
+
+
+LIVE_SCENARIOS: Mapping[str, Break] = {
+    "driver_restart": _driver_restart,
+    "estimator_restart_moved": _estimator_restart_moved,
+}
+
+
+def run_live(name: str, seed: int, folder: Path, say: Say) -> Score:
+    """Run a scenario of `LIVE_SCENARIOS`.
+
+    Args:
+        name: Which.
+        seed: Of the world, and of how long the process is away.
+        folder: Where description and log go; created.
+        say: Is told how far it is.
+
+    Raises:
+        LiveError: A node has ended, or nothing goes on.
+    """
+    links, swarm = folder / "links", _swarm()
+    links.mkdir(parents=True, exist_ok=True)
+    save_swarm(swarm, folder / "swarm.yaml")
+    names = [robot.name for robot in swarm.robots]
+    options = SimulationOptions(str(folder / "swarm.yaml"), world="w0", seed=seed)
+    nodes = simulation_nodes(options, names, str(links))
+    away_s = float(np.random.default_rng([seed, 5]).uniform(1.2, 6.0))
+    with LiveGraph(nodes, folder / "nodes.log") as graph:
+        listener = Listener(graph, names)
+        live = _Live(graph, listener, frozenset(node.full_name for node in nodes))
+        begin_ns = listener.wait_until_they_drive(say)
+        live.go_on(_BEFORE_S)
+        say(f"breaks for {away_s:.1f} s")
+        mended_s = LIVE_SCENARIOS[name](live, away_s)
+        say("mended")
+        live.go_on(_AFTER_S)
+    return scored(_estimated(listener, swarm, begin_ns), mended_s - begin_ns * 1e-9)
+
+
+def _swarm() -> Swarm:
+    """The robots where the eight begins."""
+    path = Lemniscate(HALF_WIDTH)
+    start, _ = path.at(np.arange(_ROBOTS) * path.length / _ROBOTS)
+    return describe(EightSettings(robots=_ROBOTS, errors=W0), start)
+
+
+def _estimated(listener: Listener, swarm: Swarm, begin_ns: int) -> Estimated:
+    """The poses as they came out while the robots drove, held against the truth."""
+    history, truth = read_history(listener.graph.recorder.raw), listener.truth(swarm)
+    places = np.stack(
+        [interpolate(truth[name], history.stamp_ns, DEFAULT_GAP_NS)[0] for name in listener.names], axis=1
+    )
+    known = (history.stamp_ns >= begin_ns) & np.isfinite(places).all(axis=(1, 2))
+    error = (history.pose - places)[known]
+    error[..., 2] = se2.wrap_angle(error[..., 2])
+    time_s = (history.stamp_ns[known] - begin_ns) * 1e-9
+    return Estimated(time_s, error, history.covariance[known], history.status[known] == Status.TRACKED)
