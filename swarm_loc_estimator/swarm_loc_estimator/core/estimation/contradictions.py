@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.core.filter.integrity import DENIED, pairs_set_aside
+from swarm_loc_estimator.core.filter.integrity.surprises import is_contradicted, pairs_set_aside
 from swarm_loc_estimator.core.filter.state import SwarmState
 from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
 
@@ -20,6 +20,7 @@ class Kind(Enum):
     POSE = "pose"
     SIGHTINGS = "sightings"
     DESCRIPTION = "description"
+    NOISE = "noise"
 
 
 class Contradiction(NamedTuple):
@@ -49,13 +50,15 @@ def contradictions(
     """
     names = [robot.name for robot in swarm.robots] + [f"landmark {mark.id}" for mark in swarm.landmarks]
     jumping = np.flatnonzero(tracks.contradict_themselves(now_ns)).tolist()
-    denied = np.flatnonzero(state.integrity.doubt[: len(swarm.robots)] >= DENIED).tolist()
+    robots = np.flatnonzero(state.tracked).tolist()
+    denied = [robot for robot in robots if is_contradicted(state.integrity, robot)]
     aside = pairs_set_aside(state.integrity, now_ns)
     return [
         *(_odometry(names[robot]) for robot in jumping),
         *(_pose(names[robot]) for robot in denied),
         *(_sightings(names[observer], names[source]) for observer, source in aside),
         *(_description(names[source], source, state) for source in sorted(state.contradicted)),
+        *(_noise(names[robot]) for robot in np.flatnonzero(state.integrity.hidden_noise).tolist()),
     ]
 
 
@@ -81,3 +84,8 @@ def _description(name: str, source: int, state: SwarmState) -> Contradiction:
         moved = float(np.hypot(*state.landmark[source - robots, :2]))
         text = f"{name} is not where it is described, but about {moved:.2f} m off: its place is estimated"
     return Contradiction(name, Kind.DESCRIPTION, text)
+
+
+def _noise(name: str) -> Contradiction:
+    text = f"what {name} measures counts with more noise than described, which has been contradicted"
+    return Contradiction(name, Kind.NOISE, text)

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
-from swarm_loc_estimator.core.filter.integrity import CONFIRMED, DENIED, add_hidden_errors
+from swarm_loc_estimator.core.filter.integrity.divergence import CONFIRMED, add_hidden_errors
+from swarm_loc_estimator.core.filter.integrity.surprises import is_contradicted
 from swarm_loc_estimator.core.filter.prediction import write_predicted
 from swarm_loc_estimator.core.filter.state import SwarmState
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated, TrackArrays, look_up, new_sample
@@ -110,7 +111,7 @@ def _status(integrity: IntegrityArrays, robot: int, silent: bool) -> int:
         return _STALE
     if integrity.confirmations[robot] < CONFIRMED:
         return _UNCONFIRMED
-    return _CONTRADICTED if integrity.doubt[robot] >= DENIED else _TRACKED
+    return _CONTRADICTED if is_contradicted(integrity, robot) else _TRACKED
 
 
 @compiled

@@ -21,7 +21,8 @@ from swarm_loc_estimator.core.filter.batch_update import (
 from swarm_loc_estimator.core.filter.belief import correct
 from swarm_loc_estimator.core.filter.correlated_noise import record_constraint, record_pair
 from swarm_loc_estimator.core.filter.innovation import InnovationBatch, new_batch
-from swarm_loc_estimator.core.filter.integrity import WELL_CONFIRMED, LossLimits, is_elsewhere
+from swarm_loc_estimator.core.filter.integrity.divergence import WELL_CONFIRMED, LossLimits
+from swarm_loc_estimator.core.filter.integrity.surprises import is_elsewhere
 from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray, MeasurementColumns
 from swarm_loc_estimator.core.filter.sequential_update import update_in_order
 from swarm_loc_estimator.core.filter.state import InitialPose, SwarmState
@@ -204,7 +205,7 @@ class Fusion:
         fields, passed = MeasurementColumns.of(measurements), batch.passed
         evaluate_all(fields, state.arrays(), batch)
         systematic = (measurements["systematic_share"] > 0.0).any(axis=1)
-        looks = (batch.distance, batch.whitened, batch.unexplained)
+        looks = (batch.distance, batch.whitened, batch.cause)
         contradicted = assess_all(fields, state.arrays(), self._limits, looks, passed)
         lost = confirm_all(fields, state.arrays(), passed)
         for k in np.flatnonzero(passed & systematic).tolist():
@@ -230,7 +231,7 @@ class Fusion:
     def _open(self, state: SwarmState, source: int, stamp_ns: int) -> None:
         """Estimate what a contradicted robot or landmark was described by, or locate the robot anew."""
         robots = state.tracked.size
-        if source < robots and is_elsewhere(state.integrity, source, stamp_ns):
+        if source < robots and is_elsewhere(state.integrity, source):
             state.lose(source)
             return
         poses = se2.compose(

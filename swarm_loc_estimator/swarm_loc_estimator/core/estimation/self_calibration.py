@@ -16,6 +16,7 @@ from swarm_loc_estimator.core.description.estimated_parameters import (
     ParameterTable,
 )
 from swarm_loc_estimator.core.description.swarm import Landmark, Robot, Swarm
+from swarm_loc_estimator.core.filter.integrity.hidden_noise import with_hidden_noise
 from swarm_loc_estimator.core.filter.state import SwarmState
 from swarm_loc_estimator.numerics import se2
 
@@ -65,7 +66,7 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
             yaw_sigma=sigma[CAMERA_YAW],
         ),
         sensor=replace(
-            sensor,
+            with_hidden_noise(sensor, float(state.integrity.hidden_noise[index])),
             distance_scale=seen * sensor.distance_scale,
             distance_scale_sigma=sigma[CAMERA_SCALE] / seen,
         ),

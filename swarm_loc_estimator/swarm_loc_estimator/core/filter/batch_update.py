@@ -6,18 +6,17 @@ import numpy as np
 
 from swarm_loc_estimator.core.filter.belief import BeliefArrays, to_map
 from swarm_loc_estimator.core.filter.innovation import InnovationBatch, evaluate, relative_motion
-from swarm_loc_estimator.core.filter.integrity import (
+from swarm_loc_estimator.core.filter.integrity.divergence import (
     LossLimits,
-    assess,
     confirm,
     count_gated,
-    is_set_aside,
     is_uncertain,
 )
+from swarm_loc_estimator.core.filter.integrity.surprises import assess, is_set_aside
 from swarm_loc_estimator.core.filter.measurement_model import MeasurementColumns
 from swarm_loc_estimator.core.filter.prediction import predict
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated, TrackArrays, look_up, new_sample
-from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.numerics.jit import compiled
 from swarm_loc_estimator.numerics.small_matrix import add_scaled, assign
 
@@ -71,7 +70,7 @@ def predict_all(
                 uncertain[robot] |= is_uncertain(belief, robot, batch.pose[k, i], limits)
         if measurements.landmark[k] > 0:
             assign(batch.pose[k, 1], belief.landmark[measurements.landmark[k] - 1])
-        relative_motion(measurements, k, tracks, batch.pose[k], batch.motion[k])
+        relative_motion(measurements, k, tracks, belief, batch.pose[k], batch.motion[k])
 
 
 @compiled
@@ -86,7 +85,7 @@ def assess_all(
     measurements: MeasurementColumns,
     belief: BeliefArrays,
     limits: LossLimits,
-    looks: tuple[FloatArray, FloatArray, BoolArray],
+    looks: tuple[FloatArray, FloatArray, IntArray],
     passed: BoolArray,
 ) -> BoolArray:
     """Assess all measurements (m,); return which robots and landmarks (N + L,) are contradicted.
@@ -95,7 +94,7 @@ def assess_all(
     """
     contradicted = np.zeros(belief.integrity.doubt.size, dtype=np.bool_)
     for k in range(passed.size):
-        source = assess(measurements, k, belief, limits, (looks[0][k], looks[1][k], looks[2][k]))
+        source = assess(measurements, k, belief, limits.max_doubt, (looks[0][k], looks[1][k], looks[2][k]))
         if source >= 0:
             contradicted[source] = True
         passed[k] &= not is_set_aside(measurements, k, belief)

@@ -15,7 +15,7 @@ NEVER_NS = np.iinfo(np.int64).min
 
 
 class IntegrityArrays(NamedTuple):
-    """What the newest measurements say of the belief; see `integrity.py`.
+    """What the newest measurements say of the belief; see `integrity/`.
 
     A source is what a robot measures: the robot of that index, or landmark l as N + l.
 
@@ -32,9 +32,12 @@ class IntegrityArrays(NamedTuple):
         looks: (N, S)
         doubt: (N + L,) how much speaks against each robot and landmark.
         confirmations: (N,) sightings that agreed with where the robot was initialized.
+        confirmed_ns: (N,) when such a sighting was counted last.
         gated_in_a_row: (N,) times that another source was gated since the last accepted measurement.
         gated_source: (N,) the source that was gated last.
         gated_ns: (N,) when.
+        hidden_noise: (N,) units by which each robot's measurements scatter more than described, see
+            `integrity/hidden_noise.py`.
     """
 
     source: IntArray
@@ -49,9 +52,11 @@ class IntegrityArrays(NamedTuple):
     looks: IntArray
     doubt: FloatArray
     confirmations: IntArray
+    confirmed_ns: IntArray
     gated_in_a_row: IntArray
     gated_source: IntArray
     gated_ns: IntArray
+    hidden_noise: FloatArray
 
 
 class BeliefArrays(NamedTuple):

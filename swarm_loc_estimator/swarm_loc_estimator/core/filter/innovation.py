@@ -12,7 +12,12 @@ from swarm_loc_estimator.core.filter.belief import BeliefArrays
 from swarm_loc_estimator.core.filter.correlated_noise import inflate_noise
 from swarm_loc_estimator.core.filter.gating import position_distance, soften_heading, squared_distance
 from swarm_loc_estimator.core.filter.innovation_covariance import add_uncertainty
-from swarm_loc_estimator.core.filter.integrity import is_unexplained, noise_of_frequent_looks
+from swarm_loc_estimator.core.filter.integrity.hidden_noise import add_hidden_noise, stamp_variance
+from swarm_loc_estimator.core.filter.integrity.surprises import (
+    cause_of,
+    noise_of_frequent_looks,
+    surprise_covariance,
+)
 from swarm_loc_estimator.core.filter.measurement_model import MeasurementColumns, innovation, predict_one
 from swarm_loc_estimator.core.odometry.preintegration import TrackArrays, rate_at
 from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -34,9 +39,9 @@ class InnovationBatch(NamedTuple):
         innovation: (m, 3) measured minus predicted.
         noise: (m, 3, 3) covariances of the measurements, as they are used.
         variance: (m, 3) of what was to be expected.
-        distance: (m,) squared Mahalanobis distance of the position, on which the gate decides.
-        whitened: (m, 2) position innovation over its standard deviation.
-        unexplained: (m,) whether the innovation is larger than a wrong description can explain.
+        distance: (m,) squared Mahalanobis distance of the position, small errors left out.
+        whitened: (m, 2) position innovation over its standard deviation, likewise.
+        cause: (m,) what may explain the innovation, see `integrity.cause_of`.
         passed: (m,) whether the gate lets it through.
         nis: (m,) normalised innovation squared.
     """
@@ -50,7 +55,7 @@ class InnovationBatch(NamedTuple):
     variance: FloatArray
     distance: FloatArray
     whitened: FloatArray
-    unexplained: BoolArray
+    cause: IntArray
     passed: BoolArray
     nis: FloatArray
 
@@ -68,7 +73,7 @@ def new_batch(count: int) -> InnovationBatch:
         np.zeros((count, 3)),
         np.zeros(count),
         np.zeros((count, 2)),
-        np.zeros(count, dtype=np.bool_),
+        np.zeros(count, dtype=np.int64),
         np.zeros(count, dtype=np.bool_),
         np.zeros(count),
     )
@@ -96,8 +101,10 @@ def evaluate(
     _write_jacobian(chain, bodies, camera_columns, columns, jacobian)
     s = np.empty((3, 3))
     assign_matrix(noise, measurements.covariance[k])
-    if measurements.stamp_variance[k] > 0.0:
-        _add_stamp_noise(chain, motion, measurements.stamp_variance[k], noise)
+    add_hidden_noise(measurements, k, belief, noise)
+    of_stamp = stamp_variance(measurements, k, belief)
+    if of_stamp > 0.0:
+        _add_stamp_noise(chain, motion, of_stamp, noise)
     assign_matrix(s, noise)
     add_uncertainty(belief.covariance, bodies, camera_columns, chain, s)
     for i in range(3):
@@ -108,11 +115,12 @@ def evaluate(
         innovation(measurements, k, measurements.alternative[k], predicted, other)
         if squared_distance(other, s) < squared_distance(difference, s):
             assign(difference, other)
-    batch.distance[row] = position_distance(difference, s)
-    batch.passed[row] = batch.distance[row] <= measurements.gate[k]
+    batch.passed[row] = position_distance(difference, s) <= measurements.gate[k]
+    expected = surprise_covariance(measurements.kind[k], predicted, s)
+    batch.distance[row] = position_distance(difference, expected)
     for i in range(2):
-        batch.whitened[row, i] = difference[i] / math.sqrt(s[i, i])
-    batch.unexplained[row] = is_unexplained(measurements.kind[k], difference, predicted)
+        batch.whitened[row, i] = difference[i] / math.sqrt(expected[i, i])
+    batch.cause[row] = cause_of(measurements.kind[k], difference, predicted)
     if measurements.has_heading[k]:
         before = noise[:, 2].copy()
         soften_heading(difference, s, noise)
@@ -130,7 +138,12 @@ def evaluate(
 
 @compiled
 def relative_motion(
-    measurements: MeasurementColumns, k: int, tracks: TrackArrays, pose: FloatArray, motion: FloatArray
+    measurements: MeasurementColumns,
+    k: int,
+    tracks: TrackArrays,
+    belief: BeliefArrays,
+    pose: FloatArray,
+    motion: FloatArray,
 ) -> None:
     """Write how fast xi_target - xi_observer (3,) of measurement k changes by both robots' driving [1/s].
 
@@ -140,11 +153,12 @@ def relative_motion(
         measurements: (m,).
         k: Which one.
         tracks: Odometry.
+        belief: Not changed.
         pose: (2, 3) of observer and target in `map`.
         motion: Written.
     """
     motion.fill(0.0)
-    if measurements.stamp_variance[k] == 0.0:
+    if stamp_variance(measurements, k, belief) == 0.0:
         return
     rate, sides = np.empty(3), (measurements.observer[k], measurements.target[k])
     for i in range(2):

@@ -9,14 +9,13 @@ from swarm_loc_estimator.core.filter.belief import BeliefArrays, correct, to_map
 from swarm_loc_estimator.core.filter.correlated_noise import record_pair
 from swarm_loc_estimator.core.filter.covariance import update_one
 from swarm_loc_estimator.core.filter.innovation import evaluate, new_batch, relative_motion
-from swarm_loc_estimator.core.filter.integrity import (
+from swarm_loc_estimator.core.filter.integrity.divergence import (
     LossLimits,
-    assess,
     confirm,
     count_gated,
-    is_set_aside,
     is_uncertain,
 )
+from swarm_loc_estimator.core.filter.integrity.surprises import assess, is_set_aside
 from swarm_loc_estimator.core.filter.measurement_model import SET_POSE, MeasurementColumns
 from swarm_loc_estimator.core.filter.prediction import predict
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated, TrackArrays, look_up, new_sample
@@ -74,10 +73,10 @@ def update_in_order(
                     return k, LOST, sides[i]
         if measurements.landmark[k] > 0:
             assign(pose[1], belief.landmark[measurements.landmark[k] - 1])
-        relative_motion(measurements, k, tracks, pose, batch.motion[0])
+        relative_motion(measurements, k, tracks, belief, pose, batch.motion[0])
         evaluate(measurements, k, belief, batch, 0)
-        look = (batch.distance[0], batch.whitened[0], batch.unexplained[0])
-        contradicted = assess(measurements, k, belief, limits, look)
+        look = (batch.distance[0], batch.whitened[0], batch.cause[0])
+        contradicted = assess(measurements, k, belief, limits.max_doubt, look)
         if contradicted >= 0:
             return k, CONTRADICTED, contradicted
         passed, nis[k] = batch.passed[0] and not is_set_aside(measurements, k, belief), batch.nis[0]

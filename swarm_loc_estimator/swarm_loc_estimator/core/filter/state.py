@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.core.description.estimated_parameters import PARAMETERS, ParameterTable
 from swarm_loc_estimator.core.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.core.filter.covariance import DenseFilter
-from swarm_loc_estimator.core.filter.integrity import new_integrity
+from swarm_loc_estimator.core.filter.integrity.hidden_noise import doubt_noise
+from swarm_loc_estimator.core.filter.integrity.surprises import new_integrity
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 from swarm_loc_estimator.numerics.se2 import error_covariance
@@ -204,6 +205,7 @@ class SwarmState:
         for first, survey in zip(table.survey_column, table.survey, strict=True):
             self.filter.add(first + np.arange(3), survey)
         self.integrity.doubt[:], self.integrity.evidence[:] = 0.0, 0.0
+        doubt_noise(self.integrity)
 
     def _use_table(self, table: ParameterTable) -> None:
         """Go on with more columns; the new ones are exact as yet."""

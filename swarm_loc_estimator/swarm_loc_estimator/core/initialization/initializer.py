@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from swarm_loc_estimator.core.description.estimated_parameters import CAMERA_SCALE, CAMERA_YAW
-from swarm_loc_estimator.core.filter.integrity import CONFIRMED
+from swarm_loc_estimator.core.filter.integrity.divergence import CONFIRMED
 from swarm_loc_estimator.core.filter.measurement_model import NOBODY, MeasurementArray
 from swarm_loc_estimator.core.filter.prediction import predict
 from swarm_loc_estimator.core.filter.state import SwarmState

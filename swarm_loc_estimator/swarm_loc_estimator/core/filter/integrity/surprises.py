@@ -12,32 +12,32 @@ pair is set aside. Every measurement that is no surprise counts for those whom i
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
+from swarm_loc_estimator.core.description.estimated_parameters import CAMERA_YAW
 from swarm_loc_estimator.core.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
+from swarm_loc_estimator.core.filter.integrity.hidden_noise import raise_hidden_noise
 from swarm_loc_estimator.core.filter.measurement_model import POLAR, MeasurementColumns
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.jit import compiled
 
-CONFIRMED = 2
-"""So many sightings that agree make a pose that was assumed one that is known."""
 _ASIDE, _MAX_EVIDENCE = 10.0, 15.0
 """Evidence from which on a pair is set aside, and the most that is counted."""
-DENIED = 7.5
+_DENIED = 7.5
 """From here on a robot is not told as tracked."""
-_DOUBTFUL = 2.0
-WELL_CONFIRMED = 12
-_HIDDEN_SIGMA = (0.03, 0.03, 0.06)
-"""What sensors may hide while a pose is doubtful, or few sightings have confirmed it [m], [m], [rad]."""
 
 _SOURCES = 16
 _SURPRISE = 6.0
 _MAX_WEIGHT = 3.0
 _UNEXPLAINED_WEIGHT = 2.0
+NOISE, DESCRIPTION, ELSEWHERE = 0, 1, 2
+"""What may explain an innovation: noise, a wrong description, or that a robot is somewhere else."""
+_NOISE_M = 0.05
 _EXPLAINED_M, _EXPLAINED_SHARE = 0.1, 0.35
-"""A wrong description explains errors of so much, and of that share of the distance or so many radians."""
+"""A wrong description explains errors of so much, and of that share of the distance."""
+_SMALL_M, _SMALL_SHARE = 0.003, 0.005
+"""Errors of so much, and of that share of the distance, are no surprise whatever the noise is."""
 _SINGLE_WEIGHT = 0.3
 """A surprise of an observer with no other one."""
 _MAX_SINGLE_DOUBT = 5.0
@@ -45,35 +45,19 @@ _MAX_SINGLE_DOUBT = 5.0
 _SHARED_WEIGHT = 0.2
 """The source's part where it cannot be told who is wrong."""
 _RELIEF = 0.25
-_RECENT_NS = 400_000_000
+RECENT_NS = 400_000_000
+_ONE_IMAGE_NS = 20_000_000
 _TOLD_NS = 3_000_000_000
 _AGAIN_NS = 90_000_000
 """What comes sooner after the last look of a pair is no new evidence."""
 _INDEPENDENT_NS = 100_000_000
 """The errors of looks that follow each other faster are the same."""
-_GATED_AGAIN_NS = 250_000_000
 _TREND_LOOKS = 8
 _TREND = 3.0
 """Squared sum of so many whitened innovations over the sum of their squares; 1 on average without a trend."""
 _MIN_TREND = 0.6
 """A mean of whitened innovations that matters: calibrated sensors have trends that their noise covers."""
 _TREND_WEIGHT = 4.0
-
-
-class LossLimits(NamedTuple):
-    """Beyond which a robot is given up.
-
-    Attributes:
-        position_sigma: Standard deviation of its position [m].
-        heading_sigma: Of its heading [rad].
-        gated_in_a_row: Gated measurements since the last accepted one.
-        max_doubt: How much may speak against a robot or landmark before it is contradicted.
-    """
-
-    position_sigma: float
-    heading_sigma: float
-    gated_in_a_row: int
-    max_doubt: float
 
 
 def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
@@ -91,9 +75,11 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
         looks=np.zeros((robots, _SOURCES), dtype=np.int64),
         doubt=np.zeros(robots + landmarks),
         confirmations=np.zeros(robots, dtype=np.int64),
+        confirmed_ns=np.full(robots, NEVER_NS // 2),
         gated_in_a_row=np.zeros(robots, dtype=np.int64),
         gated_source=np.full(robots, -1),
         gated_ns=np.full(robots, NEVER_NS // 2),
+        hidden_noise=np.zeros(robots),
     )
 
 
@@ -102,8 +88,8 @@ def assess(
     measurements: MeasurementColumns,
     k: int,
     belief: BeliefArrays,
-    limits: LossLimits,
-    look: tuple[float, FloatArray, bool],
+    max_doubt: float,
+    look: tuple[float, FloatArray, int],
 ) -> int:
     """Hold measurement k against what its observer and its source have shown lately.
 
@@ -111,9 +97,9 @@ def assess(
         measurements: (m,).
         k: Which one.
         belief: Its integrity is changed.
-        limits: Beyond which a robot or landmark is contradicted.
+        max_doubt: How much may speak against a robot or landmark before it is contradicted.
         look: Squared Mahalanobis distance of the position, the innovation over its standard deviation (2,),
-            and whether a wrong description could not explain it.
+            and what may explain it, see `cause_of`.
 
     Returns:
         The robot or landmark (as N + l) that is contradicted; -1: nobody.
@@ -122,13 +108,13 @@ def assess(
     if observer < 0 or source < 0:
         return -1
     state, now_ns = belief.integrity, measurements.stamp_ns[k]
-    distance, whitened, unexplained = look
+    distance, whitened, cause = look
     place = _find(measurements, k, belief)
     if place < 0:
         place = _new_place(state, observer, source)
     state.source_ns[observer, place] = max(now_ns, state.source_ns[observer, place])
     state.surprised[observer, place] = distance > _SURPRISE
-    state.unexplained[observer, place] = unexplained
+    state.unexplained[observer, place] = cause == ELSEWHERE
     if now_ns - state.counted_ns[observer, place] < _AGAIN_NS:
         return -1
     state.counted_ns[observer, place] = now_ns
@@ -139,12 +125,34 @@ def assess(
         if not state.trending[observer, place]:
             _relieve(state, observer, source, place)
         return -1
-    if not _blame(state, (observer, source), weight, unexplained, now_ns):
+    if not _blame(state, (observer, source), weight, cause == ELSEWHERE, now_ns):
         state.evidence[observer, place] = min(state.evidence[observer, place] + weight, _MAX_EVIDENCE)
     for node in (observer, source):
-        if state.doubt[node] >= limits.max_doubt:
-            return node
+        if state.doubt[node] >= max_doubt:
+            if cause != NOISE or not _is_estimated(belief, node) or not raise_hidden_noise(belief, observer):
+                return node
+            _forgive(state, node)
     return -1
+
+
+@compiled
+def _is_estimated(belief: BeliefArrays, node: int) -> bool:
+    """Whether what describes a robot or landmark is estimated already."""
+    robots, table = belief.tracked.size, belief.table
+    column = table.column[node, CAMERA_YAW] if node < robots else table.survey_column[node - robots]
+    estimated: bool = column >= 0
+    return estimated
+
+
+@compiled
+def _forgive(state: IntegrityArrays, node: int) -> None:
+    """Hold nothing against a robot or landmark any more, nor against its pairs."""
+    state.doubt[node] = 0.0
+    robots, places = state.source.shape
+    for robot in range(robots):
+        for place in range(places):
+            if node in (robot, state.source[robot, place]):
+                state.evidence[robot, place] = 0.0
 
 
 def pairs_set_aside(state: IntegrityArrays, now_ns: int) -> list[tuple[int, int]]:
@@ -162,21 +170,48 @@ def is_set_aside(measurements: MeasurementColumns, k: int, belief: BeliefArrays)
 
 
 @compiled
-def is_unexplained(kind: int, innovation: FloatArray, predicted: FloatArray) -> bool:
-    """Whether an innovation (3,) of a prediction (3,) is larger than a wrong description can explain."""
+def cause_of(kind: int, innovation: FloatArray, predicted: FloatArray) -> int:
+    """What may explain an innovation (3,) of a prediction (3,): NOISE, DESCRIPTION or ELSEWHERE."""
     if kind == POLAR:
-        far = abs(innovation[0]) > _EXPLAINED_M + _EXPLAINED_SHARE * predicted[0]
-        aside: bool = far or abs(innovation[1]) > _EXPLAINED_SHARE + _EXPLAINED_M / max(predicted[0], 1e-3)
-        return aside
-    reach = _EXPLAINED_M + _EXPLAINED_SHARE * math.hypot(predicted[0], predicted[1])
-    unexplained: bool = math.hypot(innovation[0], innovation[1]) > reach
-    return unexplained
+        distance, along, across = predicted[0], abs(innovation[0]), abs(innovation[1]) * predicted[0]
+    else:
+        distance = math.hypot(predicted[0], predicted[1])
+        along, across = abs(innovation[0]), abs(innovation[1])
+    error = math.hypot(along, across)
+    if error > _EXPLAINED_M + _EXPLAINED_SHARE * distance:
+        return ELSEWHERE
+    return DESCRIPTION if error > _NOISE_M else NOISE
 
 
-def is_elsewhere(state: IntegrityArrays, robot: int, now_ns: int) -> bool:
-    """Whether most of what a robot has just measured can only mean that it is somewhere else."""
-    recent = (state.source[robot] >= 0) & (now_ns - state.source_ns[robot] < _RECENT_NS)
-    return bool(2 * np.sum(state.unexplained[robot, recent]) > np.sum(recent))
+@compiled
+def surprise_covariance(kind: int, predicted: FloatArray, expected: FloatArray) -> FloatArray:
+    """The innovation's `expected` covariance (3, 3) with errors that are too small to matter."""
+    distance = predicted[0] if kind == POLAR else math.hypot(predicted[0], predicted[1])
+    small = (_SMALL_M + _SMALL_SHARE * abs(distance)) ** 2
+    covariance: FloatArray = expected.copy()
+    covariance[0, 0] += small
+    covariance[1, 1] += small / max(distance * distance, 1e-6) if kind == POLAR else small
+    return covariance
+
+
+@compiled
+def is_elsewhere(state: IntegrityArrays, robot: int, within_ns: int = RECENT_NS) -> bool:
+    """Whether most of what a robot has measured last can only mean that it is somewhere else."""
+    newest_ns = state.source_ns[robot].max()
+    elsewhere, count = 0, 0
+    for place in range(state.source.shape[1]):
+        recent = newest_ns - state.source_ns[robot, place] < within_ns
+        if recent and state.source[robot, place] >= 0 and state.evidence[robot, place] < _ASIDE:
+            count += 1
+            elsewhere += 1 if state.unexplained[robot, place] else 0
+    return 2 * elsewhere > count
+
+
+@compiled
+def is_contradicted(state: IntegrityArrays, robot: int) -> bool:
+    """Whether the newest measurements speak against a robot's pose: it is not told as tracked."""
+    contradicted: bool = state.doubt[robot] >= _DENIED or is_elsewhere(state, robot, _ONE_IMAGE_NS)
+    return contradicted
 
 
 @compiled
@@ -218,7 +253,7 @@ def _surprises(state: IntegrityArrays, node: int, now_ns: int) -> tuple[int, flo
         for place in range(places):
             source = state.source[robot, place]
             about = source >= 0 and node in (robot, source)
-            if about and now_ns - state.source_ns[robot, place] < _RECENT_NS:
+            if about and now_ns - state.source_ns[robot, place] < RECENT_NS:
                 count += 1
                 bad += 1 if state.surprised[robot, place] or state.trending[robot, place] else 0
     return bad, bad / max(1, count)
@@ -290,67 +325,3 @@ def noise_of_frequent_looks(measurements: MeasurementColumns, k: int, belief: Be
         return 1.0
     since_ns = measurements.stamp_ns[k] - belief.integrity.source_ns[observer, place]
     return _INDEPENDENT_NS / since_ns if 0 < since_ns < _INDEPENDENT_NS else 1.0
-
-
-@compiled
-def confirm(measurements: MeasurementColumns, k: int, belief: BeliefArrays, passed: bool) -> int:
-    """Hold measurement k against poses that were assumed; return a robot that is elsewhere, or -1."""
-    observer, target = measurements.observer[k], measurements.target[k]
-    known = belief.integrity.confirmations
-    knows_observer = observer < 0 or known[observer] >= CONFIRMED
-    knows_target = target < 0 or known[target] >= CONFIRMED
-    if passed:
-        if knows_observer and target >= 0:
-            known[target] += 1
-        if knows_target and observer >= 0:
-            known[observer] += 1
-        return -1
-    if knows_observer and knows_target:
-        return -1
-    elsewhere: int = target if knows_observer else observer
-    return elsewhere
-
-
-@compiled
-def is_uncertain(belief: BeliefArrays, robot: int, pose: FloatArray, limits: LossLimits) -> bool:
-    """Whether the standard deviation of the robot's position or heading at `pose` (3,) exceeds its limit."""
-    p = belief.covariance[3 * robot : 3 * robot + 3, 3 * robot : 3 * robot + 3]
-    x = p[0, 0] - 2.0 * pose[1] * p[0, 2] + pose[1] * pose[1] * p[2, 2]
-    y = p[1, 1] + 2.0 * pose[0] * p[1, 2] + pose[0] * pose[0] * p[2, 2]
-    uncertain: bool = max(x, y) > limits.position_sigma**2 or p[2, 2] > limits.heading_sigma**2
-    return uncertain
-
-
-@compiled
-def add_hidden_errors(state: IntegrityArrays, robot: int, covariance: FloatArray) -> None:
-    """Add to a pose's covariance (3, 3) what its sensors may hide."""
-    if state.doubt[robot] > _DOUBTFUL or state.confirmations[robot] < WELL_CONFIRMED:
-        for i in range(3):
-            covariance[i, i] += _HIDDEN_SIGMA[i] ** 2
-
-
-@compiled
-def count_gated(
-    measurements: MeasurementColumns, k: int, belief: BeliefArrays, passed: bool, limits: LossLimits
-) -> int:
-    """Count fixes and gated measurements; return a robot that has had too many gated in a row, or -1.
-
-    One source alone counts four times a second at most.
-    """
-    observer, target = measurements.observer[k], measurements.target[k]
-    lost, state = -1, belief.integrity
-    for side in (observer, target):
-        if side >= 0:
-            source = source_of(measurements, k, belief) if side == observer else observer
-            now_ns = measurements.stamp_ns[k]
-            if passed:
-                state.gated_in_a_row[side] = 0
-            elif state.gated_source[side] != source or now_ns - state.gated_ns[side] > _GATED_AGAIN_NS:
-                state.gated_in_a_row[side] += 1
-                state.gated_source[side], state.gated_ns[side] = source, now_ns
-            if state.gated_in_a_row[side] >= limits.gated_in_a_row:
-                lost = side
-    if passed and (observer < 0 or target < 0):
-        fixed = max(observer, target)
-        belief.last_fix_ns[fixed] = max(belief.last_fix_ns[fixed], measurements.stamp_ns[k])
-    return lost
