@@ -1,0 +1,1 @@
+"""Blinking lights in the events of an event camera."""

@@ -1,0 +1,1 @@
+"""Distances by a laser pointer beside an event camera."""

@@ -1,0 +1,153 @@
+"""Laser calibration: the hyperbola is found again, distances say how sure they are, files are checked."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarm_loc_vision.core.laser.calibration import LaserCalibration
+from swarm_loc_vision.core.laser.fit import (
+    CalibrationError,
+    Drive,
+    fit_hyperbola,
+    fit_logarithm,
+    logarithm_depth,
+)
+from swarm_loc_vision.core.laser.wall_drive import WallDrive
+from swarm_loc_vision.io.laser_file import LaserFileError, load_laser, save_laser
+
+DEPTHS = np.linspace(0.1, 2.5, 200)
+
+
+def drive(seed: int, *, sigma: float = 0.1, start_error: float = 0.003, outliers: float = 0.05) -> Drive:
+    """A robot that drives from 2.55 m to 0.15 m from the wall."""
+    rng = np.random.default_rng(seed)
+    driven = np.linspace(0.0, 2.4, 1200)
+    truth = LaserCalibration(63.0 + rng.random(), 6.0 + 0.5 * rng.random())
+    rows = np.array([truth.row(2.55 + start_error - 0.04 - one) for one in driven])
+    rows += sigma * rng.standard_normal(len(rows))
+    is_outlier = rng.random(len(rows)) < outliers
+    rows[is_outlier] = rng.uniform(64.0, 127.0, int(is_outlier.sum()))
+    return Drive(2.55, 0.005, driven, rows, 0.04)
+
+
+def rms_cm(depth_of: object, truth: LaserCalibration) -> float:
+    """Of depths read from the true rows over 10 to 250 cm."""
+    wrong = [depth_of(truth.row(depth)) - depth for depth in DEPTHS]  # type: ignore[operator]
+    return 100.0 * float(np.sqrt(np.mean(np.square(wrong))))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_the_hyperbola_is_found_to_a_centimetre_and_the_logarithm_is_not(seed: int) -> None:
+    one = drive(seed)
+    rng = np.random.default_rng(seed)
+    truth = LaserCalibration(63.0 + rng.random(), 6.0 + 0.5 * rng.random())
+    found = fit_hyperbola(one)
+    assert rms_cm(lambda row: found.focal_base / (row - found.row_at_infinity), truth) < 1.0
+    assert found.row_sigma == pytest.approx(0.1, rel=0.2)
+    a, b = fit_logarithm(drive(seed, outliers=0.0))
+    assert rms_cm(lambda row: logarithm_depth(a, b, row), truth) > 20.0
+
+
+@given(depth=st.floats(0.12, 2.4), sigma=st.floats(0.1, 0.5))
+def test_a_distance_and_its_sigma(depth: float, sigma: float) -> None:
+    """Sigma is that of the row, carried on by the slope of the hyperbola: d^2 sigma_px / (f b)."""
+    calibration = LaserCalibration()
+    found = calibration.distance(calibration.row(depth), sigma**2)
+    assert found.distance == pytest.approx(depth + 0.04)
+    step = 1e-6
+    slope = (calibration.row(depth + step) - calibration.row(depth - step)) / (2 * step)
+    assert found.sigma == pytest.approx(sigma / abs(slope), rel=1e-6)
+
+
+def test_beyond_the_calibration_there_is_no_distance() -> None:
+    calibration = LaserCalibration()
+    for row in (calibration.row(0.09), calibration.row(2.6), 60.0, math.nan):
+        assert math.isnan(calibration.distance(row, 0.01).distance)
+
+
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"driven": np.zeros(10), "rows": np.zeros(10)}, "seen 10 times"),
+        ({"driven": np.linspace(0, 0.2, 100), "rows": np.full(100, 70.0)}, "too short"),
+        ({"driven": np.linspace(0, 3.0, 100), "rows": np.full(100, 70.0)}, "start_distance is too small"),
+        ({"rows": np.random.default_rng(1).uniform(64, 127, 1200)}, "no hyperbola"),
+    ],
+)
+def test_drives_that_calibrate_nothing_say_why(changed: dict[str, object], sentence: str) -> None:
+    one = drive(1)
+    values = {name: changed.get(name, getattr(one, name)) for name in one.__dataclass_fields__}
+    with pytest.raises(CalibrationError, match=sentence):
+        fit_hyperbola(Drive(**values))
+
+
+def test_rows_are_taken_at_the_way_driven_at_their_stamps() -> None:
+    collected = WallDrive(2.0, 0.2)
+    collected.take_row(5, 99.0)
+    for k in range(100):
+        collected.take_odometry(1000 * k, 1.0, 2.0 + 0.02 * k, math.pi / 2)
+        collected.take_row(1000 * k + 500, 64.0 + k)
+    collected.take_row(200_000, math.nan)
+    assert collected.is_done
+    one = collected.drive(0.005, 0.04)
+    np.testing.assert_allclose(one.driven[1:], 0.02 * (one.rows[1:] - 64.0 + 0.5), atol=1e-9)
+    assert collected.count == 100
+
+
+def test_a_robot_that_turns_is_stopped() -> None:
+    collected = WallDrive(2.0, 0.2)
+    collected.take_odometry(0, 0.0, 0.0, 3.1)
+    collected.take_odometry(1, 0.1, 0.0, -3.12)
+    with pytest.raises(CalibrationError, match="turned"):
+        collected.take_odometry(2, 0.2, 0.0, -2.9)
+
+
+def test_a_file_holds_what_was_saved(tmp_path: Path) -> None:
+    calibration = LaserCalibration(63.21, 6.123456, 0.087, 0.041, 0.12, 2.61)
+    save_laser(tmp_path / "laser.yaml", calibration)
+    assert load_laser(tmp_path / "laser.yaml") == calibration
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (None, "laser.yaml"),
+        ("focal_base: 6.3\n", "exactly the keys"),
+        ("a list", "exactly the keys"),
+        ("focal_base: [", "laser.yaml"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_named(tmp_path: Path, content: str | None, sentence: str) -> None:
+    path = tmp_path / "laser.yaml"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(LaserFileError, match=sentence):
+        load_laser(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "sentence"),
+    [
+        ("focal_base", "-1", "focal_base = -1 must be a number in"),
+        ("row_sigma", "abc", "row_sigma = 'abc' must be a number"),
+        ("min_depth", "9.0", "min_depth = 9.0 must be below"),
+    ],
+)
+def test_a_number_out_of_its_range_is_named(tmp_path: Path, key: str, value: str, sentence: str) -> None:
+    path = tmp_path / "laser.yaml"
+    save_laser(path, LaserCalibration())
+    lines = [f"{key}: {value}" if line.startswith(key) else line for line in path.read_text().splitlines()]
+    path.write_text("\n".join(lines))
+    with pytest.raises(LaserFileError, match=sentence):
+        load_laser(path)
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(LaserFileError, match="cannot be written"):
+        save_laser(tmp_path / "none" / "laser.yaml", LaserCalibration())
