@@ -20,7 +20,8 @@ from swarm_loc_estimator.io.bags.writer import BagWriter
 from swarm_loc_estimator.io.messages.typestore import DETECTIONS, typestore
 from swarm_loc_vision.core.imaging.camera import CameraError
 from swarm_loc_vision.core.imaging.gray import ImageError
-from swarm_loc_vision.io.camera_detector import TRANSPORTS, CameraDetector, Transport
+from swarm_loc_vision.io.camera_detector import CameraDetector
+from swarm_loc_vision.io.transports import TRANSPORTS, Transport
 
 CreateCamera = Callable[[str, Transport], CameraDetector]
 Progress = Callable[[float, str], None]

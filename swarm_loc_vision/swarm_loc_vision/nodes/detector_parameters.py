@@ -19,7 +19,8 @@ from swarm_loc_vision.core.detection.selection import SelectionError, parse_ids,
 from swarm_loc_vision.core.detection.settings import DetectorSettings
 from swarm_loc_vision.core.imaging.camera import Camera
 from swarm_loc_vision.core.pose.bodies import robot_body, up_of
-from swarm_loc_vision.io.camera_detector import TRANSPORTS, CreateDetector
+from swarm_loc_vision.io.camera_detector import CreateDetector
+from swarm_loc_vision.io.transports import TRANSPORTS
 
 
 @dataclass(frozen=True)

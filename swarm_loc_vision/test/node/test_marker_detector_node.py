@@ -18,7 +18,7 @@ from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
 from swarm_loc_estimator.parameters.table import ParameterError
 from swarm_loc_msgs.msg import MarkerDetection, MarkerDetectionArray
 from swarm_loc_vision.core.decoding.families import family_named
-from swarm_loc_vision.nodes import marker_detector_node
+from swarm_loc_vision.nodes import camera_node
 from swarm_loc_vision.nodes.marker_detector_node import MarkerDetectorNode
 
 FAMILY = "aruco_mip_36h12"
@@ -113,7 +113,7 @@ class Camera:
 @pytest.fixture(autouse=True)
 def _frequent_diagnostics(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the node say at once what the tests wait for."""
-    monkeypatch.setattr(marker_detector_node, "_DIAGNOSTICS_PERIOD_S", 0.05)
+    monkeypatch.setattr(camera_node, "_DIAGNOSTICS_PERIOD_S", 0.05)
 
 
 def test_images_become_detections_with_their_stamp_and_frame(ros: Ros) -> None:
@@ -148,7 +148,7 @@ def test_cameras_that_publish_in_any_way_are_heard(
 
 
 def test_a_camera_that_falls_silent_is_told_each_time(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(marker_detector_node, "_PATIENCE_S", 0.3)
+    monkeypatch.setattr(camera_node, "_PATIENCE_S", 0.3)
     silence = "nothing has come on /image_raw for "
     logged: list[Log] = ros.listen(Log, "/rosout")
     camera = Camera(ros)

@@ -1,0 +1,291 @@
+"""Overhead pictures drawn by plain image operations, not by the simulator's renderer.
+
+A floor plan is painted with discs, texture, lines and things that are no robots; light and shadows are laid
+over it; a camera of any tilt and lens looks at it, pixel by pixel as means of several samples.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_vision.core.aerial.ground_camera import GroundCamera
+from swarm_loc_vision.core.aerial.pattern import MARGIN, inside_mark
+from swarm_loc_vision.core.imaging.camera import Camera
+
+Plain = NDArray[np.float32]
+
+DIAMETER = 0.07
+SIZE = (640, 480)
+_SUPER = 3
+_PLAN_FINE = 2.0
+_FAR = 60
+"""Diameters to either side of map's origin up to which the floor is painted."""
+_POSE_SIGMA = 1e-6
+_WHITE = 235.0
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a picture is like.
+
+    Attributes:
+        diameter_px: Of robots in the middle of the picture.
+        robots: How many.
+        kind: `pattern`, or plain discs: `dark`, `bright`; `led`, a bright spot with soft rims.
+        tilt: Of the camera [rad].
+        barrel: Radial distortion k1 of the lens.
+        field_of_view: Across [rad].
+        gradient: Brightness at the dark end of the floor over that at the bright one.
+        shadow: Share of the light that shadows take.
+        touching: Share of the robots that touch another one.
+        noise: Of the sensor, one standard deviation [counts].
+        floor: Brightness of the floor, 0 to 1.
+        texture: Of the floor, one standard deviation of its brightness.
+        clutter: Things on the floor that are no robots.
+        blur_px: Of the optics, one standard deviation.
+    """
+
+    diameter_px: float = 24.0
+    robots: int = 12
+    kind: str = "pattern"
+    tilt: float = 0.0
+    barrel: float = 0.0
+    field_of_view: float = math.radians(60.0)
+    gradient: float = 1.0
+    shadow: float = 0.0
+    touching: float = 0.0
+    noise: float = 2.0
+    floor: float = 0.55
+    texture: float = 0.02
+    clutter: int = 6
+    blur_px: float = 0.6
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture with what is true of it.
+
+    Attributes:
+        gray: (height, width).
+        ground: The camera.
+        poses: (N, 3) of the robots in map.
+        has_heading: Whether their pattern shows a heading.
+    """
+
+    gray: NDArray[np.uint8]
+    ground: GroundCamera
+    poses: FloatArray
+    has_heading: bool
+
+
+def overhead_camera(look: Look, rng: np.random.Generator) -> GroundCamera:
+    """A camera that sees robots as large as it should, tilted to any side."""
+    width, height = SIZE
+    focal = 0.5 * width / math.tan(0.5 * look.field_of_view)
+    lens = (look.barrel, 0.0, 0.0, 0.0, 0.0)
+    camera = Camera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), lens)
+    distance = focal * DIAMETER / look.diameter_px
+    turn = rng.uniform(-math.pi, math.pi)
+    down = np.diag([1.0, -1.0, -1.0])
+    spin = cv2.Rodrigues(np.array([0.0, 0.0, rng.uniform(-math.pi, math.pi)]))[0]
+    tilt = cv2.Rodrigues(look.tilt * np.array([math.cos(turn), math.sin(turn), 0.0]))[0]
+    rotation = tilt @ down @ spin
+    shift = np.array([0.0, 0.0, distance])
+    pose = np.concatenate([cv2.Rodrigues(rotation)[0].ravel(), shift])
+    return GroundCamera(camera, pose, _POSE_SIGMA**2 * np.eye(6))
+
+
+def draw_picture(look: Look, seed: int) -> Picture:
+    """A picture, the same for the same seed."""
+    rng = np.random.default_rng(seed)
+    ground = overhead_camera(look, rng)
+    view = _raw_places(ground)
+    fine = DIAMETER / (_PLAN_FINE * look.diameter_px)
+    poses = _poses(look, ground, rng)
+    low, high = np.nanmin(view, axis=(0, 1)), np.nanmax(view, axis=(0, 1))
+    low, high = np.maximum(low, -_FAR * DIAMETER), np.minimum(high, _FAR * DIAMETER)
+    columns, rows = (int(n) for n in np.ceil((high - low) / fine))
+    plan = _Plan(low, fine, (rows, columns), rng)
+    plan.paint_floor(look)
+    plan.scatter(look, poses)
+    for pose in poses:
+        plan.put_robot(look, pose)
+    plan.light(look, poses)
+    cells = ((view - low) / fine - 0.5).astype(np.float32)
+    light = cv2.remap(plan.image, cells[..., 0], cells[..., 1], cv2.INTER_LINEAR, borderValue=0.3)
+    light = cv2.resize(light, SIZE, interpolation=cv2.INTER_AREA)
+    light = cv2.GaussianBlur(light, (0, 0), look.blur_px)
+    counts = _WHITE * light + look.noise * rng.standard_normal(light.shape)
+    gray = np.clip(np.rint(counts), 0, 255).astype(np.uint8)
+    return Picture(gray, ground, poses, look.kind == "pattern")
+
+
+def control_pixels(
+    ground: GroundCamera, count: int, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Places (count, 3) on the floor all over the picture, and their exact pixels (count, 2)."""
+    width, height = ground.camera.width, ground.camera.height
+    pixels = rng.uniform([0.05 * width, 0.05 * height], [0.95 * width, 0.95 * height], (50 * count, 2))
+    flat = ground.places(pixels, 0.0)
+    seen = np.isfinite(flat).all(axis=1)
+    places = np.concatenate([flat[seen][:count], np.zeros((count, 1))], axis=1)
+    return places, ground.pixels(places)
+
+
+def plainer(look: Look) -> Look:
+    """The same without anything on the floor but robots."""
+    return replace(look, clutter=0, texture=0.0)
+
+
+def _raw_places(ground: GroundCamera) -> FloatArray:
+    """(3 height, 3 width, 2) places that the parts of pixels show."""
+    width, height = SIZE
+    across = (np.arange(_SUPER * width) + 0.5) / _SUPER - 0.5
+    down = (np.arange(_SUPER * height) + 0.5) / _SUPER - 0.5
+    return ground.places(np.stack(np.meshgrid(across, down), axis=-1), 0.0)
+
+
+def _poses(look: Look, ground: GroundCamera, rng: np.random.Generator) -> FloatArray:
+    """Poses (N, 3) in view, some of them touching another, none over another."""
+    width, height = ground.camera.width, ground.camera.height
+    poses: list[list[float]] = []
+    touching = round(look.touching * look.robots)
+    for _ in range(200 * look.robots):
+        if len(poses) == look.robots:
+            break
+        if poses and len(poses) > look.robots - 1 - touching:
+            near = poses[rng.integers(len(poses))]
+            angle = rng.uniform(-math.pi, math.pi)
+            place = np.array(near[:2]) + DIAMETER * np.array([math.cos(angle), math.sin(angle)])
+        else:
+            pixel = np.array([rng.uniform(0.0, width), rng.uniform(0.0, height)])
+            place = ground.places(pixel, 0.0)
+        if np.isfinite(place).all() and _fits(place, poses, ground, look):
+            poses.append([*place.tolist(), rng.uniform(-math.pi, math.pi)])
+    return np.array(poses).reshape(-1, 3)
+
+
+def _fits(place: FloatArray, poses: list[list[float]], ground: GroundCamera, look: Look) -> bool:
+    """Whether a robot may stand there: wholly in view, large enough, not in another one."""
+    if any(math.dist(place, pose[:2]) < 0.999 * DIAMETER for pose in poses):
+        return False
+    angles = np.arange(8) * math.pi / 4.0
+    rim = place + 0.75 * DIAMETER * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    pixels = ground.pixels(np.concatenate([rim, np.zeros((8, 1))], axis=1))
+    inside = (pixels > 1.0) & (pixels < np.array(SIZE) - 2.0)
+    seen = float(ground.scale(np.append(place, 0.0))) * DIAMETER
+    return bool(inside.all()) and seen > 0.6 * look.diameter_px
+
+
+class _Plan:
+    """A floor plan that is painted, brightness 0 to 1."""
+
+    def __init__(
+        self, low: FloatArray, step: float, shape: tuple[int, int], rng: np.random.Generator
+    ) -> None:
+        self._low, self._step, self._rng = low, step, rng
+        self.image: Plain = np.zeros(shape, np.float32)
+
+    def paint_floor(self, look: Look) -> None:
+        """Texture of several sizes, and joints between boards."""
+        rows, columns = self.image.shape
+        floor = np.zeros((rows, columns), np.float32)
+        for cell in (3, 9, 30, 100):
+            size = columns // cell + 2, rows // cell + 2
+            rough = self._rng.standard_normal(size[::-1]).astype(np.float32)
+            floor += cv2.resize(rough, (columns, rows), interpolation=cv2.INTER_CUBIC)
+        floor *= look.texture / max(float(floor.std()), 1e-9)
+        self.image[:] = look.floor + floor
+        if look.texture > 0.0:
+            pitch = round(2.7 * DIAMETER / self._step)
+            for line in range(int(self._rng.integers(pitch)), columns, pitch):
+                cv2.line(self.image, (line, 0), (line + rows // 9, rows), look.floor * 0.8, 2, cv2.LINE_AA)
+
+    def scatter(self, look: Look, poses: FloatArray) -> None:
+        """Lay down sheets, bars and small and large discs, away from robots."""
+        rows, columns = self.image.shape
+        for number in range(look.clutter):
+            place = self._rng.uniform([0, 0], [columns, rows]) * self._step + self._low
+            if len(poses) and np.linalg.norm(poses[:, :2] - place, axis=1).min() < 2.5 * DIAMETER:
+                continue
+            shade = float(self._rng.choice([0.1, 0.9]))
+            x, y = ((place - self._low) / self._step).tolist()
+            size = DIAMETER / self._step * self._rng.uniform(0.6, 2.5)
+            angle = float(self._rng.uniform(0.0, 180.0))
+            if number % 3 == 2:
+                radius = size * float(self._rng.choice([0.18, 1.0]))
+                cv2.circle(self.image, (round(x), round(y)), round(radius), shade, -1, cv2.LINE_AA)
+            else:
+                across = size * (1.0 if number % 3 else 0.15)
+                box = cv2.boxPoints(((x, y), (size, across), angle))
+                cv2.fillConvexPoly(self.image, np.rint(box).astype(np.int32), shade, cv2.LINE_AA)
+
+    def put_robot(self, look: Look, pose: FloatArray) -> None:
+        """One disc, in a window around it."""
+        centre = (pose[:2] - self._low) / self._step - 0.5
+        radius = 0.5 * DIAMETER / self._step
+        reach = math.ceil(1.6 * radius)
+        left, top = (math.floor(c) - reach for c in centre)
+        right, bottom = left + 2 * reach + 2, top + 2 * reach + 2
+        rows, columns = self.image.shape
+        left, top, right, bottom = max(left, 0), max(top, 0), min(right, columns), min(bottom, rows)
+        grid = np.stack(np.meshgrid(np.arange(left, right), np.arange(top, bottom)), axis=-1)
+        offset = (grid - centre) / radius
+        distance = np.linalg.norm(offset, axis=-1)
+        window = self.image[top:bottom, left:right]
+
+        def lay(depth: FloatArray, shade: float) -> None:
+            share = np.clip(0.5 + depth * radius, 0.0, 1.0).astype(np.float32)
+            window[:] = window * (1.0 - share) + shade * share
+
+        if look.kind == "led":
+            window += (0.95 * np.exp(-0.5 * (distance / 0.85) ** 8) * (1.0 - window)).astype(np.float32)
+        elif look.kind == "bright":
+            lay(1.0 - distance, 0.92)
+        elif look.kind == "dark":
+            lay(1.0 - distance, 0.12)
+        else:
+            cos, sin = math.cos(pose[2]), math.sin(pose[2])
+            turned = offset @ np.array([[cos, -sin], [sin, cos]])
+            if look.floor < 0.3:
+                lay(1.0 + MARGIN - distance, 0.9)
+            lay(1.0 - distance, 0.06)
+            lay(inside_mark(turned), 0.9)
+
+    def light(self, look: Look, poses: FloatArray) -> None:
+        """Uneven light over all, shadows beside robots and of things that are not seen."""
+        rows, columns = self.image.shape
+        if look.gradient < 1.0:
+            angle = self._rng.uniform(-math.pi, math.pi)
+            x, y = np.meshgrid(np.linspace(-1, 1, columns), np.linspace(-1, 1, rows))
+            share = 0.5 + 0.5 * (math.cos(angle) * x + math.sin(angle) * y) / 1.3
+            self.image *= (look.gradient + (1.0 - look.gradient) * share).astype(np.float32)
+        if look.shadow <= 0.0:
+            return
+        shade = np.zeros((rows, columns), np.float32)
+        angle = self._rng.uniform(-math.pi, math.pi)
+        size = DIAMETER / self._step
+        towards = np.array([math.cos(angle), math.sin(angle)])
+        for pose in poses:
+            base = (pose[:2] - self._low) / self._step
+            for share in np.linspace(0.2, 1.1, 10):
+                centre = np.rint(base + share * size * towards).astype(int)
+                cv2.circle(shade, centre.tolist(), round(0.5 * size), 1.0, -1, cv2.LINE_AA)
+        for _ in range(3):
+            corners = self._rng.uniform([0, 0], [columns, rows]) + 4.0 * size * self._rng.standard_normal(
+                (4, 2)
+            )
+            hull = cv2.convexHull(corners.astype(np.float32)).astype(np.int32)
+            cv2.fillConvexPoly(shade, hull, 1.0, cv2.LINE_AA)
+        soft = cv2.GaussianBlur(shade, (0, 0), 0.08 * size)
+        tops = np.zeros((rows, columns), np.float32)
+        for pose in poses:
+            centre = np.rint((pose[:2] - self._low) / self._step).astype(int)
+            cv2.circle(tops, centre.tolist(), round(0.5 * size), 1.0, -1, cv2.LINE_AA)
+        self.image *= 1.0 - look.shadow * soft * (1.0 - tops)

@@ -1,0 +1,99 @@
+"""Ground control of one camera: the pose by given points and floor markers, kept while it holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from swarm_loc_vision.core.aerial.control_points import (
+    NO_POINTS,
+    ControlPointError,
+    ControlPoints,
+    Noise,
+    PoseFit,
+    misfit,
+    solve_pose,
+)
+from swarm_loc_vision.core.aerial.floor_markers import FloorMarker, FloorMarkers
+from swarm_loc_vision.core.aerial.ground_camera import GroundCamera
+from swarm_loc_vision.core.aerial.rectification import Gray
+from swarm_loc_vision.core.decoding.families import Family, family_named
+from swarm_loc_vision.core.imaging.camera import Camera
+
+NO_GROUND = "there are neither control points nor floor markers, without which nothing is published."
+_SETTLING, _LATER_EVERY = 10, 10
+"""Markers are looked for in so many first images, then in every so many-th: is the camera where it was?"""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What is known of the floor.
+
+    Attributes:
+        points: Places whose pixels are known.
+        markers: Fiducials on the floor.
+        family: Their kind.
+        camera: Intrinsics; None: they come with the images.
+    """
+
+    points: ControlPoints = NO_POINTS
+    markers: tuple[FloorMarker, ...] = ()
+    family: Family = field(default_factory=lambda: family_named("aruco_mip_36h12"))
+    camera: Camera | None = None
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing to tell a camera's pose by."""
+        return not self.points.names and not self.markers
+
+
+class GroundControl:
+    """Keeps the pose of one camera.
+
+    Args:
+        ground: What is known of the floor.
+        camera: What takes the images.
+        noise: Of the control points.
+        limit: Residual beyond which they are refused, in their standard deviations.
+
+    Attributes:
+        fit: The pose; None: not known.
+        trouble: Why it is not known, a sentence; empty: it is.
+        moves: How often the camera was found to have moved.
+    """
+
+    def __init__(self, ground: Ground, camera: Camera, noise: Noise, limit: float) -> None:
+        self._ground, self._camera, self._noise, self._limit = ground, camera, noise, limit
+        self._markers = FloorMarkers(ground.markers, ground.family, camera) if ground.markers else None
+        self._images = self.moves = 0
+        self.fit: PoseFit | None = None
+        self.trouble = NO_GROUND
+        if not ground.is_empty:
+            self._solve(ground.points)
+
+    def look(self, gray: Gray) -> GroundCamera | None:
+        """The camera that took an image (height, width), with its pose; None: see `trouble`."""
+        if self._markers is not None and (
+            self.fit is None or self._images < _SETTLING or self._images % _LATER_EVERY == 0
+        ):
+            self._solve(self._ground.points.joined(self._markers.look(gray)))
+            if self.fit is None and self._images >= _SETTLING:
+                self._begin_anew(self._markers, gray)
+        self._images += 1
+        return self.fit.ground if self.fit else None
+
+    def _begin_anew(self, markers: FloorMarkers, gray: Gray) -> None:
+        """By what this image shows alone: what others showed contradicts it, or they showed too little."""
+        markers.forget()
+        self._solve(self._ground.points.joined(markers.look(gray)))
+        if self.fit is not None:
+            self._images = 0
+            self.moves += 1
+
+    def _solve(self, points: ControlPoints) -> None:
+        """The pose by points."""
+        try:
+            fit = solve_pose(self._camera, points, self._noise)
+            self.trouble = misfit(fit, points, self._noise, self._limit)
+        except ControlPointError as error:
+            fit, self.trouble = None, str(error)
+        self.fit = None if self.trouble else fit
