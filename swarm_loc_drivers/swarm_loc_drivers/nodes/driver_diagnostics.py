@@ -18,6 +18,8 @@ from swarm_loc_drivers.core.robot_driver import RobotDriver
 
 _PERIOD_S = 1.0
 _THROTTLE_S, _WRONG_THROTTLE_S = 10.0, 60.0
+_PATIENCE_S = 5.0
+"""A robot that is being switched on, or a simulation that starts, does not answer at once."""
 
 
 class DriverDiagnostics:
@@ -45,7 +47,7 @@ class DriverDiagnostics:
         self._name, self._address, self._rates = name, address, tuple(rates)
         self._wrong = wrong
         self._reported: Counter[str] = Counter()
-        self._reported_s = time.monotonic()
+        self._began_s = self._reported_s = time.monotonic()
         self._told_trouble = driver.trouble
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # runs also while simulated time stands still
@@ -74,7 +76,9 @@ class DriverDiagnostics:
 
     def _log(self, trouble: str) -> None:
         """Say what has changed."""
-        if trouble == self._told_trouble:
+        waited = time.monotonic() > self._began_s + _PATIENCE_S
+        is_starting = not self._driver.counts["connections"] and not waited
+        if trouble == self._told_trouble or is_starting:
             return
         self._told_trouble = trouble
         if trouble:
