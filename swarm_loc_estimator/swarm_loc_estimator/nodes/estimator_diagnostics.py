@@ -15,6 +15,7 @@ from swarm_loc_estimator.core.estimation.contradictions import Contradiction
 from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate
 from swarm_loc_estimator.core.estimation.fusion import Verdict
 from swarm_loc_estimator.core.filter.measurement_model import MeasurementArray
+from swarm_loc_estimator.core.identification.memory import Identities
 from swarm_loc_estimator.io.inputs.ingest import Ingest, InputStatistics
 from swarm_loc_estimator.io.inputs.topics import InputKind, InputTopic
 from swarm_loc_estimator.numerics.arrays import FloatArray
@@ -75,6 +76,16 @@ def add_contradictions(reports: Sequence[Report], contradictions: Sequence[Contr
         report.warning = True
 
 
+def add_identities(reports: Sequence[Report], identities: Identities | None) -> None:
+    """Tell in the robots' reports (the first ones) which detection of the newest aerial image they are."""
+    if identities is None:
+        return
+    columns = zip(identities.place.tolist(), identities.probability.tolist(), strict=True)
+    for report, (place, probability) in zip(reports, columns, strict=False):
+        report.values["aerial detection"] = str(place) if place >= 0 else "not known"
+        report.values["aerial probability [1]"] = _figure(probability)
+
+
 class Graph(Protocol):
     """What the ROS graph knows of publishers, see `ros/topic_graph.py`."""
 
@@ -109,8 +120,10 @@ class Diagnostics:
         self._graph = graph
         self._sole = sole
         self._inputs_of: list[list[tuple[int, InputTopic]]] = [[] for _ in swarm.robots]
+        self._of_swarm: list[tuple[int, InputTopic]] = []
         for handle, topic in enumerate(ingest.topics):
-            self._inputs_of[topic.robot].append((handle, topic))
+            inputs = self._inputs_of[topic.robot] if topic.kind.of_each else self._of_swarm
+            inputs.append((handle, topic))
         self._was_located = np.zeros(len(swarm.robots), dtype=bool)
         self._received = [0] * len(ingest.topics)
         self._reported_ns: int | None = None
@@ -141,7 +154,7 @@ class Diagnostics:
         elapsed_s = (now_ns - self._reported_ns) * 1e-9 if self._reported_ns is not None else 0.0
         self._reported_ns = now_ns
         used, nis = _used_per_robot(recent, len(self._swarm.robots))
-        common = self._rivals_on(self._sole)
+        common = self._rivals_on([*self._sole, *(topic.name for _, topic in self._of_swarm)])
         self.rivals = common.copy()
         reports = []
         for index, robot in enumerate(self._swarm.robots):
@@ -152,6 +165,10 @@ class Diagnostics:
         self._was_located |= estimate.status != Status.WAITING
         troubles = [*common, *filter(None, [self.missing_text()])]
         values = {f"dropped: {reason}": str(count) for reason, count in drops.items()}
+        for handle, topic in self._of_swarm:
+            troubles += self._input_troubles(handle, topic, None, now_ns)
+            if self._ingest.statistics[handle].received:
+                values.update(self._input_values(handle, topic, now_ns, elapsed_s))
         summary = {int(status): int(np.sum(estimate.status == status)) for status in Status}
         words = ", ".join(f"{summary[status]} {status.name.lower()}" for status in Status if summary[status])
         reports.append(Report("estimator", "; ".join(troubles) or words, bool(troubles), values))
@@ -188,7 +205,7 @@ class Diagnostics:
         values["sigma theta [rad]"] = _figure(sigma[2])
         return Report(robot.name, "; ".join(troubles) or status.name.lower(), bool(troubles), values)
 
-    def _input_troubles(self, handle: int, topic: InputTopic, robot: Robot, now_ns: int) -> list[str]:
+    def _input_troubles(self, handle: int, topic: InputTopic, robot: Robot | None, now_ns: int) -> list[str]:
         """What is wrong with an input, in words."""
         statistics = self._ingest.statistics[handle]
         if not statistics.received:
@@ -199,9 +216,10 @@ class Diagnostics:
         silent_s = (now_ns - statistics.last_arrival_ns) * 1e-9
         if silent_s > _patience_s(topic, robot, statistics):
             troubles.append(f"{topic.name} is silent for {silent_s:.1f} s")
-        map_frame, odom_frame = self._ingest.map_frame, f"{robot.name}/{self._odom_frame}"
-        if topic.kind is InputKind.FIXES and found != map_frame:
+        map_frame = self._ingest.map_frame
+        if topic.kind in {InputKind.FIXES, InputKind.AERIAL} and found != map_frame:
             troubles.append(f"{topic.name} is in frame '{found}' but must be in '{map_frame}'")
+        odom_frame = f"{robot.name}/{self._odom_frame}" if robot is not None else ""
         if topic.kind is InputKind.ODOMETRY and found != odom_frame:
             troubles.append(
                 f"{topic.name} is in frame '{found}' but transforms are published for '{odom_frame}'"
@@ -269,11 +287,11 @@ def merged(reports: Sequence[Report], name: str) -> Report:
     return Report(name, "; ".join(warnings or [report.message for report in reports]), bool(warnings), values)
 
 
-def _patience_s(topic: InputTopic, robot: Robot, statistics: InputStatistics) -> float:
+def _patience_s(topic: InputTopic, robot: Robot | None, statistics: InputStatistics) -> float:
     """How long an input may be silent; detectors and infrared boards have periods of their own."""
-    if topic.kind is InputKind.ODOMETRY:
+    if topic.kind is InputKind.ODOMETRY and robot is not None:
         return robot.odometry.timeout_s
-    if not topic.expected:
+    if topic.kind.of_each and not topic.expected:
         return math.inf
     return max(_PATIENCE_S, _PATIENCE_PERIODS * 1e-9 * (statistics.mean_period_ns or 0.0))
 

@@ -13,7 +13,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from swarm_loc_estimator.io.inputs.topics import InputKind, InputTopic
-from swarm_loc_msgs.msg import BrightnessMatrix, MarkerDetectionArray
+from swarm_loc_msgs.msg import AnonymousDetectionArray, BrightnessMatrix, MarkerDetectionArray
 
 DEPTH = 1000
 """So many messages of a topic wait for a tick at most: a busy moment as long as the horizon."""
@@ -26,6 +26,7 @@ _MESSAGE_CLASSES = {
     InputKind.DETECTIONS: MarkerDetectionArray,
     InputKind.BRIGHTNESS: BrightnessMatrix,
     InputKind.FIXES: PoseWithCovarianceStamped,
+    InputKind.AERIAL: AnonymousDetectionArray,
 }
 _LOST = {ReliabilityPolicy.RELIABLE: "overload", ReliabilityPolicy.BEST_EFFORT: "lost"}
 """Why messages are missing between two others of a publisher."""

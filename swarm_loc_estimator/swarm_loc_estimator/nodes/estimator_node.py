@@ -3,8 +3,9 @@
     ./run swarm_loc_estimator estimator_node --ros-args -p swarm_file:=swarm.yaml
 
 It subscribes to `<robot>/odom`, `<robot>/detections`, `<robot>/brightness`, `<robot>/fix` and
-`<robot>/initialpose` of the robots in the swarm description. It publishes `swarm/poses`, `<robot>/pose`,
-`/tf` (map to `<robot>/odom`, which no one else may publish), `/diagnostics`.
+`<robot>/initialpose` of the robots in the swarm description, and to `aerial/detections`. It publishes
+`swarm/poses`, `<robot>/pose`, `aerial/identities`, `/diagnostics`, and `/tf` (map to `<robot>/odom`, which no one
+else may publish).
 Services: `~/reset`, `~/set_robot_pose`. Parameters: see `doc/estimator_node.md`.
 """
 
@@ -37,6 +38,7 @@ from swarm_loc_estimator.nodes.estimator_diagnostics import (
     Report,
     TickCost,
     add_contradictions,
+    add_identities,
     load_report,
     merged,
     overload_report,
@@ -57,6 +59,8 @@ _DIAGNOSTICS_PERIOD_S = 1.0
 _THROTTLE_S = 30.0
 _ORDINARY_DROPS = frozenset(
     {
+        "aerial_ambiguous",
+        "aerial_unassigned",
         "duplicate",
         "gated",
         "ir_saturated",
@@ -148,6 +152,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
             self._pace.note(begin_s, now_ns, time.thread_time() - begin_cpu_s)
         self._say_time_jumps()
         self._outputs.publish(self._estimate)
+        self._outputs.publish_identities(self._estimator.identities)
         self._cost.note(time.perf_counter() - begin_s)
 
     def _receive(self) -> None:
@@ -188,6 +193,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         reports = self._diagnostics.reports(now_ns, self._estimate, recent, drops)
         contradictions = self._estimator.contradictions(now_ns)
         add_contradictions(reports, contradictions)
+        add_identities(reports, self._estimator.identities)
         self._warn_of_contradictions(contradictions)
         *robots, whole = reports
         overload = drops.get("overload", 0) - self._overload

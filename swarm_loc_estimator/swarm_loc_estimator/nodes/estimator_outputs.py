@@ -1,4 +1,4 @@
-"""Publish estimates: swarm/poses, <robot>/pose, and transforms from map to <robot>/odom."""
+"""Publish swarm/poses, <robot>/pose, aerial/identities, and transforms from map to <robot>/odom."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from tf2_msgs.msg import TFMessage
 
 from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate
-from swarm_loc_estimator.io.messages.encoders import encode_poses
+from swarm_loc_estimator.core.identification.memory import Identities
+from swarm_loc_estimator.io.messages.encoders import encode_identities, encode_poses
 from swarm_loc_estimator.io.messages.outputs import SwarmPosesEncoder, TransformsEncoder
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
-from swarm_loc_msgs.msg import SwarmPoses
+from swarm_loc_msgs.msg import RobotIdentities, SwarmPoses
 
 _RELIABLE = QoSProfile(depth=10)
 _TF = QoSProfile(depth=100)  # what tf2's own broadcaster offers
@@ -34,6 +35,9 @@ class EstimateOutputs:
         self._swarm_poses = node.create_publisher(SwarmPoses, "swarm/poses", _RELIABLE)
         self._swarm_poses_encoder = SwarmPosesEncoder(names, frame)
         self._frame = frame
+        self._names = names
+        self._identities = node.create_publisher(RobotIdentities, "aerial/identities", _RELIABLE)
+        self._told: Identities | None = None
         self._robot_poses = [
             node.create_publisher(PoseWithCovarianceStamped, f"{name}/pose", _RELIABLE)
             for name in (names if parameters.publish_robot_poses else [])
@@ -58,3 +62,13 @@ class EstimateOutputs:
             messages = encode_poses(self._frame, stamps_ns, e.poses[heard], e.covariances[heard])
             for robot, message in zip(heard, messages, strict=True):
                 self._robot_poses[robot].publish(message)
+
+    def publish_identities(self, identities: Identities | None) -> None:
+        """Publish who is who in the newest aerial image, whenever that changes; late data may change it."""
+        if identities is None or identities is self._told:
+            return
+        self._told = identities
+        probability = identities.probability
+        self._identities.publish(
+            encode_identities(self._frame, identities.stamp_ns, self._names, identities.place, probability)
+        )

@@ -10,8 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
-from swarm_loc_estimator.core.inputs.messages import DetectionRows, FixRows, OdometryRows, RawInputs
-from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.core.inputs.messages import (
+    AerialRows,
+    DetectionRows,
+    FixRows,
+    OdometryRows,
+    RawInputs,
+)
+from swarm_loc_estimator.io.messages.cdr import ANONYMOUS_DTYPE, DETECTION_DTYPE
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
 SECOND = 10**9
@@ -67,12 +73,13 @@ def give_fix(
 
 @dataclass(frozen=True)
 class Event:
-    """One message: odometry when `pose` is given, else detections."""
+    """One message: odometry when `pose` is given, else detections, by the robot or from above."""
 
     robot: int
     stamp_ns: int
     pose: tuple[float, float, float] | None = None
     detections: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, dtype=DETECTION_DTYPE))
+    aerial: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, dtype=ANONYMOUS_DTYPE))
 
     def give(self, estimator: SwarmEstimator, now_ns: int) -> None:
         """Hand the message in."""
@@ -93,4 +100,21 @@ def give(estimator: SwarmEstimator, arrivals: Sequence[tuple[int, Event]]) -> No
         robot, stamp_ns, arrival_ns = np.array(list(zip(*seen, strict=True)), dtype=np.int64)
         detections = joined([event.detections for _, event in arrivals])
         messages = messages._replace(detections=DetectionRows(robot, stamp_ns, detections, arrival_ns))
+    images = [(now_ns, event) for now_ns, event in arrivals if event.aerial.size]
+    if images:
+        messages = messages._replace(aerial=_aerial_rows(images))
     estimator.receive(messages)
+
+
+def _aerial_rows(images: Sequence[tuple[int, Event]]) -> AerialRows:
+    """The rows of aerial images (arrival, event)."""
+    sizes = [event.aerial.size for _, event in images]
+    shown = np.concatenate([event.aerial for _, event in images])
+    return AerialRows(
+        robot=np.full(shown.size, -1),
+        stamp_ns=np.repeat([event.stamp_ns for _, event in images], sizes),
+        number=np.concatenate([np.arange(size) for size in sizes]),
+        pose=np.column_stack([shown["x"], shown["y"], shown["theta"]]),
+        covariance=shown["covariance"].copy(),
+        arrival_ns=np.repeat([now_ns for now_ns, _ in images], sizes),
+    )

@@ -112,7 +112,8 @@ def test_damaged_bytes_are_refused_before_and_after_a_good_message(kind: str) ->
 def test_each_topic_is_read_and_counted_and_malformed_ones_go_no_further() -> None:
     ingest = Ingest(Swarm((Robot("a"), Robot("b", camera=None))))
     kinds = ("odom", "detections", "brightness", "fix")
-    assert [topic.name for topic in ingest.topics] == [f"{name}/{kind}" for name in "ab" for kind in kinds]
+    of_robots = [f"{name}/{kind}" for name in "ab" for kind in kinds]
+    assert [topic.name for topic in ingest.topics] == [*of_robots, "aerial/detections"]
     assert [topic.name for topic in ingest.topics if topic.expected] == ["a/odom", "a/detections", "b/odom"]
 
     odom, seen = ingest.handle_of["b/odom"], ingest.handle_of["a/detections"]

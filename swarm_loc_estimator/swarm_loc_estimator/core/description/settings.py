@@ -61,6 +61,23 @@ class EstimatorSettings:
         20.0, "s", 0.1, 600.0, "a waiting robot is located from sightings no older than this"
     )
 
+    aerial_probability: float = number(
+        0.99, "1", 0.5, 0.999999, "a robot that finds itself in aerial images must be so sure of it"
+    )
+    aerial_detection_probability: float = number(
+        0.95, "1", 0.1, 0.999, "share of the robots in an aerial image that are detected"
+    )
+    aerial_scale_sigma: float = number(
+        0.02, "1", 1e-4, 1.0, "how unsure the scale of aerial images is, relative"
+    )
+    aerial_scale_drift: float = number(
+        0.0, "1/s^0.5", 0.0, 0.1, "random walk of that scale, relative, as of a camera that is not still"
+    )
+    aerial_position_sigma: float = number(
+        0.02, "m", 1e-4, 10.0, "noise of aerial detections that tell no covariance, along x and y"
+    )
+    aerial_heading_sigma: float = number(0.1, "rad", 1e-4, 10.0, "likewise of their headings")
+
     def __post_init__(self) -> None:
         for name, spec in number_specs(type(self)).items():
             value = getattr(self, name)

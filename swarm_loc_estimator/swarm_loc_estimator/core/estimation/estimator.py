@@ -15,6 +15,7 @@ from swarm_loc_estimator.core.estimation.fusion import Fusion, Verdict
 from swarm_loc_estimator.core.estimation.self_calibration import learned, learns
 from swarm_loc_estimator.core.estimation.timeline import Timeline
 from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray
+from swarm_loc_estimator.core.identification.memory import Identities, Outcome
 from swarm_loc_estimator.core.inputs.infrared import BrightnessConverter
 from swarm_loc_estimator.core.inputs.messages import OdometryRows, RawInputs, ValidInputs, joined
 from swarm_loc_estimator.core.inputs.validation import (
@@ -133,11 +134,18 @@ class SwarmEstimator:
             "constraints kept": int(self._timeline.verdict_counts()[Verdict.CONSTRAINT]),
             "infrared exchanges measured": self._brightness.measured,
         }
+        outcomes = self._timeline.state.images.outcomes
+        others |= {f"identities {one.name.lower().replace('_', ' ')}": int(outcomes[one]) for one in Outcome}
         return {"measurements used": self.used} | {name: count for name, count in others.items() if count}
 
     def recent(self) -> tuple[MeasurementArray, NDArray[np.uint8], FloatArray]:
         """The measurements within the horizon, their verdicts and normalised innovations squared."""
         return self._timeline.measurements, self._timeline.verdicts, self._timeline.nis
+
+    @property
+    def identities(self) -> Identities | None:
+        """Who is who in the newest aerial image; None before the first."""
+        return self._timeline.state.images.newest
 
     def contradictions(self, now_ns: int) -> list[Contradiction]:
         """What contradicts the belief or the description at an instant, robots first."""
@@ -186,6 +194,8 @@ class SwarmEstimator:
         return {
             "gated": int(verdicts[Verdict.GATED]),
             "not_localized": int(verdicts[Verdict.NOT_LOCALIZED]),
+            "aerial_unassigned": int(verdicts[Verdict.UNASSIGNED]),
+            "aerial_ambiguous": int(verdicts[Verdict.AMBIGUOUS]),
             "duplicate": self._timeline.duplicates,
             "too_old": self._timeline.too_old,
         }

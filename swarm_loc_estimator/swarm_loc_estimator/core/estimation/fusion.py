@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from enum import IntEnum
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.core.estimation.aerial import PictureFusion, as_fixes, relieve_seen
 from swarm_loc_estimator.core.filter import sequential_update
 from swarm_loc_estimator.core.filter.batch_update import (
     assess_all,
@@ -26,6 +28,7 @@ from swarm_loc_estimator.core.filter.integrity.surprises import is_elsewhere
 from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray, MeasurementColumns
 from swarm_loc_estimator.core.filter.sequential_update import update_in_order
 from swarm_loc_estimator.core.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.core.identification.assignment import AMBIGUOUS
 from swarm_loc_estimator.core.initialization.initializer import Initializer
 from swarm_loc_estimator.core.inputs.messages import chosen
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
@@ -33,6 +36,7 @@ from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.numerics import se2
 from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray
 
+_NO_IMAGE_NS = np.iinfo(np.int64).min
 _PAIRS_PER_ROBOT = 32
 """A robot remembers what so many others have told it by infrared."""
 _CONTRADICTED_DESCRIPTION = 2
@@ -51,6 +55,8 @@ class Verdict(IntEnum):
     GATED = sequential_update.GATED  # its innovation is too unlikely
     CONSTRAINT = 3  # kept to locate a robot that waits
     NOT_LOCALIZED = 4  # neither side is located, or a robot has sent no odometry
+    UNASSIGNED = 5  # an anonymous detection that is no robot's
+    AMBIGUOUS = 6  # an anonymous detection that may be one robot's or another one's
 
 
 class Fusion:
@@ -77,6 +83,7 @@ class Fusion:
             if r.start is not None
         }
         self._initializer = Initializer(tracks, settings.fix_window_s)
+        self._pictures = PictureFusion(swarm, settings, tracks)
         self._table = ParameterTable.of(swarm.robots, swarm.landmarks)
         self._pairs = _PAIRS_PER_ROBOT if any(robot.ir is not None for robot in swarm.robots) else 0
 
@@ -135,11 +142,47 @@ class Fusion:
             nis: (m,) normalised innovations squared, written; NaN where there is none.
         """
         nis[:] = np.nan
+        anonymous = measurements["kind"] == Kind.ANONYMOUS
+        if not anonymous.any():
+            self._fuse(state, measurements, verdicts, nis)
+            return
+        image_ns = np.where(anonymous, measurements["stamp_ns"], _NO_IMAGE_NS)
+        edges = [0, *(np.flatnonzero(np.diff(image_ns)) + 1).tolist(), measurements.size]
+        for begin, end in itertools.pairwise(edges):
+            part = slice(begin, end)
+            fuse = self._fuse_image if anonymous[begin] else self._fuse
+            fuse(state, measurements[part], verdicts[part], nis[part])
+
+    def _fuse(
+        self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        """Fuse measurements that name their robots."""
         many = measurements.size >= _MANY
         if self._together and many and np.all(measurements["kind"] < Kind.SET_POSE):
             self._fuse_together(state, measurements, verdicts, nis)
         else:
             self._fuse_in_order(state, measurements, verdicts, nis)
+
+    def _fuse_image(
+        self, state: SwarmState, image: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        """Fuse the anonymous detections of an aerial image."""
+        for robot in self._starts:
+            if self._may_start(state, robot, int(image["stamp_ns"][0])):
+                self._initialize_at_start(state, robot)
+        assignment = self._pictures.assigned(state, image)
+        known = assignment.robot >= 0
+        if known.any():
+            fixes, fates = as_fixes(image[known], assignment.robot[known]), verdicts[known]
+            squares = nis[known]
+            self._fuse(state, fixes, fates, squares)
+            verdicts[known], nis[known] = fates, squares
+            relieve_seen(state, assignment.robot[known][fates == Verdict.USED])
+        unknown = (
+            Verdict.CONSTRAINT if self._pictures.identify(state, image, assignment) else Verdict.UNASSIGNED
+        )
+        unclear = assignment.robot[~known] == AMBIGUOUS
+        verdicts[~known] = np.where(unclear, Verdict.AMBIGUOUS, unknown)
 
     def _fuse_in_order(
         self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray

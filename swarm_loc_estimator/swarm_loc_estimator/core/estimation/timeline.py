@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.estimation.fusion import Verdict
 from swarm_loc_estimator.core.estimation.measurement_buffer import MeasurementBuffer
-from swarm_loc_estimator.core.filter.measurement_model import MeasurementArray
+from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.core.filter.state import SwarmState
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.jit import compiled
@@ -167,7 +167,9 @@ class Timeline:
             rows = rows[fresh]
         if period:
             rows = rows.copy()
-            rows["stamp_ns"] = (rows["stamp_ns"] + period // 2) // period * period
+            stamp_ns = rows["stamp_ns"]  # what one aerial image shows must not mix with another one's
+            nearest_ns = (stamp_ns + period // 2) // period * period
+            rows["stamp_ns"] = np.where(rows["kind"] == Kind.ANONYMOUS, stamp_ns, nearest_ns)
         return rows
 
     def _compute_from(self, key: int) -> None:
@@ -213,8 +215,13 @@ def _first_touched(
     targets: NDArray[np.int64],
     changed_from_ns: NDArray[np.int64],
 ) -> int:
-    """The first measurement (of m, by stamp) of a robot whose track (of N) changed before it; m when none."""
+    """The first measurement (of m, by stamp) of a robot whose track (of N) changed before it; m when none.
+
+    One that names nobody, an anonymous detection, may be of any of them.
+    """
     for k in range(np.searchsorted(stamps_ns, changed_from_ns.min(), side="right"), stamps_ns.size):
+        if observers[k] < 0 and targets[k] < 0:
+            return k
         for robot in (observers[k], targets[k]):
             if robot >= 0 and stamps_ns[k] > changed_from_ns[robot]:
                 return k

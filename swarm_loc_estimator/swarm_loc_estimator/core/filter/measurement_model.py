@@ -38,6 +38,7 @@ class Kind(IntEnum):
     POLAR = 1  # range [m], bearing [rad], positive to the left
     SET_POSE = 2  # the target is at `value` in map with `covariance`, whatever was believed
     FORGET = 3  # the target is not where it was believed to be
+    ANONYMOUS = 4  # some robot, seen from above, was at `value` in map; marker_id: its number in the image
 
 
 POLAR, SET_POSE = int(Kind.POLAR), int(Kind.SET_POSE)

@@ -12,6 +12,7 @@ from swarm_loc_estimator.core.filter.belief import NEVER_NS, BeliefArrays, Integ
 from swarm_loc_estimator.core.filter.covariance import DenseFilter
 from swarm_loc_estimator.core.filter.integrity.hidden_noise import doubt_noise
 from swarm_loc_estimator.core.filter.integrity.surprises import new_integrity
+from swarm_loc_estimator.core.identification.memory import IdentityMemory
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 from swarm_loc_estimator.numerics.se2 import error_covariance
@@ -67,6 +68,7 @@ class SwarmState:
         pair_history: (N, pairs, 3, 3) what was measured, see `correlated_noise.py`.
         constraints: Per robot that is not tracked, sightings which may locate it (see `initializer.py`).
         next_attempt_ns: (N,) before this instant nothing more is made of its constraints.
+        images: What is remembered of aerial images.
     """
 
     def __init__(self, table: ParameterTable, pairs: int = 0) -> None:
@@ -95,6 +97,7 @@ class SwarmState:
         self.pair_history: FloatArray = np.zeros((robots, pairs, 3, 3))
         self.constraints: dict[int, NDArray[np.void]] = {}
         self.next_attempt_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
+        self.images = IdentityMemory()
 
     def copy(self) -> SwarmState:
         """An independent copy."""

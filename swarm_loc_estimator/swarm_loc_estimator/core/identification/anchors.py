@@ -8,6 +8,7 @@ becomes a track.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -68,11 +69,13 @@ class Circles(NamedTuple):
     """Pairs (a, n) of an anchor and a detection of a later image.
 
     Attributes:
-        log_density: (a, n) of the detection [1/m^2].
+        log_density: (a, n) of the detection, if it is the robot that the anchor is [1/m^2].
+        log_alike: (a, n) likewise if both are another robot, which moves about as far.
         concentration: (a, n) of the heading that the pair shows.
     """
 
     log_density: FloatArray
+    log_alike: FloatArray
     concentration: FloatArray
 
 
@@ -82,22 +85,44 @@ def own_way(anchors: Anchors, point: TrackPoint) -> complex:
     return complex(x, y)
 
 
-def circles(anchors: Anchors, picture: Picture, point: TrackPoint, scale: Scale) -> Circles:
-    """How well detections lie on the circles around anchors."""
+def circles(anchors: Anchors, picture: Picture, point: TrackPoint, scale: Scale, likeness: float) -> Circles:
+    """How well detections lie on the circles around anchors.
+
+    Args:
+        anchors: (a,).
+        picture: (n,).
+        point: The robot's own track at the picture.
+        scale: Of the picture.
+        likeness: By what share of its way another robot's is longer or shorter.
+    """
     way = abs(own_way(anchors, point))
     gathered = scale.mean**2 * 0.5 * float(np.trace(gathered_between(anchors.point, point)[:2, :2]))
     variance = 0.5 * np.trace(anchors.covariance, axis1=1, axis2=2)[:, None] + picture.variance + gathered
     away = picture.pose[None, :, :2] - anchors.position[:, None]
     distance = np.hypot(away[..., 0], away[..., 1])
+    log_density, concentration = _rice(distance, way, variance, scale)
+    others = Scale(scale.mean, math.hypot(scale.sigma, likeness * scale.mean))
+    return Circles(log_density, _rice(distance, way, variance, others)[0], concentration)
+
+
+def _rice(
+    distance: FloatArray, way: float, variance: FloatArray, scale: Scale
+) -> tuple[FloatArray, FloatArray]:
+    """Log densities (a, n) at distances from a circle's middle, and concentrations of the direction."""
     along = variance + (scale.sigma * way) ** 2
     likely = scale.mean + scale.sigma**2 * way * (distance - scale.mean * way) / along
     concentration = np.maximum(likely, 0.0) * distance * way / variance
     log_density = np.log(i0e(concentration)) - np.log(2.0 * np.pi) - 0.5 * np.log(variance * along)
-    return Circles(log_density - 0.5 * (distance - scale.mean * way) ** 2 / along, concentration)
+    return log_density - 0.5 * (distance - scale.mean * way) ** 2 / along, concentration
 
 
 def tracks_of(
-    anchors: Anchors, rows: IntArray, picture: Picture, places: IntArray, point: TrackPoint, scale: Scale
+    anchors: Anchors,
+    rows: IntArray,
+    picture: Picture,
+    places: IntArray,
+    point: TrackPoint,
+    scale: Scale,
 ) -> Tracks:
     """The tracks (k,) that pairs of an anchor (of rows) and a detection (of places) give.
 

@@ -1,9 +1,11 @@
 """Which detection is me: the posterior over chains of anonymous detections, image after image.
 
 A robot is in the picture or not; in it, it is detected with a probability, or missed; each other detection
-is another robot or a false one, anywhere. So the likelihood of a chain is a product over images of P_D N(z;
-expected) / beta for the detection that it has, and of 1 - P_D where it has none, with beta the density of
-the others (the likelihood of one target in clutter). Robots that enter begin a chain later.
+is another robot or a false one. So the likelihood of a chain is a product over images of P_D N(z; expected)
+/ beta for the detection that it has, and of 1 - P_D where it has none (the likelihood of one target in
+clutter). The density beta is that of others, anywhere, and of one that was where the chain was before and
+moves alike: robots of one kind do, so that a detection about as far away as the own way is long tells
+little. Robots that enter begin a chain later.
 """
 
 from __future__ import annotations
@@ -42,6 +44,9 @@ _NEGLIGIBLE = 12.0
 _MAX_TRACKS = 3000
 _MAX_ANCHORED_IMAGES = 6
 """A chain whose last detection lies further back ends unless its heading is known."""
+_LIKENESS = 0.5
+"""By what share of its own way, and turn, a robot expects that of another one to differ from it."""
+_LEAST_TURN_SPREAD = 0.1
 _OUTSIDE = 0.5
 """Share of the detection probability for robots that are outside of all that was seen."""
 
@@ -181,15 +186,16 @@ class Chains:
     ) -> tuple[list[Tracks], list[Anchors]]:
         """All chains with and without a detection in the newest image."""
         probability = self.model.detection_probability
-        log_hit = math.log(probability) - log_density
+        log_hit = math.log(probability)
         tracks: list[Tracks] = [NO_TRACKS]
         if self.tracks.place.size and self.point is not None:
-            tracks += self._tracks_continued(picture, point, stamp_ns, log_hit)
+            tracks += self._tracks_continued(picture, point, stamp_ns, log_density)
         standing = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
         anchors: list[Anchors] = []
         for old in self.anchors:
-            pairs = circles(old, picture, point, self._scale_since(old.stamp_ns, stamp_ns))
-            weight = old.log_weight[:, None] + pairs.log_density + log_hit
+            pairs = circles(old, picture, point, self._scale_since(old.stamp_ns, stamp_ns), _LIKENESS)
+            log_ratio = pairs.log_density - np.logaddexp(log_density, pairs.log_alike)
+            weight = old.log_weight[:, None] + log_ratio + log_hit
             likely = weight > self._threshold()
             rows, places = np.nonzero(likely & is_concentrated(pairs.concentration))
             scale = self._scale_since(old.stamp_ns, stamp_ns)
@@ -209,17 +215,22 @@ class Chains:
         return tracks, anchors[-_MAX_ANCHORED_IMAGES:]
 
     def _tracks_continued(
-        self, picture: Picture, point: TrackPoint, stamp_ns: int, log_hit: float
+        self, picture: Picture, point: TrackPoint, stamp_ns: int, log_density: float
     ) -> list[Tracks]:
         """The tracks with a detection of the newest image each, and without."""
         before = self.point or point
         x, y = point.pose[:2] - before.pose[:2]
         drift = self.model.scale_drift**2 * (stamp_ns - self.stamp_ns) * 1e-9
         moved = predicted(self.tracks, complex(x, y), gathered_between(before, point), drift)
-        weight = moved.log_weight[:, None] + log_likelihoods(moved, picture) + log_hit
+        spread = _LIKENESS * self.model.scale.mean * math.hypot(x, y)
+        others = np.logaddexp(log_density, log_likelihoods(moved, picture, spread))
+        log_ratio = log_likelihoods(moved, picture) - others
+        weight = moved.log_weight[:, None] + log_ratio + math.log(self.model.detection_probability)
         rows, places = np.nonzero(weight > self._threshold())
         chosen = moved.chosen(rows)
-        found = updated(chosen._replace(log_weight=weight[rows, places]), picture, places, point.pose[2])
+        chosen = chosen._replace(log_weight=weight[rows, places])
+        turn_spread = max(_LIKENESS * abs(point.pose[2] - before.pose[2]), _LEAST_TURN_SPREAD)
+        found = updated(chosen, picture, places, point.pose[2], turn_spread)
         inside = np.all((moved.mean[:, :2] >= self.low) & (moved.mean[:, :2] <= self.high), axis=1)
         probability = self.model.detection_probability * np.where(inside, 1.0, _OUTSIDE)
         missed = moved._replace(

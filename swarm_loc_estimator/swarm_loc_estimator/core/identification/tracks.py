@@ -8,6 +8,7 @@ linearised.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -86,10 +87,16 @@ def predicted(tracks: Tracks, way: complex, noise: FloatArray, scale_variance: f
     return tracks._replace(mean=mean, covariance=covariance)
 
 
-def log_likelihoods(tracks: Tracks, picture: Picture) -> FloatArray:
-    """Log densities (h, n) of the detections' positions [1/m^2] where the tracks expect theirs."""
+def log_likelihoods(tracks: Tracks, picture: Picture, spread: float = 0.0) -> FloatArray:
+    """Log densities (h, n) of the detections' positions [1/m^2] where the tracks expect theirs.
+
+    Args:
+        tracks: (h,).
+        picture: (n,).
+        spread: By how much less is known of where a robot moves, along x and y each [m].
+    """
     away = picture.pose[None, :, :2] - tracks.mean[:, None, :2]
-    s = tracks.covariance[:, None, :2, :2] + picture.covariance[None, :, :2, :2]
+    s = tracks.covariance[:, None, :2, :2] + picture.covariance[None, :, :2, :2] + spread**2 * np.eye(2)
     a, b, d = s[..., 0, 0], s[..., 0, 1], s[..., 1, 1]
     x, y = away[..., 0], away[..., 1]
     determinant = a * d - b * b
@@ -97,7 +104,9 @@ def log_likelihoods(tracks: Tracks, picture: Picture) -> FloatArray:
     return np.asarray(-0.5 * squared - _LOG_TURN - 0.5 * np.log(determinant))
 
 
-def updated(tracks: Tracks, picture: Picture, places: IntArray, track_heading: float) -> Tracks:
+def updated(
+    tracks: Tracks, picture: Picture, places: IntArray, track_heading: float, turn_spread: float = math.inf
+) -> Tracks:
     """Tracks (h,) with a detection each, their weights by headings alone: those by positions are given.
 
     Args:
@@ -105,6 +114,7 @@ def updated(tracks: Tracks, picture: Picture, places: IntArray, track_heading: f
         picture: The newest image.
         places: (h,) which detection each has.
         track_heading: Of the robot on its own track [rad].
+        turn_spread: By how much another robot, which was there before, would have turned otherwise [rad].
     """
     s = tracks.covariance[:, :2, :2] + picture.covariance[places][:, :2, :2]
     gain = np.linalg.solve(s, tracks.covariance[:, :2, :]).transpose(0, 2, 1)
@@ -113,10 +123,12 @@ def updated(tracks: Tracks, picture: Picture, places: IntArray, track_heading: f
     mean = tracks.mean + (gain @ away[..., None])[..., 0]
     out = Tracks(mean, _symmetric(covariance), tracks.log_weight, places, tracks.length + 1)
     shown = np.flatnonzero(picture.has_heading[places])
-    return _with_headings(out, picture, shown, track_heading) if shown.size else out
+    return _with_headings(out, picture, shown, track_heading, turn_spread) if shown.size else out
 
 
-def _with_headings(tracks: Tracks, picture: Picture, rows: IntArray, track_heading: float) -> Tracks:
+def _with_headings(
+    tracks: Tracks, picture: Picture, rows: IntArray, track_heading: float, turn_spread: float
+) -> Tracks:
     """Tracks (h,) of which some rows (r,) also use the heading of their detection."""
     mean, covariance = tracks.mean[rows], tracks.covariance[rows]
     places = tracks.place[rows]
@@ -127,8 +139,10 @@ def _with_headings(tracks: Tracks, picture: Picture, rows: IntArray, track_headi
     difference = wrap_angle(picture.pose[places, 2] - expected)
     projected = (covariance @ jacobian[..., None])[..., 0]
     variance = picture.covariance[places, 2, 2] + np.sum(projected * jacobian, axis=1)
-    right = (1.0 - _FALSE_HEADING) * np.exp(-0.5 * difference**2 / variance)
-    right *= np.sqrt(2.0 * np.pi / variance)  # over the density of headings that are anywhere
+    right = (1.0 - _FALSE_HEADING) * _times_turn(difference, variance)
+    others = np.ones(rows.size)
+    if math.isfinite(turn_spread):
+        others = 0.5 + 0.5 * _times_turn(difference, variance + turn_spread**2)
     share = right / (right + _FALSE_HEADING)
     gain = projected / variance[:, None] * (share > 0.5)[:, None]
     changed = tracks._replace(
@@ -136,8 +150,13 @@ def _with_headings(tracks: Tracks, picture: Picture, rows: IntArray, track_headi
     )
     changed.mean[rows] += gain * difference[:, None]
     changed.covariance[rows] = _symmetric(covariance - gain[:, :, None] * projected[:, None, :])
-    changed.log_weight[rows] += np.log(right + _FALSE_HEADING)
+    changed.log_weight[rows] += np.log((right + _FALSE_HEADING) / others)
     return changed
+
+
+def _times_turn(difference: FloatArray, variance: FloatArray) -> FloatArray:
+    """Normal densities (k,) of angles, over that of angles which are anywhere."""
+    return np.asarray(np.exp(-0.5 * difference**2 / variance) * np.sqrt(2.0 * np.pi / variance))
 
 
 def _symmetric(covariance: FloatArray) -> FloatArray:

@@ -105,11 +105,32 @@ class FixRows(NamedTuple):
     arrival_ns: IntArray
 
 
+class AerialRows(NamedTuple):
+    """Anonymous detections of aerial images, a row per detection (d,).
+
+    Attributes:
+        robot: (d,) -1: they are about the whole swarm.
+        stamp_ns: (d,) exposure times.
+        number: (d,) of each in its message.
+        pose: (d, 3) x [m], y [m], heading [rad] in `map`; heading NaN: not measured.
+        covariance: (d, 3, 3) of it; a first element of -1: not known.
+        arrival_ns: (d,).
+    """
+
+    robot: IntArray
+    stamp_ns: IntArray
+    number: IntArray
+    pose: FloatArray
+    covariance: FloatArray
+    arrival_ns: IntArray
+
+
 _NONE = np.zeros(0, dtype=np.int64)
 NO_ODOMETRY = OdometryRows(_NONE, _NONE, np.zeros((0, 3)), _NONE)
 NO_DETECTIONS = DetectionRows(_NONE, _NONE, np.zeros(0, dtype=[("id", np.uint32)]), _NONE)
 NO_BRIGHTNESS = BrightnessRows(*(_NONE,) * 7, np.zeros(0, dtype=object), _NONE)
 NO_FIXES = FixRows(_NONE, _NONE, np.zeros((0, 3)), np.zeros((0, 3, 3)), _NONE)
+NO_AERIAL = AerialRows(_NONE, _NONE, _NONE, np.zeros((0, 3)), np.zeros((0, 3, 3)), _NONE)
 
 
 class RawInputs(NamedTuple):
@@ -122,6 +143,7 @@ class RawInputs(NamedTuple):
         detections: Of all cameras.
         brightness: Of all infrared boards.
         fixes: Of all robots.
+        aerial: Of cameras above the swarm.
         dropped: Reason -> how many more could not even be read.
     """
 
@@ -131,6 +153,7 @@ class RawInputs(NamedTuple):
     detections: DetectionRows = NO_DETECTIONS
     brightness: BrightnessRows = NO_BRIGHTNESS
     fixes: FixRows = NO_FIXES
+    aerial: AerialRows = NO_AERIAL
     dropped: Mapping[str, int] = MappingProxyType({})
 
 

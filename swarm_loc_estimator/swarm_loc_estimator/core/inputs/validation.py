@@ -23,6 +23,7 @@ from swarm_loc_estimator.core.filter.measurement_model import (
 from swarm_loc_estimator.core.inputs.camera import SightingConverter
 from swarm_loc_estimator.core.inputs.messages import (
     NO_MEASUREMENTS,
+    AerialRows,
     BrightnessRows,
     DetectionRows,
     FixRows,
@@ -43,6 +44,8 @@ _MAX_DISTANCE_M = 1e6
 _MIN_VARIANCE, _MAX_VARIANCE = 1e-14, 1e14
 _ASYMMETRY, _ROUNDING = 1e-6, 1e-9
 _FIX_GATE = float(gate_threshold(0.9999))
+_UNKNOWN_VARIANCE = -1.0
+"""What the sender of an anonymous detection writes first into a covariance that it does not know."""
 
 Measured = tuple[MeasurementArray, IntArray]
 """Measurements (m,) and when they arrived (m,)."""
@@ -64,15 +67,17 @@ class InputValidator:
         self._converter = SightingConverter(swarm)
         self._stands = np.array([robot.stands for robot in swarm.robots], dtype=bool)
         self._future_ns = round(settings.future_tolerance_s * 1e9)
+        sigma, heading_sigma = settings.aerial_position_sigma, settings.aerial_heading_sigma
+        self._aerial_noise = np.diag(np.square([sigma, sigma, heading_sigma]))
 
     def validate(self, messages: RawInputs) -> ValidInputs:
         """Turn messages into what can be used of them, and count the rest."""
         self.drops.update(messages.dropped)
-        seen, fixed = self._seen(messages.detections), self._fixed(messages.fixes)
+        parts = self._seen(messages.detections), self._fixed(messages.fixes), self._shown(messages.aerial)
         return ValidInputs(
             self._valid_odometry(messages.odometry),
             self._in_time(messages.brightness),
-            *_in_order_of_arrival(seen, fixed),
+            *_in_order_of_arrival(_in_order_of_arrival(parts[0], parts[1]), parts[2]),
         )
 
     def valid(self, measurements: MeasurementArray) -> NDArray[np.bool_]:
@@ -127,11 +132,28 @@ class InputValidator:
             return NO_MEASUREMENTS, rows.arrival_ns
         rows = chosen(rows, self._are_in_time(rows.stamp_ns, rows.arrival_ns))
         fixes = about_robots(rows.robot, rows.stamp_ns, rows.pose, rows.covariance, Kind.CARTESIAN)
-        without = np.isnan(rows.pose[:, 2])
-        fixes["has_heading"][without], fixes["value"][without, 2] = 0, 0.0
-        fixes["covariance"][without, 2, :] = fixes["covariance"][without, :, 2] = [0.0, 0.0, 1.0]
+        _take_out_headings(fixes, np.isnan(rows.pose[:, 2]))
         valid = self.valid(fixes)
         return fixes[valid], rows.arrival_ns[valid]
+
+    def _shown(self, rows: AerialRows) -> Measured:
+        """What the valid ones of the anonymous detections measure."""
+        if not rows.robot.size:
+            return NO_MEASUREMENTS, rows.arrival_ns
+        rows = chosen(rows, self._are_in_time(rows.stamp_ns, rows.arrival_ns))
+        shown = about_robots(NOBODY, rows.stamp_ns, rows.pose, rows.covariance, Kind.ANONYMOUS)
+        shown["marker_id"] = rows.number
+        shown["covariance"][rows.covariance[:, 0, 0] == _UNKNOWN_VARIANCE] = self._aerial_noise
+        _take_out_headings(shown, np.isnan(rows.pose[:, 2]))
+        valid = self.valid(shown)
+        return shown[valid], rows.arrival_ns[valid]
+
+
+def _take_out_headings(measurements: MeasurementArray, without: NDArray[np.bool_]) -> None:
+    """Take the headings out of those measurements (m,) that have none."""
+    measurements["has_heading"][without], measurements["value"][without, 2] = 0, 0.0
+    covariance = measurements["covariance"]
+    covariance[without, 2, :] = covariance[without, :, 2] = [0.0, 0.0, 1.0]
 
 
 def about_robots(

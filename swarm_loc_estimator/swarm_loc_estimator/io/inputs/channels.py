@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.inputs.messages import (
+    AerialRows,
     BrightnessRows,
     DetectionRows,
     FixRows,
@@ -22,8 +23,11 @@ from swarm_loc_estimator.core.inputs.messages import (
 )
 from swarm_loc_estimator.io.inputs.topics import InputKind
 from swarm_loc_estimator.io.messages.cdr import (
+    ANONYMOUS_DTYPE,
+    AnonymousMessage,
     BrightnessMessage,
     FixMessage,
+    decode_anonymous,
     decode_brightness,
     decode_fix,
     decode_odometry,
@@ -36,6 +40,11 @@ HEADING_UNKNOWN = math.pi**2
 """A heading with such a variance [rad^2] or more was not measured: all headings there are vary by less."""
 FOREIGN_FRAME = "fix_frame"
 """Why a fix that is not in `map` is dropped."""
+FOREIGN_AERIAL_FRAME = "aerial_frame"
+"""Likewise an aerial image whose detections are not."""
+TOO_MANY = "aerial_too_many"
+"""Why an aerial image with more detections than MAX_ANONYMOUS is dropped: it shows something else."""
+MAX_ANONYMOUS = 2000
 
 
 class Read(NamedTuple):
@@ -153,10 +162,41 @@ class _FixChannel:
         return Read(chosen(rows, at_home), found.stamp_ns, found.valid, foreign)
 
 
+class _AerialChannel:
+    """See `AerialRows`."""
+
+    def __init__(self, topics: int, map_frame: str) -> None:
+        self._reader = EachReader(topics, decode_anonymous)
+        self._map_frame = map_frame
+
+    def frame_id(self, topic: int) -> str:
+        return self._reader.frame_ids[topic]
+
+    def read(self, batch: MessageBatch, robot: IntArray) -> Read:
+        found = self._reader.read(batch)
+        messages: list[AnonymousMessage] = found.messages
+        foreign = np.array([m.frame_id != self._map_frame for m in messages], dtype=bool)
+        too_many = np.array([m.detections.size > MAX_ANONYMOUS for m in messages], dtype=bool) & ~foreign
+        kept = np.flatnonzero(~foreign & ~too_many)
+        sizes = [messages[k].detections.size for k in kept]
+        detections = np.concatenate([np.zeros(0, ANONYMOUS_DTYPE), *(messages[k].detections for k in kept)])
+        rows = AerialRows(
+            robot=np.repeat(robot[found.valid][kept], sizes),
+            stamp_ns=np.repeat(found.stamp_ns[found.valid][kept], sizes),
+            number=np.concatenate([np.zeros(0, dtype=np.int64), *(np.arange(size) for size in sizes)]),
+            pose=np.column_stack([detections["x"], detections["y"], detections["theta"]]).astype(float),
+            covariance=detections["covariance"].astype(float),
+            arrival_ns=np.repeat(batch.log_ns[found.valid][kept], sizes),
+        )
+        dropped = {FOREIGN_AERIAL_FRAME: int(foreign.sum()), TOO_MANY: int(too_many.sum())}
+        return Read(rows, found.stamp_ns, found.valid, dropped)
+
+
 CHANNELS: dict[InputKind, Callable[[int, str], Channel]] = {
     InputKind.ODOMETRY: _OdometryChannel,
     InputKind.DETECTIONS: _DetectionChannel,
     InputKind.BRIGHTNESS: _BrightnessChannel,
     InputKind.FIXES: _FixChannel,
+    InputKind.AERIAL: _AerialChannel,
 }
 """How each kind is read; made from the number of topics and the name of the frame `map`."""

@@ -139,7 +139,7 @@ class Ingest:
     def received(self) -> dict[str, int]:
         """Messages so far by kind of topic, such as `<robot>/odom`; kinds of which none came are missing."""
         kinds = np.bincount(self._kind, weights=self._counted["received"], minlength=len(InputKind))
-        counts = {f"<robot>/{kind.topic}": int(kinds[number]) for number, kind in enumerate(InputKind)}
+        counts = {kind.pattern: int(kinds[number]) for number, kind in enumerate(InputKind)}
         return {topic: count for topic, count in counts.items() if count}
 
     def frame_id(self, handle: int) -> str:

@@ -96,6 +96,25 @@ class BrightnessMessage(NamedTuple):
     saturation: int
 
 
+def _anonymous_dtype(order: str) -> np.dtype[np.void]:
+    """An anonymous detection's bytes; a multiple of 8, and so the same wherever it stands."""
+    numbers = [(name, f"{order}f8") for name in ("x", "y", "theta")]
+    pixels = [(name, f"{order}f4") for name in ("u_px", "v_px")]
+    return np.dtype([*numbers, ("covariance", f"{order}f8", (3, 3)), *pixels])
+
+
+ANONYMOUS_DTYPE = _anonymous_dtype("<")
+"""A swarm_loc_msgs/AnonymousDetection as it lies in little-endian CDR, at a multiple of 8 bytes."""
+
+
+class AnonymousMessage(NamedTuple):
+    """swarm_loc_msgs/AnonymousDetectionArray: `detections` has dtype `ANONYMOUS_DTYPE`."""
+
+    stamp_ns: int
+    frame_id: str
+    detections: npt.NDArray[np.void]
+
+
 _DETECTION_FIELDS: tuple[tuple[str, str, tuple[int, ...]], ...] = (
     ("id", "u4", ()),
     ("family", "u1", ()),
@@ -151,6 +170,7 @@ class _Layout:
         self.twist = struct.Struct(order + "6d")
         self.double = np.dtype(order + "f8")
         self.detection = _detection_dtype(order)
+        self.anonymous = _anonymous_dtype(order)
 
 
 _LAYOUTS = {b"\x00\x00": _Layout(">"), b"\x00\x01": _Layout("<")}
@@ -290,6 +310,26 @@ def decode_brightness(data: bytes) -> BrightnessMessage:
     readings = np.frombuffer(data, layout.reading, count, offset).astype(np.int32)
     power, saturation = layout.power.unpack_from(data, end)
     return BrightnessMessage(stamp_ns, frame_id, receiver, transmitter, n, readings, power, saturation)
+
+
+def decode_anonymous(data: bytes) -> AnonymousMessage:
+    """Read a swarm_loc_msgs/AnonymousDetectionArray.
+
+    Raises:
+        CdrError: The bytes are not one whole message.
+    """
+    layout = _layout(data)
+    stamp_ns, frame_id, offset = _header(data, layout)
+    offset += -offset % 4
+    if offset + 4 > len(data):
+        raise CdrError(f"cut off after {len(data)} bytes.")
+    (count,) = layout.count.unpack_from(data, offset)
+    offset += 4
+    if count:
+        offset += -(offset - ENCAPSULATION) % 8
+    _check_end(data, offset + count * ANONYMOUS_DTYPE.itemsize)
+    detections = np.frombuffer(data, layout.anonymous, count, offset)
+    return AnonymousMessage(stamp_ns, frame_id, detections.astype(ANONYMOUS_DTYPE))
 
 
 def decode_detections(data: bytes) -> DetectionArrayMessage:

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE, DETECTION_GAP, DETECTION_PADDING
+from swarm_loc_estimator.io.messages.cdr import (
+    ANONYMOUS_DTYPE,
+    DETECTION_DTYPE,
+    DETECTION_GAP,
+    DETECTION_PADDING,
+)
 from swarm_loc_estimator.io.messages.cdr_writer import CdrWriter
 from swarm_loc_estimator.io.messages.planar import (
     PLANE,
@@ -97,6 +103,36 @@ def encode_detections(frame_id: str, stamp_ns: int, detections: npt.NDArray[np.v
         packed = rows.tobytes()
         writer.raw(4, packed[:DETECTION_GAP])
         writer.raw(8, packed[DETECTION_GAP:])
+    return writer.message()
+
+
+def encode_anonymous(frame_id: str, stamp_ns: int, detections: npt.NDArray[np.void]) -> bytes:
+    """Serialize one swarm_loc_msgs/AnonymousDetectionArray from (n,) detections of `ANONYMOUS_DTYPE`."""
+    writer = CdrWriter.with_header(frame_id, stamp_ns)
+    writer.count(len(detections))
+    if len(detections):
+        writer.raw(8, detections.astype(ANONYMOUS_DTYPE).tobytes())
+    return writer.message()
+
+
+def encode_identities(
+    frame_id: str, stamp_ns: int, names: Sequence[str], place: IntArray, probability: FloatArray
+) -> bytes:
+    """Serialize one swarm_loc_msgs/RobotIdentities.
+
+    Args:
+        frame_id: Frame of the aerial detections.
+        stamp_ns: Of the image.
+        names: N robots.
+        place: (N,) which detection each is; -1: not known.
+        probability: (N,) of that.
+    """
+    writer = CdrWriter.with_header(frame_id, stamp_ns)
+    writer.count(len(names))
+    for name, which, sure in zip(names, place.tolist(), probability.tolist(), strict=True):
+        writer.text(name)
+        writer.raw(4, struct.pack("<i", which))
+        writer.raw(8, struct.pack("<d", sure))
     return writer.message()
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,8 @@ from swarm_loc_estimator.io.messages.cdr import (
     DETECTION_GAP,
     ENCAPSULATION,
     MAX_PADDING,
-    BrightnessMessage,
     CdrError,
     DetectionArrayMessage,
-    FixMessage,
     OdometryMessage,
     PoseMessage,
     decode_detections,
@@ -35,7 +33,20 @@ from swarm_loc_estimator.numerics.jit import compiled
 
 BytesArray = NDArray[np.uint8]
 
-Message = TypeVar("Message", BrightnessMessage, FixMessage)
+
+class StampedMessage(Protocol):
+    """Any message with a header."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """When it was true."""
+
+    @property
+    def frame_id(self) -> str:
+        """Its frame."""
+
+
+Message = TypeVar("Message", bound=StampedMessage)
 
 _LITTLE_ENDIAN = b"\x00\x01"
 _NANOSECONDS = 1_000_000_000

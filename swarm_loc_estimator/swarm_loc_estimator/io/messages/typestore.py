@@ -22,6 +22,8 @@ POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 DETECTIONS = f"{MESSAGE_PACKAGE}/msg/MarkerDetectionArray"
 DETECTION = f"{MESSAGE_PACKAGE}/msg/MarkerDetection"
 BRIGHTNESS = f"{MESSAGE_PACKAGE}/msg/BrightnessMatrix"
+ANONYMOUS_DETECTIONS = f"{MESSAGE_PACKAGE}/msg/AnonymousDetectionArray"
+ROBOT_IDENTITIES = f"{MESSAGE_PACKAGE}/msg/RobotIdentities"
 
 
 class DefinitionsNotFoundError(UserError):

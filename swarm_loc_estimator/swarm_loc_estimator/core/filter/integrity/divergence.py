@@ -16,6 +16,8 @@ WELL_CONFIRMED = 12
 _DOUBTFUL = 2.0
 _HIDDEN_SIGMA = (0.03, 0.03, 0.06)
 """What sensors may hide while a pose is doubtful, or few sightings have confirmed it [m], [m], [rad]."""
+_SEEN_RELIEF = 1.0
+"""A look from above rests on nothing else that is believed."""
 _GATED_AGAIN_NS = 250_000_000
 _CONFIRMED_AGAIN_NS = 150_000_000
 """Sightings that follow each other faster confirm a pose once: they have much of their errors in common."""
@@ -79,6 +81,17 @@ def add_hidden_errors(state: IntegrityArrays, robot: int, covariance: FloatArray
     if state.doubt[robot] > _DOUBTFUL or state.confirmations[robot] < WELL_CONFIRMED:
         for i in range(3):
             covariance[i, i] += _HIDDEN_SIGMA[i] ** 2
+
+
+def note_missed(state: IntegrityArrays, robot: int, weight: float) -> float:
+    """Count that a robot was not seen where it should be; return how much speaks against it now."""
+    state.doubt[robot] += weight
+    return float(state.doubt[robot])
+
+
+def note_seen(state: IntegrityArrays, robot: int) -> None:
+    """Count that a robot was seen from above where it is believed to be."""
+    state.doubt[robot] = max(0.0, state.doubt[robot] - _SEEN_RELIEF)
 
 
 @compiled
