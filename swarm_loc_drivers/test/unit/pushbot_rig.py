@@ -37,7 +37,7 @@ def pushbot_settings(**changed: Any) -> PushbotSettings:
         "command_timeout_s": 0.5,
         "reply_timeout_s": 0.3,
         "tick_period_s": 0.02,
-        "timestamps": "24",
+        "timestamps": "24bit",
         "on_bit": 0,
         "packet_period_s": 0.005,
         "lights": Lights(laser=450.0, leds=1000.0),

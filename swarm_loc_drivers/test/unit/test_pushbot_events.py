@@ -54,7 +54,7 @@ def test_events_and_lines_come_whole(timestamps: str) -> None:
 
 def test_the_example_of_the_users_guide() -> None:
     data = bytes.fromhex("E4A50001E240") * CONFIRMATIONS
-    parsed = parse(data, "32", Counter())
+    parsed = parse(data, "32bit", Counter())
     assert (parsed.x[0], parsed.y[0], parsed.polarity[0]) == (37, 100, 1)
 
 
@@ -86,7 +86,7 @@ def test_any_cutting_gives_the_same(
 
 @settings(max_examples=40, deadline=None)
 @given(
-    timestamps=st.sampled_from(["24", "32"]),
+    timestamps=st.sampled_from(["24bit", "32bit"]),
     seed=st.integers(0, 2**31),
     at=st.integers(300, 900),
     lost=st.integers(1, 40),
@@ -108,7 +108,7 @@ def test_after_lost_bytes_events_are_right_again_and_few_are_wrong(
     assert len(got) >= 400 - lost // size - 1 - 60
 
 
-@pytest.mark.parametrize("timestamps", ["16", "24", "32"])
+@pytest.mark.parametrize("timestamps", ["16bit", "24bit", "32bit"])
 def test_timestamps_wrap(timestamps: str) -> None:
     span = 1 << 8 * TIMESTAMPS[timestamps]
     sent = random_events(3, 400, start_us=span - 20_000)
@@ -118,7 +118,7 @@ def test_timestamps_wrap(timestamps: str) -> None:
     assert not counts
 
 
-@pytest.mark.parametrize("timestamps", ["24", "32"])
+@pytest.mark.parametrize("timestamps", ["24bit", "32bit"])
 @pytest.mark.parametrize("jump_us", [-2_000, 1_000_000])
 def test_a_jump_of_time_is_believed_once_confirmed(timestamps: str, jump_us: int) -> None:
     """As after `!ET0`, or when the scene was dark."""
@@ -134,10 +134,10 @@ def test_a_jump_of_time_is_believed_once_confirmed(timestamps: str, jump_us: int
 
 def test_a_single_wrong_timestamp_is_dropped() -> None:
     sent = random_events(6, 100)
-    pieces = event_pieces(sent, "32")
+    pieces = event_pieces(sent, "32bit")
     pieces[50] = pieces[50][:2] + b"\x7f" + pieces[50][3:]
     counts: Counter[str] = Counter()
-    parsed = parse(b"".join(pieces), "32", counts)
+    parsed = parse(b"".join(pieces), "32bit", counts)
     assert len(parsed.x) == 99
     np.testing.assert_array_equal(parsed.time_us - parsed.time_us[0], np.delete(sent.t, 50) - sent.t[0])
     assert counts == {"corrupt_events": 1}
@@ -145,15 +145,15 @@ def test_a_single_wrong_timestamp_is_dropped() -> None:
 
 def test_a_jump_that_nothing_confirms_does_not_hold_lines_back_for_ever() -> None:
     sent = random_events(7, 20)
-    lone = event_pieces(sent, "32")[0][:2] + b"\x70\0\0\0"
-    data = b"".join(event_pieces(sent, "32")) + lone + LINE * 100
-    assert len(parse(data, "32", Counter()).lines) == 100
+    lone = event_pieces(sent, "32bit")[0][:2] + b"\x70\0\0\0"
+    data = b"".join(event_pieces(sent, "32bit")) + lone + LINE * 100
+    assert len(parse(data, "32bit", Counter()).lines) == 100
 
 
 def test_a_line_that_never_ends_is_dropped_and_counted() -> None:
     counts: Counter[str] = Counter()
     sent = random_events(8, 50)
-    parsed = parse(b"a" * 1000 + b"\n" + b"".join(event_pieces(sent, "32")), "32", counts)
+    parsed = parse(b"a" * 1000 + b"\n" + b"".join(event_pieces(sent, "32bit")), "32bit", counts)
     assert_same(parsed, sent)
     assert counts["long_lines"] == 3
     assert [len(line) for _, line in parsed.lines] == [1000 - 3 * 256]

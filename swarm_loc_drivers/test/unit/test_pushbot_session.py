@@ -64,9 +64,9 @@ def test_ticks_among_events_are_stamped_by_the_boards_clock() -> None:
 
 
 def test_a_firmware_without_such_timestamps_is_named() -> None:
-    wire = PushbotWire(pushbot_settings(timestamps="32"), FIRST_FIRMWARE)
+    wire = PushbotWire(pushbot_settings(timestamps="32bit"), FIRST_FIRMWARE)
     wire.run(0.5)
-    assert "has no timestamps '32', only none, 16, 24, delta" in wire.errors[0]
+    assert "has no timestamps '32bit', only none, 16bit, 24bit, delta" in wire.errors[0]
 
 
 def test_a_board_that_is_no_pushbot_is_named() -> None:

@@ -23,7 +23,7 @@ class PushbotParameters:
 
     address: str = text("", "a serial port such as /dev/ttyUSB0, or tcp://HOST[:56000]", required=True)
     baud_rate: int = number(BAUD_RATE, "bit/s", 9600, 12_000_000, "of a serial port")
-    timestamps: str = choice("24", tuple(TIMESTAMPS), "timestamps of events: their bits, or differences")
+    timestamps: str = choice("24bit", tuple(TIMESTAMPS), "timestamps of events: their bits, or differences")
     events: bool = flag(True, "publish what the event camera sees")
     on_bit: int = number(0, "1", 0, 1, "polarity bit of pixels that became brighter")
     packet_period: float = number(0.005, "s", 0.001, 0.1, "of packets of events")

@@ -21,7 +21,7 @@ TICK_SPAN = 1 << 32
 BAUD_RATE = 4_000_000
 """After every reset [bit/s]."""
 
-TIMESTAMPS = {"none": 0, "delta": -1, "16": 2, "24": 3, "32": 4}
+TIMESTAMPS = {"none": 0, "delta": -1, "16bit": 2, "24bit": 3, "32bit": 4}
 """Timestamps of events as users name them: bytes of each; -1: difference to the last one, 1 to 4 bytes."""
 
 
@@ -45,11 +45,11 @@ class FirmwareGeneration:
 
 
 FIRST_FIRMWARE = FirmwareGeneration(
-    "first", 24, {"none": 0, "16": 1, "24": 2, "delta": 3}, ",", has_decay=False
+    "first", 24, {"none": 0, "16bit": 1, "24bit": 2, "delta": 3}, ",", has_decay=False
 )
 """The first public revision: `!S+,mask,period`, no 32-bit timestamps, no decaying velocities."""
 SECOND_FIRMWARE = FirmwareGeneration(
-    "second", 28, {"none": 0, "delta": 1, "16": 2, "24": 3, "32": 4}, "", has_decay=True
+    "second", 28, {"none": 0, "delta": 1, "16bit": 2, "24bit": 3, "32bit": 4}, "", has_decay=True
 )
 """Version 0.7 and later."""
 GENERATIONS = {one.name: one for one in (FIRST_FIRMWARE, SECOND_FIRMWARE)}

@@ -14,5 +14,5 @@ WARM_UP = Path(__file__)
 
 def warm_up() -> None:
     """Parse an event and a line."""
-    EventParser("16", Counter()).feed(b"\xe4\xa5\xe2\x40-S28 1 2\n")
+    EventParser("16bit", Counter()).feed(b"\xe4\xa5\xe2\x40-S28 1 2\n")
     note_warm(WARM_UP)

@@ -1,0 +1,278 @@
+"""PushBots over DDS: world, driver and tracker as processes, their bytes on TCP and on a serial port."""
+
+from __future__ import annotations
+
+import math
+import signal
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, Twist, Vector3
+from nav_msgs.msg import Odometry
+from node_world import Program, Ros, stamp_ns
+from rclpy.qos import qos_profile_sensor_data
+from test_world_node import free_ports
+
+from swarm_loc_drivers.core.pushbot.settings import WheelGeometry
+from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
+from swarm_loc_drivers.sim.pushbot.optics import FOCAL_PX
+from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldSettings
+from swarm_loc_msgs.msg import EventPacket, LaserDistance, LightBearingArray
+from swarm_loc_vision.core.laser.calibration import LaserCalibration
+from swarm_loc_vision.io.laser_file import load_laser, save_laser
+
+SEED = 3
+STARTS = {"pushbot1": (2.6, 1.5, math.pi), "pushbot2": (1.6, 1.2, 0.3)}
+SIM_TIME = {"use_sim_time": "true"}
+
+
+def world() -> PushbotWorld:
+    """The world of the node, to know how its robots were put together."""
+    settings = PushbotWorldSettings(SEED, floor_plan("corridor"), WheelGeometry(1e-4, 0.085))
+    return PushbotWorld(list(STARTS.values()), settings)
+
+
+def true_calibration(robot: int) -> LaserCalibration:
+    """What a perfect calibration of a robot finds."""
+    row_at_infinity, focal_base = world().optics[robot].row
+    return LaserCalibration(row_at_infinity, focal_base, 0.05, 0.04, 0.08, 3.0)
+
+
+@pytest.fixture
+def swarm_file(tmp_path: Path) -> Path:
+    path = tmp_path / "swarm.yaml"
+    rows = [
+        f"  {name}: {{start: {{x: {x}, y: {y}, theta: {theta}}}}}" for name, (x, y, theta) in STARTS.items()
+    ]
+    path.write_text("\n".join(["fileversion: 1", "robots:", *rows, ""]), encoding="utf-8")
+    return path
+
+
+class Hall:
+    """A world and the nodes of one of its robots, `pushbot1`."""
+
+    def __init__(self, ros: Ros, running: ExitStack, folder: Path, swarm_file: Path, link: str) -> None:
+        self.ros, self._running, self._folder = ros, running, folder
+        ports = free_ports()
+        place: dict[str, object] = {"first_port": ports} if link == "tcp" else {"link_folder": folder}
+        world_parameters = {"swarm_file": swarm_file, "seed": SEED, "wheel_noise": 1e-6, **place}
+        self.address = f"tcp://localhost:{ports}" if link == "tcp" else str(folder / "pushbot1")
+        self.world = self.start("pushbot_world_node", world_parameters, "")
+        self.world.wait_for("pushbot2 answers at")
+        self.odometry: list[Odometry] = ros.listen(Odometry, "pushbot1/odom")
+        self.truth: list[PoseStamped] = ros.listen(PoseStamped, "pushbot1/ground_truth")
+        self.laser: list[LaserDistance] = ros.listen(LaserDistance, "pushbot1/laser")
+        self.lights: list[LightBearingArray] = ros.listen(LightBearingArray, "pushbot1/lights")
+        self.diagnostics: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
+        self.packets: list[EventPacket] = []
+        ros.tester.create_subscription(
+            EventPacket, "pushbot1/events", self.packets.append, qos_profile_sensor_data
+        )
+        self.velocity = (0.0, 0.0)
+        self._publisher = ros.tester.create_publisher(Twist, "pushbot1/cmd_vel", 1)
+        self.commands = ros.tester.create_timer(0.05, self._command)
+
+    def start(
+        self,
+        name: str,
+        parameters: dict[str, Any],
+        namespace: str = "/pushbot1",
+        package: str = "swarm_loc_drivers",
+    ) -> Program:
+        """Start a node in the robot's namespace."""
+        arguments = ["-r", f"__ns:={namespace}"] if namespace else []
+        log = self._folder / f"{name}{namespace.strip('/')}.log"
+        return self._running.enter_context(Program(name, log, parameters, arguments, package))
+
+    def start_driver(self, **parameters: Any) -> Program:
+        """Start the driver of `pushbot1`."""
+        return self.start("pushbot_driver_node", {"address": self.address, **SIM_TIME, **parameters})
+
+    def start_tracker(self, **parameters: Any) -> Program:
+        """Start its tracker."""
+        chosen = {"light_frequencies": "[1000]", **SIM_TIME, **parameters}
+        return self.start("event_tracker_node", chosen, package="swarm_loc_vision")
+
+    def _command(self) -> None:
+        speed, turn_rate = self.velocity
+        self._publisher.publish(Twist(linear=Vector3(x=speed), angular=Vector3(z=turn_rate)))
+
+    def status(self, name: str) -> DiagnosticStatus | None:
+        """The newest diagnostics of a node."""
+        found = [one for array in self.diagnostics for one in array.status if one.name == f"pushbot1/{name}"]
+        return found[-1] if found else None
+
+    def moved(self) -> float:
+        """How far the robot truly is from where it began [m]."""
+        place = self.truth[-1].pose.position
+        return math.hypot(place.x - STARTS["pushbot1"][0], place.y - STARTS["pushbot1"][1])
+
+    def stands(self) -> bool:
+        """Whether it has stood during the last ten poses."""
+        places = [(one.pose.position.x, one.pose.position.y) for one in self.truth[-10:]]
+        return len(places) == 10 and np.ptp(places, axis=0).max() < 1e-4
+
+
+@pytest.fixture(params=["tcp", "serial"])
+def hall(ros: Ros, tmp_path: Path, swarm_file: Path, request: pytest.FixtureRequest) -> Iterator[Hall]:
+    with ExitStack() as running:
+        yield Hall(ros, running, tmp_path, swarm_file, request.param)
+
+
+def test_a_robot_drives_and_measures_and_stops_when_nobody_tells_it_to_drive(
+    hall: Hall, tmp_path: Path
+) -> None:
+    save_laser(tmp_path / "laser.yaml", true_calibration(0))
+    driver = hall.start_driver()
+    hall.start_tracker(calibration=tmp_path / "laser.yaml")
+    hall.ros.until(lambda: hall.odometry and hall.packets and hall.truth)
+    hall.velocity = (0.1, 0.0)
+    hall.ros.until(lambda: hall.moved() > 0.3)
+    hall.commands.cancel()
+    hall.ros.until(hall.stands)
+    place = hall.odometry[-1].pose.pose.position
+    assert place.x == pytest.approx(hall.moved(), abs=0.01)
+    wall = STARTS["pushbot1"][0] - hall.moved()
+    known = [one for one in hall.laser[-40:-5] if not math.isnan(one.distance)]
+    assert len(known) > 20
+    wrong = np.array([one.distance for one in known]) - wall
+    assert np.abs(wrong.mean()) < 4.0 * known[-1].sigma
+    assert hall.packets[-1].encoding == "mono"
+    assert driver.end(signal.SIGINT) == 0
+
+
+def test_leds_of_others_are_seen_where_they_are(ros: Ros, tmp_path: Path, swarm_file: Path) -> None:
+    with ExitStack() as running:
+        hall = Hall(ros, running, tmp_path, swarm_file, "tcp")
+        port = int(hall.address.rpartition(":")[2])
+        hall.start_driver()
+        hall.start_tracker()
+        other = {"address": f"tcp://localhost:{port + 1}", **SIM_TIME}
+        hall.start("pushbot_driver_node", other, "/pushbot2")
+        seen = [hall.lights]
+        ros.until(lambda: sum(len(one.lights) for one in seen[0]) > 30)
+        lights = [light for one in hall.lights for light in one.lights][-20:]
+    (x, y, theta), (ox, oy, _) = STARTS.values()
+    way = math.remainder(math.atan2(oy - y, ox - x) - theta, 2.0 * math.pi)
+    # one of two LEDs 4 cm before and behind the middle of the other robot, 1 m away; from 4 cm before our own
+    assert np.mean([one.bearing for one in lights]) == pytest.approx(way, abs=0.05)
+    assert all(one.elevation > 0.0 and one.frequency == 1000.0 for one in lights)
+    assert all(0.0 < math.sqrt(one.covariance[0]) < 1.0 / FOCAL_PX for one in lights)
+
+
+def test_a_driver_that_is_killed_leaves_a_robot_that_stops_by_itself(hall: Hall) -> None:
+    driver = hall.start_driver()
+    hall.ros.until(lambda: hall.odometry and hall.truth)
+    hall.velocity = (0.1, 0.0)
+    hall.ros.until(lambda: hall.moved() > 0.05)
+    driver.end(signal.SIGKILL)
+    hall.ros.until(hall.stands)
+    assert hall.moved() < 2.0
+
+
+def test_a_world_that_goes_and_comes_back_is_connected_anew(
+    ros: Ros, tmp_path: Path, swarm_file: Path
+) -> None:
+    with ExitStack() as running:
+        hall = Hall(ros, running, tmp_path, swarm_file, "serial")
+        hall.start_driver(use_sim_time="false")
+        ros.until(lambda: hall.odometry)
+        hall.world.end(signal.SIGINT)
+        ros.until(
+            lambda: (status := hall.status("pushbot_driver")) and status.level == DiagnosticStatus.ERROR
+        )
+        parameters = {"swarm_file": swarm_file, "seed": SEED, "link_folder": tmp_path}
+        hall.start("pushbot_world_node", parameters, "")
+        ros.until(lambda: (status := hall.status("pushbot_driver")) and status.level == DiagnosticStatus.OK)
+        before = stamp_ns(hall.odometry[-1])
+        ros.until(lambda: stamp_ns(hall.odometry[-1]) > before)
+
+
+def test_a_laser_that_is_never_seen_is_named(ros: Ros, tmp_path: Path, swarm_file: Path) -> None:
+    with ExitStack() as running:
+        hall = Hall(ros, running, tmp_path, swarm_file, "tcp")
+        hall.start_driver(laser_frequency=0.0)
+        hall.start_tracker()
+
+        def is_named() -> bool:
+            status = hall.status("event_tracker")
+            return status is not None and "450 Hz has not been seen" in status.message
+
+        ros.until(is_named)
+        assert all(math.isnan(one.distance) and one.covariance[0] == -1.0 for one in hall.laser)
+
+
+def test_a_laser_is_calibrated_by_a_drive_at_a_wall(ros: Ros, tmp_path: Path, swarm_file: Path) -> None:
+    with ExitStack() as running:
+        hall = Hall(ros, running, tmp_path, swarm_file, "tcp")
+        hall.commands.cancel()
+        hall.start_driver()
+        hall.start_tracker()
+        ros.until(lambda: hall.odometry and hall.laser)
+        parameters = {
+            "start_distance": 2.6, "speed": 0.25, "stop_distance": 0.16, "output": tmp_path / "found.yaml"
+        }  # fmt: skip
+        command = hall.start("calibrate_laser", parameters, package="swarm_loc_vision")
+        while command.process.poll() is None:
+            ros.executor.spin_once(timeout_sec=0.05)
+        assert command.end() == 0, command.output
+        assert "wrote" in command.output
+        ros.until(hall.stands)
+    found, truth = load_laser(tmp_path / "found.yaml"), true_calibration(0)
+    depths = np.linspace(0.12, 2.5, 100)
+    read = [found.focal_base / (truth.row(depth) - found.row_at_infinity) for depth in depths]
+    assert 100.0 * np.sqrt(np.mean((read - depths) ** 2)) < 3.0
+
+
+@pytest.mark.parametrize(
+    ("name", "package", "parameters", "sentence"),
+    [
+        ("pushbot_driver_node", "swarm_loc_drivers", {}, "parameter address is not set"),
+        (
+            "pushbot_driver_node",
+            "swarm_loc_drivers",
+            {"address": "udp://x"},
+            "must be the path of a serial port",
+        ),
+        (
+            "pushbot_driver_node",
+            "swarm_loc_drivers",
+            {"address": "/dev/x", "timestamps": "64bit"},
+            "must be one of",
+        ),
+        (
+            "pushbot_driver_node",
+            "swarm_loc_drivers",
+            {"address": "/dev/x", "laser_frequency": 3.0},
+            "laser_frequency = 3.0 must be 0, or at least 10 Hz",
+        ),
+        ("pushbot_world_node", "swarm_loc_drivers", {"swarm_file": "missing.yaml"}, "missing.yaml"),
+        ("event_tracker_node", "swarm_loc_vision", {"calibration": "missing.yaml"}, "missing.yaml"),
+        ("event_tracker_node", "swarm_loc_vision", {"laser_frequency": 0.0}, "leave nothing to track"),
+        (
+            "event_tracker_node",
+            "swarm_loc_vision",
+            {"light_frequencies": "['abc']"},
+            "'abc' must lie in [10, 5000]",
+        ),
+        ("calibrate_laser", "swarm_loc_vision", {}, "parameter output is not set"),
+        (
+            "calibrate_laser",
+            "swarm_loc_vision",
+            {"output": "x.yaml", "stop_distance": 2.0},
+            "stop_distance = 2.0 must be less than half",
+        ),
+    ],
+)
+def test_what_cannot_be_used_ends_a_node_with_one_sentence(
+    tmp_path: Path, name: str, package: str, parameters: dict[str, object], sentence: str
+) -> None:
+    with Program(name, tmp_path / "log", parameters, package=package) as program:
+        assert program.end() == 1
+        assert sentence in program.output
+        assert "Traceback" not in program.output
