@@ -1,7 +1,7 @@
 """A PushBot that turns, drives and measures in a floor plan, without firmware: truth, odometry, distances.
 
-What the firmware's emulator does byte by byte is done here a whole turn or drive at a time, so that hundreds of
-hours of mapping can be simulated.
+What the firmware's emulator does byte by byte is done here a whole turn or drive at a time, so that hundreds
+of hours of mapping can be simulated.
 """
 
 from __future__ import annotations
@@ -133,6 +133,11 @@ class KinematicPushBot:
         reported[:, 2] += step * np.arange(1, count + 1)
         return self._moved(poses, reported, others)
 
+    def rest(self, duration_s: float, others: list[KinematicPushBot]) -> Readings:
+        """Stand still for a while [s]."""
+        count = round(duration_s / PERIOD_S)
+        return self._moved(np.tile(self.pose, (count, 1)), np.tile(self._odometry, (count, 1)), others)
+
     def drive(self, length: float, others: list[KinematicPushBot]) -> Readings:
         """Drive ahead by a length of the odometry [m], until something is in the way."""
         count = max(1, round(length / (SPEED * PERIOD_S)))
@@ -158,8 +163,8 @@ class KinematicPushBot:
         for number, other in others.items():
             there = other.positions_at(steps)
             seen, bearing = _seen_lights(self._plan.walls, own, there)
-            for k in np.flatnonzero(seen):
-                rows.append((int(readings.stamp_ns[k]), number, float(bearing[k])))
+            chosen = np.flatnonzero(seen)
+            rows += [(int(readings.stamp_ns[k]), number, float(bearing[k])) for k in chosen]
         rows.sort()
         stamp_ns, target, bearings = (np.array(c) for c in zip(*rows, strict=True)) if rows else ([], [], [])
         count = len(rows)

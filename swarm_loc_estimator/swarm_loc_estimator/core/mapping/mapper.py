@@ -1,23 +1,26 @@
 """The cooperative mapper: readings of many robots in, their poses, one map and their next goals out.
 
-A robot stands, looks around by turning, and drives on. Each stop becomes a node of the pose graph; its beams are
-matched against those of other stops, of whichever robot. Robots join and leave at any time.
+A robot stands, looks around by turning, and drives on. Each stop becomes a node of the pose graph; its beams
+are matched against those of other stops, of whichever robot. Robots join and leave at any time.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
 from swarm_loc_estimator.core.mapping.exploration.explorer import next_stop
+from swarm_loc_estimator.core.mapping.exploration.goal import Goal, goal_by_odometry
 from swarm_loc_estimator.core.mapping.grid.occupancy import OccupancyMap, draw_map
 from swarm_loc_estimator.core.mapping.grid.visitation import VisitationMap
 from swarm_loc_estimator.core.mapping.localization.alignment import align, align_all, align_start
+from swarm_loc_estimator.core.mapping.localization.lights import LightBook, Visit
 from swarm_loc_estimator.core.mapping.localization.loop_closure import close_loop
 from swarm_loc_estimator.core.mapping.pose_graph.graph import PoseGraph
-from swarm_loc_estimator.core.mapping.readings import Readings
+from swarm_loc_estimator.core.mapping.readings import LightSightings, Readings
 from swarm_loc_estimator.core.mapping.scans.turn_ratio import turn_ratio
 from swarm_loc_estimator.core.mapping.settings import MapperSettings
 from swarm_loc_estimator.core.mapping.stops import MIN_TURN, MotionTracker, Stop
@@ -25,7 +28,7 @@ from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.se2 import between, compose, wrap_angle
 
 START_TURN = 4.5 * math.pi
-"""Turn by odometry of a whole first scan: an eighth twice, slowly, to hold the heading; then two turns [rad]."""
+"""Turn by odometry of a whole first scan: a quarter, slowly, to hold the heading; then two turns [rad]."""
 SCAN_TURN = 2.14 * math.pi
 """Turn by odometry at every later stop: a full turn also where wheels slip [rad]."""
 _START_PARTS = (0.25 * math.pi, *(0.5 * math.pi * k for k in range(1, 9)))
@@ -36,21 +39,6 @@ _LEAST_SIGMA = 0.003
 _LOST_SIGMA, _CHECK_EVERY = 0.15, 4
 """A robot that is less sure of its position [m] goes home: to an old stop nearby."""
 _HOME_AGE, _HOME_RADIUS, _AT_HOME = 10, 4.0, 0.5
-
-
-@dataclass(frozen=True)
-class Goal:
-    """Where a robot should go and look around.
-
-    Attributes:
-        number: Counts the goals of a robot, from 1 on.
-        position: (2,) in map [m].
-        odometry: (2,) the same in the robot's odom frame, if it turns there and drives by its odometry [m].
-    """
-
-    number: int
-    position: FloatArray
-    odometry: FloatArray
 
 
 @dataclass
@@ -111,6 +99,7 @@ class CooperativeMapper:
         self.visits = VisitationMap()
         self.counters = {"scans": 0, "scans_refused": 0, "loops_closed": 0}
         self._tracks: dict[int, _Track] = {}
+        self._lights = LightBook()
         self._map: OccupancyMap | None = None
 
     def join(self, pose: FloatArray, sigma: FloatArray) -> int:
@@ -142,6 +131,11 @@ class CooperativeMapper:
                     self.visits.add(np.tile(position[:2], (len(run.readings.stamp_ns), 1)))
             else:
                 self._drive(track, run.readings.odometry)
+                self._lights.note_time(robot, int(run.readings.stamp_ns[-1]))
+
+    def add_lights(self, robot: int, sightings: LightSightings) -> None:
+        """Take sightings (m,) of other robots by one of them."""
+        self._lights.add(robot, sightings)
 
     def pose(self, robot: int) -> FloatArray | None:
         """The pose (3,) of a robot in map at its newest reading; None before its first scan."""
@@ -160,8 +154,9 @@ class CooperativeMapper:
         return np.full((3, 3), np.nan) if node is None else self.graph.covariance(node)
 
     def goal(self, robot: int) -> Goal | None:
-        """Where a robot should go now; None while it has not looked around."""
-        return self._tracks[robot].goal
+        """Where a robot should go now; None unless it stands and has looked around."""
+        track = self._tracks[robot]
+        return track.goal if track.is_known else None
 
     def newest_stop(self, robot: int) -> int | None:
         """Number of the newest stop of a robot in the graph."""
@@ -217,8 +212,19 @@ class CooperativeMapper:
         if track.is_known:
             track.stop = stop
             self._update_scan(track)
-            track.left, track.path = stop.departure, 0.0
-        track.stop, track.is_known, track.goal = None, False, None
+            self._note_visit(robot, track, stop)
+            # from where the node is: its first steps away already count
+            track.left = np.array([*stop.arrival[:2], stop.departure[2]])
+            track.path = math.dist(stop.arrival[:2], stop.departure[:2])
+        track.stop, track.is_known = None, False
+
+    def _note_visit(self, robot: int, track: _Track, stop: Stop) -> None:
+        """Note where a robot stood until now, for lights that it saw and others saw of it."""
+        if track.node is not None:
+            begin_ns, end_ns = int(stop.stamp_ns[track.begin]), int(stop.stamp_ns[-1])
+            self._lights.note_visit(robot, Visit(track.node, begin_ns, end_ns, stop, track.turn_begin(stop)))
+            self._lights.note_time(robot, end_ns)
+            self._lights.settle(self.graph)
 
     def _update_scan(self, track: _Track) -> None:
         """Give the newest stop all readings made there."""
@@ -261,7 +267,7 @@ class CooperativeMapper:
         )
 
     def _enter_first(self, robot: int, track: _Track, stop: Stop, count: int) -> None:
-        """Make nodes of the parts of a first scan, so that what was seen first holds the heading at the start."""
+        """Make nodes of the parts of a first scan: what was seen first holds the heading at the start."""
         turn, inverse = stop.turn[:count], stop.inverse[:count]
         furthest = np.maximum.accumulate(np.abs(turn))
         ratio = turn_ratio(turn, inverse, stop.sigma)
@@ -271,7 +277,7 @@ class CooperativeMapper:
         bounds = sorted({0, *cuts[cuts < count].tolist(), count})
         nodes: list[int] = []
         pose = track.prior
-        for first, last in zip(bounds[:-1], bounds[1:], strict=True):
+        for first, last in pairwise(bounds):
             before = turn[first - 1] if first else 0.0
             node = self.graph.add_stop(robot, pose, stop.sigma)
             self.graph.set_scan(node, turn[first:last] - before, inverse[first:last])
@@ -292,7 +298,7 @@ class CooperativeMapper:
         node = track.node
         if node is None:
             return
-        self._look_for_home(robot, track, node)
+        self._look_for_home(track, node)
         x, y, theta, ratio = self.graph.states[node]
         others = [other for key, other in self._tracks.items() if key != robot]
         places = [self.pose(key) for key in self._tracks if key != robot]
@@ -305,14 +311,13 @@ class CooperativeMapper:
             self.settings,
             track.home,
         )
-        heading = theta + ratio * (stop.turn[count - 1] - track.turn_begin(stop))
-        turn = wrap_angle(math.atan2(hop[1] - y, hop[0] - x) - heading) / ratio
-        course = stop.arrival[2] + stop.turn[count - 1] + float(turn)
-        away = math.hypot(hop[0] - x, hop[1] - y)
-        there = stop.arrival[:2] + away * np.array([math.cos(course), math.sin(course)])
-        track.goal = Goal(track.goal.number + 1 if track.goal else 1, hop, there)
+        turned = float(stop.turn[count - 1])
+        pose = np.array([x, y, theta + ratio * (turned - track.turn_begin(stop))])
+        odometry = stop.arrival + np.array([0.0, 0.0, turned])
+        number = track.goal.number + 1 if track.goal else 1
+        track.goal = Goal(number, hop, goal_by_odometry(pose, odometry, hop, ratio))
 
-    def _look_for_home(self, robot: int, track: _Track, node: int) -> None:
+    def _look_for_home(self, track: _Track, node: int) -> None:
         """Send a robot that has become unsure of its position to where it was sure."""
         graph = self.graph
         if track.home is not None and math.dist(track.home, graph.states[node, :2]) < _AT_HOME:

@@ -1,9 +1,10 @@
-"""From a stream of readings to stops: where a robot stands and turns, and how it drives from one to the next."""
+"""From a stream of readings to stops: where a robot stands and looks around between two drives."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -67,7 +68,7 @@ class Stop:
         return float(np.abs(self.turn).max(initial=0.0))
 
     def completed(self, full: float) -> int:
-        """After how many readings the robot had turned by `full` [rad], or looked around and rested; 0: not yet."""
+        """After how many readings the robot had turned by `full` [rad], or looked and rested; 0: not yet."""
         return _completed(self.stamp_ns, self.turn, full)
 
     def turn_at(self, stamp_ns: int) -> float:
@@ -103,7 +104,7 @@ class MotionTracker:
         self._before_ns = int(readings.stamp_ns[-1])
         changes = (labels[1:] == _ARRIVES) | ((labels[1:] == _DRIVES) != (labels[:-1] == _DRIVES))
         bounds = [0, *(np.flatnonzero(changes) + 1).tolist(), len(labels)]
-        for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
+        for begin, end in pairwise(bounds):
             part = slice(begin, end)
             chosen = Readings(
                 readings.stamp_ns[part], readings.odometry[part], readings.inverse[part], readings.sigma

@@ -64,7 +64,7 @@ def next_stop(
             values *= 1.0 - _GOAL_WEIGHT * near
     best = cells[int(np.argmax(values))]
     goal_cell = (int(best[0]), int(best[1]))
-    return _first_hop(grid, before, here, goal_cell, settings.max_hop), grid.point(goal_cell)
+    return first_hop(grid, before, here, goal_cell, settings.max_hop), grid.point(goal_cell)
 
 
 def _candidates(length: FloatArray, cell: float) -> IntArray:
@@ -78,7 +78,7 @@ def _candidates(length: FloatArray, cell: float) -> IntArray:
     return chosen
 
 
-def _first_hop(
+def first_hop(
     grid: PlanningGrid, before: IntArray, here: tuple[int, int], goal: tuple[int, int], max_hop: float
 ) -> FloatArray:
     """The farthest point (2,) of the path to a goal that a straight free drive reaches [m]."""

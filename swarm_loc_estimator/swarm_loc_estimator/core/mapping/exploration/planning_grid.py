@@ -1,4 +1,4 @@
-"""Where a robot can drive: cells known to be free, far enough from walls and other robots, and paths on them."""
+"""Where a robot can drive: free cells, far enough from walls and other robots, and paths over them."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def tie(graph: PoseGraph, stop: int, pose: FloatArray, against: list[int]) -> No
 
 
 def refine(graph: PoseGraph, stop: int, against: list[int]) -> bool:
-    """Align a stop with others only, without odometry; whether it fits there and is held in all directions."""
+    """Align a stop with others only, without odometry; whether it fits and is held in all directions."""
     fit, H = 0.0, np.zeros((8, 8))
     for _ in range(4):
         H, g, fit = np.zeros((8, 8)), np.zeros(8), 0.0
@@ -81,9 +81,8 @@ def refine(graph: PoseGraph, stop: int, against: list[int]) -> bool:
 
 def _unconnected(graph: PoseGraph, stop: int) -> list[int]:
     """Old stops nearby, the nearest first, that are neither matched with this one nor with its targets."""
-    connected = {stop, *graph.targets.get(stop, ())}
-    for one in connected:
-        connected.update(graph.targets.get(one, ()))
+    near = {stop, *graph.targets.get(stop, ())}
+    connected = near.union(*(graph.targets.get(one, ()) for one in near))
     away, robot = graph.distances(stop), graph.robot
     return [
         int(one)

@@ -1,0 +1,1 @@
+"""PushBots: event tracker, calibration, driver, and the maps that they make."""

@@ -1,0 +1,217 @@
+"""One simulated exploration, and how good its map and poses are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from swarm_loc_drivers.sim.pushbot.exploration import Arrival, Exploration
+from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan
+from swarm_loc_drivers.sim.pushbot.kinematics import PushBotNoise
+from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.core.mapping.printed.particle_mapper import ParticleMapper
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.se2 import wrap_angle
+
+DIVERGED_CM = 30.0
+GOOD_CM, GOOD_DEG = 10.0, 2.0
+COVERED_M = 0.06
+"""A piece of wall is covered if a cell so near is occupied."""
+COVERED_SHARE = 0.9
+_LOOK_EVERY_S = 10.0
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """One run.
+
+    Attributes:
+        plan: Name of the floor plan.
+        slip: Share of turns that wheels lose.
+        seed: Of all noise.
+        minutes: How long.
+        robots: How many.
+        pixel: Noise of the tracker [px].
+        lights: Whether LEDs of other robots are seen.
+        printed: Whether the paper's method makes the map.
+    """
+
+    plan: str
+    slip: float
+    seed: int
+    minutes: float = 20.0
+    robots: int = 1
+    pixel: float = 0.1
+    lights: bool = True
+    printed: bool = False
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What came of a run; errors are against the truth, in the frame of the first robot's start.
+
+    Attributes:
+        settings: Of the run.
+        position_cm: Error of the robots' last poses, mean over the robots.
+        heading_deg: Likewise.
+        worst_cm: Largest error of any pose after the last solution.
+        online_cm: Median error of poses at the time when they were told.
+        online_worst_cm: The largest of these.
+        aligned_cm: RMS error of all poses after one rigid fit.
+        wall_cm: Mean distance of occupied cells from a wall.
+        wall_aligned_cm: Likewise after the fit.
+        coverage: Share of walls with an occupied cell nearby.
+        coverage_90_s: When this was nine tenths, as told at the time and after the fit; NaN: never.
+        cpu_s_per_s: Time that mapping took, per second.
+        bumps: How often a robot hit something.
+        cells: (n, 2) occupied cells [m].
+        path: (m, 3) robot, x, y of all poses [m].
+    """
+
+    settings: RunSettings
+    position_cm: float
+    heading_deg: float
+    worst_cm: float
+    online_cm: float
+    online_worst_cm: float
+    aligned_cm: float
+    wall_cm: float
+    wall_aligned_cm: float
+    coverage: float
+    coverage_90_s: float
+    cpu_s_per_s: float
+    bumps: int
+    cells: FloatArray
+    path: FloatArray
+
+    @property
+    def is_diverged(self) -> bool:
+        """Whether any pose, when told or in the end, was off by more than `DIVERGED_CM`."""
+        return not max(self.worst_cm, self.online_worst_cm) <= DIVERGED_CM
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the last poses are within `GOOD_CM` and `GOOD_DEG`."""
+        return self.position_cm <= GOOD_CM and self.heading_deg <= GOOD_DEG
+
+
+def run(settings: RunSettings) -> RunResult:
+    """Simulate and score one run."""
+    plan = floor_plan(settings.plan)
+    rng = np.random.default_rng([settings.seed, round(1e3 * settings.slip), settings.robots])
+    mapper: CooperativeMapper | ParticleMapper
+    mapper = ParticleMapper(rng.spawn(1)[0]) if settings.printed else CooperativeMapper()
+    exploration = Exploration(plan, mapper, rng, use_lights=settings.lights)
+    for number in range(settings.robots):
+        share = 1.0 if settings.robots == 1 else 0.5 + 0.5 * number / (settings.robots - 1)
+        exploration.join(PushBotNoise(slip=settings.slip * share, pixel=settings.pixel))
+    places: list[tuple[int, float]] = []
+    covered = _Covered(plan, mapper)
+
+    def note(arrival: Arrival) -> None:
+        places.append(_place(mapper, arrival))
+        covered.look(arrival.time_s)
+
+    exploration.run(60.0 * settings.minutes, note)
+    mapper.finish()
+    return _score(settings, plan, exploration, mapper, _final(mapper, exploration, places), covered.since_s)
+
+
+class _Covered:
+    """Looks now and then whether walls are covered."""
+
+    def __init__(self, plan: FloorPlan, mapper: CooperativeMapper | ParticleMapper) -> None:
+        self._mapper = mapper
+        self._points = plan.wall_points(0.04)
+        self._next_s = 0.0
+        self.since_s = math.nan
+
+    def look(self, time_s: float) -> None:
+        if time_s < self._next_s or not math.isnan(self.since_s):
+            return
+        self._next_s = time_s + _LOOK_EVERY_S
+        occupancy = self._mapper.occupancy()
+        if coverage(occupancy.centres(occupancy.occupied), self._points) >= COVERED_SHARE:
+            self.since_s = time_s
+
+
+def coverage(cells: FloatArray, points: FloatArray) -> float:
+    """Share of points (p, 2) of walls with a cell (n, 2) nearby."""
+    return float((cKDTree(cells).query(points)[0] < COVERED_M).mean()) if len(cells) else 0.0
+
+
+def wall_distance_cm(cells: FloatArray, plan: FloorPlan) -> float:
+    """Mean distance of cells (n, 2) from the nearest wall [cm]."""
+    return 100.0 * float(cKDTree(plan.wall_points(0.01)).query(cells)[0].mean()) if len(cells) else math.inf
+
+
+def rigid_fit(points: FloatArray, to: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotation (2, 2) and shift (2,) that bring points (n, 2) closest to others (n, 2)."""
+    middle, goal = points.mean(axis=0), to.mean(axis=0)
+    spread = (points - middle).T @ (to - goal)
+    angle = math.atan2(spread[0, 1] - spread[1, 0], spread[0, 0] + spread[1, 1])
+    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    return rotation, goal - rotation @ middle
+
+
+def _place(mapper: CooperativeMapper | ParticleMapper, arrival: Arrival) -> tuple[int, float]:
+    """Stop of an arrival in the graph, and the turn by odometry there until now."""
+    if isinstance(mapper, ParticleMapper):
+        return 0, 0.0
+    node = mapper.newest_stop(arrival.robot)
+    if node is None:
+        raise RuntimeError("a robot has looked around and yet is not in the graph")
+    theta, ratio = mapper.graph.states[node, 2:]
+    return node, float(wrap_angle(arrival.online[2] - theta)) / ratio
+
+
+def _final(
+    mapper: CooperativeMapper | ParticleMapper, exploration: Exploration, places: list[tuple[int, float]]
+) -> FloatArray:
+    """Poses (n, 3) of all arrivals as the mapper believes in the end; a filter does not change its mind."""
+    if isinstance(mapper, ParticleMapper):
+        return np.array([one.online for one in exploration.arrivals])
+    nodes, turns = np.array([node for node, _ in places]), np.array([turn for _, turn in places])
+    poses = mapper.graph.states[nodes, :3].copy()
+    poses[:, 2] += mapper.graph.states[nodes, 3] * turns
+    return poses
+
+
+def _score(
+    settings: RunSettings,
+    plan: FloorPlan,
+    exploration: Exploration,
+    mapper: CooperativeMapper | ParticleMapper,
+    final: FloatArray,
+    coverage_90_s: float,
+) -> RunResult:
+    arrivals = exploration.arrivals
+    truth, online = np.array([one.truth for one in arrivals]), np.array([one.online for one in arrivals])
+    robots = np.array([one.robot for one in arrivals])
+    errors, told = (100.0 * np.hypot(*(poses - truth)[:, :2].T) for poses in (final, online))
+    last = [int(np.flatnonzero(robots == robot)[-1]) for robot in exploration.robots]
+    heading = np.degrees(np.abs(wrap_angle(final[last, 2] - truth[last, 2])))
+    rotation, shift = rigid_fit(final[:, :2], truth[:, :2])
+    aligned = final[:, :2] @ rotation.T + shift - truth[:, :2]
+    occupancy = mapper.occupancy()
+    cells = occupancy.centres(occupancy.occupied)
+    return RunResult(
+        settings=settings,
+        position_cm=float(errors[last].mean()),
+        heading_deg=float(heading.mean()),
+        worst_cm=float(errors.max()),
+        online_cm=float(np.median(told)),
+        online_worst_cm=float(told.max()),
+        aligned_cm=100.0 * float(np.sqrt(np.square(aligned).sum(axis=1).mean())),
+        wall_cm=wall_distance_cm(cells, plan),
+        wall_aligned_cm=wall_distance_cm(cells @ rotation.T + shift, plan),
+        coverage=coverage(cells, plan.wall_points(0.04)),
+        coverage_90_s=coverage_90_s,
+        cpu_s_per_s=exploration.cpu_s / (60.0 * settings.minutes),
+        bumps=sum(one.bumps for one in exploration.robots.values()),
+        cells=cells,
+        path=np.column_stack([robots, final[:, :2]]),
+    )
