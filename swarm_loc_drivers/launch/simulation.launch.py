@@ -23,6 +23,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("seed", default_value="1", description="fixes the world's errors"),
             DeclareLaunchArgument("speed", default_value="0.06", description="along the eight [m/s]"),
             DeclareLaunchArgument("rate", default_value="1.0", description="simulated seconds per second"),
+            DeclareLaunchArgument("aerial", default_value="false", description="an overhead camera alone"),
             DeclareLaunchArgument("params_file", default_value="", description="ROS parameters of all nodes"),
             OpaqueFunction(function=start_nodes),
         ]

@@ -6,22 +6,37 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.epuck.world import check_swarm
+from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
+from swarm_loc_drivers.sim.scenarios.eight import ARENA
+from swarm_loc_drivers.sim.scenarios.eight_floor import eight_floor
 from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.launching.graph import NodeSpec, ParameterValue
 from swarm_loc_estimator.launching.options import check_parameter_file
 from swarm_loc_estimator.parameters.number_spec import number
 from swarm_loc_estimator.parameters.table import ParameterError
+from swarm_loc_vision.io.ground_file import save_ground
 
 Parameters = dict[str, ParameterValue]
 
 _ANSWER_WITHIN_S = 0.15
 """Images of real robots take so long to become detections, too."""
+_AERIAL_RATE_HZ = 3.0
+_AERIAL_CAMERA: Parameters = {
+    "robot_height": TOP_HEIGHT,
+    "robot_diameter": 2.0 * TOP_RADIUS,
+    "x_min": -0.5 * ARENA[0],
+    "x_max": 0.5 * ARENA[0],
+    "y_min": -0.5 * ARENA[1],
+    "y_max": 0.5 * ARENA[1],
+}
+"""What the node is told of the robots and of the arena."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +49,7 @@ class SimulationOptions:
         seed: Fixes them.
         speed: Along the eight [m/s].
         rate: Simulated seconds per second, as far as the machine keeps up.
+        aerial: Whether a camera above, which cannot tell the robots apart, is all that locates them.
         parameter_file: Path of a ROS parameter file for all nodes, None for none.
     """
 
@@ -44,6 +60,7 @@ class SimulationOptions:
     rate: float = number(
         1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
     )
+    aerial: bool = False
     parameter_file: str | None = None
 
 
@@ -61,13 +78,22 @@ def simulated_swarm(options: SimulationOptions) -> Swarm:
     return swarm
 
 
+def seen_from_above(swarm: Swarm) -> Swarm:
+    """A swarm as the estimator is given it when an overhead camera is all that there is.
+
+    Robots have odometry alone, and where they start is not known.
+    """
+    robots = (replace(robot, start=None, camera=None, faces=()) for robot in swarm.robots)
+    return Swarm(tuple(robots))
+
+
 def simulation_nodes(options: SimulationOptions, robots: Sequence[str], links: str) -> list[NodeSpec]:
     """The nodes of a simulation, in the order in which they start.
 
     Args:
         options: What the user chose.
         robots: The names of the swarm's robots.
-        links: Folder where their serial ports appear; exists.
+        links: Folder where their serial ports appear; exists. An overhead camera's files are written there.
     """
     drivers, vision, estimator = "swarm_loc_drivers", "swarm_loc_vision", "swarm_loc_estimator"
     swarm: Parameters = {"swarm_file": options.swarm_file}
@@ -80,23 +106,41 @@ def simulation_nodes(options: SimulationOptions, robots: Sequence[str], links: s
         "link_folder": links,
         "answer_within": _ANSWER_WITHIN_S,
     }
-    steering: Parameters = {**swarm, "speed": options.speed, "wait_for_poses": True}
+    steering: Parameters = {**swarm, "speed": options.speed, "wait_for_poses": True, "aerial": options.aerial}
+    described: Parameters = dict(swarm)
     file = options.parameter_file
+    cameras: list[NodeSpec] = []
+    if options.aerial:
+        described, ground = _aerial_files(options, Path(links))
+        world |= {**ground, "aerial_rate": _AERIAL_RATE_HZ}
+        seeing: Parameters = {**ground, **_AERIAL_CAMERA, **_reliable("aerial"), **time}
+        cameras = [NodeSpec(vision, "aerial_camera_node", "aerial_camera", "aerial", seeing, file)]
     nodes = [
-        NodeSpec(estimator, "estimator_node", "estimator", "", {**swarm, **time}, file),
+        NodeSpec(estimator, "estimator_node", "estimator", "", {**described, **time}, file),
         NodeSpec(drivers, "epuck_world_node", "epuck_world", "", world, file),
         NodeSpec(drivers, "eight_steering_node", "eight_steering", "", {**steering, **time}, file),
+        *cameras,
     ]
     for robot in robots:
         address: Parameters = {"address": f"{links}/{robot}"}
-        # no image may get lost because the machine is busy, nor the calibration before the first one
-        reliable: Parameters = {
-            f"qos_overrides./{robot}/{topic}.subscription.reliability": "reliable"
-            for topic in ("image_raw", "camera_info")
-        }
-        camera: Parameters = {**swarm, "robot": robot, **reliable}
-        nodes += [
-            NodeSpec(drivers, "epuck_driver_node", "epuck_driver", robot, {**address, **time}, file),
-            NodeSpec(vision, "marker_detector_node", "marker_detector", robot, {**camera, **time}, file),
-        ]
+        nodes.append(NodeSpec(drivers, "epuck_driver_node", "epuck_driver", robot, {**address, **time}, file))
+        if not options.aerial:
+            camera: Parameters = {**swarm, "robot": robot, **_reliable(robot), **time}
+            nodes.append(NodeSpec(vision, "marker_detector_node", "marker_detector", robot, camera, file))
     return nodes
+
+
+def _reliable(space: str) -> Parameters:
+    """That no image of a camera may get lost because the machine is busy, nor the calibration before it."""
+    return {
+        f"qos_overrides./{space}/{topic}.subscription.reliability": "reliable"
+        for topic in ("image_raw", "camera_info")
+    }
+
+
+def _aerial_files(options: SimulationOptions, folder: Path) -> tuple[Parameters, Parameters]:
+    """Write what an overhead camera needs; parameters that name the swarm description and the floor."""
+    swarm_file, floor_file = folder / "seen_from_above.yaml", folder / "control_points.yaml"
+    save_swarm(seen_from_above(load_swarm(Path(options.swarm_file))), swarm_file)
+    save_ground(eight_floor(), floor_file)
+    return {"swarm_file": str(swarm_file)}, {"control_points_file": str(floor_file)}

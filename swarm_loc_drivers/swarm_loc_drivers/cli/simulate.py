@@ -47,6 +47,11 @@ def parse(arguments: Sequence[str] | None) -> SimulationOptions:
             default=default,
             help=f"{spec.doc} (default: {default:g})",
         )
+    parser.add_argument(
+        "--aerial",
+        action="store_true",
+        help="a camera above, which cannot tell the robots apart, is all that locates them; starts are unknown",
+    )
     parser.add_argument("--params-file", dest="parameter_file", help="ROS parameter file for all nodes")
     return SimulationOptions(**vars(parser.parse_args(arguments)))
 
@@ -56,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run until a node ends or Ctrl-C."""
     options = parse(arguments)
     swarm = simulated_swarm(options)
-    if not is_warm(WARM_UP):  # once, not in every robot's detector at a time
+    if not options.aerial and not is_warm(WARM_UP):  # once, not in every robot's detector at a time
         say("compiling the marker detector for this machine: about half a minute")
         warm_up()
     with link_folder() as links:

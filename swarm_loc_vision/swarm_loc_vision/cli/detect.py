@@ -23,8 +23,8 @@ from swarm_loc_estimator.cli.errors import exit_with_message
 from swarm_loc_estimator.cli.progress import ProgressLine
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
 from swarm_loc_vision.io.camera_detector import CameraDetector
-from swarm_loc_vision.io.transports import Transport
 from swarm_loc_vision.io.image_bag import CreateCamera, ImageBag
+from swarm_loc_vision.io.transports import Transport
 from swarm_loc_vision.nodes.detector_parameters import DetectorParameters, detector_maker
 
 

@@ -20,7 +20,7 @@ from swarm_loc_vision.core.aerial.rectification import RectificationError
 from swarm_loc_vision.core.aerial.settings import AerialSettings
 from swarm_loc_vision.core.imaging.camera import Camera
 from swarm_loc_vision.core.imaging.gray import ImageError
-from swarm_loc_vision.io.calibrated_camera import CalibratedCamera, GrayOf, stamp_ns_of
+from swarm_loc_vision.io.calibrated_camera import CalibratedCamera, Gray, GrayOf, stamp_ns_of
 
 MAP = "map"
 
@@ -76,26 +76,27 @@ class AerialCamera(CalibratedCamera):
         Raises:
             ImageError: The image was dropped, and counted.
         """
-        gray = self.gray(message)
-        assert self.control is not None, "images without a calibration are dropped"
-        ground = self.control.look(gray)
-        try:
-            if ground is None:
-                raise ImageError("no_control_points", self.control.trouble)
-            detections = self._detector_for(ground).detect(gray)
-            self._seeing_trouble = ""
-        except RectificationError as error:
-            self._seeing_trouble = str(error)
-            self.drops["not_visible"] += 1
-            raise ImageError("not_visible", str(error)) from error
-        except ImageError as error:
-            self.drops[error.reason] += 1
-            raise
+        detections = self._seen(self.gray(message))
         self.drops.update(detections.dropped)
         self.used += 1
         self.robots += len(detections)
         self.headings += int(np.isfinite(detections.theta).sum())
         return encode_anonymous(MAP, stamp_ns_of(message), anonymous_rows(detections))
+
+    def _seen(self, gray: Gray) -> AerialDetections:
+        """The robots in an image."""
+        ground = self.control.look(gray) if self.control else None
+        if ground is None:
+            self.drops["no_control_points"] += 1
+            raise ImageError("no_control_points", self.why_nothing)
+        try:
+            detections = self._detector_for(ground).detect(gray)
+        except RectificationError as error:
+            self._seeing_trouble = str(error)
+            self.drops["not_visible"] += 1
+            raise ImageError("not_visible", str(error)) from error
+        self._seeing_trouble = ""
+        return detections
 
     def _detector_for(self, ground: GroundCamera) -> AerialDetector:
         """The detector for a pose of the camera."""

@@ -35,7 +35,7 @@ class CameraDetector(CalibratedCamera):
         self.markers = self.misfits = 0
         self._create = create
         self._ambiguity = ambiguity
-        self._detector: MarkerDetector | None = None
+        self._detector: MarkerDetector  # with the calibration, without which there is no image
 
     def use(self, camera: Camera) -> None:
         """Make the detector anew."""
@@ -48,7 +48,6 @@ class CameraDetector(CalibratedCamera):
             ImageError: The image was dropped, and counted.
         """
         gray = self.gray(message)
-        assert self._detector is not None, "images without a calibration are dropped"
         detections = self._detector.detect(gray)
         rows = detection_rows(detections, self._ambiguity)
         self.drops["no_pose"] += len(detections) - len(rows)

@@ -45,11 +45,18 @@ def load_ground(path: Path) -> Ground:
     return _Reader(path).ground(tree)
 
 
-def save_points(points: ControlPoints, path: Path, comment: str = "") -> None:
-    """Write points in a form that `load_ground` reads."""
+def save_ground(ground: Ground, path: Path, comment: str = "") -> None:
+    """Write control points and floor markers so that `load_ground` reads them back."""
+    points = ground.points
     rows = zip(points.names, points.places.tolist(), points.pixels.tolist(), strict=True)
-    entries = {name: dict(zip("xyzuv", [*place, *pixel], strict=True)) for name, place, pixel in rows}
-    text = "".join(f"# {line}\n" for line in comment.splitlines()) + tree_text({"points": entries})
+    tree = {
+        "points": {name: dict(zip("xyzuv", [*place, *pixel], strict=True)) for name, place, pixel in rows},
+        "family": ground.family.name,
+        "markers": {
+            one.id: {name: getattr(one, name) for name in number_specs(FloorMarker)} for one in ground.markers
+        },
+    }
+    text = "".join(f"# {line}\n" for line in comment.splitlines()) + tree_text(tree)
     path.write_text(text, encoding="utf-8")
 
 

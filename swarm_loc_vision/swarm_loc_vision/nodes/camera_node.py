@@ -84,7 +84,7 @@ class CameraNode(ConfiguredNode[Parameters]):
         raise NotImplementedError
 
     def trouble(self) -> str:
-        """What is wrong beside missing topics, a sentence; empty: nothing. Asked once for each diagnostics."""
+        """What is wrong beside missing topics, a sentence; empty: nothing. Asked once per diagnostics."""
         raise NotImplementedError
 
     def _on_camera_info(self, message: CameraInfo) -> None:

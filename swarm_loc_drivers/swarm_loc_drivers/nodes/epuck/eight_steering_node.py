@@ -32,6 +32,10 @@ class SteeringParameters:
     wait_for_poses: bool = flag(
         False, "begin only when swarm/poses and the detections of all robots are announced"
     )
+    aerial: bool = flag(
+        False,
+        "the detections to wait for are aerial/detections, of a camera above, in place of the robots' own",
+    )
 
 
 class EightSteeringNode(ConfiguredNode[SteeringParameters]):
@@ -41,7 +45,8 @@ class EightSteeringNode(ConfiguredNode[SteeringParameters]):
         super().__init__("eight_steering", SteeringParameters, **node_arguments)
         parameters = self.chosen
         names = [robot.name for robot in load_swarm(Path(parameters.swarm_file)).robots]
-        located = ["swarm/poses", *(f"{name}/detections" for name in names)]
+        seen = ["aerial/detections"] if parameters.aerial else [f"{name}/detections" for name in names]
+        located = ["swarm/poses", *seen]
         steer = EightSteering(len(names), parameters.speed).command
         self._steering = TruthSteering(self, names, steer, located if parameters.wait_for_poses else ())
 

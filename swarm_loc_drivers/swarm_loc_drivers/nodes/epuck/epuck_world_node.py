@@ -5,7 +5,8 @@
 Drivers connect to tcp://localhost:20000, 20001, ... in the order of the swarm description, or with
 `link_folder` to serial ports named like the robots. The node publishes `/clock`, per robot `ground_truth`
 (for evaluation and steering) and, in the place of the camera board's own driver,
-`image_raw` and `camera_info` of the 1280x960 camera; images that nobody listens to are not drawn. With
+`image_raw` and `camera_info` of the 1280x960 camera; with `aerial_rate` those of an
+overhead camera, too, under `aerial/`. Images that nobody listens to are not drawn. With
 `answer_within` time does not run away from those who read them.
 """
 
@@ -26,10 +27,13 @@ from swarm_loc_drivers.nodes.world_node import Pace, WorldNode
 from swarm_loc_drivers.protocols.epuck.hardware import EPUCK_MODELS
 from swarm_loc_drivers.sim.epuck.firmware.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.firmware.wifi_firmware import WifiFirmware
-from swarm_loc_drivers.sim.epuck.world import STEP_NS, SimulatedEpuck
+from swarm_loc_drivers.sim.epuck.world import OVERHEAD, STEP_NS, SimulatedEpuck
+from swarm_loc_drivers.sim.render.overhead import overhead_model
 from swarm_loc_estimator.ros.running import run_node
-from swarm_loc_msgs.msg import MarkerDetectionArray
+from swarm_loc_msgs.msg import AnonymousDetectionArray, MarkerDetectionArray
 
+_AERIAL = "aerial"
+"""Namespace of the overhead camera."""
 _ANSWER_QOS = QoSProfile(depth=100)
 _ANSWER_PATIENCE_S = 10.0
 _THROTTLE_S = 30.0
@@ -52,12 +56,17 @@ class EpuckWorldNode(WorldNode[WorldParameters]):
         self.begin(self._names, Pace(STEP_NS, chosen.rate, chosen.truth_rate), serve, link)
         calibration = chosen.camera.calibration
         self._cameras = [CameraOutput(self, name, calibration) for name in self._names]
+        if chosen.overhead.is_there:  # Python counts -1, which stands for it, from the end
+            self._names.append(_AERIAL)
+            self._cameras.append(CameraOutput(self, _AERIAL, overhead_model(chosen.overhead).calibration))
         self._held_since_s: float | None = None
         self._unanswered = Unanswered(chosen.answer_within)
         if chosen.answer_within > 0.0:
-            for robot, name in enumerate(self._names):
+            for robot, name in enumerate(robot.name for robot in swarm.robots):
                 answered = partial(self._on_detections, robot)
                 self.create_subscription(MarkerDetectionArray, f"{name}/detections", answered, _ANSWER_QOS)
+            answered = partial(self._on_detections, OVERHEAD)
+            self.create_subscription(AnonymousDetectionArray, f"{_AERIAL}/detections", answered, _ANSWER_QOS)
 
     def _serve_serial(self, chosen: WorldParameters, robot: int) -> str:
         firmware = SerialFirmware(SimulatedEpuck(self._world, robot), EPUCK_MODELS[chosen.model])
@@ -92,7 +101,7 @@ class EpuckWorldNode(WorldNode[WorldParameters]):
             )
         return True
 
-    def _on_detections(self, robot: int, message: MarkerDetectionArray) -> None:
+    def _on_detections(self, robot: int, message: MarkerDetectionArray | AnonymousDetectionArray) -> None:
         self._unanswered.answer(robot, nanoseconds(message.header.stamp))
 
 

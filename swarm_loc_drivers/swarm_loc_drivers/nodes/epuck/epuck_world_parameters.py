@@ -12,18 +12,21 @@ from swarm_loc_drivers.sim.common.world_error import WorldError
 from swarm_loc_drivers.sim.epuck.world import EpuckWorld, EpuckWorldSettings
 from swarm_loc_drivers.sim.render.camera_rig import Arena
 from swarm_loc_drivers.sim.render.lens import CameraModel
+from swarm_loc_drivers.sim.render.overhead import OverheadSettings
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, CAMERA_RATE_HZ, START_NS
 from swarm_loc_drivers.sim.scenarios.eight_images import FAMILY
 from swarm_loc_estimator.core.description.swarm import OdometryModel, Swarm
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.parameters.number_spec import number
 from swarm_loc_estimator.parameters.table import ParameterError, choice, text
+from swarm_loc_vision.core.aerial.floor_markers import FloorMarker
 from swarm_loc_vision.core.decoding.families import families
+from swarm_loc_vision.io.ground_file import load_ground
 
 
 @dataclass(frozen=True)
 class WorldParameters:
-    """Parameters of `epuck_world_node`; the camera's are those of `CameraModel`."""
+    """Parameters of `epuck_world_node`; the cameras' are those of `CameraModel` and `OverheadSettings`."""
 
     swarm_file: str = text("", "path of the swarm description; every robot needs a start", required=True)
     world: str = choice(
@@ -54,7 +57,27 @@ class WorldParameters:
     family: str = choice(FAMILY, tuple(families()), "kind of the markers")
     camera_rate: float = number(CAMERA_RATE_HZ, "1/s", 2.0, 60.0, "images of each camera")
     truth_rate: float = number(20.0, "1/s", 0.1, 200.0, "published true poses of each robot")
+    control_points_file: str = text(
+        "", "path of the floor markers that the overhead camera sees; empty: none are on the floor"
+    )
     camera: CameraModel = field(default_factory=CameraModel, metadata={"numbers_of": CameraModel})
+    overhead: OverheadSettings = field(
+        default_factory=OverheadSettings, metadata={"numbers_of": OverheadSettings}
+    )
+
+
+def _floor_markers(parameters: WorldParameters) -> tuple[FloorMarker, ...]:
+    """What lies on the floor."""
+    path = parameters.control_points_file
+    if not path:
+        return ()
+    ground = load_ground(Path(path))
+    if ground.markers and ground.family.name != parameters.family:
+        raise ParameterError(
+            f"parameter family = '{parameters.family}' must be that of the floor markers in '{path}':"
+            f" {ground.family.name}."
+        )
+    return ground.markers
 
 
 def make_world(parameters: WorldParameters) -> tuple[Swarm, EpuckWorld]:
@@ -79,6 +102,8 @@ def make_world(parameters: WorldParameters) -> tuple[Swarm, EpuckWorld]:
             wheels=WheelGeometry(parameters.wheel_diameter, parameters.wheel_separation),
             camera_rate_hz=parameters.camera_rate,
             start_ns=START_NS,
+            overhead=parameters.overhead,
+            floor_markers=_floor_markers(parameters),
         )
         return swarm, EpuckWorld(swarm, settings)
     except WorldError as error:

@@ -7,7 +7,7 @@ wants to see them, and look the same whenever that is.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,18 +21,22 @@ from swarm_loc_drivers.sim.common.world_error import WorldError, start_of
 from swarm_loc_drivers.sim.epuck.proximity import proximity_values
 from swarm_loc_drivers.sim.render.camera_rig import Arena, CameraRig
 from swarm_loc_drivers.sim.render.lens import CameraModel
+from swarm_loc_drivers.sim.render.overhead import OverheadRig, OverheadSettings
 from swarm_loc_drivers.sim.render.views import Views
 from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_vision.core.aerial.floor_markers import FloorMarker
 
 GrayImage = NDArray[np.uint8]
 
 STEP_NS = 5_000_000
+OVERHEAD = -1
+"""In place of a robot: the overhead camera, which stamps its images with the middle of the exposure."""
 _SLIP_S = 0.05
 """How long a slip of a wheel lasts: 3 mm of its way at 0.06 m/s."""
 _KEPT_NS = 400_000_000
 """So long an image can still be drawn after its camera has taken the next one."""
-_PHASES, _EXPOSURES, _SENSOR, _PROXIMITY = range(4)
+_PHASES, _EXPOSURES, _SENSOR, _PROXIMITY, _OVERHEAD_SENSOR = range(5)
 """Streams of random numbers, each a function of the seed, the stream, and what it is for."""
 
 
@@ -48,6 +52,8 @@ class EpuckWorldSettings:
         wheels: Of all robots.
         camera_rate_hz: [1/s].
         start_ns: First moment.
+        overhead: A camera above all, and the light.
+        floor_markers: Fiducials on the floor, which that camera sees.
     """
 
     seed: int
@@ -57,6 +63,8 @@ class EpuckWorldSettings:
     wheels: WheelGeometry
     camera_rate_hz: float
     start_ns: int
+    overhead: OverheadSettings = field(default_factory=OverheadSettings)
+    floor_markers: tuple[FloorMarker, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -64,7 +72,7 @@ class Exposure:
     """An image that a camera has taken.
 
     Attributes:
-        robot: Index of the robot.
+        robot: Index of the robot, or OVERHEAD.
         number: Counts the robot's images.
         stamp_ns: When its camera says it was taken.
         middle_ns: When it was taken: the middle of the exposure.
@@ -96,6 +104,13 @@ class EpuckWorld:
         rng = np.random.default_rng(settings.seed)
         truth = hidden_geometry(rng, swarm, settings.errors)
         self._rig = CameraRig(swarm, truth, settings.arena, settings.camera, settings.seed)
+        overhead = settings.overhead
+        self._overhead = (
+            OverheadRig(self._rig.scene, overhead, settings.floor_markers, settings.arena.family)
+            if overhead.is_there
+            else None
+        )
+        self._overhead_images = 0
         count = len(swarm.robots)
         self._slip = LastingNoise(rng, (count, 2), STEP_NS * 1e-9, _SLIP_S)
         self.now_ns = settings.start_ns
@@ -127,7 +142,7 @@ class EpuckWorld:
         self.now_ns += STEP_NS
         self._past.append((self.now_ns, self.poses))
         taken = [self._take(robot) for robot in range(len(self._next)) if self._is_due(self._next[robot])]
-        return sorted(taken, key=lambda exposure: exposure.stamp_ns)
+        return sorted([*taken, *self._seen_from_above()], key=lambda exposure: exposure.stamp_ns)
 
     def image(self, exposure: Exposure) -> GrayImage:
         """Draw what a camera took (height, width).
@@ -138,6 +153,9 @@ class EpuckWorld:
         track = Trajectories(
             np.array([stamp_ns for stamp_ns, _ in self._past]), np.array([poses for _, poses in self._past])
         )
+        if exposure.robot == OVERHEAD and self._overhead is not None:
+            rng = self._random(_OVERHEAD_SENSOR, exposure.number)
+            return self._overhead.take(exposure.middle_ns, track, rng)
         rng = self._random(_SENSOR, exposure.robot, exposure.number)
         return self._rig.take(exposure.robot, exposure.middle_ns, track, rng)
 
@@ -166,6 +184,18 @@ class EpuckWorld:
         stamp_ns = self._first_ns[robot] + number * self._period_ns
         early_s = self._settings.errors.exposure_early_s * self._random(_EXPOSURES, robot, number).random()
         return Exposure(robot, number, stamp_ns, stamp_ns - round(1e9 * early_s))
+
+    def _seen_from_above(self) -> list[Exposure]:
+        """The image that the overhead camera has just finished, if any."""
+        overhead, number = self._settings.overhead, self._overhead_images
+        if not overhead.is_there:
+            return []
+        half_ns = round(0.5e9 * overhead.aerial_exposure_s)
+        middle_ns = self._settings.start_ns + half_ns + round((number + 1) * 1e9 / overhead.aerial_rate)
+        if self.now_ns < middle_ns + half_ns:
+            return []
+        self._overhead_images += 1
+        return [Exposure(OVERHEAD, number, middle_ns, middle_ns)]
 
     def _is_due(self, exposure: Exposure) -> bool:
         """Whether its shutter has closed and its camera has stamped it."""

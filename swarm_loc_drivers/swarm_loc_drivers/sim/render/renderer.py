@@ -44,11 +44,13 @@ class Scene:
         backdrop: Behind everything, in map.
         boards: What stands alone, in map.
         robots: Of each robot its parts in its base_link, such that no part hides a later one.
+        flat: So many of the first robots are flat on the floor, as shadows are: they hide nothing.
     """
 
     backdrop: Patches
     boards: Sequence[Patches]
     robots: Sequence[Sequence[Patches]]
+    flat: int = 0
 
 
 @dataclass
@@ -186,7 +188,9 @@ class Renderer:
         middle = poses[len(poses) // 2]
         places = np.concatenate([self._board_centres[:, :2], middle[:, :2]])
         boards = len(self._board_centres)
-        for thing in np.argsort(-np.linalg.norm(places - middle[own, :2], axis=1), kind="stable").tolist():
+        distance = np.linalg.norm(places - middle[own, :2], axis=1)
+        distance[boards : boards + self._scene.flat] = np.inf
+        for thing in np.argsort(-distance, kind="stable").tolist():
             if thing < boards:
                 yield self._scene.boards[thing], of_map
             elif thing - boards != own:

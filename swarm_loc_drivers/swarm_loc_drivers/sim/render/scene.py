@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.sim.render.raster import Patches
 from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_vision.core.aerial.pattern import MARK_RADIUS
 
 BLACK, WHITE = 0.05, 0.85
 ROOM = 0.30
@@ -24,7 +25,11 @@ _WALLS, _WALL_HEIGHT = (0.58, 0.66, 0.62, 0.70), 0.30
 _CLUTTER_PER_M, _CLUTTER_ABOVE = 4.0, 0.16
 _BODY, _BODY_TOP, _BAND, _TOWER, _TOWER_TOP = 0.28, 0.35, 0.12, 0.20, 0.24
 _BODY_RADIUS, _BODY_HEIGHT, _BODY_SIDES, _BAND_HEIGHTS = 0.035, 0.055, 10, (0.024, 0.030)
-_TOWER_RADIUS, _TOWER_HEIGHT, _TOWER_SIDES = 0.036, 0.105, 5
+TOP_RADIUS, TOP_HEIGHT = 0.035, 0.105
+"""Of the pattern on a robot's top [m]."""
+_DISC_SIDES = 32
+_PENUMBRA = (-0.004, 0.0, 0.004)
+_TOWER_RADIUS, _TOWER_HEIGHT, _TOWER_SIDES = 0.036, TOP_HEIGHT, 5
 
 
 class Surface:
@@ -48,6 +53,24 @@ class Surface:
     ) -> None:
         """Add a rectangle [m], `change` brighter than what it lies on."""
         self.polygon([(left, top), (right, top), (right, bottom), (left, bottom)], change, covers=covers)
+
+    def fan(
+        self,
+        corners: Sequence[tuple[float, float]],
+        change: float,
+        *,
+        covers: bool = False,
+        cover: float = 0.0,
+    ) -> None:
+        """Add a convex outline of any number of corners [m], anticlockwise as seen from the front.
+
+        What it covers shows through where `cover`, the share of it that is hidden, is below one.
+        """
+        ring = list(corners)[::-1]
+        for i in range(1, len(ring) - 1, 2):
+            third = ring[i + 2] if i + 2 < len(ring) else ring[i + 1]
+            self.polygon([ring[0], ring[i], ring[i + 1], third], change, covers=covers)
+            self.cover[-1] = cover or self.cover[-1]
 
     def polygon(self, corners: Sequence[tuple[float, float]], change: float, *, covers: bool = False) -> None:
         """Add four corners [m] to the right and down of the origin, clockwise as seen from the front."""
@@ -93,7 +116,11 @@ def marker(pose: Sequence[float], height: float, cells: NDArray[np.bool_], size:
         cells: (n, n) of the black square, border included; True is white.
         size: Side of the black square [m].
     """
-    sheet = upright(pose[0], pose[1], height, pose[2])
+    return _printed(upright(pose[0], pose[1], height, pose[2]), cells, size)
+
+
+def _printed(sheet: Surface, cells: NDArray[np.bool_], size: float) -> Patches:
+    """A sheet with a marker on it."""
     half, cell = 0.5 * size, size / len(cells)
     sheet.rectangle(-half - cell, -half - cell, half + cell, half + cell, WHITE, covers=True)
     sheet.rectangle(-half, -half, half, half, BLACK - WHITE)
@@ -103,6 +130,16 @@ def marker(pose: Sequence[float], height: float, cells: NDArray[np.bool_], size:
             top = row * cell - half
             sheet.rectangle(left, top, right, top + cell, WHITE - BLACK)
     return patches([sheet])
+
+
+def floor_marker(pose: Sequence[float], cells: NDArray[np.bool_], size: float) -> Patches:
+    """A marker on its sheet that lies on the floor and looks up; arguments as for `marker`.
+
+    The last number of the pose is the direction to the marker's own right, from map's x.
+    """
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    sheet = Surface(np.array([pose[0], pose[1], 0.0]), np.array([cos, sin, 0.0]), np.array([sin, -cos, 0.0]))
+    return _printed(sheet, cells, size)
 
 
 def arena(size: tuple[float, float], rng: np.random.Generator) -> Patches:
@@ -152,6 +189,43 @@ def tower() -> Patches:
     return patches([*sides, _lid(_TOWER_RADIUS, _TOWER_HEIGHT, _TOWER_SIDES, _TOWER_TOP)])
 
 
+def top_pattern() -> Patches:
+    """The pattern on an e-puck's top, the same on all: a black disc with a white half-disc, in base_link."""
+    top = level(_TOWER_HEIGHT)
+    top.fan(_disc(TOP_RADIUS, 0.0, 2.0 * math.pi), BLACK, covers=True)
+    half = _disc(MARK_RADIUS * TOP_RADIUS, -0.5 * math.pi, math.pi)
+    top.fan(half, WHITE - BLACK)
+    return patches([top])
+
+
+def shadow(strength: float, towards: float, slope: float) -> Patches:
+    """The shadow of an e-puck on the floor, around its centre, with a soft rim.
+
+    Args:
+        strength: Share of the light that it takes.
+        towards: Direction in which it falls, in the frame of the patches [rad].
+        slope: Its length per height.
+    """
+    floor = level(0.0)
+    for grown in _PENUMBRA:
+        radius, length = _BODY_RADIUS + grown, _TOWER_HEIGHT * slope
+        near = _disc(radius, towards + 0.5 * math.pi, math.pi)
+        far = [
+            (x + length * math.cos(towards), y - length * math.sin(towards))
+            for x, y in _disc(radius, towards - 0.5 * math.pi, math.pi)
+        ]
+        floor.fan([*near, *far], 0.0, cover=strength / len(_PENUMBRA))
+    return patches([floor])
+
+
+def _disc(radius: float, begin: float, angle: float) -> list[tuple[float, float]]:
+    """A circle or a part of it, to the right and down, anticlockwise as seen from above."""
+    count = round(_DISC_SIDES * angle / (2.0 * math.pi))
+    ends = 0 if angle > 6.0 else 1
+    angles = begin + angle * np.arange(count + ends) / count
+    return [(radius * math.cos(a), -radius * math.sin(a)) for a in angles.tolist()]
+
+
 def _prism(radius: float, low: float, high: float, sides: int, brightness: float) -> list[Surface]:
     """The upright sides of a prism, origins in the middle of their upper edges; corners at `radius`."""
     half, inner = radius * math.sin(math.pi / sides), radius * math.cos(math.pi / sides)
@@ -169,7 +243,5 @@ def _lid(radius: float, height: float, sides: int, brightness: float) -> Surface
     surface = level(height)
     angles = -2.0 * math.pi * np.arange(sides) / sides  # clockwise as seen from above, y up
     ring = [(radius * math.cos(angle), -radius * math.sin(angle)) for angle in angles]
-    for i in range(1, sides - 1, 2):
-        third = ring[i + 2] if i + 2 < sides else ring[i + 1]
-        surface.polygon([ring[0], ring[i], ring[i + 1], third], brightness, covers=True)
+    surface.fan(ring[::-1], brightness, covers=True)
     return surface

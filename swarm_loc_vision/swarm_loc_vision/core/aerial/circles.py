@@ -22,6 +22,8 @@ _WIDEST = 0.3
 """By which share a rim may be wider or narrower than expected."""
 _OFF = 0.12
 """Farther from the circle than this share of its radius an edge is not its own."""
+_BLOCK = 30_000
+"""OpenCV's images have fewer than 2^15 rows."""
 _ROUNDS = 3
 _EVERY, _LIKELY = 4, 0.4
 """At first every fourth ray is looked along, and this share of them must meet an edge."""
@@ -30,9 +32,6 @@ _NOISES = 1.5
 """Of one pixel, that an edge's step must reach: its two sides are means over many."""
 _SLACK_PX = 0.03
 """Error of an edge that its neighbours share [px], beside what the residuals show."""
-
-_NO_MAP = np.zeros(0, np.float32)
-"""Both columns and rows are in the first map."""
 
 _ANGLES = 2.0 * np.pi * np.arange(RAYS) / RAYS
 DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
@@ -65,12 +64,14 @@ class Circles(NamedTuple):
 
 def sampled(image: Plain, cells: FloatArray) -> FloatArray:
     """Values (...) of an image at columns and rows (..., 2), linear between pixels."""
-    flat = np.ascontiguousarray(cells.reshape(-1, 2), np.float32)
-    out = np.empty(len(flat), np.float32)
-    for begin in range(0, len(flat), 30_000):  # OpenCV's images have fewer than 2^15 rows
-        part = flat[begin : begin + 30_000, None]
-        values = cv2.remap(image, part, _NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        out[begin : begin + 30_000] = values[:, 0]
+    columns, rows = np.ascontiguousarray(cells.reshape(-1, 2).T, np.float32)[..., None]
+    out = np.empty(len(columns), np.float32)
+    for begin in range(0, len(columns), _BLOCK):
+        part = slice(begin, begin + _BLOCK)
+        values = cv2.remap(
+            image, columns[part], rows[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        out[part] = values[:, 0]
     return out.reshape(cells.shape[:-1]).astype(float)
 
 

@@ -42,6 +42,8 @@ _SAME_SIZE = 0.2
 _SAME_CONTRAST = 0.45
 """So much of the others' contrast a disc must have: shadows have less."""
 _MARK_ROUNDS = 2
+_MOST, _CLEAR = 0.6, 0.85
+"""Share of the discs with a mark from which on others need so much of their rim."""
 
 
 @dataclass(frozen=True)
@@ -113,9 +115,7 @@ class AerialDetector:
                 return _nothing({"size_unknown": 1})
         if self._grid is None:
             settings = self._settings
-            self._grid = rectification(
-                self._ground, settings.robot_height, self.diameter, _SIZES_PX, settings.min_diameter_px
-            )
+            self._grid = rectification(self._ground, settings, self.diameter, _SIZES_PX)
         found, dropped = self._discs(gray, self._grid, self.diameter, noise)
         return self._located(self._grid, found, dropped)
 
@@ -170,6 +170,9 @@ class AerialDetector:
                 )
             )
         marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
+        alike = _marked_alike(circles, marks)
+        dropped = {**dropped, "without_mark": int(np.sum(~alike))}
+        circles, marks = circles.chosen(alike), Marks(*(column[alike] for column in marks))
         places = grid.places(circles.centre)
         of_pixel = self._ground.pixel_covariances(places, circles.covariance * grid.metres_per_px**2)
         of_pixel = of_pixel + settings.pixel_sigma**2 * np.eye(2)
@@ -194,9 +197,7 @@ class AerialDetector:
         least, largest = settings.min_diameter_px / per_metre, _MAX_SHARE * min(gray.shape) / per_metre
         diameters, scores = [np.zeros(0)], [np.zeros(0)]
         for diameter in ladder(1.2 * least, largest).tolist():
-            grid = rectification(
-                ground, settings.robot_height, diameter, (_ROUGH_PX, _ROUGH_PX), settings.min_diameter_px
-            )
+            grid = rectification(ground, settings, diameter, (_ROUGH_PX, _ROUGH_PX))
             found, _ = self._discs(gray, grid, diameter, noise)
             diameters.append(2.0 * found.circles.radius * grid.metres_per_px)
             scores.append(_quality(found.circles))
@@ -207,6 +208,14 @@ def _quality(circles: Circles) -> FloatArray:
     """(C,) how clear discs are, 0 to 1: how much of their rims is seen, and how round it is."""
     limit = _MAX_SPREAD * circles.radius + _MAX_SPREAD_PX
     return np.asarray(circles.coverage**2 * np.maximum(1.0 - (circles.spread / limit) ** 2, 0.0))
+
+
+def _marked_alike(circles: Circles, marks: Marks) -> NDArray[np.bool_]:
+    """Which discs may carry the same pattern: where most show a mark, those without must be clear discs."""
+    quality, has_mark = _quality(circles), np.isfinite(marks.theta)
+    if quality[has_mark].sum() < _MOST * quality.sum():
+        return np.ones(len(quality), np.bool_)
+    return np.asarray(has_mark | (circles.coverage >= _CLEAR))
 
 
 def _inside(grid: Rectification, centre: FloatArray) -> NDArray[np.bool_]:

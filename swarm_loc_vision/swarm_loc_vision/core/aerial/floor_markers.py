@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,16 +57,24 @@ class FloorMarkers:
         self._counts: dict[int, int] = {}
 
     def look(self, gray: Gray) -> ControlPoints:
-        """Control points by all images so far, this one (height, width) among them."""
-        seen = self._detector.detect(gray)
-        for marker_id, corners in zip(seen.id.tolist(), seen.corners, strict=True):
+        """Control points by one image (height, width), which counts for the mean, too."""
+        found = self._detector.detect(gray)
+        seen = dict(zip(found.id.tolist(), found.corners, strict=True))
+        for marker_id, corners in seen.items():
             self._sums[marker_id] = self._sums.get(marker_id, np.zeros((4, 2))) + corners
             self._counts[marker_id] = self._counts.get(marker_id, 0) + 1
-        found = sorted(self._sums)
+        return self._points(seen)
+
+    def mean(self) -> ControlPoints:
+        """Control points by all images so far."""
+        return self._points({i: self._sums[i] / self._counts[i] for i in self._sums})
+
+    def _points(self, corners: Mapping[int, FloatArray]) -> ControlPoints:
+        """The corners (4, 2) of markers as control points."""
         return ControlPoints(
-            [f"{corner} of marker {marker_id}" for marker_id in found for corner in _CORNER_NAMES],
-            np.array([self._markers[marker_id].corners for marker_id in found]).reshape(-1, 3),
-            np.array([self._sums[i] / self._counts[i] for i in found]).reshape(-1, 2),
+            [f"{corner} of marker {marker_id}" for marker_id in corners for corner in _CORNER_NAMES],
+            np.array([self._markers[marker_id].corners for marker_id in corners]).reshape(-1, 3),
+            np.array(list(corners.values())).reshape(-1, 2),
         )
 
     def forget(self) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from swarm_loc_vision.core.aerial.control_points import (
     NO_POINTS,
     ControlPointError,
@@ -22,6 +24,8 @@ from swarm_loc_vision.core.imaging.camera import Camera
 NO_GROUND = "there are neither control points nor floor markers, without which nothing is published."
 _SETTLING, _LATER_EVERY = 10, 10
 """Markers are looked for in so many first images, then in every so many-th: is the camera where it was?"""
+_MOVED = 3.0
+"""So many standard deviations of one point most of them are away when the camera has moved."""
 
 
 @dataclass(frozen=True)
@@ -72,22 +76,32 @@ class GroundControl:
 
     def look(self, gray: Gray) -> GroundCamera | None:
         """The camera that took an image (height, width), with its pose; None: see `trouble`."""
-        if self._markers is not None and (
-            self.fit is None or self._images < _SETTLING or self._images % _LATER_EVERY == 0
-        ):
-            self._solve(self._ground.points.joined(self._markers.look(gray)))
-            if self.fit is None and self._images >= _SETTLING:
-                self._begin_anew(self._markers, gray)
+        if self._markers is not None:
+            self._look_at(self._markers, gray)
         self._images += 1
         return self.fit.ground if self.fit else None
 
-    def _begin_anew(self, markers: FloorMarkers, gray: Gray) -> None:
-        """By what this image shows alone: what others showed contradicts it, or they showed too little."""
-        markers.forget()
-        self._solve(self._ground.points.joined(markers.look(gray)))
-        if self.fit is not None:
-            self._images = 0
-            self.moves += 1
+    def _look_at(self, markers: FloorMarkers, gray: Gray) -> None:
+        """Solve for the pose by the first images' markers, then watch whether they stay where they are."""
+        if self._images < _SETTLING:
+            markers.look(gray)
+            if self.fit is None or self._images == _SETTLING - 1:
+                self._solve(self._ground.points.joined(markers.mean()))
+        elif self.fit is None or self._images % _LATER_EVERY == 0:
+            seen = markers.look(gray)
+            if self.fit is None or self._has_moved(self.fit, seen):
+                self.moves += self.fit is not None
+                self._images = 0
+                markers.forget()
+                markers.look(gray)
+                self._solve(self._ground.points.joined(markers.mean()))
+
+    def _has_moved(self, fit: PoseFit, seen: ControlPoints) -> bool:
+        """Whether most of what is seen is no longer where it was."""
+        if not len(seen):
+            return False
+        away = np.linalg.norm(fit.ground.pixels(seen.places) - seen.pixels, axis=1)
+        return not np.median(away) <= _MOVED * np.hypot(self._noise.pixel, fit.rms_px)
 
     def _solve(self, points: ControlPoints) -> None:
         """The pose by points."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_vision.core.aerial.ground_camera import GroundCamera
+from swarm_loc_vision.core.aerial.settings import AerialSettings
 
 Gray = NDArray[np.uint8]
 Plain = NDArray[np.float32]
@@ -59,21 +60,22 @@ class Rectification:
 
 
 def rectification(
-    ground: GroundCamera, height: float, diameter: float, size_px: tuple[float, float], least_px: float
+    ground: GroundCamera, settings: AerialSettings, diameter: float, size_px: tuple[float, float]
 ) -> Rectification:
     """The part of a plane in which robots are large enough to be found.
 
     Args:
         ground: The camera.
-        height: Of the plane [m].
+        settings: Height of the plane, region, and how small robots may look in the raw image.
         diameter: Of robots [m].
         size_px: Least and largest diameter of robots in the rectified image; in between as in the raw one.
-        least_px: Where robots look smaller than this in the raw image, nothing is looked for.
 
     Raises:
         RectificationError: The camera does not see the plane, or robots on it look too small.
     """
+    height, least_px = settings.robot_height, settings.min_diameter_px
     flat, scale = _visible(ground, height)
+    lower, upper = settings.region
     usable = scale * diameter >= least_px
     if not len(flat):
         raise RectificationError(f"the camera does not see the plane {height:g} m above the floor.")
@@ -83,7 +85,9 @@ def rectification(
             f" {diameter * scale.max():.2g} px."
         )
     low, high = flat[usable].min(axis=0), flat[usable].max(axis=0)
-    low, high = low - 0.5 * diameter, high + 0.5 * diameter
+    low, high = np.maximum(low - 0.5 * diameter, lower), np.minimum(high + 0.5 * diameter, upper)
+    if not (high - low > diameter).all():
+        raise RectificationError("the camera does not see the region from x_min, y_min to x_max, y_max.")
     native = diameter * float(np.median(scale[usable]))
     wanted = min(max(native, size_px[0]), size_px[1])
     step = max(diameter / wanted, math.sqrt(float(np.prod(high - low)) / _MAX_AREA))

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.parameters.number_spec import number
 
 
@@ -11,7 +14,7 @@ from swarm_loc_estimator.parameters.number_spec import number
 class AerialSettings:
     """Numbers of the aerial detector, with units and ranges.
 
-    Ground: the first six. Robots: the rest.
+    Ground: the first three. Robots: the rest.
     """
 
     control_sigma_px: float = number(
@@ -32,6 +35,10 @@ class AerialSettings:
         0.0, "m", 0.0, 10.0, "diameter of the pattern or blob on a robot; 0: estimated from the images"
     )
     min_diameter_px: float = number(6.0, "px", 4.0, 1000.0, "robots that look smaller are not looked for")
+    x_min: float = number(-1e4, "m", -1e4, 1e4, "robots are looked for from here on in map")
+    x_max: float = number(1e4, "m", -1e4, 1e4, "up to here")
+    y_min: float = number(-1e4, "m", -1e4, 1e4, "and from here on")
+    y_max: float = number(1e4, "m", -1e4, 1e4, "up to here")
     min_contrast: float = number(
         0.12, "1", 0.01, 3.0, "by how much robots and floor differ in the logarithm of brightness"
     )
@@ -39,3 +46,8 @@ class AerialSettings:
         0.55, "1", 0.3, 1.0, "share of a robot's circle that must show an edge against the floor"
     )
     max_robots: int = number(200, "1", 1, 2000, "detections in one image at most, the clearest ones")
+
+    @property
+    def region(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper x and y (2,) between which robots are looked for [m]."""
+        return np.array([self.x_min, self.y_min]), np.array([self.x_max, self.y_max])

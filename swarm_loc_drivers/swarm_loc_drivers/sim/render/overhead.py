@@ -1,0 +1,122 @@
+"""An overhead camera: a mast that carries it, robots from above with their pattern, shadows, uneven light."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_drivers.sim.common.trajectories import Trajectories
+from swarm_loc_drivers.sim.render import scene as scenery
+from swarm_loc_drivers.sim.render.camera_rig import exposed
+from swarm_loc_drivers.sim.render.lens import CameraModel
+from swarm_loc_drivers.sim.render.raster import Patches
+from swarm_loc_drivers.sim.render.renderer import Renderer, RobotCamera, Scene
+from swarm_loc_estimator.core.description.swarm import CameraMount
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.parameters.number_spec import number
+from swarm_loc_vision.core.aerial.floor_markers import FloorMarker
+from swarm_loc_vision.core.decoding.families import Family
+
+
+@dataclass(frozen=True)
+class OverheadSettings:
+    """An overhead camera over an arena, and the light there."""
+
+    aerial_rate: float = number(0.0, "1/s", 0.0, 60.0, "images of an overhead camera; 0: there is none")
+    aerial_width: int = number(1280, "px", 16, 8192, "columns of its image")
+    aerial_height: int = number(960, "px", 16, 8192, "rows")
+    aerial_field_of_view: float = number(math.radians(75.0), "rad", 0.05, 2.6, "across, without distortion")
+    aerial_k1: float = number(-0.1, "1", -1.0, 1.0, "radial distortion, as OpenCV defines it")
+    aerial_x: float = number(0.0, "m", -100.0, 100.0, "where the camera hangs in map")
+    aerial_y: float = number(-0.35, "m", -100.0, 100.0, "likewise")
+    aerial_z: float = number(2.1, "m", 0.2, 100.0, "height above the floor")
+    aerial_tilt: float = number(math.radians(10.0), "rad", 0.0, 1.2, "away from straight down")
+    aerial_yaw: float = number(0.5 * math.pi, "rad", -6.3, 6.3, "direction to which it is tilted")
+    aerial_exposure_s: float = number(0.01, "s", 1e-5, 0.133, "how long the shutter is open")
+    aerial_light: float = number(0.5, "1", 0.05, 1.0, "light at the image's right rim over that at the left")
+    aerial_shadow: float = number(0.4, "1", 0.0, 1.0, "share of the light that robots' shadows take")
+    aerial_shadow_yaw: float = number(0.8, "rad", -6.3, 6.3, "direction in which shadows fall in map")
+    aerial_shadow_slope: float = number(0.5, "1", 0.0, 5.0, "length of shadows per height")
+
+    @property
+    def is_there(self) -> bool:
+        """Whether there is such a camera."""
+        return self.aerial_rate > 0.0
+
+
+@dataclass(frozen=True)
+class OverheadModel(CameraModel):
+    """A camera with uneven light in its image.
+
+    Attributes:
+        light: At the right rim over that at the left.
+    """
+
+    light: float = 1.0
+
+    def electrons(self) -> NDArray[np.float32]:
+        """What white leaves in each pixel (height, width) during the exposure."""
+        across = np.linspace(1.0, self.light, self.width, dtype=np.float32)
+        return np.asarray(super().electrons() * across, np.float32)
+
+
+def overhead_model(settings: OverheadSettings) -> OverheadModel:
+    """The camera as calibrated."""
+    return OverheadModel(
+        width=settings.aerial_width,
+        height=settings.aerial_height,
+        field_of_view=settings.aerial_field_of_view,
+        k1=settings.aerial_k1,
+        exposure_s=settings.aerial_exposure_s,
+        light=settings.aerial_light,
+    )
+
+
+class OverheadRig:
+    """The overhead camera of one world; for use by one thread.
+
+    Args:
+        scene: What robots' own cameras see.
+        settings: The camera, and the light.
+        markers: Fiducials on the floor, for ground control.
+        family: Their kind.
+    """
+
+    def __init__(
+        self, scene: Scene, settings: OverheadSettings, markers: Sequence[FloorMarker], family: Family
+    ) -> None:
+        model = overhead_model(settings)
+        count = len(scene.robots)
+        lying = [
+            scenery.floor_marker((one.x, one.y, one.yaw), family.pattern(one.id) != 0, one.size)
+            for one in markers
+        ]
+        shadow = scenery.shadow(
+            settings.aerial_shadow, settings.aerial_shadow_yaw, settings.aerial_shadow_slope
+        )
+        shadows: list[Sequence[Patches]] = [[shadow] if settings.aerial_shadow else [] for _ in range(count)]
+        robots = [[*parts, scenery.top_pattern()] for parts in scene.robots]
+        self._renderer = Renderer(
+            replace(scene, robots=[lying, *shadows, *robots, []], flat=1 + count), model
+        )
+        # the mast stands still at the last place, has no body, and carries the camera as a robot does
+        mount = CameraMount(
+            z=settings.aerial_z, yaw=settings.aerial_yaw, pitch=0.5 * math.pi - settings.aerial_tilt
+        )
+        self._camera = RobotCamera(2 * count + 1, model, mount)
+        self._foot = np.array([settings.aerial_x, settings.aerial_y, 0.0])
+
+    def take(self, middle_ns: int, track: Trajectories, rng: np.random.Generator) -> NDArray[np.uint8]:
+        """The image (height, width), exposed around `middle_ns`; see `CameraRig.take`."""
+
+        def poses_at(times: NDArray[np.int64]) -> FloatArray:
+            robots = track.all_at(times)
+            still = np.zeros((len(times), 1, 3))
+            shadows = robots * [1.0, 1.0, 0.0]
+            return np.concatenate([still, shadows, robots, still + self._foot], axis=1)
+
+        return exposed(self._renderer, self._camera, middle_ns, poses_at, rng)
