@@ -56,19 +56,20 @@ class Feed:
         for robot, firmware in enumerate(self._firmwares):
             self.host.serve_tcp(firmware, port=first_port + robot)
         rng = np.random.default_rng(1)
-        self._words = rng.integers(0, 1 << 15, round(rate * _STEP_S)).astype(np.uint16)
-        self._share = np.linspace(0.0, 1.0, len(self._words), endpoint=False)
+        self._words = rng.integers(0, 1 << 15, round(rate)).astype(np.uint16)
+        self._rate = rate
         self._fed_us = time.monotonic_ns() // 1000
 
     def step(self) -> None:
         """Let the events of the time since the last step be seen, and send what is due."""
         now_us = time.monotonic_ns() // 1000
-        times = (self._fed_us + self._share * (now_us - self._fed_us)).astype(np.int64)
+        count = min(round(self._rate * 1e-6 * (now_us - self._fed_us)), len(self._words))
+        times = np.linspace(self._fed_us, now_us, count, endpoint=False).astype(np.int64)
         self._fed_us = now_us
         for firmware in self._firmwares:
             for _ in range(round(1e3 * _STEP_S)):
                 firmware.millisecond()
-            firmware.see(self._words, times)
+            firmware.see(self._words[:count], times)
         self.host.poll(0.0)
 
 
