@@ -25,6 +25,14 @@ def test_a_fault_is_named_and_misleads_nobody(scenario: str, about: str, kind: K
     assert (about, kind) in found.told
 
 
+def test_noise_that_the_description_hides_is_found_and_costs_no_robot() -> None:
+    found = score(SCENARIOS["w2_on_w0_file"](SEED))
+    assert found.misleading_share <= 0.001
+    assert found.tracked_share >= 0.99
+    assert found.position_m <= 0.015
+    assert ("epuck1", Kind.NOISE) in found.told
+
+
 def test_a_landmark_that_was_moved_is_named() -> None:
     fault = SCENARIOS["moved_landmark"](SEED)
     found = score(fault)

@@ -12,6 +12,7 @@ from core_run import on_time, play, ticks
 from core_world import Plan, World, simulate
 from scipy.stats import chi2
 
+from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
 from swarm_loc_estimator.core.description.swarm import (
     CameraMount,
     Face,
@@ -24,6 +25,7 @@ from swarm_loc_estimator.core.estimation import fusion
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
 from swarm_loc_estimator.core.filter.innovation import relative_motion
 from swarm_loc_estimator.core.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns, predict
+from swarm_loc_estimator.core.filter.state import SwarmState
 from swarm_loc_estimator.core.inputs.camera import SightingConverter
 from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.numerics.arrays import FloatArray
@@ -32,6 +34,7 @@ TIME_SIGMA_S = 0.04
 SEER = Robot("seer", camera=CameraMount(x=0.04))
 FACES = (Face("left", 3, 0.01, 0.03, 0.0, 1.5, position_sigma=0.003), Face("back", 4, -0.03, yaw=3.1))
 SWARM = Swarm((SEER, Robot("other", faces=FACES)), (Landmark(7, 1.0, 0.2, 0.0, 3.0),))
+BELIEF = SwarmState(ParameterTable.of(SWARM.robots, SWARM.landmarks)).arrays()
 
 
 def with_time_sigma(swarm: Swarm, sigma_s: float) -> Swarm:
@@ -101,11 +104,11 @@ def test_relative_motion_is_the_rate_of_what_is_predicted(target: int) -> None:
 
     motion = np.empty(3)
     _, jacobian, poses = predicted(0)
-    relative_motion(MeasurementColumns.of(one), 0, tracks.arrays, poses, motion)
+    relative_motion(MeasurementColumns.of(one), 0, tracks.arrays, BELIEF, poses, motion)
     rate = wrapped((predicted(2_000_000)[0] - predicted(-2_000_000)[0])[None])[0] / 0.004
     np.testing.assert_allclose(jacobian[:, :3] @ motion, rate, rtol=0.01, atol=2e-3)
     one["stamp_variance"] = 0.0
-    relative_motion(MeasurementColumns.of(one), 0, tracks.arrays, poses, motion)
+    relative_motion(MeasurementColumns.of(one), 0, tracks.arrays, BELIEF, poses, motion)
     assert (motion == 0.0).all()
 
 
@@ -114,14 +117,14 @@ def test_a_robot_whose_motion_is_unknown_gives_no_rate() -> None:
     one = np.zeros(1, MEASUREMENT_DTYPE)
     one["target"], one["stamp_variance"], one["stamp_ns"] = -1, 1.0, T0
     motion = np.full(3, np.nan)
-    relative_motion(MeasurementColumns.of(one), 0, tracks.arrays, np.zeros((2, 3)), motion)
+    relative_motion(MeasurementColumns.of(one), 0, tracks.arrays, BELIEF, np.zeros((2, 3)), motion)
     assert (motion == 0.0).all()  # nothing has come
     tracks.extend(
         np.zeros(2, np.int64), np.array([T0, T0 + SECOND // 10]), np.array([[0.0] * 3, [0.1, 0, 0]])
     )
     for after_s, expected in ((-1.0, 0.0), (0.05, -1.0), (0.3, -1.0), (5.0, 0.0)):
         one["stamp_ns"] = T0 + round(after_s * SECOND)
-        relative_motion(MeasurementColumns.of(one), 0, tracks.arrays, np.zeros((2, 3)), motion)
+        relative_motion(MeasurementColumns.of(one), 0, tracks.arrays, BELIEF, np.zeros((2, 3)), motion)
         np.testing.assert_allclose(motion, [expected, 0.0, 0.0], atol=1e-9)
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.core.filter.belief import NEVER_NS
 from swarm_loc_estimator.core.filter.integrity.surprises import is_contradicted, pairs_set_aside
 from swarm_loc_estimator.core.filter.state import SwarmState
 from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
@@ -52,12 +53,13 @@ def contradictions(
     jumping = np.flatnonzero(tracks.contradict_themselves(now_ns)).tolist()
     robots = np.flatnonzero(state.tracked).tolist()
     denied = [robot for robot in robots if is_contradicted(state.integrity, robot)]
+    contradicted = np.flatnonzero(state.contradicted_ns > NEVER_NS).tolist()
     aside = pairs_set_aside(state.integrity, now_ns)
     return [
         *(_odometry(names[robot]) for robot in jumping),
         *(_pose(names[robot]) for robot in denied),
         *(_sightings(names[observer], names[source]) for observer, source in aside),
-        *(_description(names[source], source, state) for source in sorted(state.contradicted)),
+        *(_description(names[source], source, state) for source in contradicted),
         *(_noise(names[robot]) for robot in np.flatnonzero(state.integrity.hidden_noise).tolist()),
     ]
 

@@ -14,6 +14,7 @@ from swarm_loc_estimator.core.estimation.estimate import Status, SwarmEstimate, 
 from swarm_loc_estimator.core.estimation.fusion import Fusion, Verdict
 from swarm_loc_estimator.core.estimation.self_calibration import learned, learns
 from swarm_loc_estimator.core.estimation.timeline import Timeline
+from swarm_loc_estimator.core.filter.belief import NEVER_NS
 from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.core.identification.memory import Identities, Outcome
 from swarm_loc_estimator.core.inputs.infrared import BrightnessConverter
@@ -154,7 +155,7 @@ class SwarmEstimator:
     @property
     def is_self_calibrated(self) -> bool:
         """Whether there is anything to learn: described with a sigma, or contradicted."""
-        return learns(self.swarm) or bool(self._timeline.state.contradicted)
+        return learns(self.swarm) or bool((self._timeline.state.contradicted_ns > NEVER_NS).any())
 
     def learned(self) -> Swarm:
         """The swarm with cameras, odometry and landmarks as they are now estimated."""

@@ -39,8 +39,8 @@ from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray
 _NO_IMAGE_NS = np.iinfo(np.int64).min
 _PAIRS_PER_ROBOT = 32
 """A robot remembers what so many others have told it by infrared."""
-_CONTRADICTED_DESCRIPTION = 2
-"""When so many robots and landmarks are contradicted, so is all that was concluded from them."""
+_CONTRADICTED_DESCRIPTION, _CONTRADICTED_WITHIN_NS = 2, 60_000_000_000
+"""When so many robots and landmarks are contradicted within that time, so is all that was concluded."""
 _MAX_ROBOTS_OPENED = 30
 """With more robots only those are estimated anew that are contradicted: all would cost too much."""
 _MANY = 64
@@ -280,11 +280,11 @@ class Fusion:
         poses = se2.compose(
             state.transform, self._tracks.at(np.arange(robots), np.full(robots, stamp_ns)).pose
         )
-        alone = len(state.contradicted | {source}) < _CONTRADICTED_DESCRIPTION
-        if alone or len(state.contradicted) >= _CONTRADICTED_DESCRIPTION or robots > _MAX_ROBOTS_OPENED:
+        state.contradicted_ns[source] = stamp_ns
+        lately = np.sum(state.contradicted_ns > stamp_ns - _CONTRADICTED_WITHIN_NS)
+        if lately < _CONTRADICTED_DESCRIPTION or state.all_opened or robots > _MAX_ROBOTS_OPENED:
             state.open(source, poses[min(source, robots - 1)])
         else:
-            state.contradicted |= {source}
             state.open_all(poses)
 
     def _apply_command(self, state: SwarmState, command: MeasurementArray) -> Verdict:

@@ -62,7 +62,8 @@ class SwarmState:
         start_pending: (N,) whether the robot may still be initialized at its configured start.
         last_fix_ns: (N,) newest accepted measurement tied to a landmark or an absolute fix.
         integrity: What the newest measurements say of all this.
-        contradicted: Robots, and landmarks as N + l, that are estimated anew because they were contradicted.
+        contradicted_ns: (N + L,) when each robot and landmark was contradicted last; NEVER_NS: never.
+        all_opened: Whether everything was, at once.
         pair_robot: (N, pairs) whom each has measured; -1: nobody.
         pair_stamp_ns: (N, pairs) when last.
         pair_history: (N, pairs, 3, 3) what was measured, see `correlated_noise.py`.
@@ -91,7 +92,8 @@ class SwarmState:
         self.start_pending: NDArray[np.bool_] = np.ones(robots, dtype=bool)
         self.last_fix_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
         self.integrity = new_integrity(robots, landmarks)
-        self.contradicted: frozenset[int] = frozenset()
+        self.contradicted_ns: IntArray = np.full(robots + landmarks, NEVER_NS)
+        self.all_opened = False
         self.pair_robot: NDArray[np.int64] = np.full((robots, pairs), -1)
         self.pair_stamp_ns: NDArray[np.int64] = np.full((robots, pairs), NEVER_NS)
         self.pair_history: FloatArray = np.zeros((robots, pairs, 3, 3))
@@ -104,7 +106,7 @@ class SwarmState:
         other = SwarmState.__new__(SwarmState)
         for name, value in vars(self).items():
             # a table never changes; the arrays inside `constraints` are replaced, never written to
-            setattr(other, name, value if name in {"_table", "integrity", "contradicted"} else value.copy())
+            setattr(other, name, value if name in {"_table", "integrity", "all_opened"} else value.copy())
         other.integrity = IntegrityArrays(*(column.copy() for column in self.integrity))
         return other
 
@@ -167,7 +169,6 @@ class SwarmState:
             pose: (3,) of the robot in `map`, which becomes less certain, too.
         """
         robots = self.tracked.size
-        self.contradicted |= {source}
         self.integrity.doubt[source] = 0.0
         self.integrity.evidence[self.integrity.source == source] = 0.0
         if source < robots:
@@ -192,6 +193,7 @@ class SwarmState:
             poses: (N, 3) of the robots in `map`, which stay where they are believed to be.
         """
         robots, landmarks = self.tracked.size, self.landmark.shape[0]
+        self.all_opened = True
         table = self._table
         for robot in range(robots):
             table = table.with_robot(robot)
