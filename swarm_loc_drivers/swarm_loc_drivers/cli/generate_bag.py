@@ -4,11 +4,13 @@
     generate_bag pictures bags/eight_pictures --seed 1 --duration 9 --robots 2
     generate_bag grid /tmp/grid100 --robots 100 --duration 20
     generate_bag droplets bags/droplets_twenty --seed 1 --duration 60
+    generate_bag aerial bags/aerial_five --seed 1
     generate_bag droplets /tmp/same_boards --seed 2 --boards 1
 
 The bag holds <robot>/odom, <robot>/detections and <robot>/ground_truth; `swarm.yaml` lies inside its folder.
 `pictures` writes, in place of detections, what the cameras see: <robot>/image_raw/compressed (JPEG) and
-<robot>/camera_info. `droplets` writes <robot>/brightness and <robot>/fix in place of detections.
+<robot>/camera_info. `droplets` writes <robot>/brightness and <robot>/fix in place of detections;
+`aerial` writes aerial/detections.
 The same arguments give the same bytes.
 """
 
@@ -21,6 +23,7 @@ from typing import TYPE_CHECKING
 
 from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.droplet.world import DROPLET_WORLDS
+from swarm_loc_drivers.sim.recording.aerial_bag import write_aerial_bag
 from swarm_loc_drivers.sim.recording.bag import write_bag
 from swarm_loc_drivers.sim.recording.droplet_bag import write_droplet_bag
 from swarm_loc_drivers.sim.recording.image_bag import write_image_bag
@@ -29,6 +32,7 @@ from swarm_loc_drivers.sim.scenarios.droplet_run import DropletRunSettings, simu
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_drivers.sim.scenarios.eight_images import simulate_eight_images
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
+from swarm_loc_drivers.sim.scenarios.wandering import WanderingSettings, simulate_wandering
 from swarm_loc_estimator.cli.arguments import number_in
 from swarm_loc_estimator.cli.errors import exit_with_message
 
@@ -88,6 +92,11 @@ def _droplets(options: argparse.Namespace, comment: str) -> int:
     return write_droplet_bag(simulate_droplets(settings), options.bag, comment, options.seed)
 
 
+def _aerial(options: argparse.Namespace, comment: str) -> int:
+    settings = WanderingSettings(options.seed, options.duration, options.robots, options.start_known)
+    return write_aerial_bag(simulate_wandering(settings), options.bag, comment)
+
+
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(
@@ -122,6 +131,9 @@ def _parser() -> argparse.ArgumentParser:
     droplets.add_argument(
         "--boards", type=_ANY_SEED, help="seed of the elements' gains (default: that of --seed)"
     )
+    aerial = _swarm(swarms, "aerial", "e-pucks that wander, seen from above", 5, 20, 60.0)
+    aerial.set_defaults(write=_aerial)
+    aerial.add_argument("--start-known", action="store_true", help="swarm.yaml tells the start poses")
     grid = _swarm(swarms, "grid", "many robots, each about its cell of a grid", 100, 10_000, 20.0)
     grid.set_defaults(write=_grid)
     return parser

@@ -1,0 +1,204 @@
+"""Which detection is me: closed forms, the three methods, chains and their probabilities."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from swarm_loc_estimator.core.identification.anchors import Scale
+from swarm_loc_estimator.core.identification.angular_variation import identify_by_turns
+from swarm_loc_estimator.core.identification.chain import ChainModel, Chains
+from swarm_loc_estimator.core.identification.linear_variation import identify_by_speeds
+from swarm_loc_estimator.core.identification.own_motion import fit_chains, own_displacement, relation
+from swarm_loc_estimator.core.identification.picture import Picture, TrackPoint, gathered_between
+from swarm_loc_estimator.core.identification.random_motion import identify_by_way
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+SECOND = 10**9
+SIGMA = 0.01
+finite = st.floats(-3.0, 3.0)
+
+
+def picture(positions: FloatArray, headings: FloatArray | None = None) -> Picture:
+    pose = np.column_stack([positions, np.zeros(len(positions)) if headings is None else headings])
+    covariance = np.tile(np.diag([SIGMA**2, SIGMA**2, 0.05**2]), (len(positions), 1, 1))
+    return Picture(pose, covariance, np.full(len(positions), headings is not None))
+
+
+def point(pose: FloatArray) -> TrackPoint:
+    return TrackPoint(np.asarray(pose, dtype=float), np.zeros((3, 3)))
+
+
+@given(heading=st.floats(-3.1, 3.1), scale=st.floats(0.01, 100.0), seed=st.integers(0, 10**6))
+def test_heading_and_scale_are_exact_without_noise(heading: float, scale: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    own = own_displacement(rng.uniform(0.1, 0.5, 50), rng.uniform(-0.3, 0.3, 50), 0.1)
+    found = relation(scale * np.exp(1j * heading) * own, own)
+    assert abs(found.heading - heading) < 1e-9
+    assert abs(found.scale / scale - 1.0) < 1e-9
+
+
+def test_own_motion_is_that_of_the_steps_one_by_one() -> None:
+    rng = np.random.default_rng(1)
+    speeds, rates, heading, place = rng.uniform(0, 1, 20), rng.uniform(-1, 1, 20), 0.0, 0.0 + 0.0j
+    for speed, rate in zip(speeds, rates, strict=True):
+        heading += 0.1 * rate
+        place += 0.1 * speed * complex(math.cos(heading), math.sin(heading))
+    assert abs(own_displacement(speeds, rates, 0.1) - place) < 1e-12
+
+
+def test_a_chain_is_fitted_with_its_scale_known_and_not() -> None:
+    own = np.array([0.0, 1.0, 1.0 + 2.0j, -1.0 + 1.0j])
+    c = 1.3 * np.exp(0.7j)
+    positions = 5.0 + c * own
+    free, held = fit_chains(positions, own, 0.1), fit_chains(positions, own, 0.1, 1.0, 1e-6)
+    assert abs(free.coefficient - c) < 1e-12
+    assert free.cost < 1e-20
+    assert abs(abs(held.coefficient) - 1.0) < 1e-6
+    assert held.cost > 10.0
+
+
+def test_turns_are_told_by_their_sign_and_across_half_a_turn() -> None:
+    headings = np.array([[3.0, 3.0, 0.0], [3.0 - 0.5, 3.0 + 0.5 - 2 * np.pi, 0.5 + 0.2]])
+    assert identify_by_turns(headings, np.array([0.5])) == 1
+    assert identify_by_turns(headings, np.array([-0.5])) == 0
+
+
+def test_straight_motion_is_told_by_direction_where_the_ratio_is_the_same() -> None:
+    images = np.array([[0.0, 5.0], [1.0, 6.0], [3.0, 6.0 + 2.0j]])  # the second one turned
+    assert identify_by_speeds(images, np.array([0.0, 1.0, 3.0]), 0.05, 1.0, 0.03) == (0, 0, 0)
+
+
+def test_motion_between_two_images_gives_both_places_and_the_heading() -> None:
+    first, second = np.array([1.0 + 1.0j, 0.0]), np.array([4.0, 1.0 + 3.0j])
+    i, j, heading = identify_by_way(first, second, 2.0 + 0.0j)
+    assert (i, j) == (0, 1)
+    assert heading == pytest.approx(math.pi / 2, abs=1e-12)
+
+
+@given(x=finite, y=finite, heading=finite, moved=st.tuples(finite, finite, finite))
+def test_what_a_track_gathers_is_where_the_robot_is(
+    x: float, y: float, heading: float, moved: tuple[float, float, float]
+) -> None:
+    """A small right-invariant error moves x and y of the later point so, by finite differences."""
+    error, pose = 1e-7 * np.array(moved), np.array([x, y, heading])
+    jacobian = gathered_between(TrackPoint(pose, np.zeros((3, 3))), TrackPoint(pose, np.outer(error, error)))
+    change = se2.compose(se2.exp(error), pose) - pose
+    change[2] = se2.wrap_angle(change[2])
+    np.testing.assert_allclose(jacobian, np.outer(change, change), atol=1e-17)
+
+
+def drive(rng: np.random.Generator, robots: int, images: int) -> tuple[FloatArray, FloatArray]:
+    """True poses (images, robots, 3), and own tracks, each in a frame of its own."""
+    start = np.column_stack([rng.uniform(-2, 2, (robots, 2)), rng.uniform(-3, 3, robots)])
+    own = [np.zeros((robots, 3))]
+    for _ in range(images - 1):
+        step = np.column_stack(
+            [rng.uniform(0.1, 0.6, robots), np.zeros(robots), rng.uniform(-1.5, 1.5, robots)]
+        )
+        own.append(se2.compose(own[-1], step))
+    tracks = np.array(own)
+    return se2.compose(start, tracks), tracks
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6), headings=st.booleans())
+def test_chains_find_the_robot_its_heading_and_the_scale(seed: int, headings: bool) -> None:
+    rng = np.random.default_rng(seed)
+    truth, own = drive(rng, 4, 5)
+    scale = 1.0 + 0.02 * rng.standard_normal()
+    chains = Chains()
+    for k in range(5):
+        order = rng.permutation(4)
+        positions = scale * truth[k, order, :2] + SIGMA * rng.standard_normal((4, 2))
+        shown = truth[k, order, 2] + 0.05 * rng.standard_normal(4) if headings else None
+        chains = chains.advanced(picture(positions, shown), point(own[k, 0]), k * SECOND)
+    answer = chains.answer()
+    assert answer is not None
+    assert order[answer.place] == 0
+    assert answer.probability > 0.9
+    error = answer.pose - np.append(scale * truth[4, 0, :2], truth[4, 0, 2])
+    error[2] = se2.wrap_angle(error[2])
+    assert error @ np.linalg.solve(answer.covariance, error) < 30.0  # of 3 degrees of freedom: once in 10^6
+    assert chains.probabilities.sum() <= 1.0 + 1e-9
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_the_order_of_detections_means_nothing(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth, own = drive(rng, 5, 4)
+    one, other = Chains(), Chains()
+    for k in range(4):
+        positions = truth[k, :, :2] + SIGMA * rng.standard_normal((5, 2))
+        order = rng.permutation(5)
+        one = one.advanced(picture(positions), point(own[k, 0]), k * SECOND)
+        other = other.advanced(picture(positions[order]), point(own[k, 0]), k * SECOND)
+    np.testing.assert_allclose(one.probabilities[order], other.probabilities, atol=1e-9)
+
+
+def test_robots_that_move_alike_are_not_told_apart() -> None:
+    """A formation: every chain fits as well."""
+    places = np.array([[0.0, 0.0], [1.0, 0.3], [-0.7, 1.1]])
+    chains = Chains()
+    for k in range(6):
+        moved = np.array([0.5 * k, 0.0])
+        chains = chains.advanced(picture(places + moved), point([0.5 * k, 0.0, 0.0]), k * SECOND)
+    assert chains.probabilities.max() < 0.5
+
+
+def test_a_missed_image_and_a_false_detection_do_not_end_a_chain() -> None:
+    rng = np.random.default_rng(5)
+    truth, own = drive(rng, 3, 7)
+    chains = Chains(ChainModel(detection_probability=0.9))
+    for k in range(7):
+        shown = truth[k, [1, 2] if k == 3 else [0, 1, 2], :2]
+        false = rng.uniform(-2, 2, (1, 2))
+        chains = chains.advanced(picture(np.vstack([shown, false])), point(own[k, 0]), k * SECOND)
+        if k == 3:
+            assert chains.probabilities.max() < 0.99
+    assert chains.probabilities[0] > 0.99
+
+
+def test_a_robot_that_enters_late_finds_itself() -> None:
+    rng = np.random.default_rng(6)
+    truth, own = drive(rng, 3, 8)
+    chains = Chains()
+    for k in range(8):
+        chains = chains.advanced(picture(truth[k, 1 if k < 2 else 0 :, :2]), point(own[k, 0]), k * SECOND)
+        assert k >= 2 or chains.probabilities.max() < 0.9
+    assert chains.probabilities[0] > 0.99
+
+
+def test_a_robot_that_leaves_is_not_in_the_picture_any_more() -> None:
+    rng = np.random.default_rng(7)
+    truth, own = drive(rng, 3, 8)
+    chains = Chains()
+    for k in range(8):
+        chains = chains.advanced(picture(truth[k, 1 if k > 5 else 0 :, :2]), point(own[k, 0]), k * SECOND)
+    assert chains.probabilities.max() < 0.1
+
+
+@pytest.mark.parametrize("scale", [0.7, 1.4])
+def test_an_unknown_scale_is_found(scale: float) -> None:
+    rng = np.random.default_rng(8)
+    truth, own = drive(rng, 4, 6)
+    chains = Chains(ChainModel(scale=Scale(1.0, 0.5)))
+    for k in range(6):
+        chains = chains.advanced(picture(scale * truth[k, :, :2]), point(own[k, 2]), k * SECOND)
+    answer = chains.answer()
+    assert answer is not None
+    assert answer.place == 2
+    assert answer.scale == pytest.approx(scale, rel=0.05)
+
+
+def test_an_image_without_detections_leaves_less_certain() -> None:
+    chains = Chains().advanced(picture(np.array([[0.0, 0.0], [1.0, 1.0]])), point([0, 0, 0]), 0)
+    none = chains.advanced(picture(np.zeros((0, 2))), point([0.5, 0, 0]), SECOND)
+    assert none.probabilities.size == 0
+    assert none.answer() is None
