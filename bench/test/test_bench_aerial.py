@@ -9,6 +9,8 @@ from bench.aerial import calibration, driving, printed, straight, turning
 from bench.aerial.rates import Rate, Results
 from bench.aerial.worlds import Conditions, simulate
 from swarm_loc_estimator.core.identification.angular_variation import identify_by_turns
+from swarm_loc_estimator.core.identification.chain import ChainModel
+from swarm_loc_estimator.core.identification.own_motion import ComplexArray
 from swarm_loc_estimator.core.identification.random_motion import identify_by_way
 
 SEED = 77
@@ -36,12 +38,18 @@ def test_ratios_do_not_know_directions() -> None:
 
 
 def test_headings_from_x_and_y_agree_where_the_way_is_right_and_have_no_solution_beyond_noise() -> None:
-    own, first = 2.0 + 0.0j, np.array([0.0j])
-    exact = printed.angle_misfits(first, 2.0 * np.exp(1j * np.array([0.4, 2.0, -2.5])), own, 1.0)
+    own, first = 2.0 + 0.0j, np.array([0.0j], dtype=np.complex128)
+    exact = printed.angle_misfits(first, _away([0.4, 2.0, -2.5]), own, 1.0)
     assert exact.max() < 1e-7
     noisy = np.array([2.01 + 0.0j])
     assert np.isinf(printed.angle_misfits(first, noisy, own, 1.0)).all()
     assert identify_by_way(first, noisy, own)[:2] == (0, 0)
+
+
+def _away(angles: list[float]) -> ComplexArray:
+    """Two units away, in some directions."""
+    there: ComplexArray = np.asarray(2.0 * np.exp(1j * np.array(angles)), dtype=np.complex128)
+    return there
 
 
 def test_a_world_is_what_its_robots_did() -> None:
@@ -83,6 +91,6 @@ def test_chains_find_most_robots_and_sure_answers_are_right() -> None:
         conditions = Conditions(10, 4)
         world = simulate(conditions, rng)
         for robot in range(5):
-            chains = driving.followed(world, robot, conditions, calibration.ChainModel())
+            chains = driving.followed(world, robot, conditions, ChainModel())
             right += int(np.argmax(chains.probabilities)) == world.place_of(robot, 3)
     assert right >= 17

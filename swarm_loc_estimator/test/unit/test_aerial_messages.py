@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -88,7 +90,7 @@ def test_images_become_rows_and_those_that_cannot_be_used_are_counted() -> None:
 def test_identities_read_as_the_type_store_reads_them() -> None:
     names, place, probability = ["a", "epuck12"], np.array([3, -1]), np.array([0.995, 0.25])
     data = encode_identities("map", 7_000_000_001, names, place, probability)
-    message = typestore().deserialize_cdr(data, ROBOT_IDENTITIES)
+    message: Any = typestore().deserialize_cdr(data, ROBOT_IDENTITIES)
     told = [(one.name, one.detection, one.probability) for one in message.identities]
     assert told == [("a", 3, 0.995), ("epuck12", -1, 0.25)]
     assert (message.header.frame_id, message.header.stamp.sec, message.header.stamp.nanosec) == ("map", 7, 1)

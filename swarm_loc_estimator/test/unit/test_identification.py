@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 
 from swarm_loc_estimator.core.identification.anchors import Scale
 from swarm_loc_estimator.core.identification.angular_variation import identify_by_turns
@@ -30,7 +31,7 @@ def picture(positions: FloatArray, headings: FloatArray | None = None) -> Pictur
     return Picture(pose, covariance, np.full(len(positions), headings is not None))
 
 
-def point(pose: FloatArray) -> TrackPoint:
+def point(pose: ArrayLike) -> TrackPoint:
     return TrackPoint(np.asarray(pose, dtype=float), np.zeros((3, 3)))
 
 
