@@ -29,7 +29,7 @@ from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.live.agreement import Agreement, compare_with_replay
 from swarm_loc_estimator.live.recorder import Recorder, read_poses
 from swarm_loc_estimator.live.run import BagContent, LiveRun, play_live
-from swarm_loc_estimator.nodes.playback import clock_step_ns
+from swarm_loc_estimator.nodes.player.playback import clock_step_ns
 from swarm_loc_estimator.numerics import se2
 from swarm_loc_estimator.numerics.trajectory import interpolate
 

@@ -12,7 +12,7 @@ from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.evaluation.replay import replay
 from swarm_loc_estimator.evaluation.result import ReplayResult
 from swarm_loc_estimator.live.run import LiveRun
-from swarm_loc_estimator.nodes.playback import clock_step_ns
+from swarm_loc_estimator.nodes.player.playback import clock_step_ns
 from swarm_loc_estimator.numerics import se2
 from swarm_loc_estimator.numerics.arrays import FloatArray
 

@@ -10,7 +10,7 @@ import pytest
 from swarm_loc_estimator.cli.arguments import parameters_of
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
-from swarm_loc_estimator.nodes.player_parameters import PlayerParameters
+from swarm_loc_estimator.nodes.player.player_parameters import PlayerParameters
 from swarm_loc_estimator.parameters.table import (
     ParameterError,
     ParameterSpec,

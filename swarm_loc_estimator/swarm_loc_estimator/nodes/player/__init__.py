@@ -1,0 +1,1 @@
+"""The player of bags as a node."""
