@@ -21,6 +21,7 @@ KEYS = {
 } | {
     module: f"python3-{module.replace('_', '-')}"
     for module in (
+        "aiohttp",
         "hypothesis",
         "matplotlib",
         "numba",

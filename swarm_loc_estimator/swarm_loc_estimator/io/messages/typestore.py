@@ -24,6 +24,9 @@ DETECTION = f"{MESSAGE_PACKAGE}/msg/MarkerDetection"
 BRIGHTNESS = f"{MESSAGE_PACKAGE}/msg/BrightnessMatrix"
 ANONYMOUS_DETECTIONS = f"{MESSAGE_PACKAGE}/msg/AnonymousDetectionArray"
 ROBOT_IDENTITIES = f"{MESSAGE_PACKAGE}/msg/RobotIdentities"
+SWARM_POSES = f"{MESSAGE_PACKAGE}/msg/SwarmPoses"
+MARKERS = "visualization_msgs/msg/MarkerArray"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 
 class DefinitionsNotFoundError(UserError):
