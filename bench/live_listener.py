@@ -77,8 +77,11 @@ class Listener:
 
     @property
     def now_ns(self) -> int:
-        """How far the graph is, by its poses."""
-        return read_poses(self.graph.recorder.raw[-1]).stamp_ns
+        """How far the graph is, by its poses; by its clock while there are none."""
+        recorder = self.graph.recorder
+        if not recorder.raw:
+            return int(recorder.get_clock().now().nanoseconds)
+        return read_poses(recorder.raw[-1]).stamp_ns
 
     def newest_truth(self, name: str) -> tuple[int, NDArray[np.float64]] | None:
         """Stamp and place (2,) of a robot, and None before the first."""

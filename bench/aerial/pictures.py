@@ -24,8 +24,8 @@ DIAMETER = 0.07
 SIZE = (640, 480)
 _SUPER = 3
 _PLAN_FINE = 2.0
-_FAR = 60
-"""Diameters to either side of map's origin up to which the floor is painted."""
+_FAR = 1.2
+"""Widths of the image, at its middle, to either side of map's origin up to which the floor is painted."""
 _POSE_SIGMA = 1e-6
 _WHITE = 235.0
 
@@ -109,7 +109,8 @@ def draw_picture(look: Look, seed: int) -> Picture:
     fine = DIAMETER / (_PLAN_FINE * look.diameter_px)
     poses = _poses(look, ground, rng)
     low, high = np.nanmin(view, axis=(0, 1)), np.nanmax(view, axis=(0, 1))
-    low, high = np.maximum(low, -_FAR * DIAMETER), np.minimum(high, _FAR * DIAMETER)
+    far = _FAR * DIAMETER * SIZE[0] / look.diameter_px
+    low, high = np.maximum(low, -far), np.minimum(high, far)
     columns, rows = (int(n) for n in np.ceil((high - low) / fine))
     plan = _Plan(low, fine, (rows, columns), rng)
     plan.paint_floor(look)
@@ -117,8 +118,10 @@ def draw_picture(look: Look, seed: int) -> Picture:
     for pose in poses:
         plan.put_robot(look, pose)
     plan.light(look, poses)
-    cells = ((view - low) / fine - 0.5).astype(np.float32)
-    light = cv2.remap(plan.image, cells[..., 0], cells[..., 1], cv2.INTER_LINEAR, borderValue=0.3)
+    cells = np.nan_to_num((view - low) / fine - 0.5, nan=-1.0).astype(np.float32)
+    light = cv2.remap(
+        plan.image, cells[..., 0], cells[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     light = cv2.resize(light, SIZE, interpolation=cv2.INTER_AREA)
     light = cv2.GaussianBlur(light, (0, 0), look.blur_px)
     counts = _WHITE * light + look.noise * rng.standard_normal(light.shape)
@@ -144,11 +147,14 @@ def plainer(look: Look) -> Look:
 
 
 def _raw_places(ground: GroundCamera) -> FloatArray:
-    """(3 height, 3 width, 2) places that the parts of pixels show."""
+    """(3 height, 3 width, 2) places that the parts of pixels show, linear between pixels."""
     width, height = SIZE
-    across = (np.arange(_SUPER * width) + 0.5) / _SUPER - 0.5
-    down = (np.arange(_SUPER * height) + 0.5) / _SUPER - 0.5
-    return ground.places(np.stack(np.meshgrid(across, down), axis=-1), 0.0)
+    grid = np.stack(np.meshgrid(np.arange(-1.0, width + 1.0), np.arange(-1.0, height + 1.0)), axis=-1)
+    places = ground.places(grid, 0.0)
+    across = ((np.arange(_SUPER * width) + 0.5) / _SUPER + 0.5).astype(np.float32)
+    down = ((np.arange(_SUPER * height) + 0.5) / _SUPER + 0.5).astype(np.float32)
+    maps = np.meshgrid(across, down)
+    return np.asarray(cv2.remap(places, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), float)
 
 
 def _poses(look: Look, ground: GroundCamera, rng: np.random.Generator) -> FloatArray:

@@ -1,9 +1,10 @@
-"""Start simulated e-pucks and all that locates them.
+"""Start simulated robots: e-pucks and all that locates them, or PushBots and all that they measure with.
 
     simulate bags/eight_five_robots/swarm.yaml --world w2 --seed 1
 
 One world with rendered cameras, robots that answer their drivers' bytes on serial ports, a driver and a
-marker detector for each robot, the steering along the eight, and the estimator; all on simulated time.
+marker detector for each robot, the steering along the eight, and the estimator; all on simulated time. Robots
+whose type is `pushbot` get a hall instead, and each a driver and an event tracker with its laser calibrated.
 `ros2 launch swarm_loc_drivers simulation.launch.py` starts the same.
 """
 
@@ -14,8 +15,10 @@ import sys
 from collections.abc import Sequence
 
 from swarm_loc_drivers.link_folder import link_folder
+from swarm_loc_drivers.pushbot_simulation import has_pushbots
 from swarm_loc_drivers.sim.common.error_model import WORLDS
-from swarm_loc_drivers.simulation import SimulationOptions, simulated_swarm, simulation_nodes
+from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
+from swarm_loc_drivers.simulation import SimulationOptions, graph_of, simulated_swarm
 from swarm_loc_estimator.cli.arguments import number_in
 from swarm_loc_estimator.cli.errors import exit_with_message
 from swarm_loc_estimator.cli.graph import say
@@ -48,9 +51,15 @@ def parse(arguments: Sequence[str] | None) -> SimulationOptions:
             help=f"{spec.doc} (default: {default:g})",
         )
     parser.add_argument(
+        "--plan",
+        choices=sorted(FLOOR_PLANS),
+        default=defaults.plan,
+        help=f"the hall of PushBots (default: {defaults.plan})",
+    )
+    parser.add_argument(
         "--aerial",
         action="store_true",
-        help="a camera above, which cannot tell the robots apart, is all that locates them; starts are unknown",
+        help="an overhead camera, which cannot tell robots apart, is all that locates them, without known starts",
     )
     parser.add_argument("--params-file", dest="parameter_file", help="ROS parameter file for all nodes")
     return SimulationOptions(**vars(parser.parse_args(arguments)))
@@ -61,11 +70,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run until a node ends or Ctrl-C."""
     options = parse(arguments)
     swarm = simulated_swarm(options)
-    if not options.aerial and not is_warm(WARM_UP):  # once, not in every robot's detector at a time
+    if (
+        not has_pushbots(swarm) and not options.aerial and not is_warm(WARM_UP)
+    ):  # once, not in every robot's detector at a time
         say("compiling the marker detector for this machine: about half a minute")
         warm_up()
     with link_folder() as links:
-        return run_graph(simulation_nodes(options, [robot.name for robot in swarm.robots], links), say)
+        return run_graph(graph_of(options, swarm, links), say)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from swarm_loc_vision.core.aerial.control_points import (
+    MIN_POINTS,
     NO_POINTS,
     ControlPointError,
     ControlPoints,
@@ -61,7 +62,7 @@ class GroundControl:
 
     Attributes:
         fit: The pose; None: not known.
-        trouble: Why it is not known, a sentence; empty: it is.
+        trouble: Why it is not known, a sentence; empty: it is, or no image has come yet.
         moves: How often the camera was found to have moved.
     """
 
@@ -70,8 +71,8 @@ class GroundControl:
         self._markers = FloorMarkers(ground.markers, ground.family, camera) if ground.markers else None
         self._images = self.moves = 0
         self.fit: PoseFit | None = None
-        self.trouble = NO_GROUND
-        if not ground.is_empty:
+        self.trouble = NO_GROUND if ground.is_empty else ""
+        if len(ground.points) >= MIN_POINTS or (ground.points.names and not ground.markers):
             self._solve(ground.points)
 
     def look(self, gray: Gray) -> GroundCamera | None:

@@ -152,7 +152,8 @@ class Camera:
             found += missed
             missed = pixels - self.to_raw(found)
         is_wrong = ~(np.abs(missed).max(axis=-1) < _MAX_ERROR_PX)
-        off_axis = np.linalg.norm((found - self.intrinsics[2:]) / self.intrinsics[:2], axis=-1)
+        with np.errstate(over="ignore"):  # where there is no inverse the search runs away
+            off_axis = np.linalg.norm((found - self.intrinsics[2:]) / self.intrinsics[:2], axis=-1)
         found[is_wrong | (off_axis > _MAX_OFF_AXIS)] = np.nan
         return found
 

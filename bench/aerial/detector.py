@@ -1,0 +1,161 @@
+"""The aerial detector on drawn pictures: what is found, how exactly, under which light and lens.
+
+Pictures are drawn by plain image operations (`pictures.py`), not by the simulator's renderer.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import reduce
+
+import numpy as np
+
+from bench.aerial.pictures import DIAMETER, Look, Picture, draw_picture
+from bench.common import Cell, table
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_vision.core.aerial.detector import AerialDetections, AerialDetector
+from swarm_loc_vision.core.aerial.settings import AerialSettings
+
+SEEDS = 5
+_MATCHED = 0.3
+"""Of a diameter: a detection so near is of that robot."""
+
+_WIDE = {"field_of_view": math.radians(100.0), "barrel": -0.12, "diameter_px": 20.0}
+LOOKS: Mapping[str, Look] = {
+    "plain": Look(),
+    **{f"size_{px}px": Look(diameter_px=float(px)) for px in (7, 10, 15, 48)},
+    **{f"tilt_{deg}deg": Look(tilt=math.radians(deg)) for deg in (20, 40)},
+    **{f"wide_lens_tilt_{deg}deg": Look(tilt=math.radians(deg), **_WIDE) for deg in (0, 30)},
+    **{f"light_{percent}percent": Look(gradient=0.01 * percent) for percent in (40, 10)},
+    **{f"shadow_{percent}percent": Look(shadow=0.01 * percent) for percent in (40, 80)},
+    **{f"touching_{percent}percent": Look(touching=0.01 * percent, robots=30) for percent in (50, 100)},
+    **{f"noise_{counts}": Look(noise=float(counts)) for counts in (8, 16)},
+    "texture_10percent": Look(texture=0.1),
+    "dark_discs": Look(kind="dark"),
+    "bright_discs": Look(kind="bright", floor=0.3),
+    "lights_in_the_dark": Look(kind="led", floor=0.12, diameter_px=12.0),
+    "dark_floor": Look(floor=0.12),
+    "all_at_once": Look(
+        tilt=0.4,
+        field_of_view=1.5,
+        barrel=-0.1,
+        gradient=0.3,
+        shadow=0.5,
+        touching=0.5,
+        noise=5.0,
+        texture=0.05,
+    ),
+}
+"""What varies, by name; the rest is as in the first."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Detections beside the truth.
+
+    Attributes:
+        robots: How many there are.
+        missed: Of them, not found.
+        false: Detections of nothing.
+        position_m: (F,) distances of those that were found.
+        heading: (H,) errors of headings that were told [rad].
+        nees: (F,) normalized squared errors of places; 2 is ideal.
+        seconds: CPU time.
+    """
+
+    robots: int
+    missed: int
+    false: int
+    position_m: FloatArray
+    heading: FloatArray
+    nees: FloatArray
+    seconds: float = 0.0
+
+    def joined(self, other: Score) -> Score:
+        """Both together."""
+        return Score(
+            self.robots + other.robots,
+            self.missed + other.missed,
+            self.false + other.false,
+            np.concatenate([self.position_m, other.position_m]),
+            np.concatenate([self.heading, other.heading]),
+            np.concatenate([self.nees, other.nees]),
+            self.seconds + other.seconds,
+        )
+
+
+def score_picture(picture: Picture, found: AerialDetections, seconds: float = 0.0) -> Score:
+    """Detections beside a picture's truth, each robot's nearest one."""
+    poses = picture.poses
+    away = np.linalg.norm(found.place[:, None] - poses[None, :, :2], axis=2)
+    pairs: dict[int, int] = {}
+    for robot in range(len(poses)):
+        nearest = int(np.argmin(away[:, robot])) if len(found) else -1
+        if nearest >= 0 and away[nearest, robot] < _MATCHED * DIAMETER and nearest not in pairs:
+            pairs[nearest] = robot
+    rows, robots = list(pairs), list(pairs.values())
+    error = found.place[rows] - poses[robots, :2]
+    heading = np.asarray(se2.wrap_angle(found.theta[rows] - poses[robots, 2]))
+    information = np.linalg.inv(found.covariance[rows][:, :2, :2])
+    return Score(
+        len(poses),
+        len(poses) - len(pairs),
+        len(found) - len(pairs),
+        np.linalg.norm(error, axis=1),
+        heading[np.isfinite(heading)],
+        np.einsum("ni,nij,nj->n", error, information, error),
+        seconds,
+    )
+
+
+def measure(seed: int, say: Callable[[str], None], seeds: int = SEEDS) -> dict[str, float]:
+    """Print a table of all looks; the figures by name, `detector.LOOK.recall` and so on.
+
+    Args:
+        seed: Of the first picture of each look.
+        say: Is told how far it is.
+        seeds: Pictures of each look.
+    """
+    figures: dict[str, float] = {}
+    rows: list[list[Cell]] = []
+    for name, look in LOOKS.items():
+        say(f"detector: {name}")
+        score = reduce(Score.joined, (_scored(draw_picture(look, seed + k)) for k in range(seeds)))
+        values = _values(score, seeds)
+        figures |= {f"detector.{name}.{key}": value for key, value in values.items()}
+        rows.append([name, *values.values()])
+    print(table([f"{seeds} pictures each", *_HEADERS], rows))
+    return figures
+
+
+_HEADERS = ("recall", "false / picture", "rms [cm]", "heading [deg]", "headings told", "NEES (2)", "CPU [ms]")
+
+
+def _values(score: Score, pictures: int) -> dict[str, float]:
+    found = score.robots - score.missed
+
+    def rms(values: FloatArray) -> float:
+        return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
+
+    return {
+        "recall": found / score.robots,
+        "false_per_picture": score.false / pictures,
+        "position_cm": 100.0 * rms(score.position_m),
+        "heading_deg": math.degrees(rms(score.heading)),
+        "headings_told": len(score.heading) / max(found, 1),
+        "nees": float(score.nees.mean()) if found else math.nan,
+        "ms_per_picture": 1e3 * score.seconds / pictures,
+    }
+
+
+def _scored(picture: Picture) -> Score:
+    """A detector that has seen the picture before, so that what is done once does not count."""
+    detector = AerialDetector(AerialSettings(robot_diameter=DIAMETER), picture.ground)
+    detector.detect(picture.gray)
+    begin_s = time.process_time()
+    found = detector.detect(picture.gray)
+    return score_picture(picture, found, time.process_time() - begin_s)

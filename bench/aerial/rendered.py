@@ -1,0 +1,208 @@
+"""Five e-pucks located by an overhead camera alone: rendered images, camera node, drivers, the whole graph.
+
+The robots drive an eight; nothing tells them apart, and the estimator is not told where they start. What
+`simulate --aerial` starts runs as child processes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.time import Time
+from sensor_msgs.msg import Image
+
+from bench.live_listener import Listener
+from swarm_loc_drivers.sim.common.error_model import WORLDS
+from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
+from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
+from swarm_loc_drivers.simulation import SimulationOptions, seen_from_above, simulation_nodes
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.core.estimation.estimator import Status
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.launching.graph import NodeSpec
+from swarm_loc_estimator.live.graph import LiveGraph
+from swarm_loc_estimator.live.recorder import read_history
+from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.trajectory import interpolate
+from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities
+
+ROBOTS = 5
+WORLD = "w2"
+_SETTLED_S = 2.0
+"""So long after a robot was located its errors count."""
+_PATIENCE_S = 120.0
+_MAX_GAP_NS = 200_000_000
+"""Between true poses."""
+_KEPT = 20
+"""Images that wait for their detections and identities."""
+_INK, _HALO = (40, 220, 255), (0, 0, 0)
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class AerialRun:
+    """What came of one run.
+
+    Attributes:
+        located: (N,) when each robot was located, after they began to drive [s]; infinite: it was not.
+        errors: (K, 3) x, y [m] and heading [rad] of located robots.
+        detections_per_image: Mean.
+        picture: The last image with the names that the robots found for themselves; None: there is none.
+    """
+
+    located: FloatArray
+    errors: FloatArray
+    detections_per_image: float
+    picture: NDArray[np.uint8] | None
+
+    @property
+    def position_cm(self) -> float:
+        """Root mean square of the distance [cm]."""
+        return 100.0 * float(np.sqrt(np.mean(np.sum(self.errors[:, :2] ** 2, axis=1))))
+
+    @property
+    def heading_deg(self) -> float:
+        """Root mean square [deg]."""
+        return math.degrees(float(np.sqrt(np.mean(self.errors[:, 2] ** 2))))
+
+
+def starting_swarm() -> Swarm:
+    """The robots where the eight begins."""
+    path = Lemniscate(HALF_WIDTH)
+    start, _ = path.at(np.arange(ROBOTS) * path.length / ROBOTS)
+    return describe(EightSettings(robots=ROBOTS, errors=WORLDS[WORLD]), start)
+
+
+def run_aerial(
+    seed: int, duration_s: float, folder: Path, say: Say, *, known_start: bool = False
+) -> AerialRun:
+    """Let the swarm drive under the camera.
+
+    Args:
+        seed: Of the world.
+        duration_s: How long they drive [s].
+        folder: Where descriptions and the nodes' log go; created.
+        say: Is told how far it is.
+        known_start: Whether the estimator is told where the robots start, for comparison.
+
+    Raises:
+        LiveError: A node has ended, or nothing goes on.
+    """
+    links, swarm = folder / "links", starting_swarm()
+    links.mkdir(parents=True)
+    save_swarm(swarm, folder / "swarm.yaml")
+    names = [robot.name for robot in swarm.robots]
+    options = SimulationOptions(str(folder / "swarm.yaml"), world=WORLD, seed=seed, aerial=True)
+    nodes = simulation_nodes(options, names, str(links))
+    if known_start:
+        nodes = _told_the_starts(nodes, swarm, folder / "known_starts.yaml")
+    with LiveGraph(nodes, folder / "nodes.log") as graph:
+        listener = Listener(graph, names)
+        seen = _Overhead(graph)
+        begin_ns = listener.wait_until_they_drive(say)
+
+        def is_over() -> bool:
+            now_s = (listener.now_ns - begin_ns) * 1e-9
+            say(f"{min(now_s, duration_s):.0f} of {duration_s:.0f} simulated s")
+            return now_s >= duration_s
+
+        graph.wait_for(is_over, "go on driving", _PATIENCE_S)
+    located, errors = _score(listener, swarm, begin_ns)
+    return AerialRun(located, errors, seen.mean_count(begin_ns), seen.picture())
+
+
+def _told_the_starts(nodes: Sequence[NodeSpec], swarm: Swarm, path: Path) -> list[NodeSpec]:
+    """The same graph, but the estimator's description has the starts."""
+    bare = seen_from_above(swarm).robots
+    save_swarm(Swarm(tuple(replace(a, start=b.start) for a, b in zip(bare, swarm.robots, strict=True))), path)
+    return [
+        replace(node, parameters={**node.parameters, "swarm_file": str(path)})
+        if node.name == "estimator"
+        else node
+        for node in nodes
+    ]
+
+
+def _score(listener: Listener, swarm: Swarm, begin_ns: int) -> tuple[FloatArray, FloatArray]:
+    """When robots were located, and their errors from a little later on."""
+    history = read_history(listener.graph.recorder.raw)
+    located = np.full(len(listener.names), np.inf)
+    errors: list[FloatArray] = []
+    for robot, path in enumerate(listener.truth(swarm).values()):
+        true, is_known = interpolate(path, history.stamp_ns, _MAX_GAP_NS)
+        when_s = (history.stamp_ns - begin_ns) * 1e-9
+        tracked = history.status[:, robot] == Status.TRACKED
+        located[robot] = when_s[tracked].min(initial=np.inf)
+        counts = tracked & is_known & (when_s >= max(located[robot], 0.0) + _SETTLED_S)
+        error = history.pose[counts, robot] - true[counts]
+        error[:, 2] = se2.wrap_angle(error[:, 2])
+        errors.append(error)
+    return located, np.concatenate(errors)
+
+
+class _Overhead:
+    """Keeps the camera's last image, what was found in it, and who is who."""
+
+    def __init__(self, graph: LiveGraph) -> None:
+        self._images: dict[int, Image] = {}
+        self._detections: dict[int, AnonymousDetectionArray] = {}
+        self._identities: dict[int, RobotIdentities] = {}
+        recorder = graph.recorder
+        recorder.create_subscription(Image, "aerial/image_raw", self._on_image, 1)
+        for kind, topic, kept in (
+            (AnonymousDetectionArray, "aerial/detections", self._detections),
+            (RobotIdentities, "aerial/identities", self._identities),
+        ):
+            recorder.create_subscription(
+                kind, topic, lambda one, kept=kept: kept.update({_ns(one): one}), 100
+            )
+
+    def _on_image(self, message: Image) -> None:
+        self._images[_ns(message)] = message
+        for old in sorted(self._images)[:-_KEPT]:
+            del self._images[old]
+
+    def mean_count(self, begin_ns: int) -> float:
+        """Detections in an image since a time, in the mean."""
+        counts = [len(one.detections) for stamp_ns, one in self._detections.items() if stamp_ns >= begin_ns]
+        return float(np.mean(counts)) if counts else 0.0
+
+    def picture(self) -> NDArray[np.uint8] | None:
+        """The last image about which everything is known, with names."""
+        whole = sorted(set(self._images) & set(self._detections) & set(self._identities))
+        if not whole:
+            return None
+        stamp_ns = whole[-1]
+        return named_picture(self._images[stamp_ns], self._detections[stamp_ns], self._identities[stamp_ns])
+
+
+def named_picture(
+    image: Image, detections: AnonymousDetectionArray, identities: RobotIdentities
+) -> NDArray[np.uint8]:
+    """An overhead image (height, width, 3) with the names that the robots found for themselves."""
+    gray = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width)
+    stretched = cv2.normalize(gray, np.empty_like(gray), 0, 255, cv2.NORM_MINMAX)
+    picture = cv2.cvtColor(stretched, cv2.COLOR_GRAY2BGR)
+    for one in identities.identities:
+        if one.detection < 0:
+            continue
+        at = detections.detections[one.detection]
+        centre = round(at.u_px), round(at.v_px)
+        text = f"{one.name}  {100.0 * one.probability:.1f} %"
+        for colour, width in ((_HALO, 5), (_INK, 2)):
+            cv2.circle(picture, centre, 24, colour, width, cv2.LINE_AA)
+            place = centre[0] + 30, centre[1] + 8
+            cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, width, cv2.LINE_AA)
+    return np.asarray(picture, np.uint8)
+
+
+def _ns(message: Image | AnonymousDetectionArray | RobotIdentities) -> int:
+    return int(Time.from_msg(message.header.stamp).nanoseconds)

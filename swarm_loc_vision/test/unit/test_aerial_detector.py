@@ -1,0 +1,117 @@
+"""The aerial detector on drawn pictures: all robots that are there are found, and nothing else."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.aerial.detector import Score, score_picture
+from bench.aerial.pictures import DIAMETER, Look, Picture, draw_picture
+from swarm_loc_vision.core.aerial.detector import AerialDetector
+from swarm_loc_vision.core.aerial.rectification import RectificationError
+from swarm_loc_vision.core.aerial.settings import AerialSettings
+
+SETTINGS = AerialSettings(robot_diameter=DIAMETER)
+
+LOOKS = {
+    "plain": Look(),
+    "small": Look(diameter_px=9.0),
+    "tilted wide lens": Look(
+        tilt=math.radians(25.0), field_of_view=math.radians(90.0), barrel=-0.1, diameter_px=20.0
+    ),
+    "uneven light and shadows": Look(gradient=0.2, shadow=0.6),
+    "touching": Look(touching=0.8),
+    "dark discs": Look(kind="dark"),
+    "bright discs": Look(kind="bright", floor=0.3),
+    "lights in the dark": Look(kind="led", floor=0.12, diameter_px=12.0),
+    "pattern on a dark floor": Look(floor=0.12),
+    "noise": Look(noise=10.0, texture=0.05),
+}
+
+
+def scored(picture: Picture, settings: AerialSettings = SETTINGS, polarity: str = "auto") -> Score:
+    """What a detector makes of a picture."""
+    return score_picture(picture, AerialDetector(settings, picture.ground, polarity).detect(picture.gray))
+
+
+@pytest.mark.parametrize("name", LOOKS)
+def test_all_robots_are_found_and_nothing_else(name: str) -> None:
+    picture = draw_picture(LOOKS[name], seed=11)
+    score = scored(picture)
+    assert score.missed == 0
+    assert score.false == 0
+    assert score.position_m.max() < 0.1 * DIAMETER
+    if picture.has_heading:
+        assert len(score.heading) == len(picture.poses)
+        assert np.abs(score.heading).max() < math.radians(8.0)
+    else:
+        assert len(score.heading) == 0
+
+
+@pytest.mark.parametrize("kind", ["dark", "bright"])
+def test_the_size_is_found_out(kind: str) -> None:
+    picture = draw_picture(Look(kind=kind, diameter_px=18.0), seed=3)
+    detector = AerialDetector(AerialSettings(), picture.ground)
+    score = score_picture(picture, detector.detect(picture.gray))
+    assert (score.missed, score.false) == (0, 0)
+    assert detector.diameter == pytest.approx(DIAMETER, rel=0.12)
+
+
+def test_the_polarity_can_be_told() -> None:
+    picture = draw_picture(Look(kind="dark"), seed=5)
+    assert scored(picture, polarity="dark").missed == 0
+    assert scored(picture, polarity="bright").missed == len(picture.poses)
+
+
+def test_an_empty_floor_shows_no_robots() -> None:
+    for seed in range(3):
+        picture = draw_picture(Look(robots=0, shadow=0.5, texture=0.05), seed)
+        assert scored(picture).false <= 1
+
+
+def test_pure_noise_and_flat_images_show_no_robots() -> None:
+    picture = draw_picture(Look(robots=1), seed=1)
+    rng = np.random.default_rng(0)
+    for gray in (
+        rng.integers(0, 256, picture.gray.shape).astype(np.uint8),
+        np.zeros_like(picture.gray),
+        np.full_like(picture.gray, 255),
+    ):
+        assert len(AerialDetector(SETTINGS, picture.ground).detect(gray)) == 0
+
+
+def test_covariances_cover_the_errors() -> None:
+    nees = np.concatenate([scored(draw_picture(LOOKS["tilted wide lens"], seed)).nees for seed in range(2)])
+    assert nees.mean() < 2.5  # of two numbers; below where the shared error is smaller than pixel_sigma
+
+
+def test_detections_are_bounded_and_the_clearest_are_kept() -> None:
+    picture = draw_picture(Look(robots=20), seed=2)
+    detections = AerialDetector(replace(SETTINGS, max_robots=7), picture.ground).detect(picture.gray)
+    assert len(detections) == 7
+    assert detections.dropped["too_many"] == 13
+    assert scored(picture, replace(SETTINGS, max_robots=7)).false == 0
+
+
+def test_outside_the_region_nothing_is_looked_for() -> None:
+    picture = draw_picture(Look(robots=20), seed=2)
+    detections = AerialDetector(replace(SETTINGS, x_min=0.0), picture.ground).detect(picture.gray)
+    assert len(detections) > 0
+    assert detections.place[:, 0].min() > 0.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (replace(SETTINGS, min_diameter_px=500.0), "look smaller than 500 px everywhere"),
+        (replace(SETTINGS, robot_height=9.0), "does not see the plane 9 m above the floor"),
+        (replace(SETTINGS, x_min=500.0, x_max=501.0), "does not see the region"),
+    ],
+)
+def test_what_cannot_be_seen_is_told(settings: AerialSettings, words: str) -> None:
+    picture = draw_picture(Look(robots=1), seed=1)
+    with pytest.raises(RectificationError, match=words):
+        AerialDetector(settings, picture.ground).detect(picture.gray)
