@@ -7,22 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.common import Cell, new_plot, save_plot, table
-from swarm_loc_drivers.sim.common.body import Blinking
 from swarm_loc_drivers.sim.pushbot import optics
-from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise, EventCamera, Spot
+from swarm_loc_drivers.sim.pushbot.wall_drive import WallDriveSettings, drive_at_wall
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.events.centroid_tracker import CentroidTracker
-from swarm_loc_vision.core.events.settings import LightSource, TrackerSettings
 from swarm_loc_vision.core.laser.calibration import LaserCalibration
 from swarm_loc_vision.core.laser.fit import Drive, fit_hyperbola, fit_logarithm, logarithm_depth
 
 DEPTHS_M = np.linspace(0.1, 2.5, 241)
-_STEP_US = 5_000
-_SPEED, _NOISE_RATE = 0.1, 5.0
-_START_M, _STOP_M = 2.55, 0.15
-_START_SIGMA, _WHEEL_NOISE = 0.003, 1e-6
-"""The tape at the start [m]; variance of the path per metre [m^2/m]."""
-_LASER = LightSource(450.0, is_above=False)
 _MAX_ROW = 125.0
 
 
@@ -46,39 +37,11 @@ class Calibrated(NamedTuple):
     window_cm: FloatArray
 
 
-def drive_at_wall(seed: int) -> tuple[Drive, optics.LaserOptics, FloatArray]:
-    """A robot's drive: what odometry and tracker tell, how the robot was put together, and true depths."""
-    rng = np.random.default_rng(seed)
-    built = optics.assembled(rng)
-    camera = EventCamera(CameraNoise(noise_rate=_NOISE_RATE), rng)
-    tracker = CentroidTracker([_LASER], (128, 128), TrackerSettings())
-    wrong_start = _START_SIGMA * rng.standard_normal()
-    step_m = _SPEED * _STEP_US * 1e-6
-    depth = _START_M - optics.CAMERA_X_M + wrong_start
-    stamps, told, truths, seen = [], [0.0], [depth], []
-    for step in range(round((_START_M - _STOP_M) / step_m)):
-        begin = 1_000_000 + step * _STEP_US
-        moved = step_m + np.sqrt(_WHEEL_NOISE * step_m) * rng.standard_normal()
-        spot = Spot(
-            built.spot(depth), built.spot(depth - moved), optics.spot_brightness(depth), Blinking(2222, 1111)
-        )
-        depth -= moved
-        events = camera.look(begin, begin + _STEP_US, [spot], np.zeros((0, 3)))
-        stamps.append(begin)
-        told.append(told[-1] + step_m)
-        truths.append(depth)
-        columns = (events.x.astype(np.uint16), events.y.astype(np.uint16), events.polarity == 0)
-        seen += tracker.track(*columns, 1000 * events.time_us)
-    stamps.append(stamps[-1] + _STEP_US)
-    rows = np.array([(one.stamp_ns * 1e-3, one.v) for report in seen for one in report.sightings])
-    driven = np.interp(rows[:, 0], stamps, told)
-    depths = np.interp(rows[:, 0], stamps, truths)
-    return Drive(_START_M, 0.005, driven, rows[:, 1], optics.CAMERA_X_M), built, depths
-
-
 def calibrate(seed: int) -> Calibrated:
     """Calibrate a robot, and hold both relations against how it was put together."""
-    drive, built, depths = drive_at_wall(seed)
+    rng = np.random.default_rng(seed)
+    built = optics.assembled(rng)
+    drive, depths = drive_at_wall(rng, built, WallDriveSettings())
     found = fit_hyperbola(drive)
     a, b = fit_logarithm(drive)
     row_at_infinity, focal_base = built.row

@@ -16,6 +16,8 @@ from swarm_loc_drivers.sim.common.link_host import FirmwareHost
 from swarm_loc_drivers.sim.pushbot.firmware.pushbot_firmware import PushbotFirmware
 
 _STEP_S = 0.005
+_POLLS = 4
+"""A firmware hands on no more than two of its buffers at once."""
 _BAUD_RATE = 1_000_000_000
 """Ten of them at once are to test the driver and the graph, not the wire."""
 
@@ -70,7 +72,8 @@ class Feed:
             for _ in range(round(1e3 * _STEP_S)):
                 firmware.millisecond()
             firmware.see(self._words[:count], times)
-        self.host.poll(0.0)
+        for _ in range(_POLLS):
+            self.host.poll(0.0)
 
 
 def main() -> None:

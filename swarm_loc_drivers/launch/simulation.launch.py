@@ -1,4 +1,4 @@
-"""Start simulated e-pucks: ros2 launch swarm_loc_drivers simulation.launch.py swarm_file:=FILE."""
+"""Start simulated robots: ros2 launch swarm_loc_drivers simulation.launch.py swarm_file:=FILE."""
 
 import atexit
 from contextlib import ExitStack
@@ -9,7 +9,7 @@ from launch_ros.actions import Node
 
 from swarm_loc_drivers.link_folder import link_folder
 from swarm_loc_drivers.sim.common.error_model import WORLDS
-from swarm_loc_drivers.simulation import SimulationOptions, simulated_swarm, simulation_nodes
+from swarm_loc_drivers.simulation import SimulationOptions, graph_of, simulated_swarm
 from swarm_loc_estimator.launching.options import options_from
 from swarm_loc_estimator.launching.ros_launch import argument_texts, node_action
 
@@ -23,6 +23,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("seed", default_value="1", description="fixes the world's errors"),
             DeclareLaunchArgument("speed", default_value="0.06", description="along the eight [m/s]"),
             DeclareLaunchArgument("rate", default_value="1.0", description="simulated seconds per second"),
+            DeclareLaunchArgument("plan", default_value="corridor", description="the hall of PushBots"),
             DeclareLaunchArgument("aerial", default_value="false", description="an overhead camera alone"),
             DeclareLaunchArgument("params_file", default_value="", description="ROS parameters of all nodes"),
             OpaqueFunction(function=start_nodes),
@@ -37,5 +38,4 @@ def start_nodes(context: LaunchContext) -> list[Node]:
     stack = ExitStack()
     links = stack.enter_context(link_folder())
     atexit.register(stack.close)  # when the last process has ended
-    names = [robot.name for robot in swarm.robots]
-    return [node_action(spec) for spec in simulation_nodes(options, names, links)]
+    return [node_action(spec) for spec in graph_of(options, swarm, links)]

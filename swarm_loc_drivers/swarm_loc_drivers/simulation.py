@@ -1,4 +1,4 @@
-"""The whole graph of simulated e-pucks as data: world, drivers, steering, detectors, estimator.
+"""The whole graph of simulated robots as data: of e-pucks world, drivers, steering, detectors, estimator.
 
 `ros2 launch swarm_loc_drivers simulation.launch.py` and the `simulate` command start the same list.
 """
@@ -9,8 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from swarm_loc_drivers.pushbot_simulation import calibrate_lasers, has_pushbots, pushbot_nodes
 from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.epuck.world import check_swarm
+from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
 from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
 from swarm_loc_drivers.sim.scenarios.eight import ARENA
 from swarm_loc_drivers.sim.scenarios.eight_floor import eight_floor
@@ -49,6 +51,7 @@ class SimulationOptions:
         seed: Fixes them.
         speed: Along the eight [m/s].
         rate: Simulated seconds per second, as far as the machine keeps up.
+        plan: The hall, of PushBots.
         aerial: Whether a camera above, which cannot tell the robots apart, is all that locates them.
         parameter_file: Path of a ROS parameter file for all nodes, None for none.
     """
@@ -60,6 +63,7 @@ class SimulationOptions:
     rate: float = number(
         1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
     )
+    plan: str = "corridor"
     aerial: bool = False
     parameter_file: str | None = None
 
@@ -72,10 +76,34 @@ def simulated_swarm(options: SimulationOptions) -> Swarm:
     """
     if options.world not in WORLDS:
         raise ParameterError(f"argument world = '{options.world}' must be one of {', '.join(WORLDS)}.")
+    if options.plan not in FLOOR_PLANS:
+        raise ParameterError(f"argument plan = '{options.plan}' must be one of {', '.join(FLOOR_PLANS)}.")
     check_parameter_file(options.parameter_file)
     swarm = load_swarm(Path(options.swarm_file))
-    check_swarm(swarm)
+    if not has_pushbots(swarm):
+        check_swarm(swarm)
     return swarm
+
+
+def graph_of(options: SimulationOptions, swarm: Swarm, links: str) -> list[NodeSpec]:
+    """The nodes that simulate a swarm, of whichever kind its robots are.
+
+    Args:
+        options: What the user chose.
+        swarm: As `simulated_swarm` has it.
+        links: Folder for serial ports and files of the simulation; exists.
+    """
+    robots = [robot.name for robot in swarm.robots]
+    if not has_pushbots(swarm):
+        return simulation_nodes(options, robots, links)
+    calibrate_lasers(robots, options.seed, Path(links))
+    world: Parameters = {
+        "swarm_file": options.swarm_file,
+        "plan": options.plan,
+        "seed": options.seed,
+        "rate": options.rate,
+    }
+    return pushbot_nodes(world, robots, links, options.parameter_file)
 
 
 def seen_from_above(swarm: Swarm) -> Swarm:
@@ -88,7 +116,7 @@ def seen_from_above(swarm: Swarm) -> Swarm:
 
 
 def simulation_nodes(options: SimulationOptions, robots: Sequence[str], links: str) -> list[NodeSpec]:
-    """The nodes of a simulation, in the order in which they start.
+    """The nodes of a simulation of e-pucks, in the order in which they start.
 
     Args:
         options: What the user chose.

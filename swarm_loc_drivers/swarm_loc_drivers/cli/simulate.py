@@ -59,7 +59,7 @@ def parse(arguments: Sequence[str] | None) -> SimulationOptions:
     parser.add_argument(
         "--aerial",
         action="store_true",
-        help="an overhead camera, which cannot tell robots apart, is all that locates them, without known starts",
+        help="an overhead camera, which cannot tell robots apart, is all that locates them",
     )
     parser.add_argument("--params-file", dest="parameter_file", help="ROS parameter file for all nodes")
     return SimulationOptions(**vars(parser.parse_args(arguments)))

@@ -22,12 +22,22 @@ from swarm_loc_drivers.core.pushbot.settings import WheelGeometry
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import FOCAL_PX
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldSettings
+from swarm_loc_drivers.simulation import SimulationOptions, graph_of, simulated_swarm
+from swarm_loc_estimator.parameters.table import markdown_table
 from swarm_loc_msgs.msg import EventPacket, LaserDistance, LightBearingArray
 from swarm_loc_vision.core.laser.calibration import LaserCalibration
 from swarm_loc_vision.io.laser_file import load_laser, save_laser
+from swarm_loc_vision.nodes.calibrate_laser_node import CalibrateLaserParameters
 
 SEED = 3
 STARTS = {"pushbot1": (2.6, 1.5, math.pi), "pushbot2": (1.6, 1.2, 0.3)}
+SIMULATED = """
+fileversion: 1
+types:
+  pushbot: {odometry: {wheel_separation: 0.085}, camera: null}
+robots:
+  a: {type: pushbot, start: {x: 2.0, y: 3.0, theta: 3.14159265}}
+"""
 SIM_TIME = {"use_sim_time": "true"}
 
 
@@ -205,6 +215,28 @@ def test_a_laser_that_is_never_seen_is_named(ros: Ros, tmp_path: Path, swarm_fil
 
         ros.until(is_named)
         assert all(math.isnan(one.distance) and one.covariance[0] == -1.0 for one in hall.laser)
+
+
+def test_the_page_of_the_calibration_has_its_parameters() -> None:
+    page = Path(__file__).parents[3] / "swarm_loc_vision" / "doc" / "calibrate_laser.md"
+    assert markdown_table(CalibrateLaserParameters) in page.read_text(encoding="utf-8")
+
+
+def test_a_simulated_swarm_measures_distances_from_its_start(ros: Ros, tmp_path: Path) -> None:
+    """The whole graph of `simulate`: serial ports, lasers calibrated beforehand, trackers."""
+    swarm = tmp_path / "swarm.yaml"
+    swarm.write_text(SIMULATED, encoding="utf-8")
+    options = SimulationOptions(str(swarm), seed=5)
+    distances: list[LaserDistance] = ros.listen(LaserDistance, "a/laser")
+    with ExitStack() as running:
+        for spec in graph_of(options, simulated_swarm(options), str(tmp_path)):
+            place = ["-r", f"__ns:=/{spec.namespace}"]
+            log = tmp_path / f"{spec.name}.log"
+            running.enter_context(Program(spec.executable, log, dict(spec.parameters), place, spec.package))
+        ros.until(lambda: sum(one.distance > 0.0 for one in distances) > 20)
+    known = np.array([(one.distance, one.sigma) for one in distances if one.distance > 0.0])[-20:]
+    # the cabinet of the corridor's left end, 1.6 m before the robot
+    assert abs(known[:, 0].mean() - 1.6) < 3.0 * known[:, 1].mean()
 
 
 def test_a_laser_is_calibrated_by_a_drive_at_a_wall(ros: Ros, tmp_path: Path, swarm_file: Path) -> None:

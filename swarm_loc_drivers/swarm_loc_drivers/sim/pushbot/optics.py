@@ -56,6 +56,12 @@ def assembled(rng: np.random.Generator) -> LaserOptics:
     )
 
 
+def assembled_robots(seed: int, count: int) -> list[LaserOptics]:
+    """The robots of a world of a seed as they came from assembly."""
+    rng = np.random.default_rng(seed)
+    return [assembled(rng) for _ in range(count)]
+
+
 def spot_brightness(distance: float) -> float:
     """Brightness of the laser spot over its surroundings."""
     return min(_SPOT_BRIGHTNESS / distance**2, _MAX_BRIGHTNESS)

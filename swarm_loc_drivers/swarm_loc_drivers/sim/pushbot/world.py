@@ -85,7 +85,7 @@ class PushbotWorld:
         self.poses: FloatArray = np.array(starts, dtype=float).reshape(count, 3)
         """(N, 3) where the robots truly are, in map."""
         self.drivetrain = Drivetrain(count, 1e-3)
-        self.optics = [optics.assembled(rng) for _ in range(count)]
+        self.optics = optics.assembled_robots(settings.seed, count)
         """How the robots were put together; for evaluation."""
         self.lights = [(Blinking(), Blinking(), Blinking()) for _ in range(count)]
         """Laser, rear and front LED of each robot."""

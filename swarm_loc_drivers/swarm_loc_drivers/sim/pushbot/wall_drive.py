@@ -1,0 +1,65 @@
+"""A simulated drive at a wall that calibrates a laser: wheels, spot and noise, and the tracker itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from swarm_loc_drivers.sim.common.body import Blinking
+from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise, EventCamera, Spot
+from swarm_loc_drivers.sim.pushbot.optics import CAMERA_X_M, LaserOptics, spot_brightness
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_vision.core.events.centroid_tracker import CentroidTracker
+from swarm_loc_vision.core.events.settings import LightSource, TrackerSettings
+from swarm_loc_vision.core.laser.fit import Drive
+
+_STEP_US = 5_000
+_BLINKING, _LASER = Blinking(2222, 1111), LightSource(450.0, is_above=False)
+_TOLD_SIGMA = 0.005
+
+
+@dataclass(frozen=True)
+class WallDriveSettings:
+    """How a robot drives at a wall, and what errs.
+
+    Attributes:
+        start: From base_link to the wall at the begin [m].
+        stop: Likewise at the end [m].
+        speed: [m/s].
+        start_sigma: Of the tape at the start [m].
+        wheel_noise: Variance of the path per metre [m^2/m].
+        noise_rate: Noise events of a pixel [1/s].
+    """
+
+    start: float = 2.55
+    stop: float = 0.15
+    speed: float = 0.1
+    start_sigma: float = 0.003
+    wheel_noise: float = 1e-6
+    noise_rate: float = 5.0
+
+
+def drive_at_wall(
+    rng: np.random.Generator, built: LaserOptics, settings: WallDriveSettings
+) -> tuple[Drive, FloatArray]:
+    """What odometry and tracker tell of a drive, and the true depths (N,) [m] at the same instants."""
+    camera = EventCamera(CameraNoise(noise_rate=settings.noise_rate), rng)
+    tracker = CentroidTracker([_LASER], (128, 128), TrackerSettings())
+    step_m = settings.speed * _STEP_US * 1e-6
+    depth = settings.start - CAMERA_X_M + settings.start_sigma * rng.standard_normal()
+    steps = round((settings.start - settings.stop) / step_m)
+    moved = step_m + np.sqrt(settings.wheel_noise * step_m) * rng.standard_normal(steps)
+    depths = depth - np.concatenate([[0.0], np.cumsum(moved)])
+    stamps_us = 1_000_000 + _STEP_US * np.arange(steps + 1)
+    seen = []
+    for step in range(steps):
+        begin, end = depths[step : step + 2].tolist()
+        spot = Spot(built.spot(begin), built.spot(end), spot_brightness(end), _BLINKING)
+        events = camera.look(int(stamps_us[step]), int(stamps_us[step + 1]), [spot], np.zeros((0, 3)))
+        columns = (events.x.astype(np.uint16), events.y.astype(np.uint16), events.polarity == 0)
+        seen += tracker.track(*columns, 1000 * events.time_us)
+    rows = np.array([(1e-3 * one.stamp_ns, one.v) for report in seen for one in report.sightings])
+    driven = np.interp(rows[:, 0], stamps_us, step_m * np.arange(steps + 1))
+    told = Drive(settings.start, _TOLD_SIGMA, driven, rows[:, 1], CAMERA_X_M)
+    return told, np.interp(rows[:, 0], stamps_us, depths)

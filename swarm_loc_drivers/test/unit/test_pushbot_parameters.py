@@ -1,0 +1,123 @@
+"""Parameters of the PushBots' nodes, their pages, and what is simulated of a swarm of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from swarm_loc_drivers.nodes.pushbot.pushbot_parameters import PushbotParameters, pushbot_settings
+from swarm_loc_drivers.nodes.pushbot.pushbot_world_parameters import (
+    PushbotWorldParameters,
+    make_pushbot_world,
+)
+from swarm_loc_drivers.pushbot_simulation import calibrate_lasers
+from swarm_loc_drivers.sim.common.world_error import WorldError
+from swarm_loc_drivers.simulation import SimulationOptions, graph_of, simulated_swarm
+from swarm_loc_estimator.parameters.table import ParameterError, markdown_table
+from swarm_loc_vision.io.laser_file import load_laser
+
+DOC = Path(__file__).parents[2] / "doc"
+SWARM = """
+fileversion: 1
+types:
+  pushbot: {odometry: {wheel_separation: 0.085}, camera: null}
+robots:
+  a: {type: pushbot, start: {x: 1.5, y: 1.5, theta: 0.0}}
+  b: {type: pushbot, start: {x: 2.4, y: 1.1, theta: 0.0}}
+"""
+
+
+@pytest.fixture
+def swarm_file(tmp_path: Path) -> Path:
+    path = tmp_path / "swarm.yaml"
+    path.write_text(SWARM, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("page", "parameters"),
+    [("pushbot_driver_node.md", PushbotParameters), ("pushbot_world_node.md", PushbotWorldParameters)],
+)
+def test_pages_have_the_parameters_as_they_are(page: str, parameters: type) -> None:
+    assert markdown_table(parameters) in (DOC / page).read_text(encoding="utf-8")
+
+
+def test_tcp_goes_to_the_radios_port() -> None:
+    settings = pushbot_settings(PushbotParameters(address="tcp://10.0.0.1"))
+    assert (settings.address.host, settings.address.port) == ("10.0.0.1", 56000)
+    assert settings.timestamps == "24bit"
+    assert pushbot_settings(PushbotParameters(address="/dev/x", events=False)).timestamps == ""
+
+
+@pytest.mark.parametrize("name", ["laser_frequency", "led_frequency"])
+def test_a_light_that_hardly_blinks_is_refused(name: str) -> None:
+    with pytest.raises(ParameterError, match=f"{name} = 2.0 must be 0, or at least 10 Hz"):
+        pushbot_settings(PushbotParameters(address="/dev/x", **{name: 2.0}))
+
+
+def test_a_robot_within_a_wall_is_named(swarm_file: Path) -> None:
+    swarm_file.write_text(SWARM.replace("x: 1.5", "x: 0.01"))
+    with pytest.raises(ParameterError, match="robot 1 of the swarm begins within a wall"):
+        make_pushbot_world(PushbotWorldParameters(swarm_file=str(swarm_file)))
+
+
+def test_robots_run_into_walls_and_not_through(swarm_file: Path) -> None:
+    _, world = make_pushbot_world(PushbotWorldParameters(swarm_file=str(swarm_file)))
+    world.drivetrain.duties[:] = 0.8
+    for _ in range(800):
+        world.step()
+    assert world.poses[0, 0] < world.poses[1, 0] < 12.0
+
+
+def test_a_swarm_of_pushbots_gets_a_hall_drivers_and_calibrated_trackers(
+    swarm_file: Path, tmp_path: Path
+) -> None:
+    options = SimulationOptions(str(swarm_file), seed=4, plan="office", rate=0.5)
+    nodes = {node.full_name: node for node in graph_of(options, simulated_swarm(options), str(tmp_path))}
+    assert list(nodes) == [
+        "pushbot_world",
+        *("a/pushbot_driver", "a/event_tracker", "b/pushbot_driver", "b/event_tracker"),
+    ]
+    world = nodes["pushbot_world"].parameters
+    assert (world["plan"], world["seed"], world["rate"]) == ("office", 4, 0.5)
+    frequencies = {
+        nodes[f"{name}/{kind}"].parameters["laser_frequency"]
+        for name in "ab"
+        for kind in ("pushbot_driver", "event_tracker")
+    }
+    assert len(frequencies) == 2
+    for name in "ab":
+        assert nodes[f"{name}/pushbot_driver"].parameters["address"] == f"{tmp_path}/{name}"
+        assert load_laser(Path(str(nodes[f"{name}/event_tracker"].parameters["calibration"])))
+
+
+def test_calibrations_are_those_of_the_worlds_robots(swarm_file: Path, tmp_path: Path) -> None:
+    _, world = make_pushbot_world(PushbotWorldParameters(swarm_file=str(swarm_file), seed=7))
+    calibrate_lasers(["a", "b"], 7, tmp_path)
+    depths = np.linspace(0.2, 2.0, 50)
+    for name, built in zip("ab", world.optics, strict=True):
+        found = load_laser(tmp_path / f"{name}.yaml")
+        read = [found.focal_base / (built.spot(depth)[1] - found.row_at_infinity) for depth in depths]
+        assert np.abs(read - depths).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("b: {type: pushbot, ", "b: {", "robot 'b' is no pushbot, and others are"),
+        (", start: {x: 1.5, y: 1.5, theta: 0.0}", "", "robot 'a' has no start pose"),
+    ],
+)
+def test_a_swarm_that_is_not_one_of_pushbots_is_named(
+    swarm_file: Path, old: str, new: str, sentence: str
+) -> None:
+    swarm_file.write_text(SWARM.replace(old, new))
+    with pytest.raises(WorldError, match=sentence):
+        simulated_swarm(SimulationOptions(str(swarm_file)))
+
+
+def test_a_hall_that_is_not_there_is_named(swarm_file: Path) -> None:
+    with pytest.raises(ParameterError, match="argument plan = 'attic' must be one of corridor, office"):
+        simulated_swarm(SimulationOptions(str(swarm_file), plan="attic"))
