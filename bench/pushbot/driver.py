@@ -179,6 +179,10 @@ def measure_driver(seeds: int) -> dict[str, float]:
         "driver.core": flows[1][2],
         **{f"driver.events_per_s.robots{robots}": flow[0] for robots, flow in flows.items()},
         **{f"driver.lost_share.robots{robots}": flow[1] for robots, flow in flows.items()},
+        **{
+            f"driver.not_passed_share.robots{robots}": max(0.0, 1.0 - flow[0] / RATE)
+            for robots, flow in flows.items()
+        },
     }
 
 
