@@ -137,7 +137,8 @@ class Flow:
     def _count(self, robot: int, message: EventPacket) -> None:
         self._events[robot] += len(message.events) // _EVENT_BYTES
         self._packets[robot] += 1
-        self._lost[robot] += message.seq - self._next.get(robot, message.seq)
+        # a driver that connects anew counts from 0 again
+        self._lost[robot] += max(0, message.seq - self._next.get(robot, message.seq))
         self._next[robot] = message.seq + 1
 
     def _start(self, running: ExitStack, command: list[str]) -> subprocess.Popen[bytes]:
