@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.aerial import calibration, driving, straight, turning
+from bench.aerial import calibration, detector, driving, rendered, straight, turning
 from bench.aerial.rates import SWARMS, Results
 from bench.common import Cell, new_plot, save_plot, table, write_figures
 
@@ -44,7 +44,9 @@ def main() -> None:
         [name, *(results.values[key.format(n)] for n in SWARMS)] for name, key in _TIMES.items()
     ]
     print(table(["time [us per robot and image]", *(f"n = {n}" for n in SWARMS)], times))
-    print(write_figures("aerial", results.figures()))
+    seen = detector.measure(seed, max(2, round(detector.SEEDS * share)))
+    seen |= rendered.measure(seed, max(1, round(rendered.WORLDS_RUN * share)))
+    print(write_figures("aerial", {**results.figures(), **seen}))
     print(_drawn(results), _reliability_drawn(reliability), sep="\n")
 
 
@@ -68,11 +70,13 @@ def _drawn(results: Results) -> Path:
     rates.plot(2, 96.9, "k^", 2, 84.0, "kv", 2, 82.2, "ks", markersize=5)
     rates.set(xlabel="robots", ylabel="success [%] (black: paper)", xscale="log", ylim=(0.0, 102.0))
     rates.set_xticks(SWARMS, [str(n) for n in SWARMS])
+    rates.minorticks_off()
     rates.legend(fontsize=8)
     for name, key in _TIMES.items():
         times.loglog(SWARMS, [results.values[key.format(n)] for n in SWARMS], marker=".", label=name)
     times.set(xlabel="robots", ylabel="time per robot and image [us]")
     times.set_xticks(SWARMS, [str(n) for n in SWARMS])
+    times.minorticks_off()
     times.legend(fontsize=8)
     return save_plot(figure, "aerial")
 

@@ -76,9 +76,9 @@ def _rate(
     for _ in range(worlds):
         world = simulate(conditions, rng)
         for robot in range(min(conditions.robots, _ROBOTS_PER_WORLD)):
-            begin_s = time.perf_counter()
+            begin_s = time.process_time()
             chains = followed(world, robot, conditions, model)
-            spent_s += time.perf_counter() - begin_s
+            spent_s += time.process_time() - begin_s
             right += int(np.argmax(chains.probabilities)) == world.place_of(robot, conditions.images - 1)
             trials += 1
     return right, trials, 1e6 * spent_s / trials / conditions.images

@@ -4,8 +4,8 @@
 
 It subscribes to `<robot>/odom`, `<robot>/detections`, `<robot>/brightness`, `<robot>/fix` and
 `<robot>/initialpose` of the robots in the swarm description, and to `aerial/detections`. It publishes
-`swarm/poses`, `<robot>/pose`, `aerial/identities`, `/diagnostics`, and `/tf` (map to `<robot>/odom`, which no one
-else may publish).
+`swarm/poses`, `<robot>/pose`, `aerial/identities`, `/diagnostics`, and `/tf` (map to `<robot>/odom`, which no
+one else may publish).
 Services: `~/reset`, `~/set_robot_pose`. Parameters: see `doc/estimator_node.md`.
 """
 
@@ -153,6 +153,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         self._say_time_jumps()
         self._outputs.publish(self._estimate)
         self._outputs.publish_identities(self._estimator.identities)
+        self._outputs.publish_sightings(self._estimator, now_ns)
         self._cost.note(time.perf_counter() - begin_s)
 
     def _receive(self) -> None:

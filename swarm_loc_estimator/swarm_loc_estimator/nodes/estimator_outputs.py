@@ -1,4 +1,4 @@
-"""Publish swarm/poses, <robot>/pose, aerial/identities, and transforms from map to <robot>/odom."""
+"""Publish swarm/poses, swarm/sightings, <robot>/pose, aerial/identities, and /tf from map to <robot>/odom."""
 
 from __future__ import annotations
 
@@ -9,14 +9,18 @@ from rclpy.qos import QoSProfile
 from tf2_msgs.msg import TFMessage
 
 from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate
+from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.core.estimation.sightings import newest_sightings
 from swarm_loc_estimator.core.identification.memory import Identities
 from swarm_loc_estimator.io.messages.encoders import encode_identities, encode_poses
+from swarm_loc_estimator.io.messages.estimates import encode_sightings
 from swarm_loc_estimator.io.messages.outputs import SwarmPosesEncoder, TransformsEncoder
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
-from swarm_loc_msgs.msg import RobotIdentities, SwarmPoses
+from swarm_loc_msgs.msg import RobotIdentities, SwarmPoses, SwarmSightings
 
 _RELIABLE = QoSProfile(depth=10)
+_SIGHTINGS_PERIOD_NS = 180_000_000
+"""Of swarm/sightings, which people look at."""
 _TF = QoSProfile(depth=100)  # what tf2's own broadcaster offers
 
 
@@ -36,6 +40,8 @@ class EstimateOutputs:
         self._swarm_poses_encoder = SwarmPosesEncoder(names, frame)
         self._frame = frame
         self._names = names
+        self._sightings = node.create_publisher(SwarmSightings, "swarm/sightings", _RELIABLE)
+        self._sightings_ns = 0
         self._identities = node.create_publisher(RobotIdentities, "aerial/identities", _RELIABLE)
         self._told: Identities | None = None
         self._robot_poses = [
@@ -65,10 +71,27 @@ class EstimateOutputs:
 
     def publish_identities(self, identities: Identities | None) -> None:
         """Publish who is who in the newest aerial image, whenever that changes; late data may change it."""
-        if identities is None or identities is self._told:
+        if identities is None or (self._told is not None and _are_equal(identities, self._told)):
             return
         self._told = identities
         probability = identities.probability
         self._identities.publish(
             encode_identities(self._frame, identities.stamp_ns, self._names, identities.place, probability)
         )
+
+    def publish_sightings(self, estimator: SwarmEstimator, now_ns: int) -> None:
+        """Publish what the robots see and what became of it, a few times a second and if somebody listens."""
+        if abs(now_ns - self._sightings_ns) < _SIGHTINGS_PERIOD_NS:
+            return
+        self._sightings_ns = now_ns
+        if self._sightings.get_subscription_count():
+            sightings = newest_sightings(estimator.recent(), now_ns)
+            self._sightings.publish(encode_sightings(self._frame, now_ns, sightings))
+
+
+def _are_equal(one: Identities, other: Identities) -> bool:
+    """Whether both say the same of the same image."""
+    if one is other:
+        return True
+    same = np.array_equal(one.place, other.place) and np.array_equal(one.probability, other.probability)
+    return same and one.stamp_ns == other.stamp_ns

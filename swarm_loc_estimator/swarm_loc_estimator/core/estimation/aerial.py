@@ -16,6 +16,7 @@ from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.core.estimation.estimate import estimate_at
 from swarm_loc_estimator.core.filter.gating import gate_threshold
 from swarm_loc_estimator.core.filter.integrity.divergence import CONFIRMED, note_missed, note_seen
+from swarm_loc_estimator.core.filter.integrity.surprises import is_contradicted
 from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.core.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.core.identification.anchors import Scale
@@ -41,6 +42,10 @@ _MOVED = 6.0
 """By so many standard deviations a robot must have moved, or turned by half as many, to be looked for."""
 _MAX_DRIFT_M, _MAX_DRIFT_RAD = 0.3, 0.5
 """What its own track may have drifted between two images; more, and a robot begins anew."""
+_DOUBT_SHARE = 0.1
+"""A robot that is believed to be elsewhere, but not seen there, must be so much surer: that is rare."""
+_MAX_DOUBT = 9.0
+"""As doubtful a robot becomes that may have left the view: not told as tracked, but not lost either."""
 _HEADING_SIGMA = 0.2
 """An answer with a heading less sure than this is none."""
 
@@ -77,9 +82,15 @@ class PictureFusion:
         ratios = log_ratios(poses, covariances, picture, _log_density(picture), _GATE)
         found = assign(ratios, self._settings.aerial_detection_probability, self._settings.aerial_probability)
         sigma = np.sqrt(np.maximum(covariances[:, 0, 0], covariances[:, 1, 1]))
-        missing = (found.place == UNSEEN) & state.images.is_in_view(poses[:, :2], 3.0 * sigma)
-        for robot in robots[missing].tolist():
+        unseen, in_view = found.place == UNSEEN, state.images.is_in_view(poses[:, :2], 3.0 * sigma)
+        before_ns = state.images.newest.stamp_ns if state.images.newest is not None else stamp_ns
+        unseen &= state.last_fix_ns[robots] <= before_ns  # nothing else has confirmed its place since
+        for robot in robots[unseen & in_view].tolist():
             self._miss_robot(state, robot)
+        strangers = int(np.sum(found.robot == UNSEEN)) - int(np.sum(~state.tracked & self._moves))
+        for robot in robots[unseen & ~in_view].tolist() if strangers > 0 else ():
+            # it may have left the view, or be who nobody else is
+            note_missed(state.integrity, robot, min(self._miss, _MAX_DOUBT - state.integrity.doubt[robot]))
         place = np.full(state.tracked.size, UNSEEN)
         probability = np.zeros(state.tracked.size)
         place[robots], probability[robots] = found.place, found.probability
@@ -153,13 +164,16 @@ class PictureFusion:
             return Outcome.NOT_MOVED, None
         state.images.chains[robot] = chains = chains.advanced(picture, point, stamp_ns)
         answer = chains.answer() if chains.images > 1 else None
-        return Outcome.UNDECIDED, answer if answer is not None and self._is_sure(answer) else None
+        believed = bool(state.tracked[robot]) and not is_contradicted(state.integrity, robot)
+        sure = answer is not None and self._is_sure(answer, is_believed=believed)
+        return Outcome.UNDECIDED, answer if sure else None
 
-    def _is_sure(self, answer: Identity) -> bool:
+    def _is_sure(self, answer: Identity, *, is_believed: bool) -> bool:
         """Whether an answer may be given."""
         x, y, heading = np.sqrt(np.diag(answer.covariance)).tolist()
         settings = self._settings
-        certain = answer.probability >= settings.aerial_probability
+        doubt = (1.0 - settings.aerial_probability) * (_DOUBT_SHARE if is_believed else 1.0)
+        certain = 1.0 - answer.probability <= doubt
         return certain and max(x, y) < settings.lost_sigma and heading < _HEADING_SIGMA
 
     def _initialize(self, state: SwarmState, robot: int, stamp_ns: int, claim: Identity) -> None:

@@ -181,6 +181,11 @@ class Chains:
         sigma = math.sqrt(float(picture.variance.max(initial=1e-12)))
         return math.log(others / float(np.prod(np.maximum(extent, 10.0 * sigma))))
 
+    def _log_other_share(self, picture: Picture) -> float:
+        """How likely any detection is another robot or false, before all else."""
+        others = max(len(picture.pose) - 1, 0) + self.model.false_detections
+        return math.log(others / max(others, len(picture.pose)))
+
     def _continued(
         self, picture: Picture, point: TrackPoint, stamp_ns: int, log_density: float
     ) -> tuple[list[Tracks], list[Anchors]]:
@@ -194,7 +199,8 @@ class Chains:
         anchors: list[Anchors] = []
         for old in self.anchors:
             pairs = circles(old, picture, point, self._scale_since(old.stamp_ns, stamp_ns), _LIKENESS)
-            log_ratio = pairs.log_density - np.logaddexp(log_density, pairs.log_alike)
+            alike = pairs.log_alike + self._log_other_share(picture)
+            log_ratio = pairs.log_density - np.logaddexp(log_density, alike)
             weight = old.log_weight[:, None] + log_ratio + log_hit
             likely = weight > self._threshold()
             rows, places = np.nonzero(likely & is_concentrated(pairs.concentration))
@@ -223,8 +229,8 @@ class Chains:
         drift = self.model.scale_drift**2 * (stamp_ns - self.stamp_ns) * 1e-9
         moved = predicted(self.tracks, complex(x, y), gathered_between(before, point), drift)
         spread = _LIKENESS * self.model.scale.mean * math.hypot(x, y)
-        others = np.logaddexp(log_density, log_likelihoods(moved, picture, spread))
-        log_ratio = log_likelihoods(moved, picture) - others
+        alike = log_likelihoods(moved, picture, spread) + self._log_other_share(picture)
+        log_ratio = log_likelihoods(moved, picture) - np.logaddexp(log_density, alike)
         weight = moved.log_weight[:, None] + log_ratio + math.log(self.model.detection_probability)
         rows, places = np.nonzero(weight > self._threshold())
         chosen = moved.chosen(rows)
