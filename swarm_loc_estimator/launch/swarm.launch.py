@@ -18,6 +18,8 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("rate", default_value="1.0", description="speed of the bag"),
             DeclareLaunchArgument("use_sim_time", default_value="false", choices=["true", "false"]),
             DeclareLaunchArgument("params_file", default_value="", description="ROS parameters of all nodes"),
+            DeclareLaunchArgument("watch", default_value="false", choices=["true", "false"]),
+            DeclareLaunchArgument("watch_port", default_value="8420", description="port of the page"),
             OpaqueFunction(function=start_nodes),
         ]
     )

@@ -26,6 +26,7 @@ from swarm_loc_estimator.core.estimation.estimator import Status
 from swarm_loc_estimator.evaluation.metrics import pool, summarise
 from swarm_loc_estimator.evaluation.report.report import write_report
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.io.watch.access import free_port
 from swarm_loc_estimator.live.agreement import Agreement, compare_with_replay
 from swarm_loc_estimator.live.recorder import Recorder, read_poses
 from swarm_loc_estimator.live.run import BagContent, LiveRun, play_live
@@ -54,8 +55,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     swarm_file = swarm_beside(options.bag)
     progress = _Progress(load_swarm(swarm_file))
     print(f"Playing {options.bag} at {options.rate:g} x into the live graph", flush=True)
+    port = free_port()
+    print(f"Watch it live: http://127.0.0.1:{port}/", flush=True)
     live = play_live(
-        options.bag, swarm_file, log=options.out / "nodes.log", rate=options.rate, watch=progress
+        options.bag,
+        swarm_file,
+        log=options.out / "nodes.log",
+        rate=options.rate,
+        page_port=port,
+        watch=progress,
     )
     progress.close()
     compared = compare_with_replay(live, options.bag)

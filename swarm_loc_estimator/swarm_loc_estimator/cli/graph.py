@@ -22,6 +22,10 @@ def parse(arguments: Sequence[str]) -> GraphOptions:
         "--rate", type=number_in(0.01, 1000.0), default=1.0, help="speed of the bag (default: 1)"
     )
     parser.add_argument("--use-sim-time", action="store_true", help="take time from /clock without a bag")
+    parser.add_argument("--watch", action="store_true", help="show the swarm on a page of this machine")
+    parser.add_argument(
+        "--watch-port", type=number_in(0, 65535), default=8420, help="port of that page (default: 8420)"
+    )
     parser.add_argument("--params-file", dest="parameter_file", help="ROS parameter file for all nodes")
     return GraphOptions(**vars(parser.parse_args(arguments)))
 

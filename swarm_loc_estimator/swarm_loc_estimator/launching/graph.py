@@ -24,6 +24,8 @@ class GraphOptions:
         rate: Speed of that bag, 1 for real time.
         use_sim_time: Whether the nodes take their time from /clock though no bag is played here.
         parameter_file: Path of a ROS parameter file for all nodes, None for none.
+        watch: Whether a page shows the swarm to browsers of this machine.
+        watch_port: Where, 0 for any port that is free.
     """
 
     swarm_file: str
@@ -31,6 +33,8 @@ class GraphOptions:
     rate: float = number(1.0, "1", 0.01, 1000.0, "speed of the bag")
     use_sim_time: bool = False
     parameter_file: str | None = None
+    watch: bool = False
+    watch_port: int = number(8420, "1", 0, 65535, "port of the page")
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,7 @@ def graph_nodes(options: GraphOptions) -> list[NodeSpec]:
         options: What the user chose.
 
     Returns:
-        The estimator, and the player where a bag is played.
+        The estimator, the player where a bag is played, and the page where it is wanted.
     """
     package = "swarm_loc_estimator"
     time = {"use_sim_time": options.use_sim_time or options.bag is not None}
@@ -106,5 +110,21 @@ def graph_nodes(options: GraphOptions) -> list[NodeSpec]:
         }
         nodes.append(
             NodeSpec(package, "play", "player", parameters=player, parameter_file=options.parameter_file)
+        )
+    if options.watch:
+        page: dict[str, ParameterValue] = {
+            "swarm_file": options.swarm_file,
+            "port": options.watch_port,
+            **time,
+        }
+        nodes.append(
+            NodeSpec(
+                package,
+                "watch_node",
+                "watch",
+                parameters=page,
+                parameter_file=options.parameter_file,
+                required=False,
+            )
         )
     return nodes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +111,7 @@ def play_live(
     log: Path,
     rate: float = 1.0,
     parameter_file: Path | None = None,
+    page_port: int | None = None,
     watch: Watch = lambda _recorder, _content: None,
 ) -> LiveRun:
     """Play a whole bag into a live graph and collect the poses that come out.
@@ -121,6 +122,7 @@ def play_live(
         log: File for the nodes' output.
         rate: Speed, 1 for real time.
         parameter_file: ROS parameter file for the nodes.
+        page_port: Where a page shows the swarm to browsers, None for nowhere.
         watch: Called about once per event while the bag plays, to show progress.
 
     Raises:
@@ -133,6 +135,8 @@ def play_live(
     content = read_bag(bag, swarm)
     parameters = None if parameter_file is None else str(parameter_file)
     options = GraphOptions(str(swarm_file), bag=str(bag), rate=rate, parameter_file=parameters)
+    if page_port is not None:
+        options = replace(options, watch=True, watch_port=page_port)
     with LiveGraph(graph_nodes(options), log) as graph:
         recorder, estimator, player = graph.recorder, graph.process(ESTIMATOR), graph.process(PLAYER)
 

@@ -1,0 +1,93 @@
+"""Show a swarm on a page, in any browser of this machine.
+
+    watch swarm.yaml              a swarm whose graph runs already
+    watch bags/eight_five_robots  a bag, played through the estimator
+
+The page asks nothing of anywhere else. --address lets others look, too; they then need the --token.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from swarm_loc_estimator.cli.arguments import number_in, swarm_beside
+from swarm_loc_estimator.cli.errors import exit_with_message
+from swarm_loc_estimator.cli.graph import say
+from swarm_loc_estimator.io.watch.access import Access
+from swarm_loc_estimator.launching.graph import GraphOptions, NodeSpec, ParameterValue, graph_nodes
+from swarm_loc_estimator.launching.options import check_graph
+from swarm_loc_estimator.launching.processes import run_graph
+from swarm_loc_estimator.nodes.watch.watch_parameters import WatchParameters
+
+_DEFAULT = WatchParameters()
+_DESCRIPTIONS = (".yaml", ".yml")
+
+
+@exit_with_message
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run until Ctrl-C, or until the bag has ended."""
+    options = parser().parse_args(arguments)
+    Access(options.address, options.token)  # a wrong address is told before anything starts
+    nodes = watch_nodes(options)
+    return run_graph(nodes, say)
+
+
+def watch_nodes(options: argparse.Namespace) -> list[NodeSpec]:
+    """The nodes that the command line asks for.
+
+    Raises:
+        UserError: A file cannot be used.
+    """
+    is_bag = options.source.suffix not in _DESCRIPTIONS
+    swarm_file = options.swarm or (swarm_beside(options.source) if is_bag else options.source)
+    graph = GraphOptions(
+        str(swarm_file),
+        bag=str(options.source) if is_bag else None,
+        rate=options.rate,
+        use_sim_time=options.use_sim_time,
+    )
+    check_graph(graph)
+    page: dict[str, ParameterValue] = {
+        "swarm_file": str(swarm_file),
+        "title": options.source.resolve().name if is_bag else "",
+        "address": options.address,
+        "port": options.port,
+        "token": options.token,
+        "teleop": options.teleop,
+        "use_sim_time": is_bag or options.use_sim_time,
+    }
+    node = NodeSpec("swarm_loc_estimator", "watch_node", "watch", parameters=page)
+    if not is_bag:
+        return [node]
+    estimator, player = graph_nodes(graph)
+    player_parameters = {**player.parameters, "loop": options.loop}
+    player = NodeSpec(player.package, player.executable, player.name, parameters=player_parameters)
+    return [node, estimator, player]
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="watch", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("source", metavar="SWARM_FILE|BAG", type=Path, help="swarm description, or a bag")
+    parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
+    parser.add_argument("--address", default=_DEFAULT.address, help="what to listen on (default: 127.0.0.1)")
+    parser.add_argument(
+        "--port", type=number_in(0, 65535), default=_DEFAULT.port, help="where (default: 8420; 0: any)"
+    )
+    parser.add_argument("--token", default="", help="what browsers must give as ?token=")
+    parser.add_argument(
+        "--rate", type=number_in(0.01, 1000.0), default=1.0, help="speed of the bag (default: 1)"
+    )
+    parser.add_argument("--loop", action="store_true", help="play the bag for ever")
+    parser.add_argument("--teleop", action="store_true", help="let pages drive robots by <robot>/cmd_vel")
+    parser.add_argument("--use-sim-time", action="store_true", help="take time from /clock without a bag")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,73 @@
+"""One open page: it gets the newest frame of each kind, as fast as it takes them, within an agreed rate."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections import deque
+from collections.abc import Iterable
+from typing import Any
+
+from aiohttp import web
+
+from swarm_loc_estimator.io.watch.frames import Frame
+
+MAX_NOTES = 64
+"""So many texts wait for a slow page; older ones go first."""
+
+
+class Viewer:
+    """Sends to one page; a slow one gets fewer frames, and nothing piles up for it.
+
+    Args:
+        socket: The connection.
+        rate: Frames of a kind per second, at most.
+
+    Attributes:
+        selected: Index of the robot whose numbers the page shows; -1: none.
+        skipped: Frames that newer ones replaced before they were sent.
+    """
+
+    def __init__(self, socket: web.WebSocketResponse, rate: float) -> None:
+        self._socket = socket
+        self._period_s = 1.0 / rate
+        self._newest: dict[str, Frame] = {}
+        self._notes: deque[str] = deque(maxlen=MAX_NOTES)
+        self._wake = asyncio.Event()
+        self.selected = -1
+        self.skipped = 0
+
+    def offer(self, frame: Frame) -> None:
+        """Have a frame sent, unless a newer one of its kind comes before."""
+        self.skipped += frame.kind in self._newest
+        self._newest[frame.kind] = frame
+        self._wake.set()
+
+    def note(self, message: dict[str, Any]) -> None:
+        """Have a text sent."""
+        self._notes.append(json.dumps(message))
+        self._wake.set()
+
+    async def send_past(self, frames: Iterable[Frame]) -> None:
+        """Send what happened before the page was opened."""
+        for frame in frames:
+            await self._socket.send_bytes(frame.data)
+
+    async def send_for_ever(self) -> None:
+        """Send until the connection breaks."""
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            began_s = time.monotonic()
+            while self._notes:
+                await self._socket.send_str(self._notes.popleft())
+            frames, self._newest = self._newest, {}
+            for frame in frames.values():
+                await self._socket.send_bytes(frame.data)
+            if frames:
+                await asyncio.sleep(max(0.0, began_s + self._period_s - time.monotonic()))
+
+    async def close(self) -> None:
+        """End the connection."""
+        await self._socket.close()
