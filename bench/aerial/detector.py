@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
 
 from bench.aerial.pictures import DIAMETER, Look, Picture, draw_picture
-from bench.common import Cell, table
+from bench.common import Cell, ProgressLine, table
 from swarm_loc_estimator.numerics import se2
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_vision.core.aerial.detector import AerialDetections, AerialDetector
@@ -24,12 +24,12 @@ SEEDS = 5
 _MATCHED = 0.3
 """Of a diameter: a detection so near is of that robot."""
 
-_WIDE = {"field_of_view": math.radians(100.0), "barrel": -0.12, "diameter_px": 20.0}
+_WIDE = Look(field_of_view=math.radians(100.0), barrel=-0.12, diameter_px=20.0)
 LOOKS: Mapping[str, Look] = {
     "plain": Look(),
     **{f"size_{px}px": Look(diameter_px=float(px)) for px in (7, 10, 15, 48)},
     **{f"tilt_{deg}deg": Look(tilt=math.radians(deg)) for deg in (20, 40)},
-    **{f"wide_lens_tilt_{deg}deg": Look(tilt=math.radians(deg), **_WIDE) for deg in (0, 30)},
+    **{f"wide_lens_tilt_{deg}deg": replace(_WIDE, tilt=math.radians(deg)) for deg in (0, 30)},
     **{f"light_{percent}percent": Look(gradient=0.01 * percent) for percent in (40, 10)},
     **{f"shadow_{percent}percent": Look(shadow=0.01 * percent) for percent in (40, 80)},
     **{f"touching_{percent}percent": Look(touching=0.01 * percent, robots=30) for percent in (50, 100)},
@@ -112,22 +112,24 @@ def score_picture(picture: Picture, found: AerialDetections, seconds: float = 0.
     )
 
 
-def measure(seed: int, say: Callable[[str], None], seeds: int = SEEDS) -> dict[str, float]:
+def measure(seed: int, seeds: int = SEEDS) -> dict[str, float]:
     """Print a table of all looks; the figures by name, `detector.LOOK.recall` and so on.
 
     Args:
         seed: Of the first picture of each look.
-        say: Is told how far it is.
         seeds: Pictures of each look.
     """
     figures: dict[str, float] = {}
+    say = ProgressLine("pictures")
     rows: list[list[Cell]] = []
     for name, look in LOOKS.items():
-        say(f"detector: {name}")
+        say(name)
         score = reduce(Score.joined, (_scored(draw_picture(look, seed + k)) for k in range(seeds)))
         values = _values(score, seeds)
-        figures |= {f"detector.{name}.{key}": value for key, value in values.items()}
-        rows.append([name, *values.values()])
+        told = {key: value for key, value in values.items() if math.isfinite(value)}
+        figures |= {f"detector.{name}.{key}": value for key, value in told.items()}
+        rows.append([name, *(told.get(key) for key in values)])
+    print()
     print(table([f"{seeds} pictures each", *_HEADERS], rows))
     return figures
 

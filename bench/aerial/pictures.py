@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.aerial.ground_camera import GroundCamera
+from swarm_loc_vision.core.aerial.ground.ground_camera import GroundCamera
 from swarm_loc_vision.core.aerial.pattern import MARGIN, inside_mark
 from swarm_loc_vision.core.imaging.camera import Camera
 

@@ -7,6 +7,7 @@ The robots drive an eight; nothing tells them apart, and the estimator is not to
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from rclpy.time import Time
 from sensor_msgs.msg import Image
 
+from bench.common import OUT, Cell, ProgressLine, table
 from bench.live_listener import Listener
 from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
@@ -35,6 +37,9 @@ from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities
 
 ROBOTS = 5
 WORLD = "w2"
+WORLDS_RUN, DURATION_S = 3, 30.0
+PICTURE = OUT / "aerial_names.png"
+"""Where an overhead image with names goes."""
 _SETTLED_S = 2.0
 """So long after a robot was located its errors count."""
 _PATIENCE_S = 120.0
@@ -72,6 +77,72 @@ class AerialRun:
     def heading_deg(self) -> float:
         """Root mean square [deg]."""
         return math.degrees(float(np.sqrt(np.mean(self.errors[:, 2] ** 2))))
+
+
+def measure(seed: int, worlds: int = WORLDS_RUN, duration_s: float = DURATION_S) -> dict[str, float]:
+    """Run the whole graph in several worlds, with unknown and with known starts; print a table; the figures.
+
+    Args:
+        seed: Of the first world.
+        worlds: How many.
+        duration_s: Of each run [s].
+    """
+    runs: dict[bool, list[AerialRun]] = {False: [], True: []}
+    for k in range(worlds):
+        for known_start, kept in runs.items():
+            start = "known" if known_start else "unknown"
+            folder = OUT / "aerial_rendered" / f"seed{seed + k}_{start}"
+            shutil.rmtree(folder, ignore_errors=True)
+            say = ProgressLine(f"world {seed + k}, {start} starts")
+            kept.append(run_aerial(seed + k, duration_s, folder, say, known_start=known_start))
+            print()
+    unknown, known = (_together(runs[known_start]) for known_start in (False, True))
+    print(
+        table(
+            [f"{worlds} worlds, {ROBOTS} robots", *_HEADERS], [_row("unknown", unknown), _row("known", known)]
+        )
+    )
+    for run in runs[False]:
+        if run.picture is not None:
+            OUT.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(PICTURE), run.picture)
+            print(f"picture: {PICTURE}")
+            break
+    located = unknown.located[np.isfinite(unknown.located)]
+    return {
+        "rendered5.located": len(located) / len(unknown.located),
+        "rendered5.located_after_s": float(located.max(initial=0.0)),
+        "rendered5.position_cm": unknown.position_cm,
+        "rendered5.heading_deg": unknown.heading_deg,
+        "rendered5.detections_per_image": unknown.detections_per_image,
+        "rendered5.known_start.position_cm": known.position_cm,
+        "rendered5.known_start.heading_deg": known.heading_deg,
+    }
+
+
+_HEADERS = ("located", "... after [s]", "position [cm]", "heading [deg]", "detections / image")
+
+
+def _row(name: str, run: AerialRun) -> list[Cell]:
+    located = np.isfinite(run.located)
+    return [
+        f"{name} starts",
+        f"{located.sum()} of {len(located)}",
+        float(run.located[located].max(initial=0.0)),
+        run.position_cm,
+        run.heading_deg,
+        run.detections_per_image,
+    ]
+
+
+def _together(runs: Sequence[AerialRun]) -> AerialRun:
+    """All runs as one."""
+    return AerialRun(
+        np.concatenate([run.located for run in runs]),
+        np.concatenate([run.errors for run in runs]),
+        float(np.mean([run.detections_per_image for run in runs])),
+        None,
+    )
 
 
 def starting_swarm() -> Swarm:

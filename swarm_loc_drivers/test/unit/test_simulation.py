@@ -9,6 +9,9 @@ import pytest
 from swarm_loc_drivers.cli import simulate
 from swarm_loc_drivers.nodes.epuck.pending_images import Unanswered
 from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.parameters.table import parameter_specs
+from swarm_loc_vision.nodes.aerial_parameters import AerialParameters
 
 BAGS = Path(__file__).parents[3] / "bags"
 SECOND = 1_000_000_000
@@ -32,9 +35,31 @@ def test_every_robot_has_a_driver_on_its_link_and_a_detector_for_its_camera() ->
         assert node.parameter_file == "all.yaml"
 
 
+def test_from_above_an_overhead_camera_is_all_that_locates(tmp_path: Path) -> None:
+    swarm_file = str(BAGS / "eight_five_robots" / "swarm.yaml")
+    options = SimulationOptions(swarm_file, world="w0", aerial=True, parameter_file="all.yaml")
+    nodes = {node.full_name: node for node in simulation_nodes(options, ["a", "b"], str(tmp_path))}
+
+    assert list(nodes) == [
+        *("estimator", "epuck_world", "eight_steering", "aerial/aerial_camera"),
+        *("a/epuck_driver", "b/epuck_driver"),
+    ]
+    described = load_swarm(Path(str(nodes["estimator"].parameters["swarm_file"])))
+    assert [robot.name for robot in described.robots] == [f"epuck{k}" for k in range(1, 6)]
+    assert all((robot.start, robot.camera, robot.faces) == (None, None, ()) for robot in described.robots)
+    assert not described.landmarks
+    assert nodes["epuck_world"].parameters["swarm_file"] == swarm_file
+    assert float(str(nodes["epuck_world"].parameters["aerial_rate"])) > 0.0
+    camera = nodes["aerial/aerial_camera"]
+    assert camera.parameters["control_points_file"] == nodes["epuck_world"].parameters["control_points_file"]
+    known = {spec.name for spec in parameter_specs(AerialParameters)}
+    assert {name for name in camera.parameters if not name.startswith("qos")} - {"use_sim_time"} <= known
+    assert camera.parameter_file == "all.yaml"
+
+
 def test_the_command_line_becomes_options() -> None:
-    line = ["swarm.yaml", "--world", "w0", "--seed", "7", "--speed", "0.08", "--rate", "2"]
-    expected = SimulationOptions("swarm.yaml", world="w0", seed=7, speed=0.08, rate=2.0)
+    line = ["swarm.yaml", "--world", "w0", "--seed", "7", "--speed", "0.08", "--rate", "2", "--aerial"]
+    expected = SimulationOptions("swarm.yaml", world="w0", seed=7, speed=0.08, rate=2.0, aerial=True)
     assert simulate.parse(line) == expected
 
 

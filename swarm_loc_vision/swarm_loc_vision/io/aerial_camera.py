@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.io.messages.cdr import ANONYMOUS_DTYPE
 from swarm_loc_estimator.io.messages.encoders import encode_anonymous
-from swarm_loc_vision.core.aerial.control_points import Noise
 from swarm_loc_vision.core.aerial.detector import AerialDetections, AerialDetector
-from swarm_loc_vision.core.aerial.ground_camera import GroundCamera
-from swarm_loc_vision.core.aerial.ground_control import NO_GROUND, Ground, GroundControl
+from swarm_loc_vision.core.aerial.ground.control_points import Noise
+from swarm_loc_vision.core.aerial.ground.ground_camera import GroundCamera
+from swarm_loc_vision.core.aerial.ground.ground_control import NO_GROUND, Ground, GroundControl
 from swarm_loc_vision.core.aerial.rectification import RectificationError
 from swarm_loc_vision.core.aerial.settings import AerialSettings
 from swarm_loc_vision.core.imaging.camera import Camera

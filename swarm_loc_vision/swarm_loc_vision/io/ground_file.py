@@ -11,9 +11,9 @@ from swarm_loc_estimator.io.swarm.tree_checks import WHOLE_FILE, TreeChecks, nea
 from swarm_loc_estimator.io.yaml_tree import Tree, YamlTreeError, read_tree, tree_text
 from swarm_loc_estimator.parameters.errors import UserError
 from swarm_loc_estimator.parameters.number_spec import NumberSpec, number_specs
-from swarm_loc_vision.core.aerial.control_points import ControlPointError, ControlPoints, check_points
-from swarm_loc_vision.core.aerial.floor_markers import FloorMarker
-from swarm_loc_vision.core.aerial.ground_control import Ground
+from swarm_loc_vision.core.aerial.ground.control_points import ControlPointError, ControlPoints, check_points
+from swarm_loc_vision.core.aerial.ground.floor_markers import FloorMarker
+from swarm_loc_vision.core.aerial.ground.ground_control import Ground
 from swarm_loc_vision.core.decoding.families import Family, families
 from swarm_loc_vision.core.imaging.camera import Camera, CameraError
 

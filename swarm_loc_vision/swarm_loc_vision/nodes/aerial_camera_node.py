@@ -15,7 +15,7 @@ from rclpy.qos import QoSProfile
 
 from swarm_loc_estimator.ros.running import run_node
 from swarm_loc_msgs.msg import AnonymousDetectionArray
-from swarm_loc_vision.core.aerial.control_points import PoseFit
+from swarm_loc_vision.core.aerial.ground.control_points import PoseFit
 from swarm_loc_vision.nodes.aerial_parameters import AerialParameters, aerial_camera
 from swarm_loc_vision.nodes.camera_node import CameraNode
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from swarm_loc_estimator.parameters.table import choice, text
 from swarm_loc_vision.core.aerial.detector import POLARITIES
-from swarm_loc_vision.core.aerial.ground_control import Ground
+from swarm_loc_vision.core.aerial.ground.ground_control import Ground
 from swarm_loc_vision.core.aerial.settings import AerialSettings
 from swarm_loc_vision.io.aerial_camera import AerialCamera
 from swarm_loc_vision.io.ground_file import load_ground

@@ -16,8 +16,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from bench.aerial.pictures import DIAMETER, Look, control_pixels, draw_picture
 from swarm_loc_estimator.parameters.table import markdown_table
 from swarm_loc_msgs.msg import AnonymousDetectionArray
-from swarm_loc_vision.core.aerial.control_points import ControlPoints
-from swarm_loc_vision.core.aerial.ground_control import Ground
+from swarm_loc_vision.core.aerial.ground.control_points import ControlPoints
+from swarm_loc_vision.core.aerial.ground.ground_control import Ground
 from swarm_loc_vision.io.ground_file import GroundFileError, save_ground
 from swarm_loc_vision.nodes import camera_node
 from swarm_loc_vision.nodes.aerial_camera_node import AerialCameraNode

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.aerial.control_points import ControlPoints
-from swarm_loc_vision.core.aerial.ground_camera import GroundCamera
+from swarm_loc_vision.core.aerial.ground.control_points import ControlPoints
+from swarm_loc_vision.core.aerial.ground.ground_camera import GroundCamera
 from swarm_loc_vision.core.imaging.camera import Camera
 
 LENSES = {

@@ -10,15 +10,15 @@ import pytest
 from aerial_scenes import LENSES, floor_points, over_floor, spread
 
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.aerial.control_points import (
+from swarm_loc_vision.core.aerial.ground.control_points import (
     ControlPointError,
     ControlPoints,
     Noise,
     misfit,
     solve_pose,
 )
-from swarm_loc_vision.core.aerial.floor_markers import FloorMarker
-from swarm_loc_vision.core.aerial.ground_control import Ground
+from swarm_loc_vision.core.aerial.ground.floor_markers import FloorMarker
+from swarm_loc_vision.core.aerial.ground.ground_control import Ground
 from swarm_loc_vision.core.decoding.families import family_named
 from swarm_loc_vision.io.ground_file import GroundFileError, load_ground, save_ground
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,7 +67,7 @@ class CameraRig:
             track: True paths, from half an exposure before to half an exposure behind.
             rng: Source of the sensor's noise.
         """
-        return exposed(self._renderer, self._cameras[robot], middle_ns, track.all_at, rng)
+        return self._renderer.take(self._cameras[robot], middle_ns, track.all_at, rng)
 
     @property
     def scene(self) -> Scene:
@@ -78,22 +77,6 @@ class CameraRig:
     def views(self, robot: int, poses: FloatArray) -> Views:
         """Where markers lie in an image of a robot's camera when all robots stand at `poses` (N, 3)."""
         return views_of(self._scene, self._faces, self._ids, self._cameras[robot], poses)
-
-
-PosesAt = Callable[[NDArray[np.int64]], FloatArray]
-"""True poses (K, N, 3) at times (K,) [ns]."""
-
-
-def exposed(
-    renderer: Renderer, camera: RobotCamera, middle_ns: int, poses_at: PosesAt, rng: np.random.Generator
-) -> NDArray[np.uint8]:
-    """The image (height, width) of a camera, drawn at as many instants of its exposure as motion needs."""
-    half_ns = round(0.5e9 * camera.model.exposure_s)
-    begin, end = poses_at(np.array([middle_ns - half_ns, middle_ns + half_ns]))
-    instants = renderer.instants(camera, begin, end)
-    shares = (2 * np.arange(instants) + 1 - instants) / instants
-    poses = poses_at(middle_ns + np.rint(shares * half_ns).astype(np.int64))
-    return renderer.frame(camera, poses, rng)
 
 
 def _true_mount(camera: CameraMount | None, true: list[float]) -> CameraMount:

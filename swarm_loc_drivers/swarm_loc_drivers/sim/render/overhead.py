@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.sim.common.trajectories import Trajectories
 from swarm_loc_drivers.sim.render import scene as scenery
-from swarm_loc_drivers.sim.render.camera_rig import exposed
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.raster import Patches
 from swarm_loc_drivers.sim.render.renderer import Renderer, RobotCamera, Scene
 from swarm_loc_estimator.core.description.swarm import CameraMount
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.parameters.number_spec import number
-from swarm_loc_vision.core.aerial.floor_markers import FloorMarker
+from swarm_loc_vision.core.aerial.ground.floor_markers import FloorMarker
 from swarm_loc_vision.core.decoding.families import Family
 
 
@@ -119,4 +118,4 @@ class OverheadRig:
             shadows = robots * [1.0, 1.0, 0.0]
             return np.concatenate([still, shadows, robots, still + self._foot], axis=1)
 
-        return exposed(self._renderer, self._camera, middle_ns, poses_at, rng)
+        return self._renderer.take(self._camera, middle_ns, poses_at, rng)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -34,6 +34,10 @@ _NARROW_WAYS = ((-0.5, 0.25), (0.0, 0.5), (0.5, 0.25))
 _NARROW_VARIANCE, _WIDE_VARIANCE = 0.125, 0.64
 """Of these ways, and from which pixels are fine enough [px^2]."""
 _NOISE_LENGTH = 1 << 20
+
+
+PosesAt = Callable[[NDArray[np.int64]], FloatArray]
+"""True poses (K, N, 3) of all robots in map at times (K,) [ns]."""
 
 
 @dataclass(frozen=True)
@@ -160,6 +164,17 @@ class Renderer:
         offset = rng.integers(0, _NOISE_LENGTH - model.width, model.height)
         expose(light, frame, self._electrons, model.read_noise, model.gain, self._noise, offset)
         return frame
+
+    def take(
+        self, camera: RobotCamera, middle_ns: int, poses_at: PosesAt, rng: np.random.Generator
+    ) -> NDArray[np.uint8]:
+        """The image (height, width) that a camera takes, exposed around `middle_ns`."""
+        half_ns = round(0.5e9 * camera.model.exposure_s)
+        begin, end = poses_at(np.array([middle_ns - half_ns, middle_ns + half_ns]))
+        instants = self.instants(camera, begin, end)
+        shares = (2 * np.arange(instants) + 1 - instants) / instants
+        poses = poses_at(middle_ns + np.rint(shares * half_ns).astype(np.int64))
+        return self.frame(camera, poses, rng)
 
     def instants(self, camera: RobotCamera, begin: FloatArray, end: FloatArray) -> int:
         """At how many instants of an exposure `light` needs the poses.

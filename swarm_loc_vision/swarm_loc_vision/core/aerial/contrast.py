@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.aerial.rectification import Gray, Plain
+from swarm_loc_vision.core.aerial.rectification import Plain
+from swarm_loc_vision.core.imaging.gray import Gray
 
 _DARK = 10.0
 """Counts that black still has: below it the logarithm would show noise alone."""

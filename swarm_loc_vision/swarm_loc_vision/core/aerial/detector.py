@@ -13,16 +13,16 @@ from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_vision.core.aerial.circles import Circles, Rims, likely
 from swarm_loc_vision.core.aerial.contrast import brightness, noise_of
 from swarm_loc_vision.core.aerial.diameter import commonest, ladder
-from swarm_loc_vision.core.aerial.ground_camera import GroundCamera
+from swarm_loc_vision.core.aerial.ground.ground_camera import GroundCamera
 from swarm_loc_vision.core.aerial.heading import Marks, find_marks
 from swarm_loc_vision.core.aerial.rectification import (
-    Gray,
     Rectification,
     RectificationError,
     rectification,
 )
 from swarm_loc_vision.core.aerial.settings import AerialSettings
 from swarm_loc_vision.core.aerial.voting import BRIGHT, DARK, Edges, peaks
+from swarm_loc_vision.core.imaging.gray import Gray
 
 POLARITIES = {"auto": (BRIGHT, DARK), "bright": (BRIGHT,), "dark": (DARK,)}
 """Whether robots are brighter or darker than the floor; by name."""
@@ -41,6 +41,8 @@ _SAME_SIZE = 0.2
 """By this share a disc may be wider or narrower than the others of its image."""
 _SAME_CONTRAST = 0.45
 """So much of the others' contrast a disc must have: shadows have less."""
+_TOUCHING, _USUAL = 1.3, 0.65
+"""Discs nearer than so many diameters may touch; one alone must show so much of the usual share of rim."""
 _MARK_ROUNDS = 2
 _MOST, _CLEAR = 0.6, 0.85
 """Share of the discs with a mark from which on others need so much of their rim."""
@@ -149,6 +151,9 @@ class AerialDetector:
         strong = circles.contrast >= _SAME_CONTRAST * commonest(circles.contrast, quality)
         dropped = {"other_size": int(np.sum(~alike)), "other_contrast": int(np.sum(alike & ~strong))}
         circles = circles.chosen(alike & strong)
+        whole = _whole(circles)
+        dropped["not_whole"] = int(np.sum(~whole))
+        circles = circles.chosen(whole)
         most = self._settings.max_robots
         dropped["too_many"] = max(len(circles.radius) - most, 0)
         order = np.argsort(-_quality(circles), kind="stable")[:most]
@@ -208,6 +213,18 @@ def _quality(circles: Circles) -> FloatArray:
     """(C,) how clear discs are, 0 to 1: how much of their rims is seen, and how round it is."""
     limit = _MAX_SPREAD * circles.radius + _MAX_SPREAD_PX
     return np.asarray(circles.coverage**2 * np.maximum(1.0 - (circles.spread / limit) ** 2, 0.0))
+
+
+def _whole(circles: Circles) -> NDArray[np.bool_]:
+    """Which discs show as much of their rims as they should: those alone as much as the others.
+
+    A rim may be hidden by a disc that touches it, hardly by anything else.
+    """
+    away = np.linalg.norm(circles.centre[:, None] - circles.centre, axis=2)
+    np.fill_diagonal(away, np.inf)
+    alone = away.min(axis=1, initial=np.inf) > _TOUCHING * 2.0 * circles.radius
+    usual = np.median(circles.coverage) if len(circles.coverage) else 0.0
+    return np.asarray(~alone | (circles.coverage >= _USUAL * usual))
 
 
 def _marked_alike(circles: Circles, marks: Marks) -> NDArray[np.bool_]:

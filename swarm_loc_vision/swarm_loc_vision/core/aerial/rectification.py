@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.aerial.ground_camera import GroundCamera
+from swarm_loc_vision.core.aerial.ground.ground_camera import GroundCamera
 from swarm_loc_vision.core.aerial.settings import AerialSettings
+from swarm_loc_vision.core.imaging.gray import Gray
 
-Gray = NDArray[np.uint8]
 Plain = NDArray[np.float32]
 
 _CELL_PX = 16

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from swarm_loc_vision.core.aerial.control_points import (
+from swarm_loc_vision.core.aerial.ground.control_points import (
     MIN_POINTS,
     NO_POINTS,
     ControlPointError,
@@ -16,11 +16,11 @@ from swarm_loc_vision.core.aerial.control_points import (
     misfit,
     solve_pose,
 )
-from swarm_loc_vision.core.aerial.floor_markers import FloorMarker, FloorMarkers
-from swarm_loc_vision.core.aerial.ground_camera import GroundCamera
-from swarm_loc_vision.core.aerial.rectification import Gray
+from swarm_loc_vision.core.aerial.ground.floor_markers import FloorMarker, FloorMarkers
+from swarm_loc_vision.core.aerial.ground.ground_camera import GroundCamera
 from swarm_loc_vision.core.decoding.families import Family, family_named
 from swarm_loc_vision.core.imaging.camera import Camera
+from swarm_loc_vision.core.imaging.gray import Gray
 
 NO_GROUND = "there are neither control points nor floor markers, without which nothing is published."
 _SETTLING, _LATER_EVERY = 10, 10

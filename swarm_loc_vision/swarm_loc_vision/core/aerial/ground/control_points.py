@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.aerial.ground_camera import (
+from swarm_loc_vision.core.aerial.ground.ground_camera import (
     POSE_SIZE,
     GroundCamera,
     pose_slopes,

@@ -9,12 +9,12 @@ import numpy as np
 
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.parameters.number_spec import number
-from swarm_loc_vision.core.aerial.control_points import ControlPoints
-from swarm_loc_vision.core.aerial.rectification import Gray
+from swarm_loc_vision.core.aerial.ground.control_points import ControlPoints
 from swarm_loc_vision.core.decoding.families import Family
 from swarm_loc_vision.core.detection.detector import MarkerDetector
 from swarm_loc_vision.core.detection.settings import DetectorSettings
 from swarm_loc_vision.core.imaging.camera import Camera
+from swarm_loc_vision.core.imaging.gray import Gray
 
 _UNIT_CORNERS = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
 """Clockwise from a marker's upper left, x right and y up as seen by one who faces it."""
