@@ -19,7 +19,7 @@ from swarm_loc_estimator.core.description.swarm import OdometryModel, Swarm
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.parameters.number_spec import number
 from swarm_loc_estimator.parameters.table import ParameterError, choice, text
-from swarm_loc_vision.core.aerial.floor_markers import FloorMarker
+from swarm_loc_vision.core.aerial.ground.floor_markers import FloorMarker
 from swarm_loc_vision.core.decoding.families import families
 from swarm_loc_vision.io.ground_file import load_ground
 

@@ -25,7 +25,7 @@ from swarm_loc_drivers.sim.render.overhead import OverheadRig, OverheadSettings
 from swarm_loc_drivers.sim.render.views import Views
 from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.aerial.floor_markers import FloorMarker
+from swarm_loc_vision.core.aerial.ground.floor_markers import FloorMarker
 
 GrayImage = NDArray[np.uint8]
 
