@@ -58,7 +58,7 @@ class RunResult:
         position_cm: Error of the robots' last poses, mean over the robots.
         heading_deg: Likewise.
         worst_cm: Largest error of any pose after the last solution.
-        online_cm: Median error of poses at the time when they were told.
+        online_position_cm: Median error of poses at the time when they were told.
         online_worst_cm: The largest of these.
         aligned_cm: RMS error of all poses after one rigid fit.
         wall_cm: Mean distance of occupied cells from a wall.
@@ -75,7 +75,7 @@ class RunResult:
     position_cm: float
     heading_deg: float
     worst_cm: float
-    online_cm: float
+    online_position_cm: float
     online_worst_cm: float
     aligned_cm: float
     wall_cm: float
@@ -89,8 +89,13 @@ class RunResult:
 
     @property
     def is_diverged(self) -> bool:
-        """Whether any pose, when told or in the end, was off by more than `DIVERGED_CM`."""
-        return not max(self.worst_cm, self.online_worst_cm) <= DIVERGED_CM
+        """Whether any pose was off by more than `DIVERGED_CM` after the last solution."""
+        return not self.worst_cm <= DIVERGED_CM
+
+    @property
+    def is_diverged_online(self) -> bool:
+        """Whether any pose was off by more than that when it was told."""
+        return not self.online_worst_cm <= DIVERGED_CM
 
     @property
     def is_good(self) -> bool:
@@ -203,7 +208,7 @@ def _score(
         position_cm=float(errors[last].mean()),
         heading_deg=float(heading.mean()),
         worst_cm=float(errors.max()),
-        online_cm=float(np.median(told)),
+        online_position_cm=float(np.median(told)),
         online_worst_cm=float(told.max()),
         aligned_cm=100.0 * float(np.sqrt(np.square(aligned).sum(axis=1).mean())),
         wall_cm=wall_distance_cm(cells, plan),

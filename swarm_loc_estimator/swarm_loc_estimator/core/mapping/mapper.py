@@ -91,6 +91,7 @@ class CooperativeMapper:
         graph: The stops.
         visits: Where robots have been.
         counters: How often what has happened.
+        background: A map from before, below what the stops draw.
     """
 
     def __init__(self, settings: MapperSettings | None = None) -> None:
@@ -100,6 +101,7 @@ class CooperativeMapper:
         self.counters = {"scans": 0, "scans_refused": 0, "loops_closed": 0}
         self._tracks: dict[int, _Track] = {}
         self._lights = LightBook()
+        self.background: OccupancyMap | None = None
         self._map: OccupancyMap | None = None
 
     def join(self, pose: FloatArray, sigma: FloatArray) -> int:
@@ -165,7 +167,8 @@ class CooperativeMapper:
     def occupancy(self) -> OccupancyMap:
         """The map as the stops stand now."""
         if self._map is None:
-            self._map = draw_map(self.graph.scans, self.graph.count, self.settings.max_cells)
+            limit = self.settings.max_cells
+            self._map = draw_map(self.graph.scans, self.graph.count, limit, self.background)
         return self._map
 
     def finish(self) -> None:
@@ -315,7 +318,8 @@ class CooperativeMapper:
         pose = np.array([x, y, theta + ratio * (turned - track.turn_begin(stop))])
         odometry = stop.arrival + np.array([0.0, 0.0, turned])
         number = track.goal.number + 1 if track.goal else 1
-        track.goal = Goal(number, hop, goal_by_odometry(pose, odometry, hop, ratio))
+        there = goal_by_odometry(pose, odometry, hop, ratio)
+        track.goal = Goal(number, hop, there, int(stop.stamp_ns[count - 1]), pose)
 
     def _look_for_home(self, track: _Track, node: int) -> None:
         """Send a robot that has become unsure of its position to where it was sure."""

@@ -19,11 +19,15 @@ class Goal:
         number: Counts the goals of a robot, from 1 on.
         position: (2,) in map [m].
         odometry: (2,) the same in the robot's odom frame, if it turns there and drives by its odometry [m].
+        stamp_ns: When that was decided.
+        pose: (3,) of the robot in map then.
     """
 
     number: int
     position: FloatArray
     odometry: FloatArray
+    stamp_ns: int
+    pose: FloatArray
 
 
 def goal_by_odometry(

@@ -53,35 +53,51 @@ class OccupancyMap:
         return np.floor((np.asarray(points) - self.corner) / self.cell).astype(np.int64)
 
 
-def draw_map(scans: Scans, count: int, max_cells: int, cell: float = CELL) -> OccupancyMap:
+def draw_map(
+    scans: Scans, count: int, max_cells: int, background: OccupancyMap | None = None
+) -> OccupancyMap:
     """The map that the first stops draw; its size follows from where they are.
 
     Args:
         scans: All stops.
         count: How many there are.
         max_cells: Of a larger map, what lies furthest from its middle is left out.
-        cell: [m].
+        background: A map with such cells below what is drawn.
     """
-    corner, shape = grid_around(scans.states[:count, :2], scans.max_range + 0.1, cell, max_cells)
+    reach = scans.max_range + 0.1
+    places = scans.states[:count, :2]
+    points = [places - reach, places + reach]
+    if background is not None:
+        points.append(background.corner + CELL * np.array([(0, 0), background.log_odds.shape]))
+    corner, shape = grid_around(np.concatenate(points), CELL, max_cells)
     log_odds = np.zeros(shape)
+    if background is not None:
+        _lay_below(log_odds, corner, background)
     for stop in range(count):
-        draw_stop(log_odds, corner, cell, scans.states[stop, :3], stop, scans.lines, scans.max_range)
-    return OccupancyMap(corner, cell, np.clip(log_odds, -LOG_ODDS_CAP, LOG_ODDS_CAP))
+        draw_stop(log_odds, corner, CELL, scans.states[stop, :3], stop, scans.lines, scans.max_range)
+    return OccupancyMap(corner, CELL, np.clip(log_odds, -LOG_ODDS_CAP, LOG_ODDS_CAP))
 
 
-def grid_around(
-    points: FloatArray, margin: float, cell: float, max_cells: int
-) -> tuple[FloatArray, tuple[int, int]]:
-    """Corner (2,) and shape of the grid around points (n, 2) with a margin [m]; one cell without points."""
+def _lay_below(log_odds: FloatArray, corner: FloatArray, background: OccupancyMap) -> None:
+    """Write a map into a grid with the same cells, as far as it lies there."""
+    first = np.round((background.corner - corner) / CELL).astype(int)
+    low = np.maximum(first, 0)
+    high = np.minimum(first + background.log_odds.shape, log_odds.shape)
+    if (low < high).all():
+        here = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        there = tuple(slice(a, b) for a, b in zip(low - first, high - first, strict=True))
+        log_odds[here] = background.log_odds[there]
+
+
+def grid_around(points: FloatArray, cell: float, max_cells: int) -> tuple[FloatArray, tuple[int, int]]:
+    """Corner (2,) and shape of the grid around points (n, 2) [m]; one cell without points."""
     if not len(points):
         return np.zeros(2), (1, 1)
-    low = np.floor((points.min(axis=0) - margin) / cell)
-    high = np.ceil((points.max(axis=0) + margin) / cell)
+    low, high = np.floor(points.min(axis=0) / cell), np.ceil(points.max(axis=0) / cell)
     size = np.maximum(high - low, 1.0)
     if size.prod() > max_cells:
-        side = np.sqrt(max_cells)
-        limit = np.minimum(size, [max(side, max_cells / size[1]), max(side, max_cells / size[0])]) // 1
-        middle = (low + high) // 2
-        size = np.minimum(limit, max_cells // limit[::-1])
-        low = middle - size // 2
+        side = np.floor(np.sqrt(max_cells))
+        limit = np.maximum(side, np.floor(max_cells / size[::-1]))  # a long hall may stay long
+        size = np.minimum(size, limit)
+        low = np.floor(0.5 * (low + high - size))
     return low * cell, (int(size[0]), int(size[1]))

@@ -17,6 +17,7 @@ _GATE = 0.06
 _MAX_SHIFT, _MAX_SHIFT_PER_METRE, _MAX_TURN = 0.10, 0.08, math.radians(5.0)
 """A scan that alignment moves further than odometry can be wrong is left where odometry put it."""
 _SOLVE_ALL_EVERY = 4
+"""At every stop it is worse: a closed ring then gets half as precise again."""
 _RECENT = 8
 _START_SEARCH = Lattice(0.3, 0.05, math.radians(12.0), math.radians(1.5))
 _START_RADIUS, _START_AGAINST, _MIN_START_SCORE = 2.5, 6, 0.15

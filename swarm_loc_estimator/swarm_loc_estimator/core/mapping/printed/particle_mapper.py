@@ -51,12 +51,14 @@ class _Tribe:
         odometry: (3,) the newest pose by odometry.
         goal: Where to go.
         count: How many readings came.
+        stamp_ns: Of the newest.
     """
 
     particles: FloatArray
     odometry: FloatArray | None = None
     goal: Goal | None = None
     count: int = 0
+    stamp_ns: int = 0
 
     @property
     def mean(self) -> FloatArray:
@@ -99,6 +101,7 @@ class ParticleMapper:
                 if tribe.count % _EVERY == 0:
                     self._weigh(tribe, 1.0 / inverse)
                 self._draw(tribe.mean, 1.0 / inverse)
+        tribe.stamp_ns = int(readings.stamp_ns[-1])
         self._visits.add(tribe.mean[None, :2])
 
     def pose(self, robot: int) -> FloatArray | None:
@@ -171,4 +174,5 @@ class ParticleMapper:
             hop = first_hop(grid, before, here, (int(best[0]), int(best[1])), self._settings.max_hop)
         if tribe.odometry is not None:
             number = tribe.goal.number + 1 if tribe.goal else 1
-            tribe.goal = Goal(number, hop, goal_by_odometry(pose, tribe.odometry, hop, 1.0))
+            there = goal_by_odometry(pose, tribe.odometry, hop, 1.0)
+            tribe.goal = Goal(number, hop, there, tribe.stamp_ns, pose)

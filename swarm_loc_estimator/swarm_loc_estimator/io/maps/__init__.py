@@ -1,0 +1,1 @@
+"""Maps: their files, and the inputs that they are made of."""

@@ -1,0 +1,187 @@
+"""Makes one map with many PushBots, as a ROS 2 node.
+
+    ./run swarm_loc_estimator mapper_node --ros-args -p swarm_file:=swarm.yaml
+
+It subscribes to `<robot>/odom`, `<robot>/laser` and `<robot>/lights`. It publishes `map`, `visitation`,
+`<robot>/goal`, `<robot>/fix` (the estimator, which owns the transforms, fuses it) and `/diagnostics`.
+Services: `~/save_map`, `~/reset`. Parameters: see `doc/mapper_node.md`.
+"""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid, Odometry
+from rclpy.clock import Clock, JumpThreshold
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from swarm_loc_estimator.core.mapping.grid.occupancy import CELL, OccupancyMap
+from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.io.maps.map_file import MapFileError, load_map, save_map
+from swarm_loc_estimator.io.maps.mapper_feed import MapperFeed, MapperInput
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.nodes.mapper.map_messages import (
+    fix_message,
+    goal_message,
+    occupancy_message,
+    visitation_message,
+)
+from swarm_loc_estimator.nodes.mapper.mapper_parameters import (
+    MapperParameters,
+    chosen_robots,
+    led_frequencies,
+)
+from swarm_loc_estimator.ros.running import ConfiguredNode, run_node
+from swarm_loc_estimator.ros.topic_graph import TopicGraph
+from swarm_loc_msgs.msg import LaserDistance, LightBearingArray
+
+_LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_INPUT_QOS = QoSProfile(depth=200)
+_OUTPUT_QOS = QoSProfile(depth=10)
+_MESSAGE_CLASSES = {
+    MapperInput.ODOMETRY: Odometry,
+    MapperInput.LASER: LaserDistance,
+    MapperInput.LIGHTS: LightBearingArray,
+}
+_BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
+_DIAGNOSTICS_PERIOD_S = 1.0
+_PATIENCE_S = 5.0
+_THROTTLE_S = 30.0
+
+
+class MapperNode(ConfiguredNode[MapperParameters]):
+    """Receives, lets the core map, publishes.
+
+    Args:
+        node_arguments: Further arguments of `rclpy.node.Node`.
+    """
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("mapper", MapperParameters, **node_arguments)
+        swarm = load_swarm(Path(self.chosen.swarm_file))
+        names = chosen_robots(self.chosen.robots, list(swarm.index_of))
+        self._robots = [swarm.robots[swarm.index_of[name]] for name in names]
+        self._frequencies = led_frequencies(self.chosen.led_frequencies, names)
+        path = self.chosen.load_map
+        self._background: OccupancyMap | None = load_map(Path(path), CELL) if path else None
+        self._graph = TopicGraph(self)
+        self._known_drops: dict[str, int] = {}
+        self._since_s, self._has_said_missing = time.monotonic(), False
+        self._begin_anew()
+        self._create_publishers()
+        for index, robot in enumerate(self._robots):
+            for kind in MapperInput if self._frequencies else (MapperInput.ODOMETRY, MapperInput.LASER):
+                take = partial(self._on_message, index, kind)
+                topic = f"{robot.name}/{kind.topic}"
+                self.create_subscription(_MESSAGE_CLASSES[kind], topic, take, _INPUT_QOS, raw=True)
+        self.create_service(Trigger, "~/save_map", self._on_save)
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self._jumps = self.get_clock().create_jump_callback(_BACKWARDS, post_callback=self._on_jump)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(self.chosen.map_period_s, self._publish_map, clock=steady)
+        self.create_timer(_DIAGNOSTICS_PERIOD_S, self._on_diagnostics, clock=steady)
+        self.get_logger().info(f"ready: {len(self._robots)} robots of '{self.chosen.swarm_file}'")
+
+    def _begin_anew(self) -> None:
+        """An empty map, and robots that have not joined yet."""
+        self._mapper = CooperativeMapper(self.chosen.settings)
+        self._mapper.background = self._background
+        self._feed = MapperFeed(self._robots, self._mapper, self._frequencies)
+        self._told: dict[int, int] = {}
+        self._published: OccupancyMap | None = None
+
+    def _create_publishers(self) -> None:
+        self._map = self.create_publisher(OccupancyGrid, "map", _LATCHED)
+        self._visitation = self.create_publisher(OccupancyGrid, "visitation", _LATCHED)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", _OUTPUT_QOS)
+        names = [robot.name for robot in self._robots]
+        self._goals = [self.create_publisher(PoseStamped, f"{name}/goal", _LATCHED) for name in names]
+        self._fixes = [
+            self.create_publisher(PoseWithCovarianceStamped, f"{name}/fix", _OUTPUT_QOS) for name in names
+        ]
+
+    def _on_message(self, robot: int, kind: MapperInput, data: bytes) -> None:
+        self._feed.add(robot, kind, data)
+        number = self._feed.number(robot)
+        goal = self._mapper.goal(number) if number is not None else None
+        if number is None or goal is None or self._told.get(robot) == goal.number:
+            return
+        self._told[robot] = goal.number
+        frame = self.chosen.map_frame
+        self._fixes[robot].publish(fix_message(goal, self._mapper.covariance(number), frame))
+        self._goals[robot].publish(goal_message(goal, frame))
+
+    def _publish_map(self) -> None:
+        """Publish the map and the visits if the map has changed."""
+        occupancy = self._mapper.occupancy()
+        if occupancy is self._published:
+            return
+        self._published = occupancy
+        header = Header(frame_id=self.chosen.map_frame, stamp=self.get_clock().now().to_msg())
+        self._map.publish(occupancy_message(occupancy, header))
+        self._visitation.publish(visitation_message(occupancy, self._mapper.visits.on(occupancy), header))
+
+    def _on_jump(self, _jump: object) -> None:
+        self._begin_anew()
+        self.get_logger().warning("time has jumped back: the map begins anew")
+
+    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._begin_anew()
+        response.success, response.message = (
+            True,
+            "The map begins anew.",
+        )
+        return response
+
+    def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Solve everything anew and write the map."""
+        self._mapper.finish()
+        try:
+            path, image = save_map(self._mapper.occupancy(), Path(self.chosen.save_map))
+            response.success, response.message = True, f"The map is in '{path}' and '{image}'."
+        except MapFileError as error:
+            response.success, response.message = False, str(error)
+        return response
+
+    def _on_diagnostics(self) -> None:
+        missing = [self._why(topic) for topic in self._feed.missing()]
+        if missing and not self._has_said_missing and time.monotonic() > self._since_s + _PATIENCE_S:
+            self._has_said_missing = True
+            self.get_logger().warning(f"waiting: nothing has come on {', '.join(missing)}")
+        drops = dict(self._feed.all_drops)
+        if drops != self._known_drops:
+            self._known_drops = drops
+            words = ", ".join(f"{count} {reason}" for reason, count in drops.items())
+            self.get_logger().warning(f"dropped so far: {words}", throttle_duration_sec=_THROTTLE_S)
+        graph, counters = self._mapper.graph, self._mapper.counters
+        values = {"stops": graph.count, "bearings of lights": graph.constraints.bearing_count, **counters}
+        values |= {f"dropped: {reason}": count for reason, count in drops.items()}
+        for kind in MapperInput:
+            count = sum(self._feed.received[index, kind] for index in range(len(self._robots)))
+            values[f"<robot>/{kind.topic} received"] = count
+        text = f"nothing on {', '.join(missing)}" if missing else f"{graph.count} stops"
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.WARN if missing else DiagnosticStatus.OK,
+            name=self.get_name(),
+            message=text,
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+    def _why(self, topic: str) -> str:
+        kind = next(one for one in MapperInput if topic.endswith(f"/{one.topic}"))
+        return f"{topic}{self._graph.why_missing(topic, kind.message_type)}"
+
+
+main = partial(run_node, "mapper_node", MapperNode)
