@@ -19,7 +19,6 @@ from swarm_loc_estimator.evaluation.truth import read_truth
 from swarm_loc_estimator.io.messages.cdr import decode_pose_stamped
 from swarm_loc_estimator.io.messages.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED
 from swarm_loc_estimator.live.graph import START_PATIENCE_S, LiveError, LiveGraph
-from swarm_loc_estimator.live.recorder import read_poses
 from swarm_loc_estimator.numerics.trajectory import Trajectory
 from swarm_loc_msgs.msg import MarkerDetectionArray
 

@@ -21,9 +21,10 @@ from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.core.estimation.estimator import Status
 from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.live.graph import LiveGraph
-from swarm_loc_estimator.live.recorder import read_history
+from swarm_loc_estimator.live.recorder import read_history, read_poses
 from swarm_loc_estimator.numerics import se2
 from swarm_loc_estimator.numerics.trajectory import DEFAULT_GAP_NS, interpolate
+from swarm_loc_vision.core.warm_up import warm_up
 
 _ROBOTS = 5
 _BEFORE_S, _AFTER_S = 8.0, 10.0
@@ -39,16 +40,11 @@ class _Live:
     listener: Listener
     nodes: frozenset[str]
 
-    def now_s(self) -> float:
-        """How far the world is, by its newest truth [s]."""
-        newest = self.listener.newest_truth(self.listener.names[0])
-        return newest[0] * 1e-9 if newest else 0.0
-
     def go_on(self, duration_s: float, without: str = "") -> None:
         """Let the world go on; `without` names a node that is not there."""
-        until_s = self.now_s() + duration_s
+        until_ns = self.listener.now_ns + round(duration_s * 1e9)
         self.graph.wait_for(
-            lambda: self.now_s() >= until_s, "go on driving", _PATIENCE_S, self.nodes - {without}
+            lambda: self.listener.now_ns >= until_ns, "go on driving", _PATIENCE_S, self.nodes - {without}
         )
 
 
@@ -76,7 +72,7 @@ def _estimator_restart_moved(live: _Live, away_s: float) -> float:
     received = len(raw)
     live.graph.restart(_ESTIMATOR)
     live.graph.wait_for(lambda: len(raw) > received, "publish poses again", _PATIENCE_S)
-    return live.listener.now_ns * 1e-9
+    return read_poses(raw[received]).stamp_ns * 1e-9
 
 
 LIVE_SCENARIOS: Mapping[str, Break] = {
@@ -97,6 +93,7 @@ def run_live(name: str, seed: int, folder: Path, say: Say) -> Score:
     Raises:
         LiveError: A node has ended, or nothing goes on.
     """
+    warm_up()  # once, not in every robot's detector at a time
     links, swarm = folder / "links", _swarm()
     links.mkdir(parents=True, exist_ok=True)
     save_swarm(swarm, folder / "swarm.yaml")
