@@ -1,0 +1,66 @@
+"""Everything over DDS under an overhead camera: robots of unknown start find themselves in its images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped
+
+from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
+from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
+from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_estimator.core.estimation.estimator import Status
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.live.graph import LiveGraph
+from swarm_loc_estimator.live.recorder import Poses, read_poses
+
+PATIENCE_S = 100.0
+PARAMETERS = "epuck_world: {ros__parameters: {aerial_width: 640, aerial_height: 480}}\n"
+ROBOTS = 3
+
+
+@pytest.mark.timeout(300)  # the renderer may have to be compiled first
+def test_robots_are_located_by_a_camera_that_cannot_tell_them_apart(tmp_path: Path) -> None:
+    eight = Lemniscate(HALF_WIDTH)
+    start, _ = eight.at(np.arange(ROBOTS) * eight.length / ROBOTS)
+    swarm = describe(EightSettings(robots=ROBOTS), start)
+    save_swarm(swarm, tmp_path / "swarm.yaml")
+    (tmp_path / "parameters.yaml").write_text(PARAMETERS, encoding="utf-8")
+    (tmp_path / "links").mkdir()
+    options = SimulationOptions(
+        str(tmp_path / "swarm.yaml"),
+        world="w0",
+        aerial=True,
+        parameter_file=str(tmp_path / "parameters.yaml"),
+    )
+    names = [robot.name for robot in swarm.robots]
+    nodes = simulation_nodes(options, names, str(tmp_path / "links"))
+    truth: dict[str, dict[int, tuple[float, float]]] = {name: {} for name in names}
+
+    with LiveGraph(nodes, tmp_path / "nodes.log") as graph:
+        recorder = graph.recorder
+        for name in names:
+
+            def on_truth(message: PoseStamped, name: str = name) -> None:
+                stamp, place = message.header.stamp, message.pose.position
+                truth[name][stamp.sec * 1_000_000_000 + stamp.nanosec] = (place.x, place.y)
+
+            recorder.create_subscription(PoseStamped, f"{name}/ground_truth", on_truth, 1000)
+
+        def tracked() -> list[Poses]:
+            return [one for one in map(read_poses, recorder.raw) if (one.status == Status.TRACKED).all()]
+
+        graph.wait_for(lambda: len(tracked()) >= 20, "be located", PATIENCE_S)
+    for one in tracked()[-10:]:
+        for robot, name in enumerate(names):
+            stamps = np.array(list(truth[name]))
+            if not stamps.min() <= one.stamp_ns <= stamps.max():
+                continue
+            places = np.array(list(truth[name].values()))
+            true = [np.interp(one.stamp_ns, stamps, places[:, axis]) for axis in (0, 1)]
+            assert np.hypot(*(one.pose[robot, :2] - true)) < 0.02
+    log = (tmp_path / "nodes.log").read_text(encoding="utf-8")
+    assert "dropped" not in log
+    assert "time goes on without" not in log
