@@ -7,13 +7,18 @@ import queue
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 
 import numpy as np
 import pytest
 from playwright.sync_api import Browser
-from watched_swarm import PLACES, WatchedSwarm
+from watched_swarm import PLACES, SWARM, WatchedSwarm
 
 from bench.watch.browser import WatchedPage, chromium, running_browser
+from swarm_loc_estimator.evaluation.report.recording import recorded
+from swarm_loc_estimator.evaluation.result import ReplayResult
+from swarm_loc_estimator.io.watch.page import page as page_of
+from swarm_loc_estimator.numerics.trajectory import Trajectory
 
 PATIENCE_S = 15.0
 BLUE = (0x00, 0x72, 0xB2)
@@ -164,6 +169,27 @@ def test_a_dropped_connection_comes_back(page: WatchedPage, swarm: WatchedSwarm)
     # that the server was away is told on the console
     assert all("ERR_CONNECTION_REFUSED" in error for error in page.errors), page.errors
     page.errors.clear()
+
+
+def test_a_report_plays_its_run_without_a_server(browser: Browser, tmp_path: Path) -> None:
+    stamp_ns = np.arange(1, 41) * 100_000_000
+    pose = np.tile(PLACES, (40, 1, 1))
+    pose[:, 0, 0] += np.arange(40) * 0.01
+    covariance = np.tile(np.diag([1e-4, 1e-4, 1e-3]), (40, 3, 1, 1))
+    truth = {"alpha": Trajectory(stamp_ns, pose[:, 0] + [0.003, 0.004, 0.0])}
+    result = ReplayResult("a run", SWARM, stamp_ns, pose, covariance, truth)
+    file = tmp_path / "run.html"
+    file.write_text(page_of(recorded(result)), encoding="utf-8")
+    opened = WatchedPage(browser, file.as_uri())
+    opened.until("watch.playing && watch.painter.u")
+    opened.page.click("#pause")
+    opened.until("watch.time === watch.store.range[1] && watch.paused")
+    assert opened.evaluate("watch.store.at('poses', watch.time).columns.x[0]") == pytest.approx(0.89)
+    opened.page.mouse.click(*opened.place_of(0))
+    opened.until("document.getElementById('numbers').innerText.includes('5.0 mm')")
+    assert not opened.page.is_visible("#reset")
+    opened.close()
+    assert opened.errors == opened.foreign == []
 
 
 def test_a_command_of_a_foreign_page_is_refused(browser: Browser, swarm: WatchedSwarm) -> None:

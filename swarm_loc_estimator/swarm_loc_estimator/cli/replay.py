@@ -53,7 +53,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     settings = parameters_of(EstimatorSettings, options.set)
     swarm = load_swarm(options.swarm or swarm_beside(options.bag))
     with ProgressLine() as progress:
-        result = replay(options.bag, swarm, settings, tick_s=options.tick, progress=progress)
+        result = replay(
+            options.bag, swarm, settings, tick_s=options.tick, keep_sightings=True, progress=progress
+        )
         progress(1.0, "writing the report")
         files = write_report(result, options.out)
         write_poses(result, options.out / "poses.csv")

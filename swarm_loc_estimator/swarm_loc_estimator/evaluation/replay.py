@@ -25,6 +25,7 @@ def replay(
     *,
     tick_s: float = TICK_S,
     stamp_ns: npt.NDArray[np.int64] | None = None,
+    keep_sightings: bool = False,
     progress: Progress = unwatched,
 ) -> ReplayResult:
     """Estimate all poses from a bag and compare them with the ground truth that it may hold.
@@ -35,15 +36,15 @@ def replay(
         settings: Of the estimator.
         tick_s: Time between two outputs [s].
         stamp_ns: (T,) increasing, when to give poses instead, such as when a live estimator gave them.
+        keep_sightings: Whether what the robots see is kept, too, for people who watch the run.
         progress: Called now and then.
 
     Raises:
         BagError: Nothing in the bag can be read.
     """
     periodic = PeriodicSchedule(round(tick_s * 1e9))
-    runner = Runner(
-        SwarmEstimator(swarm, settings), periodic if stamp_ns is None else ListedSchedule(stamp_ns)
-    )
+    schedule = periodic if stamp_ns is None else ListedSchedule(stamp_ns)
+    runner = Runner(SwarmEstimator(swarm, settings), schedule, keep_sightings=keep_sightings)
     summary = read_bag(bag, swarm, runner.take, progress)
     runner.finish(summary.range_ns[1])
     remarks = list(summary.remarks)

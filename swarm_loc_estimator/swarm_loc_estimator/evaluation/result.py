@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from swarm_loc_estimator.core.description.swarm import Swarm
+    from swarm_loc_estimator.core.estimation.sightings import Sightings
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,8 @@ class ReplayResult:
         remarks: What else must be said, one sentence each, such as what could not be read of the bag.
         data_s: Duration of the data [s].
         wall_s: Duration of the replay [s].
+        status: (T, N) of `Status`; None: not known.
+        sightings: What the robots saw every half second, with its instant [ns]; empty: not kept.
         self_calibrated: The swarm with what the filter has estimated beside the poses; None: nothing.
     """
 
@@ -47,6 +50,8 @@ class ReplayResult:
     data_s: float = 0.0
     wall_s: float = 0.0
     self_calibrated: Swarm | None = None
+    status: npt.NDArray[np.uint8] | None = None
+    sightings: tuple[tuple[int, Sightings], ...] = ()
 
     @property
     def speed_factor(self) -> float:
@@ -56,7 +61,11 @@ class ReplayResult:
     def chosen(self, rows: npt.NDArray[np.bool_]) -> ReplayResult:
         """The same with the poses at some of the stamps (T,) only."""
         return replace(
-            self, stamp_ns=self.stamp_ns[rows], pose=self.pose[rows], covariance=self.covariance[rows]
+            self,
+            stamp_ns=self.stamp_ns[rows],
+            pose=self.pose[rows],
+            covariance=self.covariance[rows],
+            status=None if self.status is None else self.status[rows],
         )
 
     def track(self, index: int) -> Trajectory:

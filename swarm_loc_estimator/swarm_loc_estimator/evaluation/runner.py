@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
+from swarm_loc_estimator.core.estimation.sightings import Sightings, newest_sightings
 from swarm_loc_estimator.core.inputs.messages import RawInputs
 from swarm_loc_estimator.evaluation.result import ReplayResult
 from swarm_loc_estimator.evaluation.spool import Spool
@@ -21,6 +22,9 @@ from swarm_loc_estimator.io.inputs.ingest import MAX_PAUSE_NS
 from swarm_loc_estimator.numerics.trajectory import Trajectory
 
 _TICKS_AT_ONCE = 256
+_SIGHTINGS_PERIOD_NS = 500_000_000
+_MAX_SIGHTINGS = 500_000
+"""Kept for people who watch a run; of a very long one only the beginning."""
 
 
 class Schedule(Protocol):
@@ -98,9 +102,17 @@ class Runner:
         estimator: To run, which nobody else feeds.
         schedule: When it ticks.
         fuse_period_ns: Measurements are fused at the ticks that are multiples of this.
+        keep_sightings: Whether what the robots see is kept, too.
     """
 
-    def __init__(self, estimator: SwarmEstimator, schedule: Schedule, fuse_period_ns: int = 1) -> None:
+    def __init__(
+        self,
+        estimator: SwarmEstimator,
+        schedule: Schedule,
+        fuse_period_ns: int = 1,
+        *,
+        keep_sightings: bool = False,
+    ) -> None:
         self._estimator = estimator
         self._schedule = schedule
         self._fuse_period_ns = fuse_period_ns
@@ -110,6 +122,9 @@ class Runner:
         self._stamp_ns = np.zeros(_TICKS_AT_ONCE, dtype=np.int64)
         self._pose = np.zeros((_TICKS_AT_ONCE, robots, 3))
         self._covariance = np.zeros((_TICKS_AT_ONCE, robots, 3, 3))
+        self._status = np.zeros((_TICKS_AT_ONCE, robots), dtype=np.uint8)
+        self._sightings_left = _MAX_SIGHTINGS if keep_sightings else 0
+        self._sightings: list[tuple[int, Sightings]] = []
         self._filled = 0
 
     def take(self, inputs: RawInputs) -> None:
@@ -152,6 +167,8 @@ class Runner:
             stamp_ns=self._spool.array("stamp_ns", np.int64),
             pose=self._spool.array("pose", np.float64, robots, 3),
             covariance=self._spool.array("covariance", np.float64, robots, 3, 3),
+            status=self._spool.array("status", np.uint8, robots),
+            sightings=tuple(self._sightings),
             self_calibrated=estimator.learned() if estimator.is_self_calibrated else None,
             truth=truth,
             counters={
@@ -168,11 +185,16 @@ class Runner:
         estimate = self._estimator.tick(now_ns, fuse=now_ns % self._fuse_period_ns == 0)
         k, self._filled = self._filled, self._filled + 1
         self._stamp_ns[k], self._pose[k], self._covariance[k] = now_ns, estimate.poses, estimate.covariances
+        self._status[k] = estimate.status
+        if self._sightings_left > 0 and now_ns % _SIGHTINGS_PERIOD_NS == 0:
+            seen = newest_sightings(self._estimator.recent(), now_ns)
+            self._sightings.append((now_ns, seen))
+            self._sightings_left -= len(seen.observer)
         if self._filled == _TICKS_AT_ONCE:
             self._flush()
 
     def _flush(self) -> None:
         """Write what is kept to the spool."""
         filled, self._filled = slice(self._filled), 0
-        for name in ("stamp_ns", "pose", "covariance"):
+        for name in ("stamp_ns", "pose", "covariance", "status"):
             self._spool.append(name, getattr(self, f"_{name}")[filled])

@@ -157,6 +157,7 @@ def play_live(
         f"{bag.name}, live at {rate:g} x",
         swarm,
         *history[:3],
+        status=history.status,
         truth=content.truth,
         counters=dict(recorder.drops),
         remarks=content.remarks,

@@ -6,6 +6,7 @@ import base64
 from html import escape
 from typing import TYPE_CHECKING
 
+from swarm_loc_estimator.evaluation.report.recording import recorded
 from swarm_loc_estimator.evaluation.report.table import (
     GROUPS,
     HEADER,
@@ -17,6 +18,7 @@ from swarm_loc_estimator.evaluation.report.table import (
     self_calibrated_robots,
     summaries,
 )
+from swarm_loc_estimator.io.watch.page import page
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -50,6 +52,7 @@ th.group { text-align: center; color: var(--ink); }
 tr.pooled td { font-weight: 650; border-top: 2px solid var(--soft); }
 img { display: block; width: 100%; min-width: 42rem; background: #fff;
   border: 1px solid var(--line); border-radius: 8px; }
+.player { width: 100%; height: min(75vh, 46rem); border: 1px solid var(--line); border-radius: 8px; }
 ul { padding-left: 1.2rem; }
 small { display: block; color: var(--soft); }
 """
@@ -67,6 +70,7 @@ def html_report(result: ReplayResult, pictures: dict[str, Path]) -> str:
         _facts(result),
         _remarks(result),
         _errors(result),
+        _player(result),
         *(_picture(heading, path) for heading, path in pictures.items()),
         _self_calibration(result),
         _counters(result),
@@ -125,6 +129,15 @@ def _errors(result: ReplayResult) -> str:
     )
     head = f"<thead><tr>{groups}</tr><tr>{titles}</tr></thead>"
     return f'{title}<div class="wide"><table>{head}<tbody>{body}</tbody></table></div>'
+
+
+def _player(result: ReplayResult) -> str:
+    """The page on which people watch a swarm, with this run inside."""
+    recording = recorded(result)
+    if not recording:
+        return ""
+    inside = escape(page(recording))
+    return f'<h2>Run</h2><iframe class="player" title="The run" srcdoc="{inside}"></iframe>'
 
 
 def _self_calibration(result: ReplayResult) -> str:

@@ -11,7 +11,7 @@ class Link {
   open() {
     const { app } = this;
     const address = new URL("socket", location.href);
-    address.protocol = address.protocol.replace("http", "ws");
+    address.protocol = `ws${address.protocol.slice(4)}`;
     address.search = location.search;
     const socket = (this.socket = new WebSocket(address));
     socket.binaryType = "arraybuffer";

@@ -59,7 +59,7 @@ class Panel {
       const turned = Math.atan2(Math.sin(p.theta[i]), Math.cos(p.theta[i]));
       rows.push(["x", `${p.x[i].toFixed(3)} m`], ["y", `${p.y[i].toFixed(3)} m`], ["heading", `${(turned * deg).toFixed(1)}°`]);
       rows.push(["σ x, y", `${mm(p.sxx[i])}, ${mm(p.syy[i])} mm`], ["σ heading", `${(Math.sqrt(p.stt[i]) * deg).toFixed(2)}°`]);
-      rows.push(["age of its own fix", p.age[i] < 0 ? "never" : `${p.age[i].toFixed(1)} s`]);
+      if (p.age[i] === p.age[i]) rows.push(["age of its own fix", p.age[i] < 0 ? "never" : `${p.age[i].toFixed(1)} s`]);
       const error = this.newestError(time, i);
       if (error !== null) rows.push(["off the ground truth", `${(1e3 * error).toFixed(1)} mm`]);
     }

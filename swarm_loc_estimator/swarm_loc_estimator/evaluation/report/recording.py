@@ -1,0 +1,73 @@
+"""A run as data for the page on which people watch a swarm: thinned out to a bounded size."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from swarm_loc_estimator.core.estimation.estimate import Status
+from swarm_loc_estimator.io.messages.estimates import EstimateMessage
+from swarm_loc_estimator.io.watch.about import about
+from swarm_loc_estimator.io.watch.frames import Frame, places_frame, poses_frame, sightings_frame
+from swarm_loc_estimator.io.watch.recording import recording
+from swarm_loc_estimator.numerics.trajectory import interpolate
+
+if TYPE_CHECKING:
+    from swarm_loc_estimator.evaluation.result import ReplayResult
+
+MAX_BYTES = 12_000_000
+"""Of the frames before they are packed."""
+_BYTES_PER_FRAME, _BYTES_PER_ROBOT, _BYTES_PER_SIGHTING = 800, 64, 17
+_GAP_NS = 500_000_000
+
+
+def recorded(result: ReplayResult) -> str:
+    """The run as a text for the page; "" where there is nothing to show."""
+    if not len(result.stamp_ns) or not result.swarm.robots:
+        return ""
+    seen = sum(len(one.observer) for _, one in result.sightings) * _BYTES_PER_SIGHTING
+    each = _BYTES_PER_FRAME + _BYTES_PER_ROBOT * len(result.swarm.robots)
+    stride = -(-(each * len(result.stamp_ns)) // (MAX_BYTES // 2))
+    seen_stride = max(1, -(-seen // (MAX_BYTES // 2)))
+    frames = [*_poses(result, stride), *_truth(result, stride)]
+    frames += [sightings_frame(stamp_ns, one) for stamp_ns, one in result.sightings[::seen_stride]]
+    told = about(result.swarm, result.title, commands=False)
+    return recording(told, sorted(frames, key=lambda frame: frame.stamp_ns))
+
+
+def _poses(result: ReplayResult, stride: int) -> Iterator[Frame]:
+    names = tuple(robot.name for robot in result.swarm.robots)
+    not_kept = np.full(len(names), np.nan)
+    for k in range(0, len(result.stamp_ns), stride):
+        pose = result.pose[k]
+        located = np.isfinite(pose).all(axis=1)
+        status = (
+            np.where(located, Status.TRACKED, Status.WAITING) if result.status is None else result.status[k]
+        )
+        yield poses_frame(
+            EstimateMessage(
+                int(result.stamp_ns[k]),
+                "map",
+                names,
+                pose,
+                result.covariance[k],
+                not_kept,
+                status.astype(np.uint8),
+            )
+        )
+
+
+def _truth(result: ReplayResult, stride: int) -> Iterator[Frame]:
+    """The ground truth at the stamps of the poses."""
+    stamps_ns = np.asarray(result.stamp_ns[::stride])
+    robots = [index for index, one in enumerate(result.swarm.robots) if one.name in result.truth]
+    if not robots:
+        return
+    names = [result.swarm.robots[index].name for index in robots]
+    found = [interpolate(result.truth[name], stamps_ns, _GAP_NS) for name in names]
+    pose, known = (np.stack([one[part] for one in found], axis=1) for part in (0, 1))
+    for k, stamp_ns in enumerate(stamps_ns.tolist()):
+        there = np.flatnonzero(known[k])
+        yield places_frame("truth", stamp_ns, [robots[i] for i in there], pose[k, there])
