@@ -76,11 +76,9 @@ class Listener:
 
     @property
     def now_ns(self) -> int:
-        """How far the graph is, by its poses; by its clock while there are none."""
-        recorder = self.graph.recorder
-        if not recorder.raw:
-            return int(recorder.get_clock().now().nanoseconds)
-        return read_poses(recorder.raw[-1]).stamp_ns
+        """How far the world is, by its newest truth; 0 before the first."""
+        newest = self.newest_truth(self.names[0])
+        return newest[0] if newest else 0
 
     def newest_truth(self, name: str) -> tuple[int, NDArray[np.float64]] | None:
         """Stamp and place (2,) of a robot, and None before the first."""
