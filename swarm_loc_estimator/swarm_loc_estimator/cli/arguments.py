@@ -53,6 +53,16 @@ def yaml_to_write(text: str) -> Path:
     return path
 
 
+def mcap_to_write(text: str) -> Path:
+    """An MCAP file for argparse that can be written."""
+    path = Path(text)
+    if path.suffix != ".mcap":
+        raise argparse.ArgumentTypeError(f"'{text}' must end in .mcap")
+    folder = folder_to_write(str(path.parent))
+    folder.mkdir(parents=True, exist_ok=True)
+    return path
+
+
 def add_bag(parser: argparse.ArgumentParser, content: str = "") -> None:
     """Add the arguments of a command that reads a bag: the bag itself, and its swarm description."""
     parser.add_argument("bag", type=Path, help=f"rosbag2 folder, .mcap or .db3 file{content}")

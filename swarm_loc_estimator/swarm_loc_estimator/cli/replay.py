@@ -6,6 +6,7 @@
 
 The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. The report
 (report.txt, report.html, overview.png, paths.png, errors.png) and the poses (poses.csv) are written to --out.
+--mcap writes poses, /tf and markers of the run for RViz, Foxglove and other viewers.
 --learned writes the description for the next run, with what the filter has learned of cameras, odometry and
 landmarks; it learns of what the description gives a sigma.
 """
@@ -24,6 +25,7 @@ from swarm_loc_estimator.cli.arguments import (
     add_bag,
     add_set,
     folder_to_write,
+    mcap_to_write,
     number_in,
     parameters_of,
     swarm_beside,
@@ -32,6 +34,7 @@ from swarm_loc_estimator.cli.arguments import (
 from swarm_loc_estimator.cli.errors import exit_with_message
 from swarm_loc_estimator.cli.progress import ProgressLine
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.evaluation.export import write_mcap
 from swarm_loc_estimator.evaluation.replay import TICK_S, replay
 from swarm_loc_estimator.evaluation.report.report import write_report
 from swarm_loc_estimator.evaluation.result import ReplayResult
@@ -59,6 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         progress(1.0, "writing the report")
         files = write_report(result, options.out)
         write_poses(result, options.out / "poses.csv")
+        if options.mcap:
+            write_mcap(result, options.mcap)
         if options.learned and result.self_calibrated:
             save_swarm(result.self_calibrated, options.learned, f"Learned from {result.title}.")
     if options.learned and not result.self_calibrated:
@@ -92,6 +97,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", type=folder_to_write, default="out/replay", help="folder for the report")
     parser.add_argument(
         "--learned", type=yaml_to_write, metavar="FILE", help="where to write what was learned"
+    )
+    parser.add_argument(
+        "--mcap", type=mcap_to_write, metavar="FILE", help="where to write poses, /tf and markers for viewers"
     )
     parser.add_argument(
         "--tick", type=number_in(1e-3, 3600.0, "s"), default=TICK_S, help="seconds between outputs"

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from swarm_loc_estimator.core.estimation.estimate import Status
-from swarm_loc_estimator.io.messages.estimates import EstimateMessage
+from swarm_loc_estimator.evaluation.export import estimates
 from swarm_loc_estimator.io.watch.about import about
 from swarm_loc_estimator.io.watch.frames import Frame, places_frame, poses_frame, sightings_frame
 from swarm_loc_estimator.io.watch.recording import recording
@@ -31,32 +30,10 @@ def recorded(result: ReplayResult) -> str:
     each = _BYTES_PER_FRAME + _BYTES_PER_ROBOT * len(result.swarm.robots)
     stride = -(-(each * len(result.stamp_ns)) // (MAX_BYTES // 2))
     seen_stride = max(1, -(-seen // (MAX_BYTES // 2)))
-    frames = [*_poses(result, stride), *_truth(result, stride)]
+    frames = [*map(poses_frame, estimates(result, stride)), *_truth(result, stride)]
     frames += [sightings_frame(stamp_ns, one) for stamp_ns, one in result.sightings[::seen_stride]]
     told = about(result.swarm, result.title, commands=False)
     return recording(told, sorted(frames, key=lambda frame: frame.stamp_ns))
-
-
-def _poses(result: ReplayResult, stride: int) -> Iterator[Frame]:
-    names = tuple(robot.name for robot in result.swarm.robots)
-    not_kept = np.full(len(names), np.nan)
-    for k in range(0, len(result.stamp_ns), stride):
-        pose = result.pose[k]
-        located = np.isfinite(pose).all(axis=1)
-        status = (
-            np.where(located, Status.TRACKED, Status.WAITING) if result.status is None else result.status[k]
-        )
-        yield poses_frame(
-            EstimateMessage(
-                int(result.stamp_ns[k]),
-                "map",
-                names,
-                pose,
-                result.covariance[k],
-                not_kept,
-                status.astype(np.uint8),
-            )
-        )
 
 
 def _truth(result: ReplayResult, stride: int) -> Iterator[Frame]:

@@ -1,0 +1,81 @@
+"""Write a run as one MCAP file that any viewer shows: poses, /tf, markers, ground truth."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from swarm_loc_estimator.core.estimation.estimate import Status
+from swarm_loc_estimator.io.bags.writer import BagWriter
+from swarm_loc_estimator.io.messages.encoders import encode_pose_stamped
+from swarm_loc_estimator.io.messages.estimates import EstimateMessage
+from swarm_loc_estimator.io.messages.markers import MarkersEncoder
+from swarm_loc_estimator.io.messages.outputs import SwarmPosesEncoder, TransformsEncoder
+from swarm_loc_estimator.io.messages.typestore import MARKERS, POSE_STAMPED, SWARM_POSES, TRANSFORMS
+
+if TYPE_CHECKING:
+    from swarm_loc_estimator.evaluation.result import ReplayResult
+
+_MAP = "map"
+
+
+def write_mcap(result: ReplayResult, path: Path) -> None:
+    """Write the file; one that is there is replaced.
+
+    Transforms go from map straight to `<robot>/base_link`, since nobody else says where that is.
+
+    Args:
+        result: The run.
+        path: Where to, such as run.mcap.
+
+    Raises:
+        BagError: It cannot be written.
+    """
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".mcap_") as folder:
+        bag = Path(folder) / "run"
+        with BagWriter(bag, compress=True) as writer:
+            _add_estimates(result, writer)
+            for name, truth in result.truth.items():
+                writer.add_topic(f"{name}/ground_truth", POSE_STAMPED)
+                messages = encode_pose_stamped(_MAP, truth.stamp_ns, truth.pose)
+                for stamp_ns, message in zip(truth.stamp_ns.tolist(), messages, strict=True):
+                    writer.write(f"{name}/ground_truth", stamp_ns, message)
+        shutil.move(bag / "run.mcap", path)
+
+
+def _add_estimates(result: ReplayResult, writer: BagWriter) -> None:
+    """Poses, transforms and markers of each instant."""
+    for topic, kind in (("swarm/poses", SWARM_POSES), ("tf", TRANSFORMS), ("swarm/markers", MARKERS)):
+        writer.add_topic(topic, kind)
+    names = [robot.name for robot in result.swarm.robots]
+    poses, markers = SwarmPosesEncoder(names, _MAP), MarkersEncoder(result.swarm, _MAP)
+    transforms = TransformsEncoder(_MAP, [f"{name}/base_link" for name in names])
+    seen = dict(result.sightings)
+    newest = None
+    for one in estimates(result):
+        newest = seen.get(one.stamp_ns, newest)
+        columns = (one.pose, one.covariance, one.fix_age_s, one.status)
+        writer.write("swarm/poses", one.stamp_ns, poses.encode(one.stamp_ns, *columns))
+        located = np.isfinite(one.pose).all(axis=1)
+        if located.any():
+            writer.write("tf", one.stamp_ns, transforms.encode(one.stamp_ns, located, one.pose))
+        writer.write("swarm/markers", one.stamp_ns, markers.encode(one, newest))
+
+
+def estimates(result: ReplayResult, stride: int = 1) -> Iterator[EstimateMessage]:
+    """The poses of a run as messages hold them, every so many; ages of fixes are not known."""
+    names = tuple(robot.name for robot in result.swarm.robots)
+    not_kept = np.full(len(names), np.nan)
+    for k in range(0, len(result.stamp_ns), stride):
+        pose = result.pose[k]
+        located = np.isfinite(pose).all(axis=1)
+        status = (
+            np.where(located, Status.TRACKED, Status.WAITING) if result.status is None else result.status[k]
+        )
+        stamp_ns, covariance = int(result.stamp_ns[k]), result.covariance[k]
+        yield EstimateMessage(stamp_ns, _MAP, names, pose, covariance, not_kept, status.astype(np.uint8))

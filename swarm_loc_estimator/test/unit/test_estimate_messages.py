@@ -1,0 +1,183 @@
+"""What the estimator publishes, read back; and markers as viewers read them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from ruamel.yaml import YAML
+
+from swarm_loc_estimator.core.description.swarm import Landmark, Robot, Swarm
+from swarm_loc_estimator.core.estimation.fusion import Verdict
+from swarm_loc_estimator.core.estimation.sightings import Sightings, newest_sightings
+from swarm_loc_estimator.core.filter.measurement_model import MEASUREMENT_DTYPE, Kind
+from swarm_loc_estimator.evaluation.export import write_mcap
+from swarm_loc_estimator.evaluation.result import ReplayResult
+from swarm_loc_estimator.io.bags.reader import BagReader
+from swarm_loc_estimator.io.messages.cdr import CdrError
+from swarm_loc_estimator.io.messages.estimates import (
+    EstimateMessage,
+    SwarmPosesReader,
+    decode_sightings,
+    encode_sightings,
+)
+from swarm_loc_estimator.io.messages.markers import MarkersEncoder, ellipses
+from swarm_loc_estimator.io.messages.outputs import SwarmPosesEncoder
+from swarm_loc_estimator.io.messages.typestore import MARKERS, MESSAGE_PACKAGE, typestore
+
+SECOND = 1_000_000_000
+VIEWERS = Path(__file__).parents[2] / "viewers"
+
+
+def estimate_of(names: list[str], seed: int, stamp_ns: int = 5 * SECOND + 3) -> EstimateMessage:
+    random, n = np.random.default_rng(seed), len(names)
+    pose = random.normal(size=(n, 3))
+    root = random.normal(size=(n, 3, 3))
+    covariance = root @ np.swapaxes(root, 1, 2)
+    status = random.integers(0, 5, n).astype(np.uint8)
+    pose[status == 0] = covariance[status == 0] = np.nan
+    return EstimateMessage(stamp_ns, "map", tuple(names), pose, covariance, random.normal(size=n), status)
+
+
+@given(
+    st.lists(st.lists(st.text("abcé_1", min_size=1, max_size=9), unique=True, max_size=5), max_size=4),
+    st.integers(0, 99),
+)
+def test_swarm_poses_are_read_whoever_is_in_them(swarms: list[list[str]], seed: int) -> None:
+    reader = SwarmPosesReader()
+    for names in swarms * 2:
+        one = estimate_of(names, seed)
+        data = SwarmPosesEncoder(names, "map").encode(one.stamp_ns, *one[3:])
+        found = reader.read(data)
+        assert found[:3] == one[:3]
+        for mine, theirs in zip(found[3:], one[3:], strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+
+
+@given(st.binary(max_size=200), st.integers(0, 400))
+def test_bytes_that_are_no_swarm_poses_are_refused(noise: bytes, cut: int) -> None:
+    one = estimate_of(["a", "bb"], 1)
+    whole = SwarmPosesEncoder(["a", "bb"], "map").encode(one.stamp_ns, *one[3:])
+    for data in (noise, whole[: min(cut, len(whole) - 1)]):
+        try:
+            SwarmPosesReader().read(data)
+        except CdrError:
+            continue
+        assert data == noise, "a message that was cut off is read"
+
+
+@given(st.integers(0, 9), st.integers(0, 99))
+def test_sightings_come_back_as_they_were(count: int, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    one = Sightings(
+        random.integers(-1, 5, count).astype(np.int32),
+        random.integers(-3, 5, count).astype(np.int32),
+        random.integers(0, 5, count).astype(np.uint8),
+        random.normal(size=count).astype(np.float32),
+        random.random(count).astype(np.float32),
+    )
+    data = encode_sightings("map", 7 * SECOND, one)
+    stamp_ns, found = decode_sightings(data)
+    assert stamp_ns == 7 * SECOND
+    official = typestore().deserialize_cdr(data, f"{MESSAGE_PACKAGE}/msg/SwarmSightings")
+    for name, mine, theirs in zip(one._fields, found, one, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+        np.testing.assert_array_equal(getattr(official, name), theirs)
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 3000), st.integers(0, 2), st.integers(-2, 2), st.integers(0, 4)), max_size=40
+    )
+)
+def test_of_each_pair_the_newest_measurement_is_told(told: list[tuple[int, int, int, int]]) -> None:
+    told = sorted(told)
+    rows = np.zeros(len(told), dtype=MEASUREMENT_DTYPE)
+    for row, (at_ms, observer, target, _) in zip(rows, told, strict=True):
+        row["stamp_ns"], row["observer"], row["kind"] = at_ms * 1_000_000, observer, Kind.POLAR
+        row["target"], row["landmark"] = (target, 0) if target >= 0 else (-1, -target)
+    verdicts = np.array([verdict for *_, verdict in told], dtype=np.uint8)
+    found = newest_sightings((rows, verdicts, np.ones(len(told))), 3 * SECOND)
+    expected = {(a, b): (at_ms, verdict) for at_ms, a, b, verdict in told if at_ms >= 2000}
+    pairs = list(zip(found.observer.tolist(), found.target.tolist(), strict=True))
+    assert sorted(pairs) == sorted(expected)
+    for pair, age_s, verdict, nis in zip(pairs, found.age_s, found.verdict, found.nis, strict=True):
+        assert age_s == pytest.approx((3000 - expected[pair][0]) / 1e3, abs=1e-6)
+        assert np.isnan(nis) == (verdict not in (Verdict.USED, Verdict.GATED))
+
+
+def test_markers_are_what_viewers_read() -> None:
+    swarm = Swarm(
+        robots=(Robot("a"), Robot("b"), Robot("c")), landmarks=(Landmark(1, 1.0, 2.0, yaw=0.0), Landmark(2))
+    )
+    pose = np.array([[1.0, 2.0, np.pi / 2], [3.0, 4.0, 0.0], [np.nan] * 3])
+    covariance = np.tile(np.diag([0.04, 0.01, 0.1]), (3, 1, 1))
+    one = EstimateMessage(
+        SECOND, "map", ("a", "b", "c"), pose, covariance, np.zeros(3), np.array([1, 4, 0], np.uint8)
+    )
+    seen = Sightings(
+        np.array([0, 0, 2, -1], np.int32),
+        np.array([1, -2, 0, 0], np.int32),
+        np.array([1, 2, 3, 1], np.uint8),
+        np.zeros(4, np.float32),
+        np.zeros(4, np.float32),
+    )
+    markers = typestore().deserialize_cdr(MarkersEncoder(swarm, "map").encode(one, seen), MARKERS).markers
+    assert markers[0].action == 3, "what was shown before must go"
+    named = {marker.ns: marker for marker in markers[1:] if marker.ns != "names"}
+    assert [(p.x, p.y) for p in named["robots"].points] == [(1.0, 2.0), (3.0, 4.0)]
+    assert named["robots"].colors[0].b > 0.6
+    start, end = named["headings"].points[:2]
+    assert (start.x, start.y) == (1.0, 2.0)
+    assert end.x == pytest.approx(1.0)
+    assert end.y > 2.0
+    assert [(p.x, p.y) for p in named["sightings"].points] == [(1.0, 2.0), (3.0, 4.0), (1.0, 2.0), (0.0, 0.0)]
+    assert [marker.text for marker in markers if marker.ns == "names"] == ["a", "b"]
+    assert all(marker.header.frame_id == "map" and marker.header.stamp.sec == 1 for marker in markers)
+
+
+@given(st.integers(0, 99))
+def test_an_ellipse_is_where_the_mahalanobis_distance_is_that_of_95_percent(seed: int) -> None:
+    one = estimate_of(["a", "b"], seed)
+    located = np.isfinite(one.pose).all(axis=1)
+    pose, covariance = one.pose[located], one.covariance[located]
+    points = ellipses(pose, covariance)[:, :2].reshape(len(pose), 48, 2)
+    for k in range(len(pose)):
+        off = points[k] - pose[k, :2]
+        distance = np.einsum("ni,ij,nj->n", off, np.linalg.inv(covariance[k, :2, :2]), off)
+        np.testing.assert_allclose(distance, 5.991, rtol=1e-4)
+
+
+def test_a_run_is_written_as_mcap(tmp_path: Path) -> None:
+    stamp_ns = np.arange(1, 4) * SECOND
+    pose, covariance = np.zeros((3, 2, 3)), np.tile(np.eye(3), (3, 2, 1, 1))
+    pose[0, 1] = np.nan
+    result = ReplayResult("run", Swarm(robots=(Robot("a"), Robot("b"))), stamp_ns, pose, covariance)
+    file = tmp_path / "run.mcap"
+    file.write_bytes(b"an older one")
+    write_mcap(result, file)
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
+    reader = SwarmPosesReader()
+    with BagReader(file) as bag:
+        assert {topic.name for topic in bag.topics} == {"swarm/poses", "tf", "swarm/markers"}
+        poses = [reader.read(bytes(data)) for _, _, _, data in bag.messages(["swarm/poses"])]
+        (first, *_) = [bytes(data) for _, _, _, data in bag.messages(["tf"])]
+    assert [one.stamp_ns for one in poses] == stamp_ns.tolist()
+    assert [one.status.tolist() for one in poses] == [[1, 0], [1, 1], [1, 1]]
+    (transform,) = typestore().deserialize_cdr(first, "tf2_msgs/msg/TFMessage").transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ("map", "a/base_link")
+
+
+def test_shipped_layouts_show_what_is_published() -> None:
+    rviz = YAML(typ="safe").load((VIEWERS / "swarm.rviz").read_text(encoding="utf-8"))[
+        "Visualization Manager"
+    ]
+    topics = {one["Topic"]["Value"] for one in rviz["Displays"] if "Topic" in one}
+    assert topics == {"swarm/markers", "map"}
+    assert rviz["Global Options"]["Fixed Frame"] == "map"
+    layout = json.loads((VIEWERS / "foxglove.json").read_text(encoding="utf-8"))
+    assert layout["configById"][layout["layout"]["first"]]["topics"]["/swarm/markers"]["visible"]
