@@ -92,6 +92,7 @@ def _corridor() -> FloorPlan:
         (8.6, 1.2, 9.0, 1.7),
     ]
     starts = [(1.5, 1.5), (1.5, 0.7), (1.2, 2.2), (2.3, 1.1), (2.4, 2.0)]
+    starts += [(3.2, 0.7), (3.2, 1.5), (3.3, 2.3), (4.1, 0.9), (4.1, 1.9)]
     return FloorPlan("corridor", outline([(0, 0, 12, 3.3), *niches], furniture), np.array(starts))
 
 

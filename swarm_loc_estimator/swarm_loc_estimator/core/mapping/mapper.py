@@ -53,6 +53,7 @@ class _Track:
         node: Its newest stop in the graph.
         is_known: Whether `stop` is in the graph, as `node`.
         begin: How many readings of that stop belong to parts before.
+        looked: How many readings of that stop there were when it came into the graph.
         left: (3,) pose by odometry when it left `node`.
         last: (3,) newest pose by odometry.
         path: Driven since it left the node [m].
@@ -68,6 +69,7 @@ class _Track:
     node: int | None = None
     is_known: bool = False
     begin: int = 0
+    looked: int = 0
     left: FloatArray = field(default_factory=lambda: np.zeros(3))
     last: FloatArray | None = None
     path: float = 0.0
@@ -125,12 +127,13 @@ class CooperativeMapper:
                 self._drive(track, run.readings.odometry[:1])
                 track.stop, track.is_known = Stop(run.readings.odometry[0]), False
             if run.stands and track.stop is not None:
+                before = len(track.stop.turn)
                 track.stop.extend(run.readings)
                 track.last = run.readings.odometry[-1]
                 self._look(robot, track, track.stop)
-                position = self.pose(robot)
-                if position is not None:
-                    self.visits.add(np.tile(position[:2], (len(run.readings.stamp_ns), 1)))
+                if track.is_known:
+                    count = len(track.stop.turn) - max(before, track.looked)
+                    self.visits.add(np.tile(self.graph.states[track.node, :2], (max(count, 0), 1)))
             else:
                 self._drive(track, run.readings.odometry)
                 self._lights.note_time(robot, int(run.readings.stamp_ns[-1]))
@@ -188,7 +191,8 @@ class CooperativeMapper:
         """Note where a robot drove (n, 3)."""
         if track.last is not None:
             steps = np.diff(np.vstack([track.last, odometry])[:, :2], axis=0)
-            track.path += float(np.hypot(steps[:, 0], steps[:, 1]).sum())
+            paths = np.concatenate([[track.path], np.hypot(steps[:, 0], steps[:, 1])])
+            track.path = float(np.cumsum(paths)[-1])  # the same whoever cuts the readings
         track.last = odometry[-1]
         if track.node is not None:
             self.visits.add(self._driven(track, odometry)[:, :2])
@@ -241,7 +245,7 @@ class CooperativeMapper:
         """Make a node of the first readings of a stop, or several of a first scan, and align them."""
         self.counters["scans"] += 1
         self._map = None
-        track.is_known = True
+        track.is_known, track.looked = True, count
         if track.node is None:
             self._enter_first(robot, track, stop, count)
             return

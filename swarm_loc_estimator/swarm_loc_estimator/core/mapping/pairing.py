@@ -31,9 +31,9 @@ class ReadingPairer:
         self._sigma = math.nan
 
     @property
-    def newest_ns(self) -> int:
-        """Stamp of the newest odometry, 0 before the first."""
-        return self._odometry[-1][0] if self._odometry else 0
+    def newest_ns(self) -> float:
+        """Stamp of the newest odometry; before the first less than any."""
+        return self._odometry[-1][0] if self._odometry else -math.inf
 
     def add_odometry(self, stamp_ns: int, pose: FloatArray) -> None:
         """Take a pose (3,) by odometry."""

@@ -52,8 +52,9 @@ class Stop:
     def extend(self, readings: Readings) -> None:
         """Add readings made here."""
         headings = np.concatenate([self.departure[2:], readings.odometry[:, 2]])
-        turned = self.turn[-1] if len(self.turn) else 0.0
-        self.turn = np.concatenate([self.turn, turned + np.cumsum(wrap_angle(np.diff(headings)))])
+        turned = self.turn[-1:] if len(self.turn) else np.zeros(1)
+        steps = np.concatenate([turned, wrap_angle(np.diff(headings))])
+        self.turn = np.concatenate([self.turn, np.cumsum(steps)[1:]])  # the same whoever cuts the readings
         self.stamp_ns = np.concatenate([self.stamp_ns, readings.stamp_ns])
         self.inverse = np.concatenate([self.inverse, readings.inverse])
         self.departure, self.sigma = readings.odometry[-1], readings.sigma

@@ -16,7 +16,7 @@ from swarm_loc_estimator.io.yaml_tree import read_tree, shown, tree_text
 from swarm_loc_estimator.parameters.errors import UserError
 
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
-_OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.25
+_OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
 _MAX_BYTES = 500_000_000
 _PGM = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(\d{1,9})\s+255\s")
 

@@ -62,8 +62,9 @@ def planning_grid(
         passable &= (
             np.hypot(*(middles - other[:, None, None])) > 2.0 * settings.robot_radius + settings.margin
         )
-    passable |= own < cell
-    return PlanningGrid(occupancy.corner, cell, state.astype(np.int8), highest, passable)
+    grid = PlanningGrid(occupancy.corner, cell, state.astype(np.int8), highest, passable)
+    grid.passable[grid.index(position)] = True
+    return grid
 
 
 @compiled

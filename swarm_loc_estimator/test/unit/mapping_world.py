@@ -1,0 +1,103 @@
+"""What the tests of mapping share: a room with one niche, and a robot that looks around in it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from swarm_loc_estimator.core.mapping.readings import Readings
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.se2 import wrap_angle
+
+PERIOD_NS = 20_000_000
+MAX_RANGE = 2.5
+SIGMA = 0.1 / 6.3
+"""A tenth of a pixel [1/m]."""
+ROOM = (0.0, 0.0, 3.4, 2.6)
+"""Left, lower, right, upper [m]."""
+NICHE = (1.2, 2.6, 2.0, 3.1)
+_SPEED, _TURN_RATE = 0.2, 1.0
+
+
+def distance_in_room(x: float, y: float, angle: float) -> float:
+    """Distance along a ray from inside the room, out to its wall or that of the niche [m]."""
+    best = _leave(ROOM, x, y, angle)
+    at_x, at_y = x + best * math.cos(angle), y + best * math.sin(angle)
+    if abs(at_y - ROOM[3]) < 1e-9 and NICHE[0] < at_x < NICHE[2]:
+        best += _leave(NICHE, at_x, at_y + 1e-12, angle)
+    return best
+
+
+def _leave(box: tuple[float, float, float, float], x: float, y: float, angle: float) -> float:
+    cos, sin = math.cos(angle), math.sin(angle)
+    along_x = ((box[2] if cos > 0.0 else box[0]) - x) / cos if abs(cos) > 1e-12 else math.inf
+    along_y = ((box[3] if sin > 0.0 else box[1]) - y) / sin if abs(sin) > 1e-12 else math.inf
+    return min(along_x, along_y)
+
+
+def inverse_distances(pose: FloatArray, angles: FloatArray, rng: np.random.Generator | None) -> FloatArray:
+    """Inverse distances (n,) in directions (n,) of map, 0 beyond the range; with noise if it has a source."""
+    distances = np.array([distance_in_room(pose[0], pose[1], angle) for angle in angles])
+    noise = rng.standard_normal(len(angles)) * SIGMA if rng is not None else 0.0
+    return np.where(distances < MAX_RANGE, np.maximum(1.0 / distances + noise, 1e-3), 0.0)
+
+
+class RoomRobot:
+    """A robot whose turns are short by its slip, and whose odometry does not know.
+
+    Args:
+        pose: (3,) at the start.
+        slip: Share of turns that is lost.
+        rng: Of the laser's noise; None: exact.
+    """
+
+    def __init__(
+        self, pose: tuple[float, float, float], slip: float, rng: np.random.Generator | None
+    ) -> None:
+        self.pose = np.array(pose)
+        self.odometry = np.zeros(3)
+        self._slip, self._rng = slip, rng
+        self._stamp_ns = 0
+
+    def turn(self, angle: float, rate: float = _TURN_RATE) -> Readings:
+        """Turn by an angle of the odometry [rad]."""
+        count = max(1, round(abs(angle) / (rate * PERIOD_NS * 1e-9)))
+        turned = angle * np.arange(1, count + 1) / count
+        odometry = np.tile(self.odometry, (count, 1))
+        odometry[:, 2] += turned
+        headings = self.pose[2] + turned * (1.0 - self._slip)
+        readings = self._read(odometry, np.tile(self.pose[:2], (count, 1)), headings)
+        self.pose[2] = headings[-1]
+        return readings
+
+    def drive(self, length: float) -> Readings:
+        """Drive ahead [m]."""
+        count = max(1, round(length / (_SPEED * PERIOD_NS * 1e-9)))
+        way = length * np.arange(1, count + 1)[:, None] / count
+        odometry = np.tile(self.odometry, (count, 1))
+        odometry[:, :2] += way * [math.cos(self.odometry[2]), math.sin(self.odometry[2])]
+        places = self.pose[:2] + way * [math.cos(self.pose[2]), math.sin(self.pose[2])]
+        readings = self._read(odometry, places, np.full(count, self.pose[2]))
+        self.pose[:2] = places[-1]
+        return readings
+
+    def go_to(self, odometry: FloatArray) -> list[Readings]:
+        """Turn to a place (2,) in the odom frame and drive there."""
+        way = odometry - self.odometry[:2]
+        angle = float(wrap_angle(math.atan2(way[1], way[0]) - self.odometry[2]))
+        return [self.turn(angle), self.drive(math.hypot(way[0], way[1]))]
+
+    def _read(self, odometry: FloatArray, places: FloatArray, headings: FloatArray) -> Readings:
+        stamps = self._stamp_ns + PERIOD_NS * np.arange(1, len(odometry) + 1)
+        self._stamp_ns = int(stamps[-1])
+        self.odometry = odometry[-1].copy()
+        inverse = np.concatenate(
+            [
+                inverse_distances(place, np.array([heading]), self._rng)
+                for place, heading in zip(places, headings, strict=True)
+            ]
+        )
+        reported = odometry.copy()
+        reported[:, 2] = wrap_angle(odometry[:, 2])
+        return Readings(stamps, reported, inverse, SIGMA)

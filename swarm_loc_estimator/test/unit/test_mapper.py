@@ -1,0 +1,196 @@
+"""The mapper: one robot and two in a small room, whatever the messages' sizes, and what it says of itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from mapping_world import ROOM, RoomRobot, distance_in_room
+
+from swarm_loc_estimator.core.mapping.mapper import SCAN_TURN, CooperativeMapper
+from swarm_loc_estimator.core.mapping.printed.particle_mapper import ParticleMapper
+from swarm_loc_estimator.core.mapping.readings import LightSightings, Readings
+from swarm_loc_estimator.core.mapping.stops import MotionTracker, Stop
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.se2 import wrap_angle
+
+START = (1.0, 1.0, 0.3)
+KNOWN = np.full(3, 1e-3)
+FIRST_TURNS = ((0.5 * math.pi, 0.25), (4.0 * math.pi, 0.6))
+
+
+def look_around(robot: RoomRobot) -> list[Readings]:
+    """A first scan."""
+    return [robot.turn(angle, rate) for angle, rate in FIRST_TURNS]
+
+
+def feed(mapper: CooperativeMapper | ParticleMapper, number: int, parts: Sequence[Readings]) -> None:
+    for part in parts:
+        mapper.add_readings(number, part)
+
+
+def explore(mapper: CooperativeMapper | ParticleMapper, number: int, robot: RoomRobot, hops: int) -> None:
+    """Look around, and go to so many goals."""
+    feed(mapper, number, look_around(robot))
+    for _ in range(hops):
+        goal = mapper.goal(number)
+        assert goal is not None
+        feed(mapper, number, [*robot.go_to(goal.odometry), robot.turn(SCAN_TURN)])
+
+
+def error_of(mapper: CooperativeMapper, number: int, robot: RoomRobot) -> tuple[float, float]:
+    """Of position [m] and heading [rad]."""
+    pose = mapper.pose(number)
+    assert pose is not None
+    return math.dist(pose[:2], robot.pose[:2]), abs(float(wrap_angle(pose[2] - robot.pose[2])))
+
+
+@pytest.mark.parametrize(("slip", "seed"), [(0.0, 1), (0.02, 2), (0.05, 3)])
+def test_a_robot_that_slips_knows_where_it_is_and_draws_the_walls(slip: float, seed: int) -> None:
+    mapper, robot = CooperativeMapper(), RoomRobot(START, slip, np.random.default_rng(seed))
+    explore(mapper, mapper.join(np.array(START), KNOWN), robot, 5)
+    mapper.finish()
+    position, heading = error_of(mapper, 0, robot)
+    assert position < 0.02
+    assert heading < 3.0 * mapper.settings.turn_noise * 2.0 * math.pi  # of the last turn
+    assert abs(mapper.graph.slip[0] - slip) < 0.002
+    occupancy = mapper.occupancy()
+    walls = occupancy.centres(occupancy.occupied)
+    assert len(walls) > 200
+    off = [min(abs(x - ROOM[0]), abs(x - ROOM[2]), abs(y - ROOM[1]), abs(y - ROOM[3])) for x, y in walls]
+    assert np.median(off) < 0.02
+    middle = occupancy.index(np.array([[1.7, 1.3]]))[0]
+    assert occupancy.free[tuple(middle)]
+
+
+def cut(readings: Readings, size: int) -> list[Readings]:
+    """The same in messages of another size."""
+    bounds = range(0, len(readings.stamp_ns), size)
+    return [
+        Readings(
+            readings.stamp_ns[k : k + size],
+            readings.odometry[k : k + size],
+            readings.inverse[k : k + size],
+            readings.sigma,
+        )
+        for k in bounds
+    ]
+
+
+def test_the_size_of_messages_does_not_matter() -> None:
+    recorded, whole = [], CooperativeMapper()
+    robot = RoomRobot(START, 0.02, np.random.default_rng(4))
+    whole.join(np.array(START), KNOWN)
+    recorded += look_around(robot)
+    feed(whole, 0, recorded)
+    for _ in range(2):
+        goal = whole.goal(0)
+        assert goal is not None
+        parts = [*robot.go_to(goal.odometry), robot.turn(SCAN_TURN)]
+        feed(whole, 0, parts)
+        recorded += parts
+    for size in (1, 37):
+        other = CooperativeMapper()
+        other.join(np.array(START), KNOWN)
+        feed(other, 0, [piece for part in recorded for piece in cut(part, size)])
+        assert np.array_equal(whole.graph.states, other.graph.states)
+        assert np.array_equal(whole.occupancy().log_odds, other.occupancy().log_odds)
+        assert whole.visits.on(whole.occupancy()).sum() == other.visits.on(other.occupancy()).sum()
+
+
+def test_two_robots_share_a_map_and_one_may_leave() -> None:
+    mapper = CooperativeMapper()
+    first = RoomRobot(START, 0.0, np.random.default_rng(5))
+    start = (2.2, 1.4, -1.0)
+    second = RoomRobot(start, 0.03, np.random.default_rng(6))
+    mapper.join(np.array(START), KNOWN)
+    explore(mapper, 0, first, 1)
+    told = np.add(start, [0.08, -0.07, math.radians(4.0)])
+    number = mapper.join(told, np.array([0.1, 0.1, math.radians(5.0)]))
+    assert mapper.goal(number) is None
+    assert mapper.pose(number) is None
+    explore(mapper, number, second, 2)
+    position, heading = error_of(mapper, number, second)
+    assert position < 0.03
+    assert heading < math.radians(1.0)
+    assert abs(mapper.graph.slip[number] - 0.03) < 0.004
+    count = mapper.graph.count
+    mapper.leave(number)
+    goal = mapper.goal(0)
+    assert goal is not None
+    feed(mapper, 0, [*first.go_to(goal.odometry), first.turn(SCAN_TURN)])
+    assert mapper.graph.count == count + 1
+
+
+def test_a_light_turns_a_robot_that_sees_no_walls() -> None:
+    """Both stand; the second sees nothing but the first one's light, and learns its heading."""
+    mapper, bearing = CooperativeMapper(), math.radians(6.0)
+    sigma = np.array([0.01, 0.01, math.radians(8.0)])
+    numbers = [mapper.join(np.array(pose), s) for pose, s in (((0.0, 0, 0), KNOWN), ((2.0, 0, 0), sigma))]
+    stamps = 20_000_000 * np.arange(1, 200)
+    odometry = np.zeros((len(stamps), 3))
+    odometry[:, 2] = np.minimum(0.02 * np.arange(len(stamps)), 1.0)
+    for number in numbers:
+        mapper.add_readings(number, Readings(stamps, odometry, np.zeros(len(stamps)), 0.016))
+    seen = stamps[100:150]
+    angle = np.pi - bearing - 1.0  # it has turned by one radian
+    mapper.add_lights(
+        1, LightSightings(seen, np.zeros(50, dtype=np.int64), np.full(50, angle), np.full(50, 0.02))
+    )
+    for number in numbers:
+        mapper.leave(number)
+    mapper.graph.solve(10)
+    assert mapper.graph.constraints.bearing_count == 1
+    (begin, _) = np.flatnonzero(mapper.graph.robot[: mapper.graph.count] == 1)
+    assert mapper.graph.poses[begin, 2] == pytest.approx(bearing, abs=math.radians(2.0))
+
+
+def test_stops_are_told_from_drives() -> None:
+    robot = RoomRobot(START, 0.0, None)
+    parts = [robot.turn(1.0), robot.drive(0.5), robot.turn(-0.7), robot.drive(0.4)]
+    tracker = MotionTracker()
+    runs = [
+        (run.stands, run.arrives, len(run.readings.stamp_ns)) for part in parts for run in tracker.runs(part)
+    ]
+    assert [run[:2] for run in runs if run[1]] == [(True, True)] * 2
+    assert sum(run[2] for run in runs) == sum(len(part.stamp_ns) for part in parts)
+    assert not runs[-1][0]
+
+
+def test_a_rest_ends_a_look_around() -> None:
+    stop = Stop(np.zeros(3))
+    count = 120
+    odometry = np.zeros((count, 3))
+    odometry[:, 2] = np.minimum(0.02 * np.arange(count), 0.8)
+    stop.extend(Readings(20_000_000 * np.arange(count), odometry, np.ones(count), 0.016))
+    assert 40 + 50 <= stop.completed(6.0) <= 40 + 52
+    assert stop.completed(0.5) == 26
+    assert stop.turn_at(10 * 20_000_000) == pytest.approx(0.2)
+
+
+def test_a_stop_without_end_is_bounded() -> None:
+    stop = Stop(np.zeros(3))
+    for k in range(20):
+        stop.extend(Readings(np.arange(1000) + 1000 * k, np.zeros((1000, 3)), np.ones(1000), 0.016))
+    assert len(stop.turn) <= 4096
+    assert stop.stamp_ns[-1] == 19_999
+
+
+def test_the_printed_method_maps_with_its_tribes() -> None:
+    mapper = ParticleMapper(np.random.default_rng(7))
+    robot = RoomRobot(START, 0.0, np.random.default_rng(8))
+    explore(mapper, mapper.join(np.array(START), KNOWN), robot, 2)
+    pose: FloatArray | None = mapper.pose(0)
+    assert pose is not None
+    assert math.dist(pose[:2], robot.pose[:2]) < 0.5
+    values = mapper.occupancy().log_odds * (0.3 / 0.46)
+    assert values.max() == pytest.approx(1.0)  # the cap
+    assert values.min() == pytest.approx(-0.3)
+
+
+def test_the_room_is_as_it_should_be() -> None:
+    assert distance_in_room(1.0, 1.0, 0.0) == pytest.approx(2.4)
+    assert distance_in_room(1.5, 1.0, math.pi / 2) == pytest.approx(2.1)
+    assert distance_in_room(0.5, 1.0, math.pi / 2) == pytest.approx(1.6)

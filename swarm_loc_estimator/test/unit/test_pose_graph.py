@@ -1,0 +1,111 @@
+"""The pose graph: Jacobians of constraints, sparse normal equations beside dense ones, covariances."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from swarm_loc_estimator.core.mapping.pose_graph import constraints as model
+from swarm_loc_estimator.core.mapping.pose_graph.graph import PoseGraph
+from swarm_loc_estimator.core.mapping.pose_graph.normal_equations import NormalEquations
+from swarm_loc_estimator.core.mapping.settings import MapperSettings
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+SEEDS = range(5)
+STOPS = 4
+FIRST, SECOND = np.array([0, 1, 2]), np.array([1, 3, 0])
+
+
+def kinds(rng: np.random.Generator) -> dict[str, Callable[[FloatArray, FloatArray], model.Linearised]]:
+    """Each kind of constraint with numbers of its own, as a function of states (4, 4) and slips (2,)."""
+    motion, turn = rng.normal(0.0, 0.6, (3, 3)), rng.normal(0.0, 2.0, 3)
+    sigma, robot = rng.uniform(0.01, 0.2, (3, 3)), np.array([0, 0, 1, 1])
+    departures = model.Departures(FIRST, SECOND, turn, motion, sigma)
+    ties = model.Ties(FIRST, SECOND, motion, sigma)
+    bearings = model.Bearings(FIRST, SECOND, turn, sigma[:, 0])
+    return {
+        "odometry": lambda s, _: model.odometry(s, departures),
+        "ties": lambda s, _: model.ties(s, ties),
+        "bearings": lambda s, _: model.bearings(s, bearings),
+        "priors": lambda s, _: model.priors(s, FIRST, motion, sigma),
+        "ratios": lambda s, slip: model.ratios(s, slip, robot, np.full(STOPS, 0.01)),
+        "slips": lambda s, slip: model.slips(len(s), slip, 0.02, 0.03),
+    }
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("kind", ["odometry", "ties", "bearings", "priors", "ratios", "slips"])
+def test_jacobians_are_those_of_finite_differences(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    residuals = kinds(rng)[kind]
+    unknowns = np.concatenate([rng.normal(0.0, 1.0, 4 * STOPS), rng.normal(0.0, 0.05, 2)])
+
+    def at(values: FloatArray) -> model.Linearised:
+        return residuals(values[: 4 * STOPS].reshape(STOPS, 4), values[4 * STOPS :])
+
+    here, step = at(unknowns), 1e-6
+    for m in range(len(here.index)):
+        for column, index in enumerate(here.index[m]):
+            change = np.zeros(len(unknowns))
+            change[index] = step
+            numeric = (at(unknowns + change).residual[m] - at(unknowns - change).residual[m]) / (2.0 * step)
+            assert np.allclose(here.jacobian[m, :, column], numeric, atol=1e-5 * (1.0 + abs(numeric).max()))
+
+
+def test_sparse_equations_are_the_dense_ones() -> None:
+    rng = np.random.default_rng(1)
+    states, slip = rng.normal(0.0, 1.0, (STOPS, 4)), np.zeros(2)
+    parts = [make(states, slip) for make in kinds(rng).values()]
+    size = 4 * STOPS + 2
+    H, g = 1e-6 * np.eye(size), np.zeros(size)
+    for part in parts:
+        for index, jacobian, residual, weight in zip(*part, strict=True):
+            H[np.ix_(index, index)] += jacobian.T @ np.diag(weight) @ jacobian
+            g[index] -= jacobian.T @ (weight * residual)
+    equations = NormalEquations(np.ones(size, dtype=bool))
+    equations.add(parts)
+    step, factor = equations.solve()
+    assert np.allclose(step, np.linalg.solve(H, g))
+    chosen = np.array([4, 5, 6])
+    assert np.allclose(factor.covariance(chosen), np.linalg.inv(H)[np.ix_(chosen, chosen)])
+
+
+def test_what_is_not_free_stays() -> None:
+    rng = np.random.default_rng(2)
+    free = np.ones(4 * STOPS + 2, dtype=bool)
+    free[4:8] = False
+    equations = NormalEquations(free)
+    equations.add([make(rng.normal(0.0, 1.0, (STOPS, 4)), np.zeros(2)) for make in kinds(rng).values()])
+    step, _ = equations.solve()
+    assert (step[4:8] == 0.0).all()
+    assert np.abs(step[free]).min() > 0.0
+
+
+def test_a_chain_is_as_unsure_as_its_odometry_adds_up() -> None:
+    graph = PoseGraph(MapperSettings())
+    graph.add_robot()
+    sigma = np.array([0.02, 0.01, 1e-4])
+    stops = [graph.add_stop(0, np.array([float(k), 0.0, 0.0]), 0.02) for k in range(5)]
+    for stop in stops:
+        graph.set_scan(stop, np.zeros(1), np.zeros(1))
+    graph.constraints.add_prior(0, np.zeros(3), np.full(3, 1e-4))
+    for begin, end in pairwise(stops):
+        graph.constraints.add_departure(begin, end, 0.0, np.array([1.0, 0.0, 0.0]), sigma)
+    graph.solve(3)
+    assert np.allclose(graph.poses[:, 0], range(5), atol=1e-9)
+    deviations = np.sqrt(np.diag(graph.covariance(4)))
+    assert deviations[:2] == pytest.approx([0.04, 0.02], rel=0.02)
+
+
+def test_stops_outgrow_the_room_that_there_was() -> None:
+    graph = PoseGraph(MapperSettings())
+    graph.add_robot()
+    for k in range(150):
+        stop = graph.add_stop(0, np.array([k, 0.0, 0.0]), 0.02)
+        graph.set_scan(stop, np.linspace(0.0, 1.0, 10), np.full(10, 0.5))
+    assert graph.count == 150
+    assert (graph.scans.beams.count[:150] == 10).all()
+    assert graph.poses[:, 0].tolist() == list(range(150))
