@@ -36,6 +36,7 @@ LOOKS: Mapping[str, Look] = {
     **{f"noise_{counts}": Look(noise=float(counts)) for counts in (8, 16)},
     "texture_10percent": Look(texture=0.1),
     "dark_discs": Look(kind="dark"),
+    "dark_discs_shadow_60percent": Look(kind="dark", shadow=0.6),
     "bright_discs": Look(kind="bright", floor=0.3),
     "lights_in_the_dark": Look(kind="led", floor=0.12, diameter_px=12.0),
     "dark_floor": Look(floor=0.12),

@@ -28,7 +28,7 @@ _ROUNDS = 3
 _EVERY, _LIKELY = 4, 0.4
 """At first every fourth ray is looked along, and this share of them must meet an edge."""
 _MIN_RAYS = 12
-_NOISES = 1.5
+_NOISES = 0.5
 """Of one pixel, that an edge's step must reach: its two sides are means over many."""
 _SLACK_PX = 0.03
 """Error of an edge that its neighbours share [px], beside what the residuals show."""

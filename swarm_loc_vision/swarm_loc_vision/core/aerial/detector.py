@@ -148,9 +148,8 @@ class AerialDetector:
             return _Found(rims, circles), {}
         quality = _quality(circles)
         alike = np.abs(circles.radius / commonest(circles.radius, quality) - 1.0) <= _SAME_SIZE
-        strong = circles.contrast >= _SAME_CONTRAST * commonest(circles.contrast, quality)
-        dropped = {"other_size": int(np.sum(~alike)), "other_contrast": int(np.sum(alike & ~strong))}
-        circles = circles.chosen(alike & strong)
+        dropped = {"other_size": int(np.sum(~alike))}
+        circles = circles.chosen(alike)
         whole = _whole(circles)
         dropped["not_whole"] = int(np.sum(~whole))
         circles = circles.chosen(whole)
@@ -164,6 +163,7 @@ class AerialDetector:
         circles, rims, settings = found.circles, found.rims, self._settings
         if not len(circles.radius):
             return _nothing(dropped)
+        is_strong = circles.contrast >= _SAME_CONTRAST * commonest(circles.contrast, _quality(circles))
         for _ in range(_MARK_ROUNDS):
             marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
             again = rims.measure(circles.centre, circles.radius, marks.light)
@@ -175,9 +175,12 @@ class AerialDetector:
                 )
             )
         marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
-        alike = _marked_alike(circles, marks)
-        dropped = {**dropped, "without_mark": int(np.sum(~alike))}
-        circles, marks = circles.chosen(alike), Marks(*(column[alike] for column in marks))
+        has_mark = np.isfinite(marks.theta)
+        is_strong |= has_mark  # a shadow on it or beside it may weaken a rim, but shows no mark
+        alike = _marked_alike(circles, has_mark) | ~is_strong
+        dropped |= {"other_contrast": int(np.sum(~is_strong)), "without_mark": int(np.sum(~alike))}
+        kept = alike & is_strong
+        circles, marks = circles.chosen(kept), Marks(*(column[kept] for column in marks))
         places = grid.places(circles.centre)
         of_pixel = self._ground.pixel_covariances(places, circles.covariance * grid.metres_per_px**2)
         of_pixel = of_pixel + settings.pixel_sigma**2 * np.eye(2)
@@ -227,9 +230,9 @@ def _whole(circles: Circles) -> NDArray[np.bool_]:
     return np.asarray(~alone | (circles.coverage >= _USUAL * usual))
 
 
-def _marked_alike(circles: Circles, marks: Marks) -> NDArray[np.bool_]:
+def _marked_alike(circles: Circles, has_mark: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which discs may carry the same pattern: where most show a mark, those without must be clear discs."""
-    quality, has_mark = _quality(circles), np.isfinite(marks.theta)
+    quality = _quality(circles)
     if quality[has_mark].sum() < _MOST * quality.sum():
         return np.ones(len(quality), np.bool_)
     return np.asarray(has_mark | (circles.coverage >= _CLEAR))
