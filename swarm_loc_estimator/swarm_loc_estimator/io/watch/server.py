@@ -18,7 +18,7 @@ from swarm_loc_estimator.io.watch.access import Access, is_loopback
 from swarm_loc_estimator.io.watch.frames import Frame
 from swarm_loc_estimator.io.watch.history import History
 from swarm_loc_estimator.io.watch.page import content_security_policy, page
-from swarm_loc_estimator.io.watch.viewer import Viewer
+from swarm_loc_estimator.io.watch.viewer import RECEIVED, Viewer
 from swarm_loc_estimator.parameters.errors import UserError
 
 MAX_VIEWERS = 32
@@ -203,6 +203,9 @@ class WatchServer:
 
     def _on_text(self, viewer: Viewer, text: str) -> None:
         """A page's word."""
+        if text == RECEIVED:
+            viewer.on_received()
+            return
         try:
             command = json.loads(text)
             todo, robot = str(command["do"]), int(command.get("robot", -1))

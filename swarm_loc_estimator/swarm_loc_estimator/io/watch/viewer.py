@@ -15,6 +15,10 @@ from swarm_loc_estimator.io.watch.frames import Frame
 
 MAX_NOTES = 64
 """So many texts wait for a slow page; older ones go first."""
+RECEIVED = "+"
+"""What a page says of each frame that it has taken in."""
+_MAX_ON_THE_WAY = 4
+"""More frames would only lie in the buffers of a page that is busy, and be old when it comes to them."""
 
 
 class Viewer:
@@ -35,6 +39,7 @@ class Viewer:
         self._newest: dict[str, Frame] = {}
         self._notes: deque[str] = deque(maxlen=MAX_NOTES)
         self._wake = asyncio.Event()
+        self._on_the_way = 0
         self.selected = -1
         self.skipped = 0
 
@@ -49,10 +54,19 @@ class Viewer:
         self._notes.append(json.dumps(message))
         self._wake.set()
 
+    def on_received(self) -> None:
+        """The page has taken a frame in."""
+        self._on_the_way -= 1
+        self._wake.set()
+
     async def send_past(self, frames: Iterable[Frame]) -> None:
         """Send what happened before the page was opened."""
         for frame in frames:
-            await self._socket.send_bytes(frame.data)
+            while self._on_the_way >= _MAX_ON_THE_WAY:
+                self._wake.clear()
+                await self._wake.wait()
+            await self._send(frame)
+        self._wake.set()
 
     async def send_for_ever(self) -> None:
         """Send until the connection breaks."""
@@ -62,11 +76,17 @@ class Viewer:
             began_s = time.monotonic()
             while self._notes:
                 await self._socket.send_str(self._notes.popleft())
+            if self._on_the_way >= _MAX_ON_THE_WAY:
+                continue  # its word wakes this up
             frames, self._newest = self._newest, {}
             for frame in frames.values():
-                await self._socket.send_bytes(frame.data)
+                await self._send(frame)
             if frames:
                 await asyncio.sleep(max(0.0, began_s + self._period_s - time.monotonic()))
+
+    async def _send(self, frame: Frame) -> None:
+        self._on_the_way += 1
+        await self._socket.send_bytes(frame.data)
 
     async def close(self) -> None:
         """End the connection."""

@@ -19,7 +19,11 @@ class Link {
       this.tries = 0;
       app.setLink("live");
     };
-    socket.onmessage = ({ data }) => (typeof data === "string" ? app.onNote(JSON.parse(data)) : app.onFrame(readFrame(data)));
+    socket.onmessage = ({ data }) => {
+      if (typeof data === "string") return app.onNote(JSON.parse(data));
+      socket.send("+"); // the server sends no more than a busy page takes in
+      app.onFrame(readFrame(data));
+    };
     socket.onclose = () => {
       app.setLink("lost");
       setTimeout(() => this.open(), AGAIN_MS[Math.min(this.tries++, AGAIN_MS.length - 1)]);

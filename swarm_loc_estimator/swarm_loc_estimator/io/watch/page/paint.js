@@ -9,6 +9,7 @@ class Painter {
   constructor(canvas, app) {
     this.canvas = canvas;
     this.app = app;
+    this.discs = new Map();
   }
 
   paint(time) {
@@ -53,19 +54,10 @@ class Painter {
 
   robots(c, { theta, status }) {
     const { app } = this, n = theta.length;
-    c.lineWidth = 1;
-    for (let kind = 1; kind < STATUS.length; kind++) {
-      c.fillStyle = app.colour(STATUS[kind]);
-      c.beginPath();
-      let some = false;
-      for (let i = 0; i < n; i++) {
-        if (status[i] !== kind || !this.isSeen(i)) continue;
-        const r = this.radius(i);
-        c.moveTo(this.u[i] + r, this.v[i]);
-        c.arc(this.u[i], this.v[i], r, 0, 2 * Math.PI);
-        some = true;
-      }
-      if (some) c.fill();
+    for (let i = 0; i < n; i++) {
+      if (!status[i] || !this.isSeen(i)) continue;
+      const disc = this.disc(status[i], this.radius(i)), half = disc.extent / 2;
+      c.drawImage(disc, this.u[i] - half, this.v[i] - half, disc.extent, disc.extent);
     }
     c.strokeStyle = app.colour("ink");
     c.lineWidth = n > 300 ? 1 : 2;
@@ -85,6 +77,22 @@ class Painter {
     c.beginPath();
     c.arc(this.u[chosen], this.v[chosen], this.radius(chosen) + 5, 0, 2 * Math.PI);
     c.stroke();
+  }
+
+  // A disc of a status and radius, painted once: a thousand copies cost less than a thousand arcs.
+  disc(status, radius) {
+    const colour = this.app.colour(STATUS[status]), r = Math.round(4 * radius) / 4, key = `${colour} ${r} ${devicePixelRatio}`;
+    if (this.discs.has(key)) return this.discs.get(key);
+    if (this.discs.size > 64) this.discs.clear();
+    const canvas = document.createElement("canvas"), extent = 2 * Math.ceil(r) + 2, c = canvas.getContext("2d");
+    canvas.width = canvas.height = extent * devicePixelRatio;
+    canvas.extent = extent;
+    c.scale(devicePixelRatio, devicePixelRatio);
+    c.fillStyle = colour;
+    c.arc(extent / 2, extent / 2, r, 0, 2 * Math.PI);
+    c.fill();
+    this.discs.set(key, canvas);
+    return canvas;
   }
 
   labels(c, status) {
@@ -107,7 +115,7 @@ class Painter {
       if (!status[i] || !this.isSeen(i, 2000)) continue;
       const middle = (sxx[i] + syy[i]) / 2, half = Math.hypot((sxx[i] - syy[i]) / 2, sxy[i]);
       const a = k * Math.sqrt(middle + half), b = k * Math.sqrt(Math.max(middle - half, 0));
-      if (!(a > 1) || a > 1e5) continue;
+      if (!(a > 1) || a > 1e5 || (sxx.length > 300 && a < this.radius(i))) continue; // it would lie on the disc
       const angle = -0.5 * Math.atan2(2 * sxy[i], sxx[i] - syy[i]);
       c.moveTo(this.u[i] + a * Math.cos(angle), this.v[i] + a * Math.sin(angle));
       c.ellipse(this.u[i], this.v[i], a, b, angle, 0, 2 * Math.PI);
