@@ -80,8 +80,11 @@ def test_odometry_is_not_guessed_over_gaps_and_nothing_waits_for_ever() -> None:
     assert pairer.drops["laser_without_odometry"] == 11
 
 
-def test_unseen_beams_wait_for_a_first_that_tells_the_noise() -> None:
+def test_beams_that_met_nothing_count_before_anything_was_seen() -> None:
     pairer = pairer_with_odometry(2)
     pairer.add_distance(0, math.nan, math.nan)
-    assert pairer.ready() is None
-    assert pairer.drops["laser_unseen_yet"] == 1
+    found = pairer.ready()
+    assert found is not None
+    assert found.inverse.tolist() == [0.0]
+    assert math.isnan(found.sigma)
+    assert not pairer.drops

@@ -66,8 +66,8 @@ class ReadingPairer:
         while self._distances and self._distances[0][0] <= self.newest_ns:
             stamp_ns, inverse = self._distances.popleft()
             pose = self._pose_at(stamp_ns)
-            if pose is None or math.isnan(self._sigma):
-                self.drops["laser_without_odometry" if pose is None else "laser_unseen_yet"] += 1
+            if pose is None:
+                self.drops["laser_without_odometry"] += 1
             else:
                 rows.append((stamp_ns, pose, inverse))
         if not rows:

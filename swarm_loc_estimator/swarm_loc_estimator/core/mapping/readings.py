@@ -20,7 +20,8 @@ class Readings(NamedTuple):
         stamp_ns: (n,).
         odometry: (n, 3) pose by odometry at each stamp, in the robot's own odom frame.
         inverse: (n,) inverse distance along x of the robot, from its centre [1/m]; `UNSEEN`: nothing.
-        sigma: Standard deviation of an inverse distance, sigma_px / (f b) [1/m].
+        sigma: Standard deviation of an inverse distance, sigma_px / (f b) [1/m]; NaN where
+            nothing was seen so far.
     """
 
     stamp_ns: IntArray

@@ -39,7 +39,7 @@ class Stop:
         stamp_ns: (n,) of its readings.
         turn: (n,) turn by odometry since it came [rad].
         inverse: (n,) inverse distances [1/m].
-        sigma: Of an inverse distance [1/m].
+        sigma: Of an inverse distance; of no meaning before something was seen [1/m].
     """
 
     def __init__(self, arrival: FloatArray) -> None:
@@ -47,7 +47,7 @@ class Stop:
         self.stamp_ns: IntArray = np.zeros(0, dtype=np.int64)
         self.turn = np.zeros(0)
         self.inverse = np.zeros(0)
-        self.sigma = math.inf
+        self.sigma = 1.0
 
     def extend(self, readings: Readings) -> None:
         """Add readings made here."""
@@ -57,7 +57,9 @@ class Stop:
         self.turn = np.concatenate([self.turn, np.cumsum(steps)[1:]])  # the same whoever cuts the readings
         self.stamp_ns = np.concatenate([self.stamp_ns, readings.stamp_ns])
         self.inverse = np.concatenate([self.inverse, readings.inverse])
-        self.departure, self.sigma = readings.odometry[-1], readings.sigma
+        self.departure = readings.odometry[-1]
+        if not math.isnan(readings.sigma):
+            self.sigma = readings.sigma
         if len(self.turn) > _MAX_READINGS:
             self.turn, self.stamp_ns, self.inverse = (
                 np.concatenate([one[:-1:2], one[-1:]]) for one in (self.turn, self.stamp_ns, self.inverse)

@@ -63,6 +63,9 @@ class MapperNode(ConfiguredNode[MapperParameters]):
 
     Args:
         node_arguments: Further arguments of `rclpy.node.Node`.
+
+    Attributes:
+        feed: What has come, and what of it was not used.
     """
 
     def __init__(self, **node_arguments: Any) -> None:
@@ -95,7 +98,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         """An empty map, and robots that have not joined yet."""
         self._mapper = CooperativeMapper(self.chosen.settings)
         self._mapper.background = self._background
-        self._feed = MapperFeed(self._robots, self._mapper, self._frequencies)
+        self.feed = MapperFeed(self._robots, self._mapper, self._frequencies)
         self._told: dict[int, int] = {}
         self._published: OccupancyMap | None = None
 
@@ -110,8 +113,8 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         ]
 
     def _on_message(self, robot: int, kind: MapperInput, data: bytes) -> None:
-        self._feed.add(robot, kind, data)
-        number = self._feed.number(robot)
+        self.feed.add(robot, kind, data)
+        number = self.feed.number(robot)
         goal = self._mapper.goal(number) if number is not None else None
         if number is None or goal is None or self._told.get(robot) == goal.number:
             return
@@ -153,11 +156,11 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         return response
 
     def _on_diagnostics(self) -> None:
-        missing = [self._why(topic) for topic in self._feed.missing()]
+        missing = [self._why(topic) for topic in self.feed.missing()]
         if missing and not self._has_said_missing and time.monotonic() > self._since_s + _PATIENCE_S:
             self._has_said_missing = True
             self.get_logger().warning(f"waiting: nothing has come on {', '.join(missing)}")
-        drops = dict(self._feed.all_drops)
+        drops = dict(self.feed.all_drops)
         if drops != self._known_drops:
             self._known_drops = drops
             words = ", ".join(f"{count} {reason}" for reason, count in drops.items())
@@ -166,7 +169,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         values = {"stops": graph.count, "bearings of lights": graph.constraints.bearing_count, **counters}
         values |= {f"dropped: {reason}": count for reason, count in drops.items()}
         for kind in MapperInput:
-            count = sum(self._feed.received[index, kind] for index in range(len(self._robots)))
+            count = sum(self.feed.received[index, kind] for index in range(len(self._robots)))
             values[f"<robot>/{kind.topic} received"] = count
         text = f"nothing on {', '.join(missing)}" if missing else f"{graph.count} stops"
         status = DiagnosticStatus(
