@@ -24,6 +24,7 @@ from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.live.graph import LiveGraph
 from swarm_loc_estimator.live.recorder import read_history, read_poses
 from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.trajectory import DEFAULT_GAP_NS, interpolate
 from swarm_loc_vision.core.warm_up import warm_up
 
@@ -134,5 +135,5 @@ def _estimated(listener: Listener, swarm: Swarm, begin_ns: int) -> Estimated:
     known = (history.stamp_ns >= begin_ns) & np.isfinite(places).all(axis=(1, 2))
     error = (history.pose - places)[known]
     error[..., 2] = se2.wrap_angle(error[..., 2])
-    time_s = (history.stamp_ns[known] - begin_ns) * 1e-9
+    time_s: FloatArray = (history.stamp_ns[known] - begin_ns).astype(np.float64) * 1e-9
     return Estimated(time_s, error, history.covariance[known], history.status[known] == Status.TRACKED)
