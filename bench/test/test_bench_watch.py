@@ -8,13 +8,14 @@ import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from playwright.sync_api import Browser
-from watched_swarm import PLACES, SWARM, WatchedSwarm
 
 from bench.watch.browser import WatchedPage, chromium, running_browser
+from bench.watch.watched_swarm import PLACES, SWARM, WatchedSwarm
 from swarm_loc_estimator.evaluation.report.recording import recorded
 from swarm_loc_estimator.evaluation.result import ReplayResult
 from swarm_loc_estimator.io.watch.page import page as page_of
@@ -226,7 +227,7 @@ class ForeignPage(BaseHTTPRequestHandler):
         """Say nothing."""
 
 
-def next_order(swarm: WatchedSwarm) -> dict[str, object]:
+def next_order(swarm: WatchedSwarm) -> dict[str, Any]:
     """What the page has ordered."""
     try:
         return swarm.commands.get(timeout=PATIENCE_S)

@@ -5,8 +5,8 @@
 
 Latency is from the stamp of a pose, when it is published, through DDS, `watch_node`, the WebSocket and
 Chromium (without a window and without a GPU) to the task after the page was painted. The poses come from a
-stand-in for the estimator, `bench.watch.publisher`, at 20 Hz. The load of the real estimator is measured on bags
-that are played.
+stand-in for the estimator, `bench.watch.publisher`, at 20 Hz. The load of the real one is measured on bags that
+are played.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.core.description.swarm import Landmark, Robot, Swarm
 from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.io.watch.access import free_port
-from swarm_loc_estimator.launching.graph import GraphOptions, NodeSpec, graph_nodes
+from swarm_loc_estimator.launching.graph import GraphOptions, NodeSpec, ParameterValue, graph_nodes
 from swarm_loc_estimator.launching.processes import Child, node_command, start, stop
 from swarm_loc_estimator.live.graph import START_PATIENCE_S, LiveGraph, cpu_seconds
 from swarm_loc_estimator.live.run import ESTIMATOR, PLAYER
@@ -57,7 +57,7 @@ def measure(browser: Browser, robots: int, seconds: float) -> tuple[dict[str, fl
         swarm_file, port = work / "swarm.yaml", free_port()
         save_swarm(swarm_of(robots), swarm_file, "Robots of a benchmark.")
         log = stack.enter_context((OUT / "watch.log").open("wb"))
-        parameters = {"swarm_file": str(swarm_file), "port": port}
+        parameters: dict[str, ParameterValue] = {"swarm_file": str(swarm_file), "port": port}
         node = NodeSpec("swarm_loc_estimator", "watch_node", "watch", parameters=parameters)
         publisher = [sys.executable, "-m", "bench.watch.publisher", str(swarm_file)]
         children = [Child(node, start(command, log)) for command in (publisher, node_command(node))]

@@ -17,6 +17,7 @@ from swarm_loc_estimator.io.messages.estimates import EstimateMessage
 from swarm_loc_estimator.io.messages.markers import MarkersEncoder
 from swarm_loc_estimator.io.messages.outputs import SwarmPosesEncoder, TransformsEncoder
 from swarm_loc_estimator.io.messages.typestore import MARKERS, POSE_STAMPED, SWARM_POSES, TRANSFORMS
+from swarm_loc_estimator.numerics.arrays import BoolArray
 
 if TYPE_CHECKING:
     from swarm_loc_estimator.evaluation.result import ReplayResult
@@ -61,7 +62,7 @@ def _add_estimates(result: ReplayResult, writer: BagWriter) -> None:
         newest = seen.get(one.stamp_ns, newest)
         columns = (one.pose, one.covariance, one.fix_age_s, one.status)
         writer.write("swarm/poses", one.stamp_ns, poses.encode(one.stamp_ns, *columns))
-        located = np.isfinite(one.pose).all(axis=1)
+        located: BoolArray = np.isfinite(one.pose).all(axis=1)
         if located.any():
             writer.write("tf", one.stamp_ns, transforms.encode(one.stamp_ns, located, one.pose))
         writer.write("swarm/markers", one.stamp_ns, markers.encode(one, newest))

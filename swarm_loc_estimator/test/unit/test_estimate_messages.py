@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -126,7 +127,8 @@ def test_markers_are_what_viewers_read() -> None:
         np.zeros(4, np.float32),
         np.zeros(4, np.float32),
     )
-    markers = typestore().deserialize_cdr(MarkersEncoder(swarm, "map").encode(one, seen), MARKERS).markers
+    array: Any = typestore().deserialize_cdr(MarkersEncoder(swarm, "map").encode(one, seen), MARKERS)
+    markers = array.markers
     assert markers[0].action == 3, "what was shown before must go"
     named = {marker.ns: marker for marker in markers[1:] if marker.ns != "names"}
     assert [(p.x, p.y) for p in named["robots"].points] == [(1.0, 2.0), (3.0, 4.0)]
@@ -168,7 +170,8 @@ def test_a_run_is_written_as_mcap(tmp_path: Path) -> None:
         (first, *_) = [bytes(data) for _, _, _, data in bag.messages(["tf"])]
     assert [one.stamp_ns for one in poses] == stamp_ns.tolist()
     assert [one.status.tolist() for one in poses] == [[1, 0], [1, 1], [1, 1]]
-    (transform,) = typestore().deserialize_cdr(first, "tf2_msgs/msg/TFMessage").transforms
+    told: Any = typestore().deserialize_cdr(first, "tf2_msgs/msg/TFMessage")
+    (transform,) = told.transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("map", "a/base_link")
 
 

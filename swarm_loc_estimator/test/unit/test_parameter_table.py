@@ -11,6 +11,8 @@ from swarm_loc_estimator.cli.arguments import parameters_of
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
 from swarm_loc_estimator.nodes.player.player_parameters import PlayerParameters
+from swarm_loc_estimator.nodes.watch.markers_parameters import MarkersParameters
+from swarm_loc_estimator.nodes.watch.watch_parameters import WatchParameters
 from swarm_loc_estimator.parameters.table import (
     ParameterError,
     ParameterSpec,
@@ -24,7 +26,13 @@ DOC = Path(__file__).parents[2] / "doc"
 
 
 @pytest.mark.parametrize(
-    ("page", "cls"), [("estimator_node.md", EstimatorParameters), ("play.md", PlayerParameters)]
+    ("page", "cls"),
+    [
+        ("estimator_node.md", EstimatorParameters),
+        ("play.md", PlayerParameters),
+        ("watch.md", WatchParameters),
+        ("watch.md", MarkersParameters),
+    ],
 )
 def test_the_page_says_what_the_table_says(page: str, cls: type) -> None:
     assert markdown_table(cls) in (DOC / page).read_text(encoding="utf-8")

@@ -10,7 +10,7 @@ import pytest
 IMPORT_ALL_WITHOUT_ROS = """
 import ast, importlib, importlib.util, pathlib, pkgutil, sys
 
-GRAPHS = {"demo", "graph", "simulate"}
+GRAPHS = {"demo", "graph", "simulate", "watch"}
 
 class NoRos:
     def find_spec(self, name, path=None, target=None):

@@ -15,7 +15,7 @@ from swarm_loc_estimator.core.description.swarm import Landmark, Swarm
 from swarm_loc_estimator.core.estimation.sightings import Sightings
 from swarm_loc_estimator.io.messages.cdr_writer import CdrWriter, stamp_bytes
 from swarm_loc_estimator.io.messages.estimates import EstimateMessage
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray
 
 LINE_LIST, CUBE_LIST, SPHERE_LIST, TEXT = 5, 6, 7, 9
 _DELETE_ALL = 3
@@ -70,7 +70,7 @@ class MarkersEncoder:
 
     def encode(self, estimate: EstimateMessage, sightings: Sightings | None = None) -> bytes:
         """The message for poses and what was seen; what it does not hold any more is deleted."""
-        located = np.isfinite(estimate.pose).all(axis=1)
+        located: BoolArray = np.isfinite(estimate.pose).all(axis=1)
         pose, size = estimate.pose[located], self._size
         colours = _COLOURS[np.minimum(estimate.status[located], len(_COLOURS) - 1)]
         line = (0.15 * size, 0.0, 0.0)

@@ -18,7 +18,8 @@ from swarm_loc_estimator.io.yaml_tree import Tree
 from swarm_loc_estimator.parameters.number_spec import number_specs
 
 _NUMBERS = number_specs(RobotIr)
-_LAYER = ("platform", "estimator", "gains", *_NUMBERS)
+_DEAD = ("dead_sensors", "dead_emitters")
+_LAYER = ("platform", "estimator", "gains", *_DEAD, *_NUMBERS)
 _GAIN_LISTS = ("sensor", "emitter")
 _GAIN_NUMBERS = number_specs(IrGains)
 _METHODS = {method.value: method for method in IrMethod}
@@ -51,6 +52,7 @@ class IrSection:
             "platform": self._platform,
             "estimator": self._method,
             "gains": self._gains,
+            **dict.fromkeys(_DEAD, self._elements),
         }
         return {
             name: readers[name](value, f"{key}.{name}")
@@ -74,6 +76,11 @@ class IrSection:
                 f"{key}.gains has {len(gains.sensor)} sensors and emitters"
                 f" but must have the {platform.n} of its platform"
             )
+        for name in _DEAD:
+            if wrong := [k for k in values.get(name, ()) if k >= platform.n]:
+                raise self._checks.said(
+                    f"{key}.{name} has {wrong[0]} but elements are numbered 0 to {platform.n - 1}"
+                )
         rest = {name: value for name, value in values.items() if name not in ("platform", "gains")}
         return RobotIr(platform=platform, source=source, gains=gains, **rest)
 
@@ -95,6 +102,13 @@ class IrSection:
         except IrPlatformFileError as error:
             raise self._checks.said(f"{key}: {str(error).removesuffix('.')}") from error
         return source
+
+    def _elements(self, value: Tree, key: str) -> tuple[int, ...]:
+        """Numbers of elements, from 0 on."""
+        numbers = self._checks.list_of_numbers(value, key)
+        if any(number != int(number) or number < 0 for number in numbers):
+            raise self._checks.error(key, value, "must be a list of numbers of elements, from 0 on")
+        return tuple(int(number) for number in numbers)
 
     def _method(self, value: Tree, key: str) -> IrMethod:
         """An estimator by name."""
@@ -131,6 +145,7 @@ def ir_tree(ir: RobotIr, folder: Path) -> Values:
             **{name: list(gains[name]) for name in _GAIN_LISTS},
             **_unlike_default(gains, IrGains, _GAIN_NUMBERS),
         }
+    values |= {name: list(getattr(ir, name)) for name in _DEAD if getattr(ir, name)}
     numbers = {name: getattr(ir, name) for name in _NUMBERS}
     return {**values, **_unlike_default(numbers, RobotIr, _NUMBERS)}
 

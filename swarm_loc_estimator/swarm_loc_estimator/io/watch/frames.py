@@ -78,7 +78,8 @@ def poses_frame(estimate: EstimateMessage) -> Frame:
         "stt": covariance[:, 2, 2],
         "age": estimate.fix_age_s,
     }
-    columns = {"x": pose[:, 0], "y": pose[:, 1]} | {k: v.astype(np.float32) for k, v in single.items()}
+    columns: dict[str, npt.NDArray[Any]] = {"x": pose[:, 0], "y": pose[:, 1]}
+    columns |= {name: column.astype(np.float32) for name, column in single.items()}
     return pack("poses", estimate.stamp_ns, {**columns, "status": estimate.status})
 
 
@@ -91,5 +92,10 @@ def places_frame(
     kind: str, stamp_ns: int, robot: Sequence[int], pose: npt.NDArray[np.float64], **extra: object
 ) -> Frame:
     """Poses (n, 3) in map of some robots, or of nobody known (-1): ground truth, goals, aerial detections."""
-    columns = {"x": pose[:, 0], "y": pose[:, 1], "theta": pose[:, 2].astype(np.float32)}
-    return pack(kind, stamp_ns, {"robot": np.array(robot, dtype=np.int32), **columns}, **extra)
+    columns: dict[str, npt.NDArray[Any]] = {
+        "robot": np.array(robot, dtype=np.int32),
+        "x": pose[:, 0],
+        "y": pose[:, 1],
+        "theta": pose[:, 2].astype(np.float32),
+    }
+    return pack(kind, stamp_ns, columns, **extra)

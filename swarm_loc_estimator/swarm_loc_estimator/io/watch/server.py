@@ -71,13 +71,13 @@ class WatchServer:
         self._loop = asyncio.new_event_loop()
         self._runner = web.AppRunner(self._application(), access_log=None, shutdown_timeout=1.0)
         self._listening = threading.Event()
-        self._fault: OSError | None = None
+        self._faults: list[OSError] = []
         self._thread = threading.Thread(target=self._run, args=(port,), name="watch_server", daemon=True)
         self._thread.start()
         self._listening.wait(_START_PATIENCE_S)
-        if self._fault is not None:
+        for fault in self._faults:
             self._thread.join()
-            reason = self._fault.strerror or self._fault
+            reason = fault.strerror or fault
             raise ServerError(f"parameter port = {port}: {access.address} cannot be listened on: {reason}.")
         self.port: int = self._runner.addresses[0][1]
 
@@ -136,7 +136,7 @@ class WatchServer:
             self._listening.set()
             self._loop.run_forever()
         except OSError as error:
-            self._fault = error
+            self._faults.append(error)
         finally:
             self._loop.run_until_complete(self._runner.cleanup())
             self._loop.run_until_complete(self._loop.shutdown_asyncgens())

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from nav_msgs.msg import OccupancyGrid
 from rclpy.time import Time
 
@@ -98,7 +100,7 @@ class AerialNames:
     def _frame(self, stamp_ns: int, known: dict[int, tuple[int, float]]) -> Frame:
         seen = self._images[stamp_ns].detections
         who = [known.get(place, (-1, 0.0)) for place in range(len(seen))]
-        columns = {
+        columns: dict[str, npt.NDArray[Any]] = {
             "robot": np.array([robot for robot, _ in who], dtype=np.int32),
             "x": np.array([one.x for one in seen], dtype=np.float64),
             "y": np.array([one.y for one in seen], dtype=np.float64),

@@ -15,6 +15,7 @@ from swarm_loc_estimator.io.watch.about import about
 from swarm_loc_estimator.io.watch.access import Access
 from swarm_loc_estimator.io.watch.frames import poses_frame, sightings_frame
 from swarm_loc_estimator.io.watch.server import Answer, Command, WatchServer
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 SWARM = Swarm(
     robots=(Robot("alpha"), Robot("beta"), Robot("gamma")),
@@ -40,7 +41,7 @@ class WatchedSwarm:
         self.commands.put(dict(command))
         answer(f"done: {command['do']}")
 
-    def publish(self, poses: np.ndarray[Any, Any] = PLACES, later_ns: int = 100_000_000) -> None:
+    def publish(self, poses: FloatArray = PLACES, later_ns: int = 100_000_000) -> None:
         """All robots at poses (3, 3) a while later, tracked but the last, which waits."""
         self.now_ns += later_ns
         shown = poses.copy()
