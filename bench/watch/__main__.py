@@ -5,8 +5,8 @@
 
 Latency is from the stamp of a pose, when it is published, through DDS, `watch_node`, the WebSocket and
 Chromium (without a window and without a GPU) to the task after the page was painted. The poses come from a
-stand-in for the estimator, `bench.watch.publisher`, at 20 Hz. The load of the real one is measured on bags that
-are played.
+stand-in for the estimator, `bench.watch.publisher`, at 20 Hz. The load of the real one is measured on bags
+that are played.
 """
 
 from __future__ import annotations
