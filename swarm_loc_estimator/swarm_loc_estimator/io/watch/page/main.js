@@ -123,13 +123,20 @@ class App {
   fit() {
     const xs = [], ys = [];
     for (const [, x, y] of this.swarm.landmarks) { xs.push(x); ys.push(y); }
-    const poses = this.store.at("poses", this.shownTime);
-    if (poses) for (let i = 0; i < this.count; i++) if (poses.columns.status[i]) { xs.push(poses.columns.x[i]); ys.push(poses.columns.y[i]); }
+    let located = false;
+    for (const time of [this.shownTime, this.store.range[1]]) { // a recording may begin with robots that all wait
+      const poses = located ? null : this.store.at("poses", time);
+      if (poses) for (let i = 0; i < this.count; i++) if (poses.columns.status[i]) {
+        xs.push(poses.columns.x[i]);
+        ys.push(poses.columns.y[i]);
+        located = true;
+      }
+    }
     if (!xs.length) return false;
     const low = (list) => list.reduce((a, b) => Math.min(a, b)), high = (list) => list.reduce((a, b) => Math.max(a, b));
     this.follow(false);
     this.view.fit([low(xs), low(ys), high(xs), high(ys)]);
-    return Boolean(poses);
+    return located;
   }
 
   follow(on) {

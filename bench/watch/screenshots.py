@@ -1,0 +1,96 @@
+"""Photograph the page for the documentation: ./run -- python -m bench.watch.screenshots [--out FOLDER].
+
+Five e-pucks and twenty Droplets as the bags of this repository hold them, and three hundred simulated robots,
+each replayed by the estimator and shown in Chromium as `report.html` shows it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from playwright.sync_api import Browser
+
+from bench.common import OUT
+from bench.watch.browser import WatchedPage, chromium, running_browser
+from swarm_loc_drivers.sim.recording.bag import write_bag
+from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
+from swarm_loc_estimator.cli.arguments import swarm_beside
+from swarm_loc_estimator.evaluation.replay import replay
+from swarm_loc_estimator.evaluation.report.recording import recorded
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.io.watch.page import page
+
+ROOT = OUT.parent
+FOLDER = ROOT / "swarm_loc_estimator" / "doc" / "watch"
+SIZE = (1200, 760)
+ROBOTS = 300
+_GRID_S = 8.0
+
+
+class Picture(NamedTuple):
+    """What to photograph.
+
+    Attributes:
+        name: Of the file.
+        bag: What was recorded.
+        share: At which part of the run.
+        theme: light or dark.
+        selected: The robot whose numbers are shown, -1 for none.
+    """
+
+    name: str
+    bag: Path
+    share: float
+    theme: str
+    selected: int
+
+
+def photograph(browser: Browser, picture: Picture, work: Path, out: Path) -> Path:
+    """Replay a bag and take its picture; returns the file."""
+    swarm = load_swarm(swarm_beside(picture.bag))
+    file = work / f"{picture.name}.html"
+    file.write_text(page(recorded(replay(picture.bag, swarm, keep_sightings=True))), encoding="utf-8")
+    shown = WatchedPage(browser, file.as_uri(), SIZE)
+    shown.until("watch.playing && watch.fitted")
+    shown.evaluate(f"{{ watch.setTheme('{picture.theme}'); watch.panel.select({picture.selected}) }}")
+    shown.evaluate(f"watch.seek({picture.share})")
+    shown.until("!watch.dirty && watch.panel.painted >= 0")
+    # trails of large swarms are painted at most once a second
+    shown.until("!watch.ground.stale")
+    path = out / f"{picture.name}.png"
+    shown.page.screenshot(path=path)
+    shown.close()
+    if shown.errors or shown.foreign:
+        raise RuntimeError(f"{picture.name}: {shown.errors} {shown.foreign}")
+    return path
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Take all pictures; the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--out", type=Path, default=FOLDER, help="folder for the pictures")
+    options = parser.parse_args(arguments)
+    executable = chromium()
+    if executable is None:
+        print("There is no Chromium here: apt-get install chromium.", file=sys.stderr)
+        return 1
+    options.out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder, running_browser(executable) as browser:
+        grid = Path(folder) / "grid"
+        write_bag(simulate_grid(GridSettings(robots=ROBOTS, duration_s=_GRID_S)), grid, f"{ROBOTS} robots.")
+        for picture in (
+            Picture("epucks", ROOT / "bags" / "eight_five_robots", 0.6, "light", 1),
+            Picture("droplets", ROOT / "bags" / "droplets_twenty", 0.7, "dark", -1),
+            Picture("robots300", grid, 0.9, "light", -1),
+        ):
+            print(photograph(browser, picture, Path(folder), options.out), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
