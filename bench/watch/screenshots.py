@@ -1,4 +1,4 @@
-"""Photograph the page for the documentation: ./run -- python -m bench.watch.screenshots [--out FOLDER].
+"""Photograph the page for the documentation: ./run -- python -m bench.watch.screenshots [--only NAME].
 
 Five e-pucks and twenty Droplets as the bags of this repository hold them, and three hundred simulated robots,
 each replayed by the estimator and shown in Chromium as `report.html` shows it.
@@ -74,6 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Take all pictures; the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder for the pictures")
+    parser.add_argument("--only", help="the one picture to take")
     options = parser.parse_args(arguments)
     executable = chromium()
     if executable is None:
@@ -88,6 +89,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             Picture("droplets", ROOT / "bags" / "droplets_twenty", 0.7, "dark", -1),
             Picture("robots300", grid, 0.9, "light", -1),
         ):
+            if options.only not in (None, picture.name):
+                continue
             print(photograph(browser, picture, Path(folder), options.out), flush=True)
     return 0
 

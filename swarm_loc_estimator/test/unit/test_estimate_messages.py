@@ -103,7 +103,7 @@ def test_of_each_pair_the_newest_measurement_is_told(told: list[tuple[int, int, 
         row["target"], row["landmark"] = (target, 0) if target >= 0 else (-1, -target)
     verdicts = np.array([verdict for *_, verdict in told], dtype=np.uint8)
     found = newest_sightings((rows, verdicts, np.ones(len(told))), 3 * SECOND)
-    expected = {(a, b): (at_ms, verdict) for at_ms, a, b, verdict in told if at_ms >= 2000}
+    expected = {(a, b): (at_ms, verdict) for at_ms, a, b, verdict in told if at_ms >= 1000}
     pairs = list(zip(found.observer.tolist(), found.target.tolist(), strict=True))
     assert sorted(pairs) == sorted(expected)
     for pair, age_s, verdict, nis in zip(pairs, found.age_s, found.verdict, found.nis, strict=True):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.core.estimation.fusion import Verdict
 from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray
 
-RECENT_NS = 1_000_000_000
+RECENT_NS = 2_000_000_000
 """Older measurements do not tell what a robot sees now."""
 _SHOWN = (int(Kind.CARTESIAN), int(Kind.POLAR))
 
@@ -36,7 +36,7 @@ class Sightings(NamedTuple):
 def newest_sightings(
     recent: tuple[MeasurementArray, NDArray[np.uint8], NDArray[np.float64]], now_ns: int
 ) -> Sightings:
-    """The newest measurement of each pair within the last second.
+    """The newest measurement of each pair within the last two seconds.
 
     Args:
         recent: Measurements (m,) in the order of their stamps, their verdicts and NIS.

@@ -36,7 +36,7 @@ class Ground {
     c.font = "11px system-ui, sans-serif";
     c.lineWidth = 1;
     c.beginPath();
-    const text = (value) => `${+value.toPrecision(6)} m`;
+    const text = (value) => `${+(Math.round(value / step) * step).toPrecision(6)} m`;
     for (let x = Math.ceil(left / step) * step; x < right; x += step) {
       const [u] = view.toScreen(x, 0);
       c.moveTo(u, 0);

@@ -135,7 +135,8 @@ class App {
     if (!xs.length) return false;
     const low = (list) => list.reduce((a, b) => Math.min(a, b)), high = (list) => list.reduce((a, b) => Math.max(a, b));
     this.follow(false);
-    this.view.fit([low(xs), low(ys), high(xs), high(ys)]);
+    const room = 2.5 * high(this.swarm.radius);
+    this.view.fit([low(xs) - room, low(ys) - room, high(xs) + room, high(ys) + room]);
     return located;
   }
 
