@@ -87,16 +87,13 @@ def figures_of(results: Mapping[str, Sequence[RunResult]]) -> dict[str, float]:
     """Medians over the runs of each kind."""
     figures: dict[str, float] = {}
     for name, runs in _mapped(results):
-        medians = {key: _median(runs, key) for key in _POSES}
-        medians["aligned_cm"] = _median(runs, "aligned_cm")
+        medians = {key: _median(runs, key) for key in (*_POSES, "aligned_cm", "coverage_90_s")}
         figures |= {f"{name}.{key}": value for key, value in medians.items() if math.isfinite(value)}
         figures[f"{name}.diverged"] = float(sum(one.is_diverged for one in runs))
         figures[f"{name}.online_diverged"] = float(sum(one.is_diverged_online for one in runs))
         figures[f"{name}.good_share"] = float(np.mean([one.is_good for one in runs]))
-        reached = [one.coverage_90_s for one in runs if math.isfinite(one.coverage_90_s)]
-        figures[f"{name}.coverage_90_share"] = len(reached) / len(runs)
-        if reached:
-            figures[f"{name}.coverage_90_s"] = _median(runs, "coverage_90_s")
+        reached = [math.isfinite(one.coverage_90_s) for one in runs]
+        figures[f"{name}.coverage_90_share"] = float(np.mean(reached))
     return figures
 
 

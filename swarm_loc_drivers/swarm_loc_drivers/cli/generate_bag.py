@@ -5,12 +5,13 @@
     generate_bag grid /tmp/grid100 --robots 100 --duration 20
     generate_bag droplets bags/droplets_twenty --seed 1 --duration 60
     generate_bag aerial bags/aerial_five --seed 1
+    generate_bag pushbots /tmp/hallway --robots 2 --duration 300 --plan office
     generate_bag droplets /tmp/same_boards --seed 2 --boards 1
 
 The bag holds <robot>/odom, <robot>/detections and <robot>/ground_truth; `swarm.yaml` lies inside its folder.
 `pictures` writes, in place of detections, what the cameras see: <robot>/image_raw/compressed (JPEG) and
 <robot>/camera_info. `droplets` writes <robot>/brightness and <robot>/fix in place of detections;
-`aerial` writes aerial/detections.
+`aerial` writes aerial/detections; `pushbots` writes <robot>/laser and <robot>/lights, beside them walls.csv.
 The same arguments give the same bytes.
 """
 
@@ -23,10 +24,12 @@ from typing import TYPE_CHECKING
 
 from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.droplet.world import DROPLET_WORLDS
+from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
 from swarm_loc_drivers.sim.recording.aerial_bag import write_aerial_bag
 from swarm_loc_drivers.sim.recording.bag import write_bag
 from swarm_loc_drivers.sim.recording.droplet_bag import write_droplet_bag
 from swarm_loc_drivers.sim.recording.image_bag import write_image_bag
+from swarm_loc_drivers.sim.recording.pushbot_bag import PushbotBagSettings, write_pushbot_bag
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.scenarios.droplet_run import DropletRunSettings, simulate_droplets
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
@@ -97,6 +100,11 @@ def _aerial(options: argparse.Namespace, comment: str) -> int:
     return write_aerial_bag(simulate_wandering(settings), options.bag, comment)
 
 
+def _pushbots(options: argparse.Namespace, comment: str) -> int:
+    settings = PushbotBagSettings(options.seed, options.duration, options.robots, options.plan, options.slip)
+    return write_pushbot_bag(settings, options.bag, comment)
+
+
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(
@@ -134,6 +142,10 @@ def _parser() -> argparse.ArgumentParser:
     aerial = _swarm(swarms, "aerial", "e-pucks that wander, seen from above", 5, 20, 60.0)
     aerial.set_defaults(write=_aerial)
     aerial.add_argument("--start-known", action="store_true", help="swarm.yaml tells the start poses")
+    pushbots = _swarm(swarms, "pushbots", "PushBots that map a hall", 1, 5, 300.0)
+    pushbots.set_defaults(write=_pushbots)
+    pushbots.add_argument("--plan", choices=sorted(FLOOR_PLANS), default="corridor", help="the hall")
+    pushbots.add_argument("--slip", type=number_in(0.0, 0.1), default=0.02, help="share of turns lost")
     grid = _swarm(swarms, "grid", "many robots, each about its cell of a grid", 100, 10_000, 20.0)
     grid.set_defaults(write=_grid)
     return parser

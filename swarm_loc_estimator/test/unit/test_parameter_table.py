@@ -10,6 +10,7 @@ import pytest
 from swarm_loc_estimator.cli.arguments import parameters_of
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
+from swarm_loc_estimator.nodes.mapper.mapper_parameters import MapperParameters
 from swarm_loc_estimator.nodes.player.player_parameters import PlayerParameters
 from swarm_loc_estimator.nodes.watch.markers_parameters import MarkersParameters
 from swarm_loc_estimator.nodes.watch.watch_parameters import WatchParameters
@@ -30,6 +31,7 @@ DOC = Path(__file__).parents[2] / "doc"
     [
         ("estimator_node.md", EstimatorParameters),
         ("play.md", PlayerParameters),
+        ("mapper_node.md", MapperParameters),
         ("watch.md", WatchParameters),
         ("watch.md", MarkersParameters),
     ],

@@ -76,6 +76,8 @@ class Exploration:
         robots: Those that have joined, by number.
         arrivals: All stops so far.
         cpu_s: Time that the mapper needed.
+        starts: (3,) where the mapper was told that each robot starts.
+        on_readings: Is told of all that each robot reads.
     """
 
     plan: FloorPlan
@@ -85,6 +87,8 @@ class Exploration:
     robots: dict[int, KinematicPushBot] = field(default_factory=dict)
     arrivals: list[Arrival] = field(default_factory=list)
     cpu_s: float = 0.0
+    starts: dict[int, FloatArray] = field(default_factory=dict)
+    on_readings: Callable[[int, Readings, LightSightings | None], None] | None = None
     _odometry: dict[int, FloatArray] = field(default_factory=dict)
 
     def join(self, noise: PushBotNoise) -> int:
@@ -94,6 +98,7 @@ class Exploration:
         sigma = START_SIGMA if count else FIRST_SIGMA
         known = pose + sigma * self.rng.standard_normal(3) if count else pose
         robot = self.mapper.join(known, sigma)
+        self.starts[robot] = known
         self.robots[robot] = KinematicPushBot(self.plan, pose, noise, self.rng)
         self._odometry[robot] = np.zeros(3)
         return robot
@@ -140,6 +145,8 @@ class Exploration:
         self._odometry[robot] = readings.odometry[-1]
         others = {key: one for key, one in self.robots.items() if key != robot}
         sightings = self.robots[robot].lights(readings, others) if self.use_lights and others else None
+        if self.on_readings is not None:
+            self.on_readings(robot, readings, sightings)
         begin_s = time.process_time()
         self.mapper.add_readings(robot, readings)
         if sightings is not None:

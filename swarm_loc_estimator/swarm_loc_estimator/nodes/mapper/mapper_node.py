@@ -26,6 +26,7 @@ from std_srvs.srv import Trigger
 
 from swarm_loc_estimator.core.mapping.grid.occupancy import CELL, OccupancyMap
 from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.io.maps.led_frequencies import led_frequencies
 from swarm_loc_estimator.io.maps.map_file import MapFileError, load_map, save_map
 from swarm_loc_estimator.io.maps.mapper_feed import MapperFeed, MapperInput
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
@@ -38,7 +39,6 @@ from swarm_loc_estimator.nodes.mapper.map_messages import (
 from swarm_loc_estimator.nodes.mapper.mapper_parameters import (
     MapperParameters,
     chosen_robots,
-    led_frequencies,
 )
 from swarm_loc_estimator.ros.running import ConfiguredNode, run_node
 from swarm_loc_estimator.ros.topic_graph import TopicGraph
@@ -166,7 +166,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
             words = ", ".join(f"{count} {reason}" for reason, count in drops.items())
             self.get_logger().warning(f"dropped so far: {words}", throttle_duration_sec=_THROTTLE_S)
         graph, counters = self._mapper.graph, self._mapper.counters
-        values = {"stops": graph.count, "bearings of lights": graph.constraints.bearing_count, **counters}
+        values = {"stops": graph.count, "bearings": graph.constraints.bearing_count, **counters}
         values |= {f"dropped: {reason}": count for reason, count in drops.items()}
         for kind in MapperInput:
             count = sum(self.feed.received[index, kind] for index in range(len(self._robots)))

@@ -1,0 +1,70 @@
+"""The measures of maps."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from bench.pushbot.mapping import MappingEffort, figures_of, planned
+from bench.pushbot.runs import RunResult, RunSettings, coverage, rigid_fit, run, wall_distance_cm
+from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
+
+
+def test_a_rigid_fit_undoes_a_motion() -> None:
+    points = np.random.default_rng(1).normal(size=(20, 2))
+    angle = 0.3
+    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    found, shift = rigid_fit(points, points @ rotation.T + [1.0, -2.0])
+    assert np.allclose(found, rotation)
+    assert np.allclose(shift, [1.0, -2.0])
+
+
+def test_walls_are_covered_by_cells_on_them() -> None:
+    plan = floor_plan("ring")
+    points = plan.wall_points(0.04)
+    assert coverage(points, points) == 1.0
+    assert coverage(np.zeros((0, 2)), points) == 0.0
+    assert coverage(points + 1.0, points) < 0.3
+    assert wall_distance_cm(points, plan) < 0.6
+    inside = np.array([[0.75, 0.75]])
+    assert wall_distance_cm(inside, plan) == pytest.approx(75.0, abs=1.0)
+
+
+def test_every_kind_of_run_is_planned() -> None:
+    jobs = planned(MappingEffort(20, 3, 20.0, 2))
+    assert [len(jobs[name]) for name in ("corridor", "office", "ring", "five_robots")] == [20, 20, 20, 3]
+    assert {one.slip for one in jobs["ring"]} == {0.0, 0.02, 0.05}
+    assert len({one.seed for one in jobs["ring"]}) == 20
+    assert jobs["five_robots"][0].minutes == 10.0
+
+
+def _result(seed: int, **values: float) -> RunResult:
+    given = {"position_cm": 1.0, "heading_deg": 0.1, "worst_cm": 5.0, "online_position_cm": 2.0}
+    given |= {"online_worst_cm": 9.0, "aligned_cm": 1.0, "wall_cm": 2.0, "wall_aligned_cm": 1.0}
+    given |= {"coverage": 1.0, "coverage_90_s": math.nan, "cpu_s_per_s": 0.01, **values}
+    settings, empty = RunSettings("ring", 0.0, seed), np.zeros((0, 2))
+    return RunResult(settings=settings, bumps=0, cells=empty, path=empty, **given)  # type: ignore[arg-type]
+
+
+def test_figures_count_what_diverged_and_what_never_came() -> None:
+    runs = [_result(1), _result(2, worst_cm=31.0), _result(3, online_worst_cm=40.0, coverage_90_s=200.0)]
+    figures = figures_of({"ring": runs, "speed1": runs})
+    assert figures["ring.diverged"] == 1.0
+    assert figures["ring.online_diverged"] == 1.0
+    assert figures["ring.good_share"] == 1.0
+    assert figures["ring.coverage_90_share"] == pytest.approx(1 / 3)
+    assert "ring.coverage_90_s" not in figures  # most runs never came so far
+    assert all(math.isfinite(value) for value in figures.values())
+    assert not any(name.startswith("speed1") for name in figures)
+
+
+def test_a_short_run_is_scored_and_comes_out_the_same_twice() -> None:
+    settings = RunSettings("office", 0.02, 5, minutes=2.0)
+    first, second = run(settings), run(settings)
+    assert first.position_cm == second.position_cm
+    assert first.worst_cm < 30.0
+    assert 0.05 < first.coverage < 0.9
+    assert first.wall_aligned_cm < 4.0
+    assert np.array_equal(first.cells, second.cells)

@@ -1,0 +1,139 @@
+"""PushBots in floor plans: rays, motion and readings, a short exploration, and its bag through the mapper."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from swarm_loc_drivers.sim.pushbot.exploration import Exploration
+from swarm_loc_drivers.sim.pushbot.floor_plan import (
+    FLOOR_PLANS,
+    FloorPlan,
+    FloorPlanError,
+    floor_plan,
+    outline,
+    polygon,
+)
+from swarm_loc_drivers.sim.pushbot.kinematics import KinematicPushBot, PushBotNoise
+from swarm_loc_drivers.sim.pushbot.ray_casting import clearance, is_visible, ray_distance
+from swarm_loc_drivers.sim.recording.pushbot_bag import PushbotBagSettings, write_pushbot_bag
+from swarm_loc_estimator.cli.replay_map import main as replay_map
+from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+ROOM = FloorPlan("room", outline([(0, 0, 4, 3)], [(2, 1, 2.5, 2)]), np.array([[1.0, 1.5], [3.5, 1.5]]))
+EXACT = PushBotNoise(turn=0.0, distance=0.0, heading=0.0, pixel=1e-9, dropout=0.0, outlier=0.0, bearing=1e-9)
+
+
+def robot(noise: PushBotNoise, heading: float = 0.0, seed: int = 1) -> KinematicPushBot:
+    return KinematicPushBot(ROOM, np.array([1.0, 1.5, heading]), noise, np.random.default_rng(seed))
+
+
+def test_rays_end_at_walls_and_robots() -> None:
+    discs = np.array([[1.0, 2.5]])
+    assert ray_distance(ROOM.walls, discs, 0.06, 1.0, 1.5, 0.0) == pytest.approx(1.0)
+    assert ray_distance(ROOM.walls, discs, 0.06, 1.0, 1.5, math.pi / 2) == pytest.approx(0.94)
+    assert ray_distance(ROOM.walls, discs, 0.06, 1.0, 1.5, math.pi) == pytest.approx(1.0)
+    assert clearance(ROOM.walls, discs, 0.06, 1.8, 1.5) == pytest.approx(0.2)
+    assert clearance(ROOM.walls, discs, 0.06, 1.0, 2.3) == pytest.approx(0.14)
+    assert is_visible(ROOM.walls, 1.0, 2.5, 3.5, 2.5)
+    assert not is_visible(ROOM.walls, 1.0, 1.5, 3.5, 1.5)
+
+
+def test_rays_end_at_slanted_walls() -> None:
+    walls = polygon([(0, 0), (2, 0), (0, 2)])
+    assert ray_distance(walls, np.zeros((0, 2)), 0.06, 0.5, 0.5, math.pi / 4) == pytest.approx(math.sqrt(0.5))
+
+
+@pytest.mark.parametrize("name", sorted(FLOOR_PLANS))
+def test_robots_start_inside_closed_halls(name: str) -> None:
+    plan = floor_plan(name)
+    nobody = np.zeros((0, 2))
+    for x, y in plan.starts:
+        assert clearance(plan.walls, nobody, 0.0, x, y) > 0.3
+        assert all(
+            math.isfinite(ray_distance(plan.walls, nobody, 0.0, x, y, a)) for a in np.linspace(0, 6, 50)
+        )
+    lengths = np.hypot(*(plan.walls[:, 2:] - plan.walls[:, :2]).T)
+    assert len(plan.wall_points(0.1)) >= lengths.sum() / 0.1
+
+
+def test_an_unknown_hall_is_told() -> None:
+    with pytest.raises(FloorPlanError, match="no floor plan 'cave'; there are corridor,"):
+        floor_plan("cave")
+
+
+def test_turns_are_short_by_the_slip_and_distances_exact_without_noise() -> None:
+    body = robot(EXACT)
+    readings = body.turn(math.pi, [])
+    assert body.pose[2] == pytest.approx(math.pi)
+    assert 1.0 / readings.inverse[-1] == pytest.approx(1.0)
+    slips = robot(PushBotNoise(slip=0.05, turn=0.0))
+    slips.turn(2.0, [])
+    assert slips.pose[2] == pytest.approx(1.9)
+    assert readings.stamp_ns[0] == 20_000_000
+    assert body.time_s == pytest.approx(len(readings.stamp_ns) * 0.02)
+
+
+def test_noise_is_as_strong_as_it_says() -> None:
+    turns = [robot(PushBotNoise(), seed=seed) for seed in range(300)]
+    for one in turns:
+        one.turn(2.0 * math.pi, [])
+    spread = np.degrees(np.std([one.pose[2] for one in turns]))
+    assert spread == pytest.approx(0.64, rel=4.0 / math.sqrt(2 * 300))
+    readings = robot(PushBotNoise(dropout=0.1)).turn(1e-6, [])
+    assert len(readings.stamp_ns) == 1
+    still = robot(PushBotNoise(dropout=0.1, outlier=0.0)).rest(60.0, [])
+    seen = still.inverse[still.inverse > 0.0]
+    assert 1.0 - len(seen) / len(still.inverse) == pytest.approx(0.1, abs=4.0 * math.sqrt(0.09 / 3000))
+    assert seen.std() == pytest.approx(still.sigma, rel=4.0 / math.sqrt(2.0 * len(seen)))
+
+
+def test_walls_and_robots_stop_a_drive_and_odometry_knows() -> None:
+    body = robot(EXACT)
+    readings = body.drive(2.0, [])
+    assert body.bumps == 1
+    assert body.pose[0] == pytest.approx(2.0 - 0.06, abs=0.005)
+    assert readings.odometry[-1, 0] == pytest.approx(body.pose[0] - 1.0, abs=1e-9)
+
+
+def test_lights_are_seen_in_front_and_not_behind_walls() -> None:
+    other = KinematicPushBot(ROOM, np.array([1.0, 2.5, 0.0]), EXACT, np.random.default_rng(2))
+    body = robot(EXACT, math.pi / 2 - 0.2)
+    seen = body.lights(body.rest(0.1, [other]), {7: other})
+    assert (seen.target == 7).all()
+    assert len(seen.stamp_ns) == 5
+    assert np.allclose(seen.bearing, 0.2, atol=0.05)  # one of two lights beside its middle
+    away = robot(EXACT, -math.pi / 2)
+    assert not len(away.lights(away.rest(0.1, [other]), {7: other}).stamp_ns)
+
+
+@pytest.mark.parametrize(("plan", "seed"), [("corridor", 1), ("tee", 2)])
+def test_two_robots_explore_a_hall(plan: str, seed: int) -> None:
+    mapper = CooperativeMapper()
+    exploration = Exploration(floor_plan(plan), mapper, np.random.default_rng(seed))
+    for slip in (0.0, 0.03):
+        exploration.join(PushBotNoise(slip=slip))
+    exploration.run(100.0)
+    errors: FloatArray = np.array([one.online - one.truth for one in exploration.arrivals])
+    assert {one.robot for one in exploration.arrivals} == {0, 1}
+    assert len(errors) > 10
+    assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.3
+    assert abs(mapper.graph.slip - [0.0, 0.03]).max() < 0.005
+
+
+def test_a_bag_gives_the_same_map_twice(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    count = write_pushbot_bag(PushbotBagSettings(3, 50.0, 1, "corridor", 0.02), bag, "Of a test.")
+    assert count > 2 * 50 * 50
+    files = []
+    for name in ("a", "b"):
+        out = tmp_path / name
+        arguments = [str(bag), "--out", str(out), "--walls", str(bag / "walls.csv"), "--led", "pushbot1=1000"]
+        assert replay_map(arguments) == 0
+        files.append({path.name: path.read_bytes() for path in out.iterdir()})
+    assert files[0] == files[1]
+    assert set(files[0]) == {"map.yaml", "map.pgm", "map.png", "stops.csv"}

@@ -1,0 +1,107 @@
+"""Make the map of a bag with laser distances and odometry, and draw it.
+
+    replay_map recording --out out/hall
+    replay_map recording --swarm swarm.yaml --walls walls.csv --led pushbot1=1000 --led pushbot2=1050
+
+The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. The map goes
+to OUT/map.yaml and OUT/map.pgm, a picture of it to OUT/map.png, the robots' stops to OUT/stops.csv. The same
+bag gives the same files, byte for byte. --walls draws a floor plan below the map: a line x0,y0,x1,y1 [m] a
+wall.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from swarm_loc_estimator.cli.arguments import add_bag, add_set, folder_to_write, parameters_of, swarm_beside
+from swarm_loc_estimator.cli.errors import exit_with_message
+from swarm_loc_estimator.cli.progress import ProgressLine
+from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.core.mapping.settings import MapperSettings
+from swarm_loc_estimator.evaluation.map_replay import replay_map
+from swarm_loc_estimator.evaluation.report.map_picture import draw_map
+from swarm_loc_estimator.io.maps.led_frequencies import led_frequencies
+from swarm_loc_estimator.io.maps.map_file import save_map
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.parameters.errors import UserError
+
+
+class WallsError(UserError):
+    """A file of walls that cannot be used; the message is one sentence."""
+
+
+@exit_with_message
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    options = _parser().parse_args(arguments)
+    settings = parameters_of(MapperSettings, options.set)
+    swarm = load_swarm(options.swarm or swarm_beside(options.bag))
+    walls = read_walls(options.walls) if options.walls else np.zeros((0, 4))
+    frequencies = led_frequencies(options.led, swarm.index_of)
+    with ProgressLine() as progress:
+        mapper, feed = replay_map(options.bag, swarm.robots, settings, frequencies, progress)
+    missing = list(feed.missing())
+    if not mapper.graph.count:
+        print(
+            f"There is no map: nothing usable came on {', '.join(missing) or 'the topics'}.", file=sys.stderr
+        )
+        return 1
+    path, image = save_map(mapper.occupancy(), options.out / "map")
+    picture = draw_map(mapper.occupancy(), mapper.graph.poses, walls, options.out / "map.png")
+    numbers = {robot.name: feed.number(index) for index, robot in enumerate(swarm.robots)}
+    name_of = {number: name for name, number in numbers.items() if number is not None}
+    write_stops(mapper, name_of, options.out / "stops.csv")
+    for reason, count in feed.all_drops.items():
+        print(f"dropped: {count} {reason}")
+    print(f"{mapper.graph.count} stops; map: {path}, {image}; picture: {picture}")
+    return 0
+
+
+def read_walls(path: Path) -> FloatArray:
+    """Walls (S, 4) from lines x0,y0,x1,y1 [m].
+
+    Raises:
+        WallsError: The file cannot be read, or is no such table.
+    """
+    try:
+        walls = np.loadtxt(path, delimiter=",", ndmin=2)
+    except OSError as error:
+        raise WallsError(f"The walls '{path}' cannot be read: {error.strerror or error}.") from error
+    except ValueError as error:
+        raise WallsError(f"'{path}' is no table of x0,y0,x1,y1.") from error
+    if walls.ndim != 2 or walls.shape[1] != 4 or not np.isfinite(walls).all():
+        raise WallsError(f"'{path}' is no table of x0,y0,x1,y1.")
+    return walls
+
+
+def write_stops(mapper: CooperativeMapper, name_of: Mapping[int, str], path: Path) -> None:
+    """Write where the robots stopped: robot, x, y, theta on arrival."""
+    robots = mapper.graph.robot[: mapper.graph.count].tolist()
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["robot", "x_m", "y_m", "theta_rad"])
+        for robot, pose in zip(robots, mapper.graph.poses.tolist(), strict=True):
+            writer.writerow([name_of[robot], *pose])
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="replay_map", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_bag(parser)
+    parser.add_argument("--out", type=folder_to_write, default="out/map", help="folder for map and picture")
+    parser.add_argument("--walls", type=Path, help="floor plan to draw below the map: x0,y0,x1,y1 a line")
+    parser.add_argument("--led", action="append", default=[], metavar="ROBOT=HZ", help="frequency of LEDs")
+    add_set(parser, "a number of the mapper; may be given several times")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())
