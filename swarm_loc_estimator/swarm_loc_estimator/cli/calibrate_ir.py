@@ -2,6 +2,7 @@
 
     calibrate_ir bags/droplets_twenty
     calibrate_ir recording.mcap --swarm swarm.yaml --out calibrated.yaml --without-truth
+    calibrate_ir bags/droplets_real --board out/board.yaml --out out/swarm.yaml
 
 The bag holds <robot>/brightness. Where it has <robot>/ground_truth, that is used, but it can do without: then
 the poses are sought together with the gains. The description is the `swarm.yaml` inside the bag's folder
@@ -15,12 +16,16 @@ import argparse
 import sys
 from collections.abc import Sequence
 
+from swarm_loc_estimator.calibration.infrared.board_plots import board_text, draw_board
+from swarm_loc_estimator.calibration.infrared.board_recording import calibrate_from, with_board
 from swarm_loc_estimator.calibration.infrared.gains import calibrate_infrared
 from swarm_loc_estimator.calibration.infrared.plots import draw, text_of
 from swarm_loc_estimator.calibration.recording import read_recording
 from swarm_loc_estimator.cli.arguments import add_bag, swarm_beside, yaml_to_write
 from swarm_loc_estimator.cli.errors import exit_with_message
 from swarm_loc_estimator.cli.progress import ProgressLine
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.io.swarm.board_writer import save_ir_platform
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
 
@@ -30,12 +35,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
     swarm = load_swarm(options.swarm or swarm_beside(options.bag))
+    if options.board is not None:
+        return _board(options, swarm)
     with ProgressLine() as progress:
         recording = read_recording(options.bag, swarm, progress)
         done = calibrate_infrared(recording, swarm, progress, with_truth=not options.without_truth)
     save_swarm(done.swarm, options.out, f"Infrared gains calibrated with {options.bag.name}.")
     print("\n".join([text_of(done), *recording.remarks]))
     print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
+    return 0
+
+
+def _board(options: argparse.Namespace, swarm: Swarm) -> int:
+    """Find what the board is, and write it and the swarm description with it."""
+    with ProgressLine() as progress:
+        recording = read_recording(options.bag, swarm, progress)
+        board, done = calibrate_from(recording, swarm, progress)
+    said = f"Infrared board calibrated with {options.bag.name}."
+    save_ir_platform(done.model.platform, options.board, said)
+    save_swarm(with_board(swarm, board, done, options.board), options.out, said)
+    print(board_text(board, done, swarm))
+    picture = draw_board(board, done, options.board.with_suffix(".png"))
+    print(f"{options.board} and {options.out} written, picture: {picture}")
     return 0
 
 
@@ -50,6 +71,11 @@ def _parser() -> argparse.ArgumentParser:
         type=yaml_to_write,
         default="out/calibrated_ir.yaml",
         help="swarm description to write (default out/calibrated_ir.yaml)",
+    )
+    parser.add_argument(
+        "--board",
+        type=yaml_to_write,
+        help="find what the board itself is, by ground truth, and write it to this file",
     )
     parser.add_argument("--without-truth", action="store_true", help="do as if there were no ground truth")
     return parser

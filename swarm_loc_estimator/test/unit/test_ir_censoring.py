@@ -61,7 +61,8 @@ def test_the_cost_is_that_of_the_likelihood_with_tails_integrated(seed: int) -> 
     kinds = np.where(readings >= LIMIT, SATURATED, MEASURED).astype(np.int8)
     assert (kinds == SATURATED).any()
     ones, room = np.ones(6), new_scratch(2, 6, False)
-    pair = Pair(readings, np.full(2, LIMIT), kinds, ones, ones, np.zeros((2, 2)), 0.044, 1.0)
+    stable = np.minimum(readings, LIMIT) / droplet().noise
+    pair = Pair(readings, stable, np.full(2, LIMIT), kinds, ones, ones, np.zeros((2, 2)), 0.044, 1.0)
     rng = np.random.default_rng(seed)
     for scale in (0.0, 0.003, 0.01, 0.03):
         at = pose[0] + scale * np.array([0.1, 1.0, 1.0]) * rng.standard_normal(3)

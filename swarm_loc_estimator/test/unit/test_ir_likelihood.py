@@ -269,7 +269,8 @@ def test_the_costs_gradient_is_its_slope(seed: int) -> None:
     kinds = np.where(readings >= 255.0, SATURATED, MEASURED).astype(np.int8)
     prior = np.array([[100.0, 0.1], [50.0, 0.15]])
     gains = rng.uniform(0.9, 1.1, (2, 6))
-    pair = Pair(readings, np.full(2, 255.0), kinds, gains[0], gains[1], prior, 0.044, 1.0)
+    stable = np.minimum(readings, 255.0) / droplet().noise
+    pair = Pair(readings, stable, np.full(2, 255.0), kinds, gains[0], gains[1], prior, 0.044, 1.0)
     at = np.concatenate([0.05 * rng.standard_normal(12), pose[0] * [1.01, 1.0, 1.0] + [0.0, 0.01, 0.02]])
     _, gradient, hessian = cost_at(pair, at)
     for p in range(at.size):

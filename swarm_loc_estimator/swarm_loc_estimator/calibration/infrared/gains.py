@@ -93,7 +93,7 @@ def calibrate_infrared(
     groups, dropped = _groups(recording, swarm, with_truth=with_truth)
     remarks = [f"Matrices not used: {_counts(dropped)}."] if dropped else []
     boards: list[BoardFit] = []
-    for number, group in enumerate(groups):
+    for number, (group, _) in enumerate(groups):
         try:
             boards.append(BoardFit(group, _fit(group, _Share(progress, number, len(groups)))))
         except (CalibrationError, GainsError) as error:
@@ -105,6 +105,16 @@ def calibrate_infrared(
     if sum(map(len, left.values())) == sum(len(board.group.robots) for board in boards):
         raise CalibrationError(f"recording '{recording.name}': {' '.join(remarks)}")
     return InfraredCalibration(replace(swarm, robots=robots), tuple(boards), tuple(remarks))
+
+
+def exchanges_of(recording: Recording, swarm: Swarm) -> tuple[BoardGroup, IntArray]:
+    """What the robots with the first kind of board read of each other, and the stamps (k,).
+
+    Raises:
+        CalibrationError: Nothing can be used.
+    """
+    (group, stamps_ns), *_ = _groups(recording, swarm, with_truth=True)[0]
+    return group, stamps_ns
 
 
 def rms(residuals: FloatArray) -> float:
@@ -137,8 +147,10 @@ def _fit(group: BoardGroup, progress: _Share) -> GainsFit:
     return estimate_gains(group.platform, len(group.robots), group.exchanges, progress)
 
 
-def _groups(recording: Recording, swarm: Swarm, *, with_truth: bool) -> tuple[list[BoardGroup], Counter[str]]:
-    """Exchanges by kind of board, and which matrices could not be used.
+def _groups(
+    recording: Recording, swarm: Swarm, *, with_truth: bool
+) -> tuple[list[tuple[BoardGroup, IntArray]], Counter[str]]:
+    """Exchanges by kind of board with their stamps, and which matrices could not be used.
 
     Raises:
         CalibrationError: None could be used.
@@ -166,7 +178,7 @@ def _groups(recording: Recording, swarm: Swarm, *, with_truth: bool) -> tuple[li
         readings, saturation = screening.together(members[0], [exchanges[key] for key in own])
         board = screening.boards[members[0]]
         read = Exchanges(place[0], place[1], readings, saturation, poses)
-        groups.append(BoardGroup(board.source, board.platform, tuple(members), read))
+        groups.append((BoardGroup(board.source, board.platform, tuple(members), read), columns[0]))
     return groups, screening.dropped
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from swarm_loc_estimator.core.infrared.board import IrGains, IrPlatform
@@ -26,6 +26,8 @@ class RobotIr:
         source: Name of a packaged platform, or absolute path of the file that it comes from.
         estimator: How what it reads becomes a pose.
         gains: What is known of its elements; None: never calibrated.
+        dead_sensors: Numbers of sensors whose readings mean nothing.
+        dead_emitters: Likewise of emitters.
     """
 
     id: int
@@ -33,6 +35,8 @@ class RobotIr:
     source: str
     estimator: IrMethod = IrMethod.LIKELIHOOD
     gains: IrGains | None = None
+    dead_sensors: tuple[int, ...] = ()
+    dead_emitters: tuple[int, ...] = ()
     gate_probability: float = number(
         0.9999, "1", 0.5, 1.0, "share of good measurements that must pass the gate; 1 passes all"
     )
@@ -40,4 +44,5 @@ class RobotIr:
     @property
     def believed_gains(self) -> IrGains:
         """The gains to reckon with."""
-        return self.gains or IrGains.unknown(self.platform)
+        gains = self.gains or IrGains.unknown(self.platform)
+        return replace(gains, dead_sensors=self.dead_sensors, dead_emitters=self.dead_emitters)

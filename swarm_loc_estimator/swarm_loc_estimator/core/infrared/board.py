@@ -43,8 +43,11 @@ class IrModel(NamedTuple):
         amplitudes: (modes, 5) the fields of `Amplitude`.
         saturation: A reading tells no more from here on [count].
         noise: Of every reading, one standard deviation [count].
-        relative_noise: Of every reading besides, relative to it [1].
+        relative: By how much a reading is off besides, relative to its expectation [1].
+        lasting: The share of this in variance that is the same every time.
         blocked: The scale on which the cost of a reading that may be blocked ends; infinite: none is.
+        bright: Likewise of one that may be too bright.
+        scale: What covariances are multiplied by.
     """
 
     radius: float
@@ -55,8 +58,11 @@ class IrModel(NamedTuple):
     amplitudes: FloatArray
     saturation: float
     noise: float
-    relative_noise: float
+    relative: float
+    lasting: float
     blocked: float
+    bright: float
+    scale: float
 
 
 @dataclass(frozen=True)
@@ -84,8 +90,17 @@ class IrPlatform:
     )
     noise: float = number(1.0, "count", 0.0, 1e6, "standard deviation of every reading", above=True)
     relative_noise: float = number(0.0, "1", 0.0, 1.0, "noise besides, relative to the reading")
+    curve_sigma: float = number(
+        0.0, "1", 0.0, 1.0, "how far readings are off the curves, relative, the same every time"
+    )
     blocked_share: float = number(
         0.02, "1", 0.0, 0.5, "share of readings that something in between darkens; 0: none ever"
+    )
+    bright_share: float = number(
+        0.0, "1", 0.0, 0.5, "share of readings that show light which the model has not; 0: none ever"
+    )
+    covariance_scale: float = number(
+        1.0, "1", 1.0, 1e3, "what covariances are multiplied by, since errors have longer tails than noise"
     )
     element_sigma: float = number(
         0.1, "1", 0.0, 1.0, "how much elements differ, relative, one standard deviation; 0: not at all"
@@ -117,6 +132,11 @@ class IrPlatform:
         """The names of its powers, in the order of readings' first axis."""
         return POWERS[: len(self.amplitudes)]
 
+    @property
+    def relative(self) -> float:
+        """By how much readings are off besides `noise`, relative, one standard deviation."""
+        return math.hypot(self.relative_noise, self.curve_sigma)
+
     @cached_property
     def model(self) -> IrModel:
         """What compiled code reads."""
@@ -131,8 +151,10 @@ class IrPlatform:
             np.array(laws),
             self.saturation,
             self.noise,
-            self.relative_noise,
-            -math.log(self.blocked_share) if self.blocked_share else math.inf,
+            self.relative,
+            (self.curve_sigma / self.relative) ** 2 if self.relative else 0.0,
+            *(-math.log(share) if share else math.inf for share in (self.blocked_share, self.bright_share)),
+            self.covariance_scale,
         )
 
     def unknown_gains(self, count: int) -> PairGains:
@@ -150,15 +172,19 @@ class IrGains:
     Attributes:
         sensor: (n,) factors of the sensors [1].
         emitter: (n,) factors of the emitters [1].
+        dead_sensors: Numbers of sensors whose readings mean nothing.
+        dead_emitters: Likewise of emitters.
 
     Raises:
-        IrPlatformError: A factor is not in [0.05, 20], or sizes differ.
+        IrPlatformError: A factor is not in [0.05, 20], sizes differ, or there is no such element.
     """
 
     sensor: tuple[float, ...]
     emitter: tuple[float, ...]
     sigma: float = number(0.0, "1", 0.0, 1.0, "how unsure each factor still is, relative, by itself")
     common_sigma: float = number(0.0, "1", 0.0, 1.0, "how unsure all of a robot's factors are together")
+    dead_sensors: tuple[int, ...] = ()
+    dead_emitters: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.sensor) != len(self.emitter):
@@ -173,6 +199,11 @@ class IrGains:
                     raise IrPlatformError(
                         f"gains.{name} has {value:g} but factors must lie in [{low:g}, {high:g}]."
                     )
+        for name in ("dead_sensors", "dead_emitters"):
+            if wrong := [k for k in getattr(self, name) if not 0 <= k < len(self.sensor)]:
+                raise IrPlatformError(
+                    f"{name} has {wrong[0]} but elements are numbered 0 to {len(self.sensor) - 1}."
+                )
         check_numbers(self, "gains.")
 
     @classmethod
@@ -186,8 +217,8 @@ class PairGains(NamedTuple):
     """Gains of k pairs of robots, as the models take them.
 
     Attributes:
-        sensor: (k, n) of each receiver's sensors.
-        emitter: (k, n) of each transmitter's emitters.
+        sensor: (k, n) of each receiver's sensors; NaN: dead, what it reads means nothing.
+        emitter: (k, n) of each transmitter's emitters; NaN: likewise.
         sigma: (k, 4) own and common sigma of the receiver's sensors, then of the transmitter's emitters.
     """
 
@@ -200,7 +231,14 @@ class PairGains(NamedTuple):
         """Of pairs."""
         pairs = list(zip(receivers, transmitters, strict=True))
         return cls(
-            np.array([r.sensor for r, _ in pairs]),
-            np.array([t.emitter for _, t in pairs]),
+            _without(np.array([r.sensor for r, _ in pairs]), [r.dead_sensors for r, _ in pairs]),
+            _without(np.array([t.emitter for _, t in pairs]), [t.dead_emitters for _, t in pairs]),
             np.array([(r.sigma, r.common_sigma, t.sigma, t.common_sigma) for r, t in pairs]),
         )
+
+
+def _without(factors: FloatArray, dead: list[tuple[int, ...]]) -> FloatArray:
+    """Factors (k, n) with NaN for elements that are dead."""
+    for row, elements in zip(factors, dead, strict=True):
+        row[list(elements)] = np.nan
+    return factors

@@ -21,7 +21,7 @@ def information(platform: IrPlatform, poses: ArrayLike) -> FloatArray:
     variable that is cut off: all of it below, and beyond only on which side it is.
     """
     bright, slopes = expected_with_slopes(platform, poses)
-    sigma = np.hypot(platform.noise, platform.relative_noise * np.clip(bright, 0.0, platform.saturation))
+    sigma = np.hypot(platform.noise, platform.relative * np.clip(bright, 0.0, platform.saturation))
     z = np.clip((platform.saturation - bright) / sigma, -_FAR, _FAR)
     density = np.exp(-(z**2) / 2.0) / np.sqrt(2.0 * np.pi)
     share = ndtr(z) - z * density + density**2 / ndtr(-z)

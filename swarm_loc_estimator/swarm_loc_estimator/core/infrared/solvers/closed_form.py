@@ -91,7 +91,7 @@ class ClosedForm:
         factors = np.exp(sigma * rng.standard_normal((2, count, platform.n)))
         differing = PairGains(factors[0], factors[1], np.zeros((count, 4)))
         readings = expected(platform, poses, differing)
-        spread = np.hypot(platform.noise, platform.relative_noise * readings)
+        spread = np.hypot(platform.noise, platform.relative * readings)
         readings = np.minimum(readings + spread * rng.standard_normal(readings.shape), platform.saturation)
         found, outcomes = np.zeros_like(poses), np.zeros(count, np.int64)
         _solve_all(platform.model, *checked(platform, readings, None, None), found, outcomes)
@@ -122,7 +122,7 @@ def _solve_all(
 ) -> None:
     """All pairs, one after the other."""
     n = readings.shape[2]
-    matrix, light = np.empty((n, n)), np.empty((2, n))
+    matrix, sums = np.empty((n, n)), np.empty((2, n))
     for k in range(readings.shape[0]):
         mode = _best_power(model, readings[k], saturation[k])
         if mode < 0:
@@ -131,9 +131,10 @@ def _solve_all(
         for i in range(n):
             for j in range(n):
                 reading = readings[k, mode, i, j]
-                light_there = math.isfinite(reading) and reading > DARKEST * model.noise
-                matrix[i, j] = reading / (gains.sensor[k, i] * gains.emitter[k, j]) if light_there else 0.0
-        outcomes[k] = _solve_one(model, model.amplitudes[mode], matrix, light, poses[k])
+                light = reading / (gains.sensor[k, i] * gains.emitter[k, j])  # NaN where one is dead
+                light_there = math.isfinite(light) and reading > DARKEST * model.noise
+                matrix[i, j] = light if light_there else 0.0
+        outcomes[k] = _solve_one(model, model.amplitudes[mode], matrix, sums, poses[k])
 
 
 @compiled

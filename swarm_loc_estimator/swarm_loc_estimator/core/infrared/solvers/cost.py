@@ -1,9 +1,10 @@
 """The negative log likelihood of readings, with gradient and Hessian by pose and gains.
 
 What is sought is the pose and, where elements differ by an unknown amount, every sensor's and emitter's
-log-gain, which has a prior. A measured reading is its expectation plus Gaussian noise. A saturated one says
-only that expectation plus noise is at saturation or above, which has the probability of a normal tail. One
-that shows no light where some is expected may be blocked by another robot.
+log-gain, which has a prior. A measured reading is its expectation plus noise, Gaussian on the scale on which
+its variance is the same everywhere. A saturated one says only that expectation plus noise is at saturation or
+above, which has the probability of a normal tail. One that shows no light where some is expected may be
+blocked by another robot; on some boards others are too bright.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _TAIL = -6.0
 DARK = 4.0
 """Only darker readings can be blocked ones [sigma]."""
 _BELIEVED = 2.0
-"""A reading that costs less is no blocked one."""
+"""A reading that costs less is no outlier."""
 
 
 class Pair(NamedTuple):
@@ -34,6 +35,7 @@ class Pair(NamedTuple):
 
     Attributes:
         readings: (modes, n, n) [count].
+        stable: (modes, n, n) the readings, or saturation, by `stabilized` [sigma].
         saturation: (modes,) from where on they are SATURATED [count].
         kinds: (modes, n, n) MISSING, MEASURED or SATURATED.
         sensor: (n,) gains of the receiver's sensors.
@@ -45,6 +47,7 @@ class Pair(NamedTuple):
     """
 
     readings: FloatArray
+    stable: FloatArray
     saturation: FloatArray
     kinds: NDArray[np.int8]
     sensor: FloatArray
@@ -69,8 +72,9 @@ class Scratch(NamedTuple):
         hessians: (2, P, P) likewise, by Gauss-Newton; lower triangles.
         factor: (P, P) lower triangle.
         step: (P,).
-        tally: (2,) squares of what is left of priors and of the readings that cannot be blocked ones, and the
-            degrees of freedom of these.
+        tally: (3,) squares of what is left of priors and of the readings that are no outliers, the degrees of
+            freedom of these, and squares of what is left of all.
+        lasting: (3, 3) the part of the information on the pose by whose noise it errs the same every time.
         of_gains: (3,) the part of the pose's variances that is the unknown gains'.
         root: (3, 3) inverse of the pose's part of the factor, lower triangle.
     """
@@ -85,6 +89,7 @@ class Scratch(NamedTuple):
     factor: FloatArray
     step: FloatArray
     tally: FloatArray
+    lasting: FloatArray
     of_gains: FloatArray
     root: FloatArray
 
@@ -103,7 +108,8 @@ def new_scratch(modes: int, n: int, gains: bool) -> Scratch:
         np.empty((2, size, size)),
         np.empty((size, size)),
         np.empty(size),
-        np.empty(2),
+        np.empty(3),
+        np.zeros((3, 3)),
         np.zeros(3),
         np.zeros((3, 3)),
     )
@@ -125,7 +131,8 @@ def cost_of(
         for q in range(p + 1):
             hessian[p, q] = 0.0
     cost = _add_prior(pair, at, gradient, hessian) if sought else 0.0
-    squares, sure = 2.0 * cost, 0
+    squares, all_squares, sure = 2.0 * cost, 0.0, 0
+    room.lasting[:] = 0.0
     for m in range(modes):
         for i in range(n):
             for j in range(n):
@@ -134,10 +141,14 @@ def cost_of(
                     continue
                 factor = room.factors[0, i] * room.factors[1, j]
                 expected = factor * room.expected[m, i, j]
-                limit = pair.saturation[m]
-                one, pull, weight, blocked = _of_reading(model, kind, pair.readings[m, i, j], limit, expected)
+                reading = min(pair.readings[m, i, j], pair.saturation[m])
+                stable = pair.stable[m, i, j]
+                one, pull, weight, sure_of_it, lasting, square = _of_reading(
+                    model, kind, reading, stable, expected
+                )
                 cost += one
-                if not blocked:
+                all_squares += square
+                if sure_of_it:
                     squares += 2.0 * one
                     sure += 1 if kind == MEASURED else 0
                 if weight == 0.0:
@@ -146,37 +157,70 @@ def cost_of(
                 b = factor * room.slopes[1, m, i, j]
                 c = factor * room.slopes[2, m, i, j]
                 _add_by_pose(pull, weight, a, b, c, gradient, hessian)
+                if lasting > 0.0:
+                    _add_lasting(lasting * weight, (a, b, c), room.lasting)
                 if sought:
                     _add_by_gains(pull, weight, expected, i, n + j, gradient, hessian)
                     _add_by_both(weight * expected, a, b, c, i, n + j, hessian)
-    room.tally[0], room.tally[1] = squares, sure - 3.0
+    room.tally[0], room.tally[1], room.tally[2] = squares, sure - 3.0, all_squares
     return cost
 
 
 @compiled
+def stabilized(model: IrModel, value: float) -> tuple[float, float]:
+    """A brightness on the scale on which noise is one everywhere, and the slope of this scale [1/count].
+
+    With the variance noise^2 + (relative value)^2 it is asinh(relative value / noise) / relative.
+    """
+    per_noise = 1.0 / model.noise
+    if model.relative == 0.0:
+        return value * per_noise, per_noise
+    ratio = model.relative * value * per_noise
+    root = math.sqrt(1.0 + ratio * ratio)
+    size = math.log(abs(ratio) + root) / model.relative
+    return math.copysign(size, value), per_noise / root
+
+
+@compiled
 def _of_reading(
-    model: IrModel, kind: int, reading: float, limit: float, expected: float
-) -> tuple[float, float, float, bool]:
-    """The cost of a reading, its two derivatives by the expectation, and whether it may be a blocked one.
+    model: IrModel, kind: int, reading: float, stable: float, expected: float
+) -> tuple[float, float, float, bool, float, float]:
+    """The cost of a reading and its two derivatives by the expectation.
 
     Args:
         model: The platform.
         kind: MEASURED or SATURATED.
-        reading: [count].
-        limit: From where on it is SATURATED [count].
+        reading: Cut at saturation [count].
+        stable: The reading by `stabilized` [sigma].
         expected: At this pose with these gains [count].
+
+    Returns:
+        Besides, whether it is no outlier for sure, the share of its variance that is the same every time, and
+        the square of what it is off as if it were none.
     """
-    spread = model.relative_noise * (reading if kind == MEASURED else limit)
-    weight = 1.0 / (model.noise * model.noise + spread * spread)
+    if model.bright < math.inf:
+        more, slope = stabilized(model, expected)
+        more -= stable
+    else:  # by the reading, as good where noise is small, and simpler
+        spread = model.relative * reading
+        slope = 1.0 / math.sqrt(model.noise * model.noise + spread * spread)
+        more = (expected - reading) * slope
     if kind == SATURATED:
-        per_sigma = math.sqrt(weight)
-        cost, pull, weight = _of_saturated(per_sigma, (expected - limit) * per_sigma)
-        return cost, pull, weight, False
-    if model.blocked < math.inf and reading < min(DARK * model.noise, expected):
-        cost, pull, weight = _of_dark(weight, expected - reading, model.blocked)
-        return cost, pull, weight, True
-    pull = weight * (expected - reading)
-    return 0.5 * pull * (expected - reading), pull, weight, False
+        cost, pull, weight = _of_saturated(slope, more)
+        return cost, pull, weight, True, 0.0, 0.0
+    lasting = model.lasting * (1.0 - (model.noise * slope) ** 2)
+    limit = math.inf
+    if more < 0.0:
+        limit = model.bright
+    elif reading < DARK * model.noise or model.bright < math.inf:
+        limit = model.blocked
+    square = more * more
+    cost, pull, weight = 0.5 * square, more * slope, slope * slope
+    if limit < math.inf:
+        near = cost < _BELIEVED
+        cost, pull, weight = _of_outlier(cost, pull, weight, limit)
+        return cost, pull, weight, near and model.bright < math.inf, lasting, square
+    return cost, pull, weight, True, lasting, square
 
 
 @compiled
@@ -240,18 +284,24 @@ def _add_prior(pair: Pair, at: FloatArray, gradient: FloatArray, hessian: FloatA
 
 
 @compiled
-def _of_dark(weight: float, less: float, blocked: float) -> tuple[float, float, float]:
-    """The cost of a reading that shows no light and should, and its derivatives by the expectation.
+def _add_lasting(weight: float, slopes: tuple[float, float, float], lasting: FloatArray) -> None:
+    """Add a reading whose noise has a part that is the same every time."""
+    for p in range(3):
+        for q in range(3):
+            lasting[p, q] += weight * slopes[p] * slopes[q]
 
-    It may be blocked by something in between: the more it is below expectation, the less it counts, and its
-    cost ends at a limit.
+
+@compiled
+def _of_outlier(cost: float, pull: float, weight: float, limit: float) -> tuple[float, float, float]:
+    """The cost of a reading that may be an outlier, and its derivatives by the expectation.
+
+    It may be blocked by something in between, or lit by something else: the farther it is from expectation,
+    the less it counts, and its cost ends at a limit.
     """
-    pull = weight * less
-    cost = 0.5 * pull * less
     if cost < _BELIEVED:
         return cost, pull, weight
-    seen = math.exp((_BELIEVED - cost) / blocked)
-    return _BELIEVED + blocked * (1.0 - seen), seen * pull, seen * weight
+    seen = math.exp((_BELIEVED - cost) / limit)
+    return _BELIEVED + limit * (1.0 - seen), seen * pull, seen * weight
 
 
 @compiled

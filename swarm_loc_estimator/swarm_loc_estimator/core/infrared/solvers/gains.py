@@ -212,7 +212,7 @@ def _linearized(
     expected, slopes = expected_with_slopes(platform, poses[used], pairs)
     readings, limit = exchanges.readings[used], exchanges.saturation[used][..., None, None]
     with np.errstate(invalid="ignore"):
-        spread = np.hypot(platform.noise, platform.relative_noise * readings)
+        spread = np.hypot(platform.noise, platform.relative * readings)
         clear = expected < limit - _CLEAR_OF_SATURATION * platform.noise
         light = (readings > DARKEST * platform.noise) & (readings < limit)
     usable = np.isfinite(readings) & clear & light

@@ -23,6 +23,7 @@ from swarm_loc_estimator.core.infrared.solvers.cost import (
     Pair,
     Scratch,
     new_scratch,
+    stabilized,
 )
 from swarm_loc_estimator.core.infrared.solvers.search import pose_covariance, search
 from swarm_loc_estimator.core.infrared.solvers.start_table import (
@@ -54,6 +55,8 @@ _FAINTEST = 6.0
 """Readings must be brighter than noise by so many sigmas of the sum of their squares."""
 _EXPLAINED = 0.5
 """The share of what is read, in squares, that a pose must explain."""
+_EXPLAINED_OF_OUTLIERS = 0.3
+"""Likewise where readings may be blocked or too bright."""
 _WIDEST = 1.0
 """A bearing or heading less sure than this is open [rad]."""
 _APART = 0.1
@@ -65,6 +68,9 @@ table's best start; range, bearing, heading [m, rad]."""
 _OF_SECOND = 2
 """How many of these are of the second-best minimum."""
 _MIN_ODDS = 1e-4
+_WORTH_WEIGHING = 8.0
+"""Minima whose costs differ by more are not weighed by what is around them."""
+_NO_MINIMUM = np.full(4, math.inf)
 _EXACT = 1e-4
 """The own sigma of gains of which only the common part is unsure."""
 _FOUND, _TOO_WEAK, _TOO_FEW, _UNDETERMINED, _MISFIT = (int(outcome) for outcome in Outcome)
@@ -116,6 +122,7 @@ class _Room(NamedTuple):
         pattern: (modes * n * n,) compressed readings.
         present: (modes * n * n,) 1 where there is a reading, else 0.
         kinds: (modes, n, n) of the readings.
+        stable: (modes, n, n) the readings by `stabilized`.
         minima: (2, 4) range, bearing, heading and cost of the best two minima that lie apart.
         best: (P,) the best with its gains.
         covariance: (3, 3) of its pose.
@@ -128,6 +135,7 @@ class _Room(NamedTuple):
     pattern: Float32Array
     present: Float32Array
     kinds: NDArray[np.int8]
+    stable: FloatArray
     minima: FloatArray
     best: FloatArray
     covariance: FloatArray
@@ -146,6 +154,7 @@ def _new_room(table: StartTable, modes: int, n: int, known: bool) -> _Room:
         np.empty(modes * n * n, np.float32),
         np.empty(modes * n * n, np.float32),
         np.empty((modes, n, n), np.int8),
+        np.empty((modes, n, n)),
         np.empty((2, 4)),
         np.empty(full.at.size),
         np.empty((3, 3)),
@@ -164,7 +173,9 @@ def _solve_all(
     for k in range(readings.shape[0]):
         room = rooms[1 if _write_prior(gains.sigma[k], n, prior) else 0]
         sensor, emitter = gains.sensor[k], gains.emitter[k]
-        pair = Pair(readings[k], saturation[k], room.kinds, sensor, emitter, prior, nearest, farthest)
+        pair = Pair(
+            readings[k], room.stable, saturation[k], room.kinds, sensor, emitter, prior, nearest, farthest
+        )
         out.outcomes[k] = _solve_one(models, pair, room, out, k)
 
 
@@ -186,11 +197,13 @@ def _solve_one(models: Models, pair: Pair, room: _Room, out: IrSolutions, k: int
     if bright < measured + _FAINTEST * math.sqrt(2.0 * measured):
         return _TOO_WEAK
     _find_minima(models, pair, room, measured)
+    if models.exact.bright < math.inf:
+        _weigh_minima(models.exact, pair, room)
     best, other = room.minima[0], room.minima[1]
     covariance, odds = room.covariance, math.exp(best[3] - other[3])
     determined = pose_covariance(models.exact, pair, room.best, room.full, covariance)
     misfit = room.full.tally[0] / max(room.full.tally[1], 1.0)
-    if misfit - 1.0 > (1.0 - _EXPLAINED) * max(bright / (measured + saturated) - 1.0, 0.0):
+    if _unexplained(models.exact, pair, room, bright / (measured + saturated)):
         return _MISFIT
     if not determined:
         return _UNDETERMINED
@@ -198,7 +211,7 @@ def _solve_one(models: Models, pair: Pair, room: _Room, out: IrSolutions, k: int
     for p in range(3):
         for q in range(3):
             apart = _apart(best, other, p) * _apart(best, other, q) if share > 0.0 else 0.0
-            covariance[p, q] = max(misfit, 1.0) * covariance[p, q] + share * apart
+            covariance[p, q] = models.exact.scale * max(misfit, 1.0) * covariance[p, q] + share * apart
     if max(covariance[1, 1], covariance[2, 2]) > _WIDEST * _WIDEST:
         return _UNDETERMINED
     out.misfits[k], out.odds[k] = misfit, odds
@@ -209,6 +222,56 @@ def _solve_one(models: Models, pair: Pair, room: _Room, out: IrSolutions, k: int
         if odds > _MIN_ODDS:
             out.alternatives[k, p] = other[p]
     return _FOUND
+
+
+@compiled
+def _weigh_minima(model: IrModel, pair: Pair, room: _Room) -> None:
+    """Judge the two minima by the probability around them, not its density; writes the better one first.
+
+    A pose that takes most readings for outliers can fit the few others in a tiny region only.
+    """
+    best, other, at = room.minima[0], room.minima[1], room.full.at
+    if not other[3] - best[3] < _WORTH_WEIGHING or not pose_covariance(
+        model, pair, room.best, room.full, room.covariance
+    ):
+        return
+    best[3] -= _log_volume(room.covariance)
+    cost = search(model, pair, other, _STILL, room.full, _NO_MINIMUM)
+    found = at.copy()
+    if not pose_covariance(model, pair, found, room.full, room.covariance):
+        return
+    for p in range(3):
+        other[p] = wrap(found[at.size - 3 + p]) if p > 0 else found[at.size - 3]
+    other[3] = cost - _log_volume(room.covariance)
+    if other[3] < best[3]:
+        for p in range(4):
+            best[p], other[p] = other[p], best[p]
+        assign(room.best, found)
+
+
+@compiled
+def _log_volume(covariance: FloatArray) -> float:
+    """Half the logarithm of the determinant of a covariance (3, 3)."""
+    c = covariance
+    size = c[0, 0] * (c[1, 1] * c[2, 2] - c[1, 2] * c[2, 1])
+    size -= c[0, 1] * (c[1, 0] * c[2, 2] - c[1, 2] * c[2, 0])
+    size += c[0, 2] * (c[1, 0] * c[2, 1] - c[1, 1] * c[2, 0])
+    return 0.5 * math.log(max(size, 1e-30))
+
+
+@compiled
+def _unexplained(model: IrModel, pair: Pair, room: _Room, bright: float) -> bool:
+    """Whether a pose leaves most of what was read, mean square `bright`, unexplained."""
+    tally = room.full.tally
+    if model.bright == math.inf:
+        misfit = tally[0] / max(tally[1], 1.0)
+        return bool(misfit - 1.0 > (1.0 - _EXPLAINED) * max(bright - 1.0, 0.0))
+    total, count = 0.0, 0
+    for kind, stable in zip(pair.kinds.flat, pair.stable.flat):  # noqa: B905 (not compiled)
+        if kind == MEASURED:
+            total += stable**2
+            count += 1
+    return bool(tally[2] - count > (1.0 - _EXPLAINED_OF_OUTLIERS) * max(total - count, 0.0))
 
 
 @compiled
@@ -266,7 +329,8 @@ def _list_starts(models: Models, pair: Pair, room: _Room) -> int:
     """
     _compress(models.exact, pair, room.pattern, room.present)
     starts, found = room.starts, room.starts[1 : 1 + _TABLE_STARTS]
-    count = 1 + find_starts(models.table, room.pattern, room.present, -math.inf, room.start, found)
+    outliers = math.inf if models.exact.bright < math.inf else -math.inf
+    count = 1 + find_starts(models.table, room.pattern, room.present, outliers, room.start, found)
     search(models.blurred, pair, found[0], _LOOSE, room.plain, room.minima[0])
     for p in range(3):
         starts[0, p] = room.plain.at[p]
@@ -306,7 +370,7 @@ def _compress(model: IrModel, pair: Pair, pattern: Float32Array, present: Float3
 
 @compiled
 def _classify(model: IrModel, pair: Pair) -> tuple[int, int, float]:
-    """Write the kinds of readings; returns how many are measured, how many saturated, and how bright all are.
+    """Write `kinds` and `stable`; returns how many are measured, how many saturated, and how bright all are.
 
     Returns:
         The brightness is the sum of squares in sigmas.
@@ -317,11 +381,13 @@ def _classify(model: IrModel, pair: Pair) -> tuple[int, int, float]:
         for i in range(readings.shape[1]):
             for j in range(readings.shape[2]):
                 reading = readings[m, i, j]
-                if not math.isfinite(reading) or reading < DARKEST * model.noise:
+                dead = math.isnan(pair.sensor[i] * pair.emitter[j])
+                if dead or not math.isfinite(reading) or reading < DARKEST * model.noise:
                     kinds[m, i, j] = MISSING
                     continue
                 sigmas = min(reading, pair.saturation[m]) / model.noise
                 bright += sigmas * sigmas
+                pair.stable[m, i, j] = stabilized(model, min(reading, pair.saturation[m]))[0]
                 if reading >= pair.saturation[m]:
                     kinds[m, i, j] = SATURATED
                     saturated += 1

@@ -164,11 +164,12 @@ def pose_covariance(
     """Write the pose's covariance (3, 3) at a minimum (P,); whether the readings determine the pose.
 
     It is the mean of the inverse information there and around: beyond a kink of the curves, readings may tell
-    much less of the pose. `room.tally` is that of the minimum, `room.of_gains` the gains' share there.
+    much less of the pose. `room.tally` is that of the minimum, `room.of_gains` there the share of the
+    gains, and of other noise that is the same every time.
     """
     hessian = room.hessians[0]
     cost_of(model, pair, at, room, room.gradients[0], hessian)
-    squares, freedom = room.tally
+    squares, freedom, all_squares = room.tally
     if not _invert(hessian, room):
         return False
     _write_share_of_gains(pair, room)
@@ -185,7 +186,7 @@ def pose_covariance(
         if not _invert(hessian, room):
             return False
         _add_square(room.root, covariance, 1.0 / (1.0 + len(_AROUND)), 1.0)
-    room.tally[0], room.tally[1] = squares, freedom
+    room.tally[0], room.tally[1], room.tally[2] = squares, freedom, all_squares
     return True
 
 
@@ -200,6 +201,7 @@ def _write_share_of_gains(pair: Pair, room: Scratch) -> None:
     for p in range(3):
         room.of_gains[p] = 0.0
         if x == 0:
+            room.of_gains[p] = _share_of_lasting(room, p)
             continue
         for q in range(row.size):
             row[q] = 1.0 if q == x + p else 0.0
@@ -211,6 +213,19 @@ def _write_share_of_gains(pair: Pair, room: Scratch) -> None:
                 total += row[q]
             part = pair.prior[side, 0] * (squares - pair.prior[side, 1] * total * total)
             room.of_gains[p] += part / row[x + p]
+
+
+@compiled
+def _share_of_lasting(room: Scratch, p: int) -> float:
+    """Which share of a pose's variance, by the factor, comes from noise that is the same every time."""
+    row, part = room.step, 0.0
+    for q in range(3):
+        row[q] = 1.0 if q == p else 0.0
+    _solve(room.factor, row)
+    for a in range(3):
+        for b in range(3):
+            part += row[a] * room.lasting[a, b] * row[b]
+    return float(part / row[p])
 
 
 @compiled

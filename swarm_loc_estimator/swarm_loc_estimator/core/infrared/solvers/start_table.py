@@ -31,6 +31,8 @@ _SHOWN = 2.0
 
 _BLOCKED = np.float32(0.2)
 """What a blocked reading adds to the misfit at most."""
+_OUTLIER = np.float32(1.0)
+"""Likewise one that may be blocked or too bright; more than the step from one range to the next does."""
 _BLUR = 0.1
 """By how much `blurred` softens the curves [rad]."""
 _BLUR_NOISE = 0.1
@@ -89,6 +91,7 @@ def blurred(platform: IrPlatform) -> IrModel:
         sensor=_soft(platform.sensor),
         emitter=_soft(platform.emitter),
         relative_noise=max(platform.relative_noise, _BLUR_NOISE),
+        bright_share=0.0,
     )
     return soft.model
 
@@ -133,7 +136,7 @@ def find_starts(
         pattern: (modes * n * n,) the readings by `compress`, something finite where missing.
         present: (modes * n * n,) 1 where there is a reading, else 0.
         dark: Readings darker than this, by `compress`, may be blocked ones; how bright they are in all then
-            does not tell the range, and all ranges are tried.
+            does not tell the range, and all ranges are tried; infinite: any may be blocked or too bright.
         room: To work in.
         starts: (S, 4) range, bearing, heading, and how badly they fit.
     """
@@ -207,7 +210,9 @@ def _misfit(
     for f in range(pattern.size):
         difference = pattern[f] - expected_here[f]
         square = difference * difference
-        if pattern[f] < dark and difference < 0.0:
+        if dark == math.inf:
+            square = min(square, _OUTLIER)
+        elif pattern[f] < dark and difference < 0.0:
             square = min(square, _BLOCKED)
         total += present[f] * square
     return total

@@ -1,0 +1,214 @@
+"""Range, bearing and heading of real Droplets: a board that is calibrated, beside what was assumed before.
+
+    make bench-droplet_real
+    make bench-droplet_real ARGS="FIT_FOLDER TEST_FOLDER"
+
+Folders hold recordings of Droplets under a camera (*.txt, see `import_droplets`). The board is fitted to
+those of the first and tested on those of the second; without them each recording of
+../shared/data/droplet_2016 is tested with a board fitted to the others. Errors are those of pairs 5 to 20 cm
+apart with no other robot within 44 mm of the line between them. Headings of the truth are turned by what the
+fit found of each robot's fiducial.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from bench.common import OUT, Cell, ProgressLine, table, write_figures
+from bench.droplet_real import firmware
+from swarm_loc_estimator.calibration.infrared.board import (
+    calibrate_board,
+    dead_sensors,
+    pair_gains,
+    without_dead,
+)
+from swarm_loc_estimator.calibration.infrared.board_fit import BoardModel, BoardReadings, turned
+from swarm_loc_estimator.calibration.infrared.board_recording import MAX_RANGE, read_board
+from swarm_loc_estimator.calibration.recording import read_recording
+from swarm_loc_estimator.cli.errors import exit_with_message
+from swarm_loc_estimator.core.infrared.board import IrPlatform
+from swarm_loc_estimator.core.infrared.solution import IrEstimator
+from swarm_loc_estimator.core.infrared.solvers.closed_form import ClosedForm
+from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.io.droplets.bag import ImportSettings, import_recording
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.se2 import wrap_angle
+from swarm_loc_estimator.parameters.errors import UserError
+
+DEFAULT_FOLDER = OUT.parent.parent / "shared" / "data" / "droplet_2016"
+METHODS = ("firmware", "closed_form", "stock", "board")
+RANGES = (0.05, 0.2)
+_CHI_SQUARE_99 = 11.345
+_UNITS = np.array([100.0, np.degrees(1.0), np.degrees(1.0)])
+_NAMES = ("range_cm", "bearing_deg", "heading_deg")
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Clear pairs of a recording whose robots are numbered as in `names`."""
+
+    name: str
+    data: BoardReadings
+
+
+@dataclass
+class Results:
+    """Errors (s, 3) of one method over all tests, and how many pairs there were."""
+
+    errors: list[FloatArray]
+    nees: list[FloatArray]
+    asked: int = 0
+
+
+@exit_with_message
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the benchmark; returns its exit status."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folders", type=Path, nargs="*", help="FIT_FOLDER TEST_FOLDER")
+    options = parser.parse_args(arguments)
+    if len(options.folders) not in (0, 2):
+        parser.error("give no folder, or FIT_FOLDER and TEST_FOLDER")
+    names: list[str] = []
+    if options.folders:
+        fit, test = (read_folder(folder, names) for folder in options.folders)
+        tests = [(fit, test)]
+    else:
+        all_of_them = read_folder(DEFAULT_FOLDER, names)
+        tests = [([o for o in all_of_them if o is not one], [one]) for one in all_of_them]
+    results = {method: Results([], []) for method in METHODS}
+    for fit, test in tests:
+        measure(fit, test, len(names), results)
+    report(results)
+    return 0
+
+
+def read_folder(folder: Path, names: list[str]) -> list[Recorded]:
+    """All recordings of a folder; robots that are new are added to the names.
+
+    Raises:
+        UserError: There is none.
+    """
+    paths = sorted(folder.glob("*.txt"))
+    if not paths:
+        raise UserError(f"'{folder}' holds no recording (*.txt).")
+    recordings = []
+    for path in paths:
+        progress = ProgressLine(path.name)
+        with tempfile.TemporaryDirectory() as temporary:
+            bag = Path(temporary) / "bag"
+            done = import_recording(path, bag, ImportSettings(), lambda _, what, p=progress: p(what))  # type: ignore[misc]
+            swarm = load_swarm(bag / "swarm.yaml")
+            board = read_board(read_recording(bag, swarm), swarm)
+        print(
+            f"\r{path.name}: {done.exchanges} exchanges, {done.with_truth} with truth;"
+            f" {' '.join(done.remarks)}"
+        )
+        of_robot = []
+        for index in board.robots:
+            name = swarm.robots[index].name
+            if name not in names:
+                names.append(name)
+            of_robot.append(names.index(name))
+        numbers = np.array(of_robot)
+        data = board.data.chosen(board.clear)
+        data = data._replace(receiver=numbers[data.receiver], transmitter=numbers[data.transmitter])
+        recordings.append(Recorded(path.name, data))
+    return recordings
+
+
+def measure(fit: list[Recorded], test: list[Recorded], robots: int, results: dict[str, Results]) -> None:
+    """Fit to some recordings, and add the errors on others to the results."""
+    joined = BoardReadings(
+        *(np.concatenate(columns) for columns in zip(*(one.data for one in fit), strict=True))
+    )
+    near = joined.chosen(joined.poses[:, 0] < MAX_RANGE)
+    said = ProgressLine(f"test on {', '.join(one.name for one in test)}")
+    said("fitting")
+    done = calibrate_board(load_ir_platform("droplet_2016"), near, robots)
+    said("solving")
+    for one in test:
+        data = one.data
+        within = (data.poses[:, 0] > RANGES[0]) & (data.poses[:, 0] < RANGES[1])
+        data = without_dead(data.chosen(within), {**done.dead_sensors, **dead_sensors(data, robots)})
+        add(done.model, data, results)
+    print()
+
+
+def add(model: BoardModel, data: BoardReadings, results: dict[str, Results]) -> None:
+    """Add the errors of all methods."""
+    yaw = model.truth_yaw
+    truth = turned(data.poses, yaw[data.receiver], yaw[data.transmitter])
+    paper = load_ir_platform("droplet")
+    stock = replace(paper, amplitudes=paper.amplitudes[:1])
+    far = IrPlatform(
+        stock.angles,
+        stock.sensor,
+        stock.emitter,
+        model.platform.amplitudes,
+        saturation=model.platform.saturation,
+    )
+    estimators: dict[str, IrEstimator] = {
+        "closed_form": ClosedForm(replace(far, noise=model.platform.noise)),
+        "stock": MaximumLikelihood(stock),
+        "board": MaximumLikelihood(model.platform),
+    }
+    found = firmware.solve(data.readings, np.array(model.platform.angles))
+    gather(results["firmware"], found, truth, None)
+    readings = data.readings[:, None]
+    for name, estimator in estimators.items():
+        gains = pair_gains(model.sensor_gains, data) if name == "board" else None
+        solutions = estimator.solve(readings, gains)
+        gather(results[name], solutions.poses, truth, solutions.covariances)
+
+
+def gather(result: Results, found: FloatArray, truth: FloatArray, covariances: FloatArray | None) -> None:
+    """Add poses (k, 3), NaN where there is none."""
+    solved = np.isfinite(found).all(axis=1)
+    errors = found[solved] - truth[solved]
+    errors[:, 1:] = wrap_angle(errors[:, 1:])
+    result.errors.append(errors)
+    result.asked += len(found)
+    if covariances is not None:
+        half = np.linalg.solve(covariances[solved], errors[..., None])[..., 0]
+        result.nees.append(np.sum(errors * half, axis=1))
+
+
+def report(results: dict[str, Results]) -> None:
+    """Print and write the figures."""
+    figures: dict[str, float] = {}
+    rows: list[list[Cell]] = []
+    for name, result in results.items():
+        size = np.abs(np.concatenate(result.errors)) * _UNITS
+        medians, tails = np.median(size, axis=0), np.quantile(size, 0.9, axis=0)
+        for unit, median, tail in zip(_NAMES, medians, tails, strict=True):
+            kind, measure_unit = unit.split("_")
+            figures[f"{name}.{unit}"] = float(median)
+            figures[f"{name}.{kind}_p90_{measure_unit}"] = float(tail)
+        figures[f"{name}.solved_share"] = len(size) / max(result.asked, 1)
+        rows.append([name, *map(float, medians), *map(float, tails), figures[f"{name}.solved_share"]])
+    nees = np.concatenate(results["board"].nees)
+    figures["board.nees_median"] = float(np.median(nees))
+    figures["board.nees_beyond_99"] = float(np.mean(nees > _CHI_SQUARE_99))
+    head = ["median / 90 %", "cm", "deg", "deg", "90 % cm", "deg", "deg", "solved"]
+    print(table(head, rows))
+    print(
+        f"board: NEES median {figures['board.nees_median']:.2f} (ideal 2.37),"
+        f" {100.0 * figures['board.nees_beyond_99']:.1f} % beyond the 99 % bound"
+        f" of {results['board'].asked} clear pairs"
+    )
+    print(f"figures: {write_figures('droplet_real', figures)}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,191 @@
+"""Calibrate an infrared board from exchanges with known poses, cross-validated over blocks of time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.calibration.infrared.board_fit import (
+    BoardModel,
+    BoardReadings,
+    fit_board,
+    turned,
+)
+from swarm_loc_estimator.calibration.recording import CalibrationError
+from swarm_loc_estimator.core.infrared.board import IrPlatform, PairGains
+from swarm_loc_estimator.core.infrared.brightness import expected
+from swarm_loc_estimator.core.infrared.solution import Outcome
+from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.se2 import wrap_angle
+
+MIN_EXCHANGES = 100
+"""Fewer exchanges with ground truth tell too little of a board."""
+BLOCKS = 3
+_MISFIT = 3.0
+"""Where the stock platform's residuals are beyond so many sigmas, its curves are wrong, not the robots."""
+_DEAD_SHARE = 0.2
+"""An element that shows less than this share of the light expected of it is dead."""
+_MIN_LIT = 20
+_TAIL_SHARE, _TAIL_BOUND = 0.94, 11.345
+"""Covariances are grown until this share of errors is within the bound that 99 % of normal ones are in."""
+_MAX_SCALE = 30.0
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors in blocks of time that a fit has not seen.
+
+    Attributes:
+        errors: (s, 3) range [m], bearing, heading [rad] of the exchanges that were solved.
+        nees: (s,) normalised errors squared.
+        asked: How many exchanges there were.
+    """
+
+    errors: FloatArray
+    nees: FloatArray
+    asked: int
+
+    @property
+    def solved_share(self) -> float:
+        """Share of the exchanges that gave a pose."""
+        return len(self.errors) / max(self.asked, 1)
+
+    @property
+    def medians(self) -> FloatArray:
+        """(3,) of the errors' sizes [m, rad, rad]."""
+        return np.median(np.abs(self.errors), axis=0) if len(self.errors) else np.full(3, np.nan)
+
+
+@dataclass(frozen=True)
+class BoardCalibration:
+    """A board as it was found.
+
+    Attributes:
+        model: Fitted to everything.
+        stock_sigma: RMS residual of the platform to begin with, at the true poses [sigma].
+        held_out: Errors of the fitted board in blocks that it has not seen.
+        with_gains: Whether gains of sensors helped there and are kept.
+        dead_sensors: Robot -> numbers of its dead sensors.
+        saturation: (n,) the largest count each sensor read, by sensor.
+    """
+
+    model: BoardModel
+    stock_sigma: float
+    held_out: HeldOut
+    with_gains: bool
+    dead_sensors: dict[int, tuple[int, ...]]
+    saturation: FloatArray
+
+    @property
+    def curves_wrong(self) -> bool:
+        """Whether the platform to begin with fits so badly that no robot may be blamed."""
+        return self.stock_sigma > _MISFIT
+
+
+def calibrate_board(start: IrPlatform, data: BoardReadings, robots: int) -> BoardCalibration:
+    """Find what a board is.
+
+    Args:
+        start: The platform to begin with: its arrangement and saturation count.
+        data: What was read with the poses known.
+        robots: How many there are.
+
+    Raises:
+        CalibrationError: There are too few exchanges.
+    """
+    if len(data.receiver) < MIN_EXCHANGES:
+        raise CalibrationError(
+            f"{len(data.receiver)} exchanges with ground truth are too few for a board,"
+            f" {MIN_EXCHANGES} are the least."
+        )
+    dead = dead_sensors(data, robots)
+    alive = without_dead(data, dead)
+    tried = {gains: _cross_validated(start, alive, robots, gains=gains) for gains in (True, False)}
+    ranges = {gains: held.medians[0] / max(held.solved_share, 0.01) for gains, held in tried.items()}
+    gains = bool(ranges[True] < ranges[False])
+    model, held = fit_board(start, alive, robots, gains=gains), tried[gains]
+    scale = float(np.quantile(held.nees, _TAIL_SHARE)) / _TAIL_BOUND if held.nees.size else 1.0
+    scale = round(min(max(scale, 1.0), _MAX_SCALE), 2)
+    platform = replace(model.platform, covariance_scale=scale)
+    held = replace(held, nees=held.nees / scale)
+    brightest = np.nanmax(np.nan_to_num(data.readings), axis=(0, 2))
+    sigma = stock_residual(start, alive)
+    return BoardCalibration(replace(model, platform=platform), sigma, held, gains, dead, brightest)
+
+
+def pair_gains(sensor_gains: FloatArray, data: BoardReadings) -> PairGains:
+    """Gains of the exchanges' pairs, nothing left unknown."""
+    sensor = sensor_gains[data.receiver]
+    return PairGains(sensor, np.ones_like(sensor), np.zeros((len(sensor), 4)))
+
+
+def errors_of(model: BoardModel, data: BoardReadings) -> HeldOut:
+    """Errors of a board on exchanges whose poses are known."""
+    solutions = MaximumLikelihood(model.platform).solve(
+        data.readings[:, None], pair_gains(model.sensor_gains, data)
+    )
+    yaw = model.truth_yaw
+    truth = turned(data.poses, yaw[data.receiver], yaw[data.transmitter])
+    found = solutions.outcomes == Outcome.FOUND
+    errors = solutions.poses[found] - truth[found]
+    errors[:, 1:] = wrap_angle(errors[:, 1:])
+    solved = np.linalg.solve(solutions.covariances[found], errors[..., None])[..., 0]
+    return HeldOut(errors, np.asarray(np.sum(errors * solved, axis=1)), len(found))
+
+
+def stock_residual(platform: IrPlatform, data: BoardReadings) -> float:
+    """RMS of what readings differ from expectation at the true poses [sigma], without saturated ones."""
+    bright = expected(replace(platform, amplitudes=platform.amplitudes[:1]), data.poses)[:, 0]
+    usable = (
+        np.isfinite(data.readings) & (data.readings < platform.saturation) & (bright < platform.saturation)
+    )
+    sigma = np.hypot(platform.noise, platform.relative * bright)
+    return (
+        float(np.sqrt(np.mean(((data.readings - bright) / sigma)[usable] ** 2))) if usable.any() else np.inf
+    )
+
+
+def dead_sensors(data: BoardReadings, robots: int) -> dict[int, tuple[int, ...]]:
+    """Sensors that stay dark whatever faces them, from the exchanges alone: robot -> numbers.
+
+    A sensor is dead whose brightest readings, their 95 % quantile, are below a fifth of the median of those
+    of the same robot's sensors.
+    """
+    dead: dict[int, tuple[int, ...]] = {}
+    for robot in range(robots):
+        own = data.readings[data.receiver == robot]
+        if len(own) < _MIN_LIT:
+            continue
+        brightest = np.nanquantile(np.nanmax(np.nan_to_num(own), axis=2), 0.95, axis=0)
+        found = np.flatnonzero(brightest < _DEAD_SHARE * np.median(brightest))
+        if found.size:
+            dead[robot] = tuple(found.tolist())
+    return dead
+
+
+def without_dead(data: BoardReadings, dead: dict[int, tuple[int, ...]]) -> BoardReadings:
+    """The exchanges with what dead sensors read left out."""
+    readings = data.readings.copy()
+    for robot, sensors in dead.items():
+        rows: NDArray[np.int64] = np.flatnonzero(data.receiver == robot)
+        readings[np.ix_(rows, np.array(sensors))] = np.nan
+    return data._replace(readings=readings)
+
+
+def _cross_validated(start: IrPlatform, data: BoardReadings, robots: int, *, gains: bool) -> HeldOut:
+    """Errors in each block of time of a board fitted to all others."""
+    order = np.argsort(data.stamp_ns, kind="stable")
+    parts = []
+    for block in np.array_split(order, BLOCKS):
+        held = np.zeros(len(order), dtype=np.bool_)
+        held[block] = True
+        model = fit_board(start, data.chosen(~held), robots, gains=gains)
+        parts.append(errors_of(model, data.chosen(held)))
+    return HeldOut(
+        np.concatenate([part.errors for part in parts]),
+        np.concatenate([part.nees for part in parts]),
+        sum(part.asked for part in parts),
+    )

@@ -1,0 +1,62 @@
+"""Turn a recording of Droplets under an overhead camera into a bag with its swarm.yaml.
+
+    import_droplets rnbCalibData.txt bags/droplets
+    import_droplets rnbCalibData.txt bags/droplets --platform droplet --metres-per-pixel 0.00105
+
+One line an exchange: {"TX", "RX", 6 x 6 counts, camera time [s], {"id"->{x, y, orientation}, ...}},. The bag
+holds <robot>/brightness, <robot>/ground_truth of robots that stand, and <robot>/fix of receivers. What the
+camera saw is cleaned: ids misread, orientations a quarter turn off, robots in two places.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from swarm_loc_estimator.cli.arguments import number_in
+from swarm_loc_estimator.cli.errors import exit_with_message
+from swarm_loc_estimator.cli.progress import ProgressLine
+from swarm_loc_estimator.io.droplets.bag import METRES_PER_PIXEL, ImportSettings, import_recording, name_of
+
+
+@exit_with_message
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    options = _parser().parse_args(arguments)
+    settings = ImportSettings(options.platform, options.metres_per_pixel)
+    with ProgressLine() as progress:
+        done = import_recording(options.recording, options.bag, settings, progress)
+    for remark in done.remarks:
+        print(remark)
+    turned = ", ".join(
+        f"{name_of(robot)} {turn * 57.29578:+.0f}" for robot, turn in sorted(done.fiducials.turn_of.items())
+    )
+    mirrored = "" if done.fiducials.handedness == 1 else "; the image is mirrored"
+    print(f"fiducials sit turned by [deg]: {turned}{mirrored}")
+    print(f"{done.exchanges} exchanges, {done.with_truth} with ground truth, written to {options.bag}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="import_droplets", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("recording", type=Path, help="text file, one exchange a line")
+    parser.add_argument("bag", type=Path, help="bag folder to create")
+    parser.add_argument(
+        "--platform", default="droplet_2016", help="board of the robots (default droplet_2016)"
+    )
+    parser.add_argument(
+        "--metres-per-pixel",
+        type=number_in(1e-6, 1.0, "m"),
+        default=METRES_PER_PIXEL,
+        help="of the camera's image (default: robots of 44 mm that touch are 42 pixels apart)",
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,81 @@
+"""The fit of a board: slopes against differences, curves and yaw found again, dead sensors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ir_world import random_poses
+
+from swarm_loc_estimator.calibration.infrared.board import dead_sensors, without_dead
+from swarm_loc_estimator.calibration.infrared.board_fit import BoardReadings, _Problem, fit_board, turned
+from swarm_loc_estimator.core.infrared.board import PairGains
+from swarm_loc_estimator.core.infrared.brightness import expected
+from swarm_loc_estimator.core.infrared.curves import curve_at
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+PLATFORM = load_ir_platform("droplet_2016")
+ROBOTS = 4
+YAW = np.radians([0.0, 4.0, -3.0, 2.0])
+FACTORS = np.array([1.2, 0.8, 1.1, 0.9, 1.25, 0.85])
+
+
+def recorded(count: int, seed: int) -> BoardReadings:
+    """Robot 0 reads the others, which turn and whose truth is off by `YAW`; a few readings are blocked."""
+    rng = np.random.default_rng(seed)
+    transmitter = rng.integers(1, ROBOTS, count)
+    receiver = np.zeros(count, dtype=np.int64)
+    told = random_poses(count, seed, low=0.05, high=0.2)
+    true = turned(told, YAW[receiver], YAW[transmitter])
+    gains = PairGains(np.tile(FACTORS, (count, 1)), np.ones((count, 6)), np.zeros((count, 4)))
+    light = expected(PLATFORM, true, gains)[:, 0]
+    light = np.where(rng.uniform(size=light.shape) < 0.05, 0.0, light)
+    light = light * np.exp(0.1 * rng.standard_normal(light.shape)) + 15.0 * rng.standard_normal(light.shape)
+    readings = np.minimum(light, PLATFORM.saturation)
+    return BoardReadings(receiver, transmitter, readings, told, np.arange(count, dtype=np.int64))
+
+
+def values(curve: FloatArray) -> FloatArray:
+    """Relative to straight ahead."""
+    return curve / curve[0]
+
+
+def test_slopes_are_those_of_differences() -> None:
+    problem = _Problem(replace(PLATFORM, curve_sigma=0.2), recorded(120, 1), ROBOTS, gains=True)
+    rng = np.random.default_rng(1)
+    at = problem.first_unknowns()
+    at = at + 0.03 * rng.standard_normal(at.size)
+    slopes, step = problem.slopes(at), 1e-6
+    for k in range(at.size):
+        ahead, behind = at.copy(), at.copy()
+        ahead[k] += step
+        behind[k] -= step
+        difference = (problem.residuals(ahead) - problem.residuals(behind)) / (2.0 * step)
+        np.testing.assert_allclose(slopes[:, k], difference, atol=5e-3)
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_curves_yaw_and_gains_are_found_again(seed: int) -> None:
+    model = fit_board(load_ir_platform("droplet_2016"), recorded(500, seed), ROBOTS)
+    angles = np.radians([20.0, 40.0, 50.0, 60.0])
+    for name in ("sensor", "emitter"):
+        found, true = (
+            np.array([curve_at(getattr(one, name).table(), a)[0] for a in (0.0, *angles)])
+            for one in (model.platform, PLATFORM)
+        )
+        np.testing.assert_allclose(values(found), values(true), rtol=0.15)
+    np.testing.assert_allclose(np.degrees(model.truth_yaw), np.degrees(YAW), atol=1.5)
+    np.testing.assert_allclose(values(model.sensor_gains[0]), values(FACTORS), rtol=0.1)
+    assert 10.0 < model.platform.noise < 20.0
+
+
+def test_a_dead_sensor_is_found_from_the_exchanges_alone() -> None:
+    data = recorded(60, 4)
+    data.readings[:, 2] = 15.0 * np.random.default_rng(4).standard_normal((60, 6))
+    assert dead_sensors(data, ROBOTS) == {0: (2,)}
+    masked = without_dead(data, {0: (2,)})
+    assert np.isnan(masked.readings[:, 2]).all()
+    assert np.isfinite(masked.readings[:, [0, 1, 3, 4, 5]]).all()
+    assert dead_sensors(recorded(60, 5), ROBOTS) == {}
