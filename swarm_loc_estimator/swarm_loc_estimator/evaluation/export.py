@@ -62,7 +62,7 @@ def _add_estimates(result: ReplayResult, writer: BagWriter) -> None:
         newest = seen.get(one.stamp_ns, newest)
         columns = (one.pose, one.covariance, one.fix_age_s, one.status)
         writer.write("swarm/poses", one.stamp_ns, poses.encode(one.stamp_ns, *columns))
-        located: BoolArray = np.isfinite(one.pose).all(axis=1)
+        located: BoolArray = ~np.isnan(one.pose[:, 0])
         if located.any():
             writer.write("tf", one.stamp_ns, transforms.encode(one.stamp_ns, located, one.pose))
         writer.write("swarm/markers", one.stamp_ns, markers.encode(one, newest))

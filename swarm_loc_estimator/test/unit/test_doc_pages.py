@@ -9,7 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.cli import calibrate, calibrate_ir, import_droplets, import_mrclam, replay, replay_map, watch
+from swarm_loc_estimator.cli import (
+    calibrate,
+    calibrate_ir,
+    import_mrclam,
+    replay,
+    replay_map,
+    watch,
+)
 from swarm_loc_estimator.core.description.swarm import (
     CameraMount,
     Face,

@@ -70,7 +70,7 @@ class MarkersEncoder:
 
     def encode(self, estimate: EstimateMessage, sightings: Sightings | None = None) -> bytes:
         """The message for poses and what was seen; what it does not hold any more is deleted."""
-        located: BoolArray = np.isfinite(estimate.pose).all(axis=1)
+        located: BoolArray = ~np.isnan(estimate.pose[:, 0])
         pose, size = estimate.pose[located], self._size
         colours = _COLOURS[np.minimum(estimate.status[located], len(_COLOURS) - 1)]
         line = (0.15 * size, 0.0, 0.0)
