@@ -180,7 +180,7 @@ def _final(
     if isinstance(mapper, ParticleMapper):
         return np.array([one.online for one in exploration.arrivals])
     nodes, turns = np.array([node for node, _ in places]), np.array([turn for _, turn in places])
-    poses = mapper.graph.states[nodes, :3].copy()
+    poses: FloatArray = mapper.graph.states[nodes, :3].copy()
     poses[:, 2] += mapper.graph.states[nodes, 3] * turns
     return poses
 

@@ -45,7 +45,7 @@ def _result(seed: int, **values: float) -> RunResult:
     given |= {"online_worst_cm": 9.0, "aligned_cm": 1.0, "wall_cm": 2.0, "wall_aligned_cm": 1.0}
     given |= {"coverage": 1.0, "coverage_90_s": math.nan, "cpu_s_per_s": 0.01, **values}
     settings, empty = RunSettings("ring", 0.0, seed), np.zeros((0, 2))
-    return RunResult(settings=settings, bumps=0, cells=empty, path=empty, **given)  # type: ignore[arg-type]
+    return RunResult(settings=settings, bumps=0, cells=empty, path=empty, **given)
 
 
 def test_figures_count_what_diverged_and_what_never_came() -> None:

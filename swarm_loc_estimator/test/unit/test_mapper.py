@@ -12,6 +12,7 @@ from mapping_world import ROOM, RoomRobot, distance_in_room
 from swarm_loc_estimator.core.mapping.mapper import SCAN_TURN, CooperativeMapper
 from swarm_loc_estimator.core.mapping.printed.particle_mapper import ParticleMapper
 from swarm_loc_estimator.core.mapping.readings import LightSightings, Readings
+from swarm_loc_estimator.core.mapping.settings import MapperSettings
 from swarm_loc_estimator.core.mapping.stops import MotionTracker, Stop
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.se2 import wrap_angle
@@ -122,6 +123,17 @@ def test_two_robots_share_a_map_and_one_may_leave() -> None:
     assert goal is not None
     feed(mapper, 0, [*first.go_to(goal.odometry), first.turn(SCAN_TURN)])
     assert mapper.graph.count == count + 1
+
+
+def test_a_full_map_still_locates_robots() -> None:
+    mapper = CooperativeMapper(MapperSettings(max_stops=12))
+    robot = RoomRobot(START, 0.02, np.random.default_rng(9))
+    explore(mapper, mapper.join(np.array(START), KNOWN), robot, 7)
+    assert mapper.graph.count == 13
+    assert max(mapper.graph.targets) < 13
+    position, heading = error_of(mapper, 0, robot)
+    assert position < 0.03
+    assert heading < math.radians(2.0)
 
 
 def test_a_light_turns_a_robot_that_sees_no_walls() -> None:

@@ -53,7 +53,7 @@ def test_beams_of_more_than_one_stop_are_thinned_and_nothing_is_free() -> None:
     set_beams(beams, 0, turn, np.zeros(len(turn)))
     beams.sigma[0] = SIGMA
     fit_lines(0, 1.0, MAX_RANGE, beams, lines)
-    assert beams.count[0] == MAX_BEAMS
+    assert beams.counts[0] == MAX_BEAMS
     assert (lines.kind[0] == FREE).all()
 
 

@@ -47,8 +47,8 @@ def test_jacobians_are_those_of_finite_differences(kind: str, seed: int) -> None
         return residuals(values[: 4 * STOPS].reshape(STOPS, 4), values[4 * STOPS :])
 
     here, step = at(unknowns), 1e-6
-    for m in range(len(here.index)):
-        for column, index in enumerate(here.index[m]):
+    for m in range(len(here.unknowns)):
+        for column, index in enumerate(here.unknowns[m]):
             change = np.zeros(len(unknowns))
             change[index] = step
             numeric = (at(unknowns + change).residual[m] - at(unknowns - change).residual[m]) / (2.0 * step)
@@ -107,5 +107,5 @@ def test_stops_outgrow_the_room_that_there_was() -> None:
         stop = graph.add_stop(0, np.array([k, 0.0, 0.0]), 0.02)
         graph.set_scan(stop, np.linspace(0.0, 1.0, 10), np.full(10, 0.5))
     assert graph.count == 150
-    assert (graph.scans.beams.count[:150] == 10).all()
+    assert (graph.scans.beams.counts[:150] == 10).all()
     assert graph.poses[:, 0].tolist() == list(range(150))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.parameters.errors import UserError
 
 Rectangle = tuple[float, float, float, float]
@@ -68,7 +68,7 @@ def _edges(values: Sequence[float]) -> FloatArray:
     return np.concatenate([[inner[0] - 1.0], inner, [inner[-1] + 1.0]])
 
 
-def _within(x: FloatArray, y: FloatArray, rectangles: Sequence[Rectangle]) -> FloatArray:
+def _within(x: FloatArray, y: FloatArray, rectangles: Sequence[Rectangle]) -> BoolArray:
     """Whether points lie in any of the rectangles."""
     inside = np.zeros(x.shape, dtype=bool)
     for left, low, right, high in rectangles:

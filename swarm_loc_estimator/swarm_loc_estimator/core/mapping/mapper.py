@@ -52,6 +52,7 @@ class _Track:
         stop: Where it stands.
         node: Its newest stop in the graph.
         is_known: Whether `stop` is in the graph, as `node`.
+        passes: Whether `node` is one too many: the next stop takes its place.
         begin: How many readings of that stop belong to parts before.
         looked: How many readings of that stop there were when it came into the graph.
         left: (3,) pose by odometry when it left `node`.
@@ -68,6 +69,7 @@ class _Track:
     stop: Stop | None = None
     node: int | None = None
     is_known: bool = False
+    passes: bool = False
     begin: int = 0
     looked: int = 0
     left: FloatArray = field(default_factory=lambda: np.zeros(3))
@@ -250,16 +252,29 @@ class CooperativeMapper:
             self._enter_first(robot, track, stop, count)
             return
         track.begin = 0
-        begin, motion = track.node, between(track.left, stop.arrival)
-        node = self.graph.add_stop(robot, self._driven(track, stop.arrival), stop.sigma)
-        self.graph.set_scan(node, stop.turn[:count], stop.inverse[:count])
+        motion = between(track.left, stop.arrival)
         sigma = self._motion_sigma(track.path, abs(float(motion[2])))
-        self.graph.constraints.add_departure(begin, node, self.graph.turned[begin], motion, sigma)
-        track.node = node
+        pose = self._driven(track, stop.arrival)
+        if track.passes:
+            node = self._replace(track.node, pose, sigma, stop.sigma)
+        else:
+            begin, node = track.node, self.graph.add_stop(robot, pose, stop.sigma)
+            self.graph.constraints.add_departure(begin, node, self.graph.turned[begin], motion, sigma)
+        self.graph.set_scan(node, stop.turn[:count], stop.inverse[:count])
+        track.node, track.passes = node, self.graph.count > self.settings.max_stops
         if not align(self.graph, node, track.path):
             self.counters["scans_refused"] += 1
         if close_loop(self.graph, node):
             self.counters["loops_closed"] += 1
+
+    def _replace(self, node: int, pose: FloatArray, motion_sigma: FloatArray, sigma: float) -> int:
+        """Let the newest stop of a robot become its next one: the map is full, the robot goes on."""
+        known = np.sqrt(np.maximum(np.diag(self.graph.covariance(node)), 0.0))
+        self._lights.forget_node(node)
+        self.graph.reuse_stop(node, pose, sigma)
+        drive = np.array([*np.full(2, motion_sigma[:2].max()), motion_sigma[2]])
+        self.graph.constraints.add_prior(node, pose, np.hypot(known, drive))
+        return node
 
     def _motion_sigma(self, path: float, turn: float) -> FloatArray:
         """Standard deviations (3,) of a drive: along [m], across [m], heading [rad]."""

@@ -46,7 +46,7 @@ def next_stop(
         where there is no way at all.
     """
     grid = planning_grid(occupancy, position, others, settings)
-    here = grid.index(position)
+    here = grid.cell_of(position)
     length, before = paths_from(grid.passable, *here)
     cells = _candidates(length, grid.cell)
     if not len(cells):

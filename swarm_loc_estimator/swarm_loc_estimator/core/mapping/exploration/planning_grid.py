@@ -34,7 +34,7 @@ class PlanningGrid(NamedTuple):
     evidence: FloatArray
     passable: BoolArray
 
-    def index(self, point: FloatArray) -> tuple[int, int]:
+    def cell_of(self, point: FloatArray) -> tuple[int, int]:
         """The cell of a point (2,) in the grid [m]."""
         i, j = np.floor((np.asarray(point) - self.corner) / self.cell).astype(int).tolist()
         return min(max(i, 0), self.state.shape[0] - 1), min(max(j, 0), self.state.shape[1] - 1)
@@ -63,7 +63,7 @@ def planning_grid(
             np.hypot(*(middles - other[:, None, None])) > 2.0 * settings.robot_radius + settings.margin
         )
     grid = PlanningGrid(occupancy.corner, cell, state.astype(np.int8), highest, passable)
-    grid.passable[grid.index(position)] = True
+    grid.passable[grid.cell_of(position)] = True
     return grid
 
 

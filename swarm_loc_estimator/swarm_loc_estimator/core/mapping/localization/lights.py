@@ -60,6 +60,11 @@ class LightBook:
         """A robot has left where it stood."""
         self._visits.setdefault(robot, deque(maxlen=_MAX_VISITS)).append(visit)
 
+    def forget_node(self, node: int) -> None:
+        """The number of a stop is given to another one."""
+        for robot, visits in self._visits.items():
+            self._visits[robot] = deque((one for one in visits if one.node != node), maxlen=_MAX_VISITS)
+
     def note_time(self, robot: int, stamp_ns: int) -> None:
         """Where a robot stood until a time is known."""
         self._until_ns[robot] = stamp_ns

@@ -99,7 +99,7 @@ def beam_residual(
 def agreement(scans: Scans, k: int, j: int, gate: float, stride: int) -> tuple[int, int, float]:
     """How well beams of stop k, every `stride`-th, agree with lines of stop j: matched, tried, loss."""
     matched, tried, loss = 0, 0, 0.0
-    for i in range(0, scans.beams.count[k], stride):
+    for i in range(0, scans.beams.counts[k], stride):
         if scans.beams.inverse[k, i] <= 0.0:
             continue
         fate, residual, variance, _, _, _, _ = beam_residual(scans, k, i, j, gate)
@@ -121,7 +121,7 @@ def accumulate(
     """
     matched, tried = 0, 0
     row = np.zeros(8)
-    for i in range(0, scans.beams.count[k], stride):
+    for i in range(0, scans.beams.counts[k], stride):
         if scans.beams.inverse[k, i] <= 0.0:
             continue
         fate, residual, variance, per_metre, nx, ny, m = beam_residual(scans, k, i, j, gate)

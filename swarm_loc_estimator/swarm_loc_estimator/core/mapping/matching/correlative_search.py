@@ -51,7 +51,7 @@ def search_offsets(scans: Scans, parts: IntArray, against: IntArray, lattice: La
     """Search the offset that moves stops (p,), as one body around the first of them, to fit others (q,)."""
     scores = np.zeros(_shape(lattice))
     for k in parts:
-        stride = max(3, int(scans.beams.count[k]) // _BEAMS)
+        stride = max(3, int(scans.beams.counts[k]) // _BEAMS)
         scores += _scores(scans, int(k), int(parts[0]), against, lattice, stride)
     best = np.unravel_index(int(scores.argmax()), scores.shape)
     half = (np.array(scores.shape) - 1) // 2

@@ -20,13 +20,13 @@ class Linearised(NamedTuple):
     """Constraints (m,) with e residuals each on c unknowns each.
 
     Attributes:
-        index: (m, c) which unknowns.
+        unknowns: (m, c) their indices.
         jacobian: (m, e, c).
         residual: (m, e).
         weight: (m, e) one over the variance.
     """
 
-    index: IntArray
+    unknowns: IntArray
     jacobian: FloatArray
     residual: FloatArray
     weight: FloatArray

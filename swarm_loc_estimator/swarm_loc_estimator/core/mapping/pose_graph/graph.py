@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from swarm_loc_estimator.core.mapping.pose_graph.constraint_lists import Constra
 from swarm_loc_estimator.core.mapping.pose_graph.constraints import STOP_UNKNOWNS
 from swarm_loc_estimator.core.mapping.pose_graph.normal_equations import Factor, NormalEquations
 from swarm_loc_estimator.core.mapping.scans.beams import Beams, no_beams, set_beams
-from swarm_loc_estimator.core.mapping.scans.lines import fit_lines, no_lines
+from swarm_loc_estimator.core.mapping.scans.lines import Lines, fit_lines, no_lines
 from swarm_loc_estimator.core.mapping.settings import MapperSettings
 from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
 
@@ -88,6 +89,19 @@ class PoseGraph:
         self.robot[k] = robot
         self._beams.sigma[k] = sigma
         return k
+
+    def reuse_stop(self, stop: int, pose: FloatArray, sigma: float) -> None:
+        """Forget a stop, and let its number be that of a new one of the same robot; see `add_stop`."""
+        self.constraints.remove_stop(stop)
+        self.targets = {
+            one: [other for other in others if other != stop]
+            for one, others in self.targets.items()
+            if one != stop
+        }
+        self.starts.discard(stop)
+        self.states[stop] = (*pose[:3], 1.0 - self.slip[self.robot[stop]])
+        self._beams.sigma[stop] = sigma
+        self._factored = -1
 
     def set_scan(self, stop: int, turn: FloatArray, inverse: FloatArray) -> None:
         """Set the beams (n,) of a stop: turn by odometry since arrival [rad], inverse distances [1/m]."""
@@ -217,10 +231,10 @@ class PoseGraph:
         self.states, self.robot = _doubled(self.states), _doubled(self.robot)
         self.turned, self._turned_all = _doubled(self.turned), _doubled(self._turned_all)
         self._fitted_ratio = _doubled(self._fitted_ratio)
-        self._beams = Beams(*map(_doubled, self._beams))
-        self._lines = type(self._lines)(*map(_doubled, self._lines))
+        self._beams = Beams(*(_doubled(one) for one in self._beams))
+        self._lines = Lines(*(_doubled(one) for one in self._lines))
 
 
-def _doubled(array: FloatArray) -> FloatArray:
+def _doubled(array: Any) -> Any:
     """An array with as much room again behind."""
     return np.concatenate([array, np.zeros_like(array)])

@@ -36,7 +36,7 @@ class NormalEquations:
         for one in constraints:
             weighted = one.jacobian * one.weight[:, :, None]
             squares = np.einsum("mea,meb->mab", weighted, one.jacobian)
-            self.add_blocks(one.index, squares, -np.einsum("mea,me->ma", weighted, one.residual))
+            self.add_blocks(one.unknowns, squares, -np.einsum("mea,me->ma", weighted, one.residual))
 
     def add_blocks(self, index: IntArray, squares: FloatArray, gradient: FloatArray) -> None:
         """Add blocks (m, c, c) with right sides (m, c) on unknowns (m, c)."""
@@ -84,4 +84,5 @@ class Factor:
         for number, direction in enumerate(chosen):
             np.add.at(columns[:, number], self._place[index], direction)
         covariance: NDArray[np.float64] = columns.T @ self._factor.solve(columns)
-        return 0.5 * (covariance + covariance.T)
+        symmetric: FloatArray = 0.5 * (covariance + covariance.T)
+        return symmetric

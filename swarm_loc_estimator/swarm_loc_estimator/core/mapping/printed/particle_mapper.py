@@ -162,7 +162,7 @@ class ParticleMapper:
         others = [one.mean[:2] for key, one in self._tribes.items() if key != robot]
         occupancy = OccupancyMap(self._corner, CELL, self._values)
         grid = planning_grid(occupancy, pose[:2], np.array(others).reshape(-1, 2), self._settings)
-        here = grid.index(pose[:2])
+        here = grid.cell_of(pose[:2])
         length, before = paths_from(grid.passable, *here)
         visits = self._visits.on(occupancy)
         shape = grid.state.shape

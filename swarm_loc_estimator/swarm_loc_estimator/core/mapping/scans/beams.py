@@ -18,13 +18,13 @@ class Beams(NamedTuple):
     Attributes:
         turn: (k, MAX_BEAMS) turn by odometry since the robot came to this stop [rad].
         inverse: (k, MAX_BEAMS) inverse distance [1/m], 0: nothing seen.
-        count: (k,) how many beams there are.
+        counts: (k,) how many beams there are.
         sigma: (k,) standard deviation of an inverse distance [1/m].
     """
 
     turn: FloatArray
     inverse: FloatArray
-    count: IntArray
+    counts: IntArray
     sigma: FloatArray
 
 
@@ -39,4 +39,4 @@ def set_beams(beams: Beams, stop: int, turn: FloatArray, inverse: FloatArray) ->
     every = -(-len(turn) // MAX_BEAMS) or 1
     turn, inverse = turn[::every], inverse[::every]
     beams.turn[stop, : len(turn)], beams.inverse[stop, : len(turn)] = turn, inverse
-    beams.count[stop] = len(turn)
+    beams.counts[stop] = len(turn)

@@ -57,8 +57,8 @@ class Lines(NamedTuple):
 def no_lines(capacity: int) -> Lines:
     """Room for the lines of so many stops."""
     shape = (capacity, BINS)
-    numbers = [np.zeros(shape) for _ in range(5)]
-    return Lines(np.zeros(shape, dtype=np.int8), *numbers, np.zeros(shape, dtype=bool))
+    a, b, distance, variance, turn = np.zeros((5, *shape))
+    return Lines(np.zeros(shape, dtype=np.int8), a, b, distance, variance, turn, np.zeros(shape, dtype=bool))
 
 
 @compiled
@@ -96,7 +96,7 @@ def fit_lines(stop: int, ratio: float, max_range: float, beams: Beams, lines: Li
 def _sums_per_bin(stop: int, ratio: float, beams: Beams) -> tuple[FloatArray, FloatArray]:
     """Sums (BINS, 11), and sums of turns by odometry (BINS,)."""
     sums, turns = np.zeros((BINS, 11)), np.zeros(BINS)
-    for i in range(beams.count[stop]):
+    for i in range(beams.counts[stop]):
         angle = ratio * beams.turn[stop, i]
         m = math.floor(angle * BINS / (2.0 * math.pi)) % BINS
         y = beams.inverse[stop, i]
@@ -188,4 +188,4 @@ def _is_free(total: FloatArray, m: int) -> bool:
     if looked == 0.0 or seen > 0.2 * looked:
         return False
     around = total[here + 3, _ALL] - total[here - 2, _ALL]
-    return total[here + 3, _SEEN] - total[here - 2, _SEEN] <= 0.34 * around
+    return bool(total[here + 3, _SEEN] - total[here - 2, _SEEN] <= 0.34 * around)
