@@ -173,8 +173,8 @@ def test_gains_that_cannot_be_are_refused(
 @pytest.mark.parametrize("name", packaged_platforms())
 def test_every_packaged_platform_loads(name: str) -> None:
     platform = load_ir_platform(name)
-    assert platform.n == {"droplet": 6, "epuck_twelve": 12}[name]
-    assert platform.powers == {"droplet": ("far", "near"), "epuck_twelve": ("far",)}[name]
+    assert platform.n == {"droplet": 6, "droplet_2016": 6, "epuck_twelve": 12}[name]
+    assert platform.powers == (("far", "near") if name == "droplet" else ("far",))
 
 
 def test_a_path_starts_from_the_folder_that_is_given(tmp_path: Path) -> None:
@@ -214,5 +214,7 @@ def test_a_wrong_file_says_which_key(tmp_path: Path, old: str, new: str, words: 
 
 
 def test_an_unknown_name_lists_those_that_there_are() -> None:
-    with pytest.raises(IrPlatformFileError, match=r"'dropled' is no packaged .* \(droplet, epuck_twelve\)"):
+    with pytest.raises(
+        IrPlatformFileError, match=r"'dropled' is no packaged .* \(droplet, droplet_2016, epuck_twelve\)"
+    ):
         load_ir_platform("dropled")

@@ -29,7 +29,7 @@ _MISFIT = 3.0
 _DEAD_SHARE = 0.2
 """An element that shows less than this share of the light expected of it is dead."""
 _MIN_LIT = 20
-_TAIL_SHARE, _TAIL_BOUND = 0.94, 11.345
+_TAIL_SHARE, _TAIL_BOUND = 0.97, 11.345
 """Covariances are grown until this share of errors is within the bound that 99 % of normal ones are in."""
 _MAX_SCALE = 30.0
 

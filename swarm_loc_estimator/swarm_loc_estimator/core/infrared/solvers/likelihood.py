@@ -55,7 +55,7 @@ _FAINTEST = 6.0
 """Readings must be brighter than noise by so many sigmas of the sum of their squares."""
 _EXPLAINED = 0.5
 """The share of what is read, in squares, that a pose must explain."""
-_EXPLAINED_OF_OUTLIERS = 0.3
+_EXPLAINED_OF_OUTLIERS = 0.2
 """Likewise where readings may be blocked or too bright."""
 _WIDEST = 1.0
 """A bearing or heading less sure than this is open [rad]."""
@@ -212,7 +212,7 @@ def _solve_one(models: Models, pair: Pair, room: _Room, out: IrSolutions, k: int
         for q in range(3):
             apart = _apart(best, other, p) * _apart(best, other, q) if share > 0.0 else 0.0
             covariance[p, q] = models.exact.scale * max(misfit, 1.0) * covariance[p, q] + share * apart
-    if max(covariance[1, 1], covariance[2, 2]) > _WIDEST * _WIDEST:
+    if max(covariance[1, 1], covariance[2, 2]) > models.exact.scale * _WIDEST * _WIDEST:
         return _UNDETERMINED
     out.misfits[k], out.odds[k] = misfit, odds
     assign(out.systematic_share[k], room.full.of_gains)
