@@ -125,6 +125,18 @@ def test_two_robots_share_a_map_and_one_may_leave() -> None:
     assert mapper.graph.count == count + 1
 
 
+def test_odometry_that_begins_anew_is_no_drive() -> None:
+    mapper, robot = CooperativeMapper(), RoomRobot(START, 0.02, np.random.default_rng(10))
+    explore(mapper, mapper.join(np.array(START), KNOWN), robot, 2)
+    robot.odometry = np.array([40.0, -7.0, 2.0])
+    robot.pose[:2] += [0.04, -0.03]  # somebody has pushed it a little, too
+    explore(mapper, 0, robot, 2)
+    assert mapper.counters["odometry_restarts"] == 1
+    position, heading = error_of(mapper, 0, robot)
+    assert position < 0.03
+    assert heading < math.radians(2.0)
+
+
 def test_a_full_map_still_locates_robots() -> None:
     mapper = CooperativeMapper(MapperSettings(max_stops=12))
     robot = RoomRobot(START, 0.02, np.random.default_rng(9))

@@ -38,6 +38,7 @@ _PART_SIGMA = np.array([0.002, 0.002, 0.002])
 _LEAST_SIGMA = 0.003
 _LOST_SIGMA, _CHECK_EVERY = 0.15, 4
 """A robot that is less sure of its position [m] goes home: to an old stop nearby."""
+_RESTART_SIGMA = np.array([0.10, 0.10, math.radians(5.0)])
 _HOME_AGE, _HOME_RADIUS, _AT_HOME = 10, 4.0, 0.5
 
 
@@ -102,7 +103,7 @@ class CooperativeMapper:
         self.settings = settings or MapperSettings()
         self.graph = PoseGraph(self.settings)
         self.visits = VisitationMap()
-        self.counters = {"scans": 0, "scans_refused": 0, "loops_closed": 0}
+        self.counters = {"scans": 0, "scans_refused": 0, "loops_closed": 0, "odometry_restarts": 0}
         self._tracks: dict[int, _Track] = {}
         self._lights = LightBook()
         self.background: OccupancyMap | None = None
@@ -125,8 +126,11 @@ class CooperativeMapper:
         for run in track.motion.runs(readings):
             if run.arrives or not run.stands:
                 self._depart(robot, track)
-            if run.arrives:
+            if run.jumps:
+                track = self._begin_anew(robot, track)
+            elif run.arrives:
                 self._drive(track, run.readings.odometry[:1])
+            if run.arrives:
                 track.stop, track.is_known = Stop(run.readings.odometry[0]), False
             if run.stands and track.stop is not None:
                 before = len(track.stop.turn)
@@ -139,6 +143,15 @@ class CooperativeMapper:
             else:
                 self._drive(track, run.readings.odometry)
                 self._lights.note_time(robot, int(run.readings.stamp_ns[-1]))
+
+    def _begin_anew(self, robot: int, track: _Track) -> _Track:
+        """Odometry has begun anew, as when a driver was restarted: the robot is about where it was last."""
+        self.counters["odometry_restarts"] += 1
+        pose = self.pose(robot)
+        fresh = _Track(track.prior, track.prior_sigma) if pose is None else _Track(pose, _RESTART_SIGMA)
+        fresh.motion = track.motion
+        self._tracks[robot] = fresh
+        return fresh
 
     def add_lights(self, robot: int, sightings: LightSightings) -> None:
         """Take sightings (m,) of other robots by one of them."""

@@ -24,7 +24,9 @@ _MAX_READINGS = 4096
 """Of more at one stop, every second one is left out."""
 _REST_NS, _REST_TURN = 1_000_000_000, 0.01
 """A robot that turns less than this in such a time rests [rad]."""
-_DRIVES, _STANDS, _ARRIVES = 0, 1, 2
+_DRIVES, _STANDS, _ARRIVES, _JUMPS = 0, 1, 2, 3
+_MAX_SPEED, _MAX_STEP, _MAX_RATE, _MAX_TURN = 3.0, 0.05, 20.0, 0.3
+"""Odometry that goes further than such a speed or rate allows has begun anew [m/s], [m], [rad/s], [rad]."""
 
 
 class Stop:
@@ -86,11 +88,13 @@ class Run(NamedTuple):
     Attributes:
         stands: Whether the robot stands.
         arrives: Whether it has just come.
+        jumps: Whether odometry has begun anew, by which nothing is known of the way here.
         readings: These.
     """
 
     stands: bool
     arrives: bool
+    jumps: bool
     readings: Readings
 
 
@@ -98,32 +102,37 @@ class MotionTracker:
     """Tells standing from driving for one robot."""
 
     def __init__(self) -> None:
-        self._state = np.full(5, np.nan)  # anchor x, y; position before x, y; whether it stands
+        self._state = np.full(6, np.nan)  # anchor x, y; before x, y; whether it stands; heading before
         self._before_ns = 0
 
     def runs(self, readings: Readings) -> Iterator[Run]:
         """Cut readings (n,) where the robot comes or leaves."""
         labels = _labels(readings.stamp_ns, readings.odometry, self._state, self._before_ns)
         self._before_ns = int(readings.stamp_ns[-1])
-        changes = (labels[1:] == _ARRIVES) | ((labels[1:] == _DRIVES) != (labels[:-1] == _DRIVES))
+        changes = (labels[1:] >= _ARRIVES) | ((labels[1:] == _DRIVES) != (labels[:-1] == _DRIVES))
         bounds = [0, *(np.flatnonzero(changes) + 1).tolist(), len(labels)]
         for begin, end in pairwise(bounds):
             part = slice(begin, end)
             chosen = Readings(
                 readings.stamp_ns[part], readings.odometry[part], readings.inverse[part], readings.sigma
             )
-            yield Run(bool(labels[begin] != _DRIVES), bool(labels[begin] == _ARRIVES), chosen)
+            label = int(labels[begin])
+            yield Run(label != _DRIVES, label >= _ARRIVES, label == _JUMPS, chosen)
 
 
 @compiled
 def _labels(stamp_ns: IntArray, odometry: FloatArray, state: FloatArray, before_ns: int) -> IntArray:
-    """Whether a robot drives, stands or arrives at each reading; the state goes on."""
+    """Whether a robot drives, stands or arrives at each reading, or jumps; the state goes on."""
     labels = np.zeros(len(stamp_ns), dtype=np.int64)
     for k in range(len(stamp_ns)):
         x, y = odometry[k, 0], odometry[k, 1]
         elapsed_s = (stamp_ns[k] - before_ns) * 1e-9
         step = math.hypot(x - state[2], y - state[3])
-        if state[4] == 1.0 and math.hypot(x - state[0], y - state[1]) <= _DEPARTED:
+        turn = abs((odometry[k, 2] - state[5] + math.pi) % (2.0 * math.pi) - math.pi)
+        if step > _MAX_SPEED * elapsed_s + _MAX_STEP or turn > _MAX_RATE * elapsed_s + _MAX_TURN:
+            labels[k] = _JUMPS
+            state[0], state[1], state[4] = x, y, 1.0
+        elif state[4] == 1.0 and math.hypot(x - state[0], y - state[1]) <= _DEPARTED:
             labels[k] = _STANDS
         elif math.isnan(state[4]) or (state[4] == 0.0 and step < _STAND_SPEED * elapsed_s):
             labels[k] = _ARRIVES
@@ -131,7 +140,7 @@ def _labels(stamp_ns: IntArray, odometry: FloatArray, state: FloatArray, before_
         else:
             labels[k] = _DRIVES
             state[4] = 0.0
-        state[2], state[3] = x, y
+        state[2], state[3], state[5] = x, y, odometry[k, 2]
         before_ns = stamp_ns[k]
     return labels
 

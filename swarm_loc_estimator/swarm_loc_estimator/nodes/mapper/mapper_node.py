@@ -116,9 +116,9 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self.feed.add(robot, kind, data)
         number = self.feed.number(robot)
         goal = self._mapper.goal(number) if number is not None else None
-        if number is None or goal is None or self._told.get(robot) == goal.number:
+        if number is None or goal is None or self._told.get(robot) == goal.stamp_ns:
             return
-        self._told[robot] = goal.number
+        self._told[robot] = goal.stamp_ns
         frame = self.chosen.map_frame
         self._fixes[robot].publish(fix_message(goal, self._mapper.covariance(number), frame))
         self._goals[robot].publish(goal_message(goal, frame))

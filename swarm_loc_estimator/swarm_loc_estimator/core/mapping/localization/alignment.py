@@ -56,11 +56,11 @@ def _align_alone(graph: PoseGraph, stop: int, path: float) -> bool:
 
 
 def align_start(graph: PoseGraph, parts: Sequence[int]) -> None:
-    """Align the parts of a robot's first scan with each other and, as one body, with other robots' scans."""
+    """Align the parts of a robot's first scan with each other and, as one body, with older scans."""
     others = [
         int(other)
         for other in np.argsort(graph.distances(parts[0]), kind="stable")
-        if graph.robot[other] != graph.robot[parts[0]] and graph.distances(parts[0])[other] < _START_RADIUS
+        if other < parts[0] and graph.distances(parts[0])[other] < _START_RADIUS
     ][:_START_AGAINST]
     if others:
         found = search_offsets(graph.scans, np.array(parts), np.array(others), _START_SEARCH)
