@@ -39,7 +39,7 @@ setup:
 
 bench-%:
 	@$(PYTHON) tools/setup_workspace.py --bench
-	@./run -- python -m bench.$* $(ARGS)
+	@./run -- python -m bench $* $(ARGS)
 
 clean:
 	rm -rf .venv .workspace out .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,6 +1,6 @@
 """Benchmarks: each prints a table, draws it under out/ and leaves its figures in out/bench/.
 
-`make bench-NAME` runs `python -m bench.NAME`: bench/NAME.py, or bench/NAME/__main__.py.
+`make bench-NAME` runs `python -m bench NAME`, which knows them all.
 """
 
 import os

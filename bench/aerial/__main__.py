@@ -10,7 +10,7 @@ from pathlib import Path
 
 from bench.aerial import calibration, detector, driving, rendered, straight, turning
 from bench.aerial.rates import SWARMS, Results
-from bench.common import Cell, new_plot, save_plot, table, write_figures
+from bench.shared.common import Cell, new_plot, save_plot, table, write_figures
 
 _METHODS = {
     "angular": "angular.n{}.success",

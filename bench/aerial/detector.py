@@ -14,7 +14,7 @@ from functools import reduce
 import numpy as np
 
 from bench.aerial.pictures import DIAMETER, Look, Picture, draw_picture
-from bench.common import Cell, ProgressLine, table
+from bench.shared.common import Cell, ProgressLine, table
 from swarm_loc_estimator.numerics import se2
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_vision.core.aerial.detector import AerialDetections, AerialDetector

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from rclpy.time import Time
 from sensor_msgs.msg import Image
 
-from bench.common import OUT, Cell, ProgressLine, table
-from bench.live_listener import Listener
+from bench.graph.listener import Listener
+from bench.shared.common import OUT, Cell, ProgressLine, table
 from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
 from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate

@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.common import Cell, new_plot, save_plot, table, write_figures
 from bench.droplet import swarm as droplet_swarm
+from bench.shared.common import Cell, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.core.infrared.board import IrPlatform, PairGains
 from swarm_loc_estimator.core.infrared.brightness import expected
 from swarm_loc_estimator.core.infrared.cramer_rao import information

@@ -27,7 +27,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
-from bench.common import OUT, Cell, new_plot, save_plot, table, write_figures
+from bench.shared.common import OUT, Cell, new_plot, save_plot, table, write_figures
 from swarm_loc_drivers.sim.recording.droplet_bag import write_droplet_bag
 from swarm_loc_drivers.sim.scenarios.droplet_run import (
     FIXED,

@@ -27,10 +27,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.common import Cell, new_plot, save_plot, table, write_figures
 from bench.epuck.rendered_report import rendered_worlds
 from bench.epuck.rendered_report import report as report_rendered
-from bench.simulated_run import errors_of, mean_nees, run_core
+from bench.shared.common import Cell, new_plot, save_plot, table, write_figures
+from bench.shared.simulated_run import errors_of, mean_nees, run_core
 from bench.vision import report as vision_report
 from swarm_loc_drivers.sim.common.error_model import W0, W2, W2_FAST, ErrorModel
 from swarm_loc_drivers.sim.scenarios.dense import DenseSettings, blind_robots, simulate_dense

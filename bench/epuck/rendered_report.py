@@ -14,9 +14,9 @@ from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from bench.common import OUT, Cell, ProgressLine, new_plot, save_plot, table
 from bench.epuck.rendered import RenderedRun, run_rendered, starting_swarm
 from bench.epuck.seen import Seen, count_seen
+from bench.shared.common import OUT, Cell, ProgressLine, new_plot, save_plot, table
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.evaluation.metrics import ErrorSummary, pool, summarise

@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.common import OUT, Cell, ProgressLine, new_plot, save_plot, table, write_figures
 from bench.integrity.live import LIVE_SCENARIOS, run_live
 from bench.integrity.scenarios import SCENARIOS
 from bench.integrity.scoring import Score, score
+from bench.shared.common import OUT, Cell, ProgressLine, new_plot, save_plot, table, write_figures
 
 _NAMES = (*SCENARIOS, *LIVE_SCENARIOS)
 _PLOTS_PER_FILE = 5

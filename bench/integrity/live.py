@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.graph.listener import Listener, Say
 from bench.integrity.scoring import Estimated, Score, scored
-from bench.live_listener import Listener, Say
 from swarm_loc_drivers.sim.common.error_model import W0
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
 from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate

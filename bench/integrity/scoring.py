@@ -9,7 +9,7 @@ import numpy as np
 
 from bench.integrity.faults import seconds
 from bench.integrity.scenarios import Fault
-from bench.simulated_run import errors_of, inputs_between
+from bench.shared.simulated_run import errors_of, inputs_between
 from swarm_loc_estimator.core.estimation.contradictions import Kind
 from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimator
 from swarm_loc_estimator.evaluation.metrics import nees

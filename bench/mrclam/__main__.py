@@ -23,7 +23,6 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from bench.common import OUT
 from bench.mrclam.jobs import (
     MODELS,
     Results,
@@ -37,6 +36,7 @@ from bench.mrclam.jobs import (
 )
 from bench.mrclam.report import report
 from bench.mrclam.sets import NoSetsError, find_sets
+from bench.shared.common import OUT
 from swarm_loc_estimator.cli.errors import exit_with_message
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
 

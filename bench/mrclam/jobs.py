@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.common import OUT
 from bench.mrclam.sets import (
     import_set,
     load,
@@ -20,6 +19,7 @@ from bench.mrclam.sets import (
     without_robots,
     without_sightings,
 )
+from bench.shared.common import OUT
 from swarm_loc_estimator.calibration.motion_and_camera.fit import Options, calibrate
 from swarm_loc_estimator.calibration.recording import Recording
 from swarm_loc_estimator.calibration.rerun import rerun

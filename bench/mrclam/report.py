@@ -8,8 +8,8 @@ from pathlib import Path
 
 from matplotlib.axes import Axes
 
-from bench.common import new_plot, save_plot, table, write_figures
 from bench.mrclam.jobs import MODELS, ONLINE, SMOOTHER, Results
+from bench.shared.common import new_plot, save_plot, table, write_figures
 
 COLUMNS = ("odometry", "landmarks", ONLINE, "unknown_start", SMOOTHER, "blind_robots")
 FIGURES = ("position_rmse_m", "heading_rmse_deg", "nees")

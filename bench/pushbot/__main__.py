@@ -18,7 +18,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from bench.common import write_figures
+from bench.shared.common import write_figures
 
 PARTS = ("tracker", "calibration", "driver", "mapping")
 

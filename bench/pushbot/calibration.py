@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.common import Cell, new_plot, save_plot, table
+from bench.shared.common import Cell, new_plot, save_plot, table
 from swarm_loc_drivers.sim.pushbot import optics
 from swarm_loc_drivers.sim.pushbot.wall_drive import WallDriveSettings, drive_at_wall
 from swarm_loc_estimator.numerics.arrays import FloatArray

@@ -18,8 +18,8 @@ import rclpy
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from bench.common import Cell, new_plot, save_plot, table
 from bench.pushbot.event_feed import StandingBody
+from bench.shared.common import Cell, new_plot, save_plot, table
 from swarm_loc_drivers.core.pushbot.session import PushbotSession
 from swarm_loc_drivers.core.pushbot.settings import PushbotSettings, WheelGeometry
 from swarm_loc_drivers.protocols.pushbot.commands import Lights

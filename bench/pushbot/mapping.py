@@ -10,9 +10,9 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from bench.common import Cell, table
 from bench.pushbot.maps import draw_maps
 from bench.pushbot.runs import RunResult, RunSettings, run
+from bench.shared.common import Cell, table
 
 PLANS = ("corridor", "office", "ring")
 UNSEEN = ("bend", "atrium", "tee")

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
-from bench.common import new_plot, save_plot
 from bench.pushbot.runs import RunResult
+from bench.shared.common import new_plot, save_plot
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 
 _SHOWN = (

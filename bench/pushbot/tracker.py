@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.common import Cell, new_plot, save_plot, table
+from bench.shared.common import Cell, new_plot, save_plot, table
 from swarm_loc_drivers.sim.common.body import Blinking
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraEvents, CameraNoise, EventCamera, Spot
 from swarm_loc_drivers.sim.pushbot.optics import spot_brightness

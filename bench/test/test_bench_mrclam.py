@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.common import save_plot, write_figures
 from bench.mrclam import __main__ as mrclam
 from bench.mrclam import report as reporting
 from bench.mrclam.jobs import MODELS, Done, Job, Sums, collected, jobs_of
@@ -22,6 +21,7 @@ from bench.mrclam.sets import (
     without_robots,
     without_sightings,
 )
+from bench.shared.common import save_plot, write_figures
 from swarm_loc_estimator.calibration.recording import Recording, Rows
 from swarm_loc_estimator.core.description.swarm import Face, Landmark, Robot, SensorModel, Swarm
 from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE

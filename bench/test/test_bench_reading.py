@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bench import reading
+from bench.peers import reading
 from swarm_loc_estimator.io.bags.cut import copy_beginning
 from swarm_loc_estimator.io.messages.typestore import DETECTIONS, ODOMETRY
 

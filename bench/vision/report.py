@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.common import Cell, new_plot, save_plot, table
+from bench.shared.common import Cell, new_plot, save_plot, table
 from bench.vision.bch import BchFigures, measure_bch
 from bench.vision.comparison import (
     BLURS_PX,

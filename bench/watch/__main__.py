@@ -25,7 +25,7 @@ import numpy as np
 from domain_coordinator import domain_id
 from playwright.sync_api import Browser
 
-from bench.common import OUT, ProgressLine, new_plot, save_plot, table, write_figures
+from bench.shared.common import OUT, ProgressLine, new_plot, save_plot, table, write_figures
 from bench.watch.browser import WatchedPage, chromium, running_browser
 from bench.watch.publisher import homes
 from swarm_loc_drivers.sim.recording.bag import write_bag

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from playwright.sync_api import Browser
 
-from bench.common import OUT
+from bench.shared.common import OUT
 from bench.watch.browser import WatchedPage, chromium, running_browser
 from swarm_loc_drivers.sim.recording.bag import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid

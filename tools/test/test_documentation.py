@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from bench.__main__ import BENCHMARKS
 from workspace.layout import PACKAGES, ROOT
 
 FOLDERS = (*PACKAGES, "bags", "bench", "tools")
@@ -63,8 +64,7 @@ def executables(package: str) -> set[str]:
 
 def has_target(name: str) -> bool:
     if name.startswith("bench-"):
-        module = ROOT / "bench" / name.removeprefix("bench-")
-        return module.with_suffix(".py").exists() or (module / "__main__.py").exists()
+        return name.removeprefix("bench-") in BENCHMARKS
     return re.search(rf"^{re.escape(name)}:", text_of(ROOT / "Makefile"), re.MULTILINE) is not None
 
 

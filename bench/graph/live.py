@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.common import OUT, new_plot, save_plot, table, write_figures
+from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.evaluation.metrics import pool, summarise
 from swarm_loc_estimator.evaluation.result import ReplayResult
 from swarm_loc_estimator.io.bags.cut import copy_beginning

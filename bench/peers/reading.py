@@ -19,8 +19,8 @@ import numpy as np
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
-from bench.common import OUT, new_plot, save_plot, table, write_figures
 from bench.mrclam.sets import import_set
+from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.io.bags.cut import copy_beginning
 from swarm_loc_estimator.io.bags.reader import BagReader
 from swarm_loc_estimator.io.messages.cdr import decode_odometry
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from swarm_loc_estimator.numerics.arrays import FloatArray
 
-DEMO = Path(__file__).resolve().parents[1] / "bags" / "eight_five_robots"
+DEMO = Path(__file__).resolve().parents[2] / "bags" / "eight_five_robots"
 MRCLAM_S = 300.0
 """How much of a set is read [s]; costs per message do not change with the length."""
 REPEATS = 3

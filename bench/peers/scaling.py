@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.common import OUT, new_plot, save_plot, table, write_figures
 from bench.peers import filterpy_ekf, gtsam_batch, gtsam_lag
-from bench.simulated_run import errors_of, mean_nees, position_rmse, run_core
+from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
+from bench.shared.simulated_run import errors_of, mean_nees, position_rmse, run_core
 from swarm_loc_drivers.sim.recording.bag import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.core.description.settings import EstimatorSettings

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.common import OUT, new_plot, save_plot, table, write_figures
+from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.launching.graph import GraphOptions, graph_nodes
 from swarm_loc_estimator.live.graph import START_PATIENCE_S, LiveGraph, cpu_seconds
 from swarm_loc_estimator.live.recorder import Recorder, read_poses

@@ -21,8 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.common import OUT, Cell, ProgressLine, table, write_figures
-from bench.droplet_real import firmware
+from bench.droplet.real import firmware
+from bench.shared.common import OUT, Cell, ProgressLine, table, write_figures
 from swarm_loc_estimator.calibration.infrared.board import (
     calibrate_board,
     dead_sensors,

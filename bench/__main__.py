@@ -1,0 +1,36 @@
+"""Run a benchmark by its name: python -m bench NAME [ARGUMENTS], which `make bench-NAME` calls."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+
+BENCHMARKS = {
+    "aerial": "bench.aerial",
+    "droplet": "bench.droplet",
+    "droplet_real": "bench.droplet.real",
+    "epuck": "bench.epuck",
+    "integrity": "bench.integrity",
+    "live": "bench.graph.live",
+    "mrclam": "bench.mrclam",
+    "pushbot": "bench.pushbot",
+    "reading": "bench.peers.reading",
+    "scaling": "bench.peers.scaling",
+    "soak": "bench.graph.soak",
+    "vision": "bench.vision",
+    "watch": "bench.watch",
+}
+"""Name -> module."""
+
+
+def main() -> None:
+    """Run the benchmark that the first argument names with the other ones."""
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if name not in BENCHMARKS:
+        sys.exit(f"'{name}' is no benchmark; there are {', '.join(BENCHMARKS)}.")
+    del sys.argv[1]
+    runpy.run_module(BENCHMARKS[name], run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    main()
