@@ -64,7 +64,13 @@ class BoardReadings(NamedTuple):
 
     def chosen(self, rows: NDArray[np.bool_]) -> BoardReadings:
         """Those that are marked (k,)."""
-        return BoardReadings(*(column[rows] for column in self))
+        return BoardReadings(
+            self.receiver[rows],
+            self.transmitter[rows],
+            self.readings[rows],
+            self.poses[rows],
+            self.stamp_ns[rows],
+        )
 
 
 @dataclass(frozen=True)
@@ -112,7 +118,7 @@ def fit_board(start: IrPlatform, data: BoardReadings, robots: int, *, gains: boo
 
 def turned(poses: FloatArray, receiver_yaw: FloatArray, transmitter_yaw: FloatArray) -> FloatArray:
     """Relative poses (k, 3) of robots whose headings are ahead of their ground truth by (k,) [rad]."""
-    moved = poses.copy()
+    moved: FloatArray = poses.copy()
     moved[:, 1] = wrap_angle(poses[:, 1] - receiver_yaw)
     moved[:, 2] = wrap_angle(poses[:, 2] + transmitter_yaw - receiver_yaw)
     return moved
@@ -188,7 +194,8 @@ class _Problem:
         distance, (alpha, beta) = self.angles(yaw)
         logs = law[0] - law[2] * np.log(np.maximum(distance + law[1], 1e-3))
         logs += self.log_gains(unknowns)[self._data.receiver, :, None]
-        return np.exp(logs + self._spline(alpha) @ sensor + self._spline(beta) @ emitter)
+        readings: FloatArray = np.exp(logs + self._spline(alpha) @ sensor + self._spline(beta) @ emitter)
+        return readings
 
     def scatter(self, unknowns: FloatArray) -> FloatArray:
         """What readings are above expectation (k, n, n) [sigma]; NaN where there is none."""

@@ -153,7 +153,8 @@ class IrPlatform:
             self.noise,
             self.relative,
             (self.curve_sigma / self.relative) ** 2 if self.relative else 0.0,
-            *(-math.log(share) if share else math.inf for share in (self.blocked_share, self.bright_share)),
+            -math.log(self.blocked_share) if self.blocked_share else math.inf,
+            -math.log(self.bright_share) if self.bright_share else math.inf,
             self.covariance_scale,
         )
 

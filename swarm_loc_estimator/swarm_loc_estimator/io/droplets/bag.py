@@ -150,13 +150,13 @@ def _write(
         for one, where in zip(exchanges, poses, strict=True):
             stamp_ns = max(round(one.time_s * _NS), last_ns + 1000)
             last_ns = stamp_ns
-            for robot, seen in where.items():
-                pose = scene.pose(robot, seen)
+            for robot_id, seen in where.items():
+                pose = scene.pose(robot_id, seen)
                 (message,) = encode_pose_stamped("map", np.array([stamp_ns]), pose)
-                bag.write(f"{name_of(robot)}/ground_truth", stamp_ns, message)
-                if robot == one.receiver:
+                bag.write(f"{name_of(robot_id)}/ground_truth", stamp_ns, message)
+                if robot_id == one.receiver:
                     fix = encode_fix("map", stamp_ns, pose[0], covariance)
-                    bag.write(f"{name_of(robot)}/{InputKind.FIXES.topic}", stamp_ns, fix)
+                    bag.write(f"{name_of(robot_id)}/{InputKind.FIXES.topic}", stamp_ns, fix)
             receiver = name_of(one.receiver)
             matrix = encode_brightness(
                 f"{receiver}/base_link", stamp_ns, (one.receiver, one.transmitter), one.readings
