@@ -27,8 +27,13 @@ def parse(data: bytes, timestamps: str, counts: Counter[str], cuts: list[int] | 
     lines = [
         (int(start) + at, line) for start, part in zip(before, parts, strict=False) for at, line in part.lines
     ]
-    columns = (np.concatenate([part[k] for part in parts]) for k in range(4))
-    return Parsed(*columns, lines)  # type: ignore[arg-type]
+    return Parsed(
+        np.concatenate([part.x for part in parts]),
+        np.concatenate([part.y for part in parts]),
+        np.concatenate([part.polarity for part in parts]),
+        np.concatenate([part.time_us for part in parts]),
+        lines,
+    )
 
 
 def assert_same(parsed: Parsed, sent: Sent) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +55,7 @@ def test_tcp_goes_to_the_radios_port() -> None:
 @pytest.mark.parametrize("name", ["laser_frequency", "led_frequency"])
 def test_a_light_that_hardly_blinks_is_refused(name: str) -> None:
     with pytest.raises(ParameterError, match=f"{name} = 2.0 must be 0, or at least 10 Hz"):
-        pushbot_settings(PushbotParameters(address="/dev/x", **{name: 2.0}))
+        pushbot_settings(replace(PushbotParameters(address="/dev/x"), **{name: 2.0}))
 
 
 def test_a_robot_within_a_wall_is_named(swarm_file: Path) -> None:
@@ -90,7 +91,8 @@ def test_a_swarm_of_pushbots_gets_a_hall_drivers_and_calibrated_trackers(
     assert len(frequencies) == 2
     for name in "ab":
         assert nodes[f"{name}/pushbot_driver"].parameters["address"] == f"{tmp_path}/{name}"
-        assert load_laser(Path(str(nodes[f"{name}/event_tracker"].parameters["calibration"])))
+        calibration = str(nodes[f"{name}/event_tracker"].parameters["calibration"])
+        assert load_laser(Path(calibration)).focal_base > 0.0
 
 
 def test_calibrations_are_those_of_the_worlds_robots(swarm_file: Path, tmp_path: Path) -> None:

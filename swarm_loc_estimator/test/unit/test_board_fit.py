@@ -39,7 +39,8 @@ def recorded(count: int, seed: int) -> BoardReadings:
 
 def values(curve: FloatArray) -> FloatArray:
     """Relative to straight ahead."""
-    return curve / curve[0]
+    relative: FloatArray = curve / curve[0]
+    return relative
 
 
 def test_slopes_are_those_of_differences() -> None:
