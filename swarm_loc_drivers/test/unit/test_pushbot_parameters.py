@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -54,8 +55,9 @@ def test_tcp_goes_to_the_radios_port() -> None:
 
 @pytest.mark.parametrize("name", ["laser_frequency", "led_frequency"])
 def test_a_light_that_hardly_blinks_is_refused(name: str) -> None:
+    slow: dict[str, Any] = {name: 2.0}
     with pytest.raises(ParameterError, match=f"{name} = 2.0 must be 0, or at least 10 Hz"):
-        pushbot_settings(replace(PushbotParameters(address="/dev/x"), **{name: 2.0}))
+        pushbot_settings(replace(PushbotParameters(address="/dev/x"), **slow))
 
 
 def test_a_robot_within_a_wall_is_named(swarm_file: Path) -> None:

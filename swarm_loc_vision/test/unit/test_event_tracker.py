@@ -128,10 +128,11 @@ def test_packets_of_any_size_give_the_same_reports(cuts: list[int], method: str)
         return CentroidTracker([LASER], SIZE, SETTINGS)
 
     whole, cut = tracker().track(*events), tracker()
+    x, y, is_on, time_ns = events
     parts = [
         report
-        for begin, end in zip([0, *places], [*places, len(events.x)], strict=True)
-        for report in cut.track(*(column[begin:end] for column in events))
+        for begin, end in zip([0, *places], [*places, len(x)], strict=True)
+        for report in cut.track(x[begin:end], y[begin:end], is_on[begin:end], time_ns[begin:end])
     ]
     assert [(one.stamp_ns, [s[:4] for s in one.sightings]) for one in parts] == [
         (one.stamp_ns, [s[:4] for s in one.sightings]) for one in whole
