@@ -169,8 +169,7 @@ def _place(mapper: CooperativeMapper | ParticleMapper, arrival: Arrival) -> tupl
     node = mapper.newest_stop(arrival.robot)
     if node is None:
         raise RuntimeError("a robot has looked around and yet is not in the graph")
-    theta, ratio = mapper.graph.states[node, 2:]
-    return node, float(wrap_angle(arrival.online[2] - theta)) / ratio
+    return node, mapper.turned(arrival.robot)
 
 
 def _final(

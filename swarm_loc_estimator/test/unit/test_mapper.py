@@ -137,6 +137,22 @@ def test_odometry_that_begins_anew_is_no_drive() -> None:
     assert heading < math.radians(2.0)
 
 
+def test_a_robot_that_cannot_leave_looks_again_and_gets_another_goal() -> None:
+    mapper, robot = CooperativeMapper(), RoomRobot(START, 0.02, np.random.default_rng(11))
+    explore(mapper, mapper.join(np.array(START), KNOWN), robot, 1)
+    count, first = mapper.graph.count, mapper.goal(0)
+    feed(mapper, 0, [robot.turn(0.7), robot.turn(SCAN_TURN), robot.turn(-0.4), robot.turn(SCAN_TURN)])
+    second = mapper.goal(0)
+    assert mapper.graph.count == count + 2
+    assert first is not None
+    assert second is not None
+    assert second.number == first.number + 2
+    assert np.allclose(mapper.graph.poses[count:, :2], mapper.graph.poses[count - 1, :2], atol=0.01)
+    position, heading = error_of(mapper, 0, robot)
+    assert position < 0.02
+    assert heading < math.radians(2.0)
+
+
 def test_a_full_map_still_locates_robots() -> None:
     mapper = CooperativeMapper(MapperSettings(max_stops=12))
     robot = RoomRobot(START, 0.02, np.random.default_rng(9))

@@ -54,8 +54,6 @@ class _Track:
         node: Its newest stop in the graph.
         is_known: Whether `stop` is in the graph, as `node`.
         passes: Whether `node` is one too many: the next stop takes its place.
-        begin: How many readings of that stop belong to parts before.
-        looked: How many readings of that stop there were when it came into the graph.
         left: (3,) pose by odometry when it left `node`.
         last: (3,) newest pose by odometry.
         path: Driven since it left the node [m].
@@ -71,18 +69,12 @@ class _Track:
     node: int | None = None
     is_known: bool = False
     passes: bool = False
-    begin: int = 0
-    looked: int = 0
     left: FloatArray = field(default_factory=lambda: np.zeros(3))
     last: FloatArray | None = None
     path: float = 0.0
     target: FloatArray | None = None
     goal: Goal | None = None
     home: FloatArray | None = None
-
-    def turn_begin(self, stop: Stop) -> float:
-        """Turn by odometry at a stop up to where its node begins [rad]."""
-        return float(stop.turn[self.begin - 1]) if self.begin else 0.0
 
 
 class CooperativeMapper:
@@ -133,13 +125,9 @@ class CooperativeMapper:
             if run.arrives:
                 track.stop, track.is_known = Stop(run.readings.odometry[0]), False
             if run.stands and track.stop is not None:
-                before = len(track.stop.turn)
                 track.stop.extend(run.readings)
                 track.last = run.readings.odometry[-1]
                 self._look(robot, track, track.stop)
-                if track.is_known:
-                    count = len(track.stop.turn) - max(before, track.looked)
-                    self.visits.add(np.tile(self.graph.states[track.node, :2], (max(count, 0), 1)))
             else:
                 self._drive(track, run.readings.odometry)
                 self._lights.note_time(robot, int(run.readings.stamp_ns[-1]))
@@ -164,7 +152,7 @@ class CooperativeMapper:
             return None
         if track.is_known and track.stop is not None:
             x, y, theta, ratio = self.graph.states[track.node]
-            theta += ratio * (track.stop.turn[-1] - track.turn_begin(track.stop))
+            theta += ratio * (track.stop.turn[-1] - track.stop.begin_turn)
             return np.array([x, y, wrap_angle(theta)])
         return self._driven(track, track.last)
 
@@ -181,6 +169,11 @@ class CooperativeMapper:
     def newest_stop(self, robot: int) -> int | None:
         """Number of the newest stop of a robot in the graph."""
         return self._tracks[robot].node
+
+    def turned(self, robot: int) -> float:
+        """Turn by odometry of a robot that stands, since its newest stop began [rad]."""
+        stop = self._tracks[robot].stop
+        return 0.0 if stop is None or not self._tracks[robot].is_known else stop.turn[-1] - stop.begin_turn
 
     def occupancy(self) -> OccupancyMap:
         """The map as the stops stand now."""
@@ -214,14 +207,17 @@ class CooperativeMapper:
 
     def _look(self, robot: int, track: _Track, stop: Stop) -> None:
         """Take a stop into the graph once the robot has looked around."""
-        if track.is_known:
-            return
-        is_first = track.node is None
         around = min(2.02 * math.pi / (1.0 - self.graph.slip[robot]), SCAN_TURN - _TURN_TOLERANCE)
-        count = stop.completed(START_TURN - _TURN_TOLERANCE if is_first else around)
-        if count:
-            self._enter(robot, track, stop, count)
-            self._choose_goal(robot, track, stop, count)
+        if not track.is_known:
+            count = stop.completed(START_TURN - _TURN_TOLERANCE if track.node is None else around)
+            if count:
+                self._enter(robot, track, stop, count)
+                self._choose_goal(robot, track, stop)
+        again = stop.split(around) if track.is_known else None
+        if again is not None:  # it could not leave, and turns once more: a stop of its own, and a new goal
+            self._depart(robot, track)
+            track.stop = again
+            self._look(robot, track, again)
 
     def _depart(self, robot: int, track: _Track) -> None:
         """A robot leaves where it stood."""
@@ -237,14 +233,15 @@ class CooperativeMapper:
             self._note_visit(robot, track, stop)
             # from where the node is: its first steps away already count
             track.left = np.array([*stop.arrival[:2], stop.departure[2]])
+            self.visits.add(np.tile(self.graph.states[track.node, :2], (stop.total, 1)))
             track.path = math.dist(stop.arrival[:2], stop.departure[:2])
         track.stop, track.is_known = None, False
 
     def _note_visit(self, robot: int, track: _Track, stop: Stop) -> None:
         """Note where a robot stood until now, for lights that it saw and others saw of it."""
         if track.node is not None:
-            begin_ns, end_ns = int(stop.stamp_ns[track.begin]), int(stop.stamp_ns[-1])
-            self._lights.note_visit(robot, Visit(track.node, begin_ns, end_ns, stop, track.turn_begin(stop)))
+            begin_ns, end_ns = int(stop.stamp_ns[stop.begin]), int(stop.stamp_ns[-1])
+            self._lights.note_visit(robot, Visit(track.node, begin_ns, end_ns, stop, stop.begin_turn))
             self._lights.note_time(robot, end_ns)
             self._lights.settle(self.graph)
 
@@ -252,19 +249,18 @@ class CooperativeMapper:
         """Give the newest stop all readings made there."""
         stop = track.stop
         if stop is not None and track.is_known and track.node is not None:
-            turn = stop.turn[track.begin :] - track.turn_begin(stop)
-            self.graph.set_scan(track.node, turn, stop.inverse[track.begin :])
+            turn = stop.turn[stop.begin :] - stop.begin_turn
+            self.graph.set_scan(track.node, turn, stop.inverse[stop.begin :])
             self._map = None
 
     def _enter(self, robot: int, track: _Track, stop: Stop, count: int) -> None:
         """Make a node of the first readings of a stop, or several of a first scan, and align them."""
         self.counters["scans"] += 1
         self._map = None
-        track.is_known, track.looked = True, count
+        track.is_known, stop.looked = True, count
         if track.node is None:
             self._enter_first(robot, track, stop, count)
             return
-        track.begin = 0
         motion = between(track.left, stop.arrival)
         sigma = self._motion_sigma(track.path, abs(float(motion[2])))
         pose = self._driven(track, stop.arrival)
@@ -322,13 +318,13 @@ class CooperativeMapper:
             else:
                 self.graph.constraints.add_prior(node, track.prior, track.prior_sigma)
             pose = np.array([pose[0], pose[1], self.graph.heading_at_departure(node)])
-            track.begin = first
+            stop.begin = first
             nodes.append(node)
         track.node = nodes[-1]
         self.graph.starts.update(nodes)
         align_start(self.graph, nodes)
 
-    def _choose_goal(self, robot: int, track: _Track, stop: Stop, count: int) -> None:
+    def _choose_goal(self, robot: int, track: _Track, stop: Stop) -> None:
         """Decide where a robot goes next."""
         node = track.node
         if node is None:
@@ -346,12 +342,12 @@ class CooperativeMapper:
             self.settings,
             track.home,
         )
-        turned = float(stop.turn[count - 1])
-        pose = np.array([x, y, theta + ratio * (turned - track.turn_begin(stop))])
+        turned = float(stop.turn[stop.looked - 1])
+        pose = np.array([x, y, theta + ratio * (turned - stop.begin_turn)])
         odometry = stop.arrival + np.array([0.0, 0.0, turned])
         number = track.goal.number + 1 if track.goal else 1
         there = goal_by_odometry(pose, odometry, hop, ratio)
-        track.goal = Goal(number, hop, there, int(stop.stamp_ns[count - 1]), pose)
+        track.goal = Goal(number, hop, there, int(stop.stamp_ns[stop.looked - 1]), pose)
 
     def _look_for_home(self, track: _Track, node: int) -> None:
         """Send a robot that has become unsure of its position to where it was sure."""

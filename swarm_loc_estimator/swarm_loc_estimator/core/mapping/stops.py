@@ -42,6 +42,9 @@ class Stop:
         turn: (n,) turn by odometry since it came [rad].
         inverse: (n,) inverse distances [1/m].
         sigma: Of an inverse distance; of no meaning before something was seen [1/m].
+        begin: How many of the readings belong to nodes before the one that this stop is.
+        looked: How many there were when it became a node; 0: it is none.
+        total: How many there were in all.
     """
 
     def __init__(self, arrival: FloatArray) -> None:
@@ -50,6 +53,7 @@ class Stop:
         self.turn = np.zeros(0)
         self.inverse = np.zeros(0)
         self.sigma = 1.0
+        self.begin = self.looked = self.total = 0
 
     def extend(self, readings: Readings) -> None:
         """Add readings made here."""
@@ -60,17 +64,43 @@ class Stop:
         self.stamp_ns = np.concatenate([self.stamp_ns, readings.stamp_ns])
         self.inverse = np.concatenate([self.inverse, readings.inverse])
         self.departure = readings.odometry[-1]
+        self.total += len(readings.stamp_ns)
         if not math.isnan(readings.sigma):
             self.sigma = readings.sigma
         if len(self.turn) > _MAX_READINGS:
             self.turn, self.stamp_ns, self.inverse = (
                 np.concatenate([one[:-1:2], one[-1:]]) for one in (self.turn, self.stamp_ns, self.inverse)
             )
+            self.begin, self.looked = (self.begin + 1) // 2, (self.looked + 1) // 2
 
     @property
     def turned(self) -> float:
         """The largest turn by odometry there was [rad]."""
         return float(np.abs(self.turn).max(initial=0.0))
+
+    @property
+    def begin_turn(self) -> float:
+        """Turn by odometry at which its node begins [rad]."""
+        return float(self.turn[self.begin - 1]) if self.begin else 0.0
+
+    def split(self, around: float) -> Stop | None:
+        """Cut off what came since it became a node as another stop, if it turned by `around` [rad] then."""
+        if not self.looked or self.looked == len(self.turn):
+            return None
+        before = float(self.turn[self.looked - 1])
+        if np.abs(self.turn[self.looked :] - before).max() < around:
+            return None
+        heading = wrap_angle(self.arrival[2] + before)
+        other = Stop(np.array([*self.arrival[:2], heading]))
+        other.departure, other.sigma = self.departure, self.sigma
+        other.turn = self.turn[self.looked :] - before
+        other.stamp_ns, other.inverse = self.stamp_ns[self.looked :], self.inverse[self.looked :]
+        other.total = len(other.turn)
+        self.total -= other.total
+        self.turn, self.inverse = self.turn[: self.looked], self.inverse[: self.looked]
+        self.stamp_ns = self.stamp_ns[: self.looked]
+        self.departure = other.arrival
+        return other
 
     def completed(self, full: float) -> int:
         """After how many readings the robot had turned by `full` [rad], or looked and rested; 0: not yet."""
