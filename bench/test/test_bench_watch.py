@@ -188,6 +188,9 @@ def test_a_report_plays_its_run_without_a_server(browser: Browser, tmp_path: Pat
     assert opened.evaluate("watch.store.at('poses', watch.time).columns.x[0]") == pytest.approx(0.89)
     opened.page.mouse.click(*opened.place_of(0))
     opened.until("document.getElementById('numbers').innerText.includes('5.0 mm')")
+    # the numbers are those of the time that is shown, also when it changes right after they were painted
+    opened.evaluate("{ watch.panel.painted = performance.now(); watch.seek(0) }")
+    opened.until("document.getElementById('numbers').innerText.includes('0.500 m')")
     assert not opened.page.is_visible("#reset")
     opened.close()
     assert opened.errors == opened.foreign == []

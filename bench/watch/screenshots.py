@@ -59,7 +59,7 @@ def photograph(browser: Browser, picture: Picture, work: Path, out: Path) -> Pat
     shown.until("watch.playing && watch.fitted")
     shown.evaluate(f"{{ watch.setTheme('{picture.theme}'); watch.panel.select({picture.selected}) }}")
     shown.evaluate(f"watch.seek({picture.share})")
-    shown.until("!watch.dirty && watch.panel.painted >= 0")
+    shown.until("!watch.dirty && !watch.panel.later")
     # trails of large swarms are painted at most once a second
     shown.until("!watch.ground.stale")
     path = out / f"{picture.name}.png"

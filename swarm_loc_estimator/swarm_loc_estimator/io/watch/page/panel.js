@@ -1,6 +1,7 @@
 // The numbers and curves of one robot.
 const CURVE_MS = 60e3;
 const CURVE_POINTS = 300;
+const PAINT_MS = 200;
 const SAY_STATUS = {
   waiting: "waits for a sighting or a fix that locates it",
   tracked: "tracked",
@@ -16,6 +17,7 @@ class Panel {
     this.nis = [];
     this.plots = null;
     this.painted = 0;
+    this.later = 0;
   }
 
   select(robot) {
@@ -47,7 +49,8 @@ class Panel {
 
   paint(now, time) {
     const { app } = this, i = app.selected;
-    if (i < 0 || now - this.painted < 200) return;
+    if (i < 0) return;
+    if (now - this.painted < PAINT_MS) return this.paintLater();
     this.painted = now;
     const poses = app.store.at("poses", time);
     if (!poses) return;
@@ -66,6 +69,11 @@ class Panel {
     for (const [verdict, count] of this.counts(app.store.at("sightings", time, SEEN_MS), i)) rows.push([`sightings ${verdict}`, count]);
     fill(element("numbers"), rows);
     this.curves(time, i);
+  }
+
+  // What has changed since the last time is not forgotten, only not painted at once.
+  paintLater() {
+    this.later ||= setTimeout(() => { this.later = 0; this.app.touch(); }, PAINT_MS);
   }
 
   // Distance of a pose from the ground truth, which is interpolated to its stamp [m]; null: not known.
