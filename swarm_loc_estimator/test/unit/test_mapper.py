@@ -164,6 +164,21 @@ def test_a_full_map_still_locates_robots() -> None:
     assert heading < math.radians(2.0)
 
 
+def test_a_start_that_is_far_from_where_scans_put_it_stays_as_told() -> None:
+    mapper = CooperativeMapper()
+    first = RoomRobot(START, 0.0, np.random.default_rng(12))
+    second = RoomRobot((2.2, 1.4, -1.0), 0.0, np.random.default_rng(13))
+    mapper.join(np.array(START), KNOWN)
+    explore(mapper, 0, first, 1)
+    before = mapper.graph.poses.copy()
+    told = np.array([2.0, 1.3, -0.9])  # 22 cm off, and said to be right to 1 cm
+    explore(mapper, mapper.join(told, np.full(3, 0.01)), second, 0)
+    pose = mapper.pose(1)
+    assert pose is not None
+    assert math.dist(pose[:2], told[:2]) < 0.06
+    assert np.abs(mapper.graph.poses[: len(before)] - before).max() < 0.02  # and the map is not torn
+
+
 def test_a_light_turns_a_robot_that_sees_no_walls() -> None:
     """Both stand; the second sees nothing but the first one's light, and learns its heading."""
     mapper, bearing = CooperativeMapper(), math.radians(6.0)

@@ -322,7 +322,7 @@ class CooperativeMapper:
             nodes.append(node)
         track.node = nodes[-1]
         self.graph.starts.update(nodes)
-        align_start(self.graph, nodes)
+        align_start(self.graph, nodes, track.prior_sigma)
 
     def _choose_goal(self, robot: int, track: _Track, stop: Stop) -> None:
         """Decide where a robot goes next."""

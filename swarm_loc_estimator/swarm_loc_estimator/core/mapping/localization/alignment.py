@@ -9,6 +9,7 @@ import numpy as np
 
 from swarm_loc_estimator.core.mapping.matching.correlative_search import Lattice, search_offsets
 from swarm_loc_estimator.core.mapping.pose_graph.graph import PoseGraph
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 _TARGETS, _MIN_OVERLAP = 7, 0.2
 _START_TARGETS, _MIN_START_OVERLAP = 8, 0.08
@@ -20,7 +21,8 @@ _SOLVE_ALL_EVERY = 4
 """At every stop it is worse: a closed ring then gets half as precise again."""
 _RECENT = 8
 _START_SEARCH = Lattice(0.3, 0.05, math.radians(12.0), math.radians(1.5))
-_START_RADIUS, _START_AGAINST, _MIN_START_SCORE = 2.5, 6, 0.15
+_START_RADIUS, _START_AGAINST, _MIN_START_SCORE = 2.5, 12, 0.35
+_MAX_START_SIGMAS, _LEAST_START_SHIFT = 4.0, 0.02
 
 
 def align(graph: PoseGraph, stop: int, path: float) -> bool:
@@ -55,21 +57,40 @@ def _align_alone(graph: PoseGraph, stop: int, path: float) -> bool:
     return False
 
 
-def align_start(graph: PoseGraph, parts: Sequence[int]) -> None:
-    """Align the parts of a robot's first scan with each other and, as one body, with older scans."""
-    others = [
-        int(other)
-        for other in np.argsort(graph.distances(parts[0]), kind="stable")
-        if other < parts[0] and graph.distances(parts[0])[other] < _START_RADIUS
-    ][:_START_AGAINST]
+def align_start(graph: PoseGraph, parts: Sequence[int], sigma: FloatArray) -> None:
+    """Align the parts of a robot's first scan with each other and, as one body, with older scans.
+
+    Args:
+        graph: Is changed.
+        parts: The newest stops, all at one place.
+        sigma: (3,) how well that is known. Where older scans would move it further than four of these, they
+            are not believed, and the robot is left where it was said to be.
+    """
+    away = graph.distances(parts[0])
+    others = [one for one in np.argsort(away, kind="stable") if one < parts[0] and away[one] < _START_RADIUS]
+    told, states, slip = graph.states[parts[0]].copy(), graph.states.copy(), graph.slip.copy()
     if others:
-        found = search_offsets(graph.scans, np.array(parts), np.array(others), _START_SEARCH)
+        against = np.array(others[:_START_AGAINST])
+        found = search_offsets(graph.scans, np.array(parts), against, _START_SEARCH)
         if found.score > _MIN_START_SCORE:
             graph.states[parts, :3] += found.offset
+    _match_parts(graph, parts, 0)
+    if (np.abs(graph.states[parts[0], :3] - told[:3]) > _MAX_START_SIGMAS * sigma + _LEAST_START_SHIFT).any():
+        graph.states[:], graph.slip = states, slip
+        for one, targets in graph.targets.items():
+            graph.targets[one] = [other for other in targets if (one in parts) == (other in parts)]
+        _match_parts(graph, parts, parts[0])
+
+
+def _match_parts(graph: PoseGraph, parts: Sequence[int], oldest: int) -> None:
+    """Match parts of a first scan with stops from the oldest on, and solve."""
     for stop in parts:
-        graph.targets[stop] = graph.neighbours(stop, _START_TARGETS, _MIN_START_OVERLAP)
+        near = graph.neighbours(stop, _START_TARGETS, _MIN_START_OVERLAP)
+        graph.targets[stop] = [other for other in near if other >= oldest]
         graph.match_both_ways(stop)
     graph.solve(6, gate=_GATE, stride=1)
+    for stop in range(graph.count):
+        graph.fit(stop)
 
 
 def align_all(graph: PoseGraph) -> None:

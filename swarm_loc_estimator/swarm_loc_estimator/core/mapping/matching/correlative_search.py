@@ -7,7 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarm_loc_estimator.core.mapping.matching.beam_matching import Scans, agreement
+from swarm_loc_estimator.core.mapping.matching.beam_matching import (
+    CAUCHY,
+    FIT,
+    UNUSABLE,
+    Scans,
+    beam_residual,
+)
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 from swarm_loc_estimator.numerics.jit import compiled
 
@@ -38,7 +44,7 @@ class Found(NamedTuple):
 
     Attributes:
         offset: (3,) x [m], y [m], theta [rad] to add to the pose.
-        score: Share of beams that fit, 1 at most for each stop searched against.
+        score: Share of beams that fit any of the stops searched against, less their losses.
         other: The best score of another place.
     """
 
@@ -86,11 +92,24 @@ def _scores(scans: Scans, k: int, pivot: int, against: IntArray, lattice: Lattic
                 states[k, 0] = centre_x + cos * arm_x - sin * arm_y + b * lattice.step
                 states[k, 1] = centre_y + sin * arm_x + cos * arm_y + c * lattice.step
                 states[k, 2] = before[2] + turn
-                good, tried = 0.0, 0
-                for j in against:
-                    matched, looked, loss = agreement(scans, k, j, 0.0, stride)
-                    good += matched - loss
-                    tried += looked
-                scores[a + turns, b + cells, c + cells] = good / max(1, tried)
+                scores[a + turns, b + cells, c + cells] = _score(scans, k, against, stride)
     states[k] = before
     return scores
+
+
+@compiled
+def _score(scans: Scans, k: int, against: IntArray, stride: int) -> float:
+    """The share of every `stride`-th beam of a stop that fits any of others, each less its loss."""
+    good, tried = 0.0, 0
+    for i in range(0, scans.beams.counts[k], stride):
+        if scans.beams.inverse[k, i] <= 0.0:
+            continue
+        best, can_tell = 0.0, False
+        for j in against:
+            fate, residual, variance, _, _, _, _ = beam_residual(scans, k, i, j, 0.0)
+            can_tell = can_tell or fate != UNUSABLE
+            if fate == FIT:
+                best = max(best, 1.0 - math.log(1.0 + residual * residual / variance / CAUCHY))
+        good += best
+        tried += can_tell
+    return good / max(1, tried)
