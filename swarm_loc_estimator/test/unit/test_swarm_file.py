@@ -315,7 +315,7 @@ def boards(board_id: int) -> st.SearchStrategy[RobotIr]:
         st.just("droplet"),
         st.sampled_from(IrMethod),
         st.none() | st.builds(IrGains, gain, gain, st.floats(0.0, 1.0), st.floats(0.0, 1.0)),
-        st.floats(0.5, 1.0),
+        gate_probability=st.floats(0.5, 1.0),
     )
 
 
