@@ -267,6 +267,7 @@ class StandIn:
         self.time_jumps = 0
         self.drops: dict[str, int] = {}
         self.counters: dict[str, int] = {}
+        self.identities = None
 
     def receive(self, messages: RawInputs) -> None:
         """Remember whose and when."""
