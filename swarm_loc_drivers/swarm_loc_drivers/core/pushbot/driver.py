@@ -78,7 +78,7 @@ class PushbotDriver(RobotDriver[PushbotSession]):
     def _serve(self, session: PushbotSession) -> None:
         found, session.found = session.found, []
         for one in found:
-            if not one.stamp_ns:
+            if one.stamp_ns <= 0:  # before the clock has come, or began
                 self.counts["no_clock"] += 1
             elif isinstance(one, EventPacket):
                 self.counts["packets"] += 1
