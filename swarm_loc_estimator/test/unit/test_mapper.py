@@ -154,11 +154,11 @@ def test_a_robot_that_cannot_leave_looks_again_and_gets_another_goal() -> None:
 
 
 def test_a_full_map_still_locates_robots() -> None:
-    mapper = CooperativeMapper(MapperSettings(max_stops=14))
+    mapper = CooperativeMapper(MapperSettings(max_stops=12))
     robot = RoomRobot(START, 0.02, np.random.default_rng(9))
     explore(mapper, mapper.join(np.array(START), KNOWN), robot, 7)
-    assert mapper.graph.count == 15
-    assert max(mapper.graph.targets) < 15
+    assert mapper.graph.count == 13
+    assert max(mapper.graph.targets) < 13
     position, heading = error_of(mapper, 0, robot)
     assert position < 0.03
     assert heading < math.radians(2.0)

@@ -31,7 +31,7 @@ START_TURN = 4.5 * math.pi
 """Turn by odometry of a whole first scan: a quarter, slowly, to hold the heading; then two turns [rad]."""
 SCAN_TURN = 2.14 * math.pi
 """Turn by odometry at every later stop: a full turn also where wheels slip [rad]."""
-_START_PARTS = (*(0.125 * math.pi * k for k in range(1, 5)), *(0.5 * math.pi * k for k in range(2, 9)))
+_START_PARTS = (0.25 * math.pi, *(0.5 * math.pi * k for k in range(1, 9)))
 """Where a first scan is cut into parts, each a stop [rad]."""
 _TURN_TOLERANCE = 0.03
 _PART_SIGMA = np.array([0.002, 0.002, 0.002])
