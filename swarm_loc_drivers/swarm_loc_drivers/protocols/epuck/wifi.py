@@ -1,8 +1,9 @@
 """The e-puck2's WiFi stream: commands of 21 bytes one way, images and sensor values the other.
 
 Messages of the robot are an id byte and a payload of fixed length, without checksum. A place in the stream
-counts as the begin of a message when the id is known and the values are such as the sensors can give; a
-image, which can be anything, counts when a message follows it and none lies within it.
+counts as the begin of a message when the id is known, the values are such as the sensors can give, and what
+has come behind it may begin a message, too. An image, which can be anything, counts when a message follows
+it and none lies within it.
 """
 
 from __future__ import annotations
@@ -150,9 +151,9 @@ class StreamParser:
             return _BAD
         length = self._length_at(0)
         is_image = self._image_begins_at(0)
-        if length > 0 and (is_image or not self._synced):
+        if length > 0 and not self._image_begins_at(length):
             following = self._length_at(length)
-            if following <= 0 and not self._image_begins_at(length):
+            if following == _BAD or (following == _UNDECIDED and (is_image or not self._synced)):
                 length = following
         if length == _UNDECIDED and is_image and self._holds_sensor_values():
             return _BAD
