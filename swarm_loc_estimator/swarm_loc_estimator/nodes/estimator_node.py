@@ -51,6 +51,7 @@ from swarm_loc_estimator.nodes.set_pose import NO_CLOCK, PoseCommands
 from swarm_loc_estimator.nodes.warm_up import WARM_UP, warm_up
 from swarm_loc_estimator.numerics.jit import is_warm
 from swarm_loc_estimator.ros.running import ConfiguredNode, run_node
+from swarm_loc_estimator.ros.static_transforms import StaticTransforms
 from swarm_loc_estimator.ros.ticks import Ticks
 from swarm_loc_estimator.ros.topic_graph import TopicGraph
 
@@ -112,6 +113,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         self._told_drops_s = -math.inf
         self._overload = 0
         self._known_rivals: list[str] = []
+        self._static_transforms = StaticTransforms(self, self._owned_frames())
         self._known_contradictions: set[tuple[str, Kind]] = set()
         self._inputs = EstimatorInputs(self, self._ingest.topics, self._estimator.drop)
         self.create_service(Trigger, "~/reset", self._on_reset)
@@ -126,6 +128,11 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
     def _create_diagnostics(self) -> Diagnostics:
         sole = ["swarm/poses", *(["/clock"] if self.get_clock().ros_time_is_active else [])]
         return Diagnostics(self._swarm, self._ingest, self.chosen.odom_frame, TopicGraph(self), sole)
+
+    def _owned_frames(self) -> list[str]:
+        """The frames whose parent this node alone tells; none where it publishes no transforms."""
+        robots = self._swarm.robots if self.chosen.publish_tf else ()
+        return [f"{robot.name}/{self.chosen.odom_frame}" for robot in robots]
 
     def _start_timers(self) -> None:
         self._ticks = Ticks(self, self.chosen.tick_period_s, self._on_tick)
@@ -202,6 +209,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         whole.values["time jumps"] = str(self._estimator.time_jumps)
         whole.values.update({name: str(count) for name, count in self._estimator.counters.items()})
         causes = [whole, load, *([overload_report(overload)] if overload else [])]
+        causes += [Report("transforms", text, warning=True) for text in self._static_transforms.foreign]
         return [*robots, merged(causes, "estimator")]
 
     def _warn_of_drops(self, now_s: float) -> None:
@@ -214,9 +222,10 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
             self.get_logger().warning(f"dropped so far: {words}")
 
     def _warn_of_rivals(self) -> None:
-        """Tell of topics with too many publishers, once whenever these change."""
-        if self._diagnostics.rivals != self._known_rivals:
-            self._known_rivals = self._diagnostics.rivals
+        """Tell of topics with too many publishers, and of foreign transforms, once whenever these change."""
+        rivals = [*self._diagnostics.rivals, *self._static_transforms.foreign]
+        if rivals != self._known_rivals:
+            self._known_rivals = rivals
             for sentence in self._known_rivals:
                 self.get_logger().warning(sentence)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from node_world import (
     PATIENCE_S,
@@ -27,8 +27,9 @@ from rcl_interfaces.msg import Log, ParameterType
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
+from tf2_msgs.msg import TFMessage
 
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 
@@ -91,6 +92,23 @@ def test_a_second_estimator_and_a_second_clock_are_named(ros: Ros, robots: Robot
     message = newest(heard, "estimator").message
     assert "swarm/poses has 2 publishers: /estimator, /estimator" in message
     assert "/clock has 2 publishers: /other, /tester" in message
+
+
+def test_a_static_transform_into_a_robots_odom_frame_is_named(ros: Ros, robots: Robots) -> None:
+    log, heard = ros.listen(Log, "/rosout"), ros.listen(DiagnosticArray, "/diagnostics")
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    transforms = [TransformStamped(child_frame_id=name) for name in ("alpha/odom", "alpha/camera")]
+    for transform in transforms:
+        transform.header.frame_id = "world"
+    ros.add(Node("other")).create_publisher(TFMessage, "/tf_static", latched).publish(
+        TFMessage(transforms=transforms)
+    )
+    robots.run(T0_NS, 4)
+    sentence = "/tf_static has a transform from 'world' to 'alpha/odom', which only the estimator may publish"
+    ros.until(lambda: heard and sentence in newest(heard, "estimator").message)
+    assert newest(heard, "estimator").level == DiagnosticStatus.WARN
+    ros.until(lambda: sum(entry.msg == sentence for entry in log) == 1)
+    assert "alpha/camera" not in newest(heard, "estimator").message
 
 
 def test_the_clock_cannot_be_changed_while_the_node_runs(ros: Ros, robots: Robots) -> None:

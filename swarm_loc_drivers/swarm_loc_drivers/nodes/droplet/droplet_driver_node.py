@@ -25,7 +25,8 @@ from swarm_loc_drivers.core.odometry_state import OdometryState
 from swarm_loc_drivers.nodes.driver_diagnostics import DriverDiagnostics
 from swarm_loc_drivers.nodes.droplet.droplet_parameters import DropletParameters, droplet_settings
 from swarm_loc_drivers.nodes.odometry_output import OdometryOutput, stamp_message, transform_publisher
-from swarm_loc_estimator.ros.running import ConfiguredNode, Stop, run_node
+from swarm_loc_drivers.nodes.robot_driver_node import RobotDriverNode
+from swarm_loc_estimator.ros.running import run_node
 from swarm_loc_msgs.msg import BrightnessMatrix
 
 _COMMAND_QOS = QoSProfile(depth=1)
@@ -44,18 +45,19 @@ _WRONG = {
 }
 
 
-class DropletDriverNode(ConfiguredNode[DropletParameters]):
+class DropletDriverNode(RobotDriverNode[DropletParameters]):
     """Hands velocities to the driver and publishes what it reports."""
+
+    _driver: DropletDriver
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("droplet_driver", DropletParameters, **node_arguments)
         settings = droplet_settings(self.chosen)
         robot = self.get_namespace().strip("/")
-        prefix = f"{robot}/" if robot else ""
-        self._base_frame = f"{prefix}{self.chosen.base_frame}"
+        self._base_frame = f"{self._prefix}{self.chosen.base_frame}"
         self._transforms = transform_publisher(self) if self.chosen.publish_tf else None
         self._brightness = self.create_publisher(BrightnessMatrix, "brightness", _BRIGHTNESS_QOS)
-        self._odometry = {OWN: self._odometry_output("odom", prefix)}
+        self._odometry = {OWN: self._odometry_output("odom", self._prefix)}
         for name in settings.relayed:
             path = _relayed_path(robot, name)
             self._odometry[name] = self._odometry_output(f"/{path}/odom", f"{path}/")
@@ -65,33 +67,12 @@ class DropletDriverNode(ConfiguredNode[DropletParameters]):
             topic = f"/{_relayed_path(robot, name)}/cmd_vel" if name else "cmd_vel"
             self.create_subscription(Twist, topic, partial(self._on_cmd_vel, name), _COMMAND_QOS)
         self.create_service(Trigger, "~/measure", self._on_measure)
-        name, address = f"{prefix}{self.get_name()}", settings.device
+        name, address = f"{self._prefix}{self.get_name()}", settings.device
         self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
 
     def _odometry_output(self, topic: str, prefix: str) -> OdometryOutput:
         odom_frame, base_frame = f"{prefix}{self.chosen.odom_frame}", f"{prefix}{self.chosen.base_frame}"
         return OdometryOutput(self, topic, odom_frame, base_frame, self._transforms)
-
-    def start(self) -> None:
-        """Begin to talk to the robot; not when constructed, since who is interrupted there is not stopped."""
-        self._driver.start()
-
-    def run(self, stop: Stop) -> int:
-        """Drive the robot until asked to stop; the exit status."""
-        self.start()
-        return super().run(stop)
-
-    def begin_to_stop(self) -> None:
-        """Have the robots stand; `destroy_node` waits until they do."""
-        self._driver.begin_to_stop()
-
-    def destroy_node(self) -> None:
-        """Stop the robots first."""
-        self._driver.stop()
-        super().destroy_node()
-
-    def _now_ns(self) -> int:
-        return int(self.get_clock().now().nanoseconds)
 
     def _on_cmd_vel(self, name: str, message: Twist) -> None:
         self._driver.set_velocity(name, (message.linear.x, message.linear.y, message.angular.z))

@@ -25,7 +25,8 @@ from swarm_loc_drivers.nodes.driver_diagnostics import DriverDiagnostics
 from swarm_loc_drivers.nodes.epuck import epuck_messages
 from swarm_loc_drivers.nodes.epuck.epuck_parameters import EpuckParameters, camera_calibration, epuck_settings
 from swarm_loc_drivers.nodes.odometry_output import OdometryOutput, transform_publisher
-from swarm_loc_estimator.ros.running import ConfiguredNode, Stop, run_node
+from swarm_loc_drivers.nodes.robot_driver_node import RobotDriverNode
+from swarm_loc_estimator.ros.running import run_node
 
 _COMMAND_QOS = QoSProfile(depth=1)
 _TF_STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -41,15 +42,15 @@ _WRONG = {
 }
 
 
-class EpuckDriverNode(ConfiguredNode[EpuckParameters]):
+class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
     """Hands velocities to the driver and publishes what it reports."""
+
+    _driver: EpuckDriver
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("epuck_driver", EpuckParameters, **node_arguments)
         parameters = self.chosen
         settings = epuck_settings(parameters)
-        robot = self.get_namespace().strip("/")
-        self._prefix = f"{robot}/" if robot else ""
         self._base_frame = f"{self._prefix}{parameters.base_frame}"
         self._camera_frame = f"{self._prefix}camera_optical_frame"
         self._calibration = camera_calibration(parameters, settings.camera) if settings.camera else None
@@ -77,23 +78,6 @@ class EpuckDriverNode(ConfiguredNode[EpuckParameters]):
         self._tf_static = self.create_publisher(TFMessage, "/tf_static", _TF_STATIC_QOS)
         sensors = epuck_messages.proximity_transforms(self._now_ns(), self._base_frame, self._prefix)
         self._tf_static.publish(TFMessage(transforms=sensors))
-
-    def start(self) -> None:
-        """Begin to talk to the robot; not when constructed, since who is interrupted there is not stopped."""
-        self._driver.start()
-
-    def run(self, stop: Stop) -> int:
-        """Drive the robot until asked to stop; the exit status."""
-        self.start()
-        return super().run(stop)
-
-    def destroy_node(self) -> None:
-        """Stop the robot first."""
-        self._driver.stop()
-        super().destroy_node()
-
-    def _now_ns(self) -> int:
-        return int(self.get_clock().now().nanoseconds)
 
     def _on_cmd_vel(self, message: Twist) -> None:
         self._driver.set_velocity(message.linear.x, message.angular.z)

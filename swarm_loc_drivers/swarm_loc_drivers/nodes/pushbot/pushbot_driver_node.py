@@ -20,8 +20,9 @@ from swarm_loc_drivers.nodes.driver_diagnostics import DriverDiagnostics
 from swarm_loc_drivers.nodes.odometry_output import OdometryOutput, transform_publisher
 from swarm_loc_drivers.nodes.pushbot.event_output import event_message
 from swarm_loc_drivers.nodes.pushbot.pushbot_parameters import PushbotParameters, pushbot_settings
+from swarm_loc_drivers.nodes.robot_driver_node import RobotDriverNode
 from swarm_loc_drivers.protocols.pushbot.warm_up import warm_up
-from swarm_loc_estimator.ros.running import ConfiguredNode, Stop, run_node
+from swarm_loc_estimator.ros.running import run_node
 from swarm_loc_msgs.msg import EventPacket as EventPacketMessage
 
 EVENT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -40,42 +41,25 @@ _WRONG = {
 }
 
 
-class PushbotDriverNode(ConfiguredNode[PushbotParameters]):
+class PushbotDriverNode(RobotDriverNode[PushbotParameters]):
     """Hands velocities to the driver and publishes what it reports."""
+
+    _driver: PushbotDriver
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("pushbot_driver", PushbotParameters, **node_arguments)
         parameters = self.chosen
         settings = pushbot_settings(parameters)
         warm_up()
-        robot = self.get_namespace().strip("/")
-        prefix = f"{robot}/" if robot else ""
         transforms = transform_publisher(self) if parameters.publish_tf else None
-        frames = f"{prefix}{parameters.odom_frame}", f"{prefix}{parameters.base_frame}"
+        frames = f"{self._prefix}{parameters.odom_frame}", f"{self._prefix}{parameters.base_frame}"
         odometry = OdometryOutput(self, "odom", *frames, transforms)
-        self._camera_frame = f"{prefix}event_camera_optical_frame"
+        self._camera_frame = f"{self._prefix}event_camera_optical_frame"
         self._events = self.create_publisher(EventPacketMessage, "events", EVENT_QOS)
         self._driver = PushbotDriver(settings, Listeners(odometry.publish, self._publish), self._now_ns)
-        name, address = f"{prefix}{self.get_name()}", str(settings.address)
+        name, address = f"{self._prefix}{self.get_name()}", str(settings.address)
         self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
         self.create_subscription(Twist, "cmd_vel", self._on_cmd_vel, _COMMAND_QOS)
-
-    def start(self) -> None:
-        """Begin to talk to the robot; not when constructed, since who is interrupted there is not stopped."""
-        self._driver.start()
-
-    def run(self, stop: Stop) -> int:
-        """Drive the robot until asked to stop; the exit status."""
-        self.start()
-        return super().run(stop)
-
-    def destroy_node(self) -> None:
-        """Stop the robot first."""
-        self._driver.stop()
-        super().destroy_node()
-
-    def _now_ns(self) -> int:
-        return int(self.get_clock().now().nanoseconds)
 
     def _on_cmd_vel(self, message: Twist) -> None:
         self._driver.set_velocity(message.linear.x, message.angular.z)
