@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import queue
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser
 
-from bench.watch.browser import WatchedPage, chromium, running_browser
+from bench.watch.browser import WatchedPage
 from bench.watch.watched_swarm import PLACES, SWARM, WatchedSwarm
 from swarm_loc_estimator.evaluation.report.recording import recorded
 from swarm_loc_estimator.evaluation.result import ReplayResult
@@ -23,36 +22,6 @@ from swarm_loc_estimator.numerics.trajectory import Trajectory
 
 PATIENCE_S = 15.0
 BLUE = (0x00, 0x72, 0xB2)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    """One for all tests of this file."""
-    executable = chromium()
-    if executable is None:
-        assert "CI" not in os.environ, "continuous integration has installed no Chromium: see .ci/run"
-        pytest.skip("there is no Chromium here: apt-get install chromium")
-    with running_browser(executable) as running:
-        yield running
-
-
-@pytest.fixture
-def swarm() -> Iterator[WatchedSwarm]:
-    served = WatchedSwarm()
-    yield served
-    served.server.close()
-
-
-@pytest.fixture
-def page(browser: Browser, swarm: WatchedSwarm) -> Iterator[WatchedPage]:
-    """The page with the robots painted; it must end without errors and without having asked anyone else."""
-    swarm.publish()
-    opened = WatchedPage(browser, swarm.server.url)
-    opened.until("watch.fitted && watch.painter.u && watch.metrics.frame.length > 0")
-    yield opened
-    opened.close()
-    assert opened.errors == []
-    assert opened.foreign == []
 
 
 def test_robots_are_painted_where_they_are_in_the_colour_of_their_status(page: WatchedPage) -> None:

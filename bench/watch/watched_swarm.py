@@ -10,10 +10,18 @@ import numpy as np
 
 from swarm_loc_estimator.core.description.swarm import Landmark, Robot, Swarm
 from swarm_loc_estimator.core.estimation.sightings import Sightings
+from swarm_loc_estimator.io.maps.grid_messages import GridMessage
 from swarm_loc_estimator.io.messages.estimates import EstimateMessage
 from swarm_loc_estimator.io.watch.about import about
 from swarm_loc_estimator.io.watch.access import Access
-from swarm_loc_estimator.io.watch.frames import poses_frame, sightings_frame
+from swarm_loc_estimator.io.watch.frames import (
+    Frame,
+    aerial_frame,
+    map_frame,
+    places_frame,
+    poses_frame,
+    sightings_frame,
+)
 from swarm_loc_estimator.io.watch.server import Answer, Command, WatchServer
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
@@ -22,6 +30,7 @@ SWARM = Swarm(
     landmarks=(Landmark(1, -1.0, -1.0, yaw=0.5), Landmark(2, 1.0, 1.0)),
 )
 PLACES = np.array([[0.5, 0.25, 1.0], [-0.5, 0.5, -2.0], [0.0, -0.5, 0.0]])
+MAP_CORNER = (-1.5, -1.5, 0.3)
 
 
 class WatchedSwarm:
@@ -29,12 +38,15 @@ class WatchedSwarm:
 
     Args:
         port: 0 for any.
+        access: Who may look.
+        infrared: Whether beta sees by infrared.
     """
 
-    def __init__(self, port: int = 0) -> None:
+    def __init__(self, port: int = 0, access: Access | None = None, *, infrared: bool = False) -> None:
         self.commands: queue.Queue[dict[str, Any]] = queue.Queue()
         told = about(SWARM, "three robots", teleop=True)
-        self.server = WatchServer(told, Access("127.0.0.1"), port, 20.0, self._take)
+        told["infrared"] = [0, int(infrared), 0]
+        self.server = WatchServer(told, access or Access("127.0.0.1"), port, 20.0, self._take)
         self.now_ns = time.time_ns()
 
     def _take(self, command: Command, answer: Answer) -> None:
@@ -44,19 +56,43 @@ class WatchedSwarm:
     def publish(self, poses: FloatArray = PLACES, later_ns: int = 100_000_000) -> None:
         """All robots at poses (3, 3) a while later, tracked but the last, which waits."""
         self.now_ns += later_ns
-        shown = poses.copy()
-        shown[2] = np.nan
-        covariance = np.tile(np.diag([1e-4, 4e-4, 1e-3]), (3, 1, 1))
-        status = np.array([1, 1, 0], dtype=np.uint8)
-        age = np.array([0.1, -1.0, -1.0])
-        names = tuple(robot.name for robot in SWARM.robots)
-        estimate = EstimateMessage(self.now_ns, "map", names, shown, covariance, age, status)
-        self.server.publish(poses_frame(estimate))
-        sees = Sightings(
-            np.array([0, 0], np.int32),
-            np.array([1, -1], np.int32),
-            np.array([1, 2], np.uint8),
-            np.array([1.0, 30.0], np.float32),
-            np.array([0.1, 0.2], np.float32),
-        )
-        self.server.publish(sightings_frame(self.now_ns, sees))
+        for frame in swarm_frames(self.now_ns, poses):
+            self.server.publish(frame)
+
+    def publish_surroundings(self) -> None:
+        """All else that a page shows, at the instant of the newest poses."""
+        for frame in surroundings(self.now_ns):
+            self.server.publish(frame)
+
+
+def swarm_frames(stamp_ns: int, poses: FloatArray = PLACES) -> list[Frame]:
+    """All robots at poses (3, 3), tracked but the last, which waits; and what they see."""
+    shown = poses.copy()
+    shown[2] = np.nan
+    covariance = np.tile(np.diag([1e-4, 4e-4, 1e-3]), (3, 1, 1))
+    status = np.array([1, 1, 0], dtype=np.uint8)
+    age = np.array([0.1, -1.0, -1.0])
+    names = tuple(robot.name for robot in SWARM.robots)
+    estimate = EstimateMessage(stamp_ns, "map", names, shown, covariance, age, status)
+    sees = Sightings(
+        np.array([0, 0, 1], np.int32),
+        np.array([1, -1, -2], np.int32),
+        np.array([1, 2, 1], np.uint8),
+        np.array([1.0, 30.0, 1.0], np.float32),
+        np.array([0.1, 0.2, 0.2], np.float32),
+    )
+    return [poses_frame(estimate), sightings_frame(stamp_ns, sees)]
+
+
+def surroundings(stamp_ns: int) -> list[Frame]:
+    """Ground truth, a goal, an image from above in which one robot is known, and a map."""
+    cells = np.full((40, 60), -1, dtype=np.int8)
+    cells[10:30, 10:50] = 0
+    cells[10:30, (10, 49)] = cells[(10, 29), 10:50] = 100
+    seen = np.array([[0.55, 0.25], [-0.5, 0.4], [0.9, -0.7]])
+    return [
+        places_frame("truth", stamp_ns, [0, 1], PLACES[:2] + np.array([0.03, 0.0, 0.1])),
+        places_frame("goals", stamp_ns, [1], np.array([[-1.0, 0.0, 0.0]])),
+        aerial_frame(stamp_ns, seen, {0: (0, 0.97)}),
+        map_frame(stamp_ns, GridMessage(stamp_ns, "map", 0.05, MAP_CORNER, cells)),
+    ]

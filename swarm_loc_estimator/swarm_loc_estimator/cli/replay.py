@@ -6,7 +6,7 @@
 
 The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. The report
 (report.txt, report.html, overview.png, paths.png, errors.png) and the poses (poses.csv) are written to --out.
---mcap writes poses, /tf and markers of the run for RViz, Foxglove and other viewers.
+--mcap writes poses, /tf, markers, and the bag's map and goals for RViz, Foxglove and other viewers.
 --learned writes the description for the next run, with what the filter has learned of cameras, odometry and
 landmarks; it learns of what the description gives a sigma.
 """

@@ -1,10 +1,10 @@
-"""Write a run as one MCAP file that any viewer shows: poses, /tf, markers, ground truth."""
+"""Write a run as one MCAP file that any viewer shows: poses, /tf, markers, ground truth, map and goals."""
 
 from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,12 +12,14 @@ import numpy as np
 
 from swarm_loc_estimator.core.estimation.estimate import Status
 from swarm_loc_estimator.io.bags.writer import BagWriter
+from swarm_loc_estimator.io.maps.grid_messages import OCCUPANCY_GRID
 from swarm_loc_estimator.io.messages.encoders import encode_pose_stamped
 from swarm_loc_estimator.io.messages.estimates import EstimateMessage
 from swarm_loc_estimator.io.messages.markers import MarkersEncoder
 from swarm_loc_estimator.io.messages.outputs import SwarmPosesEncoder, TransformsEncoder
 from swarm_loc_estimator.io.messages.typestore import MARKERS, POSE_STAMPED, SWARM_POSES, TRANSFORMS
 from swarm_loc_estimator.numerics.arrays import BoolArray
+from swarm_loc_estimator.numerics.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from swarm_loc_estimator.evaluation.result import ReplayResult
@@ -41,12 +43,22 @@ def write_mcap(result: ReplayResult, path: Path) -> None:
         bag = Path(folder) / "run"
         with BagWriter(bag, compress=True) as writer:
             _add_estimates(result, writer)
-            for name, truth in result.truth.items():
-                writer.add_topic(f"{name}/ground_truth", POSE_STAMPED)
-                messages = encode_pose_stamped(_MAP, truth.stamp_ns, truth.pose)
-                for stamp_ns, message in zip(truth.stamp_ns.tolist(), messages, strict=True):
-                    writer.write(f"{name}/ground_truth", stamp_ns, message)
+            _add_places("ground_truth", result.truth, writer)
+            _add_places("goal", result.goals, writer)
+            if result.maps:
+                writer.add_topic("map", OCCUPANCY_GRID, is_latched=True)
+            for one in result.maps:
+                writer.write("map", one.log_ns, one.data)
         shutil.move(bag / "run.mcap", path)
+
+
+def _add_places(topic: str, places: Mapping[str, Trajectory], writer: BagWriter) -> None:
+    """A PoseStamped for each place of each robot."""
+    for name, track in places.items():
+        writer.add_topic(f"{name}/{topic}", POSE_STAMPED)
+        messages = encode_pose_stamped(_MAP, track.stamp_ns, track.pose)
+        for stamp_ns, message in zip(track.stamp_ns.tolist(), messages, strict=True):
+            writer.write(f"{name}/{topic}", stamp_ns, message)
 
 
 def _add_estimates(result: ReplayResult, writer: BagWriter) -> None:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.core.inputs.messages import RawInputs
+from swarm_loc_estimator.evaluation.surroundings import MapReader, RecordedMap
 from swarm_loc_estimator.evaluation.truth import TruthReader
 from swarm_loc_estimator.io.bags.reader import BagReader, BagTopic
 from swarm_loc_estimator.io.inputs.ingest import Ingest
 from swarm_loc_estimator.io.inputs.topics import InputKind
+from swarm_loc_estimator.io.messages.message_batch import MessageBatch
 from swarm_loc_estimator.numerics.trajectory import Trajectory
 
 Progress = Callable[[float, str], None]
@@ -31,12 +33,16 @@ class BagSummary:
         truth: Robot name -> ground truth; robots without are missing.
         received: Messages for the estimator by kind of topic.
         remarks: What could not be read or used, one sentence each.
+        maps: What was recorded of `map`, thinned out where it is very much.
+        goals: Robot name -> where it was to go, by the instants at which that was decided.
     """
 
     range_ns: tuple[int, int]
     truth: Mapping[str, Trajectory]
     received: Mapping[str, int]
     remarks: tuple[str, ...]
+    maps: tuple[RecordedMap, ...] = ()
+    goals: Mapping[str, Trajectory] = field(default_factory=dict)
 
 
 def read_bag(bag: Path, swarm: Swarm, take: Callable[[RawInputs], None], progress: Progress) -> BagSummary:
@@ -51,19 +57,26 @@ def read_bag(bag: Path, swarm: Swarm, take: Callable[[RawInputs], None], progres
     Raises:
         BagError: Nothing in the bag can be read.
     """
-    ingest, truth = Ingest(swarm), TruthReader(swarm)
-    count = len(ingest.topics)
+    ingest, truth, maps = Ingest(swarm), TruthReader(swarm), MapReader(swarm)
+    first_truth = len(ingest.topics)
+    first_map = first_truth + len(truth.topics)
     with BagReader(bag) as reader:
         range_ns = reader.time_range_ns
-        for batch in reader.batches([*ingest.handle_of, *truth.topics]):
-            is_input = batch.topic < count
-            for inputs in ingest.read(batch.chosen(is_input)):
+        for batch in reader.batches([*ingest.handle_of, *truth.topics, *maps.topics]):
+            for inputs in ingest.read(batch.chosen(batch.topic < first_truth)):
                 take(inputs)
-            others = batch.chosen(~is_input)
-            truth.add(others._replace(topic=others.topic - count))
+            truth.add(_from(batch.chosen(batch.topic < first_map), first_truth))
+            maps.add(_from(batch, first_map))
             progress(reader.progress, "reading")
-        remarks = (*reader.losses, *_strangers(reader.topics, ingest), *_missing(ingest), *truth.remarks())
-        return BagSummary(range_ns, truth.tracks(), ingest.received(), remarks)
+        found = (*_strangers(reader.topics, ingest), *_missing(ingest))
+        remarks = (*reader.losses, *found, *truth.remarks(), *maps.remarks())
+        return BagSummary(range_ns, truth.tracks(), ingest.received(), remarks, maps.maps(), maps.goals())
+
+
+def _from(batch: MessageBatch, first: int) -> MessageBatch:
+    """The messages whose topics have such a number or a higher one, with numbers that begin at 0."""
+    others = batch.chosen(batch.topic >= first)
+    return others._replace(topic=others.topic - first)
 
 
 def _missing(ingest: Ingest) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,4 +52,5 @@ def replay(
     if periodic.jumps:
         jumps = f"The log time jumps ahead by more than an hour, {periodic.jumps} x"
         remarks.append(f"{jumps}; no poses are given meanwhile.")
-    return runner.result(bag.name, summary.range_ns, summary.truth, summary.received, tuple(remarks))
+    result = runner.result(bag.name, summary.range_ns, summary.truth, summary.received, tuple(remarks))
+    return replace(result, maps=summary.maps, goals=summary.goals)

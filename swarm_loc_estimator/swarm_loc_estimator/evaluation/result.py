@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from swarm_loc_estimator.core.description.swarm import Swarm
     from swarm_loc_estimator.core.estimation.sightings import Sightings
+    from swarm_loc_estimator.evaluation.surroundings import AerialImage, RecordedMap
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,9 @@ class ReplayResult:
         wall_s: Duration of the replay [s].
         status: (T, N) of `Status`; None: not known.
         sightings: What the robots saw every half second, with its instant [ns]; empty: not kept.
+        images: Aerial images with who is who in them; empty: none, or not kept.
+        maps: What the mapper told, as it was recorded.
+        goals: Robot name -> where the mapper sent it; robots without are missing.
         self_calibrated: The swarm with what the filter has estimated beside the poses; None: nothing.
     """
 
@@ -52,6 +56,9 @@ class ReplayResult:
     self_calibrated: Swarm | None = None
     status: npt.NDArray[np.uint8] | None = None
     sightings: tuple[tuple[int, Sightings], ...] = ()
+    images: tuple[AerialImage, ...] = ()
+    maps: tuple[RecordedMap, ...] = ()
+    goals: Mapping[str, Trajectory] = field(default_factory=dict)
 
     @property
     def speed_factor(self) -> float:

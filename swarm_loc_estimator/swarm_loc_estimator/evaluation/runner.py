@@ -18,6 +18,7 @@ from swarm_loc_estimator.core.estimation.sightings import Sightings, newest_sigh
 from swarm_loc_estimator.core.inputs.messages import RawInputs
 from swarm_loc_estimator.evaluation.result import ReplayResult
 from swarm_loc_estimator.evaluation.spool import Spool
+from swarm_loc_estimator.evaluation.surroundings import AerialImages
 from swarm_loc_estimator.io.inputs.ingest import MAX_PAUSE_NS
 from swarm_loc_estimator.numerics.trajectory import Trajectory
 
@@ -102,7 +103,7 @@ class Runner:
         estimator: To run, which nobody else feeds.
         schedule: When it ticks.
         fuse_period_ns: Measurements are fused at the ticks that are multiples of this.
-        keep_sightings: Whether what the robots see is kept, too.
+        keep_sightings: Whether what the robots and cameras above them see is kept, too.
     """
 
     def __init__(
@@ -125,11 +126,14 @@ class Runner:
         self._status = np.zeros((_TICKS_AT_ONCE, robots), dtype=np.uint8)
         self._sightings_left = _MAX_SIGHTINGS if keep_sightings else 0
         self._sightings: list[tuple[int, Sightings]] = []
+        self._images = AerialImages() if keep_sightings else None
         self._filled = 0
 
     def take(self, inputs: RawInputs) -> None:
         """Hand in the inputs of a stretch of time, and do all ticks that are due until its end."""
         self._schedule.begin(inputs.begin_ns)
+        if self._images is not None:
+            self._images.add(inputs.aerial)
         stamps_ns = self._schedule.due(inputs.end_ns)
         parts = self._estimator.validate(inputs).until_each(np.array(stamps_ns, dtype=np.int64))
         for now_ns in stamps_ns:
@@ -169,6 +173,7 @@ class Runner:
             covariance=self._spool.array("covariance", np.float64, robots, 3, 3),
             status=self._spool.array("status", np.uint8, robots),
             sightings=tuple(self._sightings),
+            images=self._images.images() if self._images is not None else (),
             self_calibrated=estimator.learned() if estimator.is_self_calibrated else None,
             truth=truth,
             counters={
@@ -186,6 +191,8 @@ class Runner:
         k, self._filled = self._filled, self._filled + 1
         self._stamp_ns[k], self._pose[k], self._covariance[k] = now_ns, estimate.poses, estimate.covariances
         self._status[k] = estimate.status
+        if self._images is not None:
+            self._images.note(self._estimator.identities)
         if self._sightings_left > 0 and now_ns % _SIGHTINGS_PERIOD_NS == 0:
             seen = newest_sightings(self._estimator.recent(), now_ns)
             self._sightings.append((now_ns, seen))

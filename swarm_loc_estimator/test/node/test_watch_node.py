@@ -14,6 +14,7 @@ import aiohttp
 import numpy as np
 import pytest
 from aiohttp.client_exceptions import ClientError
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import OccupancyGrid, Odometry
 from node_world import STEP_NS, T0_NS, TRUE_POSES, Robots, Ros, overrides
@@ -24,6 +25,7 @@ from visualization_msgs.msg import MarkerArray
 from swarm_loc_estimator.io.watch.frames import unpack
 from swarm_loc_estimator.nodes.watch.markers_node import MarkersNode
 from swarm_loc_estimator.nodes.watch.watch_node import WatchNode
+from swarm_loc_msgs.msg import SwarmPose, SwarmPoses
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -125,6 +127,29 @@ def test_a_page_is_told_what_the_graph_says(
     assert np.isin(seen["verdict"], [0, 1, 2, 3, 4]).all()
     report = next(note for note in viewer.notes if note["kind"] == "report")
     assert (report["robot"], "status" in report["values"]) == (0, True)
+
+
+@pytest.mark.usefixtures("page_node")
+def test_what_a_page_cannot_show_is_told_on_diagnostics(ros: Ros) -> None:
+    maps = ros.tester.create_publisher(OccupancyGrid, "map", LATCHED)
+    truth = ros.tester.create_publisher(PoseStamped, "alpha/ground_truth", BEST_EFFORT)
+    told = ros.listen(DiagnosticArray, "/diagnostics")
+    poses = ros.tester.create_publisher(SwarmPoses, "swarm/poses", QoSProfile(depth=10))
+    maps.publish(OccupancyGrid(data=[0, 0, 0]))  # its width and height are 0
+    nowhere = PoseStamped()
+    nowhere.pose.position.x = float("nan")
+
+    def values() -> dict[str, str]:
+        poses.publish(SwarmPoses(poses=[SwarmPose(name="stranger")]))
+        truth.publish(nowhere)
+        newest = [one for message in told for one in message.status if one.name == "watch"][-1:]
+        return {pair.key: pair.value for one in newest for pair in one.values}
+
+    ros.until(lambda: {"dropped: map malformed", "dropped: swarm/poses other_swarm"} <= values().keys())
+    levels = [(one.level, one.message) for message in told for one in message.status if one.name == "watch"]
+    assert any(level == DiagnosticStatus.WARN and "map malformed" in said for level, said in levels)
+    assert values()["dropped: map malformed"] == "1"
+    assert values()["pages"] == "0"
 
 
 def test_orders_of_a_page_reach_the_estimator_and_the_robots(

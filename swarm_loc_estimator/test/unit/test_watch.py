@@ -19,7 +19,7 @@ from swarm_loc_estimator.io.watch.access import Access, AccessError
 from swarm_loc_estimator.io.watch.frames import Frame, pack, unpack
 from swarm_loc_estimator.io.watch.history import History
 from swarm_loc_estimator.io.watch.page import content_security_policy, page
-from swarm_loc_estimator.io.watch.server import Answer, Command, ServerError, WatchServer
+from swarm_loc_estimator.io.watch.server import Answer, Command, ServerError, ServerLoad, WatchServer
 
 SECOND = 1_000_000_000
 MEGABYTE = 1 << 20
@@ -160,3 +160,37 @@ def test_a_page_that_does_not_read_costs_nothing_and_others_see_the_newest(serve
             return took_s
 
     assert asyncio.run(look()) < 0.5, "publishing waits for a page"
+
+
+def test_a_page_that_is_behind_is_told_as_slow(server: WatchServer) -> None:
+    async def look() -> tuple[ServerLoad, ServerLoad]:
+        async with aiohttp.ClientSession() as session:
+            sleeper = await session.ws_connect(f"{server.url}socket")
+            reader = await session.ws_connect(f"{server.url}socket")
+            assert (await reader.receive_json())["names"] == ["alpha"]
+            for k in range(1, 11):
+                server.publish(pack("poses", k * SECOND, {"x": np.zeros(3)}))
+                await reader.receive_bytes()
+                await reader.send_str("+")
+            found = (server.load(), server.load())
+            await reader.close()
+            await sleeper.close()
+            while server.has_viewers:
+                await asyncio.sleep(0)
+            return found
+
+    first, then = asyncio.run(look())
+    assert (first.pages, first.slow) == (2, 1)
+    assert first.left_out >= 4
+    assert (then.slow, then.left_out) == (0, first.left_out)
+    assert server.load() == first._replace(pages=0, slow=0), "what was left out is forgotten with its page"
+
+
+def test_pages_that_are_not_let_in_are_counted(server: WatchServer) -> None:
+    async def ask() -> int:
+        headers = {"Origin": "https://elsewhere.example"}
+        async with aiohttp.ClientSession() as session, session.get(server.url, headers=headers) as answer:
+            return answer.status
+
+    assert asyncio.run(ask()) == 403
+    assert server.load().refused == 1

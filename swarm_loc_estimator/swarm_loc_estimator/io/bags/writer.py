@@ -47,6 +47,8 @@ RELIABLE = Qos(
     avoid_ros_namespace_conventions=False,
 )
 """Odometry, detections and estimates: reliable, small depth."""
+LATCHED = RELIABLE._replace(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
+"""A map: who subscribes later gets the newest."""
 
 
 class _McapStorage:
@@ -120,14 +122,22 @@ class BagWriter:
         except (WriterError, OSError) as error:
             raise BagError(f"The bag '{path}' cannot be created: {error}") from error
 
-    def add_topic(self, name: str, message_type: str) -> None:
+    def add_topic(self, name: str, message_type: str, *, is_latched: bool = False) -> None:
         """Announce a topic, such as robot1/odom of nav_msgs/msg/Odometry.
 
         Names are written fully qualified, as a recorder writes them.
+
+        Args:
+            name: Of the topic.
+            message_type: Of its messages.
+            is_latched: Whether its publisher is said to have kept the newest for late subscribers.
         """
         topic = "/" + name.lstrip("/")
         self._connections[name] = self._writer.add_connection(
-            topic, message_type, typestore=typestore(), offered_qos_profiles=[RELIABLE]
+            topic,
+            message_type,
+            typestore=typestore(),
+            offered_qos_profiles=[LATCHED if is_latched else RELIABLE],
         )
 
     def write(self, topic: str, log_ns: int, data: bytes) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from swarm_loc_estimator.core.estimation.sightings import Sightings
+from swarm_loc_estimator.io.maps.grid_messages import GridMessage
 from swarm_loc_estimator.io.messages.estimates import EstimateMessage
 
 _TYPES = {"float64": "f8", "float32": "f4", "int32": "i4", "uint8": "u1", "int8": "i1"}
@@ -99,3 +100,30 @@ def places_frame(
         "theta": pose[:, 2].astype(np.float32),
     }
     return pack(kind, stamp_ns, columns, **extra)
+
+
+def aerial_frame(
+    stamp_ns: int, position: npt.NDArray[np.float64], known: Mapping[int, tuple[int, float]]
+) -> Frame:
+    """What an aerial image shows.
+
+    Args:
+        stamp_ns: Of the image.
+        position: (n, 2) of its detections in map [m].
+        known: Detection -> the robot that it is believed to be, and the probability of that.
+    """
+    who = [known.get(place, (-1, 0.0)) for place in range(len(position))]
+    columns: dict[str, npt.NDArray[Any]] = {
+        "robot": np.array([robot for robot, _ in who], dtype=np.int32),
+        "x": position[:, 0],
+        "y": position[:, 1],
+        "probability": np.array([sure for _, sure in who], dtype=np.float32),
+    }
+    return pack("aerial", stamp_ns, columns)
+
+
+def map_frame(stamp_ns: int, grid: GridMessage) -> Frame:
+    """The map as it is known at an instant."""
+    height, width = grid.cells.shape
+    shape = {"width": width, "height": height, "resolution": grid.resolution, "origin": grid.origin}
+    return pack("map", stamp_ns, {"cells": grid.cells}, **shape)

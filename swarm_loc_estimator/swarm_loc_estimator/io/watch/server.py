@@ -10,7 +10,7 @@ import json
 import socket as sockets
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from aiohttp import WSMsgType, web
 
@@ -18,7 +18,7 @@ from swarm_loc_estimator.io.watch.access import Access, is_loopback
 from swarm_loc_estimator.io.watch.frames import Frame
 from swarm_loc_estimator.io.watch.history import History
 from swarm_loc_estimator.io.watch.page import content_security_policy, page
-from swarm_loc_estimator.io.watch.viewer import RECEIVED, Viewer
+from swarm_loc_estimator.io.watch.viewer import RECEIVED, LeftOut, Viewer
 from swarm_loc_estimator.parameters.errors import UserError
 
 MAX_VIEWERS = 32
@@ -45,6 +45,24 @@ class ServerError(UserError):
     """The server cannot listen; the message is one sentence."""
 
 
+class ServerLoad(NamedTuple):
+    """How the server and its pages get on.
+
+    Attributes:
+        pages: Open now.
+        slow: Of these, those for which frames were left out since the last time.
+        left_out: Frames left out for pages that were busy with older ones, of all pages so far.
+        texts_left_out: Likewise texts.
+        refused: Pages that were not let in so far.
+    """
+
+    pages: int
+    slow: int
+    left_out: int
+    texts_left_out: int
+    refused: int
+
+
 class WatchServer:
     """Serves the page.
 
@@ -68,6 +86,9 @@ class WatchServer:
         self._on_command = on_command
         self._history = History()
         self._viewers: set[Viewer] = set()
+        self._gone = LeftOut(0, 0)
+        self._refused = 0
+        self._told: dict[int, int] = {}
         self._loop = asyncio.new_event_loop()
         self._runner = web.AppRunner(self._application(), access_log=None, shutdown_timeout=1.0)
         self._listening = threading.Event()
@@ -97,6 +118,14 @@ class WatchServer:
     def selected(self) -> set[int]:
         """Indices of the robots whose numbers are shown."""
         return {viewer.selected for viewer in tuple(self._viewers)} - {-1}
+
+    def load(self) -> ServerLoad:
+        """How it gets on; slow pages since the last call."""
+        counts = {id(viewer): viewer.left_out for viewer in tuple(self._viewers)}
+        slow = sum(count.frames > self._told.get(key, 0) for key, count in counts.items())
+        self._told = {key: count.frames for key, count in counts.items()}
+        frames, texts = (sum(parts) for parts in zip(self._gone, *counts.values(), strict=True))
+        return ServerLoad(len(counts), slow, frames, texts, self._refused)
 
     def publish(self, frame: Frame) -> None:
         """Hand a frame over; from any thread."""
@@ -159,6 +188,7 @@ class WatchServer:
         origin = request.headers.get("Origin")
         refusal = self._access.refusal(request.host, origin, request.query.get("token", ""))
         if refusal:
+            self._refused += 1
             raise web.HTTPForbidden(text=refusal)
 
     async def _on_page(self, request: web.Request) -> web.Response:
@@ -174,6 +204,7 @@ class WatchServer:
     async def _on_socket(self, request: web.Request) -> web.WebSocketResponse:
         self._check(request)
         if len(self._viewers) >= MAX_VIEWERS:
+            self._refused += 1
             raise web.HTTPServiceUnavailable(text=f"{MAX_VIEWERS} pages are open, which is the limit.")
         socket = web.WebSocketResponse(
             heartbeat=_HEARTBEAT_S, max_msg_size=_MAX_COMMAND_BYTES, writer_limit=_SEND_BUFFER_BYTES
@@ -189,6 +220,7 @@ class WatchServer:
                     self._on_text(viewer, message.data)
         finally:
             self._viewers.discard(viewer)
+            self._gone = LeftOut(*map(sum, zip(self._gone, viewer.left_out, strict=True)))
             sending.cancel()
         return socket
 

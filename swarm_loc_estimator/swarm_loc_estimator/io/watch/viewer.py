@@ -7,7 +7,7 @@ import json
 import time
 from collections import deque
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 from aiohttp import web
 
@@ -21,6 +21,18 @@ _MAX_ON_THE_WAY = 4
 """More frames would only lie in the buffers of a page that is busy, and be old when it comes to them."""
 
 
+class LeftOut(NamedTuple):
+    """What a page did not get.
+
+    Attributes:
+        frames: That newer ones replaced while it was still busy with older ones.
+        texts: That were dropped since too many waited.
+    """
+
+    frames: int
+    texts: int
+
+
 class Viewer:
     """Sends to one page; a slow one gets fewer frames, and nothing piles up for it.
 
@@ -30,7 +42,7 @@ class Viewer:
 
     Attributes:
         selected: Index of the robot whose numbers the page shows; -1: none.
-        skipped: Frames that newer ones replaced before they were sent.
+        left_out: What it did not get.
     """
 
     def __init__(self, socket: web.WebSocketResponse, rate: float) -> None:
@@ -41,16 +53,19 @@ class Viewer:
         self._wake = asyncio.Event()
         self._on_the_way = 0
         self.selected = -1
-        self.skipped = 0
+        self.left_out = LeftOut(0, 0)
 
     def offer(self, frame: Frame) -> None:
         """Have a frame sent, unless a newer one of its kind comes before."""
-        self.skipped += frame.kind in self._newest
+        if frame.kind in self._newest and self._on_the_way >= _MAX_ON_THE_WAY:
+            self.left_out = self.left_out._replace(frames=self.left_out.frames + 1)
         self._newest[frame.kind] = frame
         self._wake.set()
 
     def note(self, message: dict[str, Any]) -> None:
         """Have a text sent."""
+        if len(self._notes) == MAX_NOTES:
+            self.left_out = self.left_out._replace(texts=self.left_out.texts + 1)
         self._notes.append(json.dumps(message))
         self._wake.set()
 

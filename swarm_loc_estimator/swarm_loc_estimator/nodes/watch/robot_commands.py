@@ -29,6 +29,9 @@ class RobotCommands:
         names: The robots.
         parameters: What is allowed.
         now_ns: A clock that always runs [ns].
+
+    Attributes:
+        dropped: Commands that came while too many waited.
     """
 
     def __init__(
@@ -38,6 +41,7 @@ class RobotCommands:
         self._names = names
         self._parameters = parameters
         self._now_ns = now_ns
+        self.dropped = 0
         self._waiting: queue.Queue[tuple[Command, Answer]] = queue.Queue(_MAX_WAITING)
         self._reset = node.create_client(Trigger, f"{parameters.estimator}/reset")
         self._set_pose = node.create_client(SetRobotPose, f"{parameters.estimator}/set_robot_pose")
@@ -54,6 +58,7 @@ class RobotCommands:
         try:
             self._waiting.put_nowait((command, answer))
         except queue.Full:
+            self.dropped += 1
             answer("Too many commands at once: this one was dropped.", ok=False)
 
     def work(self) -> None:

@@ -1,21 +1,16 @@
-"""Frames of what robots publish of places: ground truth, goals, aerial detections with names, the map."""
+"""Frames of what robots publish of places: ground truth, goals, aerial detections with names."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from nav_msgs.msg import OccupancyGrid
 from rclpy.time import Time
 
 from swarm_loc_estimator.io.messages.cdr import CdrError, decode_pose_stamped
-from swarm_loc_estimator.io.messages.planar import yaw_of
-from swarm_loc_estimator.io.watch.frames import Frame, pack, places_frame
+from swarm_loc_estimator.io.watch.frames import Frame, aerial_frame, places_frame
 from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities
 
-MAX_CELLS = 4_000_000
 _OLD_NS = 500_000_000
 _IMAGES = 8
 
@@ -99,24 +94,5 @@ class AerialNames:
 
     def _frame(self, stamp_ns: int, known: dict[int, tuple[int, float]]) -> Frame:
         seen = self._images[stamp_ns].detections
-        who = [known.get(place, (-1, 0.0)) for place in range(len(seen))]
-        columns: dict[str, npt.NDArray[Any]] = {
-            "robot": np.array([robot for robot, _ in who], dtype=np.int32),
-            "x": np.array([one.x for one in seen], dtype=np.float64),
-            "y": np.array([one.y for one in seen], dtype=np.float64),
-            "probability": np.array([sure for _, sure in who], dtype=np.float32),
-        }
-        return pack("aerial", stamp_ns, columns)
-
-
-def map_frame(message: OccupancyGrid, stamp_ns: int) -> Frame | None:
-    """The map as it is known at an instant; None where its numbers cannot be."""
-    info, cells = message.info, np.array(message.data, dtype=np.int8)
-    if not 0 < cells.size <= MAX_CELLS or cells.size != info.width * info.height or info.resolution <= 0.0:
-        return None
-    at, q = info.origin.position, info.origin.orientation
-    origin = [at.x, at.y, yaw_of(q.x, q.y, q.z, q.w)]
-    if not np.isfinite(origin).all():
-        return None
-    shape = {"width": info.width, "height": info.height, "resolution": info.resolution}
-    return pack("map", stamp_ns, {"cells": cells}, origin=origin, **shape)
+        position = np.array([(one.x, one.y) for one in seen]).reshape(-1, 2)
+        return aerial_frame(stamp_ns, position, known)

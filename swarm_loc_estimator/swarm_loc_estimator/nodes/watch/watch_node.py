@@ -3,8 +3,8 @@
     ./run swarm_loc_estimator watch_node --ros-args -p swarm_file:=swarm.yaml
 
 It subscribes to `swarm/poses`, `swarm/sightings` (while somebody looks), `/diagnostics`, `aerial/detections`,
-`aerial/identities`, `map`, `<robot>/ground_truth` and `<robot>/goal`; and publishes `<robot>/cmd_vel` where
-driving is allowed. Parameters: see `doc/watch.md`.
+`aerial/identities`, `map`, `<robot>/ground_truth` and `<robot>/goal`; and publishes `/diagnostics`, and
+`<robot>/cmd_vel` where driving is allowed. Parameters: see `doc/watch.md`.
 """
 
 from __future__ import annotations
@@ -26,17 +26,19 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
+from swarm_loc_estimator.io.maps.grid_messages import decode_occupancy_grid
 from swarm_loc_estimator.io.messages.cdr import CdrError
 from swarm_loc_estimator.io.messages.estimates import SwarmPosesReader, decode_sightings
 from swarm_loc_estimator.io.messages.typestore import SWARM_POSES
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.io.watch.about import about
 from swarm_loc_estimator.io.watch.access import Access
-from swarm_loc_estimator.io.watch.frames import Frame, poses_frame, sightings_frame
+from swarm_loc_estimator.io.watch.frames import Frame, map_frame, poses_frame, sightings_frame
 from swarm_loc_estimator.io.watch.server import WatchServer
 from swarm_loc_estimator.nodes.watch.newest_messages import NewestMessages
 from swarm_loc_estimator.nodes.watch.robot_commands import RobotCommands
-from swarm_loc_estimator.nodes.watch.robot_places import AerialNames, Places, map_frame
+from swarm_loc_estimator.nodes.watch.robot_places import AerialNames, Places
+from swarm_loc_estimator.nodes.watch.watch_diagnostics import WatchDiagnostics
 from swarm_loc_estimator.nodes.watch.watch_parameters import WatchParameters
 from swarm_loc_estimator.ros.running import ConfiguredNode, run_node
 from swarm_loc_estimator.ros.topic_graph import TopicGraph
@@ -45,7 +47,8 @@ from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities, SwarmPo
 _FLEETING = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Hears every publisher, and what comes too fast for it is lost to it alone."""
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-_WORK_S, _LOOK_S = 0.05, 1.0
+_OUTPUT_QOS = QoSProfile(depth=10)
+_WORK_S, _LOOK_S, _DIAGNOSTICS_S = 0.05, 1.0, 1.0
 _PLACES_PERIOD_S = 0.1
 _PATIENCE_S = 5.0
 _THROTTLE_S = 30.0
@@ -79,9 +82,12 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         access = Access(self.chosen.address, self.chosen.token)
         self.server = WatchServer(told, access, self.chosen.port, self.chosen.rate, self._commands.order)
         self._subscribe()
+        self._diagnostics = WatchDiagnostics(self.get_name())
+        self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", _OUTPUT_QOS)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_WORK_S, self._commands.work, clock=steady)
         self.create_timer(_LOOK_S, self._look_around, clock=steady)
+        self.create_timer(_DIAGNOSTICS_S, self._publish_diagnostics, clock=steady)
         self.get_logger().info(f"watch the swarm at {self.server.url}")
 
     @property
@@ -117,16 +123,14 @@ class WatchNode(ConfiguredNode[WatchParameters]):
             _FLEETING,
         )
         follow = SubscriptionEventCallbacks(incompatible_qos=self._follow_map)
-        self._map = self.create_subscription(
-            OccupancyGrid, "map", self._on_map, _LATCHED, event_callbacks=follow
-        )
+        self._map = raw(OccupancyGrid, "map", self._on_map, _LATCHED, event_callbacks=follow)
 
     def _follow_map(self, _event: object) -> None:
         """The map's publisher keeps none for late subscribers, or is best effort: hear it all the same."""
         if self._map.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
             return
         self.destroy_subscription(self._map)
-        self._map = self.create_subscription(OccupancyGrid, "map", self._on_map, _FLEETING)
+        self._map = self.create_subscription(OccupancyGrid, "map", self._on_map, _FLEETING, raw=True)
         self.get_logger().info("map is not published transient local: it is shown once it comes anew")
 
     def _publish(self, frame: Frame | None) -> None:
@@ -161,11 +165,11 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         except CdrError:
             self._drop("swarm/sightings", "malformed")
 
-    def _on_map(self, message: OccupancyGrid) -> None:
-        frame = map_frame(message, self._newest_ns)
-        if frame is None:
+    def _on_map(self, data: bytes) -> None:
+        try:
+            self.server.publish(map_frame(self._newest_ns, decode_occupancy_grid(data)))
+        except CdrError:
             self._drop("map", "malformed")
-        self._publish(frame)
 
     def _on_diagnostics(self, data: bytes) -> None:
         """Tell what is said of the robots that somebody has chosen; to others it costs nothing."""
@@ -199,6 +203,15 @@ class WatchNode(ConfiguredNode[WatchParameters]):
             missing = f"nothing received on swarm/poses{why}"
             self.get_logger().warning(f"waiting: {missing}", throttle_duration_sec=_THROTTLE_S)
             self.server.tell({"kind": "said", "text": f"Waiting: {missing}.", "ok": False})
+
+    def _publish_diagnostics(self) -> None:
+        drops = {
+            **self._drops,
+            **({"command too_many": dropped} if (dropped := self._commands.dropped) else {}),
+        }
+        message = DiagnosticArray(status=[self._diagnostics.status(self.server.load(), drops)])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics_publisher.publish(message)
 
     def _drop(self, topic: str, reason: str) -> None:
         """Count a message that cannot be used, and tell of it now and then."""
