@@ -40,11 +40,14 @@ class WatchedSwarm:
         port: 0 for any.
         access: Who may look.
         infrared: Whether beta sees by infrared.
+        teleop: Whether robots may be driven.
     """
 
-    def __init__(self, port: int = 0, access: Access | None = None, *, infrared: bool = False) -> None:
+    def __init__(
+        self, port: int = 0, access: Access | None = None, *, infrared: bool = False, teleop: bool = True
+    ) -> None:
         self.commands: queue.Queue[dict[str, Any]] = queue.Queue()
-        told = about(SWARM, "three robots", teleop=True)
+        told = about(SWARM, "three robots", teleop=teleop)
         told["infrared"] = [0, int(infrared), 0]
         self.server = WatchServer(told, access or Access("127.0.0.1"), port, 20.0, self._take)
         self.now_ns = time.time_ns()

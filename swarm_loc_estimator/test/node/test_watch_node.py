@@ -175,6 +175,17 @@ def test_orders_of_a_page_reach_the_estimator_and_the_robots(
     )
 
 
+def test_pages_drive_nobody_unless_that_is_allowed(ros: Ros, swarm_file: Path) -> None:
+    parameters = overrides(swarm_file=str(swarm_file), port=0, use_sim_time=True)
+    node: WatchNode = ros.add(WatchNode(parameter_overrides=parameters))
+    with closing(Viewer(node.server.url)) as viewer:
+        viewer.order(do="drive", robot=1, ahead=1, left=0)
+        refusal = "Driving is not allowed: parameter teleop is false."
+        ros.until(lambda: any(note.get("text") == refusal for note in viewer.notes))
+    assert ros.tester.count_publishers("beta/cmd_vel") == 0
+    assert not viewer.notes[0]["teleop"]
+
+
 def test_markers_cost_nothing_until_somebody_looks(ros: Ros, robots: Robots, swarm_file: Path) -> None:
     node = ros.add(MarkersNode(parameter_overrides=overrides(swarm_file=str(swarm_file), use_sim_time=True)))
     robots.run(T0_NS, 4)

@@ -54,8 +54,9 @@ class View {
   down(event) {
     this.canvas.setPointerCapture(event.pointerId);
     this.canvas.focus({ preventScroll: true });
+    if (!this.pointers.size) this.moved = 0;
+    else this.moved = Infinity; // two fingers tap nothing
     this.pointers.set(event.pointerId, { u: event.offsetX, v: event.offsetY });
-    this.moved = 0;
     if (this.placing) this.placing.begin(this.toWorld(event.offsetX, event.offsetY));
   }
 
@@ -80,6 +81,9 @@ class View {
       const other = [...this.pointers.values()].find((one) => one !== pointer);
       const was = Math.hypot(before.u - other.u, before.v - other.v);
       const is = Math.hypot(pointer.u - other.u, pointer.v - other.v);
+      this.x -= (pointer.u - before.u) / 2 / this.scale; // what lies between the fingers stays there
+      this.y += (pointer.v - before.v) / 2 / this.scale;
+      this.onMove();
       if (was > 0) this.zoom(is / was, (pointer.u + other.u) / 2, (pointer.v + other.v) / 2);
     }
   }
