@@ -11,6 +11,7 @@ from swarm_loc_estimator.core.description.robot_ir import IrMethod, RobotIr
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.description.swarm import Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
+from swarm_loc_estimator.core.filter.integrity.surprises import is_elsewhere, new_integrity
 from swarm_loc_estimator.core.infrared.brightness import expected
 from swarm_loc_estimator.core.inputs.camera import CONTENT_POSE_TWO, CONTENT_POSITION
 from swarm_loc_estimator.io.inputs.ingest import Ingest
@@ -68,9 +69,14 @@ def _run(settings: EstimatorSettings) -> None:
             for power, stamp_ns in enumerate((now_ns, now_ns - _SECOND // 4)):
                 light = encode_brightness("", stamp_ns, (1 + number, 3), _LIGHT[power], power)
                 backlog.append((ingest.handle_of[f"{robot.name}/brightness"], light, now_ns))
+        # what came late is taken in by code of its own
+        late_ns = now_ns - _SECOND // 8
+        backlog.append((ingest.handle_of["a/odom"], _odometry(late_ns, 0.01 * step, 0.001 * step), now_ns))
         for messages in ingest.read(MessageBatch.of(backlog)):
             estimator.receive(messages)
         estimator.tick(now_ns)
+        estimator.contradictions(now_ns)
+    is_elsewhere(new_integrity(len(robots), _LANDMARKS), 0)  # asked once something contradicts
 
 
 def _board(number: int) -> RobotIr:

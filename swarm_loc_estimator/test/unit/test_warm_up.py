@@ -1,0 +1,87 @@
+"""Once it is warm, the estimator compiles nothing: a tick that does is deaf for seconds."""
+
+from __future__ import annotations
+
+import gc
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from numba.core.dispatcher import Dispatcher
+
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
+from swarm_loc_estimator.core.inputs.messages import RawInputs
+from swarm_loc_estimator.evaluation.recorded_bag import read_bag, unwatched
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.nodes.warm_up import warm_up
+
+BAGS = Path(__file__).parents[3] / "bags"
+SECOND = 1_000_000_000
+SPAN_NS = 12 * SECOND
+RECORDED = ("aerial_five", "droplets_twenty", "eight_five_robots")
+
+
+class EnoughError(Exception):
+    """The beginning of a bag is enough."""
+
+
+def test_nothing_is_compiled_once_data_come() -> None:
+    done = subprocess.run([sys.executable, __file__], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == []
+
+
+def compiled_late() -> list[str]:
+    """What is compiled when robots are replayed though all is warm; in a process of its own."""
+    warm_up()
+    before = signatures()
+    for name in RECORDED:
+        for settings in (EstimatorSettings(), EstimatorSettings(fusion_period_s=0.1)):
+            run(BAGS / name, settings)
+    run(BAGS / "eight_five_robots", EstimatorSettings(), late=True)
+    run(BAGS / "eight_five_robots", EstimatorSettings(), moved_landmarks=True)
+    return sorted(name for name, known in signatures().items() if known != before.get(name, 0))
+
+
+def signatures() -> dict[str, int]:
+    """Compiled function -> for how many kinds of arguments it was compiled as called by what is not."""
+    found = [one for one in gc.get_objects() if isinstance(one, Dispatcher)]
+    known = {f"{one.py_func.__module__}.{one.py_func.__qualname__}": len(one.signatures) for one in found}
+    return {name: count for name, count in known.items() if ".io.bags." not in name}  # these only read bags
+
+
+def run(bag: Path, settings: EstimatorSettings, *, late: bool = False, moved_landmarks: bool = False) -> None:
+    """Estimate the beginning of a bag as the node does, with odometry out of order, or in a wrong map."""
+    swarm = load_swarm(bag / "swarm.yaml")
+    if moved_landmarks:
+        marks = (replace(mark, x=mark.x + 0.3 * (k % 3)) for k, mark in enumerate(swarm.landmarks))
+        swarm = replace(swarm, landmarks=tuple(marks))
+    estimator, begun_ns = SwarmEstimator(swarm, settings), list[int]()
+
+    def take(inputs: RawInputs) -> None:
+        begun_ns.append(inputs.begin_ns)
+        if inputs.begin_ns - begun_ns[0] > SPAN_NS:
+            raise EnoughError
+        rows = inputs.odometry
+        turned = type(rows)(*(column[::-1].copy() for column in rows))
+        estimator.receive(inputs._replace(odometry=turned) if late else inputs)
+        estimator.tick(inputs.end_ns)
+        estimator.contradictions(inputs.end_ns)
+        estimator.recent()
+
+    _quietly(lambda: read_bag(bag, swarm, take, unwatched))
+
+
+def _quietly(work: Callable[[], object]) -> None:
+    try:
+        work()
+    except EnoughError:
+        return
+
+
+if __name__ == "__main__":
+    json.dump(compiled_late(), sys.stdout)
