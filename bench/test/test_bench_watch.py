@@ -158,7 +158,7 @@ def test_a_report_plays_its_run_without_a_server(browser: Browser, tmp_path: Pat
     opened.page.mouse.click(*opened.place_of(0))
     opened.until("document.getElementById('numbers').innerText.includes('5.0 mm')")
     # the numbers are those of the time that is shown, also when it changes right after they were painted
-    opened.evaluate("{ watch.panel.painted = performance.now(); watch.seek(0) }")
+    opened.evaluate("{ watch.panel.painted = watch.panel.drawn = performance.now(); watch.seek(0) }")
     opened.until("document.getElementById('numbers').innerText.includes('0.500 m')")
     assert not opened.page.is_visible("#reset")
     opened.close()

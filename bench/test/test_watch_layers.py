@@ -164,7 +164,7 @@ def near(page: WatchedPage, u: float, v: float, name: str) -> bool:
 
 def screen(page: WatchedPage) -> Picture:
     """What is painted (height, width, 3) in blue, green and red, once the page has nothing more to paint."""
-    page.until("!watch.dirty && !watch.ground.stale && !watch.panel.later")
+    page.until("watch.settled")
     data = np.frombuffer(page.page.screenshot(style=_CANVASES_ONLY), dtype=np.uint8)
     picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
     assert picture is not None

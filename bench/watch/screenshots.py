@@ -59,9 +59,7 @@ def photograph(browser: Browser, picture: Picture, work: Path, out: Path) -> Pat
     shown.until("watch.playing && watch.fitted")
     shown.evaluate(f"{{ watch.setTheme('{picture.theme}'); watch.panel.select({picture.selected}) }}")
     shown.evaluate(f"watch.seek({picture.share})")
-    shown.until("!watch.dirty && !watch.panel.later")
-    # trails of large swarms are painted at most once a second
-    shown.until("!watch.ground.stale")
+    shown.until("watch.settled")
     path = out / f"{picture.name}.png"
     shown.page.screenshot(path=path)
     shown.close()

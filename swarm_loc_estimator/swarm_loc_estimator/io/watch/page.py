@@ -8,7 +8,17 @@ from functools import lru_cache
 from pathlib import Path
 
 _FOLDER = Path(__file__).parent / "page"
-_SCRIPTS = ("frames.js", "store.js", "view.js", "ground.js", "paint.js", "link.js", "panel.js", "actions.js")
+_SCRIPTS = (
+    "frames.js",
+    "store.js",
+    "view.js",
+    "ground.js",
+    "trails.js",
+    "paint.js",
+    "link.js",
+    "panel.js",
+    "actions.js",
+)
 
 
 @lru_cache(maxsize=1)

@@ -1,29 +1,24 @@
-// What changes seldom: grid, map, landmarks, trails; painted again when the view moves, or a few times a second.
-const TRAIL_MS = 15e3;
-const FEW = 100;
+// What changes seldom: grid, map, landmarks; painted again when the view moves or another map comes.
 
 class Ground {
   constructor(canvas, app) {
     this.canvas = canvas;
     this.app = app;
     this.stale = true;
-    this.painted = 0;
     this.mapFrame = null;
     this.mapImage = null;
   }
 
-  paint(now, time) {
-    const { app, canvas } = this, many = app.count > FEW;
-    if (!this.stale && now - this.painted < (many ? 1000 : 200)) return;
-    if (this.stale && many && now - this.painted < 60) return; // a drag of a large swarm stays smooth
+  paint(time) {
+    const { app } = this, map = app.shows.map ? app.store.at("map", time) : null;
+    if (!this.stale && map === this.paintedMap) return;
     this.stale = false;
-    this.painted = now;
-    const c = fitCanvas(canvas);
+    this.paintedMap = map;
+    const c = fitCanvas(this.canvas, { alpha: false });
     c.fillStyle = app.colour("paper");
     c.fillRect(0, 0, app.view.width, app.view.height);
     if (app.shows.grid) this.grid(c);
-    if (app.shows.map) this.map(c, time);
-    if (app.shows.trails) this.trails(c, time);
+    if (map) this.map(c, map);
     if (app.shows.landmarks) this.landmarks(c);
   }
 
@@ -52,9 +47,7 @@ class Ground {
     c.stroke();
   }
 
-  map(c, time) {
-    const frame = this.app.store.at("map", time);
-    if (!frame) return;
+  map(c, frame) {
     if (frame !== this.mapFrame) this.bake(frame);
     const { view } = this.app, [x, y, yaw] = frame.origin, [u, v] = view.toScreen(x, y);
     c.save();
@@ -68,9 +61,10 @@ class Ground {
 
   bake(frame) {
     const image = new ImageData(frame.width, frame.height), cells = frame.columns.cells;
-    const [r, g, b] = rgb(this.app.colour("wall"));
+    const pixels = new Uint32Array(image.data.buffer), [r, g, b] = rgb(this.app.colour("wall"));
     for (let k = 0; k < cells.length; k++) {
-      image.data.set([r, g, b, cells[k] < 0 ? 40 : Math.round(cells[k] * 2.2)], 4 * k);
+      const opacity = cells[k] < 0 ? 40 : Math.round(cells[k] * 2.2);
+      pixels[k] = (opacity << 24) | (b << 16) | (g << 8) | r;
     }
     this.mapImage ||= document.createElement("canvas");
     this.mapImage.width = frame.width;
@@ -99,42 +93,15 @@ class Ground {
     }
     c.stroke();
   }
-
-  trails(c, time) {
-    const { view, store, count } = this.app, list = store.frames.poses || [], last = store.indexAt("poses", time);
-    if (last < 1) return;
-    const points = Math.max(6, Math.min(60, Math.round(12000 / count)));
-    const first = Math.max(0, store.indexAt("poses", time - TRAIL_MS) + 1);
-    const stride = Math.max(1, Math.ceil((last - first) / points));
-    // an anchor that does not move with time: trails must not flicker
-    const chosen = [];
-    for (let k = last; k >= first; k--) if (k === last || Math.floor(list[k].stamp / (stride * 50)) !== Math.floor(list[k + 1].stamp / (stride * 50))) chosen.push(list[k].columns);
-    c.strokeStyle = this.app.colour("tracked");
-    c.globalAlpha = 0.45;
-    c.lineWidth = 1.2;
-    c.beginPath();
-    const { scale } = view, dx = view.width / 2 - view.x * scale, dy = view.height / 2 + view.y * scale;
-    for (let i = 0; i < count; i++) {
-      let open = false;
-      for (const { x, y } of chosen) {
-        const u = x[i] * scale + dx, v = dy - y[i] * scale;
-        if (!(u === u)) open = false;
-        else if (open) c.lineTo(u, v);
-        else { c.moveTo(u, v); open = true; }
-      }
-    }
-    c.stroke();
-    c.globalAlpha = 1;
-  }
 }
 
-function fitCanvas(canvas) {
+function fitCanvas(canvas, options) {
   const ratio = window.devicePixelRatio || 1, w = canvas.clientWidth, h = canvas.clientHeight;
   if (canvas.width !== Math.round(w * ratio) || canvas.height !== Math.round(h * ratio)) {
     canvas.width = Math.round(w * ratio);
     canvas.height = Math.round(h * ratio);
   }
-  const c = canvas.getContext("2d");
+  const c = canvas.getContext("2d", options);
   c.setTransform(ratio, 0, 0, ratio, 0, 0);
   return c;
 }

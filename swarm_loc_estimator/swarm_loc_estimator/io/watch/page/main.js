@@ -17,6 +17,7 @@ class App {
     this.dirty = true;
     this.view = new View(element("top"), () => this.touch());
     this.ground = new Ground(element("ground"), this);
+    this.trails = new Trails(element("trails"), this);
     this.painter = new Painter(element("top"), this);
     this.panel = new Panel(this);
     this.link = null;
@@ -32,7 +33,8 @@ class App {
   get count() { return this.swarm.names.length; }
   get shownTime() { return this.paused || this.playing ? this.time : this.store.range[1]; }
   colour(name) { return (this.colours[name] ||= getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim()); }
-  touch() { this.dirty = this.ground.stale = true; }
+  touch() { this.dirty = this.ground.stale = this.trails.stale = true; }
+  get settled() { return !this.dirty && !this.panel.later; }
 
   controls() {
     element("fit").onclick = () => this.fit();
@@ -203,12 +205,11 @@ class App {
     this.dirty = false;
     const begin = performance.now(), time = this.shownTime;
     if (this.following) this.keepInTheMiddle(time);
-    this.ground.paint(now, time);
-    const poses = this.painter.paint(time);
-    this.panel.paint(now, time);
+    this.ground.paint(time);
+    const others = this.trails.paint(now, time), poses = this.painter.paint(time);
+    this.panel.paint(now, time, others);
     this.bars(time, first, last, poses);
     if (poses) this.measure(poses, begin);
-    if (this.ground.stale) this.dirty = true;
   }
 
   keepInTheMiddle(time) {
@@ -217,15 +218,16 @@ class App {
     if (poses && poses.columns.status[i]) {
       this.view.x = poses.columns.x[i];
       this.view.y = poses.columns.y[i];
-      this.ground.stale = true;
+      this.ground.stale = this.trails.stale = true;
     }
   }
 
   bars(time, first, last, poses) {
     const slider = element("slider"), share = last > first ? (time - first) / (last - first) : 1;
-    if (document.activeElement !== slider || !this.paused) slider.value = share;
+    if (document.activeElement !== slider || !this.paused) if (slider.value !== String(share)) slider.value = share;
     const behind = (time - last) / 1e3;
-    element("time").textContent = this.playing ? `${((time - first) / 1e3).toFixed(1)} of ${((last - first) / 1e3).toFixed(1)} s` : behind > -0.05 ? "now" : `${behind.toFixed(1)} s`;
+    const text = this.playing ? `${((time - first) / 1e3).toFixed(1)} of ${((last - first) / 1e3).toFixed(1)} s` : behind > -0.05 ? "now" : `${behind.toFixed(1)} s`;
+    if (text !== this.timeText) element("time").textContent = this.timeText = text; // else the page would be laid out anew
     const counts = STATUS.map(() => 0);
     if (poses) for (const status of poses.columns.status) counts[status]++;
     if (counts.join() === this.counted) return;

@@ -9,7 +9,6 @@ class Painter {
   constructor(canvas, app) {
     this.canvas = canvas;
     this.app = app;
-    this.discs = new Map();
   }
 
   paint(time) {
@@ -54,10 +53,15 @@ class Painter {
 
   robots(c, { theta, status }) {
     const { app } = this, n = theta.length;
-    for (let i = 0; i < n; i++) {
-      if (!status[i] || !this.isSeen(i)) continue;
-      const disc = this.disc(status[i], this.radius(i)), half = disc.extent / 2;
-      c.drawImage(disc, this.u[i] - half, this.v[i] - half, disc.extent, disc.extent);
+    for (let k = 1; k < STATUS.length; k++) {
+      c.fillStyle = app.colour(STATUS[k]);
+      c.beginPath();
+      for (let i = 0; i < n; i++) if (status[i] === k && this.isSeen(i)) {
+        const r = this.radius(i);
+        c.moveTo(this.u[i] + r, this.v[i]);
+        c.arc(this.u[i], this.v[i], r, 0, 2 * Math.PI);
+      }
+      c.fill();
     }
     c.strokeStyle = app.colour("ink");
     c.lineWidth = n > 300 ? 1 : 2;
@@ -77,22 +81,6 @@ class Painter {
     c.beginPath();
     c.arc(this.u[chosen], this.v[chosen], this.radius(chosen) + 5, 0, 2 * Math.PI);
     c.stroke();
-  }
-
-  // A disc of a status and radius, painted once: a thousand copies cost less than a thousand arcs.
-  disc(status, radius) {
-    const colour = this.app.colour(STATUS[status]), r = Math.round(4 * radius) / 4, key = `${colour} ${r} ${devicePixelRatio}`;
-    if (this.discs.has(key)) return this.discs.get(key);
-    if (this.discs.size > 64) this.discs.clear();
-    const canvas = document.createElement("canvas"), extent = 2 * Math.ceil(r) + 2, c = canvas.getContext("2d");
-    canvas.width = canvas.height = extent * devicePixelRatio;
-    canvas.extent = extent;
-    c.scale(devicePixelRatio, devicePixelRatio);
-    c.fillStyle = colour;
-    c.arc(extent / 2, extent / 2, r, 0, 2 * Math.PI);
-    c.fill();
-    this.discs.set(key, canvas);
-    return canvas;
   }
 
   labels(c, status) {

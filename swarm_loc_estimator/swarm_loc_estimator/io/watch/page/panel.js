@@ -2,6 +2,7 @@
 const CURVE_MS = 60e3;
 const CURVE_POINTS = 300;
 const PAINT_MS = 200;
+const CURVE_PERIOD_MS = 1000;
 const SAY_STATUS = {
   waiting: "waits for a sighting or a fix that locates it",
   tracked: "tracked",
@@ -16,8 +17,14 @@ class Panel {
     this.values = {};
     this.nis = [];
     this.plots = null;
-    this.painted = 0;
     this.later = 0;
+    this.renew();
+  }
+
+  // Nothing that is painted holds any more.
+  renew() {
+    this.painted = this.drawn = -Infinity;
+    this.numbersAt = this.curvesAt = NaN;
   }
 
   select(robot) {
@@ -33,7 +40,7 @@ class Panel {
     }
     element("more").hidden = !app.link;
     if (app.link) app.link.send({ do: "select", robot });
-    this.painted = 0;
+    this.renew();
   }
 
   // What /diagnostics says of the robot that is shown.
@@ -47,13 +54,24 @@ class Panel {
     fill(element("values"), Object.entries(values));
   }
 
-  paint(now, time) {
-    const { app } = this, i = app.selected;
-    if (i < 0) return;
-    if (now - this.painted < PAINT_MS) return this.paintLater();
-    this.painted = now;
-    const poses = app.store.at("poses", time);
+  // Numbers and curves in turn, and no curves beside much else, so that no single painting takes long.
+  paint(now, time, others) {
+    const i = this.app.selected, poses = i < 0 ? null : this.app.store.at("poses", time);
     if (!poses) return;
+    if (now - this.painted >= PAINT_MS && this.numbersAt !== time) {
+      this.painted = now;
+      this.numbersAt = time;
+      this.numbers(poses, time, i);
+    } else if (now - this.drawn >= CURVE_PERIOD_MS && this.curvesAt !== time && !others) {
+      this.drawn = now;
+      this.curvesAt = time;
+      this.curves(time, i);
+    }
+    if (this.numbersAt !== time || this.curvesAt !== time) this.paintLater();
+  }
+
+  numbers(poses, time, i) {
+    const { app } = this;
     const p = poses.columns, status = STATUS[p.status[i]];
     if (!app.link) element("message").textContent = SAY_STATUS[status];
     const rows = [["status", status]];
@@ -68,12 +86,11 @@ class Panel {
     }
     for (const [verdict, count] of this.counts(app.store.at("sightings", time, SEEN_MS), i)) rows.push([`sightings ${verdict}`, count]);
     fill(element("numbers"), rows);
-    this.curves(time, i);
   }
 
   // What has changed since the last time is not forgotten, only not painted at once.
   paintLater() {
-    this.later ||= setTimeout(() => { this.later = 0; this.app.touch(); }, PAINT_MS);
+    this.later ||= setTimeout(() => { this.later = 0; this.app.dirty = true; }, PAINT_MS);
   }
 
   // Distance of a pose from the ground truth, which is interpolated to its stamp [m]; null: not known.
@@ -135,7 +152,7 @@ class Panel {
   restyle() {
     if (this.plots) for (const plot of this.plots) plot?.destroy();
     this.plots = null;
-    this.painted = 0;
+    this.renew();
   }
 }
 
@@ -148,14 +165,14 @@ function element(id) {
   return document.getElementById(id);
 }
 
+// Only what has changed: else all of the page would be laid out anew.
 function fill(table, rows) {
-  table.replaceChildren(...rows.map((row) => {
-    const tr = document.createElement("tr");
-    tr.append(...row.map((text) => {
-      const td = document.createElement("td");
-      td.textContent = text;
-      return td;
-    }));
-    return tr;
-  }));
+  while (table.rows.length > rows.length) table.deleteRow(-1);
+  rows.forEach((row, k) => {
+    const tr = table.rows[k] || table.insertRow();
+    row.forEach((text, n) => {
+      const td = tr.cells[n] || tr.insertCell();
+      if (td.textContent !== String(text)) td.textContent = text;
+    });
+  });
 }
