@@ -13,7 +13,9 @@ from playwright.sync_api import Browser
 
 from bench.watch.browser import WatchedPage
 from bench.watch.watched_swarm import MAP_CORNER, SWARM, WatchedSwarm, surroundings, swarm_frames
+from swarm_loc_estimator.io.maps.grid_messages import GridMessage
 from swarm_loc_estimator.io.watch.about import about
+from swarm_loc_estimator.io.watch.frames import map_frame
 from swarm_loc_estimator.io.watch.page import page as page_of
 from swarm_loc_estimator.io.watch.recording import recording
 
@@ -115,6 +117,27 @@ def test_walls_goals_and_names_from_above_are_where_they_belong(
     assert near(page, u + 3, v + 3, "goal"), "the cross of a goal"
     u, v = page.evaluate("watch.view.toScreen(0.9, -0.7)")
     assert near(page, u - 7, v, "aerial"), "the square of a detection"
+
+
+def test_all_of_the_known_map_is_in_view(browser: Browser) -> None:
+    swarm = WatchedSwarm()
+    swarm.publish()
+    page = WatchedPage(browser, swarm.server.url)
+    page.until("watch.fitted")
+    cells = np.full((100, 300), -1, dtype=np.int8)
+    cells[20:30, 150:280] = 0
+    swarm.server.publish(
+        map_frame(swarm.now_ns, GridMessage(swarm.now_ns, "map", 0.1, (0.0, 0.0, 0.0), cells))
+    )
+    page.until("watch.store.frames.map && watch.settled")
+    for x, y in ((15.0, 2.0), (28.0, 3.0)):
+        u, v = page.evaluate(f"watch.view.toScreen({x}, {y})")
+        assert 0 < u < 1200
+        assert 40 < v < 760
+    assert page.evaluate("watch.view.toScreen(30, 10)")[0] > 1200 * 0.95, "what is unknown takes room"
+    page.close()
+    swarm.server.close()
+    assert page.errors == []
 
 
 def test_links_by_infrared_are_dashed(live: WatchedPage) -> None:

@@ -5,8 +5,8 @@
 
 Latency is from the stamp of a pose, when it is published, through DDS, `watch_node`, the WebSocket and
 Chromium (without a window and without a GPU) to the task after the page was painted. The poses come from a
-stand-in for the estimator, `bench.watch.publisher`, at 20 Hz. The load of the real one is measured on bags
-that are played.
+stand-in for the estimator, `bench.watch.publisher`, at 20 Hz; and, as `robots5_estimated`, from the real one,
+which gets what five robots have sent as if they sent it now. Its load is measured on bags that are played.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from domain_coordinator import domain_id
@@ -49,24 +50,49 @@ _SETTLED = 20
 Samples = dict[str, list[float]]
 
 
-def measure(browser: Browser, robots: int, seconds: float) -> tuple[dict[str, float], Samples]:
-    """Figures of a page with a swarm of one size, and latencies and times of painting [ms]."""
+class Source(NamedTuple):
+    """Where poses come from.
+
+    Attributes:
+        swarm_file: Whose.
+        commands: Programs that publish them.
+    """
+
+    swarm_file: Path
+    commands: Sequence[Sequence[str]]
+
+
+def stand_in(robots: int, work: Path) -> Source:
+    """A swarm of one size without an estimator."""
+    swarm_file = work / f"swarm{robots}.yaml"
+    save_swarm(swarm_of(robots), swarm_file, "Robots of a benchmark.")
+    return Source(swarm_file, [[sys.executable, "-m", "bench.watch.publisher", str(swarm_file)]])
+
+
+def real() -> Source:
+    """Five robots with the estimator."""
+    swarm_file = DEMO_BAG / "swarm.yaml"
+    parameters: dict[str, ParameterValue] = {"swarm_file": str(swarm_file)}
+    estimator = NodeSpec("swarm_loc_estimator", "estimator_node", "estimator", parameters=parameters)
+    robots = [sys.executable, "-m", "bench.watch.restamped", str(DEMO_BAG)]
+    return Source(swarm_file, [node_command(estimator), robots])
+
+
+def measure(browser: Browser, source: Source, seconds: float) -> tuple[dict[str, float], Samples]:
+    """Figures of a page, and latencies and times of painting [ms]."""
     with ExitStack() as stack:
-        work = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         stack.enter_context(own_domain())
-        swarm_file, port = work / "swarm.yaml", free_port()
-        save_swarm(swarm_of(robots), swarm_file, "Robots of a benchmark.")
+        port = free_port()
         log = stack.enter_context((OUT / "watch.log").open("wb"))
-        parameters: dict[str, ParameterValue] = {"swarm_file": str(swarm_file), "port": port}
+        parameters: dict[str, ParameterValue] = {"swarm_file": str(source.swarm_file), "port": port}
         node = NodeSpec("swarm_loc_estimator", "watch_node", "watch", parameters=parameters)
-        publisher = [sys.executable, "-m", "bench.watch.publisher", str(swarm_file)]
-        children = [Child(node, start(command, log)) for command in (publisher, node_command(node))]
+        children = [Child(node, start(command, log)) for command in (node_command(node), *source.commands)]
         stack.callback(stop, children, lambda _: None)
-        page = open_page(browser, port, children[1])
+        page = open_page(browser, port, children[0])
         page.until(f"watch.metrics.latency.length > {_SETTLED}", _PATIENCE_MS)
         page.page.mouse.click(*page.place_of(0))
         page.evaluate("{ watch.metrics.latency.length = watch.metrics.frame.length = 0 }")
-        pid, begin_s = children[1].process.pid, time.monotonic()
+        pid, begin_s = children[0].process.pid, time.monotonic()
         begin_cpu_s = cpu_seconds(pid)
         page.page.wait_for_timeout(1e3 * seconds)
         core = (cpu_seconds(pid) - begin_cpu_s) / (time.monotonic() - begin_s)
@@ -181,7 +207,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as work, running_browser(executable) as browser:
         for robots in options.sizes:
             progress(f"page with {robots} robots")
-            results[robots], samples[robots] = measure(browser, robots, options.seconds)
+            source = stand_in(robots, Path(work))
+            results[robots], samples[robots] = measure(browser, source, options.seconds)
+        progress("page with 5 robots and the estimator")
+        estimated, _ = measure(browser, real(), options.seconds)
         for robots in () if options.no_load else LOADED:
             progress(f"estimator of {robots} robots")
             bag, figures = bag_of(robots, Path(work)), results.setdefault(robots, {})
@@ -189,11 +218,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             figures["estimator_core_watched"] = estimator_core(bag, browser, options.seconds)
     print()
     names = list(dict.fromkeys(name for figures in results.values() for name in figures))
-    rows = [[name, *(figures.get(name) for figures in results.values())] for name in names]
-    bars = ["bar: latency_ms", *(BARS_MS.get(robots) for robots in results)]
-    print(table(["figure", *(f"{robots} robots" for robots in results)], [*rows, bars]))
+    columns = [*results.values(), estimated]
+    rows = [[name, *(figures.get(name) for figures in columns)] for name in names]
+    bars = ["bar: latency_ms", *(BARS_MS.get(robots) for robots in results), BARS_MS[5]]
+    heads = [*(f"{robots} robots" for robots in results), "5, estimated"]
+    print(table(["figure", *heads], [*rows, bars]))
     draw(samples)
     flat = {f"robots{n}.{name}": value for n, figures in results.items() for name, value in figures.items()}
+    flat |= {f"robots5_estimated.{name}": value for name, value in estimated.items()}
     flat["machine_load"] = os.getloadavg()[0]
     print(f"figures: {write_figures('watch', flat)}; load of the machine {flat['machine_load']:.1f}")
     return 0

@@ -1,7 +1,7 @@
 """Photograph the page for the documentation: ./run -- python -m bench.watch.screenshots [--only NAME].
 
-Five e-pucks and twenty Droplets as the bags of this repository hold them, and three hundred simulated robots,
-each replayed by the estimator and shown in Chromium as `report.html` shows it.
+Five e-pucks and twenty Droplets as the bags of this repository hold them, three hundred simulated robots,
+each replayed by the estimator, and three PushBots that make a map; shown in Chromium as by `report.html`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ from typing import NamedTuple
 
 from playwright.sync_api import Browser
 
+from bench.pushbot.runs import RunSettings
 from bench.shared.common import OUT
 from bench.watch.browser import WatchedPage, chromium, running_browser
+from bench.watch.mapping_run import mapping_run
 from swarm_loc_drivers.sim.recording.bag import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.cli.arguments import swarm_beside
@@ -30,6 +32,7 @@ FOLDER = ROOT / "swarm_loc_estimator" / "doc" / "watch"
 SIZE = (1200, 760)
 ROBOTS = 300
 _GRID_S = 8.0
+MAPPED = RunSettings("office", slip=0.02, seed=1, minutes=6.0, robots=3)
 
 
 class Picture(NamedTuple):
@@ -37,14 +40,14 @@ class Picture(NamedTuple):
 
     Attributes:
         name: Of the file.
-        bag: What was recorded.
+        bag: What was recorded; None: the run of the mapper.
         share: At which part of the run.
         theme: light or dark.
         selected: The robot whose numbers are shown, -1 for none.
     """
 
     name: str
-    bag: Path
+    bag: Path | None
     share: float
     theme: str
     selected: int
@@ -52,13 +55,12 @@ class Picture(NamedTuple):
 
 def photograph(browser: Browser, picture: Picture, work: Path, out: Path) -> Path:
     """Replay a bag and take its picture; returns the file."""
-    swarm = load_swarm(swarm_beside(picture.bag))
     file = work / f"{picture.name}.html"
-    file.write_text(page(recorded(replay(picture.bag, swarm, keep_sightings=True))), encoding="utf-8")
+    file.write_text(page(_recording(picture.bag)), encoding="utf-8")
     shown = WatchedPage(browser, file.as_uri(), SIZE)
     shown.until("watch.playing && watch.fitted")
     shown.evaluate(f"{{ watch.setTheme('{picture.theme}'); watch.panel.select({picture.selected}) }}")
-    shown.evaluate(f"watch.seek({picture.share})")
+    shown.evaluate(f"{{ watch.seek({picture.share}); watch.fit() }}")
     shown.until("watch.settled")
     path = out / f"{picture.name}.png"
     shown.page.screenshot(path=path)
@@ -66,6 +68,13 @@ def photograph(browser: Browser, picture: Picture, work: Path, out: Path) -> Pat
     if shown.errors or shown.foreign:
         raise RuntimeError(f"{picture.name}: {shown.errors} {shown.foreign}")
     return path
+
+
+def _recording(bag: Path | None) -> str:
+    """What the page plays."""
+    if bag is None:
+        return mapping_run(MAPPED)
+    return recorded(replay(bag, load_swarm(swarm_beside(bag)), keep_sightings=True))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -81,11 +90,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder, running_browser(executable) as browser:
         grid = Path(folder) / "grid"
-        write_bag(simulate_grid(GridSettings(robots=ROBOTS, duration_s=_GRID_S)), grid, f"{ROBOTS} robots.")
+        if options.only in (None, "robots300"):
+            write_bag(
+                simulate_grid(GridSettings(robots=ROBOTS, duration_s=_GRID_S)), grid, f"{ROBOTS} robots."
+            )
         for picture in (
             Picture("epucks", ROOT / "bags" / "eight_five_robots", 0.6, "light", 1),
             Picture("droplets", ROOT / "bags" / "droplets_twenty", 0.7, "dark", -1),
             Picture("robots300", grid, 0.9, "light", -1),
+            Picture("mapper", None, 1.0, "light", -1),
         ):
             if options.only not in (None, picture.name):
                 continue

@@ -42,7 +42,7 @@ class Ground {
       const [, v] = view.toScreen(0, y);
       c.moveTo(0, v);
       c.lineTo(view.width, v);
-      c.fillText(text(y), 3, v - 3);
+      if (v > 60) c.fillText(text(y), 3, v - 3); // above it is the header
     }
     c.stroke();
   }
@@ -93,6 +93,20 @@ class Ground {
     }
     c.stroke();
   }
+}
+
+// Corners, in the plane, of the part of a map that is known.
+function knownCorners({ width, height, resolution, origin: [x, y, yaw], columns: { cells } }) {
+  let left = width, right = -1, bottom = height, top = -1;
+  for (let row = 0, k = 0; row < height; row++) for (let column = 0; column < width; column++, k++) if (cells[k] >= 0) {
+    left = Math.min(left, column);
+    right = Math.max(right, column);
+    bottom = Math.min(bottom, row);
+    top = Math.max(top, row);
+  }
+  if (right < 0) return [];
+  const c = resolution * Math.cos(yaw), s = resolution * Math.sin(yaw);
+  return [[left, bottom], [right + 1, bottom], [left, top + 1], [right + 1, top + 1]].map(([a, b]) => [x + c * a - s * b, y + s * a + c * b]);
 }
 
 function fitCanvas(canvas, options) {

@@ -57,7 +57,8 @@ class App {
         this.shows[name] = box.checked;
         this.touch();
       };
-      sample.style.background = `var(--${colour})`;
+      sample.style.background = name === "sightings" ? "linear-gradient(90deg, var(--used) 33%, var(--kept) 33% 66%, var(--gated) 66%)" : `var(--${colour})`;
+      if (name === "sightings") label.title = "used, waiting, gated; infrared links are dashed";
       label.append(box, sample, name);
       element("layerlist").append(label);
     }
@@ -118,13 +119,18 @@ class App {
     if (frame.kind === "poses" && !this.paused) {
       this.dirty = true;
       if (!this.view.touched && !this.fitted) this.fitted = this.fit();
-    } else if (frame.kind === "map") this.touch();
+    } else if (frame.kind === "map") {
+      if (!this.view.touched && this.fitted && !this.following) this.fit(); // it grows
+      this.touch();
+    }
   }
 
   // Show everything that has a place; whether there is anything.
   fit() {
     const xs = [], ys = [];
     for (const [, x, y] of this.swarm.landmarks) { xs.push(x); ys.push(y); }
+    const map = this.store.at("map", this.playing ? Infinity : this.shownTime);
+    for (const [x, y] of map ? knownCorners(map) : []) { xs.push(x); ys.push(y); }
     let located = false;
     for (const time of [this.shownTime, this.store.range[1]]) { // a recording may begin with robots that all wait
       const poses = located ? null : this.store.at("poses", time);
@@ -183,7 +189,8 @@ class App {
     this.setLink("recorded");
     this.onAbout(about);
     for (const frame of frames) this.store.add(frame);
-    this.time = this.store.range[0];
+    const begun = (this.store.frames.poses || []).find((frame) => frame.columns.status.some(Boolean));
+    this.time = begun ? begun.stamp : this.store.range[0]; // not where nobody is located yet
     element("speed").hidden = false;
     this.fitted = this.fit();
     this.pause(true);

@@ -130,7 +130,7 @@ class Panel {
     const t = [], sigma = [], error = [];
     for (let k = first; k <= last; k += stride) {
       const p = list[k].columns;
-      t.push(list[k].stamp / 1e3);
+      t.push((list[k].stamp - time) / 1e3);
       sigma.push(p.status[i] ? 1e3 * Math.sqrt((p.sxx[i] + p.syy[i]) / 2) : null);
       const off = this.error(list[k], i);
       error.push(off === null ? null : 1e3 * off);
@@ -138,13 +138,13 @@ class Panel {
     const nis = this.nis.filter(([stamp]) => stamp <= time && stamp > time - CURVE_MS);
     this.plots ||= [this.plot(["σ [mm]", "error [mm]"], ["tracked", "gated"]), this.app.link ? this.plot(["mean NIS"], ["kept"]) : null];
     this.plots[0].setData([t, sigma, error]);
-    if (this.plots[1]) this.plots[1].setData([nis.map(([stamp]) => stamp / 1e3), nis.map(([, value]) => value)]);
+    if (this.plots[1]) this.plots[1].setData([nis.map(([stamp]) => (stamp - time) / 1e3), nis.map(([, value]) => value)]);
   }
 
   plot(labels, colours) {
     const { app } = this, ink = { stroke: app.colour("soft"), grid: { stroke: app.colour("grid") }, font: "10px system-ui" };
     const series = labels.map((label, k) => ({ label, stroke: app.colour(colours[k]), width: 1.5, points: { show: false } }));
-    const options = { width: element("panel").clientWidth - 30, height: 110, series: [{}, ...series], axes: [{ ...ink, space: 60 }, { ...ink, size: 38 }], cursor: { show: false }, legend: { live: false } };
+    const options = { width: element("panel").clientWidth - 30, height: 110, series: [{}, ...series], scales: { x: { time: false } }, axes: [{ ...ink, space: 60, values: (_, ticks) => ticks.map((tick) => `${tick} s`) }, { ...ink, size: 38, space: 25 }], cursor: { show: false }, legend: { live: false } };
     return new uPlot(options, [[], ...labels.map(() => [])], element("curves"));
   }
 
