@@ -113,6 +113,28 @@ def test_a_page_that_is_opened_later_knows_the_past(browser: Browser, swarm: Wat
     late.close()
 
 
+def test_robots_that_are_located_later_come_into_view(browser: Browser, swarm: WatchedSwarm) -> None:
+    places = PLACES.copy()
+    places[1:] = np.nan
+    swarm.publish(places, status=(1, 0, 0))
+    opened = WatchedPage(browser, swarm.server.url)
+    opened.until("watch.fitted === 1")
+    far = PLACES + np.array([[0.0, 0.0, 0.0], [-9.0, 4.0, 0.0], [0.0, 0.0, 0.0]])
+    swarm.publish(far)
+    opened.until("watch.fitted === 2 && watch.settled")
+    u, v = opened.place_of(1)
+    assert 0 < u < 1200
+    assert 40 < v < 760
+    opened.page.mouse.move(600, 400)
+    opened.page.mouse.wheel(0, -400)
+    opened.until("watch.view.touched")
+    scale = opened.evaluate("watch.view.scale")
+    swarm.publish(20.0 * far, status=(1, 1, 1))
+    opened.until("watch.store.at('poses', Infinity).columns.status[2] === 1")
+    assert opened.evaluate("watch.view.scale") == scale, "a view that was chosen by hand has moved"
+    opened.close()
+
+
 def test_view_follows_zooms_and_changes_its_colours(page: WatchedPage, swarm: WatchedSwarm) -> None:
     before = page.evaluate("watch.view.scale")
     page.page.mouse.move(600, 400)

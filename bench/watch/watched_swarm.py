@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ SWARM = Swarm(
     landmarks=(Landmark(1, -1.0, -1.0, yaw=0.5), Landmark(2, 1.0, 1.0)),
 )
 PLACES = np.array([[0.5, 0.25, 1.0], [-0.5, 0.5, -2.0], [0.0, -0.5, 0.0]])
+STATUS = (1, 1, 0)
 MAP_CORNER = (-1.5, -1.5, 0.3)
 
 
@@ -56,10 +58,12 @@ class WatchedSwarm:
         self.commands.put(dict(command))
         answer(f"done: {command['do']}")
 
-    def publish(self, poses: FloatArray = PLACES, later_ns: int = 100_000_000) -> None:
+    def publish(
+        self, poses: FloatArray = PLACES, later_ns: int = 100_000_000, status: Sequence[int] = STATUS
+    ) -> None:
         """All robots at poses (3, 3) a while later, tracked but the last, which waits."""
         self.now_ns += later_ns
-        for frame in swarm_frames(self.now_ns, poses):
+        for frame in swarm_frames(self.now_ns, poses, status):
             self.server.publish(frame)
 
     def publish_surroundings(self) -> None:
@@ -68,15 +72,14 @@ class WatchedSwarm:
             self.server.publish(frame)
 
 
-def swarm_frames(stamp_ns: int, poses: FloatArray = PLACES) -> list[Frame]:
+def swarm_frames(stamp_ns: int, poses: FloatArray = PLACES, status: Sequence[int] = STATUS) -> list[Frame]:
     """All robots at poses (3, 3), tracked but the last, which waits; and what they see."""
     shown = poses.copy()
-    shown[2] = np.nan
+    shown[np.array(status) == 0] = np.nan
     covariance = np.tile(np.diag([1e-4, 4e-4, 1e-3]), (3, 1, 1))
-    status = np.array([1, 1, 0], dtype=np.uint8)
     age = np.array([0.1, -1.0, -1.0])
     names = tuple(robot.name for robot in SWARM.robots)
-    estimate = EstimateMessage(stamp_ns, "map", names, shown, covariance, age, status)
+    estimate = EstimateMessage(stamp_ns, "map", names, shown, covariance, age, np.array(status, np.uint8))
     sees = Sightings(
         np.array([0, 0, 1], np.int32),
         np.array([1, -1, -2], np.int32),

@@ -118,34 +118,34 @@ class App {
     this.store.add(frame);
     if (frame.kind === "poses" && !this.paused) {
       this.dirty = true;
-      if (!this.view.touched && !this.fitted) this.fitted = this.fit();
+      if (!this.view.touched && !this.following && located(frame) > (this.fitted || 0)) this.fitted = this.fit();
     } else if (frame.kind === "map") {
       if (!this.view.touched && this.fitted && !this.following) this.fit(); // it grows
       this.touch();
     }
   }
 
-  // Show everything that has a place; whether there is anything.
+  // Show everything that has a place now and in the end; how many robots have one.
   fit() {
     const xs = [], ys = [];
     for (const [, x, y] of this.swarm.landmarks) { xs.push(x); ys.push(y); }
     const map = this.store.at("map", this.playing ? Infinity : this.shownTime);
     for (const [x, y] of map ? knownCorners(map) : []) { xs.push(x); ys.push(y); }
-    let located = false;
-    for (const time of [this.shownTime, this.store.range[1]]) { // a recording may begin with robots that all wait
-      const poses = located ? null : this.store.at("poses", time);
+    let most = 0;
+    for (const time of [this.shownTime, this.store.range[1]]) {
+      const poses = this.store.at("poses", time);
       if (poses) for (let i = 0; i < this.count; i++) if (poses.columns.status[i]) {
         xs.push(poses.columns.x[i]);
         ys.push(poses.columns.y[i]);
-        located = true;
       }
+      if (poses) most = Math.max(most, located(poses));
     }
-    if (!xs.length) return false;
+    if (!xs.length) return 0;
     const low = (list) => list.reduce((a, b) => Math.min(a, b)), high = (list) => list.reduce((a, b) => Math.max(a, b));
     this.follow(false);
     const room = 2.5 * high(this.swarm.radius);
     this.view.fit([low(xs) - room, low(ys) - room, high(xs) + room, high(ys) + room]);
-    return located;
+    return most;
   }
 
   follow(on) {
@@ -253,6 +253,12 @@ class App {
     };
     channel.port2.postMessage(0);
   }
+}
+
+function located({ columns: { status } }) {
+  let count = 0;
+  for (let i = 0; i < status.length; i++) if (status[i]) count++;
+  return count;
 }
 
 function push(list, value) {
