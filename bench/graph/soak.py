@@ -99,15 +99,13 @@ def figures_of(rows: FloatArray, sigint_s: float) -> dict[str, float]:
     }
 
 
-def draw(runs: dict[str, FloatArray]) -> None:
+def draw(name: str, rows: FloatArray) -> None:
     """Memory, CPU, lost messages and age of poses by time."""
     figure, axes = new_plot(len(COLUMNS) - 1)
-    for name, rows in runs.items():
-        for axis, column, title in zip(axes, rows.T[1:], COLUMNS[1:], strict=True):
-            axis.plot(rows[:, 0] / 60.0, column, label=name)
-            axis.set(xlabel="time [min]", ylabel=title, ylim=(0.0, None))
-    axes[0].legend(loc="lower right")
-    print(f"plot: {save_plot(figure, 'soak')}")
+    for axis, column, title in zip(axes, rows.T[1:], COLUMNS[1:], strict=True):
+        axis.plot(rows[:, 0] / 60.0, column)
+        axis.set(xlabel="time [min]", ylabel=title, ylim=(0.0, None))
+    print(f"plot: {save_plot(figure, f'soak_{name}')}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -118,17 +116,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--overload-minutes", type=float, default=3.0, help="at the rate that is too much")
     parser.add_argument("--overload-rate", type=float, default=100.0, help="that rate")
     options = parser.parse_args(arguments)
-    runs, figures = {}, {}
+    figures = {}
     for name, rate, minutes in (
         ("steady", options.rate, options.minutes),
         ("overload", options.overload_rate, options.overload_minutes),
     ):
         print(f"{BAG.name} at {rate:g} x for {minutes:g} min ...", flush=True)
-        runs[name], sigint_s = run(BAG, rate, minutes)
-        figures[name] = figures_of(runs[name], sigint_s)
+        rows, sigint_s = run(BAG, rate, minutes)
+        draw(name, rows)
+        figures[name] = figures_of(rows, sigint_s)
     keys = list(figures["steady"])
     print(table(["figure", *figures], [[key, *(f[key] for f in figures.values())] for key in keys]))
-    draw(runs)
     flat = {f"{name}.{key}": value for name, one in figures.items() for key, value in one.items()}
     print(f"figures: {write_figures('soak', flat)}")
     return int(any(one[key] > most for one in figures.values() for key, most in _TOLERATED.items()))
