@@ -1,26 +1,16 @@
-"""The graph of simulated PushBots as data: a hall, drivers, event trackers, lasers calibrated beforehand."""
+"""The graph of simulated PushBots as data: a hall, drivers, trackers, mapper, estimator, and who drives."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-
-import numpy as np
 
 from swarm_loc_drivers.sim.common.world_error import WorldError, start_of
-from swarm_loc_drivers.sim.pushbot.optics import assembled_robots
-from swarm_loc_drivers.sim.pushbot.wall_drive import WallDriveSettings, drive_at_wall
+from swarm_loc_drivers.sim.pushbot.optics import MAX_ROBOTS, laser_hz, led_hz
 from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.launching.graph import NodeSpec, ParameterValue
-from swarm_loc_vision.core.laser.fit import fit_hyperbola
-from swarm_loc_vision.io.laser_file import save_laser
 
 TYPE = "pushbot"
 """The type, in a swarm description, of robots that are simulated so."""
-_CALIBRATION = WallDriveSettings(speed=0.25)
-_LASERS_HZ = (410.0, 430.0, 450.0, 470.0, 530.0, 550.0, 570.0, 590.0)
-"""Each robot of a hall has its own; 500 Hz is a fraction of the LEDs' 1000."""
-_LEDS_HZ = 1000.0
 
 Parameters = dict[str, ParameterValue]
 
@@ -40,15 +30,12 @@ def has_pushbots(swarm: Swarm) -> bool:
                 f"robot '{robot.name}' is no {TYPE}, and others are: one world has one kind of robots."
             )
         start_of(robot)
+    if len(swarm.robots) > MAX_ROBOTS:
+        raise WorldError(
+            f"{len(swarm.robots)} robots are more than the {MAX_ROBOTS} whose lights trackers can tell"
+            " from each other."
+        )
     return True
-
-
-def calibrate_lasers(robots: Sequence[str], seed: int, folder: Path) -> None:
-    """Write the laser calibrations of a world's robots, from drives at a wall, to FOLDER/ROBOT.yaml."""
-    rng = np.random.default_rng([seed, 1])
-    for name, built in zip(robots, assembled_robots(seed, len(robots)), strict=True):
-        drive, _ = drive_at_wall(rng, built, _CALIBRATION)
-        save_laser(folder / f"{name}.yaml", fit_hyperbola(drive))
 
 
 def pushbot_nodes(world: Parameters, robots: Sequence[str], links: str, file: str | None) -> list[NodeSpec]:
@@ -60,19 +47,25 @@ def pushbot_nodes(world: Parameters, robots: Sequence[str], links: str, file: st
         links: Folder where their serial ports appear, and where their laser calibrations are.
         file: Path of a ROS parameter file for all nodes, None for none.
     """
-    drivers, vision = "swarm_loc_drivers", "swarm_loc_vision"
+    drivers, vision, estimator = "swarm_loc_drivers", "swarm_loc_vision", "swarm_loc_estimator"
     time: Parameters = {"use_sim_time": True}
+    swarm: Parameters = {"swarm_file": world["swarm_file"]}
+    leds = [f"{robot}={led_hz(number)}" for number, robot in enumerate(robots)] if len(robots) > 1 else []
+    mapper: Parameters = {**swarm, **({"led_frequencies": leds} if leds else {}), **time}
+    exploration: Parameters = {**swarm, "wait_for_poses": True, **time}
+    hall: Parameters = {**world, "link_folder": links}
     nodes = [
-        NodeSpec(drivers, "pushbot_world_node", "pushbot_world", "", {**world, "link_folder": links}, file)
+        NodeSpec(estimator, "estimator_node", "estimator", "", {**swarm, **time}, file),
+        NodeSpec(estimator, "mapper_node", "mapper", "", mapper, file),
+        NodeSpec(drivers, "pushbot_world_node", "pushbot_world", "", hall, file),
+        NodeSpec(drivers, "exploration_node", "exploration", "", exploration, file),
     ]
     for number, robot in enumerate(robots):
-        laser: Parameters = {"laser_frequency": _LASERS_HZ[number % len(_LASERS_HZ)], **time}
-        driver: Parameters = {"address": f"{links}/{robot}", "led_frequency": _LEDS_HZ, **laser}
-        tracker: Parameters = {
-            "calibration": f"{links}/{robot}.yaml",
-            "light_frequencies": [str(_LEDS_HZ)],
-            **laser,
-        }
+        laser: Parameters = {"laser_frequency": laser_hz(number), **time}
+        driver: Parameters = {"address": f"{links}/{robot}", "led_frequency": led_hz(number), **laser}
+        others = [str(led_hz(other)) for other in range(len(robots)) if other != number]
+        tracker: Parameters = {"calibration": f"{links}/{robot}.yaml", **laser}
+        tracker |= {"light_frequencies": others} if others else {}
         nodes += [
             NodeSpec(drivers, "pushbot_driver_node", "pushbot_driver", robot, driver, file),
             NodeSpec(vision, "event_tracker_node", "event_tracker", robot, tracker, file),

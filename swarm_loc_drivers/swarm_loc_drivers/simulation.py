@@ -9,10 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from swarm_loc_drivers.pushbot_simulation import calibrate_lasers, has_pushbots, pushbot_nodes
+from swarm_loc_drivers.pushbot_simulation import has_pushbots, pushbot_nodes
 from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.epuck.world import check_swarm
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
+from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
 from swarm_loc_drivers.sim.scenarios.eight import ARENA
 from swarm_loc_drivers.sim.scenarios.eight_floor import eight_floor

@@ -11,7 +11,8 @@
 The bag holds <robot>/odom, <robot>/detections and <robot>/ground_truth; `swarm.yaml` lies inside its folder.
 `pictures` writes, in place of detections, what the cameras see: <robot>/image_raw/compressed (JPEG) and
 <robot>/camera_info. `droplets` writes <robot>/brightness and <robot>/fix in place of detections;
-`aerial` writes aerial/detections; `pushbots` writes <robot>/laser and <robot>/lights, beside them walls.csv.
+`aerial` writes aerial/detections; `pushbots` writes <robot>/laser, <robot>/lights and <robot>/fix, with
+--events <robot>/events, and beside them walls.csv and the calibrations of the lasers.
 The same arguments give the same bytes.
 """
 
@@ -101,7 +102,9 @@ def _aerial(options: argparse.Namespace, comment: str) -> int:
 
 
 def _pushbots(options: argparse.Namespace, comment: str) -> int:
-    settings = PushbotBagSettings(options.seed, options.duration, options.robots, options.plan, options.slip)
+    settings = PushbotBagSettings(
+        options.seed, options.duration, options.robots, options.plan, options.slip, options.events
+    )
     return write_pushbot_bag(settings, options.bag, comment)
 
 
@@ -146,6 +149,9 @@ def _parser() -> argparse.ArgumentParser:
     pushbots.set_defaults(write=_pushbots)
     pushbots.add_argument("--plan", choices=sorted(FLOOR_PLANS), default="corridor", help="the hall")
     pushbots.add_argument("--slip", type=number_in(0.0, 0.1), default=0.02, help="share of turns lost")
+    pushbots.add_argument(
+        "--events", type=number_in(0.0, 60.0, "s"), default=0.0, help="of events, at the begin [s]"
+    )
     grid = _swarm(swarms, "grid", "many robots, each about its cell of a grid", 100, 10_000, 20.0)
     grid.set_defaults(write=_grid)
     return parser

@@ -1,10 +1,11 @@
-"""Start simulated robots: e-pucks and all that locates them, or PushBots and all that they measure with.
+"""Start simulated robots: e-pucks and all that locates them, or PushBots that map a hall.
 
     simulate bags/eight_five_robots/swarm.yaml --world w2 --seed 1
 
 One world with rendered cameras, robots that answer their drivers' bytes on serial ports, a driver and a
 marker detector for each robot, the steering along the eight, and the estimator; all on simulated time. Robots
-whose type is `pushbot` get a hall instead, and each a driver and an event tracker with its laser calibrated.
+whose type is `pushbot` get a hall instead, each a driver and an event tracker with its laser calibrated, and
+together a mapper and a node that drives them to its goals.
 `ros2 launch swarm_loc_drivers simulation.launch.py` starts the same.
 """
 

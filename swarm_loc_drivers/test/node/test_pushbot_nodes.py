@@ -24,7 +24,7 @@ from swarm_loc_drivers.sim.pushbot.optics import FOCAL_PX
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldSettings
 from swarm_loc_drivers.simulation import SimulationOptions, graph_of, simulated_swarm
 from swarm_loc_estimator.parameters.table import markdown_table
-from swarm_loc_msgs.msg import EventPacket, LaserDistance, LightBearingArray
+from swarm_loc_msgs.msg import EventPacket, LaserDistance, LightBearingArray, SwarmPose, SwarmPoses
 from swarm_loc_vision.core.laser.calibration import LaserCalibration
 from swarm_loc_vision.io.laser_file import load_laser, save_laser
 from swarm_loc_vision.nodes.calibrate_laser_node import CalibrateLaserParameters
@@ -222,21 +222,28 @@ def test_the_page_of_the_calibration_has_its_parameters() -> None:
     assert markdown_table(CalibrateLaserParameters) in page.read_text(encoding="utf-8")
 
 
-def test_a_simulated_swarm_measures_distances_from_its_start(ros: Ros, tmp_path: Path) -> None:
-    """The whole graph of `simulate`: serial ports, lasers calibrated beforehand, trackers."""
+def test_a_simulated_swarm_maps_its_hall_and_is_tracked(ros: Ros, tmp_path: Path) -> None:
+    """The whole graph of `simulate`: serial ports, lasers, trackers, mapper, estimator, and who drives."""
     swarm = tmp_path / "swarm.yaml"
     swarm.write_text(SIMULATED, encoding="utf-8")
-    options = SimulationOptions(str(swarm), seed=5)
+    options = SimulationOptions(str(swarm), seed=5, rate=2.0)
     distances: list[LaserDistance] = ros.listen(LaserDistance, "a/laser")
+    truths: list[PoseStamped] = ros.listen(PoseStamped, "a/ground_truth")
+    goals: list[PoseStamped] = ros.listen(PoseStamped, "a/goal")
+    poses: list[SwarmPoses] = ros.listen(SwarmPoses, "swarm/poses")
     with ExitStack() as running:
         for spec in graph_of(options, simulated_swarm(options), str(tmp_path)):
-            place = ["-r", f"__ns:=/{spec.namespace}"]
             log = tmp_path / f"{spec.name}.log"
-            running.enter_context(Program(spec.executable, log, dict(spec.parameters), place, spec.package))
+            running.enter_context(Program(spec.executable, log, {}, spec.ros_arguments()[1:], spec.package))
         ros.until(lambda: sum(one.distance > 0.0 for one in distances) > 20)
-    known = np.array([(one.distance, one.sigma) for one in distances if one.distance > 0.0])[-20:]
+        ros.until(lambda: len(goals) > 1, patience_s=90.0)  # it has looked around twice
+        ros.until(lambda: poses[-1].robots[0].status == SwarmPose.STATUS_TRACKED)
+    known = np.array([(one.distance, one.sigma) for one in distances if one.distance > 0.0])[:20]
     # the cabinet of the corridor's left end, 1.6 m before the robot
     assert abs(known[:, 0].mean() - 1.6) < 3.0 * known[:, 1].mean()
+    told, truth = poses[-1].robots[0], truths[-1].pose.position
+    assert math.hypot(told.x - truth.x, told.y - truth.y) < 0.1
+    assert math.hypot(truth.x - 2.0, truth.y - 3.0) > 0.2
 
 
 def test_a_laser_is_calibrated_by_a_drive_at_a_wall(ros: Ros, tmp_path: Path, swarm_file: Path) -> None:

@@ -61,6 +61,7 @@ class PushbotWire:
             plan=HALL,
             wheels=GEOMETRY,
             wheel_noise=0.0,
+            turn_noise=0.0,
             turn_slip=0.0,
             camera=CameraNoise(noise_rate=0.5),
         )

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from swarm_loc_drivers.core.pushbot.event_clock import EventClock
 from swarm_loc_drivers.core.pushbot.event_packets import MAX_EVENTS, EventPackets
 from swarm_loc_drivers.core.pushbot.settings import WheelGeometry, WheelTicks
+from swarm_loc_drivers.core.pushbot.tick_clock import TickClock
 from swarm_loc_drivers.core.pushbot.wheel_odometry import PushbotOdometry
 from swarm_loc_drivers.protocols.pushbot.hardware import tick_difference
 from swarm_loc_estimator.io.messages.event_encoding import ENCODING, decode_events
@@ -139,7 +140,46 @@ def test_ticks_that_no_motor_can_make_are_refused_once_and_believed_the_second_t
     assert counts == {"implausible_counters": 2, "counter_restarts": 1}
 
 
+def test_a_stamp_that_is_corrected_backwards_is_no_jump_of_time() -> None:
+    reckoning, counts = odometry()
+    reckoning.update(WheelTicks(10**9, 0, 0))
+    assert reckoning.update(WheelTicks(10**9 - 30 * MS, 20, 20)) is None
+    state = reckoning.update(WheelTicks(10**9 + 10 * MS, 50, 50))
+    assert state is not None
+    assert state.pose == pytest.approx([0.005, 0.0, 0.0])
+    assert counts == {"corrected_times": 1}
+    assert reckoning.update(WheelTicks(10**9 - 800 * MS, 60, 60)) is not None
+    assert counts == {"corrected_times": 1, "time_jumps": 1}
+
+
 def test_commands_keep_the_curve_at_the_limit() -> None:
     left, right = GEOMETRY.velocities(1.0, 2.0)
     assert max(left, right) == 100
     assert left / right == pytest.approx((1.0 - 0.085) / (1.0 + 0.085), rel=0.02)
+
+
+def test_readings_keep_their_period_while_events_wait_for_the_wire() -> None:
+    """Events come up to 50 ms late for a while; one reading is lost."""
+    clock, offset_ns = TickClock(20), 7 * 10**9
+    stamps = {}
+    for k in range(1, 400):
+        read_us = 20_000 * k
+        waited_us = 200 if k < 100 or k > 250 else min(50_000, 600 * (k - 99))
+        event_us = read_us - waited_us
+        if k != 150:
+            clock.pass_event(event_us, offset_ns + 1000 * event_us)
+            stamps[k] = clock.stamp_ns(offset_ns + 1000 * read_us + 30 * MS)
+    wrong_ns = {k: stamp - offset_ns - 20 * MS * k for k, stamp in stamps.items()}
+    assert max(abs(wrong) for k, wrong in wrong_ns.items() if k < 150 or k > 255) < MS
+    assert max(abs(wrong) for wrong in wrong_ns.values()) < 21 * MS
+
+
+def test_a_reading_without_events_is_stamped_as_it_comes() -> None:
+    assert TickClock(20).stamp_ns(5 * MS) == 5 * MS
+
+
+def test_no_reading_is_from_the_future() -> None:
+    clock = TickClock(20)
+    for k in range(10):  # twice as many as there should be
+        clock.pass_event(10_000 * k, 10 * MS * k)
+        assert clock.stamp_ns(10 * MS * k + MS) <= 10 * MS * k + MS

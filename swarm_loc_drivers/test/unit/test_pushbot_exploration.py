@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,11 +19,18 @@ from swarm_loc_drivers.sim.pushbot.floor_plan import (
     polygon,
 )
 from swarm_loc_drivers.sim.pushbot.kinematics import KinematicPushBot, PushBotNoise
+from swarm_loc_drivers.sim.pushbot.optics import laser_hz
 from swarm_loc_drivers.sim.pushbot.ray_casting import clearance, is_visible, ray_distance
 from swarm_loc_drivers.sim.recording.pushbot_bag import PushbotBagSettings, write_pushbot_bag
 from swarm_loc_estimator.cli.replay_map import main as replay_map
 from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.io.bags.reader import BagReader
+from swarm_loc_estimator.io.messages.event_encoding import decode_events
+from swarm_loc_estimator.io.messages.typestore import typestore
 from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_vision.core.events.centroid_tracker import CentroidTracker
+from swarm_loc_vision.core.events.settings import LightSource, TrackerSettings
+from swarm_loc_vision.io.laser_file import load_laser
 
 ROOM = FloorPlan("room", outline([(0, 0, 4, 3)], [(2, 1, 2.5, 2)]), np.array([[1.0, 1.5], [3.5, 1.5]]))
 EXACT = PushBotNoise(turn=0.0, distance=0.0, heading=0.0, pixel=1e-9, dropout=0.0, outlier=0.0, bearing=1e-9)
@@ -137,3 +145,35 @@ def test_a_bag_gives_the_same_map_twice(tmp_path: Path) -> None:
         files.append({path.name: path.read_bytes() for path in out.iterdir()})
     assert files[0] == files[1]
     assert set(files[0]) == {"map.yaml", "map.pgm", "map.png", "stops.csv"}
+
+
+def test_the_events_of_a_bag_show_the_distances_of_the_bag(tmp_path: Path) -> None:
+    """The tracker, with the calibration beside the bag, reads from the events what `laser` says."""
+    bag = tmp_path / "bag"
+    write_pushbot_bag(PushbotBagSettings(3, 50.0, 2, "corridor", 0.02, events_s=2.0), bag, "Of a test.")
+    calibration = load_laser(bag / "pushbot1.yaml")
+    tracker = CentroidTracker([LightSource(laser_hz(0), is_above=False)], (128, 128), TrackerSettings())
+    told: dict[int, float] = {}
+    read: list[tuple[int, float, float]] = []
+    with BagReader(bag) as reader:
+        for topic, kind, _, data in reader.messages({"pushbot1/events", "pushbot1/laser"}):
+            message: Any = typestore().deserialize_cdr(data, kind)
+            stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+            if topic.endswith("laser"):
+                told[stamp_ns] = message.distance
+                continue
+            events = decode_events(
+                message.events.tobytes(), message.encoding, (message.width, message.height)
+            )
+            for report in tracker.track(events.x, events.y, events.is_on, stamp_ns + events.time_ns):
+                for seen in report.sightings:
+                    found = calibration.distance(seen.v, float(seen.covariance[1, 1]))
+                    read.append((seen.stamp_ns, *found))
+    assert len(read) > 20
+    stamps = np.array(sorted(told))
+    distances = np.array([told[one] for one in stamps.tolist()])
+    nearest = np.abs(stamps[:, None] - np.array([one[0] for one in read])[None, :]).argmin(axis=0)
+    off = np.array([one[1] for one in read]) - distances[nearest]
+    sigma = np.array([one[2] for one in read])
+    assert abs(np.nanmedian(off / sigma)) < 1.0
+    assert np.nanmedian(np.abs(off)) < 0.05

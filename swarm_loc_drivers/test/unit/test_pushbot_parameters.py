@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from swarm_loc_drivers.nodes.pushbot.exploration_parameters import ExplorationParameters
 from swarm_loc_drivers.nodes.pushbot.pushbot_parameters import PushbotParameters, pushbot_settings
 from swarm_loc_drivers.nodes.pushbot.pushbot_world_parameters import (
     PushbotWorldParameters,
     make_pushbot_world,
 )
-from swarm_loc_drivers.pushbot_simulation import calibrate_lasers
 from swarm_loc_drivers.sim.common.world_error import WorldError
+from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.simulation import SimulationOptions, graph_of, simulated_swarm
 from swarm_loc_estimator.parameters.table import ParameterError, markdown_table
 from swarm_loc_vision.io.laser_file import load_laser
@@ -40,7 +41,11 @@ def swarm_file(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize(
     ("page", "parameters"),
-    [("pushbot_driver_node.md", PushbotParameters), ("pushbot_world_node.md", PushbotWorldParameters)],
+    [
+        ("pushbot_driver_node.md", PushbotParameters),
+        ("pushbot_world_node.md", PushbotWorldParameters),
+        ("exploration_node.md", ExplorationParameters),
+    ],
 )
 def test_pages_have_the_parameters_as_they_are(page: str, parameters: type) -> None:
     assert markdown_table(parameters) in (DOC / page).read_text(encoding="utf-8")
@@ -80,7 +85,7 @@ def test_a_swarm_of_pushbots_gets_a_hall_drivers_and_calibrated_trackers(
     options = SimulationOptions(str(swarm_file), seed=4, plan="office", rate=0.5)
     nodes = {node.full_name: node for node in graph_of(options, simulated_swarm(options), str(tmp_path))}
     assert list(nodes) == [
-        "pushbot_world",
+        *("estimator", "mapper", "pushbot_world", "exploration"),
         *("a/pushbot_driver", "a/event_tracker", "b/pushbot_driver", "b/event_tracker"),
     ]
     world = nodes["pushbot_world"].parameters
@@ -91,6 +96,13 @@ def test_a_swarm_of_pushbots_gets_a_hall_drivers_and_calibrated_trackers(
         for kind in ("pushbot_driver", "event_tracker")
     }
     assert len(frequencies) == 2
+    leds = {name: nodes[f"{name}/pushbot_driver"].parameters["led_frequency"] for name in "ab"}
+    assert nodes["mapper"].parameters["led_frequencies"] == [f"{name}={hz}" for name, hz in leds.items()]
+    assert nodes["a/event_tracker"].parameters["light_frequencies"] == [str(leds["b"])]
+    for name, node in nodes.items():
+        assert node.parameters.get("use_sim_time", False) is (name != "pushbot_world")  # which makes the time
+    described = {nodes[name].parameters["swarm_file"] for name in list(nodes)[:4]}
+    assert described == {str(swarm_file)}
     for name in "ab":
         assert nodes[f"{name}/pushbot_driver"].parameters["address"] == f"{tmp_path}/{name}"
         calibration = str(nodes[f"{name}/event_tracker"].parameters["calibration"])

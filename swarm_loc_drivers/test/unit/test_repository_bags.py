@@ -19,6 +19,8 @@ SIMULATED = [
     "eight_five_robots_w2",
     "eight_one_robot_fast",
     "eight_one_robot_slow",
+    "pushbot_one",
+    "pushbots_two",
 ]
 ROUNDING = 1e-9  # numpy's sines differ by their last bits where a processor has wider registers
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from swarm_loc_estimator.core.description.swarm import Robot
+from swarm_loc_estimator.core.description.swarm import Robot, Swarm
 from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.core.mapping.settings import MapperSettings
+from swarm_loc_estimator.evaluation.truth import read_truth
 from swarm_loc_estimator.io.bags.reader import BagReader
 from swarm_loc_estimator.io.maps.mapper_feed import MapperFeed, MapperInput
+from swarm_loc_estimator.io.messages.typestore import POSE_STAMPED
+from swarm_loc_estimator.numerics.trajectory import Trajectory
 
 _TELL_EVERY = 1000
 
@@ -49,3 +52,14 @@ def replay_map(
                 progress(reader.progress, "mapping")
     mapper.finish()
     return mapper, feed
+
+
+def truth_of(bag: Path, swarm: Swarm) -> dict[str, Trajectory]:
+    """Ground truth of a bag by robot, for evaluation only; empty without any."""
+    found: dict[str, list[bytes]] = {}
+    names = {f"{robot.name}/ground_truth": robot.name for robot in swarm.robots}
+    with BagReader(bag) as reader:
+        for topic, message_type, _, data in reader.messages(names):
+            if message_type == POSE_STAMPED:
+                found.setdefault(names[topic], []).append(data)
+    return read_truth(swarm, found) if found else {}

@@ -88,3 +88,12 @@ def test_beams_that_met_nothing_count_before_anything_was_seen() -> None:
     assert found.inverse.tolist() == [0.0]
     assert math.isnan(found.sigma)
     assert not pairer.drops
+
+
+def test_a_dim_spot_is_no_measure_of_the_others() -> None:
+    pairer = pairer_with_odometry(50)
+    for k in range(40):
+        pairer.add_distance(k * STEP_NS, 2.0, 0.5 if k in (0, 20, 39) else 0.04)
+    found = pairer.ready()
+    assert found is not None
+    assert found.sigma == pytest.approx(0.01)

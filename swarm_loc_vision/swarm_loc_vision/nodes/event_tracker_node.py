@@ -41,6 +41,8 @@ EVENT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 _OUTPUT_QOS = QoSProfile(depth=50)
 _PERIOD_S = 1.0
 _PATIENCE_S = 5.0
+_LASER_PATIENCE_S, _SEEN_PATIENCE_S = 15.0, 60.0
+"""For the laser, before it was seen and afterwards: robots in large halls often have nothing within range."""
 _THROTTLE_S = 30.0
 _MAX_PIXELS = 1 << 21
 """Of a sensor; the tracker remembers the last bursts of each."""
@@ -173,9 +175,11 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
             self._laser_s = now_s
             topic = self.resolve_topic_name("events")
             return f"waiting: nothing has come on {topic} for {_PATIENCE_S:g} s and more"
-        if self._has_laser and now_s > self._laser_s + _PATIENCE_S:
+        has_seen = self._counts["reports"] > self._counts["windows without the laser"]
+        patience_s = _SEEN_PATIENCE_S if has_seen else _LASER_PATIENCE_S
+        if self._has_laser and now_s > self._laser_s + patience_s:
             return (
-                f"the laser at {self._sources[0].frequency:g} Hz has not been seen for {_PATIENCE_S:g} s and"
+                f"the laser at {self._sources[0].frequency:g} Hz has not been seen for {patience_s:g} s and"
                 " more: is it on, at this frequency, and something within its range?"
             )
         return ""

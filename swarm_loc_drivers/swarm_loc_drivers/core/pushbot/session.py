@@ -15,6 +15,7 @@ from typing import TypeVar
 from swarm_loc_drivers.core.pushbot.event_clock import EventClock
 from swarm_loc_drivers.core.pushbot.event_packets import EventPacket, EventPackets
 from swarm_loc_drivers.core.pushbot.settings import PushbotSettings, WheelTicks
+from swarm_loc_drivers.core.pushbot.tick_clock import TickClock
 from swarm_loc_drivers.core.robot_driver import SessionError
 from swarm_loc_drivers.protocols.pushbot import commands, lines
 from swarm_loc_drivers.protocols.pushbot.event_bytes import EventParser, Parsed
@@ -102,7 +103,7 @@ class PushbotSession:
         if settings.timestamps:
             yield from self._choose_format(generation, settings.timestamps)
         self._output += commands.lights(settings.lights) + commands.BRAKE + commands.MOTORS_ON
-        self._output += commands.stream_ticks(generation, max(1, round(1e3 * settings.tick_period_s)))
+        self._output += commands.stream_ticks(generation, _tick_period_ms(settings))
         if settings.timestamps:
             self._output += commands.EVENTS_ON
         return generation
@@ -138,6 +139,7 @@ class PushbotSession:
         parser = EventParser(settings.timestamps or "none", self._counts)
         clock = EventClock(parser.span_us) if settings.timestamps not in ("", "none") else None
         packets = EventPackets(settings.packet_period_s, settings.on_bit)
+        readings = TickClock(_tick_period_ms(settings))
         ticks_s = self._steady_s
         while not self.ending:
             yield
@@ -145,8 +147,9 @@ class PushbotSession:
             parsed = parser.feed(received)
             stamps_ns = self._take_events(parsed, clock, packets)
             for before, line in parsed.lines:
-                stamp_ns = int(stamps_ns[before - 1]) if before else self._now_ns
-                if self._take_line(line, stamp_ns, generation):
+                if before and clock is not None:
+                    readings.pass_event(int(parsed.time_us[before - 1]), stamps_ns[before - 1])
+                if self._take_line(line, readings, generation):
                     ticks_s, self.connected = self._steady_s, True
             if self._steady_s > ticks_s + settings.reply_timeout_s + settings.tick_period_s:
                 raise SessionError("the robot tells no wheel ticks any more")
@@ -168,7 +171,7 @@ class PushbotSession:
         packets.ready.clear()
         return stamps
 
-    def _take_line(self, line: bytes, stamp_ns: int, generation: FirmwareGeneration) -> bool:
+    def _take_line(self, line: bytes, readings: TickClock, generation: FirmwareGeneration) -> bool:
         """Take a line; whether it was wheel ticks.
 
         Raises:
@@ -177,7 +180,7 @@ class PushbotSession:
         ticks = lines.wheel_ticks(line, generation)
         if ticks is not None:
             self._counts["readings"] += 1
-            self.found.append(WheelTicks(stamp_ns, *ticks))
+            self.found.append(WheelTicks(readings.stamp_ns(self._now_ns), *ticks))
             return True
         if lines.BANNER.search(line + b"\n"):
             raise SessionError("the robot has been reset")
@@ -197,3 +200,8 @@ class PushbotSession:
         dark = commands.lights(commands.Lights(0.0, 0.0))
         off = commands.EVENTS_OFF + commands.STOP_SENSORS + commands.MOTORS_OFF
         return b"\n" + commands.BRAKE + off + dark + commands.QUERY_FORMAT
+
+
+def _tick_period_ms(settings: PushbotSettings) -> int:
+    """Between two readings of the wheel ticks [ms]."""
+    return max(1, round(1e3 * settings.tick_period_s))

@@ -13,6 +13,8 @@ _MAX_RATE = 2.0 * MAX_TICK_RATE
 """No wheel is faster, not even when its controller catches up [ticks/s]."""
 _SLACK_S = 0.15
 """Stamps may be wrong by so much."""
+_MAX_CORRECTION_S = 0.5
+"""So far back stamps step when a shorter way of the bytes is found, or events come behind ticks."""
 
 
 class PushbotOdometry:
@@ -23,7 +25,7 @@ class PushbotOdometry:
     Args:
         geometry: The wheels.
         wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
-        counts: Gets `implausible_counters`, `counter_restarts` and `time_jumps`.
+        counts: Gets `implausible_counters`, `counter_restarts`, `time_jumps` and `corrected_times`.
     """
 
     def __init__(self, geometry: WheelGeometry, wheel_noise: float, counts: Counter[str]) -> None:
@@ -46,6 +48,9 @@ class PushbotOdometry:
         if ticks.stamp_ns == last.stamp_ns:
             return None
         elapsed_s = (ticks.stamp_ns - last.stamp_ns) * 1e-9
+        if -_MAX_CORRECTION_S < elapsed_s < 0.0:
+            self._counts["corrected_times"] += 1  # its way is told with the next reading
+            return None
         if elapsed_s < 0.0:
             self._counts["time_jumps"] += 1
             elapsed_s = 0.0

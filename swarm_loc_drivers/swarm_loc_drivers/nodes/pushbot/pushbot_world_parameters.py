@@ -10,7 +10,12 @@ from swarm_loc_drivers.protocols.pushbot.hardware import GENERATIONS, SECOND_FIR
 from swarm_loc_drivers.sim.common.world_error import WorldError, start_of
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS, floor_plan
-from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldSettings
+from swarm_loc_drivers.sim.pushbot.world import (
+    TURN_NOISE,
+    WHEEL_NOISE,
+    PushbotWorld,
+    PushbotWorldSettings,
+)
 from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.parameters.number_spec import number
@@ -29,8 +34,9 @@ class PushbotWorldParameters:
     )
     turn_slip: float = number(0.02, "1", 0.0, 0.5, "share of turns that the wheels make in vain")
     wheel_noise: float = number(
-        2e-5, "m", 0.0, 0.01, "variance of each wheel's path per metre it rolls [m^2/m]"
+        WHEEL_NOISE, "m", 0.0, 0.01, "variance of each wheel's path per metre it rolls [m^2/m]"
     )
+    turn_noise: float = number(TURN_NOISE, "rad", 0.0, 1.0, "error of a whole turn besides")
     link_folder: str = text("", "where each robot's serial port appears under its name; empty: TCP")
     first_port: int = number(0, "1", 0, 65000, "TCP port of the first robot, the others follow; 0: any")
     firmware: str = choice(SECOND_FIRMWARE.name, tuple(GENERATIONS), "generation of the robots' firmware")
@@ -53,6 +59,7 @@ def make_pushbot_world(parameters: PushbotWorldParameters) -> tuple[Swarm, Pushb
         plan=floor_plan(parameters.plan),
         wheels=WheelGeometry(parameters.metres_per_tick, parameters.wheel_separation),
         wheel_noise=parameters.wheel_noise,
+        turn_noise=parameters.turn_noise,
         turn_slip=parameters.turn_slip,
         camera=parameters.camera,
     )

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from swarm_loc_drivers.sim.common.body import Blinking
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
 FOCAL_PX = 90.0
@@ -28,6 +29,11 @@ _HALF_FIELD = math.radians(37.0)
 _SPOT_BRIGHTNESS, _LED_BRIGHTNESS = 12.0, 20.0
 """At a metre, over that of the surroundings."""
 _MAX_BRIGHTNESS = 60.0
+_LASER_PERIODS_US = (2430, 2330, 2230, 2130, 1880, 1820, 1760, 1700, 2500, 1640)
+_LED_PERIODS_US = (1000, 900, 1100, 800, 1200, 1300, 700, 1400, 1500, 1600)
+"""Each robot of a hall has its own; trackers tell apart LEDs whose periods differ by a tenth of a ms."""
+MAX_ROBOTS = len(_LED_PERIODS_US)
+"""Of one hall."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +66,22 @@ def assembled_robots(seed: int, count: int) -> list[LaserOptics]:
     """The robots of a world of a seed as they came from assembly."""
     rng = np.random.default_rng(seed)
     return [assembled(rng) for _ in range(count)]
+
+
+def laser_hz(robot: int) -> float:
+    """At which the laser of a robot of a hall blinks, by its index [Hz]."""
+    return round(1e6 / _LASER_PERIODS_US[robot], 3)
+
+
+def led_hz(robot: int) -> float:
+    """Likewise its LEDs [Hz]."""
+    return round(1e6 / _LED_PERIODS_US[robot], 3)
+
+
+def lights_of(robot: int) -> tuple[Blinking, Blinking, Blinking]:
+    """Laser, rear and front LED of a robot of a hall, as it is told to let them blink."""
+    laser, led = _LASER_PERIODS_US[robot], _LED_PERIODS_US[robot]
+    return Blinking(laser, laser // 2), Blinking(led, led // 2), Blinking(led, led // 2)
 
 
 def spot_brightness(distance: float) -> float:

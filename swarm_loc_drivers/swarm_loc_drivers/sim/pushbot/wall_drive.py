@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from swarm_loc_drivers.sim.common.body import Blinking
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise, EventCamera, Spot
-from swarm_loc_drivers.sim.pushbot.optics import CAMERA_X_M, LaserOptics, spot_brightness
+from swarm_loc_drivers.sim.pushbot.optics import (
+    CAMERA_X_M,
+    LaserOptics,
+    assembled_robots,
+    spot_brightness,
+)
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_vision.core.events.centroid_tracker import CentroidTracker
 from swarm_loc_vision.core.events.settings import LightSource, TrackerSettings
-from swarm_loc_vision.core.laser.fit import Drive
+from swarm_loc_vision.core.laser.fit import Drive, fit_hyperbola
+from swarm_loc_vision.io.laser_file import save_laser
 
 _STEP_US = 5_000
 _BLINKING, _LASER = Blinking(2222, 1111), LightSource(450.0, is_above=False)
@@ -63,3 +71,11 @@ def drive_at_wall(
     driven = np.interp(rows[:, 0], stamps_us, step_m * np.arange(steps + 1))
     told = Drive(settings.start, _TOLD_SIGMA, driven, rows[:, 1], CAMERA_X_M)
     return told, np.interp(rows[:, 0], stamps_us, depths)
+
+
+def calibrate_lasers(robots: Sequence[str], seed: int, folder: Path) -> None:
+    """Write the laser calibrations of a world's robots, from drives at a wall, to FOLDER/ROBOT.yaml."""
+    rng = np.random.default_rng([seed, 1])
+    for name, built in zip(robots, assembled_robots(seed, len(robots)), strict=True):
+        drive, _ = drive_at_wall(rng, built, WallDriveSettings(speed=0.25))
+        save_laser(folder / f"{name}.yaml", fit_hyperbola(drive))

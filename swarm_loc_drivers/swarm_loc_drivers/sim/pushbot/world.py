@@ -5,6 +5,7 @@ What happens is fixed by the seed and by when the robots are told what.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -17,20 +18,18 @@ from swarm_loc_drivers.sim.common.differential_drive import Drive, LastingNoise,
 from swarm_loc_drivers.sim.common.world_error import WorldError
 from swarm_loc_drivers.sim.pushbot import optics
 from swarm_loc_drivers.sim.pushbot.drivetrain import Drivetrain
-from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise, EventCamera, Spot
+from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan
-from swarm_loc_drivers.sim.pushbot.ray_casting import clearance, is_visible, ray_distance
+from swarm_loc_drivers.sim.pushbot.ray_casting import clearance
+from swarm_loc_drivers.sim.pushbot.sight import BODY_RADIUS_M, HallSight, Lights
 from swarm_loc_estimator.core.description.swarm import Pose2
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
 STEP_NS = 5_000_000
 _MS_PER_STEP = 5
-_MAX_SPOT_M = 5.0
-"""Beyond it no pixel notices the laser."""
 _SLIP_S = 0.05
-_CONTRAST = 0.6
-"""Share of the pixels along an upright edge that notice it."""
-BODY_RADIUS_M = 0.07
+WHEEL_NOISE, TURN_NOISE = 1e-7, math.radians(0.64)
+"""Headings err by .3 deg a root metre driven straight on, and by this for each root turn [m], [rad]."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +41,7 @@ class PushbotWorldSettings:
         plan: The hall.
         wheels: Of all robots.
         wheel_noise: Variance of a wheel's path per metre it rolls [m^2/m].
+        turn_noise: Standard deviation of a whole turn besides [rad].
         turn_slip: Share of every turn that the ticks tell and the floor does not [1].
         camera: How far event cameras are from ideal ones.
         start_ns: First moment.
@@ -50,7 +50,8 @@ class PushbotWorldSettings:
     seed: int
     plan: FloorPlan
     wheels: WheelGeometry
-    wheel_noise: float = 2e-5
+    wheel_noise: float = WHEEL_NOISE
+    turn_noise: float = TURN_NOISE
     turn_slip: float = 0.02
     camera: CameraNoise = field(default_factory=CameraNoise)
     start_ns: int = 1_000_000_000
@@ -87,14 +88,13 @@ class PushbotWorld:
         self.drivetrain = Drivetrain(count, 1e-3)
         self.optics = optics.assembled_robots(settings.seed, count)
         """How the robots were put together; for evaluation."""
-        self.lights = [(Blinking(), Blinking(), Blinking()) for _ in range(count)]
+        self.lights: list[Lights] = [(Blinking(), Blinking(), Blinking()) for _ in range(count)]
         """Laser, rear and front LED of each robot."""
         self.firmwares: list[StepsAlong | None] = [None] * count
-        self._cameras = [EventCamera(settings.camera, one) for one in rng.spawn(count)]
-        self._slip = LastingNoise(rng, (count, 2), STEP_NS * 1e-9, _SLIP_S)
+        self.sight = HallSight(settings.plan.walls, self.optics, settings.camera, rng)
+        """What their cameras see."""
+        self._slip = LastingNoise(rng, (count, 3), STEP_NS * 1e-9, _SLIP_S)
         self._drive = Drive(settings.wheels.wheel_separation, settings.wheel_noise, settings.turn_slip)
-        self._corners = np.unique(settings.plan.walls.reshape(-1, 2), axis=0)
-        self._contrast = rng.choice([-_CONTRAST, _CONTRAST], len(self._corners))
         for robot in range(count):
             if self._is_blocked(robot, self.poses):
                 raise WorldError(f"robot {robot + 1} of the swarm begins within a wall or another robot.")
@@ -113,18 +113,15 @@ class PushbotWorld:
         for robot in range(len(self.poses)):
             self._look(robot, before)
 
-    def distance(self, robot: int, poses: FloatArray) -> float:
-        """From a robot's camera to what its laser hits when all stand at `poses` (N, 3) [m]."""
-        x, y = optics.camera_place(poses[robot])
-        others = np.delete(poses[:, :2], robot, axis=0)
-        return float(ray_distance(self._settings.plan.walls, others, BODY_RADIUS_M, x, y, poses[robot, 2]))
-
     def _rolled(self, ticks: FloatArray) -> FloatArray:
         """Where the robots come; who would run into something turns its wheels in vain."""
         step_s = STEP_NS * 1e-9
         left, right = (self._settings.wheels.metres_per_tick * ticks / step_s).T
-        noise = np.sqrt(self._drive.wheel_noise) * self._slip.next()
+        slip = self._slip.next()
+        noise = np.sqrt(self._drive.wheel_noise) * slip[:, :2]
         turn_rate = (right - left) / self._drive.wheel_separation
+        turns = np.abs(turn_rate) * step_s / (2.0 * np.pi)
+        turn_rate += self._settings.turn_noise * np.sqrt(turns) * slip[:, 2] / step_s
         poses = roll(self.poses, 0.5 * (left + right), turn_rate, self._drive, step_s, noise)
         for robot in range(len(poses)):
             if self._is_blocked(robot, poses):
@@ -141,50 +138,9 @@ class PushbotWorld:
         firmware = self.firmwares[robot]
         if firmware is None:
             return
-        spots = self._laser_spot(robot, before) + self._led_spots(robot, before)
-        begin_us = (self.now_ns - STEP_NS) // 1000
-        edges = self._edges(before[robot], self.poses[robot])
-        seen = self._cameras[robot].look(begin_us, self.now_ns // 1000, spots, edges)
+        span_us = (self.now_ns - STEP_NS) // 1000, self.now_ns // 1000
+        seen = self.sight.look(robot, before, self.poses, span_us, self.lights)
         firmware.see(seen.words(), seen.time_us)
-
-    def _laser_spot(self, robot: int, before: FloatArray) -> list[Spot]:
-        begin, end = self.distance(robot, before), self.distance(robot, self.poses)
-        laser = self.lights[robot][0]
-        if not laser.period_us or max(begin, end) > _MAX_SPOT_M or min(begin, end) <= 0.0:
-            return []
-        spot = self.optics[robot].spot
-        return [Spot(spot(begin), spot(end), optics.spot_brightness(end), laser)]
-
-    def _led_spots(self, robot: int, before: FloatArray) -> list[Spot]:
-        """The LEDs of other robots, where no wall is between."""
-        spots = []
-        x, y = optics.camera_place(self.poses[robot])
-        for other in range(len(self.poses)):
-            for blinking, front in zip(self.lights[other][1:], (False, True), strict=True):
-                if other == robot or not blinking.period_us:
-                    continue
-                begin = optics.led_pixel(before[robot], before[other], front=front)
-                end = optics.led_pixel(self.poses[robot], self.poses[other], front=front)
-                place = optics.led_place(self.poses[other], front=front)
-                if begin and end and is_visible(self._settings.plan.walls, x, y, *place):
-                    spots.append(Spot(begin[:2], end[:2], optics.led_brightness(end[2]), blinking))
-        return spots
-
-    def _edges(self, before: FloatArray, after: FloatArray) -> FloatArray:
-        """Corners of walls as upright edges (E, 3) in the image, at the begin and the end of a step."""
-        columns = []
-        for pose in (before, after):
-            x, y = self._corners.T - np.array(optics.camera_place(pose))[:, None]
-            ahead = x * np.cos(pose[2]) + y * np.sin(pose[2])
-            left = y * np.cos(pose[2]) - x * np.sin(pose[2])
-            with np.errstate(divide="ignore", invalid="ignore"):
-                columns.append(
-                    np.where(ahead > 0.05, optics.CENTRE_PX - optics.FOCAL_PX * left / ahead, np.nan)
-                )
-        edges = np.column_stack([*columns, self._contrast])
-        near = (np.abs(edges[:, :2] - optics.CENTRE_PX) < 2.0 * optics.CENTRE_PX).all(axis=1)
-        chosen: FloatArray = edges[near]
-        return chosen
 
 
 class SimulatedPushbot:

@@ -10,19 +10,30 @@ from typing import Any
 
 import numpy as np
 
-from swarm_loc_drivers.sim.pushbot.exploration import FIRST_SIGMA, START_SIGMA, Exploration
+from swarm_loc_drivers.sim.pushbot.exploration import FIRST_SIGMA, START_SIGMA, Arrival, Exploration
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_drivers.sim.pushbot.kinematics import FOCAL_BASELINE, PERIOD_S, PushBotNoise
+from swarm_loc_drivers.sim.pushbot.optics import CAMERA_X_M, LaserOptics, assembled_robots, led_hz
+from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.recording.bag import Stream, write_streams
-from swarm_loc_estimator.core.description.swarm import Robot, StartSigma, Swarm
+from swarm_loc_drivers.sim.recording.pushbot_events import event_streams, poses_between, sight_of
+from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot, StartSigma, Swarm
+from swarm_loc_estimator.core.mapping.exploration.goal import Goal
 from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.core.mapping.readings import LightSightings, Readings
+from swarm_loc_estimator.io.maps.fix_covariance import fix_covariance
 from swarm_loc_estimator.io.maps.laser_messages import LASER, LIGHTS
-from swarm_loc_estimator.io.messages.encoders import UNKNOWN_COVARIANCE, encode_odometry, encode_pose_stamped
+from swarm_loc_estimator.io.messages.encoders import (
+    UNKNOWN_COVARIANCE,
+    encode_fix,
+    encode_odometry,
+    encode_pose_stamped,
+)
 from swarm_loc_estimator.io.messages.typestore import (
     MESSAGE_PACKAGE,
     ODOMETRY,
     POSE_STAMPED,
+    POSE_WITH_COVARIANCE,
     encode,
     typestore,
 )
@@ -30,10 +41,16 @@ from swarm_loc_estimator.numerics import se2
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
 BEGIN_NS = 1_700_000_000_000_000_000
-FIRST_LED_HZ, LED_STEP_HZ = 1000.0, 50.0
-"""Frequencies of the robots' LEDs, each its own."""
 _TRUTH_EVERY = 5
-_CENTRE_PX = 63.5
+_ODOMETRY = OdometryModel(
+    wheel_separation=0.085,
+    wheel_noise=1e-6,
+    distance_noise=3e-4,
+    turn_noise=2e-5,
+    turn_scale=0.98,
+    turn_scale_sigma=0.015,
+)
+"""Paths to 1.8 % of a hop, turns to .64 deg a turn, and slip of two percent, more or less."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +63,7 @@ class PushbotBagSettings:
         robots: How many.
         plan: Name of the floor plan.
         slip: Share of turns that wheels lose.
+        events_s: Events of so long at the begin [s].
     """
 
     seed: int
@@ -53,10 +71,13 @@ class PushbotBagSettings:
     robots: int
     plan: str
     slip: float
+    events_s: float = 0.0
 
 
 def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) -> int:
-    """Write `<robot>/odom`, `laser`, `lights` and `ground_truth`, `swarm.yaml` and `walls.csv`.
+    """Write `<robot>/odom`, `laser`, `lights`, `fix`, `events` and `ground_truth`, and files beside them.
+
+    Those are `swarm.yaml`, `walls.csv`, and `<robot>.yaml` with the calibration of each laser.
 
     Args:
         settings: What is simulated.
@@ -70,31 +91,69 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
         BagError: The folder is there already, or cannot be created.
     """
     plan = floor_plan(settings.plan)
-    rng = np.random.default_rng(settings.seed)
-    exploration = Exploration(plan, CooperativeMapper(), rng)
+    mapper = CooperativeMapper()
+    exploration = Exploration(plan, mapper, np.random.default_rng(settings.seed))
     recorded: dict[int, list[tuple[Readings, LightSightings | None]]] = defaultdict(list)
     exploration.on_readings = lambda robot, readings, lights: recorded[robot].append((readings, lights))
+    fixes: dict[int, list[Goal]] = defaultdict(list)
+    covariances: dict[int, list[FloatArray]] = defaultdict(list)
+
+    def note_fix(arrival: Arrival) -> None:
+        goal = mapper.goal(arrival.robot)
+        if goal is not None:
+            fixes[arrival.robot].append(goal)
+            covariances[arrival.robot].append(mapper.covariance(arrival.robot))
+
     for _ in range(settings.robots):
         exploration.join(PushBotNoise(slip=settings.slip))
-    exploration.run(settings.duration_s)
-    robots = tuple(
-        Robot(
-            f"pushbot{number + 1}",
-            camera=None,
-            start=tuple(exploration.starts[number].tolist()),
-            start_sigma=StartSigma(*(START_SIGMA if number else FIRST_SIGMA).tolist()),
-        )
-        for number in range(settings.robots)
-    )
+    exploration.run(settings.duration_s, note_fix)
+    robots = tuple(_described(number, exploration) for number in range(settings.robots))
+    built = assembled_robots(settings.seed, settings.robots)
     streams: list[Stream] = []
     for number, robot in enumerate(robots):
         readings = [one for one, _ in recorded[number]]
-        streams += [_odometry(robot.name, readings), _laser(robot.name, readings)]
+        streams += [_odometry(robot.name, readings), _laser(robot.name, readings, built[number])]
         streams += _lights(robot.name, [lights for _, lights in recorded[number] if lights is not None])
+        streams.append(_fixes(robot.name, fixes[number], covariances[number]))
         streams.append(_truth(robot.name, exploration.robots[number].trace))
+    names = [robot.name for robot in robots]
+    streams += _events(names, exploration, settings)
     count = write_streams(streams, Swarm(robots), folder, comment)
     np.savetxt(folder / "walls.csv", plan.walls, fmt="%.4f", delimiter=",", header="x0,y0,x1,y1 [m]")
+    calibrate_lasers(names, settings.seed, folder)
     return count
+
+
+def _described(number: int, exploration: Exploration) -> Robot:
+    """A robot as the swarm description has it."""
+    return Robot(
+        f"pushbot{number + 1}",
+        type="pushbot",
+        odometry=_ODOMETRY,
+        camera=None,
+        start=tuple(exploration.starts[number].tolist()),
+        start_sigma=StartSigma(*(START_SIGMA if number else FIRST_SIGMA).tolist()),
+    )
+
+
+def _events(names: list[str], exploration: Exploration, settings: PushbotBagSettings) -> list[Stream]:
+    """What the cameras see at the begin."""
+    if not settings.events_s:
+        return []
+    traces = [exploration.robots[number].trace for number in range(settings.robots)]
+    poses = poses_between(traces, round(1e6 * PERIOD_S), round(1e6 * settings.events_s))
+    sight = sight_of(exploration.plan.walls, settings.seed, settings.robots)
+    return event_streams(names, poses, BEGIN_NS, sight)
+
+
+def _fixes(name: str, goals: list[Goal], covariances: list[FloatArray]) -> Stream:
+    """Where the mapper had the robot when it decided on its goals, as the mapper's node publishes it."""
+    stamp_ns = BEGIN_NS + np.array([goal.stamp_ns for goal in goals], dtype=np.int64)
+    data = [
+        encode_fix("map", at_ns, goal.pose, fix_covariance(covariance))
+        for at_ns, goal, covariance in zip(stamp_ns.tolist(), goals, covariances, strict=True)
+    ]
+    return Stream(f"{name}/fix", POSE_WITH_COVARIANCE, stamp_ns, data)
 
 
 def _odometry(name: str, readings: list[Readings]) -> Stream:
@@ -107,7 +166,7 @@ def _odometry(name: str, readings: list[Readings]) -> Stream:
     return Stream(f"{name}/odom", ODOMETRY, stamp_ns, data)
 
 
-def _laser(name: str, readings: list[Readings]) -> Stream:
+def _laser(name: str, readings: list[Readings], built: LaserOptics) -> Stream:
     stamp_ns = BEGIN_NS + np.concatenate([one.stamp_ns for one in readings])
     inverse = np.concatenate([one.inverse for one in readings])
     sigma = readings[0].sigma
@@ -117,14 +176,14 @@ def _laser(name: str, readings: list[Readings]) -> Stream:
         seen = value > 0.0
         distance = 1.0 / value if seen else math.nan
         pixel = (sigma * FOCAL_BASELINE) ** 2 if seen else -1.0
-        row = _CENTRE_PX + FOCAL_BASELINE * value if seen else math.nan
+        column, row = built.spot(distance - CAMERA_X_M) if seen else (math.nan, math.nan)
         data.append(
             encode(
                 message(
                     header=_header(at_ns, f"{name}/base_link"),
                     distance=distance,
                     sigma=sigma * distance**2,
-                    u_px=_CENTRE_PX if seen else math.nan,
+                    u_px=column,
                     v_px=row,
                     covariance=np.array([pixel, 0.0, 0.0, pixel]),
                     events=int(seen),
@@ -143,7 +202,7 @@ def _lights(name: str, sightings: list[LightSightings]) -> list[Stream]:
         for at_ns in np.unique(part.stamp_ns).tolist():
             lights = [
                 light(
-                    frequency=FIRST_LED_HZ + LED_STEP_HZ * int(part.target[k]),
+                    frequency=led_hz(int(part.target[k])),
                     bearing=float(part.bearing[k]),
                     elevation=0.0,
                     covariance=np.diag([float(part.sigma[k]) ** 2] * 2).ravel(),

@@ -89,6 +89,7 @@ class CooperativeMapper:
         visits: Where robots have been.
         counters: How often what has happened.
         background: A map from before, below what the stops draw.
+        begin_ns: Stop in the graph -> its first reading [ns].
     """
 
     def __init__(self, settings: MapperSettings | None = None) -> None:
@@ -99,6 +100,7 @@ class CooperativeMapper:
         self._tracks: dict[int, _Track] = {}
         self._lights = LightBook()
         self.background: OccupancyMap | None = None
+        self.begin_ns: dict[int, int] = {}
         self._map: OccupancyMap | None = None
 
     def join(self, pose: FloatArray, sigma: FloatArray) -> int:
@@ -269,6 +271,7 @@ class CooperativeMapper:
         else:
             begin, node = track.node, self.graph.add_stop(robot, pose, stop.sigma)
             self.graph.constraints.add_departure(begin, node, self.graph.turned[begin], motion, sigma)
+        self.begin_ns[node] = int(stop.stamp_ns[0])
         self.graph.set_scan(node, stop.turn[:count], stop.inverse[:count])
         track.node, track.passes = node, self.graph.count > self.settings.max_stops
         if not align(self.graph, node, track.path):
@@ -319,6 +322,7 @@ class CooperativeMapper:
                 self.graph.constraints.add_prior(node, track.prior, track.prior_sigma)
             pose = np.array([pose[0], pose[1], self.graph.heading_at_departure(node)])
             stop.begin = first
+            self.begin_ns[node] = int(stop.stamp_ns[first])
             nodes.append(node)
         track.node = nodes[-1]
         self.graph.starts.update(nodes)

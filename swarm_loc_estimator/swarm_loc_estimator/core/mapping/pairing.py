@@ -15,6 +15,8 @@ MAX_WAITING = 500
 """Of either kind: what is older than so many is dropped."""
 MAX_GAP_NS = 500_000_000
 """Odometry is not interpolated over longer gaps."""
+_SIGMAS = 301
+"""Of so many distances the median sigma counts."""
 
 
 class ReadingPairer:
@@ -28,7 +30,7 @@ class ReadingPairer:
         self.drops: Counter[str] = Counter()
         self._odometry: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_WAITING)
         self._distances: deque[tuple[int, float]] = deque()
-        self._sigma = math.nan
+        self._sigmas: deque[float] = deque(maxlen=_SIGMAS)
 
     @property
     def newest_ns(self) -> float:
@@ -54,7 +56,7 @@ class ReadingPairer:
             self.drops["laser_bad_value"] += 1
             return
         if seen:
-            self._sigma = sigma / (distance * distance)
+            self._sigmas.append(sigma / (distance * distance))
         if len(self._distances) == MAX_WAITING:
             self._distances.popleft()
             self.drops["laser_without_odometry"] += 1
@@ -73,7 +75,11 @@ class ReadingPairer:
         if not rows:
             return None
         stamps, poses, inverses = zip(*rows, strict=True)
-        return Readings(np.array(stamps, dtype=np.int64), np.array(poses), np.array(inverses), self._sigma)
+        return Readings(np.array(stamps, dtype=np.int64), np.array(poses), np.array(inverses), self._sigma())
+
+    def _sigma(self) -> float:
+        """Standard deviation of an inverse distance as usual lately: a dim spot is no measure of others."""
+        return float(np.median(self._sigmas)) if self._sigmas else math.nan
 
     def _pose_at(self, stamp_ns: int) -> FloatArray | None:
         """Pose (3,) by odometry at an instant up to the newest; None: not known."""

@@ -15,7 +15,9 @@ from swarm_loc_estimator.numerics.arrays import FloatArray
 _WIDTH_IN = 9.0
 
 
-def draw_map(occupancy: OccupancyMap, stops: FloatArray, walls: FloatArray, path: Path) -> Path:
+def draw_map(
+    occupancy: OccupancyMap, stops: FloatArray, walls: FloatArray, path: Path, title: str = ""
+) -> Path:
     """Draw the probability of cells, stops (k, 3) and walls (S, 4) to a PNG; returns it."""
     low = occupancy.corner
     high = low + occupancy.cell * np.array(occupancy.log_odds.shape)
@@ -28,7 +30,7 @@ def draw_map(occupancy: OccupancyMap, stops: FloatArray, walls: FloatArray, path
     segments = [wall.reshape(2, 2) for wall in walls]
     axes.add_collection(LineCollection(segments, colors="C0", linewidths=1.0, alpha=0.7))
     axes.plot(stops[:, 0], stops[:, 1], ".", color="C3", markersize=3.0)
-    axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=f"{len(stops)} stops")
+    axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title or f"{len(stops)} stops")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, metadata={"Software": None})
     return path

@@ -23,6 +23,7 @@ from swarm_loc_estimator.io.maps.laser_messages import (
 from swarm_loc_estimator.io.messages.cdr import CdrError, decode_odometry
 from swarm_loc_estimator.io.messages.typestore import ODOMETRY
 from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.se2 import between, compose
 from swarm_loc_estimator.parameters.errors import UserError
 
 ORIGIN_SIGMA = np.full(3, 1e-3)
@@ -82,6 +83,7 @@ class MapperFeed:
         self._mapper = mapper
         self._pairers = [ReadingPairer() for _ in robots]
         self._number: dict[int, int] = {}
+        self._begin: dict[int, FloatArray] = {}
         index_of = {robot.name: index for index, robot in enumerate(robots)}
         self._light_of = [(hz, index_of[name]) for name, hz in frequencies.items() if name in index_of]
         self._readers: dict[MapperInput, Callable[[int, bytes], None]] = {
@@ -100,7 +102,7 @@ class MapperFeed:
             return
         readings = self._pairers[robot].ready()
         if readings is not None:
-            self._mapper.add_readings(self._joined(robot), readings)
+            self._mapper.add_readings(self._joined(robot, readings.odometry[0]), readings)
 
     @property
     def all_drops(self) -> Counter[str]:
@@ -121,18 +123,23 @@ class MapperFeed:
                 if not self.received[index, kind]:
                     yield f"{robot.name}/{kind.topic}"
 
-    def _joined(self, robot: int) -> int:
+    def _joined(self, robot: int, odometry: FloatArray) -> int:
+        """The mapper's number of a robot; it joins where odometry (3,) since its first message has it."""
         if robot not in self._number:
             described = self._robots[robot]
             start, sigma = described.start, described.start_sigma
-            pose: FloatArray = np.zeros(3) if start is None else np.array(start)
+            since: FloatArray = between(self._begin[robot], odometry)
+            pose: FloatArray = since if start is None else compose(np.array(start), since)
             known = ORIGIN_SIGMA if start is None else np.array([sigma.x, sigma.y, sigma.theta])
             self._number[robot] = self._mapper.join(pose, np.maximum(known, ORIGIN_SIGMA))
         return self._number[robot]
 
     def _read_odometry(self, robot: int, data: bytes) -> None:
         message = decode_odometry(data)
-        self._pairers[robot].add_odometry(message.stamp_ns, np.array(message.pose))
+        pose = np.array(message.pose)
+        if robot not in self._begin and np.isfinite(pose).all():
+            self._begin[robot] = pose
+        self._pairers[robot].add_odometry(message.stamp_ns, pose)
 
     def _read_laser(self, robot: int, data: bytes) -> None:
         self._pairers[robot].add_distance(*decode_laser(data))

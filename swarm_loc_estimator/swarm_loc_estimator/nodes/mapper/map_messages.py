@@ -12,11 +12,9 @@ from std_msgs.msg import Header
 
 from swarm_loc_estimator.core.mapping.exploration.goal import Goal
 from swarm_loc_estimator.core.mapping.grid.occupancy import OccupancyMap
+from swarm_loc_estimator.io.maps.fix_covariance import fix_covariance
 from swarm_loc_estimator.io.messages.planar import PLANE, planar_covariance
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
-
-_LEAST_SIGMA = np.array([0.02, 0.02, 0.01])
-"""Errors of the map that all fixes share are no noise: no fix is told better than this [m, m, rad]."""
 
 
 def occupancy_message(occupancy: OccupancyMap, header: Header) -> OccupancyGrid:
@@ -58,7 +56,7 @@ def fix_message(goal: Goal, covariance: FloatArray, frame: str) -> PoseWithCovar
     message.header.stamp = Time(nanoseconds=goal.stamp_ns).to_msg()
     _set_pose(message.pose.pose, goal.pose)
     full = planar_covariance(0.0, 0.0, 0.0)
-    full[PLANE] = covariance + np.diag(_LEAST_SIGMA**2)
+    full[PLANE] = fix_covariance(covariance)
     message.pose.covariance = full.ravel()
     return message
 
