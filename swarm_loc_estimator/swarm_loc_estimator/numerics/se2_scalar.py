@@ -15,6 +15,30 @@ def wrap(angle: float) -> float:
 
 
 @compiled
+def direction_of(y: float, x: float) -> float:
+    """The angle [rad] in [-pi, pi] of a vector as `math.atan2` has it, to 5e-16, without a branch.
+
+    So loops over many are vectorized. The rational approximation is that of the Cephes library.
+    """
+    width, height = abs(x), abs(y)
+    large, small = max(width, height, 1e-300), min(width, height)
+    turned = small > 0.41421356237309503 * large
+    t = (small - large if turned else small) / (small + large if turned else large)
+    z = t * t
+    above = -8.750608600031904122785e-1 * z - 1.615753718733365076637e1
+    above = (above * z - 7.500855792314704667340e1) * z - 1.228866684490136173410e2
+    above = above * z - 6.485021904942025371773e1
+    below = (z + 2.485846490142306297962e1) * z + 1.650270098316988542046e2
+    below = (below * z + 4.328810604912902668951e2) * z + 4.853903996359136964868e2
+    below = below * z + 1.945506571482613964425e2
+    angle = t + t * z * above / below
+    angle = angle + (0.25 * math.pi if turned else 0.0)
+    angle = 0.5 * math.pi - angle if height > width else angle
+    angle = math.pi - angle if x < 0.0 else angle
+    return math.copysign(angle, y)
+
+
+@compiled
 def composed(
     ax: float, ay: float, atheta: float, bx: float, by: float, btheta: float
 ) -> tuple[float, float, float]:

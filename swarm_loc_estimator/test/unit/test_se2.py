@@ -7,6 +7,7 @@ from scipy.linalg import expm
 
 from swarm_loc_estimator.numerics import se2
 from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.se2_scalar import direction_of
 
 
 def poses(seed: int, *shape: int) -> FloatArray:
@@ -90,3 +91,12 @@ def test_covariances_go_to_the_error_and_back(seed: int) -> None:
     sampled = np.random.default_rng(seed).multivariate_normal(np.zeros(3), 1e-6 * error[0], 20_000)
     spread = se2.compose(se2.exp(sampled), pose[0]) - pose[0]
     np.testing.assert_allclose(np.cov(spread.T) * 1e6, covariance[0], atol=0.05 * np.trace(covariance[0]))
+
+
+def test_directions_are_those_of_the_arc_tangent() -> None:
+    angles = np.concatenate([np.linspace(-np.pi, np.pi, 2001), np.arange(-8, 9) * np.pi / 8])
+    for length in (1e-9, 1.0, 3e7):
+        for x, y in zip(length * np.cos(angles), length * np.sin(angles), strict=True):
+            assert direction_of(y, x) == pytest.approx(np.arctan2(y, x), abs=5e-16)
+    axes = [(0.0, 0.0), (0.0, -1.0), (-0.0, -1.0), (1.0, 0.0), (-1.0, 0.0)]
+    assert [direction_of(y, x) for y, x in axes] == [0.0, np.pi, -np.pi, 0.5 * np.pi, -0.5 * np.pi]

@@ -31,6 +31,24 @@ _TOGETHER = 1e-3
 """Two elements closer than this are one [rad]."""
 
 
+class ReadingErrors(NamedTuple):
+    """How readings err, numbers alone: whole models are dear to hand on for every reading.
+
+    Attributes:
+        noise: Of every reading, one standard deviation [count].
+        relative: By how much a reading is off besides, relative to its expectation [1].
+        lasting: The share of this in variance that is the same every time.
+        blocked: The scale on which the cost of a reading that may be blocked ends; infinite: none is.
+        bright: Likewise of one that may be too bright.
+    """
+
+    noise: float
+    relative: float
+    lasting: float
+    blocked: float
+    bright: float
+
+
 class IrModel(NamedTuple):
     """A platform as compiled code reads it.
 
@@ -43,10 +61,7 @@ class IrModel(NamedTuple):
         amplitudes: (modes, 5) the fields of `Amplitude`.
         saturation: A reading tells no more from here on [count].
         noise: Of every reading, one standard deviation [count].
-        relative: By how much a reading is off besides, relative to its expectation [1].
-        lasting: The share of this in variance that is the same every time.
-        blocked: The scale on which the cost of a reading that may be blocked ends; infinite: none is.
-        bright: Likewise of one that may be too bright.
+        errors: How readings err.
         scale: What covariances are multiplied by.
     """
 
@@ -58,10 +73,7 @@ class IrModel(NamedTuple):
     amplitudes: FloatArray
     saturation: float
     noise: float
-    relative: float
-    lasting: float
-    blocked: float
-    bright: float
+    errors: ReadingErrors
     scale: float
 
 
@@ -142,6 +154,13 @@ class IrPlatform:
         """What compiled code reads."""
         angles = np.array(self.angles)
         laws = [[getattr(law, name) for name in number_specs(Amplitude)] for law in self.amplitudes]
+        errors = ReadingErrors(
+            self.noise,
+            self.relative,
+            (self.curve_sigma / self.relative) ** 2 if self.relative else 0.0,
+            -math.log(self.blocked_share) if self.blocked_share else math.inf,
+            -math.log(self.bright_share) if self.bright_share else math.inf,
+        )
         return IrModel(
             self.radius,
             angles,
@@ -151,10 +170,7 @@ class IrPlatform:
             np.array(laws),
             self.saturation,
             self.noise,
-            self.relative,
-            (self.curve_sigma / self.relative) ** 2 if self.relative else 0.0,
-            -math.log(self.blocked_share) if self.blocked_share else math.inf,
-            -math.log(self.bright_share) if self.bright_share else math.inf,
+            errors,
             self.covariance_scale,
         )
 

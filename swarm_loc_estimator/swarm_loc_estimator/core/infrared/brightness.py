@@ -19,6 +19,7 @@ from swarm_loc_estimator.core.infrared.board import IrModel, IrPlatform, PairGai
 from swarm_loc_estimator.core.infrared.curves import amplitude_at, curve_at
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.se2_scalar import direction_of
 
 
 def expected(platform: IrPlatform, poses: ArrayLike, gains: PairGains | None = None) -> FloatArray:
@@ -68,17 +69,25 @@ def predict_brightness(
     n, modes, rho = model.angles.size, model.amplitudes.shape[0], model.radius
     ux, uy = math.cos(bearing), math.sin(bearing)
     cos, sin = math.cos(heading), math.sin(heading)
+    # what is read there before it is written: the way from sensor to emitter x, y, its length and direction
+    way_x, way_y, length, direction = slopes[0, 0], slopes[1, 0], slopes[2, 0], readings[0]
+    for i in range(n):
+        sensor_x, sensor_y = rho * model.units[i, 0], rho * model.units[i, 1]
+        for j in range(n):
+            jx = cos * model.units[j, 0] - sin * model.units[j, 1]
+            jy = sin * model.units[j, 0] + cos * model.units[j, 1]
+            way_x[i, j], way_y[i, j] = (
+                distance * ux + rho * jx - sensor_x,
+                distance * uy + rho * jy - sensor_y,
+            )
+    _measure(way_x.ravel(), way_y.ravel(), length.ravel(), direction.ravel())
     for j in range(n):
-        # the emitter's direction and place in the receiver's frame
+        # the emitter's direction in the receiver's frame
         jx = cos * model.units[j, 0] - sin * model.units[j, 1]
         jy = sin * model.units[j, 0] + cos * model.units[j, 1]
-        ex, ey = distance * ux + rho * jx, distance * uy + rho * jy
         for i in range(n):
-            rx, ry = ex - rho * model.units[i, 0], ey - rho * model.units[i, 1]
-            square = max(rx * rx + ry * ry, 1e-12)
-            r = math.sqrt(square)
+            rx, ry, r, along = way_x[i, j], way_y[i, j], length[i, j], direction[i, j]
             per_r = 1.0 / r
-            along = math.atan2(ry, rx)
             seen, seen_slope = curve_at(model.sensor, along - model.angles[i])
             lit, lit_slope = curve_at(model.emitter, along + math.pi - model.angles[j] - heading)
             # how the distance and the direction from sensor to emitter change with the pose
@@ -97,3 +106,11 @@ def predict_brightness(
                 slopes[0, m, i, j] = by_r * dr_distance + by_a * da_distance
                 slopes[1, m, i, j] = by_r * dr_bearing + by_a * da_bearing
                 slopes[2, m, i, j] = by_r * dr_heading + by_a * da_heading - seen * lit_slope * amplitude
+
+
+@compiled
+def _measure(x: FloatArray, y: FloatArray, length: FloatArray, direction: FloatArray) -> None:
+    """Write lengths, none of them zero, and directions [rad] of vectors, in a loop that is vectorized."""
+    for k in range(x.size):
+        length[k] = math.sqrt(max(x[k] * x[k] + y[k] * y[k], 1e-12))
+        direction[k] = direction_of(y[k], x[k])

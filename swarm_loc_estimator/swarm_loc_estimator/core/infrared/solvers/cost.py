@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.infrared.board import IrModel
+from swarm_loc_estimator.core.infrared.board import IrModel, ReadingErrors
 from swarm_loc_estimator.core.infrared.brightness import predict_brightness
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.jit import compiled
@@ -122,7 +122,7 @@ def cost_of(
     """The cost at some place; writes its gradient and Hessian there."""
     size, modes, n = at.size, pair.readings.shape[0], pair.readings.shape[1]
     predict_brightness(model, at[size - 3], at[size - 2], at[size - 1], room.expected, room.slopes)
-    sought = size > 3
+    sought, errors = size > 3, model.errors
     for i in range(n):
         room.factors[0, i] = pair.sensor[i] * (math.exp(at[i]) if sought else 1.0)
         room.factors[1, i] = pair.emitter[i] * (math.exp(at[n + i]) if sought else 1.0)
@@ -130,9 +130,14 @@ def cost_of(
         gradient[p] = 0.0
         for q in range(p + 1):
             hessian[p, q] = 0.0
+    for p in range(3):
+        for q in range(3):
+            room.lasting[p, q] = 0.0
     cost = _add_prior(pair, at, gradient, hessian) if sought else 0.0
     squares, all_squares, sure = 2.0 * cost, 0.0, 0
-    room.lasting[:] = 0.0
+    # by the pose alone, summed apart: in arrays the sums would be stored for each reading
+    by_r, by_b, by_h = 0.0, 0.0, 0.0
+    rr, br, bb, hr, hb, hh = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for m in range(modes):
         for i in range(n):
             for j in range(n):
@@ -142,9 +147,8 @@ def cost_of(
                 factor = room.factors[0, i] * room.factors[1, j]
                 expected = factor * room.expected[m, i, j]
                 reading = min(pair.readings[m, i, j], pair.saturation[m])
-                stable = pair.stable[m, i, j]
                 one, pull, weight, sure_of_it, lasting, square = _of_reading(
-                    model, kind, reading, stable, expected
+                    errors, kind, reading, pair.stable[m, i, j], expected
                 )
                 cost += one
                 all_squares += square
@@ -156,39 +160,45 @@ def cost_of(
                 a = factor * room.slopes[0, m, i, j]
                 b = factor * room.slopes[1, m, i, j]
                 c = factor * room.slopes[2, m, i, j]
-                _add_by_pose(pull, weight, a, b, c, gradient, hessian)
+                by_r, by_b, by_h = by_r + pull * a, by_b + pull * b, by_h + pull * c
+                rr, br, bb = rr + weight * a * a, br + weight * a * b, bb + weight * b * b
+                hr, hb, hh = hr + weight * a * c, hb + weight * b * c, hh + weight * c * c
                 if lasting > 0.0:
                     _add_lasting(lasting * weight, (a, b, c), room.lasting)
                 if sought:
                     _add_by_gains(pull, weight, expected, i, n + j, gradient, hessian)
                     _add_by_both(weight * expected, a, b, c, i, n + j, hessian)
+    x = size - 3
+    gradient[x], gradient[x + 1], gradient[x + 2] = by_r, by_b, by_h
+    hessian[x, x], hessian[x + 1, x], hessian[x + 1, x + 1] = rr, br, bb
+    hessian[x + 2, x], hessian[x + 2, x + 1], hessian[x + 2, x + 2] = hr, hb, hh
     room.tally[0], room.tally[1], room.tally[2] = squares, sure - 3.0, all_squares
     return cost
 
 
 @compiled
-def stabilized(model: IrModel, value: float) -> tuple[float, float]:
+def stabilized(errors: ReadingErrors, value: float) -> tuple[float, float]:
     """A brightness on the scale on which noise is one everywhere, and the slope of this scale [1/count].
 
     With the variance noise^2 + (relative value)^2 it is asinh(relative value / noise) / relative.
     """
-    per_noise = 1.0 / model.noise
-    if model.relative == 0.0:
+    per_noise = 1.0 / errors.noise
+    if errors.relative == 0.0:
         return value * per_noise, per_noise
-    ratio = model.relative * value * per_noise
+    ratio = errors.relative * value * per_noise
     root = math.sqrt(1.0 + ratio * ratio)
-    size = math.log(abs(ratio) + root) / model.relative
+    size = math.log(abs(ratio) + root) / errors.relative
     return math.copysign(size, value), per_noise / root
 
 
 @compiled
 def _of_reading(
-    model: IrModel, kind: int, reading: float, stable: float, expected: float
+    errors: ReadingErrors, kind: int, reading: float, stable: float, expected: float
 ) -> tuple[float, float, float, bool, float, float]:
     """The cost of a reading and its two derivatives by the expectation.
 
     Args:
-        model: The platform.
+        errors: Of the platform.
         kind: MEASURED or SATURATED.
         reading: Cut at saturation [count].
         stable: The reading by `stabilized` [sigma].
@@ -198,46 +208,32 @@ def _of_reading(
         Besides, whether it is no outlier for sure, the share of its variance that is the same every time, and
         the square of what it is off as if it were none.
     """
-    if model.bright < math.inf:
-        more, slope = stabilized(model, expected)
+    two_sided = errors.bright < math.inf
+    if two_sided:
+        more, slope = stabilized(errors, expected)
         more -= stable
     else:  # by the reading, as good where noise is small, and simpler
-        spread = model.relative * reading
-        slope = 1.0 / math.sqrt(model.noise * model.noise + spread * spread)
+        sigma = errors.noise
+        if errors.relative > 0.0:
+            sigma = math.sqrt(sigma * sigma + (errors.relative * reading) ** 2)
+        slope = 1.0 / sigma
         more = (expected - reading) * slope
     if kind == SATURATED:
         cost, pull, weight = _of_saturated(slope, more)
         return cost, pull, weight, True, 0.0, 0.0
-    lasting = model.lasting * (1.0 - (model.noise * slope) ** 2)
+    lasting = errors.lasting * (1.0 - (errors.noise * slope) ** 2) if errors.lasting > 0.0 else 0.0
     limit = math.inf
     if more < 0.0:
-        limit = model.bright
-    elif reading < DARK * model.noise or model.bright < math.inf:
-        limit = model.blocked
+        limit = errors.bright
+    elif two_sided or reading < DARK * errors.noise:
+        limit = errors.blocked
     square = more * more
     cost, pull, weight = 0.5 * square, more * slope, slope * slope
     if limit < math.inf:
         near = cost < _BELIEVED
         cost, pull, weight = _of_outlier(cost, pull, weight, limit)
-        return cost, pull, weight, near and model.bright < math.inf, lasting, square
+        return cost, pull, weight, near and two_sided, lasting, square
     return cost, pull, weight, True, lasting, square
-
-
-@compiled
-def _add_by_pose(
-    pull: float, weight: float, a: float, b: float, c: float, gradient: FloatArray, hessian: FloatArray
-) -> None:
-    """Add a reading whose slopes by range, bearing and heading are a, b and c."""
-    x = gradient.size - 3
-    gradient[x] += pull * a
-    gradient[x + 1] += pull * b
-    gradient[x + 2] += pull * c
-    hessian[x, x] += weight * a * a
-    hessian[x + 1, x] += weight * a * b
-    hessian[x + 1, x + 1] += weight * b * b
-    hessian[x + 2, x] += weight * a * c
-    hessian[x + 2, x + 1] += weight * b * c
-    hessian[x + 2, x + 2] += weight * c * c
 
 
 @compiled

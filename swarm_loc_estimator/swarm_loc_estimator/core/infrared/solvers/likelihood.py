@@ -197,7 +197,7 @@ def _solve_one(models: Models, pair: Pair, room: _Room, out: IrSolutions, k: int
     if bright < measured + _FAINTEST * math.sqrt(2.0 * measured):
         return _TOO_WEAK
     _find_minima(models, pair, room, measured)
-    if models.exact.bright < math.inf:
+    if models.exact.errors.bright < math.inf:
         _weigh_minima(models.exact, pair, room)
     best, other = room.minima[0], room.minima[1]
     covariance, odds = room.covariance, math.exp(best[3] - other[3])
@@ -263,7 +263,7 @@ def _log_volume(covariance: FloatArray) -> float:
 def _unexplained(model: IrModel, pair: Pair, room: _Room, bright: float) -> bool:
     """Whether a pose leaves most of what was read, mean square `bright`, unexplained."""
     tally = room.full.tally
-    if model.bright == math.inf:
+    if model.errors.bright == math.inf:
         misfit = tally[0] / max(tally[1], 1.0)
         return bool(misfit - 1.0 > (1.0 - _EXPLAINED) * max(bright - 1.0, 0.0))
     total, count = 0.0, 0
@@ -295,7 +295,7 @@ def _find_minima(models: Models, pair: Pair, room: _Room, measured: int) -> None
             for p in range(3):
                 start[p] = origin[p] + _ASIDE[aside, p]
             reached = _search_from(models, pair, room, start, reached)
-    if _in_doubt(room, reached, measured) and models.exact.blocked < math.inf:
+    if _in_doubt(room, reached, measured) and models.exact.errors.blocked < math.inf:
         dark = compress(models.exact, DARK * models.exact.noise)
         blocked = find_starts(models.table, room.pattern, room.present, dark, room.start, room.starts)
         for s in range(min(blocked, _TABLE_STARTS)):
@@ -329,7 +329,7 @@ def _list_starts(models: Models, pair: Pair, room: _Room) -> int:
     """
     _compress(models.exact, pair, room.pattern, room.present)
     starts, found = room.starts, room.starts[1 : 1 + _TABLE_STARTS]
-    outliers = math.inf if models.exact.bright < math.inf else -math.inf
+    outliers = math.inf if models.exact.errors.bright < math.inf else -math.inf
     count = 1 + find_starts(models.table, room.pattern, room.present, outliers, room.start, found)
     search(models.blurred, pair, found[0], _LOOSE, room.plain, room.minima[0])
     for p in range(3):
@@ -387,7 +387,7 @@ def _classify(model: IrModel, pair: Pair) -> tuple[int, int, float]:
                     continue
                 sigmas = min(reading, pair.saturation[m]) / model.noise
                 bright += sigmas * sigmas
-                pair.stable[m, i, j] = stabilized(model, min(reading, pair.saturation[m]))[0]
+                pair.stable[m, i, j] = stabilized(model.errors, min(reading, pair.saturation[m]))[0]
                 if reading >= pair.saturation[m]:
                     kinds[m, i, j] = SATURATED
                     saturated += 1

@@ -184,9 +184,12 @@ def _best_level(
     patterns: Float32Array, pattern: Float32Array, present: Float32Array, dark: np.float32
 ) -> tuple[int, np.float32]:
     """The range of patterns (L, modes * n * n) that fits best, and how badly it does."""
-    best, least = 0, np.float32(math.inf)
+    best, least, outliers = 0, np.float32(math.inf), dark == math.inf
     for level in range(patterns.shape[0]):
-        misfit = _misfit(patterns[level], pattern, present, dark)
+        if outliers:
+            misfit = _misfit_of_outliers(patterns[level], pattern, present)
+        else:
+            misfit = _misfit(patterns[level], pattern, present, dark)
         if misfit < least:
             best, least = level, misfit
     return best, least
@@ -210,11 +213,21 @@ def _misfit(
     for f in range(pattern.size):
         difference = pattern[f] - expected_here[f]
         square = difference * difference
-        if dark == math.inf:
-            square = min(square, _OUTLIER)
-        elif pattern[f] < dark and difference < 0.0:
+        if pattern[f] < dark and difference < 0.0:
             square = min(square, _BLOCKED)
         total += present[f] * square
+    return total
+
+
+@compiled_sums
+def _misfit_of_outliers(
+    expected_here: Float32Array, pattern: Float32Array, present: Float32Array
+) -> np.float32:
+    """Likewise where each may be blocked or too bright."""
+    total: np.float32 = np.float32(0.0)
+    for f in range(pattern.size):
+        difference = pattern[f] - expected_here[f]
+        total += present[f] * min(difference * difference, _OUTLIER)
     return total
 
 
