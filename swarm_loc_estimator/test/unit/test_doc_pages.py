@@ -22,6 +22,7 @@ from swarm_loc_estimator.core.description.swarm import (
     Face,
     Landmark,
     OdometryModel,
+    RandomWalk,
     SensorModel,
     StartSigma,
 )
@@ -42,7 +43,7 @@ def table_of(cls: type, *required: str) -> str:
     return "\n".join(lines)
 
 
-@pytest.mark.parametrize("cls", [OdometryModel, CameraMount, SensorModel, Face, StartSigma])
+@pytest.mark.parametrize("cls", [OdometryModel, RandomWalk, CameraMount, SensorModel, Face, StartSigma])
 def test_every_number_of_a_robot_has_its_place(cls: type) -> None:
     assert table_of(cls) in SWARM_DESCRIPTION
 

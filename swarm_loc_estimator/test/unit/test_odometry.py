@@ -11,13 +11,14 @@ from core_messages import SECOND, T0
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.description.estimated_parameters import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
-from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot
+from swarm_loc_estimator.core.description.swarm import OdometryModel, RandomWalk, Robot
 from swarm_loc_estimator.core.odometry.preintegration import OdometrySample
 from swarm_loc_estimator.core.odometry.tracks import OdometryTracks, TrackChange
 from swarm_loc_estimator.numerics import se2
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
 PLAIN = OdometryModel(wheel_separation=0.1, wheel_noise=1e-4)
+WALK = RandomWalk(position=2e-4, heading=0.05)
 STEP_NS = SECOND // 20
 
 
@@ -149,6 +150,19 @@ def test_a_robot_without_odometry_stands_for_ever() -> None:
     assert not sample.covariance[0].any()
     assert not sample.jacobian[0].any()
     assert sample.silence_s.tolist() == [0.0, math.inf]
+
+
+def test_a_robot_without_odometry_may_walk_at_random() -> None:
+    track = OdometryTracks([Robot("still", stands=True), Robot("odd", stands=True, random_walk=WALK)])
+    assert track.begun(1, T0)
+    assert [track.walks(robot) for robot in (0, 1)] == [False, True]
+    stamps = np.array([T0, T0 + 3_000_000_000])
+    sample = track.at(np.array([1, 1]), stamps)
+    assert not sample.pose.any()
+    assert sample.silence_s.tolist() == [0.0, 0.0]
+    gained = sample.covariance[1] - sample.covariance[0]
+    expected = 3.0 * np.diag([WALK.position, WALK.position, WALK.heading])
+    np.testing.assert_allclose(gained, expected, rtol=1e-6)
 
 
 def test_noise_of_a_straight_drive_in_closed_form() -> None:

@@ -18,6 +18,7 @@ from swarm_loc_estimator.core.description.swarm import (
     Face,
     Landmark,
     OdometryModel,
+    RandomWalk,
     Robot,
     SensorModel,
     StartSigma,
@@ -326,7 +327,8 @@ def swarms(draw: st.DrawFn) -> Swarm:
         st.lists(st.text(string.ascii_letters, min_size=1, max_size=6), unique=True, min_size=1, max_size=4)
     )
     robots: list[Robot] = []
-    pool = {cls: [cls(), draw(build(cls))] for cls in (OdometryModel, CameraMount, SensorModel, StartSigma)}
+    kinds = (OdometryModel, RandomWalk, CameraMount, SensorModel, StartSigma)
+    pool = {cls: [cls(), draw(build(cls))] for cls in kinds}
     face_numbers = draw(st.lists(numbers(Face), max_size=3))
     for name in names:
         faces = tuple(Face(f"f{k}", next(ids), **values) for k, values in enumerate(face_numbers))
@@ -345,6 +347,7 @@ def swarms(draw: st.DrawFn) -> Swarm:
                 ),
                 start_sigma=draw(st.sampled_from(pool[StartSigma])),
                 stands=stands,
+                random_walk=draw(st.sampled_from(pool[RandomWalk])) if stands else RandomWalk(),
                 ir=draw(st.none() | boards(len(robots) + 1)),
             )
         )

@@ -237,6 +237,19 @@ class StartSigma:
 
 
 @dataclass(frozen=True)
+class RandomWalk:
+    """How a robot moves that sends no odometry: nothing is known but how fast its pose may change."""
+
+    position: float = number(0.0, "m^2/s", 0.0, 1e3, "variance of x and of y per second; 0: it stands")
+    heading: float = number(0.0, "rad^2/s", 0.0, 1e3, "variance of the heading per second")
+
+    @property
+    def moves(self) -> bool:
+        """Whether it does at all."""
+        return self.position > 0.0 or self.heading > 0.0
+
+
+@dataclass(frozen=True)
 class Robot:
     """One robot.
 
@@ -250,7 +263,8 @@ class Robot:
         faces: Markers on its body.
         start: Pose in map at the first datum; None: unknown, it waits for a fix.
         start_sigma: How sure the start is.
-        stands: Whether it has no odometry and does not move.
+        stands: Whether it has no odometry, and does not move but as `random_walk` says.
+        random_walk: How it may move without odometry.
         ir: Its infrared board; None when it has none.
     """
 
@@ -264,6 +278,7 @@ class Robot:
     start: Pose2 | None = None
     start_sigma: StartSigma = StartSigma()
     stands: bool = False
+    random_walk: RandomWalk = RandomWalk()
     ir: RobotIr | None = None
 
 
@@ -291,7 +306,8 @@ class Swarm:
     """All robots and landmarks.
 
     Raises:
-        SwarmError: A robot name, a marker id or the id of an infrared board appears twice.
+        SwarmError: A robot name, a marker id or the id of an infrared board appears twice, or a robot with
+            odometry walks at random.
     """
 
     robots: tuple[Robot, ...] = ()
@@ -306,6 +322,10 @@ class Swarm:
         if twice := _given_twice((r.ir.id, f"robot '{r.name}'") for r in self.robots if r.ir is not None):
             board, one, other = twice
             raise SwarmError(f"ir.id {board} belongs to both {one} and {other}; ids must be unique.")
+        if walking := [r.name for r in self.robots if r.random_walk.moves and not r.stands]:
+            raise SwarmError(
+                f"robot '{walking[0]}' has a random_walk, which must be 0 where odometry is not null."
+            )
 
     def _named_ids(self) -> Iterator[tuple[int, str]]:
         """Every marker id with its owner in words."""

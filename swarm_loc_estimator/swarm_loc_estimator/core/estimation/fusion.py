@@ -92,12 +92,19 @@ class Fusion:
         return SwarmState(self._table, self._pairs)
 
     def with_starts(self, state: SwarmState, stamp_ns: int) -> SwarmState:
-        """The state, together with those robots at their starts about whom there was no measurement yet."""
-        ready = [robot for robot in self._starts if self._may_start(state, robot, stamp_ns)]
+        """The state, together with those robots at their starts about whom there was no measurement yet.
+
+        Not those that walk at random: nobody knows since when.
+        """
+        ready = [
+            robot
+            for robot in self._starts
+            if self._may_start(state, robot, stamp_ns) and not self._tracks.walks(robot)
+        ]
         if ready:
             state = state.copy()
             for robot in ready:
-                self._initialize_at_start(state, robot)
+                self._initialize_at_start(state, robot, stamp_ns)
         return state
 
     def _may_start(self, state: SwarmState, robot: int, stamp_ns: int) -> bool:
@@ -106,11 +113,16 @@ class Fusion:
             bool(state.start_pending[robot]) and robot in self._starts and self._tracks.begun(robot, stamp_ns)
         )
 
-    def _initialize_at_start(self, state: SwarmState, robot: int) -> None:
+    def _initialize_at_start(self, state: SwarmState, robot: int, stamp_ns: int) -> None:
+        """Where its track begins; or, if it walks at random, with the first measurement about it."""
         start, covariance = self._starts[robot]
         begin_ns, pose = self._tracks.arrays.begin_ns[robot], self._tracks.arrays.begin_pose[robot]
         initial = InitialPose(se2.compose(start, se2.inverse(pose)), se2.error_covariance(start, covariance))
-        state.initialize(robot, initial, Preintegrated.begin(int(begin_ns)))
+        begin = Preintegrated.begin(int(begin_ns))
+        if self._tracks.walks(robot):
+            here = self._tracks.at(np.array([robot]), np.array([stamp_ns]))
+            begin = Preintegrated(stamp_ns, here.covariance[0], here.jacobian[0])
+        state.initialize(robot, initial, begin)
 
     def _initialize_measured(self, state: SwarmState, measurements: MeasurementArray) -> bool:
         """Initialize robots at their starts with the first measurement (m,) about them; whether any was.
@@ -122,7 +134,7 @@ class Fusion:
             new = np.append(state.start_pending, False)[measurements[side]]  # NOBODY (-1) finds the last
             for robot, stamp_ns in zip(measurements[side][new], measurements["stamp_ns"][new], strict=True):
                 if self._may_start(state, int(robot), int(stamp_ns)):
-                    self._initialize_at_start(state, int(robot))
+                    self._initialize_at_start(state, int(robot), int(stamp_ns))
                     initialized = True
         return initialized
 
@@ -169,7 +181,7 @@ class Fusion:
         """Fuse the anonymous detections of an aerial image."""
         for robot in self._starts:
             if self._may_start(state, robot, int(image["stamp_ns"][0])):
-                self._initialize_at_start(state, robot)
+                self._initialize_at_start(state, robot, int(image["stamp_ns"][0]))
         assignment = self._pictures.assigned(state, image)
         known = assignment.robot >= 0
         if known.any():

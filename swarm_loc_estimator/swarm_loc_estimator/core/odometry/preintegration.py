@@ -89,7 +89,8 @@ class TrackArrays(NamedTuple):
         response_turn_rate: (N, W) turn rates likewise.
         begin_ns: (N,) instant of the very first row.
         begin_pose: (N, 3) the pose there, where nothing is preintegrated yet.
-        stands: (N,) whether the robot has no odometry and never moves from where its track begins.
+        stands: (N,) whether the robot has no odometry: its track never leaves the origin.
+        walk: (N, 2) variances per second of its position [m^2/s] and heading [rad^2/s] then.
     """
 
     filled: IntArray
@@ -109,6 +110,7 @@ class TrackArrays(NamedTuple):
     begin_ns: IntArray
     begin_pose: FloatArray
     stands: NDArray[np.bool_]
+    walk: FloatArray
 
 
 @compiled
@@ -129,7 +131,7 @@ def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample,
 
     Within a step the motion is an arc of constant twist. Past the newest row the last twist goes on, less and
     less sure; after `timeout_s` the motion since that row counts as unknown. Before the first row the robot
-    stands.
+    stands. One without odometry stands, or walks at random, in body directions about where it is.
     """
     count = tracks.filled[robot]
     out.silence_s[k] = 0.0
@@ -139,6 +141,8 @@ def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample,
         out.covariance[k].fill(0.0)
         out.jacobian[k].fill(0.0)
         out.silence_s[k] = 0.0 if tracks.stands[robot] else math.inf
+        for i in range(3):  # of a random walk only the differences between instants count
+            out.covariance[k, i, i] = tracks.walk[robot, i // 2] * (1e-9 * stamp_ns)
         return
     stamps, timeout_ns = tracks.stamp_ns[robot, :count], tracks.model[robot].timeout_s * 1e9
     row = max(0, np.searchsorted(stamps, stamp_ns, side="right") - 1)
@@ -321,11 +325,8 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
         tracks.known_ns[robot, row] = known_ns if contradictory else stamp_ns
         return bool(jump)
     tracks.known_ns[robot, row] = stamp_ns
-    reported = (
-        math.cos(middle) * dx + math.sin(middle) * dy,
-        math.cos(middle) * dy - math.sin(middle) * dx,
-        turn,
-    )
+    cos, sin = math.cos(middle), math.sin(middle)
+    reported = (cos * dx + sin * dy, cos * dy - sin * dx, turn)
     before_rate = tracks.rate[robot, row - 1]
     forward, left, turn = _true_motion(tracks, robot, reported, duration_s, before_rate, rate)
     # the way of the axle, then that of base_link ahead of it
@@ -359,11 +360,8 @@ def _true_motion(
     speed = math.hypot(reported[0], reported[1]) / duration_s
     speed_share, turn_share = _response(tracks, robot, speed, abs(reported[2]) / duration_s)
     scale, turn_scale = model.distance_scale * speed_share, model.turn_scale * turn_share
-    true_rate = (
-        scale * reported[0] / duration_s,
-        scale * reported[1] / duration_s,
-        turn_scale * reported[2] / duration_s,
-    )
+    ahead, aside, turning = reported
+    true_rate = (scale * ahead / duration_s, scale * aside / duration_s, turn_scale * turning / duration_s)
     remaining, mean = 0.0, 0.0  # of what is left to follow: at the end, and on average over the step
     if model.lag_s > 0.0:
         remaining = math.exp(-duration_s / model.lag_s)

@@ -69,6 +69,8 @@ class OdometryTracks:
         names = MODEL_DTYPE.names or ()
         self._model = np.array([tuple(getattr(m, name) for name in names) for m in models], dtype=MODEL_DTYPE)
         self._stands = np.array([robot.stands for robot in robots], dtype=bool)
+        walks = [robot.random_walk for robot in robots]
+        self._walk = np.array([(walk.position, walk.heading) for walk in walks]).reshape(-1, 2)
         self._delay_ns = np.array([round(m.delay_s * 1e9) for m in models], dtype=np.int64)
         self.clear()
 
@@ -88,6 +90,10 @@ class OdometryTracks:
         """Whether the robot's odometry has begun by an instant; one without has always stood there."""
         begun = self.arrays.filled[robot] and self.arrays.begin_ns[robot] <= stamp_ns
         return bool(begun or self._stands[robot])
+
+    def walks(self, robot: int) -> bool:
+        """Whether a robot walks at random, without odometry."""
+        return bool(self._walk[robot].any())
 
     def contradict_themselves(self, now_ns: int) -> BoolArray:
         """Whether the odometry of each robot (N,) has jumped again and again of late."""
@@ -166,6 +172,7 @@ class OdometryTracks:
             begin_ns=np.zeros(self._robots, dtype=np.int64),
             begin_pose=np.zeros((self._robots, 3)),
             stands=self._stands,
+            walk=self._walk,
         )
 
     def _grow(self) -> None:

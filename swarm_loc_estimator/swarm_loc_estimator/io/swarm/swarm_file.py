@@ -2,7 +2,7 @@
 
 ```yaml
 fileversion: 1
-defaults:                 # any of odometry, response, camera, sensor, ir, faces, start_sigma
+defaults:                 # any of odometry, random_walk, response, camera, sensor, ir, faces, start_sigma
   sensor: {range_sigma: 0.1}
   landmark: {size: 0.06, position_sigma: 0.01, yaw_sigma: 0.02}  # without sigmas: surveyed exactly
 types:
@@ -18,6 +18,7 @@ types:
       front: {x: 0.035, yaw: 0.0, size: 0.036, position_sigma: 0.001}
   droplet:
     odometry: null                          # null: it has none, and stands where it is
+    random_walk: {position: 1e-4, heading: 0.05}   # or moves, nobody knows where to
     camera: null
     ir:                                     # its infrared board; null: it has none
       platform: droplet                     # a packaged one, or the path of a file, from here
@@ -51,6 +52,7 @@ from swarm_loc_estimator.core.description.swarm import (
     Landmark,
     OdometryModel,
     Pose2,
+    RandomWalk,
     Robot,
     SensorModel,
     StartSigma,
@@ -70,11 +72,12 @@ if TYPE_CHECKING:
 FILE_VERSION = 1
 
 _SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks")
-_LAYER = ("odometry", "response", "camera", "sensor", "ir", "faces", "start_sigma")
+_LAYER = ("odometry", "random_walk", "response", "camera", "sensor", "ir", "faces", "start_sigma")
 _DEFAULTS = (*_LAYER, "landmark")
 _ROBOT = ("type", *_LAYER, "ids", "start")
 MODELS: dict[str, type] = {
     "odometry": OdometryModel,
+    "random_walk": RandomWalk,
     "camera": CameraMount,
     "sensor": SensorModel,
     "start_sigma": StartSigma,
