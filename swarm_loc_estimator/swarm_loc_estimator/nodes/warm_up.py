@@ -7,11 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
+from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
 from swarm_loc_estimator.core.description.robot_ir import IrMethod, RobotIr
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.description.swarm import Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
-from swarm_loc_estimator.core.filter.integrity.surprises import is_elsewhere, new_integrity
+from swarm_loc_estimator.core.filter.correlated_noise import record_pair
+from swarm_loc_estimator.core.filter.integrity.surprises import is_elsewhere
+from swarm_loc_estimator.core.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns
+from swarm_loc_estimator.core.filter.state import SwarmState
 from swarm_loc_estimator.core.infrared.brightness import expected
 from swarm_loc_estimator.core.inputs.camera import CONTENT_POSE_TWO, CONTENT_POSITION
 from swarm_loc_estimator.io.inputs.ingest import Ingest
@@ -76,7 +80,15 @@ def _run(settings: EstimatorSettings) -> None:
             estimator.receive(messages)
         estimator.tick(now_ns)
         estimator.contradictions(now_ns)
-    is_elsewhere(new_integrity(len(robots), _LANDMARKS), 0)  # asked once something contradicts
+    _call_rare(swarm)
+
+
+def _call_rare(swarm: Swarm) -> None:
+    """What is called once something contradicts, or once many infrared exchanges are fused together."""
+    state = SwarmState(ParameterTable.of(swarm.robots, swarm.landmarks), pairs=2)
+    is_elsewhere(state.integrity, 0)
+    columns = MeasurementColumns.of(np.zeros(2, MEASUREMENT_DTYPE))
+    record_pair(columns, 0, state.arrays(), np.ones(3), np.eye(3))
 
 
 def _board(number: int) -> RobotIr:
