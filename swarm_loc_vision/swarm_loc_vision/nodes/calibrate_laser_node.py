@@ -2,7 +2,8 @@
 
     ./run swarm_loc_vision calibrate_laser --ros-args -r __ns:=/pushbot1 -p output:=pushbot1.yaml
 
-The robot's driver and its `event_tracker_node` must run. Put the robot square to a wall, measure from the
+With `bag:=FOLDER` the drive is one that was recorded. Otherwise the
+robot's driver and its `event_tracker_node` must run. Put the robot square to a wall, measure from the
 middle between its wheels to the wall, and start. It takes `odom` and `laser` and publishes `cmd_vel`.
 Parameters: see `doc/calibrate_laser.md`.
 """
@@ -32,6 +33,7 @@ from swarm_loc_vision.core.laser.calibration import LaserCalibration
 from swarm_loc_vision.core.laser.fit import CalibrationError, fit_hyperbola
 from swarm_loc_vision.core.laser.wall_drive import WallDrive
 from swarm_loc_vision.io.laser_file import save_laser
+from swarm_loc_vision.io.recorded_drive import recorded_drive
 
 _QOS = QoSProfile(depth=10)
 _COMMAND_S = 0.05
@@ -53,6 +55,7 @@ class CalibrateLaserParameters:
     speed: float = number(0.1, "m/s", 0.01, 1.0, "at which it drives")
     camera_x: float = number(0.04, "m", -1.0, 1.0, "the camera before base_link")
     output: str = text("", "path of the file that is written", required=True)
+    bag: str = text("", "path of a recorded drive, with the robot's odom and laser; empty: drive now")
 
 
 class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
@@ -77,7 +80,10 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
         self._error: CalibrationError | None = None
 
     def run(self, stop: Stop) -> int:
-        """Drive to the wall, then fit and write; the exit status."""
+        """Drive to the wall, or read of such a drive, then fit and write; the exit status."""
+        if self.chosen.bag:
+            drive = recorded_drive(Path(self.chosen.bag), self.get_namespace().strip("/"), self._drive)
+            return self._fit(drive)
         executor = EventsExecutor()
         executor.add_node(self)
         done_s = math.inf
@@ -95,16 +101,19 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
         return 130 if stop.requested else self._finish()
 
     def _finish(self) -> int:
-        chosen = self.chosen
         if not self._drive.is_done:
             missing = min(self._heard_s, key=lambda name: self._heard_s[name])
             raise CalibrationError(
                 f"nothing has come on {self.resolve_topic_name(missing)} for {_PATIENCE_S:g} s, and the robot"
                 f" has driven {self._drive.driven:.2f} m."
             )
-        calibration = fit_hyperbola(self._drive.drive(chosen.start_sigma, chosen.camera_x))
+        return self._fit(self._drive)
+
+    def _fit(self, drive: WallDrive) -> int:
+        chosen = self.chosen
+        calibration = fit_hyperbola(drive.drive(chosen.start_sigma, chosen.camera_x))
         save_laser(Path(chosen.output), calibration)
-        print(summary(calibration, self._drive.count, chosen.output), file=sys.stdout)
+        print(summary(calibration, drive.count, chosen.output), file=sys.stdout)
         return 0
 
     def _hears_all(self) -> bool:

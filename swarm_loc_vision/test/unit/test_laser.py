@@ -12,6 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from swarm_loc_estimator.io.bags.writer import BagWriter
+from swarm_loc_estimator.io.maps.laser_messages import LASER
+from swarm_loc_estimator.io.messages.encoders import UNKNOWN_COVARIANCE, encode_odometry
+from swarm_loc_estimator.io.messages.typestore import ODOMETRY, encode, typestore
 from swarm_loc_vision.core.laser.calibration import LaserCalibration
 from swarm_loc_vision.core.laser.fit import (
     CalibrationError,
@@ -22,6 +26,7 @@ from swarm_loc_vision.core.laser.fit import (
 )
 from swarm_loc_vision.core.laser.wall_drive import WallDrive
 from swarm_loc_vision.io.laser_file import LaserFileError, load_laser, save_laser
+from swarm_loc_vision.io.recorded_drive import recorded_drive
 
 DEPTHS = np.linspace(0.1, 2.5, 200)
 
@@ -151,3 +156,49 @@ def test_a_number_out_of_its_range_is_named(tmp_path: Path, key: str, value: str
 def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(LaserFileError, match="cannot be written"):
         save_laser(tmp_path / "none" / "laser.yaml", LaserCalibration())
+
+
+def write_drive(folder: Path, one: Drive, robot: str = "a") -> None:
+    """A drive as a bag; messages that are cut in between."""
+    types: Any = typestore().types
+    stamps_ns = 1_000_000_000 + 20_000_000 * np.arange(len(one.driven))
+    pose = np.column_stack([one.driven, np.zeros((len(one.driven), 2))])
+    unknown = UNKNOWN_COVARIANCE
+    odometry = encode_odometry("odom", "base_link", stamps_ns, pose, np.zeros_like(pose), unknown, unknown)
+    with BagWriter(folder) as bag:
+        bag.add_topic(f"{robot}/odom", ODOMETRY)
+        bag.add_topic(f"{robot}/laser", LASER)
+        for at_ns, data, row in zip(stamps_ns.tolist(), odometry, one.rows.tolist(), strict=True):
+            seconds, rest_ns = divmod(at_ns, 1_000_000_000)
+            stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=rest_ns)
+            message = types[LASER](
+                header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="base_link"),
+                distance=math.nan,
+                sigma=math.nan,
+                u_px=64.0,
+                v_px=row,
+                covariance=np.zeros(4),
+                events=9,
+            )
+            bag.write(f"{robot}/odom", at_ns, data)
+            bag.write(f"{robot}/laser", at_ns, encode(message, LASER))
+            if rest_ns == 0:
+                bag.write(f"{robot}/laser", at_ns, encode(message, LASER)[:20])
+                bag.write(f"{robot}/odom", at_ns, data[:20])
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_recorded_drive_calibrates_as_the_drive_itself(tmp_path: Path, seed: int) -> None:
+    one = drive(seed)
+    write_drive(tmp_path / "bag", one)
+    again = recorded_drive(tmp_path / "bag", "a", WallDrive(2.55, 0.16)).drive(0.005, 0.04)
+    assert len(again.rows) > 1100
+    found, expected = fit_hyperbola(again), fit_hyperbola(one)
+    assert found.row_at_infinity == pytest.approx(expected.row_at_infinity, abs=0.02)
+    assert found.focal_base == pytest.approx(expected.focal_base, abs=0.02)
+
+
+def test_a_bag_without_the_robots_drive_is_named(tmp_path: Path) -> None:
+    write_drive(tmp_path / "bag", drive(1), "b")
+    with pytest.raises(CalibrationError, match="has nothing usable on a/odom"):
+        recorded_drive(tmp_path / "bag", "a", WallDrive(2.55, 0.16))

@@ -16,11 +16,12 @@ class BadMessageError(ValueError):
 
 
 class LaserMessage(NamedTuple):
-    """What the mapper reads of swarm_loc_msgs/LaserDistance; NaN: nothing was seen."""
+    """A swarm_loc_msgs/LaserDistance: distance and sigma [m], row of the spot [px]; NaN: nothing was seen."""
 
     stamp_ns: int
     distance: float
     sigma: float
+    row: float
 
 
 class LightMessage(NamedTuple):
@@ -39,7 +40,9 @@ def decode_laser(data: bytes) -> LaserMessage:
         BadMessageError: The bytes are not one.
     """
     message = _decoded(data, LASER)
-    return LaserMessage(_stamp_ns(message), float(message.distance), float(message.sigma))
+    return LaserMessage(
+        _stamp_ns(message), float(message.distance), float(message.sigma), float(message.v_px)
+    )
 
 
 def decode_lights(data: bytes) -> list[LightMessage]:

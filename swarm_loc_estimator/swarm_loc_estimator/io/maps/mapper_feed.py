@@ -142,7 +142,8 @@ class MapperFeed:
         self._pairers[robot].add_odometry(message.stamp_ns, pose)
 
     def _read_laser(self, robot: int, data: bytes) -> None:
-        self._pairers[robot].add_distance(*decode_laser(data))
+        message = decode_laser(data)
+        self._pairers[robot].add_distance(message.stamp_ns, message.distance, message.sigma)
 
     def _read_lights(self, robot: int, data: bytes) -> None:
         rows = []
