@@ -7,6 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from bench.pushbot.driver import robots_on_two_cores
+from bench.pushbot.event_flow import RATE, Measured
 from bench.pushbot.mapping import MappingEffort, figures_of, planned
 from bench.pushbot.runs import RunResult, RunSettings, coverage, rigid_fit, run, wall_distance_cm
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
@@ -38,6 +40,12 @@ def test_every_kind_of_run_is_planned() -> None:
     assert {one.slip for one in jobs["ring"]} == {0.0, 0.02, 0.05}
     assert len({one.seed for one in jobs["ring"]}) == 20
     assert jobs["five_robots"][0].minutes == 10.0
+
+
+def test_what_two_cores_carry_counts_only_events_that_came() -> None:
+    flow = Measured(0.5 * RATE, 0.0, driver=0.06, tracker=0.04, feed=0.1, others=0.0)
+    assert robots_on_two_cores(flow) == pytest.approx(10.0)
+    assert robots_on_two_cores(flow._replace(events_per_s=RATE)) == pytest.approx(20.0)
 
 
 def _result(seed: int, **values: float) -> RunResult:
