@@ -24,12 +24,13 @@ import numpy as np
 from bench.droplet.real import firmware
 from bench.shared.common import OUT, Cell, ProgressLine, table, write_figures
 from swarm_loc_estimator.calibration.infrared.board import (
+    BoardCalibration,
     calibrate_board,
     dead_sensors,
     pair_gains,
     without_dead,
 )
-from swarm_loc_estimator.calibration.infrared.board_fit import BoardModel, BoardReadings, turned
+from swarm_loc_estimator.calibration.infrared.board_fit import BoardReadings, turned
 from swarm_loc_estimator.calibration.infrared.board_recording import MAX_RANGE, read_board
 from swarm_loc_estimator.calibration.recording import read_recording
 from swarm_loc_estimator.cli.errors import exit_with_message
@@ -141,13 +142,13 @@ def measure(fit: list[Recorded], test: list[Recorded], robots: int, results: dic
         data = one.data
         within = (data.poses[:, 0] > RANGES[0]) & (data.poses[:, 0] < RANGES[1])
         data = without_dead(data.chosen(within), {**done.dead_sensors, **dead_sensors(data, robots)})
-        add(done.model, data, results)
+        add(done, data, results)
     print()
 
 
-def add(model: BoardModel, data: BoardReadings, results: dict[str, Results]) -> None:
+def add(done: BoardCalibration, data: BoardReadings, results: dict[str, Results]) -> None:
     """Add the errors of all methods."""
-    yaw = model.truth_yaw
+    model, yaw = done.model, done.model.truth_yaw
     truth = turned(data.poses, yaw[data.receiver], yaw[data.transmitter])
     paper = load_ir_platform("droplet")
     stock = replace(paper, amplitudes=paper.amplitudes[:1])
@@ -167,7 +168,7 @@ def add(model: BoardModel, data: BoardReadings, results: dict[str, Results]) -> 
     gather(results["firmware"], found, truth, None)
     readings = data.readings[:, None]
     for name, estimator in estimators.items():
-        gains = pair_gains(model.sensor_gains, data) if name == "board" else None
+        gains = pair_gains(model, data, known=done.with_gains) if name == "board" else None
         solutions = estimator.solve(readings, gains)
         gather(results[name], solutions.poses, truth, solutions.covariances)
 

@@ -21,9 +21,13 @@ from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikeliho
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.se2 import wrap_angle
 
+GAIN_SIGMA = 0.05
+"""How unsure gains still are that were found, relative."""
 MIN_EXCHANGES = 100
 """Fewer exchanges with ground truth tell too little of a board."""
 BLOCKS = 3
+_STRAY = (0.0, 0.01, 0.02, 0.03, 0.04, 0.06)
+"""Stray light that is tried."""
 _MISFIT = 3.0
 """Where the stock platform's residuals are beyond so many sigmas, its curves are wrong, not the robots."""
 _DEAD_SHARE = 0.2
@@ -52,6 +56,14 @@ class HeldOut:
     def solved_share(self) -> float:
         """Share of the exchanges that gave a pose."""
         return len(self.errors) / max(self.asked, 1)
+
+    @property
+    def badness(self) -> float:
+        """Logarithms of median and 90 % of all three errors, on average, and of the share solved."""
+        if len(self.errors) < 2:
+            return np.inf
+        sizes = np.quantile(np.abs(self.errors), (0.5, 0.9), axis=0)
+        return float(np.mean(np.log(sizes)) - np.log(self.solved_share))
 
     @property
     def medians(self) -> FloatArray:
@@ -103,29 +115,37 @@ def calibrate_board(start: IrPlatform, data: BoardReadings, robots: int) -> Boar
         )
     dead = dead_sensors(data, robots)
     alive = without_dead(data, dead)
-    tried = {gains: _cross_validated(start, alive, robots, gains=gains) for gains in (True, False)}
-    ranges = {gains: held.medians[0] / max(held.solved_share, 0.01) for gains, held in tried.items()}
+    validated = _cross_validated(start, alive, robots)
+    stray = min(validated, key=lambda one: validated[one][True].badness)
+    tried = validated[stray]
+    ranges = {known: one.medians[0] / max(one.solved_share, 0.01) for known, one in tried.items()}
     gains = bool(ranges[True] < ranges[False])
-    model, held = fit_board(start, alive, robots, gains=gains), tried[gains]
-    scale = float(np.quantile(held.nees, _TAIL_SHARE)) / _TAIL_BOUND if held.nees.size else 1.0
-    scale = round(min(max(scale, 1.0), _MAX_SCALE), 2)
-    platform = replace(model.platform, covariance_scale=scale)
+    model, held = fit_board(start, alive, robots), tried[gains]
+    # robots whose gains are not known have the platform, too
+    scales = [np.quantile(one.nees, _TAIL_SHARE) / _TAIL_BOUND for one in tried.values() if one.nees.size]
+    scale = round(float(np.clip(max(scales, default=1.0), 1.0, _MAX_SCALE)), 2)
+    platform = replace(model.platform, stray_noise=stray, covariance_scale=scale)
     held = replace(held, nees=held.nees / scale)
     brightest = np.nanmax(np.nan_to_num(data.readings), axis=(0, 2))
     sigma = stock_residual(start, alive)
     return BoardCalibration(replace(model, platform=platform), sigma, held, gains, dead, brightest)
 
 
-def pair_gains(sensor_gains: FloatArray, data: BoardReadings) -> PairGains:
-    """Gains of the exchanges' pairs, nothing left unknown."""
-    sensor = sensor_gains[data.receiver]
-    return PairGains(sensor, np.ones_like(sensor), np.zeros((len(sensor), 4)))
+def pair_gains(model: BoardModel, data: BoardReadings, *, known: bool = True) -> PairGains:
+    """Gains of the exchanges' pairs; what was not sought, or is not to be known, is unsure by the spread."""
+    sensor, count = model.sensor_gains[data.receiver], len(data.receiver)
+    if not known:
+        return model.platform.unknown_gains(count)
+    sigma = np.zeros((count, 4))
+    sigma[:, 0] = np.where(model.gains_sought[data.receiver], GAIN_SIGMA, model.platform.element_sigma)
+    sigma[:, 2] = model.platform.element_sigma
+    return PairGains(sensor, np.ones_like(sensor), sigma)
 
 
-def errors_of(model: BoardModel, data: BoardReadings) -> HeldOut:
-    """Errors of a board on exchanges whose poses are known."""
+def errors_of(model: BoardModel, data: BoardReadings, *, known: bool = True) -> HeldOut:
+    """Errors of a board on exchanges whose poses are known, with or without the gains that were found."""
     solutions = MaximumLikelihood(model.platform).solve(
-        data.readings[:, None], pair_gains(model.sensor_gains, data)
+        data.readings[:, None], pair_gains(model, data, known=known)
     )
     yaw = model.truth_yaw
     truth = turned(data.poses, yaw[data.receiver], yaw[data.transmitter])
@@ -175,15 +195,36 @@ def without_dead(data: BoardReadings, dead: dict[int, tuple[int, ...]]) -> Board
     return data._replace(readings=readings)
 
 
-def _cross_validated(start: IrPlatform, data: BoardReadings, robots: int, *, gains: bool) -> HeldOut:
-    """Errors in each block of time of a board fitted to all others."""
-    order = np.argsort(data.stamp_ns, kind="stable")
-    parts = []
-    for block in np.array_split(order, BLOCKS):
-        held = np.zeros(len(order), dtype=np.bool_)
-        held[block] = True
-        model = fit_board(start, data.chosen(~held), robots, gains=gains)
-        parts.append(errors_of(model, data.chosen(held)))
+def _cross_validated(start: IrPlatform, data: BoardReadings, robots: int) -> dict[float, dict[bool, HeldOut]]:
+    """Errors in each block of time of a board fitted to all others, by stray light and known gains."""
+    parts: dict[float, dict[bool, list[HeldOut]]] = {stray: {True: [], False: []} for stray in _STRAY}
+    blocks = _blocks(data)
+    for block in range(BLOCKS):
+        held = blocks == block
+        model, others = fit_board(start, data.chosen(~held), robots), data.chosen(held)
+        for stray, by_gains in parts.items():
+            strayed = replace(model, platform=replace(model.platform, stray_noise=stray))
+            for known, found in by_gains.items():
+                found.append(errors_of(strayed, others, known=known))
+    return {
+        stray: {known: _joined(found) for known, found in by_gains.items()}
+        for stray, by_gains in parts.items()
+    }
+
+
+def _blocks(data: BoardReadings) -> NDArray[np.int64]:
+    """In which block of time (k,) each exchange is, of those with its receiver."""
+    blocks = np.zeros(len(data.receiver), dtype=np.int64)
+    for receiver in np.unique(data.receiver).tolist():
+        rows = np.flatnonzero(data.receiver == receiver)
+        in_order = rows[np.argsort(data.stamp_ns[rows], kind="stable")]
+        for number, part in enumerate(np.array_split(in_order, BLOCKS)):
+            blocks[part] = number
+    return blocks
+
+
+def _joined(parts: list[HeldOut]) -> HeldOut:
+    """Those of several blocks."""
     return HeldOut(
         np.concatenate([part.errors for part in parts]),
         np.concatenate([part.nees for part in parts]),

@@ -30,13 +30,15 @@ _YAW_SIGMA = np.radians(4.0)
 _OFFSET, _OFFSET_SIGMA, _EXPONENT, _EXPONENT_SIGMA = 0.05, 0.05, 2.5, 1.0
 _PRIOR = 3.0
 _STEP = 1e-5
-_GAIN_SIGMA = 0.25
+_GAIN_SIGMA, _MIN_SPREAD = 0.25, 0.01
 _MIN_MEASURED = 100
 """Sensors of robots that measured in fewer exchanges have no gains."""
 _LIMIT = 2.0
 """Outliers count as residuals of so many sigmas do at most."""
-_DARK, _LIT = 0.5, 8.0
-"""Readings expected below so many sigmas show the noise floor, those above how far curves are off [sigma]."""
+_DIM = 3.0
+"""Readings within so many sigmas of the median show the noise, for most elements do not face each other."""
+_LIT = 8.0
+"""Readings expected above so many sigmas show how far curves are off."""
 _OUTLIER = 3.0
 _MIN_SHARE, _MAX_SHARE = 0.02, 0.3
 _ROUNDS = 2
@@ -80,6 +82,7 @@ class BoardModel:
     Attributes:
         platform: The board.
         sensor_gains: (robots, n) factors of the receivers' sensors; ones where not sought.
+        gains_sought: (robots,) whether they were; what they differ by is the platform's `element_sigma`.
         truth_yaw: (robots,) by how much each robot's heading is ahead of its ground truth's [rad].
         scatter: (k, n, n) residuals of the readings it was fitted to [sigma].
         angles: (2, k, n, n) at which sensors and emitters are met [rad].
@@ -87,6 +90,7 @@ class BoardModel:
 
     platform: IrPlatform
     sensor_gains: FloatArray
+    gains_sought: NDArray[np.bool_]
     truth_yaw: FloatArray
     scatter: FloatArray
     angles: FloatArray
@@ -101,7 +105,7 @@ def fit_board(start: IrPlatform, data: BoardReadings, robots: int, *, gains: boo
         robots: How many there are.
         gains: Whether sensors of robots that measured often may have gains.
     """
-    noise = noise_floor(data.readings)
+    noise = round(noise_floor(data), 2)
     platform = replace(start, noise=noise, curve_sigma=0.3, relative_noise=0.0, element_sigma=0.0)
     unknowns = _Problem(platform, data, robots, gains=gains).first_unknowns()
     for _ in range(_ROUNDS):
@@ -112,8 +116,11 @@ def fit_board(start: IrPlatform, data: BoardReadings, robots: int, *, gains: boo
         platform = _with_noise(problem.platform_of(unknowns), problem, unknowns)
     scatter = problem.scatter(unknowns)
     yaw = problem.parts(unknowns)[3]
-    gains_found = np.exp(problem.log_gains(unknowns))
-    return BoardModel(platform, gains_found, yaw, scatter, problem.angles(yaw)[1])
+    logs, sought = problem.log_gains(unknowns), problem.gains_sought
+    if sought.any():
+        spread = float(np.sqrt(np.mean(logs[sought] ** 2)))
+        platform = replace(platform, element_sigma=round(min(max(spread, _MIN_SPREAD), 1.0), 3))
+    return BoardModel(platform, np.exp(logs), sought, yaw, scatter, problem.angles(yaw)[1])
 
 
 def turned(poses: FloatArray, receiver_yaw: FloatArray, transmitter_yaw: FloatArray) -> FloatArray:
@@ -124,11 +131,22 @@ def turned(poses: FloatArray, receiver_yaw: FloatArray, transmitter_yaw: FloatAr
     return moved
 
 
-def noise_floor(readings: FloatArray) -> float:
-    """Robust standard deviation of readings (k, n, n) where there is no light [count], from the dim half."""
-    known = readings[np.isfinite(readings)]
-    dim = known[known <= np.median(known)]
-    return float(max(_TO_SIGMA * 1.0 * np.median(np.abs(dim - np.median(known))), 0.5))
+def noise_floor(data: BoardReadings) -> float:
+    """Robust standard deviation of readings where there is no light [count].
+
+    By the differences of one element's readings in successive exchanges of a receiver, in both of which it is
+    dark: so what an amplifier is off, and drifts by, is no noise.
+    """
+    middle = float(np.nanmedian(data.readings))
+    limit = _DIM * max(_TO_SIGMA * float(np.nanmedian(np.abs(data.readings - middle))), 0.5)
+    steps = []
+    for receiver in np.unique(data.receiver).tolist():
+        rows = np.flatnonzero(data.receiver == receiver)
+        own = data.readings[rows[np.argsort(data.stamp_ns[rows], kind="stable")]]
+        dark = np.abs(own - middle) < limit
+        steps.append(np.diff(own, axis=0)[dark[1:] & dark[:-1]])
+    found = np.concatenate(steps)
+    return float(max(_robust_sigma(found) / np.sqrt(2.0), 0.5)) if found.size else 0.5
 
 
 class _Problem:
@@ -138,6 +156,7 @@ class _Problem:
         self._platform, self._data, self._robots = platform, data, robots
         often = np.bincount(data.receiver, minlength=robots) >= _MIN_MEASURED
         self._often = np.flatnonzero(often & gains)
+        self.gains_sought: NDArray[np.bool_] = often & gains
         count = len(_KNOTS)
         flat = ((1, np.zeros(count)), (1, np.zeros(count)))
         self._spline = CubicSpline(_KNOTS, np.eye(count), bc_type=flat)
@@ -303,15 +322,12 @@ def _with_noise(platform: IrPlatform, problem: _Problem, unknowns: FloatArray) -
     """The platform with the noise, and the shares of outliers, that its residuals show."""
     expected, scatter = problem.expected(unknowns), problem.scatter(unknowns)
     known = np.isfinite(scatter)
-    dark = known & (expected < _DARK * platform.noise)
     lit = known & (expected > _LIT * platform.noise) & (expected < platform.saturation)
-    floor = platform.noise * _robust_sigma(scatter[dark]) if dark.any() else platform.noise
     relative = platform.relative * (_robust_sigma(scatter[lit]) if lit.any() else 1.0)
     blocked = float(np.mean(scatter[lit] < -_OUTLIER)) if lit.any() else 0.0
     bright = float(np.mean(scatter[known & ~lit] > _OUTLIER))
     return replace(
         platform,
-        noise=round(floor, 2),
         curve_sigma=round(min(max(relative, 0.01), 1.0), 3),
         blocked_share=round(min(max(blocked, _MIN_SHARE), _MAX_SHARE), 3),
         bright_share=round(min(max(bright, _MIN_SHARE), _MAX_SHARE), 3),

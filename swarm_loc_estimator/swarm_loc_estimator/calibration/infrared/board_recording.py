@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.calibration.infrared.board import BoardCalibration, calibrate_board
+from swarm_loc_estimator.calibration.infrared.board import GAIN_SIGMA, BoardCalibration, calibrate_board
 from swarm_loc_estimator.calibration.infrared.board_fit import BoardReadings
 from swarm_loc_estimator.calibration.infrared.gains import exchanges_of
 from swarm_loc_estimator.calibration.recording import CalibrationError, Recording
@@ -23,7 +23,6 @@ MAX_RANGE = 0.3
 _BODIES = 2.0
 """A robot within so many radii of the line between two others may be in their way."""
 _TRUTH_GAP_NS = 200_000_000
-_GAIN_SIGMA = 0.05
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,7 @@ def with_board(swarm: Swarm, board: BoardRecording, done: BoardCalibration, path
         gains, factors = None, done.model.sensor_gains[place]
         if done.with_gains and np.any(factors != 1.0):
             ones = (1.0,) * board.platform.n
-            gains = IrGains(tuple(np.clip(factors, 0.05, 20.0).round(4).tolist()), ones, _GAIN_SIGMA)
+            gains = IrGains(tuple(np.clip(factors, 0.05, 20.0).round(4).tolist()), ones, GAIN_SIGMA)
         found = RobotIr(
             ir.id,
             done.model.platform,

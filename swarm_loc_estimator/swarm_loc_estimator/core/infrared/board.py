@@ -62,6 +62,7 @@ class IrModel(NamedTuple):
         saturation: A reading tells no more from here on [count].
         noise: Of every reading, one standard deviation [count].
         errors: How readings err.
+        stray: Noise besides, relative to the brightest reading of an exchange.
         scale: What covariances are multiplied by.
     """
 
@@ -74,6 +75,7 @@ class IrModel(NamedTuple):
     saturation: float
     noise: float
     errors: ReadingErrors
+    stray: float
     scale: float
 
 
@@ -102,6 +104,13 @@ class IrPlatform:
     )
     noise: float = number(1.0, "count", 0.0, 1e6, "standard deviation of every reading", above=True)
     relative_noise: float = number(0.0, "1", 0.0, 1.0, "noise besides, relative to the reading")
+    stray_noise: float = number(
+        0.0,
+        "1",
+        0.0,
+        1.0,
+        "noise besides, relative to the brightest reading: light by way of bodies and floor",
+    )
     curve_sigma: float = number(
         0.0, "1", 0.0, 1.0, "how far readings are off the curves, relative, the same every time"
     )
@@ -171,6 +180,7 @@ class IrPlatform:
             self.saturation,
             self.noise,
             errors,
+            self.stray_noise,
             self.covariance_scale,
         )
 

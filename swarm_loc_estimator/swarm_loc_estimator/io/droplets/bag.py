@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from swarm_loc_estimator.core.description.robot_ir import RobotIr
-from swarm_loc_estimator.core.description.swarm import Robot, Swarm
+from swarm_loc_estimator.core.description.swarm import RandomWalk, Robot, Swarm
 from swarm_loc_estimator.core.infrared.board import IrPlatform
 from swarm_loc_estimator.io.bags.writer import BagWriter
 from swarm_loc_estimator.io.droplets.fiducials import Fiducials, find_fiducials
@@ -30,6 +30,8 @@ METRES_PER_PIXEL = DIAMETER_M / 42.0
 """Robots that touch are 42 pixels apart in the recordings of 2016."""
 FIX_SIGMA = (0.001, 0.001, 0.05)
 """How well the camera knows the receiver: x, y [m], heading [rad]."""
+WALK = RandomWalk(position=5e-6, heading=2e-3)
+"""They stand for a minute or so, then turn and go some centimetres: on average over ten seconds as much."""
 _NS = 1_000_000_000
 
 
@@ -130,7 +132,14 @@ def _describe(
     path = str(Path(source).resolve()) if source.endswith((".yaml", ".yml")) else source
     return Swarm(
         tuple(
-            Robot(name_of(robot), ROBOT_TYPE, camera=None, stands=True, ir=RobotIr(robot, platform, path))
+            Robot(
+                name_of(robot),
+                ROBOT_TYPE,
+                camera=None,
+                stands=True,
+                random_walk=WALK,
+                ir=RobotIr(robot, platform, path),
+            )
             for robot in sorted(ids)
         )
     )

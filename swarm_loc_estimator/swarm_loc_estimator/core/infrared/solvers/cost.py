@@ -116,6 +116,29 @@ def new_scratch(modes: int, n: int, gains: bool) -> Scratch:
 
 
 @compiled
+def with_stray_light(model: IrModel, readings: FloatArray) -> IrModel:
+    """The platform with the noise that an exchange has whose readings (modes, n, n) are so bright."""
+    brightest, e = 0.0, model.errors
+    for reading in readings.flat:
+        if math.isfinite(reading):
+            brightest = max(brightest, reading)
+    noise = math.hypot(e.noise, model.stray * min(brightest, model.saturation))
+    return IrModel(
+        model.radius,
+        model.angles,
+        model.units,
+        model.sensor,
+        model.emitter,
+        model.amplitudes,
+        model.saturation,
+        noise,
+        ReadingErrors(noise, e.relative, e.lasting, e.blocked, e.bright),
+        model.stray,
+        model.scale,
+    )
+
+
+@compiled
 def cost_of(
     model: IrModel, pair: Pair, at: FloatArray, room: Scratch, gradient: FloatArray, hessian: FloatArray
 ) -> float:

@@ -24,6 +24,7 @@ from swarm_loc_estimator.core.infrared.solvers.cost import (
     Scratch,
     new_scratch,
     stabilized,
+    with_stray_light,
 )
 from swarm_loc_estimator.core.infrared.solvers.search import pose_covariance, search
 from swarm_loc_estimator.core.infrared.solvers.start_table import (
@@ -176,7 +177,9 @@ def _solve_all(
         pair = Pair(
             readings[k], room.stable, saturation[k], room.kinds, sensor, emitter, prior, nearest, farthest
         )
-        out.outcomes[k] = _solve_one(models, pair, room, out, k)
+        exact = with_stray_light(models.exact, readings[k])
+        soft = with_stray_light(models.blurred, readings[k])
+        out.outcomes[k] = _solve_one(Models(exact, soft, models.table), pair, room, out, k)
 
 
 @compiled
