@@ -28,6 +28,7 @@ from swarm_loc_estimator.io.bags.reader import BagReader
 from swarm_loc_estimator.io.messages.event_encoding import decode_events
 from swarm_loc_estimator.io.messages.typestore import typestore
 from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.se2 import wrap_angle
 from swarm_loc_vision.core.events.centroid_tracker import CentroidTracker
 from swarm_loc_vision.core.events.settings import LightSource, TrackerSettings
 from swarm_loc_vision.io.laser_file import load_laser
@@ -131,6 +132,19 @@ def test_two_robots_explore_a_hall(plan: str, seed: int) -> None:
     assert len(errors) > 10
     assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.3
     assert abs(mapper.graph.slip - [0.0, 0.03]).max() < 0.005
+
+
+def test_five_robots_whose_starts_are_hardly_known_all_find_their_places() -> None:
+    """The fifth is told to start 20 cm and 5 deg off; the nearest robot sees little of what it does."""
+    mapper = CooperativeMapper()
+    exploration = Exploration(floor_plan("corridor"), mapper, np.random.default_rng([4, 20, 5]))
+    for number in range(5):
+        exploration.join(PushBotNoise(slip=0.02 * (0.5 + 0.125 * number)))
+    exploration.run(35.0)
+    errors: FloatArray = np.array([one.online - one.truth for one in exploration.arrivals])
+    assert {one.robot for one in exploration.arrivals} == set(range(5))
+    assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.05
+    assert np.degrees(np.abs(wrap_angle(errors[:, 2]))).max() < 2.5
 
 
 def test_a_bag_gives_the_same_map_twice(tmp_path: Path) -> None:

@@ -21,7 +21,8 @@ _SOLVE_ALL_EVERY = 4
 """At every stop it is worse: a closed ring then gets half as precise again."""
 _RECENT = 8
 _START_SEARCH = Lattice(0.3, 0.05, math.radians(12.0), math.radians(1.5))
-_START_RADIUS, _START_AGAINST, _MIN_START_SCORE = 2.5, 12, 0.35
+_START_RADIUS, _START_AGAINST, _MIN_START_SCORE = 2.5, 48, 0.35
+"""A first scan has ten parts: against a dozen would be against those of the nearest robot alone."""
 _MAX_START_SIGMAS, _LEAST_START_SHIFT = 4.0, 0.02
 
 
