@@ -4,7 +4,8 @@ The swarm is a grid with about three neighbours in view of each robot (`sim.scen
 odometry at 20 Hz, cameras at 7.5 Hz, 150-300 ms late. Everybody gives all poses ten times a second and uses
 new measurements five times a second, as the live node does with a large swarm. Measured is CPU time of this
 process per simulated second, without reading messages; the optimum is gtsam's batch solution of all data that
-have arrived by the same moment. At the end a hundred robots are played into the live graph in real time.
+have arrived by the same moment. Swarms of several shapes are compared with the exact filter (`shapes.py`). At
+the end a hundred robots are played into the live graph in real time.
 """
 
 from __future__ import annotations
@@ -18,29 +19,33 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.peers import filterpy_ekf, gtsam_batch, gtsam_lag
+from bench.peers.shapes import ShapeRuns, measure_shape, show
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
-from bench.shared.simulated_run import errors_of, mean_nees, position_rmse, run_core
+from bench.shared.simulated_run import errors_of, mean_nees, position_rmse, run_core, ticks
 from swarm_loc_drivers.sim.recording.bag import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
+from swarm_loc_drivers.sim.scenarios.grid_shapes import Shape
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.live.run import play_live
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from swarm_loc_drivers.sim.common.record import SimulatedRun
 
 LIVE_ROBOTS = 100
-SIZES = (5, 20, 50, 100, 200, 300)
+SIZES = (5, 20, 50, 100, 200, 300, 500, 1000)
+SHAPE_SIZES = (300, 1000)
+SHAPE_DURATION_S = 120.0
+EXACT_S = 10.0
+"""Of the largest swarms the exact filter has only so much: its cost per second grows with their cube."""
+LARGEST_FOR_EXACT = 300
 LARGEST_FOR_BATCH = 50
 DURATION_S = 20.0
 PEER_ROBOT_SECONDS = 1500.0
 """Peers get the first part of a large swarm's run: their cost per second does not change with its length."""
 SETTLING_S = 3.0
 """Errors count from here on."""
-TICK_NS = 100_000_000
 FUSE_NS = 200_000_000
 
 
@@ -83,11 +88,6 @@ def measure_live(duration_s: float, seed: int) -> dict[str, float]:
     }
 
 
-def ticks(run: SimulatedRun) -> NDArray[np.int64]:
-    """When all poses are asked for (K,)."""
-    return np.arange(run.start_ns + TICK_NS, run.end_ns + 1, TICK_NS)
-
-
 def first_part(run: SimulatedRun, duration_s: float) -> SimulatedRun:
     """The run as if it had ended after `duration_s`."""
     end_ns = run.start_ns + round(duration_s * 1e9)
@@ -120,7 +120,7 @@ def draw(results: dict[int, dict[str, float]]) -> None:
     print(f"plot: {save_plot(figure, 'scaling')}")
 
 
-def report(results: dict[int, dict[str, float]], live: dict[str, float]) -> None:
+def report(results: dict[int, dict[str, float]], shapes: dict[str, float], live: dict[str, float]) -> None:
     """Print the tables, draw the plot and write the figures."""
     keys = {
         "cpu_s_per_s": "CPU s/s",
@@ -133,22 +133,30 @@ def report(results: dict[int, dict[str, float]], live: dict[str, float]) -> None
     }
     rows = [[robots, *(figures.get(key) for key in keys)] for robots, figures in results.items()]
     print(table(["robots", *keys.values()], rows))
-    print(f"\n{LIVE_ROBOTS} robots over DDS")
-    print(table(["messages lost", "estimator core", "pose age ms (95 %)"], [list(live.values())]))
-    draw(results)
+    if live:
+        print(f"\n{LIVE_ROBOTS} robots over DDS")
+        print(table(["messages lost", "estimator core", "pose age ms (95 %)"], [list(live.values())]))
+    if results:
+        draw(results)
     flat = {
         f"n{robots}.{key}": value for robots, figures in results.items() for key, value in figures.items()
     }
-    flat |= {f"live{LIVE_ROBOTS}.{key}": value for key, value in live.items()}
+    flat |= shapes | {f"live{LIVE_ROBOTS}.{key}": value for key, value in live.items()}
     print(f"figures: {write_figures('scaling', flat)}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--robots", type=int, nargs="+", default=SIZES, help="swarm sizes")
+    parser.add_argument("--robots", type=int, nargs="*", default=SIZES, help="swarm sizes")
     parser.add_argument("--duration", type=float, default=DURATION_S, help="simulated time [s]")
     parser.add_argument("--seed", type=int, default=1, help="of the simulation")
+    names = [shape.value for shape in Shape]
+    parser.add_argument("--shapes", nargs="*", choices=names, default=names, help="shapes of swarms")
+    parser.add_argument("--shape-robots", type=int, nargs="+", default=SHAPE_SIZES, help="their sizes")
+    parser.add_argument("--shape-duration", type=float, default=SHAPE_DURATION_S, help="simulated time [s]")
+    parser.add_argument("--shape-seeds", type=int, nargs="+", default=(1, 2, 3), help="of the simulation")
+    parser.add_argument("--no-live", action="store_true", help="leave the live graph out")
     options = parser.parse_args(arguments)
     settings = EstimatorSettings()
     warm_up = simulate_grid(GridSettings(robots=4, duration_s=2.0))
@@ -157,8 +165,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for robots in options.robots:
         print(f"{robots} robots ...", flush=True)
         results[robots] = measure(robots, options.duration, options.seed, settings)
-    print(f"{LIVE_ROBOTS} robots over DDS, in real time ...", flush=True)
-    report(results, measure_live(options.duration, options.seed))
+    shaped = {}
+    for name in options.shapes:
+        for robots in options.shape_robots:
+            print(f"{name}, {robots} robots ...", flush=True)
+            longest = options.shape_duration if robots <= LARGEST_FOR_EXACT else EXACT_S
+            runs = ShapeRuns(options.shape_duration, longest, tuple(options.shape_seeds))
+            shaped[Shape(name), robots] = measure_shape(Shape(name), robots, runs)
+    live = {}
+    if not options.no_live:
+        print(f"{LIVE_ROBOTS} robots over DDS, in real time ...", flush=True)
+        live = measure_live(options.duration, options.seed)
+    report(results, show(shaped), live)
 
 
 if __name__ == "__main__":

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.numerics.arrays import FloatArray
 
 
+_TICK_NS = 100_000_000
+
+
 @dataclass(frozen=True)
 class CoreResult:
     """What the estimator made of a run.
@@ -69,6 +72,11 @@ def inputs_between(run: SimulatedRun, tick_ns: NDArray[np.int64]) -> list[RawInp
         parts.append(RawInputs(now_ns, now_ns, chosen(odometry, first), chosen(seen, second)))
         begin = ends
     return parts
+
+
+def ticks(run: SimulatedRun) -> NDArray[np.int64]:
+    """When all poses are asked for (K,): ten times a second."""
+    return np.arange(run.start_ns + _TICK_NS, run.end_ns + 1, _TICK_NS)
 
 
 def errors_of(poses: FloatArray, run: SimulatedRun, stamp_ns: NDArray[np.int64]) -> FloatArray:

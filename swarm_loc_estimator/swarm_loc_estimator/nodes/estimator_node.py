@@ -145,6 +145,8 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
             f"ready: {len(self._swarm.robots)} robots and {len(self._swarm.landmarks)} landmarks"
             f" of '{self.chosen.swarm_file}'"
         )
+        if note := self._estimator.note:
+            self.get_logger().warning(note)
 
     def _on_tick(self) -> None:
         begin_s = time.perf_counter()

@@ -54,18 +54,24 @@ def compiled(function: Function) -> Function:
     return _compiled(function, fastmath=False)
 
 
+def inlined(function: Function) -> Function:
+    """The same for short functions of large tuples, written out where they are called: a call costs more."""
+    return _compiled(function, fastmath=False, forceinline=True)
+
+
 def compiled_sums(function: Function) -> Function:
     """The same for sums that may be taken in any order, which is several times faster for long ones."""
     return _compiled(function, fastmath={"reassoc", "contract"})
 
 
-def _compiled(function: Function, *, fastmath: bool | set[str]) -> Function:
+def _compiled(function: Function, *, fastmath: bool | set[str], forceinline: bool = False) -> Function:
     """Compile a function, with a cache of its module."""
     # one cache, whether a package is found by a link or not: numba has another one for every path
     source = Path(function.__code__.co_filename).resolve()
     function.__code__ = function.__code__.replace(co_filename=str(source))
     numba.config.CACHE_DIR = str(_cache_folder(source))  # type: ignore[attr-defined]
-    return cast("Function", numba.njit(cache=True, error_model="numpy", fastmath=fastmath)(function))
+    compiler = numba.njit(cache=True, error_model="numpy", fastmath=fastmath, forceinline=forceinline)
+    return cast("Function", compiler(function))
 
 
 def _mark(source: Path) -> Path:

@@ -62,6 +62,7 @@ def assert_same(a: Outcome, b: Outcome) -> None:
     lost_after=st.sampled_from([2, 12]),
     late_s=st.sampled_from([0.3, 1.0, 1.9]),
     lasting=st.sampled_from([0.0, 1.0]),
+    sparse=st.booleans(),
 )
 @example(  # a sighting within the horizon, the state closest to it beyond
     seed=163,
@@ -74,6 +75,20 @@ def assert_same(a: Outcome, b: Outcome) -> None:
     lost_after=2,
     late_s=1.9,
     lasting=0.0,
+    sparse=False,
+)
+@example(  # robots that start unknown, are gated and lost, in the sparse filter
+    seed=7,
+    robots=4,
+    content=POSE,
+    start_known=(True, False),
+    fusion_period_s=0.2,
+    state_period_s=0.0,
+    outliers=0.1,
+    lost_after=2,
+    late_s=1.0,
+    lasting=0.0,
+    sparse=True,
 )
 def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
     seed: int,
@@ -86,12 +101,16 @@ def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
     lost_after: int,
     late_s: float,
     lasting: float,
+    sparse: bool,
 ) -> None:
     rng = np.random.default_rng(seed)
     plan = Plan(robots, 3.5, 0.2, content=content, start_known=start_known, outliers=outliers, flips=0.1)
     world = simulate(replace(plan, lasting=lasting, survey=lasting), seed)
     chosen = EstimatorSettings(
-        fusion_period_s=fusion_period_s, state_period_s=state_period_s, lost_after=lost_after
+        fusion_period_s=fusion_period_s,
+        sparse_from=2 if sparse else 250,
+        state_period_s=state_period_s,
+        lost_after=lost_after,
     )
     events = [event for event in world.events if rng.uniform() < 0.9]
     silent = rng.integers(robots)  # for longer than its motion counts as known
@@ -282,9 +301,13 @@ def test_a_clock_that_wobbles_neither_resets_nor_breaks() -> None:
     assert estimator.drops == {"too_old": 1}
 
 
-def test_the_same_data_give_the_same_bytes() -> None:
-    world = simulate(Plan(3, 3.0, flips=0.1, content=POSE_TWO), 3)
-    a, b = (outcome(world, on_time(world), ticks(T0, T0 + 3 * SECOND)).estimate for _ in range(2))
+@pytest.mark.parametrize("sparse_from", [2, 250])
+def test_the_same_data_give_the_same_bytes(sparse_from: int) -> None:
+    world, chosen = (
+        simulate(Plan(3, 3.0, flips=0.1, content=POSE_TWO), 3),
+        EstimatorSettings(sparse_from=sparse_from),
+    )
+    a, b = (outcome(world, on_time(world), ticks(T0, T0 + 3 * SECOND), chosen).estimate for _ in range(2))
     assert a.poses.tobytes() == b.poses.tobytes()
     assert a.covariances.tobytes() == b.covariances.tobytes()
 

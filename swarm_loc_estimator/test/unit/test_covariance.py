@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.filter.covariance import DenseFilter, update_one
+from swarm_loc_estimator.core.filter.dense.covariance import DenseFilter, update_one
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.small_matrix import cholesky3, solve3
 

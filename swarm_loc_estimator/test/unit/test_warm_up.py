@@ -43,6 +43,7 @@ def compiled_late() -> list[str]:
         for settings in (EstimatorSettings(), EstimatorSettings(fusion_period_s=0.1)):
             run(BAGS / name, settings)
     run(BAGS / "eight_five_robots", EstimatorSettings(), late=True)
+    run(BAGS / "eight_five_robots", EstimatorSettings(sparse_from=2))
     run(BAGS / "eight_five_robots", EstimatorSettings(), moved_landmarks=True)
     return sorted(name for name, known in signatures().items() if known != before.get(name, 0))
 

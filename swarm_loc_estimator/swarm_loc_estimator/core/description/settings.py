@@ -30,6 +30,13 @@ class EstimatorSettings:
         1.0,
         "where a large swarm has many measurements in such a period, they are fused together; 0: never",
     )
+    sparse_from: int = number(
+        250,
+        "1",
+        2,
+        1_000_000,
+        "from so many robots on only covariances of neighbours are kept, unless robots are calibrated",
+    )
     state_period_s: float = number(
         0.0,
         "s",

@@ -76,6 +76,18 @@ class SwarmEstimator:
         self._check_clock(messages.end_ns)
         self.add(self.validate(messages))
 
+    @property
+    def note(self) -> str:
+        """What users should know of how the swarm is estimated, as a sentence; "" when there is nothing."""
+        count, largest = len(self.swarm.robots), self.settings.sparse_from
+        if count < largest or self._fusion.is_sparse:
+            return ""
+        why = "fusion_period_s is 0" if self.settings.fusion_period_s == 0.0 else "robots are calibrated"
+        return (
+            f"{count} robots are estimated with a full covariance, which grows with the cube of their number,"
+            f" because {why}; otherwise {largest} robots and more (sparse_from) would take a sparse one."
+        )
+
     def validate(self, messages: RawInputs) -> ValidInputs:
         """Turn messages into what can be used of them, and count the rest; nothing is taken in yet."""
         return self._validator.validate(messages)

@@ -12,9 +12,9 @@ from swarm_loc_estimator.core.description.estimated_parameters import ParameterT
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.core.estimation.aerial import PictureFusion, as_fixes, relieve_seen
-from swarm_loc_estimator.core.filter import sequential_update
 from swarm_loc_estimator.core.filter.batch_update import (
     assess_all,
+    body_columns_all,
     confirm_all,
     count_all_gated,
     evaluate_all,
@@ -22,11 +22,14 @@ from swarm_loc_estimator.core.filter.batch_update import (
 )
 from swarm_loc_estimator.core.filter.belief import correct
 from swarm_loc_estimator.core.filter.correlated_noise import record_constraint, record_pair
+from swarm_loc_estimator.core.filter.dense import sequential_update
+from swarm_loc_estimator.core.filter.dense.sequential_update import update_in_order
 from swarm_loc_estimator.core.filter.innovation import InnovationBatch, new_batch
 from swarm_loc_estimator.core.filter.integrity.divergence import WELL_CONFIRMED, LossLimits
 from swarm_loc_estimator.core.filter.integrity.surprises import is_elsewhere
+from swarm_loc_estimator.core.filter.joint_filter import JointFilter, Robots
 from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray, MeasurementColumns
-from swarm_loc_estimator.core.filter.sequential_update import update_in_order
+from swarm_loc_estimator.core.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.core.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.core.identification.assignment import AMBIGUOUS
 from swarm_loc_estimator.core.initialization.initializer import Initializer
@@ -73,6 +76,7 @@ class Fusion:
         self._limits = LossLimits(
             settings.lost_sigma, settings.lost_heading_sigma, settings.lost_after, settings.max_doubt
         )
+        self._sparse_from = settings.sparse_from
         self._together = settings.fusion_period_s > 0.0
         self._starts = {
             i: (
@@ -89,7 +93,14 @@ class Fusion:
 
     def new_state(self) -> SwarmState:
         """Nothing is known yet."""
-        return SwarmState(self._table, self._pairs)
+        joint: JointFilter | None = SparseFilter(self._table.filter_size) if self.is_sparse else None
+        return SwarmState(self._table, self._pairs, joint)
+
+    @property
+    def is_sparse(self) -> bool:
+        """Whether only covariances of neighbours are kept: in a large swarm without calibration."""
+        count, calibrated = self._table.column.shape[0], not np.any(self._table.column >= 0)
+        return self._together and count >= self._sparse_from and calibrated
 
     def with_starts(self, state: SwarmState, stamp_ns: int) -> SwarmState:
         """The state, together with those robots at their starts about whom there was no measurement yet.
@@ -169,11 +180,20 @@ class Fusion:
         self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
     ) -> None:
         """Fuse measurements that name their robots."""
-        many = measurements.size >= _MANY
-        if self._together and many and np.all(measurements["kind"] < Kind.SET_POSE):
-            self._fuse_together(state, measurements, verdicts, nis)
-        else:
-            self._fuse_in_order(state, measurements, verdicts, nis)
+        measured = measurements["kind"] < Kind.SET_POSE
+        if state.filter.sequential:
+            if self._together and measurements.size >= _MANY and measured.all():
+                self._fuse_together(state, measurements, verdicts, nis)
+            else:
+                self._fuse_in_order(state, measurements, verdicts, nis)
+            return
+        edges = [0, *(np.flatnonzero(np.diff(measured)) + 1).tolist(), measurements.size]
+        for begin, end in itertools.pairwise(edges):
+            part = slice(begin, end)
+            if measured[begin]:
+                self._fuse_together(state, measurements[part], verdicts[part], nis[part])
+            else:
+                self._fuse_in_order(state, measurements[part], verdicts[part], nis[part])
 
     def _fuse_image(
         self, state: SwarmState, image: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
@@ -234,7 +254,8 @@ class Fusion:
             good = ~(lost[measurements["observer"][rows]] | lost[measurements["target"][rows]])
             tied[rows[~good]] = False
             rows = rows[good]
-            verdicts[rows], nis[rows] = self._update(state, measurements[rows], chosen(batch, good))
+            if rows.size:
+                verdicts[rows], nis[rows] = self._update(state, measurements[rows], chosen(batch, good))
         for k in np.flatnonzero(~tied):
             verdicts[k] = self._note(state, measurements[k : k + 1])
 
@@ -258,6 +279,9 @@ class Fusion:
     ) -> tuple[NDArray[np.uint8], FloatArray]:
         """Hold measurements (m,) against one belief, use those that pass; return verdicts and their NIS."""
         fields, passed = MeasurementColumns.of(measurements), batch.passed
+        batch.across[:] = state.filter.relate_pairs(
+            body_columns_all(fields, state.arrays()), self._robots(state, int(measurements["stamp_ns"][-1]))
+        )
         evaluate_all(fields, state.arrays(), batch)
         systematic = (measurements["systematic_share"] > 0.0).any(axis=1)
         looks = (batch.distance, batch.whitened, batch.cause)
@@ -276,6 +300,15 @@ class Fusion:
             self._open(state, source, int(measurements["stamp_ns"][-1]))
         return np.where(passed, Verdict.USED, Verdict.GATED).astype(np.uint8), batch.nis
 
+    def _robots(self, state: SwarmState, stamp_ns: int) -> Robots:
+        """Where all robots are at an instant."""
+        return Robots(self._poses(state, stamp_ns)[:, :2], state.tracked.copy())
+
+    def _poses(self, state: SwarmState, stamp_ns: int) -> FloatArray:
+        """Poses (N, 3) of all robots in `map` at an instant."""
+        robots = np.arange(state.tracked.size)
+        return se2.compose(state.transform, self._tracks.at(robots, np.full(robots.size, stamp_ns)).pose)
+
     def _note(self, state: SwarmState, one: MeasurementArray) -> Verdict:
         """Keep a measurement (1,) as a constraint if it ties a waiting robot to something located."""
         if not self._initializer.note(state, one):
@@ -289,12 +322,11 @@ class Fusion:
         if source < robots and is_elsewhere(state.integrity, source):
             state.lose(source)
             return
-        poses = se2.compose(
-            state.transform, self._tracks.at(np.arange(robots), np.full(robots, stamp_ns)).pose
-        )
+        poses = self._poses(state, stamp_ns)
         state.contradicted_ns[source] = stamp_ns
         lately = np.sum(state.contradicted_ns > stamp_ns - _CONTRADICTED_WITHIN_NS)
-        if lately < _CONTRADICTED_DESCRIPTION or state.all_opened or robots > _MAX_ROBOTS_OPENED:
+        some = robots > _MAX_ROBOTS_OPENED or not state.filter.calibrates
+        if lately < _CONTRADICTED_DESCRIPTION or state.all_opened or some:
             state.open(source, poses[min(source, robots - 1)])
         else:
             state.open_all(poses)

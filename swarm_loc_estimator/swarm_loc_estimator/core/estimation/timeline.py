@@ -25,6 +25,8 @@ Step = Callable[[SwarmState, MeasurementArray, NDArray[np.uint8], FloatArray], N
 
 _CHECKPOINTS = 40
 _FORGOTTEN_AT_ONCE = 4
+_MIN_LAST_SHARE = 0.25
+"""A newest period with fewer measurements than this share of those of the one before is fused with it."""
 _BEFORE_ALL = np.iinfo(np.int64).min
 
 
@@ -60,6 +62,7 @@ class Timeline:
         """Drop all measurements and go on from `state`."""
         self.state = state
         self._head_key = _BEFORE_ALL
+        self._joined_key: int | None = None
         self._checkpoints = [_Checkpoint(_BEFORE_ALL, state.copy())]
         self._new: list[MeasurementArray] = []
         self._withdrawn: list[MeasurementArray] = []
@@ -173,7 +176,13 @@ class Timeline:
         return rows
 
     def _compute_from(self, key: int) -> None:
-        """Go back to before step `key`, if it is not ahead, and do all steps that are due."""
+        """Go back to before step `key`, if it is not ahead, and do all steps that are due.
+
+        What little has come of the newest period is fused with the one before, until there is more: nearly as
+        good, and two thirds of the work.
+        """
+        if self._joined_key is not None:
+            key, self._joined_key = min(key, self._joined_key), None
         if key <= self._head_key:
             while self._checkpoints[-1].key >= key:
                 self._checkpoints.pop()
@@ -182,10 +191,13 @@ class Timeline:
         buffer, begin = self._buffer, self._count_until(self._head_key)
         while begin < len(buffer):
             end = self._end_of_steps(begin)
+            if self._is_joined(begin, end):
+                self._joined_key, end = self._key(int(buffer.stamp_ns[begin])), len(buffer)
             rows = slice(begin, end)
             self._step(self.state, buffer.measurements[rows], buffer.verdicts[rows], buffer.nis[rows])
             self._head_key = self._key(int(buffer.stamp_ns[end - 1]))
-            if self._head_key - max(self._checkpoints[-1].key, -(2**62)) >= self._spacing_ns:
+            spaced = self._head_key - max(self._checkpoints[-1].key, -(2**62)) >= self._spacing_ns
+            if spaced and self._joined_key is None:
                 self._checkpoints.append(_Checkpoint(self._head_key, self.state.copy()))
             begin = end
 
@@ -194,6 +206,13 @@ class Timeline:
         stamps_ns, length_ns = self._buffer.stamp_ns, self._fusion_period_ns or self._spacing_ns
         next_ns = (int(stamps_ns[begin]) // length_ns + 1) * length_ns
         return stamps_ns.size if stamps_ns[-1] < next_ns else int(stamps_ns.searchsorted(next_ns))
+
+    def _is_joined(self, begin: int, end: int) -> bool:
+        """Whether all measurements behind those of a step are few, and of the period that follows."""
+        stamp_ns, period_ns = self._buffer.stamp_ns, self._fusion_period_ns
+        if not period_ns or not end < len(self._buffer) < end + _MIN_LAST_SHARE * (end - begin):
+            return False
+        return self._key(int(stamp_ns[-1])) == self._key(int(stamp_ns[end - 1])) + period_ns
 
     def _forget_before(self, key: int) -> None:
         """Keep one checkpoint before step `key` and only the measurements after it."""

@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from swarm_loc_estimator.core.filter.belief import BeliefArrays, to_map
-from swarm_loc_estimator.core.filter.innovation import InnovationBatch, evaluate, relative_motion
+from swarm_loc_estimator.core.filter.innovation import (
+    InnovationBatch,
+    body_columns,
+    evaluate,
+    relative_motion,
+)
 from swarm_loc_estimator.core.filter.integrity.divergence import (
     LossLimits,
     confirm,
@@ -71,6 +76,15 @@ def predict_all(
         if measurements.landmark[k] > 0:
             assign(batch.pose[k, 1], belief.landmark[measurements.landmark[k] - 1])
         relative_motion(measurements, k, tracks, belief, batch.pose[k], batch.motion[k])
+
+
+@compiled
+def body_columns_all(measurements: MeasurementColumns, belief: BeliefArrays) -> IntArray:
+    """The first columns (m, 2) of the observers and targets of measurements (m,); -1: has none."""
+    columns = np.empty((measurements.stamp_ns.size, 2), dtype=np.int64)
+    for k in range(columns.shape[0]):
+        columns[k, 0], columns[k, 1] = body_columns(measurements, k, belief)
+    return columns
 
 
 @compiled

@@ -8,7 +8,7 @@ import numpy as np
 
 from swarm_loc_estimator.core.description.estimated_parameters import PARAMETERS, ParameterTable
 from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import compiled, inlined
 from swarm_loc_estimator.numerics.se2_scalar import composed, moved_by_twist, wrap
 
 NEVER_NS = np.iinfo(np.int64).min
@@ -60,10 +60,11 @@ class IntegrityArrays(NamedTuple):
 
 
 class BeliefArrays(NamedTuple):
-    """The arrays of a `SwarmState`, as compiled code reads and writes them; see there."""
+    """The arrays of a `SwarmState`, as compiled code reads and writes them; see there and `JointFilter`."""
 
     transform: FloatArray
     covariance: FloatArray
+    marginal: FloatArray
     parameter: FloatArray
     landmark: FloatArray
     table: ParameterTable
@@ -78,7 +79,17 @@ class BeliefArrays(NamedTuple):
     pair_history: FloatArray
 
 
-@compiled
+@inlined
+def body_covariance(belief: BeliefArrays, column: int) -> FloatArray:
+    """A view (3, 3) of the covariance of the body whose first column is given."""
+    if belief.covariance.shape[0] > 0:
+        whole: FloatArray = belief.covariance[column : column + 3, column : column + 3]
+        return whole
+    own: FloatArray = belief.marginal[column // 3][0:3, 0:3]
+    return own
+
+
+@inlined
 def to_map(belief: BeliefArrays, robot: int, pose: FloatArray) -> None:
     """Change a pose (3,) on the robot's track to its pose in `map`, in place."""
     t = belief.transform[robot]

@@ -23,7 +23,7 @@ import numpy as np
 from swarm_loc_estimator.core.filter.belief import BeliefArrays
 from swarm_loc_estimator.core.filter.measurement_model import MeasurementColumns
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import compiled, inlined
 from swarm_loc_estimator.numerics.se2_scalar import wrap
 
 _FORGOTTEN = 0.5
@@ -34,7 +34,7 @@ _VALUE, _WEIGHT, _VARIANCE = 0, 1, 2
 """Rows of what is remembered of a pair: value measured, weights a, variances p."""
 
 
-@compiled
+@inlined
 def inflate_noise(
     measurements: MeasurementColumns,
     k: int,
@@ -100,7 +100,7 @@ def record_constraint(measurements: MeasurementColumns, k: int, belief: BeliefAr
         _keep(measurements, k, belief, place, np.ones(3), variance)
 
 
-@compiled
+@inlined
 def _place(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int:
     """Where the pair of measurement k is remembered or is to be, in place of the oldest; -1: needs not."""
     places, best = belief.pair_robot.shape[1], 0

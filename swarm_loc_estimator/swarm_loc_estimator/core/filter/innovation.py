@@ -8,10 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.core.description.estimated_parameters import CAMERA_SCALE, CAMERA_YAW
-from swarm_loc_estimator.core.filter.belief import BeliefArrays
+from swarm_loc_estimator.core.filter.belief import BeliefArrays, body_covariance
 from swarm_loc_estimator.core.filter.correlated_noise import inflate_noise
 from swarm_loc_estimator.core.filter.gating import position_distance, soften_heading, squared_distance
-from swarm_loc_estimator.core.filter.innovation_covariance import add_uncertainty
 from swarm_loc_estimator.core.filter.integrity.hidden_noise import add_hidden_noise, stamp_variance
 from swarm_loc_estimator.core.filter.integrity.surprises import (
     cause_of,
@@ -21,7 +20,7 @@ from swarm_loc_estimator.core.filter.integrity.surprises import (
 from swarm_loc_estimator.core.filter.measurement_model import MeasurementColumns, innovation, predict_one
 from swarm_loc_estimator.core.odometry.preintegration import TrackArrays, rate_at
 from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import compiled, inlined
 from swarm_loc_estimator.numerics.small_matrix import assign, assign_matrix
 
 DEPENDS_ON = 8
@@ -34,6 +33,7 @@ class InnovationBatch(NamedTuple):
     Attributes:
         pose: (m, 2, 3) observers and targets in `map` at the stamps, or by what a landmark is moved.
         motion: (m, 3) how fast xi_target - xi_observer changes by driving [1/s], see `relative_motion`.
+        across: (m, 3, 3) covariance of the observer's error with the target's.
         columns: (m, DEPENDS_ON) what each depends on.
         jacobian: (m, 3, DEPENDS_ON) of the innovation.
         innovation: (m, 3) measured minus predicted.
@@ -48,6 +48,7 @@ class InnovationBatch(NamedTuple):
 
     pose: FloatArray
     motion: FloatArray
+    across: FloatArray
     columns: IntArray
     jacobian: FloatArray
     innovation: FloatArray
@@ -66,6 +67,7 @@ def new_batch(count: int) -> InnovationBatch:
     return InnovationBatch(
         np.zeros((count, 2, 3)),
         np.zeros((count, 3)),
+        np.zeros((count, 3, 3)),
         np.zeros((count, DEPENDS_ON), dtype=np.int64),
         np.zeros((count, 3, DEPENDS_ON)),
         np.zeros((count, 3)),
@@ -89,12 +91,13 @@ def evaluate(
         measurements: (m,).
         k: Which one.
         belief: Not changed.
-        batch: Its `pose` and `motion` are read, all others written.
+        batch: Its `pose` and `motion` are read, all others written; `across` is read, too, unless the whole
+            covariance is at hand.
         row: Where in the batch.
     """
     columns, jacobian, difference = batch.columns[row], batch.jacobian[row], batch.innovation[row]
     pose, motion, noise, variances = batch.pose[row], batch.motion[row], batch.noise[row], batch.variance[row]
-    bodies = _body_columns(measurements, k, belief)
+    bodies = body_columns(measurements, k, belief)
     camera, camera_columns = _camera(belief, measurements.observer[k])
     predicted, chain = np.empty(3), np.empty((3, 5))
     predict_one(measurements, k, pose[0], pose[1], camera, predicted, chain)
@@ -106,7 +109,9 @@ def evaluate(
     if of_stamp > 0.0:
         _add_stamp_noise(chain, motion, of_stamp, noise)
     assign_matrix(s, noise)
-    add_uncertainty(belief.covariance, bodies, camera_columns, chain, s)
+    if belief.covariance.shape[0] > 0:
+        _read_across(belief.covariance, bodies, batch.across[row])
+    _add_uncertainty(belief, bodies, camera_columns, chain, batch.across[row], s)
     for i in range(3):
         variances[i] = s[i, i] - noise[i, i]
     innovation(measurements, k, measurements.value[k], predicted, difference)
@@ -171,7 +176,7 @@ def relative_motion(
             motion[2] += sign * rate[2]
 
 
-@compiled
+@inlined
 def _camera(belief: BeliefArrays, observer: int) -> tuple[FloatArray, IntArray]:
     """Yaw and scale (2,) of an observer's camera, and their columns (2,); -1: has none."""
     camera, columns = np.zeros(2), np.full(2, -1)
@@ -218,11 +223,78 @@ def _add_stamp_noise(chain: FloatArray, motion: FloatArray, variance: float, noi
             noise[i, j] += variance * change[i] * change[j]
 
 
-@compiled
-def _body_columns(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> tuple[int, int]:
+@inlined
+def body_columns(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> tuple[int, int]:
     """The first of the three columns of the observer and of the target of measurement k; -1: has none."""
     observer, target = measurements.observer[k], measurements.target[k]
     first = 3 * target if target >= 0 else -1
     if measurements.landmark[k] > 0:
         first = belief.table.survey_column[measurements.landmark[k] - 1]
     return (3 * observer if observer >= 0 else -1), first
+
+
+@inlined
+def _read_across(p: FloatArray, bodies: tuple[int, int], out: FloatArray) -> None:
+    """Write the covariance (3, 3) of the observer's error with the target's; of nobody it does not matter."""
+    o, t = max(bodies[0], 0), max(bodies[1], 0)
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = p[o + i, t + j]
+
+
+@inlined
+def _add_uncertainty(
+    belief: BeliefArrays,
+    bodies: tuple[int, int],
+    camera: IntArray,
+    chain: FloatArray,
+    across: FloatArray,
+    s: FloatArray,
+) -> None:
+    """Add H P H^T (3, 3), eq. (13) of the e-puck paper, where H is `chain` (3, 5) by xi_target - xi_observer.
+
+    The difference is taken first: a third of the work.
+
+    Args:
+        belief: Not changed.
+        bodies: First column of the observer and of the target, or -1.
+        camera: (2,) columns of its parameters, or -1.
+        chain: (3, 5).
+        across: (3, 3) covariance of the observer's error with the target's.
+        s: (3, 3) added to.
+    """
+    p, o, t = belief.covariance, max(bodies[0], 0), max(bodies[1], 0)
+    of_o, of_t = body_covariance(belief, o), body_covariance(belief, t)
+    of_observer, of_target = 1.0 if bodies[0] >= 0 else 0.0, 1.0 if bodies[1] >= 0 else 0.0
+    difference, half = np.empty((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            both = of_target * of_observer * (across[j, i] + across[i, j])
+            difference[i, j] = of_target * of_t[i, j] + of_observer * of_o[i, j] - both
+    _turned(chain, difference, half)
+    for i in range(3):
+        for j in range(3):
+            for a in range(3):
+                s[i, j] += half[i, a] * chain[j, a]
+    for k in range(2):
+        if camera[k] >= 0:
+            for a in range(3):
+                of_side = of_target * p[t + a, camera[k]] - of_observer * p[o + a, camera[k]]
+                difference[a, 0] = of_side
+            for i in range(3):
+                beside = chain[i, 0] * difference[0, 0] + chain[i, 1] * difference[1, 0]
+                beside += chain[i, 2] * difference[2, 0]
+                for other in range(2):  # its own variance, and its covariance with the other parameter
+                    if camera[other] >= 0:
+                        beside += 0.5 * chain[i, 3 + other] * p[camera[other], camera[k]]
+                for j in range(3):
+                    s[i, j] += beside * chain[j, 3 + k]
+                    s[j, i] += beside * chain[j, 3 + k]
+
+
+@compiled
+def _turned(chain: FloatArray, matrix: FloatArray, out: FloatArray) -> None:
+    """Write the product of the first three columns of `chain` and a matrix (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = chain[i, 0] * matrix[0, j] + chain[i, 1] * matrix[1, j] + chain[i, 2] * matrix[2, j]

@@ -19,12 +19,12 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.core.description.estimated_parameters import DRIVES, TURN_BIAS
-from swarm_loc_estimator.core.filter.belief import BeliefArrays
+from swarm_loc_estimator.core.filter.belief import BeliefArrays, body_covariance
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 from swarm_loc_estimator.numerics.jit import compiled
 from swarm_loc_estimator.numerics.se2_scalar import adjoint_of, carry, moved_by_twist
-from swarm_loc_estimator.numerics.small_matrix import assign, assign_matrix, cholesky3
+from swarm_loc_estimator.numerics.small_matrix import add_scaled, assign, assign_matrix, cholesky3
 
 
 class _Drift(NamedTuple):
@@ -48,16 +48,14 @@ class _Drift(NamedTuple):
 @compiled
 def predict(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
     """Predict a robot, in place, to an instant."""
-    added, first = np.empty((3, 3)), 3 * robot
+    added = np.empty((3, 3))
     if not _new_noise(belief, robot, to.covariance, added):
         return
     if _has_drives(belief, robot):
         drift = _new_drift(belief, robot, to)
         _move(drift.twist, belief.transform[robot])
         _drive(belief, robot, drift)
-    for i in range(3):
-        for j in range(3):
-            belief.covariance[first + i, first + j] += added[i, j]
+    add_scaled(body_covariance(belief, 3 * robot), added, 1.0)
     assign_matrix(belief.preintegrated_covariance[robot], to.covariance)
     assign_matrix(belief.preintegrated_jacobian[robot], to.jacobian)
     belief.predicted_to_ns[robot] = max(to.stamp_ns, belief.predicted_to_ns[robot])
@@ -68,9 +66,9 @@ def write_predicted(
     belief: BeliefArrays, robot: int, to: Preintegrated, transform: FloatArray, covariance: FloatArray
 ) -> None:
     """Write T (3,) and the covariance (3, 3) of its error where `predict` would take them; change nothing."""
-    added, first = np.empty((3, 3)), 3 * robot
+    added = np.empty((3, 3))
     assign(transform, belief.transform[robot])
-    assign_matrix(covariance, belief.covariance[first : first + 3, first : first + 3])
+    assign_matrix(covariance, body_covariance(belief, 3 * robot))
     if not _new_noise(belief, robot, to.covariance, added):
         return
     if _has_drives(belief, robot):

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.description.estimated_parameters import PARAMETERS, ParameterTable
 from swarm_loc_estimator.core.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
-from swarm_loc_estimator.core.filter.covariance import DenseFilter
-from swarm_loc_estimator.core.filter.integrity.hidden_noise import doubt_noise
+from swarm_loc_estimator.core.filter.dense.covariance import DenseFilter
+from swarm_loc_estimator.core.filter.integrity.hidden_noise import MAX_UNITS, doubt_noise
 from swarm_loc_estimator.core.filter.integrity.surprises import new_integrity
+from swarm_loc_estimator.core.filter.joint_filter import JointFilter
 from swarm_loc_estimator.core.identification.memory import IdentityMemory
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
@@ -49,6 +50,7 @@ class SwarmState:
     Args:
         table: Which parameters are estimated besides the poses.
         pairs: Of how many others each robot remembers what it has measured.
+        joint: A filter of the table's size in which nothing is known; a dense one if not given.
 
     Attributes:
         transform: (N, 3) T, from `map` to the frame of the robot's odometry track.
@@ -72,14 +74,14 @@ class SwarmState:
         images: What is remembered of aerial images.
     """
 
-    def __init__(self, table: ParameterTable, pairs: int = 0) -> None:
+    def __init__(self, table: ParameterTable, pairs: int = 0, joint: JointFilter | None = None) -> None:
         robots = table.column.shape[0]
         self._table = table
         self.transform: FloatArray = np.zeros((robots, 3))
         self.parameter: FloatArray = np.zeros((robots, PARAMETERS))
         landmarks = table.survey_column.size
         self.landmark: FloatArray = np.zeros((landmarks, 3))
-        self.filter = DenseFilter(table.filter_size)
+        self.filter: JointFilter = DenseFilter(table.filter_size) if joint is None else joint
         estimated = table.column >= 0
         self.filter.place(table.column[estimated], np.diag(table.sigma[estimated] ** 2))
         for first, survey in zip(table.survey_column, table.survey, strict=True):
@@ -115,6 +117,7 @@ class SwarmState:
         return BeliefArrays(
             self.transform,
             self.filter.covariance,
+            self.filter.marginal,
             self.parameter,
             self.landmark,
             self._table,
@@ -164,6 +167,8 @@ class SwarmState:
     def open(self, source: int, pose: FloatArray) -> None:
         """Estimate what a contradicted robot or landmark was described by, or estimate it anew.
 
+        Where no parameters of robots can be estimated, what the robot measures counts with more noise.
+
         Args:
             source: The robot, or N plus the landmark.
             pose: (3,) of the robot in `map`, which becomes less certain, too.
@@ -179,7 +184,11 @@ class SwarmState:
                 self.landmark_column(source - robots) + np.arange(3), self._table.survey[source - robots]
             )
             return
-        self._use_table(self._table.with_robot(source))
+        if self.filter.calibrates:
+            self._use_table(self._table.with_robot(source))
+        else:
+            units = self.integrity.hidden_noise[source]
+            self.integrity.hidden_noise[source] = min(units + 1.0, MAX_UNITS)
         estimated = np.flatnonzero(self._table.column[source] >= 0)
         sigma = self._table.sigma[source, estimated]
         self.filter.add(self._table.column[source, estimated], np.diag(sigma**2))
@@ -234,20 +243,18 @@ class SwarmState:
         """Give the pose this covariance (3, 3); what was learned of the robot's sensors stays."""
         self.filter.place(robot_columns(np.array([robot]))[0], covariance)
         columns = self._table.column[robot, self._table.column[robot] >= 0]
-        self.filter.place(columns, np.diag(np.diag(self.filter.covariance)[columns]))
+        self.filter.place(columns, np.diag(np.diag(self.filter.block(columns))))
 
     def parameter_sigma(self, robot: int) -> FloatArray:
         """Standard deviations (PARAMETERS,) of a robot's parameters; zero of those not estimated."""
         column = self._table.column[robot]
-        variance = np.where(column >= 0, np.diag(self.filter.covariance)[column], 0.0)
-        sigma: FloatArray = np.sqrt(variance)
+        sigma, estimated = np.zeros(column.size), column >= 0
+        sigma[estimated] = np.sqrt(np.diag(self.filter.block(column[estimated])))
         return sigma
 
     def landmark_covariance(self, landmark: int) -> FloatArray:
         """Covariance (3, 3) of the right-invariant error of a landmark that is estimated."""
-        own = self.landmark_column(landmark) + np.arange(3)
-        covariance: FloatArray = self.filter.covariance[np.ix_(own, own)]
-        return covariance
+        return self.filter.block(self.landmark_column(landmark) + np.arange(3))
 
     def landmark_column(self, landmark: int) -> int:
         """First filter column of the error of a landmark that is estimated."""

@@ -16,14 +16,14 @@ from swarm_loc_estimator.core.description.swarm import SensorModel
 from swarm_loc_estimator.core.filter.belief import BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.core.filter.measurement_model import POLAR, MeasurementColumns
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import compiled, inlined
 
 _POSITION_SIGMA, _BEARING_SIGMA, _HEADING_SIGMA, _STAMP_SIGMA = 0.004, 0.01, 0.03, 0.03
 """One unit of it [m], [rad], [rad], [s]."""
 _DOUBTED_UNITS, MAX_UNITS = 2.0, 5.0
 
 
-@compiled
+@inlined
 def stamp_variance(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> float:
     """How unsure the stamp of measurement k is, as described and as found out [s^2]."""
     variance: float = measurements.stamp_variance[k]
@@ -33,7 +33,7 @@ def stamp_variance(measurements: MeasurementColumns, k: int, belief: BeliefArray
     return variance
 
 
-@compiled
+@inlined
 def add_hidden_noise(
     measurements: MeasurementColumns, k: int, belief: BeliefArrays, noise: FloatArray
 ) -> None:

@@ -20,7 +20,7 @@ from swarm_loc_estimator.core.filter.belief import NEVER_NS, BeliefArrays, Integ
 from swarm_loc_estimator.core.filter.integrity.hidden_noise import raise_hidden_noise
 from swarm_loc_estimator.core.filter.measurement_model import POLAR, MeasurementColumns
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import compiled, inlined
 
 _ASIDE, _MAX_EVIDENCE = 10.0, 15.0
 """Evidence from which on a pair is set aside, and the most that is counted."""
@@ -161,7 +161,7 @@ def pairs_set_aside(state: IntegrityArrays, now_ns: int) -> list[tuple[int, int]
     return [(int(observer), int(state.source[observer, place])) for observer, place in np.argwhere(aside)]
 
 
-@compiled
+@inlined
 def is_set_aside(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> bool:
     """Whether the pair of measurement k has disagreed so often that it does not count."""
     observer, place = measurements.observer[k], _find(measurements, k, belief)
@@ -282,7 +282,7 @@ def _forget_trend(state: IntegrityArrays, observer: int, place: int) -> None:
     state.squares[observer, place], state.looks[observer, place] = 0.0, 0
 
 
-@compiled
+@inlined
 def _find(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int:
     """Where the pair of measurement k is remembered; -1: nowhere, or it is no pair."""
     observer, source = measurements.observer[k], source_of(measurements, k, belief)
@@ -309,7 +309,7 @@ def _new_place(state: IntegrityArrays, observer: int, source: int) -> int:
     return oldest
 
 
-@compiled
+@inlined
 def source_of(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int:
     """What measurement k is of: a robot, N + l for a landmark, or -1."""
     landmark: int = measurements.landmark[k] - 1
@@ -317,7 +317,7 @@ def source_of(measurements: MeasurementColumns, k: int, belief: BeliefArrays) ->
     return belief.tracked.size + landmark if landmark >= 0 else target
 
 
-@compiled
+@inlined
 def noise_of_frequent_looks(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> float:
     """By what factor the noise of measurement k counts more, so soon after another one of its pair."""
     observer, place = measurements.observer[k], _find(measurements, k, belief)

@@ -1,7 +1,6 @@
 """The full covariance of the joint state, and its updates.
 
-The filter knows columns and Jacobians, not robots or sensors. The mean lives outside: an update gives
-the correction, which its owner applies on the manifold.
+See `joint_filter.py` for what a filter is.
 """
 
 from __future__ import annotations
@@ -9,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import lapack
 
+from swarm_loc_estimator.core.filter.joint_filter import Robots
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 from swarm_loc_estimator.numerics.jit import compiled
 from swarm_loc_estimator.numerics.small_matrix import assign_matrix, cholesky3, solve3
@@ -21,13 +21,17 @@ class DenseFilter:
         size: Number of columns; each starts with unit variance, independent.
     """
 
+    calibrates = True
+    sequential = True
+
     def __init__(self, size: int) -> None:
         self.covariance: FloatArray = np.eye(size)
+        self.marginal: FloatArray = np.zeros((0, 3, 3))
 
     def copy(self) -> DenseFilter:
         """An independent copy."""
         other = DenseFilter.__new__(DenseFilter)
-        other.covariance = self.covariance.copy()
+        other.covariance, other.marginal = self.covariance.copy(), self.marginal
         return other
 
     def place(self, columns: IntArray, covariance: FloatArray) -> None:
@@ -54,6 +58,17 @@ class DenseFilter:
         self.covariance[columns, :] += common
         self.covariance[:, columns] += common.T
         self.covariance[np.ix_(columns, columns)] += 0.5 * (added + added.T)
+
+    def block(self, columns: IntArray) -> FloatArray:
+        """Covariance (k, k) of columns (k,)."""
+        covariance: FloatArray = self.covariance[np.ix_(columns, columns)]
+        return covariance
+
+    def relate_pairs(self, columns: IntArray, _robots: Robots) -> FloatArray:
+        """Cross-covariances (m, 3, 3) of pairs of bodies by their first columns (m, 2); -1: there is none."""
+        rows = np.maximum(columns, 0)[:, :, None] + np.arange(3)
+        across: FloatArray = self.covariance[rows[:, 0, :, None], rows[:, 1, None, :]]
+        return across
 
     def update(
         self, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.filter.belief import BeliefArrays, correct, to_map
 from swarm_loc_estimator.core.filter.correlated_noise import record_pair
-from swarm_loc_estimator.core.filter.covariance import update_one
+from swarm_loc_estimator.core.filter.dense.covariance import update_one
 from swarm_loc_estimator.core.filter.innovation import evaluate, new_batch, relative_motion
 from swarm_loc_estimator.core.filter.integrity.divergence import (
     LossLimits,

@@ -1,0 +1,73 @@
+"""Large swarms of several shapes: what the estimator costs, and how near it comes to the exact filter.
+
+The same data go through the estimator as it is and through the exact dense filter, whatever the size. Errors
+of the second half of a run count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bench.shared.common import table
+from bench.shared.simulated_run import errors_of, mean_nees, position_rmse, run_core, ticks
+from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
+from swarm_loc_drivers.sim.scenarios.grid_shapes import Shape
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+
+_NEVER = 1_000_000
+_FUSE_NS = 200_000_000
+
+
+@dataclass(frozen=True)
+class ShapeRuns:
+    """What to run.
+
+    Attributes:
+        duration_s: Of a run [s].
+        exact_s: The exact filter has so much of it at most [s], and is compared there.
+        seeds: One run each.
+    """
+
+    duration_s: float
+    exact_s: float
+    seeds: tuple[int, ...]
+
+
+def measure_shape(shape: Shape, robots: int, runs: ShapeRuns) -> dict[str, float]:
+    """CPU time, ratio of RMSE to the exact filter's, NEES: means over the seeds."""
+    figures = [
+        _measure(GridSettings(robots, seed, runs.duration_s, shape), runs.exact_s) for seed in runs.seeds
+    ]
+    return {name: float(np.mean([one[name] for one in figures])) for name in figures[0]}
+
+
+def _measure(grid: GridSettings, exact_s: float) -> dict[str, float]:
+    run = simulate_grid(grid)
+    at_ns = ticks(run)
+    core = run_core(run, at_ns, EstimatorSettings(), _FUSE_NS)
+    errors, counted = errors_of(core.poses, run, at_ns), np.arange(at_ns.size) >= at_ns.size // 2
+    figures = {
+        "cpu_s_per_s": core.cpu_s / run.duration_s,
+        "position_rmse_mm": 1e3 * position_rmse(errors[counted]),
+        "nees": mean_nees(errors[counted], core.covariances[counted]),
+    }
+    if exact_s < grid.duration_s:
+        run = simulate_grid(replace(grid, duration_s=exact_s))
+        at_ns = ticks(run)
+        core = run_core(run, at_ns, EstimatorSettings(), _FUSE_NS)
+        errors, counted = errors_of(core.poses, run, at_ns), np.arange(at_ns.size) >= at_ns.size // 2
+    exact = run_core(run, at_ns, EstimatorSettings(sparse_from=_NEVER), _FUSE_NS)
+    reference = errors_of(exact.poses, run, at_ns)[counted]
+    figures["position_rmse_ratio_to_exact"] = position_rmse(errors[counted]) / position_rmse(reference)
+    figures["exact_nees"] = mean_nees(reference, exact.covariances[counted])
+    figures["exact_cpu_s_per_s"] = exact.cpu_s / run.duration_s
+    return figures
+
+
+def show(results: dict[tuple[Shape, int], dict[str, float]]) -> dict[str, float]:
+    """Print a table; return the figures by name."""
+    names = list(next(iter(results.values()))) if results else []
+    print(table(["shape", "robots", *names], [[s.value, n, *f.values()] for (s, n), f in results.items()]))
+    return {f"{s.value}.n{n}.{name}": value for (s, n), f in results.items() for name, value in f.items()}

@@ -1,0 +1,1 @@
+"""The dense filter: one full covariance matrix."""

@@ -1,0 +1,79 @@
+"""What the estimator asks of a filter: a joint covariance of errors, of which two implementations exist.
+
+A filter knows columns and Jacobians, not robots or sensors. The mean lives outside: an update gives the
+correction, which its owner applies on the manifold. Columns 3i..3i+2 are the error of body i, a twist; single
+columns of parameters are behind those of the robots.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
+
+
+class Robots(NamedTuple):
+    """Where robots are, so that a filter knows who is near whom.
+
+    Attributes:
+        places: (N, 2) [m] in `map`.
+        active: (N,) whether each is part of the estimate; what is known of others is forgotten.
+    """
+
+    places: FloatArray
+    active: BoolArray
+
+
+class JointFilter(Protocol):
+    """The covariance of the errors of all bodies and parameters.
+
+    Attributes:
+        covariance: (n, n) of all columns; (0, 0) where only parts of it are kept.
+        marginal: (bodies, 3, 3) of each body's error; (0, 3, 3) where `covariance` has it. Either is written
+            to by predictions.
+        calibrates: Whether it may have columns of parameters.
+        sequential: Whether measurements may also be used one by one, by `dense/sequential_update.py`.
+    """
+
+    covariance: FloatArray
+    marginal: FloatArray
+    calibrates: bool
+    sequential: bool
+
+    def copy(self) -> JointFilter:
+        """An independent copy."""
+
+    def place(self, columns: IntArray, covariance: FloatArray) -> None:
+        """Give the columns (k,) this covariance (k, k), independent of the rest, whatever was known."""
+
+    def add(self, columns: IntArray, covariance: FloatArray) -> None:
+        """Add a covariance (k, k) to that of columns (k,): their errors are larger than was known."""
+
+    def grow(self, count: int) -> None:
+        """Append columns without error."""
+
+    def relate(self, columns: IntArray, others: IntArray, mapping: FloatArray) -> None:
+        """Add the errors of other columns (m,), mapped by (k, m), to those of columns (k,) just placed."""
+
+    def block(self, columns: IntArray) -> FloatArray:
+        """Covariance (k, k) of columns (k,): of one body, or of parameters."""
+
+    def relate_pairs(self, columns: IntArray, robots: Robots, /) -> FloatArray:
+        """Cross-covariances (m, 3, 3) of pairs of bodies before an update with measurements (m,) of them.
+
+        Args:
+            columns: (m, 2) the first columns of both bodies; -1: there is none.
+            robots: Where all are.
+        """
+
+    def update(
+        self, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
+    ) -> FloatArray:
+        """Use measurements (m,) with independent errors at once; return the correction (n,) of all columns.
+
+        Args:
+            columns: (m, c) what each depends on, the two bodies' first; a column may be named twice.
+            jacobian: (m, 3, c) its Jacobian; a zero row is a component that was not measured.
+            innovation: (m, 3) measured minus predicted.
+            noise: (m, 3, 3) covariance of the measurement.
+        """

@@ -1,0 +1,1 @@
+"""The sparse filter: a junction tree of fronts from a nested dissection of who sees whom."""

@@ -1,0 +1,111 @@
+"""Errors about each body's own place, which are well-conditioned far from the origin of `map`, too.
+
+The filter's columns are right-invariant errors xi, twists about the origin of `map`, in which a small error
+of a heading moves what is far away by much. Here they are eta = Lev(r) xi, twists about a place r near the
+body.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.small_matrix import cholesky3, solve3
+
+
+class Information(NamedTuple):
+    """What measurements say: H^T R^-1 H in blocks, and H^T R^-1 y.
+
+    Attributes:
+        first: (k,) bodies; a block of two bodies is given once.
+        second: (k,)
+        block: (k, 3, 3)
+        gradient: (n, 3)
+    """
+
+    first: IntArray
+    second: IntArray
+    block: FloatArray
+    gradient: FloatArray
+
+
+def levers(places: FloatArray) -> FloatArray:
+    """Lev(r) (n, 3, 3) of places (n, 2); its inverse is that of -r."""
+    out = np.tile(np.eye(3), (len(places), 1, 1))
+    out[:, 0, 2], out[:, 1, 2] = -places[:, 1], places[:, 0]
+    return out
+
+
+def carried(places: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Covariances (n, 3, 3) of Lev(r) e for errors e of covariances (n, 3, 3)."""
+    lever = levers(places)
+    out: FloatArray = lever @ covariances @ lever.transpose(0, 2, 1)
+    return out
+
+
+def centre(covariance: FloatArray) -> FloatArray:
+    """The place (2,) about which an error of covariance (3, 3) turns without moving, on average."""
+    place: FloatArray = np.array([-covariance[1, 2], covariance[0, 2]]) / covariance[2, 2]
+    return place
+
+
+@compiled
+def information_of(
+    columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray, places: FloatArray
+) -> Information:
+    """What measurements say of bodies, each about its own place.
+
+    Args:
+        columns: (m, c) filter columns that each depends on: those of two bodies, first of all.
+        jacobian: (m, 3, c), zero for a body that there is none of.
+        innovation: (m, 3) measured minus predicted.
+        noise: (m, 3, 3) covariances.
+        places: (n, 2) of all bodies.
+    """
+    measurements, count = columns.shape[0], 0
+    first, second = np.empty(3 * measurements, dtype=np.int64), np.empty(3 * measurements, dtype=np.int64)
+    block, gradient = np.zeros((3 * measurements, 3, 3)), np.zeros((len(places), 3))
+    by, weighted = np.empty((2, 3, 3)), np.empty((2, 3, 3))
+    for k in range(measurements):
+        factor = cholesky3(noise[k])
+        for side in range(2):
+            _about_place(jacobian[k, :, 3 * side : 3 * side + 3], places[columns[k, 3 * side] // 3], by[side])
+            for a in range(3):
+                solve3(factor, by[side, a], weighted[side, a])
+        for side in range(2):
+            body = columns[k, 3 * side] // 3
+            if not _depends(by[side]):
+                continue
+            for a in range(3):
+                for i in range(3):
+                    gradient[body, a] += weighted[side, a, i] * innovation[k, i]
+            for other in range(side + 1):
+                if _depends(by[other]):
+                    first[count], second[count] = body, columns[k, 3 * other] // 3
+                    for a in range(3):
+                        for b in range(3):
+                            for i in range(3):
+                                block[count, a, b] += weighted[side, a, i] * by[other, b, i]
+                    count += 1
+    return Information(first[:count], second[:count], block[:count], gradient)
+
+
+@compiled
+def _about_place(jacobian: FloatArray, place: FloatArray, out: FloatArray) -> None:
+    """Write the columns of a Jacobian by xi (3, 3) as rows by eta."""
+    for i in range(3):
+        out[0, i], out[1, i] = jacobian[i, 0], jacobian[i, 1]
+        out[2, i] = jacobian[i, 2] + place[1] * jacobian[i, 0] - place[0] * jacobian[i, 1]
+
+
+@compiled
+def _depends(rows: FloatArray) -> bool:
+    """Whether any entry of a matrix (3, 3) is not zero."""
+    total = 0.0
+    for i in range(3):
+        for j in range(3):
+            total += abs(rows[i, j])
+    return total > 0.0

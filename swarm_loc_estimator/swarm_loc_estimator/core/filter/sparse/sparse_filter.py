@@ -1,0 +1,278 @@
+"""The sparse filter: errors of bodies on a chordal pattern, which follows who sees whom."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.core.filter.joint_filter import Robots
+from swarm_loc_estimator.core.filter.sparse.dissection import Order, dissect
+from swarm_loc_estimator.core.filter.sparse.elimination import Prior, eliminate
+from swarm_loc_estimator.core.filter.sparse.factor import (
+    EMPTY,
+    Derived,
+    with_derived,
+    write_covariances,
+)
+from swarm_loc_estimator.core.filter.sparse.levers import carried, centre, information_of, levers
+from swarm_loc_estimator.core.filter.sparse.neighbours import adjacency, near_pairs, spread
+from swarm_loc_estimator.core.filter.sparse.symbolic import Pattern, pattern_of, wanted_rows
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+
+_COPIES = 32
+_COPIED_SHARE = 8
+"""One of so many bodies is copied, at most."""
+_COPIED_AGAIN = 25
+"""Updates after which other bodies are copied."""
+_COPY_SPREAD = np.diag(np.square([3e-5, 3e-5, 3e-4]))
+"""What keeps a copy apart from the body [m^2], [m^2], [rad^2]."""
+_ORDERED_AGAIN = 3
+_GROWN = 1.2
+"""An order is replaced after so many updates, or when its largest front has grown so much."""
+_PAIRS_KEPT = 3
+"""Pairs of so many updates count as neighbours."""
+_FAR_M = 20.0
+"""A body so far from where its error is held about is held about another place."""
+
+
+class _Ordering(NamedTuple):
+    """An order of elimination in use: its pairs of near bodies, since how many updates, its first width."""
+
+    order: Order
+    near: IntArray
+    updates: int
+    width: int
+
+
+class _Prepared(NamedTuple):
+    """What an update needs: the pattern, the covariances before it, who is active."""
+
+    pattern: Pattern
+    prior: Prior
+    active: IntArray
+
+
+class SparseFilter:
+    """Errors of bodies, of which those of bodies that are not neighbours are known through others.
+
+    Args:
+        size: Number of columns, three for each body; each starts with unit variance, independent.
+    """
+
+    calibrates = False
+    sequential = False
+
+    def __init__(self, size: int) -> None:
+        count = size // 3
+        self.covariance: FloatArray = np.zeros((0, 0))
+        self.marginal: FloatArray = np.tile(np.eye(3), (count, 1, 1))
+        self._settled = self.marginal.copy()
+        self._place: FloatArray = np.zeros((count, 2))
+        self._number: IntArray = np.full(count, -1)
+        self._factor, self._copies = EMPTY, np.zeros(0, dtype=np.int64)
+        self._copy_place: FloatArray = np.zeros((0, 2))
+        self._new: tuple[Derived, ...] = ()
+        self._pairs: tuple[IntArray, ...] = ()
+        self._ordering: _Ordering | None = None
+        self._updates = 0
+        self._prepared: _Prepared | None = None
+        self._room = _Room()
+
+    def copy(self) -> SparseFilter:
+        """An independent copy; factors are shared, since they are never written to."""
+        other = SparseFilter.__new__(SparseFilter)
+        copied = {name: vars(self)[name].copy() for name in ("marginal", "_settled", "_place", "_number")}
+        vars(other).update(vars(self) | copied | {"_prepared": None})
+        return other
+
+    def place(self, columns: IntArray, covariance: FloatArray) -> None:
+        """Give a body's columns (3,) this covariance (3, 3), independent of the rest, whatever was known."""
+        if columns.size:
+            body = int(columns[0]) // 3
+            self._place[body] = centre(covariance)
+            own = carried(self._place[body : body + 1], covariance[None])[0]
+            self._append(body, Derived(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), own))
+            self.marginal[body] = self._settled[body] = covariance
+
+    def _append(self, body: int, derived: Derived) -> None:
+        """Let a body be a new one."""
+        self._number[body] = self._factor.bodies + len(self._new)
+        self._new += (derived,)
+
+    def add(self, columns: IntArray, covariance: FloatArray) -> None:
+        """Add a covariance (3, 3) to that of a body's columns (3,): its error is larger than was known."""
+        if columns.size:
+            body = int(columns[0]) // 3
+            if self._number[body] < 0:
+                self.place(columns, covariance)
+            else:
+                self.marginal[body] += covariance
+
+    def grow(self, count: int) -> None:
+        """Append columns without error, three for each body."""
+        bodies = count // 3
+        self.marginal = np.concatenate([self.marginal, np.zeros((bodies, 3, 3))])
+        self._settled = np.concatenate([self._settled, np.zeros((bodies, 3, 3))])
+        self._place = np.concatenate([self._place, np.zeros((bodies, 2))])
+        self._number = np.concatenate([self._number, np.full(bodies, -1)])
+        self._ordering = None
+
+    def relate(self, columns: IntArray, others: IntArray, mapping: FloatArray) -> None:
+        """Add the errors of other bodies' columns (m,), mapped by (3, m), to those of a body just placed.
+
+        Until the next update its marginal is that of others which err alike.
+        """
+        if others.size == 0:
+            return
+        body, bodies = int(columns[0]) // 3, others[::3] // 3
+        placed, self._new = self._new[-1], self._new[:-1]
+        self._take_in_noise(bodies)
+        lever, back = levers(self._place[[body]])[0], levers(-self._place[bodies])
+        shares = lever @ mapping.reshape(3, -1, 3).transpose(1, 0, 2) @ back
+        alike = np.linalg.cholesky(carried(self._place[bodies], self.marginal[bodies]))
+        common = np.sum(shares @ alike, axis=0)
+        gain = shares.transpose(0, 2, 1).reshape(-1, 3)
+        self._append(body, Derived(self._number[bodies], gain, placed.spread))
+        self.marginal[body] += carried(-self._place[[body]], (common @ common.T)[None])[0]
+        self._settled[body] = self.marginal[body]
+
+    def _take_in_noise(self, bodies: IntArray) -> None:
+        """Take what bodies have erred by since the newest factor into their errors, so others share it."""
+        added = carried(self._place[bodies], self.marginal[bodies] - self._settled[bodies])
+        for body, noise in zip(bodies.tolist(), added, strict=True):
+            if noise.any():
+                self._append(body, Derived(self._number[[body]], np.eye(3), noise))
+                self._settled[body] = self.marginal[body]
+
+    def block(self, columns: IntArray) -> FloatArray:
+        """Covariance (3, 3) of a body's columns (3,); (0, 0) of none."""
+        if columns.size == 0:
+            return np.zeros((0, 0))
+        covariance: FloatArray = self.marginal[int(columns[0]) // 3].copy()
+        return covariance
+
+    def relate_pairs(self, columns: IntArray, robots: Robots) -> FloatArray:
+        """Cross-covariances (m, 3, 3) of pairs of bodies before an update with measurements (m,) of them."""
+        tied = (columns >= 0).all(axis=1)
+        pairs = columns[tied] // 3
+        prepared = self._prepare(pairs, robots)
+        out = np.zeros((len(columns), 3, 3))
+        first, second = pairs.T
+        places, covariance = prepared.prior.place, prepared.prior.covariance
+        across = covariance[places[first], places[second]]
+        back = levers(-self._place)
+        out[tied] = back[first] @ across @ back[second].transpose(0, 2, 1)
+        return out
+
+    def _prepare(self, pairs: IntArray, robots: Robots) -> _Prepared:
+        """Have the covariances of all pairs of a pattern that pairs (k, 2) fit into."""
+        count = robots.active.size
+        places = np.concatenate(
+            [robots.places, self._place[count:]]
+        )  # landmarks stand where they were placed
+        active = np.flatnonzero(np.concatenate([robots.active, self._number[count:] >= 0]))
+        self._move_far(active, places)
+        if self._updates % _COPIED_AGAIN == 0:
+            self._copy_some(active, places)
+        self._updates += 1
+        factor = with_derived(self._factor, self._new)
+        pattern = self._pattern(pairs, active, places)
+        numbers = np.concatenate([self._number, self._copies])
+        rows = wanted_rows(factor.pattern, pattern, numbers, len(self._new))
+        covariance = self._room.of(factor.bodies)
+        write_covariances(factor, rows, covariance)
+        added = carried(self._place[active], self.marginal[active] - self._settled[active])
+        covariance[numbers[active], numbers[active]] += added
+        self._prepared = _Prepared(pattern, Prior(covariance, numbers), active)
+        return self._prepared
+
+    def _move_far(self, active: IntArray, places: FloatArray) -> None:
+        """Hold the errors of bodies that have gone far about where they are now."""
+        moved = places[active] - self._place[active]
+        far = active[np.hypot(moved[:, 0], moved[:, 1]) > _FAR_M]
+        turns = levers(places[far] - self._place[far])
+        for body, turn in zip(far.tolist(), turns, strict=True):
+            self._append(body, Derived(self._number[[body]], turn.T.copy(), np.zeros((3, 3))))
+            self._place[body] = places[body]
+
+    def _copy_some(self, active: IntArray, places: FloatArray) -> None:
+        """Have copies of bodies far from each other, which, unlike these, do not move on."""
+        copied = active[spread(places[active], min(_COPIES, active.size // _COPIED_SHARE))]
+        self._copies = self._factor.bodies + len(self._new) + np.arange(copied.size)
+        self._copy_place = self._place[copied]
+        self._new += tuple(Derived(self._number[[body]], np.eye(3), _COPY_SPREAD) for body in copied.tolist())
+
+    def _pattern(self, pairs: IntArray, active: IntArray, places: FloatArray) -> Pattern:
+        """A pattern in which all these pairs (k, 2) lie, in the order in use or a new one."""
+        count, copies, ordering = self._number.size, self._copies.size, self._ordering
+        here = np.zeros(count, dtype=bool)
+        here[active] = True
+        self._pairs = (*self._pairs[1 - _PAIRS_KEPT :], pairs)
+        recent = np.concatenate(self._pairs)
+        recent = recent[here[recent].all(axis=1)]
+        is_recent = ordering is not None and ordering.updates < _ORDERED_AGAIN
+        if ordering is not None and is_recent and np.array_equal(np.sort(ordering.order.body), active):
+            graph = adjacency(count, np.concatenate([recent, ordering.near]))
+            pattern = pattern_of(ordering.order, graph, copies)
+            if pattern.width <= _GROWN * ordering.width:
+                self._ordering = ordering._replace(updates=ordering.updates + 1)
+                return pattern
+        near = active[near_pairs(places[active])]
+        graph = adjacency(count, np.concatenate([recent, near]))
+        order = dissect(active, places, graph)
+        pattern = pattern_of(order, graph, copies)
+        self._ordering = _Ordering(order, near, 1, pattern.width)
+        return pattern
+
+    def update(
+        self, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
+    ) -> FloatArray:
+        """Use many measurements with independent errors at once; return the correction (n,) of all columns.
+
+        Their pairs must have been among those of `relate_pairs`, which comes before each update.
+
+        Args:
+            columns: (m, c) what each depends on, the two bodies' first.
+            jacobian: (m, 3, c) its Jacobian; a zero row is a component that was not measured.
+            innovation: (m, 3) measured minus predicted.
+            noise: (m, 3, 3) covariance of the measurement.
+        """
+        if self._prepared is None:
+            raise RuntimeError("the pairs of an update are related first")
+        (pattern, prior, active), self._prepared = self._prepared, None
+        places = np.concatenate([self._place, self._copy_place])
+        measured = information_of(columns, jacobian, innovation, noise, places)
+        self._factor, correction = eliminate(pattern, prior, measured)
+        count = self._number.size
+        self._number = np.full(count, -1)
+        self._number[active] = active
+        self._copies = count + np.arange(self._copies.size)
+        self._new = ()
+        self._settle(active)
+        moved = np.einsum("nij,nj->ni", levers(-self._place[active]), correction[active])
+        out = np.zeros((count, 3))
+        out[active] = moved
+        return out.reshape(-1)
+
+    def _settle(self, active: IntArray) -> None:
+        """Have the marginals of the newest factor."""
+        none = np.zeros(0, dtype=np.int64), np.zeros(self._factor.pattern.fronts + 1, dtype=np.int64)
+        covariance = self._room.of(self._factor.bodies)
+        write_covariances(self._factor, none, covariance)
+        self.marginal[active] = carried(-self._place[active], covariance[active, active])
+        self._settled[active] = self.marginal[active]
+
+
+class _Room:
+    """Where covariances are written between two factors, for a filter and all its copies."""
+
+    def __init__(self) -> None:
+        self._blocks: FloatArray = np.zeros((0, 0, 3, 3))
+
+    def of(self, bodies: int) -> FloatArray:
+        """Room for so many bodies (n, n, 3, 3); what stands there is not to be relied on."""
+        if len(self._blocks) < bodies:
+            size = bodies + bodies // 8
+            self._blocks = np.zeros((size, size, 3, 3))
+        return self._blocks

@@ -1,0 +1,169 @@
+"""Symbolic elimination: which bodies each front holds, and what of the factor before it has to be known.
+
+A front eliminates its pivots J, given its border B: all bodies eliminated later that are paired with one of
+them, or with what was eliminated before and led to them. The pairs within all J and B are the pattern.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.core.filter.sparse.dissection import Order
+from swarm_loc_estimator.core.filter.sparse.neighbours import Adjacency
+from swarm_loc_estimator.numerics.arrays import BoolArray, IntArray
+from swarm_loc_estimator.numerics.jit import compiled
+
+
+class Pattern(NamedTuple):
+    """Fronts in the order of their elimination.
+
+    Attributes:
+        pivot: Bodies, front by front.
+        pivot_begin: (F + 1,) where those of each front begin.
+        border: Likewise the bodies of the borders.
+        border_begin: (F + 1,)
+        front: (n,) in which front each body is a pivot; -1: in none.
+    """
+
+    pivot: IntArray
+    pivot_begin: IntArray
+    border: IntArray
+    border_begin: IntArray
+    front: IntArray
+
+    @property
+    def fronts(self) -> int:
+        """How many there are."""
+        return self.pivot_begin.size - 1
+
+    def pivots_of(self, front: int) -> IntArray:
+        """The bodies that a front eliminates."""
+        return self.pivot[self.pivot_begin[front] : self.pivot_begin[front + 1]]
+
+    def border_of(self, front: int) -> IntArray:
+        """The bodies that a front leaves."""
+        return self.border[self.border_begin[front] : self.border_begin[front + 1]]
+
+    @property
+    def width(self) -> int:
+        """Bodies in the largest front."""
+        return int((np.diff(self.pivot_begin) + np.diff(self.border_begin)).max(initial=0))
+
+
+def pattern_of(order: Order, adjacency: Adjacency, copies: int) -> Pattern:
+    """The fronts of an order of n bodies with so many copies, numbered behind them and in all fronts."""
+    count = adjacency.begin.size - 1
+    anchors = np.arange(count, count + copies)
+    pivot = np.concatenate([order.body, anchors])
+    begin = np.append(order.begin, pivot.size) if copies else order.begin
+    front = np.full(count + copies, -1, dtype=np.int64)
+    front[pivot] = np.repeat(np.arange(begin.size - 1), np.diff(begin))
+    border, border_begin = _borders(pivot, begin, front, adjacency, anchors)
+    return Pattern(pivot, begin, border, border_begin, front)
+
+
+@compiled
+def _borders(
+    pivot: IntArray, begin: IntArray, front: IntArray, adjacency: Adjacency, anchors: IntArray
+) -> tuple[IntArray, IntArray]:
+    """The bodies of all borders, front by front, and where each begins (F + 1,)."""
+    fronts, seen = begin.size - 1, np.full(front.size, -1, dtype=np.int64)
+    borders, border_begin = np.empty(64 * front.size, dtype=np.int64), np.zeros(fronts + 1, dtype=np.int64)
+    child, sibling = np.full(fronts, -1, dtype=np.int64), np.full(fronts, -1, dtype=np.int64)
+    end = 0
+    for f in range(fronts):
+        if end + front.size > borders.size:
+            borders = np.concatenate((borders, np.empty_like(borders)))
+        first = end
+        for body in pivot[begin[f] : begin[f + 1]]:
+            if body < adjacency.begin.size - 1:
+                neighbours = adjacency.neighbour[adjacency.begin[body] : adjacency.begin[body + 1]]
+                end = _take(neighbours, f, front, seen, borders, end)
+        below = child[f]
+        while below >= 0:
+            end = _take(borders[border_begin[below] : border_begin[below + 1]], f, front, seen, borders, end)
+            below = sibling[below]
+        end = _take(anchors, f, front, seen, borders, end)
+        border_begin[f + 1] = end
+        if end > first:
+            parent = front[borders[first:end]].min()
+            sibling[f], child[parent] = child[parent], f
+    return borders[:end].copy(), border_begin
+
+
+@compiled
+def _take(bodies: IntArray, f: int, front: IntArray, seen: IntArray, borders: IntArray, end: int) -> int:
+    """Write those bodies behind the borders that are pivots later than front f; return the new end."""
+    for body in bodies:
+        if front[body] > f and seen[body] != f:
+            seen[body] = f
+            borders[end] = body
+            end += 1
+    return end
+
+
+def wanted_rows(old: Pattern, new: Pattern, place: IntArray, derived: int) -> tuple[IntArray, IntArray]:
+    """What has to be known of an old factor besides its own pattern, for a new pattern to be.
+
+    Args:
+        old: Its bodies have numbers of their own.
+        new: Whose pairs are wanted.
+        place: (n,) the numbers of the new pattern's bodies in the old one.
+        derived: So many of the first fronts have borders whose pairs may be in no front.
+
+    Returns:
+        Bodies, front by front of the old pattern, whose covariances with its pivots are wanted, and where
+        those of each front begin (F + 1,).
+    """
+    wanted = np.zeros((old.fronts, old.front.size), dtype=np.bool_)
+    _want_pairs(old, new, place, wanted)
+    return _close(old, wanted, derived)
+
+
+@compiled
+def _want_pairs(old: Pattern, new: Pattern, place: IntArray, wanted: BoolArray) -> None:
+    """Note all pairs of the new pattern at the earlier one's front."""
+    for f in range(new.pivot_begin.size - 1):
+        for k in range(new.pivot_begin[f], new.pivot_begin[f + 1]):
+            a = place[new.pivot[k]]
+            for q in range(k + 1, new.pivot_begin[f + 1]):
+                _want(old.front, a, place[new.pivot[q]], wanted)
+            for q in range(new.border_begin[f], new.border_begin[f + 1]):
+                _want(old.front, a, place[new.border[q]], wanted)
+
+
+@compiled
+def _want(front: IntArray, a: int, b: int, wanted: BoolArray) -> None:
+    """Note a pair of bodies; those of one front are known."""
+    if front[a] < front[b]:
+        wanted[front[a], b] = True
+    elif front[b] < front[a]:
+        wanted[front[b], a] = True
+
+
+@compiled
+def _close(old: Pattern, wanted: BoolArray, derived: int) -> tuple[IntArray, IntArray]:
+    """Add what the wanted ones follow from: a pair of a pivot follows from those of its border."""
+    fronts, count = wanted.shape
+    begin, end = np.zeros(fronts + 1, dtype=np.int64), 0
+    for f in range(fronts):
+        border = old.border[old.border_begin[f] : old.border_begin[f + 1]]
+        for body in border:
+            wanted[f, body] = False
+            for other in border if f < derived else border[:0]:
+                _want(old.front, body, other, wanted)
+        for body in range(count):
+            if wanted[f, body]:
+                end += 1
+                for other in border:
+                    _want(old.front, body, other, wanted)
+        begin[f + 1] = end
+    rows, end = np.empty(end, dtype=np.int64), 0
+    for f in range(fronts):
+        for body in range(count):
+            if wanted[f, body]:
+                rows[end] = body
+                end += 1
+    return rows, begin
