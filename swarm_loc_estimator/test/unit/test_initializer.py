@@ -320,7 +320,7 @@ def test_attempts_become_rarer_but_never_stop(monkeypatch: pytest.MonkeyPatch) -
     tracks.extend(np.zeros(2, dtype=np.int64), np.array([T0, T0 + 20 * SECOND]), np.zeros((2, 3)))
     attempts: list[int] = []
     monkeypatch.setattr(
-        initializer, "align", lambda constraints, _: attempts.append(int(constraints["stamp_ns"][-1]))
+        initializer, "align", lambda constraints, *_: attempts.append(int(constraints["stamp_ns"][-1]))
     )
     state, waiting = SwarmState(ParameterTable.of(robots)), initializer.Initializer(tracks, 20.0)
     one = np.zeros(1, dtype=MEASUREMENT_DTYPE)

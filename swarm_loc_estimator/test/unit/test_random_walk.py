@@ -100,6 +100,20 @@ def test_a_start_counts_from_the_first_measurement_on() -> None:
     assert np.sqrt(estimate.covariances[0, 0, 0]) == pytest.approx(math.hypot(0.01, HIDDEN), rel=0.01)
 
 
+def test_a_robot_of_unsure_heading_is_located_where_such_headings_are_not_lost() -> None:
+    sigma, poses = np.array([0.02, 0.02, 0.45]), walked(5)[0]
+    found = []
+    for limit in (0.3, 1.5):
+        settings = EstimatorSettings(fusion_period_s=0.0, lost_heading_sigma=limit)
+        estimator = SwarmEstimator(SWARM, settings)
+        for k in range(3):
+            stamp_ns = T0 + k * SECOND
+            give_fix(estimator, 0, stamp_ns, poses[0], np.diag(sigma**2), stamp_ns)
+        found.append(estimator.tick(T0 + 2 * SECOND).status[0])
+    assert found[0] == Status.WAITING
+    assert found[1] != Status.WAITING
+
+
 def test_a_robot_with_odometry_does_not_walk_at_random() -> None:
     with pytest.raises(SwarmError, match=r"robot 'a' has a random_walk, which must be 0"):
         Swarm((Robot("a", random_walk=WALK),))

@@ -39,6 +39,8 @@ from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.numerics import se2
 from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray
 
+_SURER_AT_FIRST = 1.5
+"""By this factor a heading must be surer than one that is lost, for a robot to be initialized."""
 _NO_IMAGE_NS = np.iinfo(np.int64).min
 _PAIRS_PER_ROBOT = 32
 """A robot remembers what so many others have told it by infrared."""
@@ -86,7 +88,8 @@ class Fusion:
             for i, r in enumerate(swarm.robots)
             if r.start is not None
         }
-        self._initializer = Initializer(tracks, settings.fix_window_s)
+        surer = settings.lost_heading_sigma / _SURER_AT_FIRST
+        self._initializer = Initializer(tracks, settings.fix_window_s, surer)
         self._pictures = PictureFusion(swarm, settings, tracks)
         self._table = ParameterTable.of(swarm.robots, swarm.landmarks)
         self._pairs = _PAIRS_PER_ROBOT if any(robot.ir is not None for robot in swarm.robots) else 0

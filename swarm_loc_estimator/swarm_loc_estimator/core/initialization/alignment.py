@@ -27,19 +27,22 @@ _MIN_SHARE = 0.6  # of the constraints must agree with an alignment
 _RIVAL_SHARE = 0.8  # another transform with this share of the best one's support is a rival
 _MAX_RIVALS = 8
 _APART_M, _APART_RAD = 0.1, 0.1
-_HEADING_SIGMA = 0.2
+HEADING_SIGMA = 0.2
 _POSITION_SIGMA = 0.5
 _REFINEMENTS = 5
 _MARGIN = 1e-6  # so that what is its own is a covariance where next to nothing is
 _PRIOR = 1e-6  # so that what no constraint shows is unsure instead of singular
 
 
-def align(constraints: ConstraintArray, track_noise: FloatArray) -> InitialPose | None:
+def align(
+    constraints: ConstraintArray, track_noise: FloatArray, heading_sigma: float = HEADING_SIGMA
+) -> InitialPose | None:
     """The transform that a robot's constraints (k,) agree on, or None while it is not unique and sure.
 
     Args:
         constraints: Of CONSTRAINT_DTYPE, refreshed.
         track_noise: (3, 3) preintegrated covariance of the track by now.
+        heading_sigma: How sure the heading must be [rad].
     """
     if constraints.size < MIN_CONSTRAINTS:
         return None
@@ -54,7 +57,7 @@ def align(constraints: ConstraintArray, track_noise: FloatArray) -> InitialPose 
     if np.count_nonzero(weight) < enough:
         return None
     position, heading = _unsureness(constraints, track_noise, weight, transform, covariance)
-    if not (position < _POSITION_SIGMA and heading < _HEADING_SIGMA):
+    if not (position < _POSITION_SIGMA and heading < heading_sigma):
         return None
     rivals = hypotheses[support >= _RIVAL_SHARE * support[best]]
     limits = (_APART_M + 3.0 * position, _APART_RAD + 3.0 * heading)

@@ -16,7 +16,7 @@ from swarm_loc_estimator.core.filter.integrity.divergence import CONFIRMED
 from swarm_loc_estimator.core.filter.measurement_model import NOBODY, MeasurementArray
 from swarm_loc_estimator.core.filter.prediction import predict
 from swarm_loc_estimator.core.filter.state import SwarmState
-from swarm_loc_estimator.core.initialization.alignment import MIN_CONSTRAINTS, align
+from swarm_loc_estimator.core.initialization.alignment import HEADING_SIGMA, MIN_CONSTRAINTS, align
 from swarm_loc_estimator.core.initialization.constraints import (
     NO_CONSTRAINTS,
     THE_MAP,
@@ -45,9 +45,11 @@ class Initializer:
     Args:
         tracks: The robots' odometry.
         window_s: Age up to which a constraint is used.
+        heading_sigma: How sure the heading of a robot must be that is initialized [rad].
     """
 
-    def __init__(self, tracks: OdometryTracks, window_s: float) -> None:
+    def __init__(self, tracks: OdometryTracks, window_s: float, heading_sigma: float = HEADING_SIGMA) -> None:
+        self._heading_sigma = heading_sigma
         self._tracks = tracks
         self._window_ns = int(window_s * 1e9)
 
@@ -75,7 +77,7 @@ class Initializer:
         few = constraints.size < MIN_CONSTRAINTS or constraints["stamp_ns"][0] == now_ns
         if few or now_ns < state.next_attempt_ns[robot]:
             return True
-        initial = align(refreshed(constraints, state.arrays()), at.covariance)
+        initial = align(refreshed(constraints, state.arrays()), at.covariance, self._heading_sigma)
         if initial is not None:
             state.initialize(robot, initial, at, CONFIRMED)
         else:

@@ -30,8 +30,8 @@ METRES_PER_PIXEL = DIAMETER_M / 42.0
 """Robots that touch are 42 pixels apart in the recordings of 2016."""
 FIX_SIGMA = (0.001, 0.001, 0.05)
 """How well the camera knows the receiver: x, y [m], heading [rad]."""
-WALK = RandomWalk(position=5e-6, heading=2e-3)
-"""They stand for a minute or so, then turn and go some centimetres: on average over ten seconds as much."""
+WALK = RandomWalk(position=5e-6, heading=3e-2)
+"""They turn often and go some centimetres a minute."""
 _NS = 1_000_000_000
 
 
