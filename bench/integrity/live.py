@@ -19,7 +19,7 @@ from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
 from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
 from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.core.estimation.estimator import Status
-from swarm_loc_estimator.io.messages.cdr import decode_detections
+from swarm_loc_estimator.io.messages.cdr import decode_detections, decode_odometry
 from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.live.graph import LiveGraph
 from swarm_loc_estimator.live.recorder import read_history, read_poses
@@ -55,16 +55,23 @@ Break = Callable[[_Live, float], float]
 
 
 def _driver_restart(live: _Live, away_s: float) -> float:
-    """Kill a driver; mended when its robot's camera sees something again."""
-    robot = live.listener.names[0]
-    driver, (arrivals, images) = f"{robot}/epuck_driver", live.listener.kept[robot, "detections"]
+    """Kill a driver; mended with the first sighting of its robot that was made once odometry came again."""
+    robot, kept = live.listener.names[0], live.listener.kept
+    driver, (_, odometry), (arrivals, images) = (
+        f"{robot}/epuck_driver",
+        kept[robot, "odom"],
+        kept[robot, "detections"],
+    )
     live.graph.kill(driver)
     live.go_on(away_s, without=driver)
-    received = len(images)
+    driven, received = len(odometry), len(images)
     live.graph.restart(driver)
+    live.graph.wait_for(lambda: len(odometry) > driven, "send odometry again", _PATIENCE_S)
+    since_ns = decode_odometry(odometry[driven]).stamp_ns
 
     def seen_again() -> list[int]:
-        return [k for k in range(received, len(images)) if decode_detections(images[k]).detections.size]
+        found = {k: decode_detections(images[k]) for k in range(received, len(images))}
+        return [k for k, one in found.items() if one.detections.size and one.stamp_ns >= since_ns]
 
     live.graph.wait_for(lambda: bool(seen_again()), "see something again", _PATIENCE_S)
     return arrivals[seen_again()[0]] * 1e-9

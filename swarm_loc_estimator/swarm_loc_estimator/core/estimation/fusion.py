@@ -282,9 +282,9 @@ class Fusion:
     ) -> tuple[NDArray[np.uint8], FloatArray]:
         """Hold measurements (m,) against one belief, use those that pass; return verdicts and their NIS."""
         fields, passed = MeasurementColumns.of(measurements), batch.passed
-        batch.across[:] = state.filter.relate_pairs(
-            body_columns_all(fields, state.arrays()), self._robots(state, int(measurements["stamp_ns"][-1]))
-        )
+        if not state.filter.covariance.size:  # else they are read where all are
+            robots = self._robots(state, int(measurements["stamp_ns"][-1]))
+            batch.across[:] = state.filter.relate_pairs(body_columns_all(fields, state.arrays()), robots)
         evaluate_all(fields, state.arrays(), batch)
         systematic = (measurements["systematic_share"] > 0.0).any(axis=1)
         looks = (batch.distance, batch.whitened, batch.cause)
