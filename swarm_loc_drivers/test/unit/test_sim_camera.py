@@ -11,7 +11,8 @@ from swarm_loc_drivers.sim.common.camera import View, deliver, hidden, schedule_
 from swarm_loc_drivers.sim.common.error_model import W0, W2
 from swarm_loc_drivers.sim.common.record import SIGHTING_DTYPE, SimulatedRun
 from swarm_loc_drivers.sim.scenarios.eight import VIEW, EightSettings, describe, simulate_eight, wall_markers
-from swarm_loc_drivers.sim.scenarios.grid import SENSOR, GridSettings, border, cells, simulate_grid
+from swarm_loc_drivers.sim.scenarios.grid import SENSOR, GridSettings, simulate_grid
+from swarm_loc_drivers.sim.scenarios.grid_shapes import Shape, cells
 from swarm_loc_estimator.numerics import se2
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
@@ -226,7 +227,7 @@ def test_grid_robots_stay_in_their_cells_among_a_closed_border() -> None:
     away = np.linalg.norm(run.truth.poses[..., :2] - cells(20), axis=-1)
     assert away.max() < 0.2
     assert away.max(axis=0).min() > 0.05  # each one moves
-    marks = border(cells(20))
+    marks = Shape.BORDER.landmarks(cells(20))
     assert len(marks) == len(np.unique(marks, axis=0)) == 22
     assert np.linalg.norm(marks[:, None] - cells(20), axis=-1).min() == pytest.approx(0.5)
 
