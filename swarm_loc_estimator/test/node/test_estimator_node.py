@@ -268,6 +268,7 @@ class StandIn:
         self.drops: dict[str, int] = {}
         self.counters: dict[str, int] = {}
         self.identities = None
+        self.note = ""
 
     def receive(self, messages: RawInputs) -> None:
         """Remember whose and when."""
