@@ -141,7 +141,7 @@ def evaluate(
     batch.nis[row] = squared_distance(difference, s)
 
 
-@compiled
+@inlined
 def relative_motion(
     measurements: MeasurementColumns,
     k: int,

@@ -8,7 +8,7 @@ from swarm_loc_estimator.core.filter.belief import BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.core.filter.integrity.surprises import source_of
 from swarm_loc_estimator.core.filter.measurement_model import MeasurementColumns
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import compiled, inlined
 
 CONFIRMED = 2
 """So many sightings that agree make a pose that was assumed one that is known."""
@@ -65,7 +65,7 @@ def _count_confirmation(state: IntegrityArrays, robot: int, stamp_ns: int) -> No
         state.confirmed_ns[robot] = stamp_ns
 
 
-@compiled
+@inlined
 def is_uncertain(belief: BeliefArrays, robot: int, pose: FloatArray, limits: LossLimits) -> bool:
     """Whether the standard deviation of the robot's position or heading at `pose` (3,) exceeds its limit."""
     p = body_covariance(belief, 3 * robot)
