@@ -90,6 +90,7 @@ def measure(browser: Browser, source: Source, seconds: float) -> tuple[dict[str,
         stack.callback(stop, children, lambda _: None)
         page = open_page(browser, port, children[0])
         page.until(f"watch.metrics.latency.length > {_SETTLED}", round(1e3 * START_PATIENCE_S))
+        page.until("isFinite(watch.painter.u[0])", round(1e3 * START_PATIENCE_S))  # located
         page.page.mouse.click(*page.place_of(0))
         page.evaluate("{ watch.metrics.latency.length = watch.metrics.frame.length = 0 }")
         pid, begin_s = children[0].process.pid, time.monotonic()
