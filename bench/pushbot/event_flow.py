@@ -19,6 +19,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.qos import QoSProfile
 
 from swarm_loc_estimator.launching.processes import executable_path
+from swarm_loc_estimator.live.graph import cpu_seconds
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
 RATE = 300_000
@@ -78,12 +79,12 @@ class EventFlow:
                 self._spin_until(executor, lambda: len(self._counts) == self._robots, _START_S)
                 self._spin_until(executor, lambda: False, _SETTLE_S)
                 before, begin_s = dict(self._counts), time.monotonic()
-                used = [_cpu_s(one.pid) for one in (feed, *drivers, *trackers)]
+                used = [cpu_seconds(one.pid) for one in (feed, *drivers, *trackers)]
                 machine = _machine_s()
                 self._spin_until(executor, lambda: False, _SECONDS)
                 elapsed_s = time.monotonic() - begin_s
                 cores = (
-                    np.array([_cpu_s(one.pid) for one in (feed, *drivers, *trackers)]) - used
+                    np.array([cpu_seconds(one.pid) for one in (feed, *drivers, *trackers)]) - used
                 ) / elapsed_s
                 others = (_machine_s() - machine) / elapsed_s - float(cores.sum())
                 return self._result(before, cores, others)
@@ -136,12 +137,6 @@ def _driver(robot: int) -> list[str]:
 def _tracker(robot: int) -> list[str]:
     executable = str(executable_path("swarm_loc_vision", "event_tracker_node"))
     return [executable, "--ros-args", "-r", f"__ns:=/pushbot{robot}", "-p", "light_frequencies:=['1000']"]
-
-
-def _cpu_s(process: int) -> float:
-    """Time that a process has used of a core [s]."""
-    fields = Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _machine_s() -> float:

@@ -77,7 +77,6 @@ class _Notes:
     def _grid(self, stamp_ns: int) -> GridMessage:
         """The map as the mapper's node publishes it."""
         occupancy = self._mapper.occupancy()
-        percent = 100.0 / (1.0 + np.exp(-occupancy.log_odds))
-        cells = np.where(occupancy.log_odds == 0.0, -1.0, percent).round().astype(np.int8)
+        cells = occupancy.percent.round().astype(np.int8)
         x, y = map(float, occupancy.corner)
         return GridMessage(stamp_ns, "map", occupancy.cell, (x, y, 0.0), np.ascontiguousarray(cells.T))

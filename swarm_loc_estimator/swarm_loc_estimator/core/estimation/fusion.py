@@ -102,8 +102,8 @@ class Fusion:
     @property
     def is_sparse(self) -> bool:
         """Whether only covariances of neighbours are kept: in a large swarm without calibration."""
-        count, calibrated = self._table.column.shape[0], not np.any(self._table.column >= 0)
-        return self._together and count >= self._sparse_from and calibrated
+        count, is_calibrated = self._table.column.shape[0], bool(np.any(self._table.column >= 0))
+        return self._together and count >= self._sparse_from and not is_calibrated
 
     def with_starts(self, state: SwarmState, stamp_ns: int) -> SwarmState:
         """The state, together with those robots at their starts about whom there was no measurement yet.

@@ -19,8 +19,7 @@ from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 
 def occupancy_message(occupancy: OccupancyMap, header: Header) -> OccupancyGrid:
     """The map: -1 unknown, else the probability that a cell is occupied [%]."""
-    probability = 100.0 / (1.0 + np.exp(-occupancy.log_odds))
-    return _grid(occupancy, np.where(occupancy.log_odds == 0.0, -1.0, probability), header)
+    return _grid(occupancy, occupancy.percent, header)
 
 
 def visitation_message(occupancy: OccupancyMap, visits: IntArray, header: Header) -> OccupancyGrid:

@@ -43,6 +43,13 @@ class OccupancyMap:
         free: BoolArray = self.log_odds < _FREE
         return free
 
+    @property
+    def percent(self) -> FloatArray:
+        """How probably each cell is occupied [%]; -1 where nothing is known."""
+        probability = 100.0 / (1.0 + np.exp(-self.log_odds))
+        known: FloatArray = np.where(self.log_odds == 0.0, -1.0, probability)
+        return known
+
     def centres(self, chosen: BoolArray) -> FloatArray:
         """Middles (n, 2) of chosen cells (nx, ny) [m]."""
         centres: FloatArray = self.corner + (np.argwhere(chosen) + 0.5) * self.cell
