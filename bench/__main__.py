@@ -11,6 +11,7 @@ BENCHMARKS = {
     "droplet_real": "bench.droplet.real",
     "epuck": "bench.epuck",
     "integrity": "bench.integrity",
+    "large_swarms": "bench.graph.large_swarms",
     "live": "bench.graph.live",
     "mrclam": "bench.mrclam",
     "pushbot": "bench.pushbot",

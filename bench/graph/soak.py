@@ -21,7 +21,7 @@ import numpy as np
 
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.launching.graph import GraphOptions, graph_nodes
-from swarm_loc_estimator.live.graph import START_PATIENCE_S, LiveGraph, cpu_seconds
+from swarm_loc_estimator.live.graph import START_PATIENCE_S, LiveGraph, cpu_seconds, resident_mb
 from swarm_loc_estimator.live.recorder import Recorder, read_poses
 from swarm_loc_estimator.live.run import ESTIMATOR, PLAYER
 from swarm_loc_estimator.numerics.arrays import FloatArray
@@ -74,13 +74,6 @@ def heard(recorder: Recorder) -> tuple[float, float]:
     recorder.received_ns.clear()
     lost = sum(recorder.drops.get(reason, 0) for reason in _MISSING)
     return float(lost), float(np.median(ages_s)) if ages_s else float("nan")
-
-
-def resident_mb(pid: int) -> float:
-    """Memory of a process [MB]."""
-    lines = Path("/proc", str(pid), "status").read_text(encoding="ascii").splitlines()
-    (kilobytes,) = [line.split()[1] for line in lines if line.startswith("VmRSS:")]
-    return int(kilobytes) / 1e3
 
 
 def figures_of(rows: FloatArray, sigint_s: float) -> dict[str, float]:

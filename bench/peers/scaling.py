@@ -5,35 +5,31 @@ odometry at 20 Hz, cameras at 7.5 Hz, 150-300 ms late. Everybody gives all poses
 new measurements five times a second, as the live node does with a large swarm. Measured is CPU time of this
 process per simulated second, without reading messages; the optimum is gtsam's batch solution of all data that
 have arrived by the same moment. Swarms of several shapes are compared with the exact filter (`shapes.py`). At
-the end a hundred robots are played into the live graph in real time.
+the end some are played into the live graph in real time (`make bench-large_swarms`).
 """
 
 from __future__ import annotations
 
 import argparse
-import tempfile
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.graph import large_swarms
 from bench.peers import filterpy_ekf, gtsam_batch, gtsam_lag
 from bench.peers.shapes import ShapeRuns, measure_shape, show
-from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
+from bench.shared.common import new_plot, save_plot, table, write_figures
 from bench.shared.simulated_run import errors_of, mean_nees, position_rmse, run_core, ticks
-from swarm_loc_drivers.sim.recording.bag import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.scenarios.grid_shapes import Shape
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.live.run import play_live
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from swarm_loc_drivers.sim.common.record import SimulatedRun
 
-LIVE_ROBOTS = 100
 SIZES = (5, 20, 50, 100, 200, 300, 500, 1000)
 SHAPE_SIZES = (300, 1000)
 SHAPE_DURATION_S = 120.0
@@ -72,20 +68,6 @@ def measure(robots: int, duration_s: float, seed: int, settings: EstimatorSettin
         reached = position_rmse(errors_of(core.poses[chosen], run, tick_ns[chosen]))
         figures["position_rmse_ratio_to_batch"] = reached / optimum
     return figures
-
-
-def measure_live(duration_s: float, seed: int) -> dict[str, float]:
-    """A large swarm through the live graph: messages lost, the estimator's load, the poses' age."""
-    run = simulate_grid(GridSettings(robots=LIVE_ROBOTS, seed=seed, duration_s=duration_s))
-    with tempfile.TemporaryDirectory() as work:
-        bag = Path(work, f"grid{LIVE_ROBOTS}")
-        write_bag(run, bag, "A simulated grid.")
-        live = play_live(bag, bag / "swarm.yaml", log=OUT / "scaling" / "nodes.log")
-    return {
-        "lost_messages": float(live.lost),
-        "estimator_core": live.estimator_core,
-        "pose_age_ms": 1e3 * float(np.percentile(live.age_s, 95.0)),
-    }
 
 
 def first_part(run: SimulatedRun, duration_s: float) -> SimulatedRun:
@@ -133,15 +115,12 @@ def report(results: dict[int, dict[str, float]], shapes: dict[str, float], live:
     }
     rows = [[robots, *(figures.get(key) for key in keys)] for robots, figures in results.items()]
     print(table(["robots", *keys.values()], rows))
-    if live:
-        print(f"\n{LIVE_ROBOTS} robots over DDS")
-        print(table(["messages lost", "estimator core", "pose age ms (95 %)"], [list(live.values())]))
     if results:
         draw(results)
     flat = {
         f"n{robots}.{key}": value for robots, figures in results.items() for key, value in figures.items()
     }
-    flat |= shapes | {f"live{LIVE_ROBOTS}.{key}": value for key, value in live.items()}
+    flat |= shapes | live
     print(f"figures: {write_figures('scaling', flat)}")
 
 
@@ -174,8 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             shaped[Shape(name), robots] = measure_shape(Shape(name), robots, runs)
     live = {}
     if not options.no_live:
-        print(f"{LIVE_ROBOTS} robots over DDS, in real time ...", flush=True)
-        live = measure_live(options.duration, options.seed)
+        live = large_swarms.measure(large_swarms.SIZES, options.duration, options.seed)
     report(results, show(shaped), live)
 
 

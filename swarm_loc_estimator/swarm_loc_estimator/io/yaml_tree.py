@@ -106,8 +106,12 @@ def shown(value: object) -> str:
     return _SHORT.repr(value).replace("\n", " ")
 
 
-def read_tree(path: Path) -> Tree:
+def read_tree(path: Path, most_bytes: int = MAX_BYTES) -> Tree:
     """Read a YAML file.
+
+    Args:
+        path: The file.
+        most_bytes: Larger files are refused [byte].
 
     Returns:
         Nested dicts, lists and scalars.
@@ -117,11 +121,11 @@ def read_tree(path: Path) -> Tree:
     """
     try:
         with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
+            data = file.read(most_bytes + 1)
     except OSError as error:
         raise YamlTreeError(f"{path} cannot be read: {error.strerror or error}.") from error
-    if len(data) > MAX_BYTES:
-        raise YamlTreeError(f"{path} has more than the {MAX_BYTES} bytes that are sensible.")
+    if len(data) > most_bytes:
+        raise YamlTreeError(f"{path} has more than the {most_bytes} bytes that are sensible.")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of anchors that are used twice

@@ -157,6 +157,13 @@ def cpu_seconds(pid: int) -> float:
     return user_and_system / os.sysconf("SC_CLK_TCK")
 
 
+def resident_mb(pid: int) -> float:
+    """Memory of a process [MB]."""
+    lines = Path("/proc", str(pid), "status").read_text(encoding="ascii").splitlines()
+    (kilobytes,) = [line.split()[1] for line in lines if line.startswith("VmRSS:")]
+    return int(kilobytes) / 1e3
+
+
 @contextmanager
 def _own_domain() -> Iterator[None]:
     """Give this process and its children a ROS domain of their own on this machine."""

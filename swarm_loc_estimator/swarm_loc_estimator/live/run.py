@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,8 +16,8 @@ from swarm_loc_estimator.evaluation.truth import TruthReader
 from swarm_loc_estimator.io.bags.reader import BagReader
 from swarm_loc_estimator.io.inputs.topics import input_topics
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.launching.graph import GraphOptions, graph_nodes
-from swarm_loc_estimator.live.graph import START_PATIENCE_S, LiveError, LiveGraph, cpu_seconds
+from swarm_loc_estimator.launching.graph import GraphOptions, NodeSpec, graph_nodes
+from swarm_loc_estimator.live.graph import START_PATIENCE_S, LiveError, LiveGraph, cpu_seconds, resident_mb
 from swarm_loc_estimator.live.recorder import Recorder, read_history, read_poses
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
 from swarm_loc_estimator.numerics.arrays import FloatArray
@@ -42,6 +42,9 @@ class LiveRun:
         estimator_core: CPU time of the estimator's process per second while the bag played.
         age_s: (A,) time of reception minus stamp of poses, in the bag's time, of those that came when it was
             known here.
+        start_up_s: From the start of the estimator's process to its first poses, which come when all topics
+            of the bag have been found and the player has begun.
+        memory_mb: Of the estimator's process at the end.
     """
 
     result: ReplayResult
@@ -51,6 +54,8 @@ class LiveRun:
     received: int
     estimator_core: float
     age_s: FloatArray
+    start_up_s: float
+    memory_mb: float
 
     @property
     def sent(self) -> int:
@@ -70,13 +75,15 @@ class BagContent:
     Attributes:
         begin_ns: First log time.
         end_ns: Last one.
-        arrival_ns: (M,) increasing, log times of the messages for the estimator.
+        inputs: The topics for the estimator.
+        arrival_ns: (M,) increasing, log times of their messages.
         truth: Robot name -> ground truth.
         remarks: What could not be read, one sentence each.
     """
 
     begin_ns: int
     end_ns: int
+    inputs: tuple[str, ...]
     arrival_ns: NDArray[np.int64]
     truth: Mapping[str, Trajectory]
     remarks: tuple[str, ...]
@@ -95,13 +102,14 @@ def read_bag(bag: Path, swarm: Swarm) -> BagContent:
     arrivals = [np.zeros(0, dtype=np.int64)]
     with BagReader(bag) as reader:
         begin_ns, end_ns = reader.time_range_ns
+        recorded = tuple(topic.name for topic in reader.topics if topic.name in set(inputs))
         for batch in reader.batches([*truth.topics, *inputs]):
             is_truth = batch.topic < len(truth.topics)
             truth.add(batch.chosen(is_truth))
             arrivals.append(batch.log_ns[~is_truth])
         tracks = truth.tracks()
         remarks = (*reader.losses, *truth.remarks())
-    return BagContent(begin_ns, end_ns, np.concatenate(arrivals), tracks, remarks)
+    return BagContent(begin_ns, end_ns, recorded, np.concatenate(arrivals), tracks, remarks)
 
 
 def play_live(
@@ -112,6 +120,7 @@ def play_live(
     rate: float = 1.0,
     parameter_file: Path | None = None,
     page_port: int | None = None,
+    inputs_only: bool = False,
     watch: Watch = lambda _recorder, _content: None,
 ) -> LiveRun:
     """Play a whole bag into a live graph and collect the poses that come out.
@@ -123,6 +132,7 @@ def play_live(
         rate: Speed, 1 for real time.
         parameter_file: ROS parameter file for the nodes.
         page_port: Where a page shows the swarm to browsers, None for nowhere.
+        inputs_only: Whether nothing but the estimator's inputs is played.
         watch: Called about once per event while the bag plays, to show progress.
 
     Raises:
@@ -137,7 +147,11 @@ def play_live(
     options = GraphOptions(str(swarm_file), bag=str(bag), rate=rate, parameter_file=parameters)
     if page_port is not None:
         options = replace(options, watch=True, watch_port=page_port)
-    with LiveGraph(graph_nodes(options), log) as graph:
+    nodes = graph_nodes(options)
+    if inputs_only:
+        nodes = [_with_topics(node, content.inputs) if node.name == PLAYER else node for node in nodes]
+    begin_s = time.monotonic()
+    with LiveGraph(nodes, log) as graph:
         recorder, estimator, player = graph.recorder, graph.process(ESTIMATOR), graph.process(PLAYER)
 
         def has_ended() -> bool:
@@ -146,12 +160,14 @@ def play_live(
 
         graph.wait_for(lambda: bool(recorder.raw), "publish poses", START_PATIENCE_S)
         cpu_s, wall_s = cpu_seconds(estimator.pid), time.monotonic()
+        start_up_s = wall_s - begin_s
         graph.wait_for(has_ended, "go on publishing poses", _SILENCE_PATIENCE_S, needed=[ESTIMATOR])
         played_s = time.monotonic() - wall_s
         core = (cpu_seconds(estimator.pid) - cpu_s) / played_s
         if player.returncode:
             raise LiveError(f"The player ended with status {player.returncode}; see {log}.")
         _wait_for_the_rest(graph, len(content.arrival_ns), content.end_ns)
+        memory_mb = resident_mb(estimator.pid)
     history = read_history(recorder.raw)
     result = ReplayResult(
         f"{bag.name}, live at {rate:g} x",
@@ -165,7 +181,14 @@ def play_live(
         wall_s=played_s,
     )
     age_s = _ages(np.array(recorder.received_ns, dtype=np.int64), result.stamp_ns)
-    return LiveRun(result, content.arrival_ns, rate, history.status, recorder.inputs, core, age_s)
+    return LiveRun(
+        result, content.arrival_ns, rate, history.status, recorder.inputs, core, age_s, start_up_s, memory_mb
+    )
+
+
+def _with_topics(player: NodeSpec, topics: Sequence[str]) -> NodeSpec:
+    """The player of some topics only."""
+    return replace(player, parameters={**player.parameters, "topics": [*topics]})
 
 
 def _ages(received_ns: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> FloatArray:

@@ -18,9 +18,9 @@ from swarm_loc_estimator.core.filter.measurement_model import MeasurementArray
 from swarm_loc_estimator.core.identification.memory import Identities
 from swarm_loc_estimator.io.inputs.ingest import Ingest, InputStatistics
 from swarm_loc_estimator.io.inputs.topics import InputKind, InputTopic
+from swarm_loc_estimator.nodes.wording import listed
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
-_SHOWN_NAMES = 8
 _FULL_LOAD = 0.95
 _PATIENCE_S, _PATIENCE_PERIODS = 10.0, 5.0
 """An expected input that is silent for longer than so many seconds and of its mean periods may have died."""
@@ -138,7 +138,7 @@ class Diagnostics:
         by_cause: dict[str, list[str]] = {}
         for topic in self.missing():
             by_cause.setdefault(self._why_missing(topic), []).append(topic.name)
-        return "; ".join(f"nothing received on {_listed(names)}{cause}" for cause, names in by_cause.items())
+        return "; ".join(f"nothing received on {listed(names)}{cause}" for cause, names in by_cause.items())
 
     def reports(
         self, now_ns: int, estimate: SwarmEstimate, recent: Recent, drops: Mapping[str, int]
@@ -181,7 +181,7 @@ class Diagnostics:
         """One sentence for each of the topics that several nodes publish."""
         found = {topic: self._graph.rivals(topic) for topic in topics}
         some = {topic: names for topic, names in found.items() if names}
-        return [f"{topic} has {len(names)} publishers: {_listed(names)}" for topic, names in some.items()]
+        return [f"{topic} has {len(names)} publishers: {listed(names)}" for topic, names in some.items()]
 
     def _robot_report(
         self, index: int, robot: Robot, estimate: SwarmEstimate, now_ns: int, elapsed_s: float
@@ -305,12 +305,6 @@ def _used_per_robot(recent: Recent, robots: int) -> tuple[list[int], list[float]
     total = np.bincount(observers, nis[mine], minlength=robots)
     mean = np.divide(total, count, out=np.full(robots, np.nan), where=count > 0)
     return count.tolist(), mean.tolist()
-
-
-def _listed(names: Sequence[str]) -> str:
-    """Names for people, not too many."""
-    more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
-    return ", ".join(names[:_SHOWN_NAMES]) + more
 
 
 def _figure(value: float | None) -> str:

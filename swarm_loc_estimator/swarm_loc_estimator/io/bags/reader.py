@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 __all__ = ["BagError", "BagReader", "BagTopic", "RawMessage"]
 
 _STORAGES: dict[str, type[McapFile | SqliteFile]] = {".mcap": McapFile, ".db3": SqliteFile}
+_METADATA_BYTES = 20_000_000
+"""Larger metadata are not read; the three thousand topics of a thousand robots take a tenth of it."""
 
 
 class BagReader:
@@ -162,7 +164,7 @@ class BagReader:
         """File names in the folder's metadata; none when a crash left it without."""
         path = self._path / "metadata.yaml"
         try:
-            tree = read_tree(path) if path.exists() else None
+            tree = read_tree(path, _METADATA_BYTES) if path.exists() else None
         except YamlTreeError as error:
             self._own_losses.append(str(error))
             return []

@@ -25,6 +25,7 @@ from swarm_loc_estimator.io.bags.reader import BagReader, BagTopic, RawMessage
 from swarm_loc_estimator.nodes.player.playback import STEP_S, PlayedSoFar, play
 from swarm_loc_estimator.nodes.player.player_parameters import PlayerParameters
 from swarm_loc_estimator.nodes.player.playing_qos import RELIABLE, playing_qos
+from swarm_loc_estimator.nodes.wording import listed
 from swarm_loc_estimator.parameters.table import ParameterError
 from swarm_loc_estimator.ros.running import ConfiguredNode, Stop, run_node
 
@@ -92,7 +93,7 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
         for name in wanted:
             if name not in topics:
                 raise ParameterError(
-                    f"parameter topics names '{name}', but '{self.chosen.bag}' has: {', '.join(topics)}."
+                    f"parameter topics names '{name}', but '{self.chosen.bag}' has: {listed([*topics])}."
                 )
         return [topics[name] for name in wanted or topics]
 
@@ -165,7 +166,7 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
             if silent:
                 self._own_executor.spin_once(timeout_sec=_POLL_S)
         if silent and not stop.requested:
-            self.get_logger().warning(f"not everything was received on {', '.join(silent)}")
+            self.get_logger().warning(f"not everything was received on {listed([*silent])}")
 
 
 main = partial(run_node, "play", PlayNode)
