@@ -41,8 +41,11 @@ def write_exchanges(
     count: int,
     seed: int,
     told: Callable[[FloatArray], FloatArray] = lambda pose: pose,
+    truly: IrPlatform | None = None,
 ) -> FloatArray:
     """Robots that are somewhere else at every exchange, and the ground truth `told` of where they are.
+
+    Their boards may be `truly` others than described.
 
     Returns:
         The true log-gains (2, robots, n).
@@ -56,7 +59,7 @@ def write_exchanges(
     transmitter = (receiver + rng.integers(1, len(robots), count)) % len(robots)
     relative = random_poses(count, seed, 0.08, 0.28)
     gains = PairGains(np.exp(logs[0, receiver]), np.exp(logs[1, transmitter]), np.zeros((count, 4)))
-    readings = np.rint(readings_of(platform, relative, seed, gains))
+    readings = np.rint(readings_of(truly or platform, relative, seed, gains))
     seen = np.column_stack(
         [relative[:, 0] * np.cos(relative[:, 1]), relative[:, 0] * np.sin(relative[:, 1]), relative[:, 2]]
     )
@@ -215,6 +218,24 @@ def test_ground_truth_that_contradicts_what_was_read_calibrates_nothing(
     save_swarm(Swarm(tuple(robots)), tmp_path / "bag" / "swarm.yaml")
     said = error_of(capsys, tmp_path / "bag", "--out", tmp_path / "out.yaml")
     assert "What they read contradicts itself or the ground truth, and as they were: a, b, c." in said
+    assert not (tmp_path / "out.yaml").exists()
+
+
+@pytest.mark.parametrize("options", [(), ("--without-truth",)])
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_robots_are_not_blamed_where_the_curves_of_their_board_are_wrong(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], seed: int
+) -> None:
+    """Lobes as wide as those of real Droplets, described as the paper has them."""
+    robots, real = described(("a", "b", "c"), droplet(SPREAD), "droplet"), load_ir_platform("droplet_2016")
+    truly = replace(droplet(SPREAD), sensor=real.sensor, emitter=real.emitter)
+    with BagWriter(tmp_path / "bag") as bag:
+        add_topics(bag, robots)
+        write_exchanges(bag, robots, 100, seed, truly=truly)
+    save_swarm(Swarm(tuple(robots)), tmp_path / "bag" / "swarm.yaml")
+    said = error_of(capsys, tmp_path / "bag", "--out", tmp_path / "out.yaml", *options)
+    assert "Platform droplet: its curves do not hold" in said
+    assert "`calibrate_ir --board`." in said
     assert not (tmp_path / "out.yaml").exists()
 
 

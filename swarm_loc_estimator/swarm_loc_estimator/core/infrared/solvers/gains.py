@@ -36,7 +36,8 @@ _SEARCH_SIGMA = 0.02
 """How unsure gains are taken to be while poses are searched with them."""
 _MAX_ODDS = 0.05
 _MAX_MISFIT = 3.0
-"""Exchanges whose second-best pose is likelier, or that fit worse, are left out."""
+"""Exchanges whose second-best pose is likelier, or that fit worse, are left out; where most fit worse though
+gains are free, the curves are wrong."""
 _CLEAR_OF_SATURATION = 3.0
 """Readings expected nearer to saturation than this are left out [sigma]."""
 _WORST = 5.0
@@ -99,13 +100,15 @@ def estimate_gains(
         progress: Called with a word on what is being done.
 
     Raises:
-        GainsError: Elements cannot differ, or no exchange can be used.
+        GainsError: Elements cannot differ, the platform's curves do not hold, or no exchange can be used.
     """
     if platform.element_sigma == 0.0:
         raise GainsError("element_sigma of the platform is 0, so that all gains are 1.")
     estimator = MaximumLikelihood(platform)
     logs = np.zeros((2, robots, platform.n))
-    poses, used = _poses(estimator, exchanges, _pairs(exchanges, logs, platform.element_sigma))
+    unknown = _pairs(exchanges, logs, platform.element_sigma)
+    _check_curves(estimator, exchanges, unknown)
+    poses, used = _poses(estimator, exchanges, unknown)
     before = _residuals(platform, exchanges, logs, poses, used)
     for number in range(_ROUNDS):
         progress(f"gains, round {number + 1}")
@@ -123,6 +126,21 @@ def _pairs(exchanges: Exchanges, logs: FloatArray, sigma: float) -> PairGains:
     factors = np.exp(logs)
     sigmas = np.tile([sigma, 0.0, sigma, 0.0], (len(exchanges.receiver), 1))
     return PairGains(factors[0, exchanges.receiver], factors[1, exchanges.transmitter], sigmas)
+
+
+def _check_curves(estimator: MaximumLikelihood, exchanges: Exchanges, unknown: PairGains) -> None:
+    """Refuse to blame elements where most exchanges fit no pose whatsoever, however elements differ.
+
+    Raises:
+        GainsError: So it is.
+    """
+    misfits = estimator.solve(exchanges.readings, unknown, exchanges.saturation).misfits
+    found = misfits[np.isfinite(misfits)]
+    if found.size and np.median(found) > _MAX_MISFIT:
+        raise GainsError(
+            f"its curves do not hold, for readings are off by {np.sqrt(np.median(found)):.1f} sigma whatever"
+            " poses and gains are taken; find the board itself first, with `calibrate_ir --board`."
+        )
 
 
 def _poses(
