@@ -23,6 +23,7 @@ from swarm_loc_estimator.evaluation.result import ReplayResult
 from swarm_loc_estimator.io.bags.cut import copy_beginning
 from swarm_loc_estimator.io.mrclam.bag import Delay, convert
 from swarm_loc_estimator.io.mrclam.dataset import read_dataset
+from swarm_loc_estimator.launching.graph import GraphOptions
 from swarm_loc_estimator.live.agreement import Agreement, compare_with_replay
 from swarm_loc_estimator.live.run import LiveRun, play_live
 
@@ -36,7 +37,8 @@ Outcome = tuple[LiveRun, Agreement]
 
 def run_bag(bag: Path, swarm_file: Path, rate: float) -> Outcome:
     """Play a bag live and compare with its replay."""
-    live = play_live(bag, swarm_file, log=OUT / "live" / f"{bag.name}.log", rate=rate)
+    options = GraphOptions(str(swarm_file), bag=str(bag), rate=rate)
+    live = play_live(options, log=OUT / "live" / f"{bag.name}.log")
     return live, compare_with_replay(live, bag)
 
 

@@ -27,6 +27,7 @@ from swarm_loc_estimator.evaluation.metrics import pool, summarise
 from swarm_loc_estimator.evaluation.report.report import write_report
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.io.watch.access import free_port
+from swarm_loc_estimator.launching.graph import GraphOptions
 from swarm_loc_estimator.live.agreement import Agreement, compare_with_replay
 from swarm_loc_estimator.live.recorder import Recorder, read_poses
 from swarm_loc_estimator.live.run import BagContent, LiveRun, play_live
@@ -57,14 +58,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(f"Playing {options.bag} at {options.rate:g} x into the live graph", flush=True)
     port = free_port()
     print(f"Watch it live: http://127.0.0.1:{port}/", flush=True)
-    live = play_live(
-        options.bag,
-        swarm_file,
-        log=options.out / "nodes.log",
-        rate=options.rate,
-        page_port=port,
-        watch=progress,
+    graph = GraphOptions(
+        str(swarm_file), bag=str(options.bag), rate=options.rate, watch=True, watch_port=port
     )
+    live = play_live(graph, log=options.out / "nodes.log", watch=progress)
     progress.close()
     compared = compare_with_replay(live, options.bag)
     files = write_report(live.result, options.out)

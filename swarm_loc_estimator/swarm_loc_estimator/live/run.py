@@ -113,40 +113,31 @@ def read_bag(bag: Path, swarm: Swarm) -> BagContent:
 
 
 def play_live(
-    bag: Path,
-    swarm_file: Path,
+    options: GraphOptions,
     *,
     log: Path,
-    rate: float = 1.0,
-    parameter_file: Path | None = None,
-    page_port: int | None = None,
     inputs_only: bool = False,
     watch: Watch = lambda _recorder, _content: None,
 ) -> LiveRun:
     """Play a whole bag into a live graph and collect the poses that come out.
 
     Args:
-        bag: rosbag2 folder, .mcap or .db3 file.
-        swarm_file: Description of the swarm in it.
+        options: The graph, with the bag.
         log: File for the nodes' output.
-        rate: Speed, 1 for real time.
-        parameter_file: ROS parameter file for the nodes.
-        page_port: Where a page shows the swarm to browsers, None for nowhere.
         inputs_only: Whether nothing but the estimator's inputs is played.
         watch: Called about once per event while the bag plays, to show progress.
 
     Raises:
+        ValueError: The options have no bag.
         LiveError: The graph did not play to the end.
         GraphError: An executable is missing.
         BagError: Nothing in the bag can be read.
         SwarmFileError: The description cannot be used.
     """
-    swarm = load_swarm(swarm_file)
+    if options.bag is None:
+        raise ValueError("there is no bag to play")
+    bag, swarm = Path(options.bag), load_swarm(Path(options.swarm_file))
     content = read_bag(bag, swarm)
-    parameters = None if parameter_file is None else str(parameter_file)
-    options = GraphOptions(str(swarm_file), bag=str(bag), rate=rate, parameter_file=parameters)
-    if page_port is not None:
-        options = replace(options, watch=True, watch_port=page_port)
     nodes = graph_nodes(options)
     if inputs_only:
         nodes = [_with_topics(node, content.inputs) if node.name == PLAYER else node for node in nodes]
@@ -170,7 +161,7 @@ def play_live(
         memory_mb = resident_mb(estimator.pid)
     history = read_history(recorder.raw)
     result = ReplayResult(
-        f"{bag.name}, live at {rate:g} x",
+        f"{bag.name}, live at {options.rate:g} x",
         swarm,
         *history[:3],
         status=history.status,
@@ -182,7 +173,15 @@ def play_live(
     )
     age_s = _ages(np.array(recorder.received_ns, dtype=np.int64), result.stamp_ns)
     return LiveRun(
-        result, content.arrival_ns, rate, history.status, recorder.inputs, core, age_s, start_up_s, memory_mb
+        result,
+        content.arrival_ns,
+        options.rate,
+        history.status,
+        recorder.inputs,
+        core,
+        age_s,
+        start_up_s,
+        memory_mb,
     )
 
 

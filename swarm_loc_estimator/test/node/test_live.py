@@ -34,7 +34,8 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_live_poses_are_those_of_replay(bag: Path, tmp_path: Path) -> None:
     every_tick = tmp_path / "parameters.yaml"  # fuses, however slow the machine
     every_tick.write_text("estimator:\n  ros__parameters:\n    fusion_load: 1.0\n", encoding="utf-8")
-    live = play_live(bag, SWARM_FILE, log=tmp_path / "nodes.log", parameter_file=every_tick)
+    options = GraphOptions(str(SWARM_FILE), bag=str(bag), parameter_file=str(every_tick))
+    live = play_live(options, log=tmp_path / "nodes.log")
 
     assert live.received == live.sent > 1000
     compared = compare_with_replay(live, bag)

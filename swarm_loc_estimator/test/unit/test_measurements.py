@@ -204,3 +204,8 @@ def test_innovations_wrap_angles_and_leave_out_headings_not_measured(
     out = np.empty(3)
     innovation(MeasurementColumns.of(one), 0, np.array(measured), np.array(predicted_value), out)
     np.testing.assert_allclose(out, expected, atol=1e-12)
+
+
+def test_columns_of_many_measurements_are_contiguous_as_those_of_one_are() -> None:
+    many = MeasurementColumns.of(np.zeros(3, MEASUREMENT_DTYPE))
+    assert all(column.flags.c_contiguous for column in many)  # else all is compiled again for one

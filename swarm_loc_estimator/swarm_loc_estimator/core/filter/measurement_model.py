@@ -78,7 +78,7 @@ MeasurementArray = NDArray[np.void]
 
 
 class MeasurementColumns(NamedTuple):
-    """The fields of measurements (m,) as compiled code reads them."""
+    """The fields of measurements (m,) as compiled code takes them."""
 
     stamp_ns: NDArray[np.int64]
     observer: NDArray[np.int64]
@@ -98,7 +98,16 @@ class MeasurementColumns(NamedTuple):
 
     @classmethod
     def of(cls, measurements: MeasurementArray) -> MeasurementColumns:
-        """The columns of an array of MEASUREMENT_DTYPE."""
+        """The columns of an array of MEASUREMENT_DTYPE, to be read.
+
+        Each is contiguous. As views they would be so only of a single measurement, for which everything
+        that takes them would be compiled a second time, perhaps while robots wait.
+        """
+        return cls(*(np.ascontiguousarray(measurements[name]) for name in cls._fields))
+
+    @classmethod
+    def views(cls, measurements: MeasurementArray) -> MeasurementColumns:
+        """Likewise, to be written."""
         return cls(*(measurements[name] for name in cls._fields))
 
 

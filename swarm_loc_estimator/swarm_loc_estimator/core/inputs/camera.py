@@ -141,7 +141,7 @@ class SightingConverter:
             _Detections(*(detections[name] for name in _Detections._fields)),
             self._cameras,
             self._markers,
-            MeasurementColumns.of(measurements),
+            MeasurementColumns.views(measurements),
             measurements["marker_id"],
             fates,
         )
