@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 from ir_world import random_poses
 
-from swarm_loc_estimator.calibration.infrared.board import dead_sensors, without_dead
+from swarm_loc_estimator.calibration.infrared.board import (
+    dead_sensors,
+    errors_of,
+    without_dead,
+)
 from swarm_loc_estimator.calibration.infrared.board_fit import BoardReadings, _Problem, fit_board, turned
 from swarm_loc_estimator.core.infrared.board import PairGains
 from swarm_loc_estimator.core.infrared.brightness import expected
@@ -80,3 +84,21 @@ def test_a_dead_sensor_is_found_from_the_exchanges_alone() -> None:
     assert np.isnan(masked.readings[:, 2]).all()
     assert np.isfinite(masked.readings[:, [0, 1, 3, 4, 5]]).all()
     assert dead_sensors(recorded(60, 5), ROBOTS) == {}
+
+
+def with_stray_light(data: BoardReadings, share: float, seed: int) -> BoardReadings:
+    """The same with light by way of bodies and floor, a share of the brightest reading of each exchange."""
+    brightest = data.readings.max(axis=(1, 2), keepdims=True)
+    light = share * brightest * np.random.default_rng(seed).standard_normal(data.readings.shape)
+    return data._replace(readings=np.minimum(data.readings + light, PLATFORM.saturation))
+
+
+@pytest.mark.parametrize("seed", [8, 9])
+def test_a_board_that_knows_of_stray_light_is_less_overconfident(seed: int) -> None:
+    data = with_stray_light(recorded(400, seed), 0.06, seed)
+    model = fit_board(PLATFORM, data, ROBOTS)
+    nees = {
+        stray: errors_of(replace(model, platform=replace(model.platform, stray_noise=stray)), data).nees
+        for stray in (0.0, 0.06)
+    }
+    assert np.mean(nees[0.06]) < 0.6 * np.mean(nees[0.0])

@@ -22,7 +22,11 @@ from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.se2 import wrap_angle
 
 GAIN_SIGMA = 0.05
-"""How unsure gains still are that were found, relative."""
+"""How unsure gains still are that were found, relative.
+
+Set by hand: a jackknife over blocks of time says .03 to .17 on the recordings of 2016, for some sensors are
+dark at times, and other recordings then come out less well: 10.6 instead of 10.4 deg of heading.
+"""
 MIN_EXCHANGES = 100
 """Fewer exchanges with ground truth tell too little of a board."""
 BLOCKS = 3
