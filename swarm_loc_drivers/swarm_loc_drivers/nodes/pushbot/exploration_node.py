@@ -9,7 +9,6 @@ It takes `<robot>/goal` and `<robot>/fix` of `mapper_node`, `<robot>/odom` of th
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from functools import partial
 from pathlib import Path
@@ -27,6 +26,7 @@ from swarm_loc_drivers.core.pushbot.stop_and_go import MapGoal, StopAndGo, StopA
 from swarm_loc_drivers.core.velocity_command import Velocity
 from swarm_loc_drivers.nodes.odometry_output import nanoseconds
 from swarm_loc_drivers.nodes.pushbot.exploration_parameters import ExplorationParameters, driven_robots
+from swarm_loc_estimator.io.messages.planar import yaw_of
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.ros.running import ConfiguredNode, run_node
@@ -142,9 +142,8 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
 
 def _planar(pose: Pose) -> FloatArray:
     """x, y and yaw (3,) of a pose."""
-    return np.array(
-        [pose.position.x, pose.position.y, 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)]
-    )
+    turned = pose.orientation
+    return np.array([pose.position.x, pose.position.y, yaw_of(turned.x, turned.y, turned.z, turned.w)])
 
 
 main = partial(run_node, "exploration_node", ExplorationNode)

@@ -6,7 +6,6 @@ import math
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,12 +15,13 @@ from swarm_loc_drivers.sim.pushbot.kinematics import FOCAL_BASELINE, PERIOD_S, P
 from swarm_loc_drivers.sim.pushbot.optics import CAMERA_X_M, LaserOptics, assembled_robots, led_hz
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.recording.bag import Stream, write_streams
-from swarm_loc_drivers.sim.recording.pushbot_events import event_streams, poses_between, sight_of
+from swarm_loc_drivers.sim.recording.pushbot_events import event_streams, header_at, poses_between, sight_of
+from swarm_loc_drivers.sim.recording.pushbot_maps import MapNotes, goal_stream
 from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot, StartSigma, Swarm
 from swarm_loc_estimator.core.mapping.exploration.goal import Goal
 from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.core.mapping.readings import LightSightings, Readings
-from swarm_loc_estimator.io.maps.fix_covariance import fix_covariance
+from swarm_loc_estimator.io.maps.fix_covariance import FixCovariances
 from swarm_loc_estimator.io.maps.laser_messages import LASER, LIGHTS
 from swarm_loc_estimator.io.messages.encoders import (
     UNKNOWN_COVARIANCE,
@@ -75,9 +75,9 @@ class PushbotBagSettings:
 
 
 def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) -> int:
-    """Write `<robot>/odom`, `laser`, `lights`, `fix`, `events` and `ground_truth`, and files beside them.
+    """Write `map`, and per robot `odom`, `laser`, `lights`, `fix`, `goal`, `events` and `ground_truth`.
 
-    Those are `swarm.yaml`, `walls.csv`, and `<robot>.yaml` with the calibration of each laser.
+    Beside the bag come `swarm.yaml`, `walls.csv`, and `<robot>.yaml` with the calibration of each laser.
 
     Args:
         settings: What is simulated.
@@ -96,13 +96,17 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
     recorded: dict[int, list[tuple[Readings, LightSightings | None]]] = defaultdict(list)
     exploration.on_readings = lambda robot, readings, lights: recorded[robot].append((readings, lights))
     fixes: dict[int, list[Goal]] = defaultdict(list)
+    maps = MapNotes(BEGIN_NS)
     covariances: dict[int, list[FloatArray]] = defaultdict(list)
+    told = [FixCovariances(mapper.settings) for _ in range(settings.robots)]
 
     def note_fix(arrival: Arrival) -> None:
         goal = mapper.goal(arrival.robot)
         if goal is not None:
             fixes[arrival.robot].append(goal)
-            covariances[arrival.robot].append(mapper.covariance(arrival.robot))
+            maps.note(goal.stamp_ns, mapper.occupancy())
+            covariance = told[arrival.robot].told(goal, mapper.covariance(arrival.robot))
+            covariances[arrival.robot].append(covariance)
 
     for _ in range(settings.robots):
         exploration.join(PushBotNoise(slip=settings.slip))
@@ -115,7 +119,9 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
         streams += [_odometry(robot.name, readings), _laser(robot.name, readings, built[number])]
         streams += _lights(robot.name, [lights for _, lights in recorded[number] if lights is not None])
         streams.append(_fixes(robot.name, fixes[number], covariances[number]))
+        streams.append(goal_stream(robot.name, BEGIN_NS, fixes[number]))
         streams.append(_truth(robot.name, exploration.robots[number].trace))
+    streams.append(maps.stream())
     names = [robot.name for robot in robots]
     streams += _events(names, exploration, settings)
     count = write_streams(streams, Swarm(robots), folder, comment)
@@ -150,7 +156,7 @@ def _fixes(name: str, goals: list[Goal], covariances: list[FloatArray]) -> Strea
     """Where the mapper had the robot when it decided on its goals, as the mapper's node publishes it."""
     stamp_ns = BEGIN_NS + np.array([goal.stamp_ns for goal in goals], dtype=np.int64)
     data = [
-        encode_fix("map", at_ns, goal.pose, fix_covariance(covariance))
+        encode_fix("map", at_ns, goal.pose, covariance)
         for at_ns, goal, covariance in zip(stamp_ns.tolist(), goals, covariances, strict=True)
     ]
     return Stream(f"{name}/fix", POSE_WITH_COVARIANCE, stamp_ns, data)
@@ -180,7 +186,7 @@ def _laser(name: str, readings: list[Readings], built: LaserOptics) -> Stream:
         data.append(
             encode(
                 message(
-                    header=_header(at_ns, f"{name}/base_link"),
+                    header=header_at(at_ns, f"{name}/base_link"),
                     distance=distance,
                     sigma=sigma * distance**2,
                     u_px=column,
@@ -213,7 +219,7 @@ def _lights(name: str, sightings: list[LightSightings]) -> list[Stream]:
                 for k in np.flatnonzero(part.stamp_ns == at_ns)
             ]
             stamps.append(BEGIN_NS + at_ns)
-            header = _header(BEGIN_NS + at_ns, f"{name}/base_link")
+            header = header_at(BEGIN_NS + at_ns, f"{name}/base_link")
             data.append(encode(array(header=header, lights=lights), LIGHTS))
     return [Stream(f"{name}/lights", LIGHTS, np.array(stamps, dtype=np.int64), data)] if data else []
 
@@ -225,9 +231,3 @@ def _truth(name: str, trace: FloatArray) -> Stream:
     return Stream(
         f"{name}/ground_truth", POSE_STAMPED, stamp_ns, encode_pose_stamped("map", stamp_ns, chosen)
     )
-
-
-def _header(at_ns: int, frame: str) -> Any:
-    types = typestore().types
-    stamp = types["builtin_interfaces/msg/Time"](sec=at_ns // 1_000_000_000, nanosec=at_ns % 1_000_000_000)
-    return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)

@@ -57,14 +57,18 @@ def event_streams(
     return streams
 
 
-def _packet(name: str, stamp_ns: int, number: int, events: Events) -> bytes:
-    types: Any = typestore().types
+def header_at(stamp_ns: int, frame: str) -> Any:
+    """The header of a message."""
+    types = typestore().types
     stamp = types["builtin_interfaces/msg/Time"](
         sec=stamp_ns // 1_000_000_000, nanosec=stamp_ns % 1_000_000_000
     )
-    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id=f"{name}/event_camera_optical_frame")
-    message = types[EVENTS](
-        header=header,
+    return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
+
+
+def _packet(name: str, stamp_ns: int, number: int, events: Events) -> bytes:
+    message = typestore().types[EVENTS](
+        header=header_at(stamp_ns, f"{name}/event_camera_optical_frame"),
         height=SENSOR_PX,
         width=SENSOR_PX,
         seq=number,

@@ -85,6 +85,7 @@ def body_covariance(belief: BeliefArrays, column: int) -> FloatArray:
     if belief.covariance.shape[0] > 0:
         whole: FloatArray = belief.covariance[column : column + 3, column : column + 3]
         return whole
+    # all of it, but cut: compiled code wants views of one memory layout from both branches
     own: FloatArray = belief.marginal[column // 3][0:3, 0:3]
     return own
 

@@ -12,7 +12,6 @@ from std_msgs.msg import Header
 
 from swarm_loc_estimator.core.mapping.exploration.goal import Goal
 from swarm_loc_estimator.core.mapping.grid.occupancy import OccupancyMap
-from swarm_loc_estimator.io.maps.fix_covariance import fix_covariance
 from swarm_loc_estimator.io.messages.planar import PLANE, planar_covariance
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 
@@ -49,13 +48,13 @@ def goal_message(goal: Goal, frame: str) -> PoseStamped:
 
 
 def fix_message(goal: Goal, covariance: FloatArray, frame: str) -> PoseWithCovarianceStamped:
-    """Where a robot was when its goal was decided, with the covariance (3, 3) of its stop."""
+    """Where a robot was when its goal was decided, with a covariance (3, 3); see `FixCovariances`."""
     message = PoseWithCovarianceStamped()
     message.header.frame_id = frame
     message.header.stamp = Time(nanoseconds=goal.stamp_ns).to_msg()
     _set_pose(message.pose.pose, goal.pose)
     full = planar_covariance(0.0, 0.0, 0.0)
-    full[PLANE] = fix_covariance(covariance)
+    full[PLANE] = covariance
     message.pose.covariance = full.ravel()
     return message
 

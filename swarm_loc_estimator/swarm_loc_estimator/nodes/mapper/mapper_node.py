@@ -26,6 +26,7 @@ from std_srvs.srv import Trigger
 
 from swarm_loc_estimator.core.mapping.grid.occupancy import CELL, OccupancyMap
 from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.io.maps.fix_covariance import FixCovariances
 from swarm_loc_estimator.io.maps.led_frequencies import led_frequencies
 from swarm_loc_estimator.io.maps.map_file import MapFileError, load_map, save_map
 from swarm_loc_estimator.io.maps.mapper_feed import MapperFeed, MapperInput
@@ -100,6 +101,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self._mapper.background = self._background
         self.feed = MapperFeed(self._robots, self._mapper, self._frequencies)
         self._told: dict[int, int] = {}
+        self._covariances = [FixCovariances(self.chosen.settings) for _ in self._robots]
         self._published: OccupancyMap | None = None
 
     def _create_publishers(self) -> None:
@@ -120,7 +122,8 @@ class MapperNode(ConfiguredNode[MapperParameters]):
             return
         self._told[robot] = goal.stamp_ns
         frame = self.chosen.map_frame
-        self._fixes[robot].publish(fix_message(goal, self._mapper.covariance(number), frame))
+        covariance = self._covariances[robot].told(goal, self._mapper.covariance(number))
+        self._fixes[robot].publish(fix_message(goal, covariance, frame))
         self._goals[robot].publish(goal_message(goal, frame))
 
     def _publish_map(self) -> None:
