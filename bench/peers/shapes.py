@@ -44,26 +44,28 @@ def measure_shape(shape: Shape, robots: int, runs: ShapeRuns) -> dict[str, float
 
 
 def _measure(grid: GridSettings, exact_s: float) -> dict[str, float]:
+    is_long = exact_s < grid.duration_s
+    own = _scored(grid, EstimatorSettings())
+    compared = replace(grid, duration_s=exact_s) if is_long else grid
+    exact = _scored(compared, EstimatorSettings(sparse_from=_NEVER))
+    beside = _scored(compared, EstimatorSettings()) if is_long else own
+    ratio = beside["position_rmse_mm"] / exact["position_rmse_mm"]
+    reference = {f"exact_{name}": exact[name] for name in ("nees", "cpu_s_per_s")}
+    return own | {"position_rmse_ratio_to_exact": ratio} | reference
+
+
+def _scored(grid: GridSettings, settings: EstimatorSettings) -> dict[str, float]:
+    """CPU time of a run, and the errors of its second half."""
     run = simulate_grid(grid)
     at_ns = ticks(run)
-    core = run_core(run, at_ns, EstimatorSettings(), _FUSE_NS)
-    errors, counted = errors_of(core.poses, run, at_ns), np.arange(at_ns.size) >= at_ns.size // 2
-    figures = {
+    core = run_core(run, at_ns, settings, _FUSE_NS)
+    counted = np.arange(at_ns.size) >= at_ns.size // 2
+    errors = errors_of(core.poses, run, at_ns)[counted]
+    return {
         "cpu_s_per_s": core.cpu_s / run.duration_s,
-        "position_rmse_mm": 1e3 * position_rmse(errors[counted]),
-        "nees": mean_nees(errors[counted], core.covariances[counted]),
+        "position_rmse_mm": 1e3 * position_rmse(errors),
+        "nees": mean_nees(errors, core.covariances[counted]),
     }
-    if exact_s < grid.duration_s:
-        run = simulate_grid(replace(grid, duration_s=exact_s))
-        at_ns = ticks(run)
-        core = run_core(run, at_ns, EstimatorSettings(), _FUSE_NS)
-        errors, counted = errors_of(core.poses, run, at_ns), np.arange(at_ns.size) >= at_ns.size // 2
-    exact = run_core(run, at_ns, EstimatorSettings(sparse_from=_NEVER), _FUSE_NS)
-    reference = errors_of(exact.poses, run, at_ns)[counted]
-    figures["position_rmse_ratio_to_exact"] = position_rmse(errors[counted]) / position_rmse(reference)
-    figures["exact_nees"] = mean_nees(reference, exact.covariances[counted])
-    figures["exact_cpu_s_per_s"] = exact.cpu_s / run.duration_s
-    return figures
 
 
 def show(results: dict[tuple[Shape, int], dict[str, float]]) -> dict[str, float]:
