@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import compiled, inlined
 
 
 @compiled
@@ -33,16 +33,24 @@ def add_scaled(target: FloatArray, source: FloatArray, factor: float) -> None:
             target[i, j] += factor * source[i, j]
 
 
+@inlined
+def factor_numbers(matrix: FloatArray) -> tuple[float, float, float, float, float, float]:
+    """The rows of the lower Cholesky factor of a positive definite matrix (3, 3), one behind the other."""
+    a = math.sqrt(matrix[0, 0])
+    b = matrix[1, 0] / a
+    c = math.sqrt(matrix[1, 1] - b * b)
+    d = matrix[2, 0] / a
+    e = (matrix[2, 1] - d * b) / c
+    return a, b, c, d, e, math.sqrt(matrix[2, 2] - d * d - e * e)
+
+
 @compiled
 def cholesky3(matrix: FloatArray) -> FloatArray:
     """Lower Cholesky factor (3, 3) of a positive definite matrix (3, 3)."""
     factor = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(i + 1):
-            value = matrix[i, j]
-            for k in range(j):
-                value -= factor[i, k] * factor[j, k]
-            factor[i, j] = math.sqrt(value) if i == j else value / factor[j, j]
+    factor[0, 0], factor[1, 0], factor[1, 1], factor[2, 0], factor[2, 1], factor[2, 2] = factor_numbers(
+        matrix
+    )
     return factor
 
 

@@ -22,7 +22,7 @@ from swarm_loc_estimator.core.filter.measurement_model import MeasurementColumns
 from swarm_loc_estimator.core.filter.prediction import predict
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated, TrackArrays, look_up, new_sample
 from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import compiled, inlined
 from swarm_loc_estimator.numerics.small_matrix import add_scaled, assign
 
 
@@ -45,7 +45,7 @@ def predict_all(
         batch: (m,) its `pose` and `motion` are written; nobody's pose is not.
         uncertain: (N,) written: robots involved that no longer know where they are.
     """
-    robots, sample = belief.tracked.size, new_sample(1)
+    robots, sample = belief.tracked.size, new_sample(2)
     covariance, jacobian = np.zeros((robots, 3, 3)), np.zeros((robots, 3, 3))
     times, stamps = np.zeros(robots), np.zeros(robots)
     for k in range(measurements.stamp_ns.size):
@@ -53,12 +53,13 @@ def predict_all(
         for i in range(2):
             robot = sides[i]
             if robot >= 0:
-                look_up(tracks, robot, measurements.stamp_ns[k], sample, 0)
-                assign(batch.pose[k, i], sample.pose[0])
+                if not _is_of_same_image(measurements, k, i):
+                    look_up(tracks, robot, measurements.stamp_ns[k], sample, i)
+                assign(batch.pose[k, i], sample.pose[i])
                 times[robot] += 1.0
                 stamps[robot] += measurements.stamp_ns[k] - measurements.stamp_ns[0]
-                add_scaled(covariance[robot], sample.covariance[0], 1.0)
-                add_scaled(jacobian[robot], sample.jacobian[0], 1.0)
+                add_scaled(covariance[robot], sample.covariance[i], 1.0)
+                add_scaled(jacobian[robot], sample.jacobian[i], 1.0)
     for robot in range(robots):
         if times[robot] > 0.0:
             mean_ns = measurements.stamp_ns[0] + round(stamps[robot] / times[robot])
@@ -76,6 +77,15 @@ def predict_all(
         if measurements.landmark[k] > 0:
             assign(batch.pose[k, 1], belief.landmark[measurements.landmark[k] - 1])
         relative_motion(measurements, k, tracks, belief, batch.pose[k], batch.motion[k])
+
+
+@inlined
+def _is_of_same_image(measurements: MeasurementColumns, k: int, side: int) -> bool:
+    """Whether the observer of measurement k was looked up at the same instant for the one before it."""
+    if side != 0 or k == 0 or measurements.observer[k] != measurements.observer[k - 1]:
+        return False
+    same: bool = measurements.stamp_ns[k] == measurements.stamp_ns[k - 1]
+    return same
 
 
 @compiled

@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike
 from scipy.special import gammaincinv
 
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.jit import compiled
-from swarm_loc_estimator.numerics.small_matrix import cholesky3, solve3
+from swarm_loc_estimator.numerics.jit import inlined
+from swarm_loc_estimator.numerics.small_matrix import factor_numbers
 
 _STUDENT_DOF = 4.0
 
@@ -19,28 +19,40 @@ def gate_threshold(probability: ArrayLike) -> FloatArray:
     return threshold
 
 
-@compiled
+@inlined
 def squared_distance(innovation: FloatArray, covariance: FloatArray) -> float:
     """Normalised innovation squared of an innovation (3,) under its covariance (3, 3)."""
-    weighted = np.empty(3)
-    solve3(cholesky3(covariance), innovation, weighted)
-    distance: float = innovation[0] * weighted[0] + innovation[1] * weighted[1] + innovation[2] * weighted[2]
+    aa, ba, bb, ca, cb, cc = factor_numbers(covariance)
+    a = innovation[0] / aa
+    b = (innovation[1] - ba * a) / bb
+    c = (innovation[2] - ca * a - cb * b) / cc
+    c = c / cc
+    b = (b - cb * c) / bb
+    a = (a - ba * b - ca * c) / aa
+    distance: float = innovation[0] * a + innovation[1] * b + innovation[2] * c
     return distance
 
 
-@compiled
-def position_distance(innovation: FloatArray, covariance: FloatArray) -> float:
+@inlined
+def position_distance(
+    innovation: FloatArray, covariance: FloatArray, more: tuple[float, float] = (0.0, 0.0)
+) -> float:
     """Normalised square of the first two components, on which alone the gate decides.
 
     The heading has no vote: the planar ambiguity of a square marker flips it in otherwise good sightings.
+
+    Args:
+        innovation: (3,).
+        covariance: (3, 3) of it.
+        more: Variances added to those of both components.
     """
-    a, b, d = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    a, b, d = covariance[0, 0] + more[0], covariance[0, 1], covariance[1, 1] + more[1]
     x, y = innovation[0], innovation[1]
     distance: float = (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
     return distance
 
 
-@compiled
+@inlined
 def soften_heading(innovation: FloatArray, covariance: FloatArray, noise: FloatArray) -> None:
     """Enlarge the heading's part of `noise` (3, 3) where its innovation is unlikely: flips count little.
 

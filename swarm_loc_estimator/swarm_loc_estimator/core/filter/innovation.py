@@ -15,7 +15,7 @@ from swarm_loc_estimator.core.filter.integrity.hidden_noise import add_hidden_no
 from swarm_loc_estimator.core.filter.integrity.surprises import (
     cause_of,
     noise_of_frequent_looks,
-    surprise_covariance,
+    small_variances,
 )
 from swarm_loc_estimator.core.filter.measurement_model import MeasurementColumns, innovation, predict_one
 from swarm_loc_estimator.core.odometry.preintegration import TrackArrays, rate_at
@@ -81,7 +81,7 @@ def new_batch(count: int) -> InnovationBatch:
     )
 
 
-@compiled
+@inlined
 def evaluate(
     measurements: MeasurementColumns, k: int, belief: BeliefArrays, batch: InnovationBatch, row: int
 ) -> None:
@@ -121,13 +121,13 @@ def evaluate(
         if squared_distance(other, s) < squared_distance(difference, s):
             assign(difference, other)
     batch.passed[row] = position_distance(difference, s) <= measurements.gate[k]
-    expected = surprise_covariance(measurements.kind[k], predicted, s)
-    batch.distance[row] = position_distance(difference, expected)
+    small = small_variances(measurements.kind[k], predicted)
+    batch.distance[row] = position_distance(difference, s, small)
     for i in range(2):
-        batch.whitened[row, i] = difference[i] / math.sqrt(expected[i, i])
+        batch.whitened[row, i] = difference[i] / math.sqrt(s[i, i] + small[i])
     batch.cause[row] = cause_of(measurements.kind[k], difference, predicted)
     if measurements.has_heading[k]:
-        before = noise[:, 2].copy()
+        before = (noise[0, 2], noise[1, 2], noise[2, 2])
         soften_heading(difference, s, noise)
         for i in range(3):
             s[i, 2] += noise[i, 2] - before[i]
@@ -177,22 +177,22 @@ def relative_motion(
 
 
 @inlined
-def _camera(belief: BeliefArrays, observer: int) -> tuple[FloatArray, IntArray]:
-    """Yaw and scale (2,) of an observer's camera, and their columns (2,); -1: has none."""
-    camera, columns = np.zeros(2), np.full(2, -1)
-    if observer >= 0:
-        camera[0] = belief.parameter[observer, CAMERA_YAW]
-        camera[1] = belief.parameter[observer, CAMERA_SCALE]
-        columns[0] = belief.table.column[observer, CAMERA_YAW]
-        columns[1] = belief.table.column[observer, CAMERA_SCALE]
-    return camera, columns
+def _camera(belief: BeliefArrays, observer: int) -> tuple[tuple[float, float], tuple[int, int]]:
+    """Yaw and scale of an observer's camera, and their columns; -1: has none."""
+    if observer < 0:
+        return (0.0, 0.0), (-1, -1)
+    parameter, column = belief.parameter, belief.table.column
+    return (
+        (parameter[observer, CAMERA_YAW], parameter[observer, CAMERA_SCALE]),
+        (column[observer, CAMERA_YAW], column[observer, CAMERA_SCALE]),
+    )
 
 
-@compiled
+@inlined
 def _write_jacobian(
     chain: FloatArray,
     bodies: tuple[int, int],
-    camera_columns: IntArray,
+    camera_columns: tuple[int, int],
     columns: IntArray,
     jacobian: FloatArray,
 ) -> None:
@@ -211,7 +211,7 @@ def _write_jacobian(
             jacobian[i, 6 + j] = chain[i, 3 + j] if camera_columns[j] >= 0 else 0.0
 
 
-@compiled
+@inlined
 def _add_stamp_noise(chain: FloatArray, motion: FloatArray, variance: float, noise: FloatArray) -> None:
     """Add to `noise` (3, 3) what a stamp of such variance does to a value that changes by `motion` (3,)."""
     change = np.zeros(3)
@@ -246,7 +246,7 @@ def _read_across(p: FloatArray, bodies: tuple[int, int], out: FloatArray) -> Non
 def _add_uncertainty(
     belief: BeliefArrays,
     bodies: tuple[int, int],
-    camera: IntArray,
+    camera: tuple[int, int],
     chain: FloatArray,
     across: FloatArray,
     s: FloatArray,
@@ -258,7 +258,7 @@ def _add_uncertainty(
     Args:
         belief: Not changed.
         bodies: First column of the observer and of the target, or -1.
-        camera: (2,) columns of its parameters, or -1.
+        camera: Columns of its parameters, or -1.
         chain: (3, 5).
         across: (3, 3) covariance of the observer's error with the target's.
         s: (3, 3) added to.
@@ -266,16 +266,15 @@ def _add_uncertainty(
     p, o, t = belief.covariance, max(bodies[0], 0), max(bodies[1], 0)
     of_o, of_t = body_covariance(belief, o), body_covariance(belief, t)
     of_observer, of_target = 1.0 if bodies[0] >= 0 else 0.0, 1.0 if bodies[1] >= 0 else 0.0
-    difference, half = np.empty((3, 3)), np.empty((3, 3))
+    difference = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
             both = of_target * of_observer * (across[j, i] + across[i, j])
             difference[i, j] = of_target * of_t[i, j] + of_observer * of_o[i, j] - both
-    _turned(chain, difference, half)
     for i in range(3):
+        x, y, z = _turned(chain, i, difference)
         for j in range(3):
-            for a in range(3):
-                s[i, j] += half[i, a] * chain[j, a]
+            s[i, j] = s[i, j] + x * chain[j, 0] + y * chain[j, 1] + z * chain[j, 2]
     for k in range(2):
         if camera[k] >= 0:
             for a in range(3):
@@ -292,9 +291,12 @@ def _add_uncertainty(
                     s[j, i] += beside * chain[j, 3 + k]
 
 
-@compiled
-def _turned(chain: FloatArray, matrix: FloatArray, out: FloatArray) -> None:
-    """Write the product of the first three columns of `chain` and a matrix (3, 3)."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = chain[i, 0] * matrix[0, j] + chain[i, 1] * matrix[1, j] + chain[i, 2] * matrix[2, j]
+@inlined
+def _turned(chain: FloatArray, row: int, matrix: FloatArray) -> tuple[float, float, float]:
+    """The product of the first three columns of a row of `chain` and a matrix (3, 3)."""
+    a, b, c = chain[row, 0], chain[row, 1], chain[row, 2]
+    return (
+        a * matrix[0, 0] + b * matrix[1, 0] + c * matrix[2, 0],
+        a * matrix[0, 1] + b * matrix[1, 1] + c * matrix[2, 1],
+        a * matrix[0, 2] + b * matrix[1, 2] + c * matrix[2, 2],
+    )

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import inlined
 from swarm_loc_estimator.numerics.se2_scalar import composed, wrap
 
 NOBODY = -1
@@ -132,17 +132,19 @@ def predict(
     errors = np.zeros((measurements.size, 2)) if camera is None else camera
     columns = MeasurementColumns.of(measurements)
     for k in range(measurements.size):
-        predict_one(columns, k, observer_pose[k], target_pose[k], errors[k], value[k], jacobian[k])
+        predict_one(
+            columns, k, observer_pose[k], target_pose[k], (errors[k, 0], errors[k, 1]), value[k], jacobian[k]
+        )
     return value, jacobian
 
 
-@compiled
+@inlined
 def predict_one(
     measurements: MeasurementColumns,
     k: int,
     observer_pose: FloatArray,
     target_pose: FloatArray,
-    camera: FloatArray,
+    camera: tuple[float, float],
     value: FloatArray,
     jacobian: FloatArray,
 ) -> None:
@@ -177,7 +179,7 @@ def predict_one(
             jacobian[1, j] = (ux * left - uy * forward) / (stretch * distance)
 
 
-@compiled
+@inlined
 def innovation(
     measurements: MeasurementColumns, k: int, measured: FloatArray, predicted: FloatArray, out: FloatArray
 ) -> None:

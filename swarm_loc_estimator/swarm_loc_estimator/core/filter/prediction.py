@@ -22,9 +22,9 @@ from swarm_loc_estimator.core.description.estimated_parameters import DRIVES, TU
 from swarm_loc_estimator.core.filter.belief import BeliefArrays, body_covariance
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import compiled, inlined
 from swarm_loc_estimator.numerics.se2_scalar import adjoint_of, carry, moved_by_twist
-from swarm_loc_estimator.numerics.small_matrix import add_scaled, assign, assign_matrix, cholesky3
+from swarm_loc_estimator.numerics.small_matrix import add_scaled, assign, assign_matrix, factor_numbers
 
 
 class _Drift(NamedTuple):
@@ -45,7 +45,7 @@ class _Drift(NamedTuple):
     shared: float
 
 
-@compiled
+@inlined
 def predict(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
     """Predict a robot, in place, to an instant."""
     added = np.empty((3, 3))
@@ -82,7 +82,7 @@ def write_predicted(
             covariance[i, j] += added[i, j]
 
 
-@compiled
+@inlined
 def _new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, added: FloatArray) -> bool:
     """Write Ad(T) (G2 - G1) Ad(T)^T (3, 3) and return True; or leave it when that is no covariance.
 
@@ -96,14 +96,14 @@ def _new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, added: Float
         for j in range(3):
             difference[i, j] = noise[i, j] - before[i, j]
             work[i, j] = difference[i, j] + (rounding if i == j else 0.0)
-    factor = cholesky3(work)
-    if not math.isfinite(factor[0, 0] + factor[1, 1] + factor[2, 2]):
+    first, _, second, _, _, third = factor_numbers(work)
+    if not math.isfinite(first + second + third):
         return False
     carry(belief.transform[robot], difference, added)
     return True
 
 
-@compiled
+@inlined
 def _has_drives(belief: BeliefArrays, robot: int) -> bool:
     """Whether any parameter of the robot's motion is estimated."""
     estimated = False

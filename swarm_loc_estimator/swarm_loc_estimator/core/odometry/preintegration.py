@@ -17,7 +17,7 @@ from swarm_loc_estimator.core.odometry.process_noise import (
     add_step_noise,
 )
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import compiled, inlined
 from swarm_loc_estimator.numerics.se2_scalar import wrap
 from swarm_loc_estimator.numerics.small_matrix import add_scaled, assign, assign_matrix
 
@@ -125,7 +125,7 @@ def new_sample(count: int) -> OdometrySample:
     )
 
 
-@compiled
+@inlined
 def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample, k: int) -> None:
     """Write where the track of a robot is at an instant, in row k of a sample.
 
@@ -188,7 +188,7 @@ def rate_at(tracks: TrackArrays, robot: int, stamp_ns: int, rate: FloatArray) ->
     rate[2] = turn / duration_s
 
 
-@compiled
+@inlined
 def _along_step(
     tracks: TrackArrays, robot: int, row: int, fraction: float, out: OdometrySample, k: int
 ) -> None:
@@ -211,7 +211,7 @@ def look_up_all(tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray) -> O
     return out
 
 
-@compiled
+@inlined
 def _interpolate(start: FloatArray, end: FloatArray, fraction: float, out: FloatArray) -> None:
     """The pose on the arc of constant twist from `start` to `end`; a `fraction` past 1 runs on."""
     turn = end[2] - start[2]

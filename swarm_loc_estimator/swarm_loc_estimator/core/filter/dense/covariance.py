@@ -84,10 +84,10 @@ class DenseFilter:
             innovation: (m, r) measured minus predicted.
             noise: (m, r, r) covariance of the measurement.
         """
-        information = _inverse(self.covariance)
-        gradient = np.zeros(information.shape[0])
-        _gather(information, gradient, columns, jacobian, innovation, noise)
-        self.covariance = _inverse(information)
+        gradient = np.zeros(self.covariance.shape[0])
+        _invert(self.covariance)
+        _gather(self.covariance, gradient, columns, jacobian, innovation, noise)
+        _invert(self.covariance)
         correction: FloatArray = self.covariance @ gradient
         return correction
 
@@ -190,17 +190,18 @@ def innovation_covariance(
     return s
 
 
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of a symmetric positive definite matrix, symmetric to the last bit."""
+def _invert(matrix: FloatArray) -> None:
+    """Invert a symmetric positive definite matrix where it stands, symmetric to the last bit.
+
+    Fresh memory for large matrices would cost about as much as the arithmetic.
+    """
     # in Fortran order the upper triangle is faster, and the transpose of a symmetric matrix costs no copy
-    factor, info = lapack.dpotrf(matrix.T, lower=0, clean=0)
+    factor, info = lapack.dpotrf(matrix.T, lower=0, clean=0, overwrite_a=1)
     if not info:
-        inverse, info = lapack.dpotri(factor, lower=0, overwrite_c=1)
+        _, info = lapack.dpotri(factor, lower=0, overwrite_c=1)
     if info:
         raise np.linalg.LinAlgError("the covariance is not positive definite")
-    symmetric: FloatArray = inverse.T
-    _mirror(symmetric)
-    return symmetric
+    _mirror(matrix)
 
 
 @compiled

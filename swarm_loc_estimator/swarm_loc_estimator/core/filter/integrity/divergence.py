@@ -39,7 +39,7 @@ class LossLimits(NamedTuple):
     max_doubt: float
 
 
-@compiled
+@inlined
 def confirm(measurements: MeasurementColumns, k: int, belief: BeliefArrays, passed: bool) -> int:
     """Hold measurement k against poses that were assumed; return a robot that is elsewhere, or -1."""
     observer, target = measurements.observer[k], measurements.target[k]
@@ -58,7 +58,7 @@ def confirm(measurements: MeasurementColumns, k: int, belief: BeliefArrays, pass
     return elsewhere
 
 
-@compiled
+@inlined
 def _count_confirmation(state: IntegrityArrays, robot: int, stamp_ns: int) -> None:
     if stamp_ns - state.confirmed_ns[robot] >= _CONFIRMED_AGAIN_NS:
         state.confirmations[robot] += 1
@@ -94,7 +94,7 @@ def note_seen(state: IntegrityArrays, robot: int) -> None:
     state.doubt[robot] = max(0.0, state.doubt[robot] - _SEEN_RELIEF)
 
 
-@compiled
+@inlined
 def count_gated(
     measurements: MeasurementColumns, k: int, belief: BeliefArrays, passed: bool, limits: LossLimits
 ) -> int:

@@ -83,7 +83,7 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
     )
 
 
-@compiled
+@inlined
 def assess(
     measurements: MeasurementColumns,
     k: int,
@@ -183,15 +183,12 @@ def cause_of(kind: int, innovation: FloatArray, predicted: FloatArray) -> int:
     return DESCRIPTION if error > _NOISE_M else NOISE
 
 
-@compiled
-def surprise_covariance(kind: int, predicted: FloatArray, expected: FloatArray) -> FloatArray:
-    """The innovation's `expected` covariance (3, 3) with errors that are too small to matter."""
+@inlined
+def small_variances(kind: int, predicted: FloatArray) -> tuple[float, float]:
+    """Variances of errors of a position, forward or range and left or bearing, too small to matter."""
     distance = predicted[0] if kind == POLAR else math.hypot(predicted[0], predicted[1])
     small = (_SMALL_M + _SMALL_SHARE * abs(distance)) ** 2
-    covariance: FloatArray = expected.copy()
-    covariance[0, 0] += small
-    covariance[1, 1] += small / max(distance * distance, 1e-6) if kind == POLAR else small
-    return covariance
+    return small, (small / max(distance * distance, 1e-6) if kind == POLAR else small)
 
 
 @compiled
@@ -214,7 +211,7 @@ def is_contradicted(state: IntegrityArrays, robot: int) -> bool:
     return contradicted
 
 
-@compiled
+@inlined
 def _relieve(state: IntegrityArrays, observer: int, source: int, place: int) -> None:
     """Count a look that is no surprise for those whom it is about."""
     state.evidence[observer, place] = max(0.0, state.evidence[observer, place] - _RELIEF)
@@ -259,7 +256,7 @@ def _surprises(state: IntegrityArrays, node: int, now_ns: int) -> tuple[int, flo
     return bad, bad / max(1, count)
 
 
-@compiled
+@inlined
 def _weight_of_trend(state: IntegrityArrays, observer: int, place: int, whitened: FloatArray) -> float:
     """Take a whitened innovation (2,) into the pair's sum; what speaks against it when there are enough."""
     total = state.whitened[observer, place]
@@ -276,7 +273,7 @@ def _weight_of_trend(state: IntegrityArrays, observer: int, place: int, whitened
     return _TREND_WEIGHT if trending else 0.0
 
 
-@compiled
+@inlined
 def _forget_trend(state: IntegrityArrays, observer: int, place: int) -> None:
     state.whitened[observer, place, 0] = state.whitened[observer, place, 1] = 0.0
     state.squares[observer, place], state.looks[observer, place] = 0.0, 0
@@ -294,7 +291,7 @@ def _find(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int
     return -1
 
 
-@compiled
+@inlined
 def _new_place(state: IntegrityArrays, observer: int, source: int) -> int:
     """Remember a new pair in place of the one seen longest ago."""
     oldest = 0
