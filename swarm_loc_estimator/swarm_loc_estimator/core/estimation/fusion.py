@@ -259,8 +259,14 @@ class Fusion:
             rows = rows[good]
             if rows.size:
                 verdicts[rows], nis[rows] = self._update(state, measurements[rows], chosen(batch, good))
-        for k in np.flatnonzero(~tied):
-            verdicts[k] = self._note(state, measurements[k : k + 1])
+        untied = np.flatnonzero(~tied)
+        sides = zip(measurements["observer"][untied], measurements["target"][untied], strict=True)
+        for k, (observer, target) in zip(untied.tolist(), sides, strict=True):
+            # most of what comes before a swarm is located; who is known changes on the way
+            if state.is_known(observer) == state.is_known(target):
+                verdicts[k] = Verdict.NOT_LOCALIZED
+            else:
+                verdicts[k] = self._note(state, measurements[k : k + 1])
 
     def _predict(
         self, state: SwarmState, measurements: MeasurementArray

@@ -13,6 +13,7 @@ from swarm_loc_estimator.core.filter.dense.covariance import DenseFilter
 from swarm_loc_estimator.core.filter.integrity.hidden_noise import MAX_UNITS, doubt_noise
 from swarm_loc_estimator.core.filter.integrity.surprises import new_integrity
 from swarm_loc_estimator.core.filter.joint_filter import JointFilter
+from swarm_loc_estimator.core.filter.measurement_model import NOBODY
 from swarm_loc_estimator.core.identification.memory import IdentityMemory
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
@@ -131,6 +132,10 @@ class SwarmState:
             self.pair_stamp_ns,
             self.pair_history,
         )
+
+    def is_known(self, side: int) -> bool:
+        """Whether a side of a measurement is located: a robot, or NOBODY in place of what is in `map`."""
+        return side == NOBODY or bool(self.tracked[side])
 
     def initialize(self, robot: int, initial: InitialPose, at: Preintegrated, confirmations: int = 0) -> None:
         """Take the robot into the estimate.

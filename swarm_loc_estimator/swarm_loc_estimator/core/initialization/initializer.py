@@ -60,17 +60,17 @@ class Initializer:
             Whether the measurement does so.
         """
         observer, target, now_ns = int(one["observer"][0]), int(one["target"][0]), int(one["stamp_ns"][0])
-        knows_observer, knows_target = (side == NOBODY or state.tracked[side] for side in (observer, target))
+        knows_observer, knows_target = state.is_known(observer), state.is_known(target)
         robot, other = (target, observer) if knows_observer else (observer, target)
         if knows_observer == knows_target or not self._tracks.begun(robot, now_ns):
             return False
-        track = self._tracks.at(np.array([robot]), one["stamp_ns"])
-        at = Preintegrated(now_ns, track.covariance[0], track.jacobian[0])
-        camera = np.zeros(2) if observer == NOBODY else state.parameter[observer, [CAMERA_YAW, CAMERA_SCALE]]
         old = state.constraints.get(robot, NO_CONSTRAINTS)
         same = old[(old["marker_id"] == one["marker_id"][0]) & (old["other"] == other)]
         if same.size and abs(now_ns - int(same["stamp_ns"][-1])) < _INDEPENDENT_NS:
             return True
+        track = self._tracks.at(np.array([robot]), one["stamp_ns"])
+        at = Preintegrated(now_ns, track.covariance[0], track.jacobian[0])
+        camera = np.zeros(2) if observer == NOBODY else state.parameter[observer, [CAMERA_YAW, CAMERA_SCALE]]
         waiting, seen = Waiting(robot, track.pose[0], at.covariance), self._located(state, other, one)
         constraints = with_constraint(old, one, camera, waiting, seen, self._window_ns)
         state.constraints[robot] = constraints
