@@ -234,6 +234,7 @@ class SwarmState:
     def _trust(self, robot: int, confirmations: int) -> None:
         """Forget what was held against a robot that begins anew."""
         self.integrity.gated_in_a_row[robot] = 0
+        self.integrity.gated_fixes[robot] = 0
         self.integrity.doubt[robot] = 0.0
         self.integrity.confirmations[robot] = confirmations
         self.integrity.source[robot] = -1

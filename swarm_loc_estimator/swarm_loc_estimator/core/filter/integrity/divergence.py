@@ -19,6 +19,8 @@ _HIDDEN_SIGMA = (0.03, 0.03, 0.06)
 _SEEN_RELIEF = 1.0
 """A look from above rests on nothing else that is believed."""
 _GATED_AGAIN_NS = 250_000_000
+_MAX_GATED_FIXES = 3
+"""A robot is where fixes put it, not where other robots that hang on it say: so many send it there."""
 _CONFIRMED_AGAIN_NS = 150_000_000
 """Sightings that follow each other faster confirm a pose once: they have much of their errors in common."""
 
@@ -115,7 +117,24 @@ def count_gated(
                 state.gated_source[side], state.gated_ns[side] = source, now_ns
             if state.gated_in_a_row[side] >= limits.gated_in_a_row:
                 lost = side
+    if observer < 0 and target >= 0 and _is_off_its_fixes(state, target, measurements.stamp_ns[k], passed):
+        lost = target
     if passed and (observer < 0 or target < 0):
         fixed = max(observer, target)
         belief.last_fix_ns[fixed] = max(belief.last_fix_ns[fixed], measurements.stamp_ns[k])
     return lost
+
+
+@compiled
+def _is_off_its_fixes(state: IntegrityArrays, robot: int, stamp_ns: int, passed: bool) -> bool:
+    """Count an absolute fix of a robot; whether it has had too many gated since the last accepted one.
+
+    Robots that were located by way of this one agree with it wherever it is, so what they say does not count.
+    """
+    if passed:
+        state.gated_fixes[robot] = 0
+    elif stamp_ns - state.gated_fix_ns[robot] > _GATED_AGAIN_NS:
+        state.gated_fixes[robot] += 1
+        state.gated_fix_ns[robot] = stamp_ns
+    off: bool = state.gated_fixes[robot] >= _MAX_GATED_FIXES
+    return off

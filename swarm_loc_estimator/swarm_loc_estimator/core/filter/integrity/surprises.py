@@ -79,6 +79,8 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
         gated_in_a_row=np.zeros(robots, dtype=np.int64),
         gated_source=np.full(robots, -1),
         gated_ns=np.full(robots, NEVER_NS // 2),
+        gated_fixes=np.zeros(robots, dtype=np.int64),
+        gated_fix_ns=np.full(robots, NEVER_NS // 2),
         hidden_noise=np.zeros(robots),
     )
 
@@ -207,7 +209,11 @@ def is_elsewhere(state: IntegrityArrays, robot: int, within_ns: int = RECENT_NS)
 @compiled
 def is_contradicted(state: IntegrityArrays, robot: int) -> bool:
     """Whether the newest measurements speak against a robot's pose: it is not told as tracked."""
-    contradicted: bool = state.doubt[robot] >= _DENIED or is_elsewhere(state, robot, _ONE_IMAGE_NS)
+    contradicted: bool = (
+        state.doubt[robot] >= _DENIED
+        or state.gated_fixes[robot] > 0
+        or is_elsewhere(state, robot, _ONE_IMAGE_NS)
+    )
     return contradicted
 
 

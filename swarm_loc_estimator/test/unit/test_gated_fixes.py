@@ -1,0 +1,71 @@
+"""A robot is where absolute fixes put it, whatever others say that were located by way of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from core_messages import SECOND, T0, give_fix
+
+from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.description.swarm import RandomWalk, Robot, Swarm
+from swarm_loc_estimator.core.estimation.contradictions import Kind as Contradicted
+from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimator
+from swarm_loc_estimator.core.filter.integrity.divergence import LossLimits, count_gated
+from swarm_loc_estimator.core.filter.integrity.surprises import is_contradicted
+from swarm_loc_estimator.core.filter.measurement_model import MEASUREMENT_DTYPE, NOBODY, MeasurementColumns
+from swarm_loc_estimator.core.filter.state import SwarmState
+
+ROOT, NEIGHBOUR = 0, 1
+LIMITS = LossLimits(1.0, 0.3, 12, 10.0)
+WALKER = Swarm((Robot("root", camera=None, stands=True, random_walk=RandomWalk(1e-6, 1e-4)),))
+NOISE = np.diag(np.square([0.002, 0.002, 0.02]))
+HERE, THERE = np.array([0.1, 0.2, 0.3]), np.array([0.4, 0.0, 1.3])
+
+
+def looked(state: SwarmState, second: int, observer: int, passed: bool) -> int:
+    """Count a fix of the root, or what another robot measures of it; returns who is lost."""
+    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
+    one["stamp_ns"], one["observer"], one["target"] = T0 + second * SECOND, observer, ROOT
+    lost: int = count_gated(MeasurementColumns.of(one), 0, state.arrays(), passed, LIMITS)
+    return lost
+
+
+def new_state() -> SwarmState:
+    return SwarmState(ParameterTable.of([Robot("root"), Robot("neighbour")]))
+
+
+def test_what_others_say_does_not_outweigh_fixes() -> None:
+    """They were located by the root, so they agree with it wherever it is."""
+    state = new_state()
+    lost = []
+    for second in range(3):
+        assert looked(state, second, NEIGHBOUR, passed=True) == -1
+        lost.append(looked(state, second, NOBODY, passed=False))
+        assert is_contradicted(state.integrity, ROOT)
+    assert lost == [-1, -1, ROOT]
+
+
+def test_one_fix_that_is_wrong_is_forgiven_with_the_next_good_one() -> None:
+    state = new_state()
+    for second in range(20):
+        assert looked(state, second, NOBODY, passed=second % 2 == 0) == -1
+        assert is_contradicted(state.integrity, ROOT) == (second % 2 == 1)
+    for _ in range(5):  # of one instant, as of several trackers
+        assert looked(state, 30, NOBODY, passed=False) == -1
+
+
+def test_a_robot_that_was_carried_away_is_not_told_as_tracked_until_it_is_found() -> None:
+    estimator = SwarmEstimator(WALKER, EstimatorSettings())
+    told, named = [], []
+    for second in range(18):
+        stamp_ns = T0 + second * SECOND
+        true = HERE if second < 10 else THERE
+        give_fix(estimator, 0, stamp_ns, true, NOISE, stamp_ns)
+        estimate = estimator.tick(stamp_ns)
+        right = bool(np.hypot(*(estimate.poses[0] - true)[:2]) < 0.05)
+        told.append((estimate.status[0] == Status.TRACKED, right))
+        named.append(bool(estimator.contradictions(stamp_ns)))
+    assert all(right for tracked, right in told if tracked)
+    assert told[9] == told[17] == (True, True)
+    assert named[10]
+    assert {one.kind for one in estimator.contradictions(T0 + 17 * SECOND)} <= {Contradicted.DESCRIPTION}
