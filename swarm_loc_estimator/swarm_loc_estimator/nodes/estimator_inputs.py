@@ -19,7 +19,9 @@ DEPTH = 1000
 """So many messages of a topic wait for a tick at most: a busy moment as long as the horizon."""
 _MAX_PER_TAKE = 5000
 """What a tick may take of all topics, so that none takes long."""
-_MIN_PER_TOPIC = 10
+_MIN_PER_TOPIC = 100
+"""Of each topic at least so many: what comes within the usual horizon. With less, an estimator that is once
+behind would get ever older data, which cost more to use, and never catch up."""
 
 _MESSAGE_CLASSES = {
     InputKind.ODOMETRY: Odometry,

@@ -75,6 +75,8 @@ _ORDINARY_DROPS = frozenset(
     }
 )
 """Late, double or outlying data is a matter of course, and so is light of robots too far or too near."""
+_MOST_TOLD = 8
+"""So many new contradictions are logged one by one; where more come at once, something else is wrong."""
 _PATIENCE_S = 5.0
 """How long nothing may come before the log names what is missing."""
 
@@ -233,9 +235,11 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
 
     def _warn_of_contradictions(self, contradictions: list[Contradiction]) -> None:
         """Tell of each contradiction once, until it has gone."""
-        for one in contradictions:
-            if (one.about, one.kind) not in self._known_contradictions:
-                self.get_logger().warning(one.text)
+        new = [one.text for one in contradictions if (one.about, one.kind) not in self._known_contradictions]
+        for text in new[:_MOST_TOLD]:
+            self.get_logger().warning(text)
+        if len(new) > _MOST_TOLD:
+            self.get_logger().warning(f"{len(new) - _MOST_TOLD} more contradictions: see /diagnostics")
         self._known_contradictions = {(one.about, one.kind) for one in contradictions}
 
     def _say_what_is_missing(self, now_s: float) -> None:
