@@ -7,6 +7,7 @@ functions cost ten to fifty times the arithmetic. Compiled code is cached in the
 from __future__ import annotations
 
 import hashlib
+import inspect
 import os
 import re
 import shutil
@@ -24,6 +25,7 @@ import numba
 Function = TypeVar("Function", bound=Callable[..., object])
 
 _IMPORT = re.compile(r"^from (?P<module>[\w.]+) import (?P<names>\([^)]*\)|.*)$", re.MULTILINE)
+_NUMBERS = {"None", "bool", "int", "float", "tuple"}
 _KEPT_S = 30 * 86400.0
 
 
@@ -55,7 +57,18 @@ def compiled(function: Function) -> Function:
 
 
 def inlined(function: Function) -> Function:
-    """The same for short functions of large tuples, written out where they are called: a call costs more."""
+    """The same for functions of large tuples of arrays, written out where they are called.
+
+    A call, and numba's counting of references to every array touched, would cost more than the arithmetic. So
+    nothing is counted within: such a function borrows the arrays of its caller. It cannot allocate one, which
+    does not compile; and it and all that it calls return numbers, for nobody would release an array.
+
+    Raises:
+        TypeError: It is declared to return something else.
+    """
+    returned = inspect.formatannotation(function.__annotations__["return"])
+    if not _NUMBERS.issuperset(re.findall(r"\w+", returned)):
+        raise TypeError(f"{function.__qualname__} returns {returned}: inlined functions return numbers only")
     return _compiled(function, fastmath=False, forceinline=True)
 
 
@@ -70,7 +83,14 @@ def _compiled(function: Function, *, fastmath: bool | set[str], forceinline: boo
     source = Path(function.__code__.co_filename).resolve()
     function.__code__ = function.__code__.replace(co_filename=str(source))
     numba.config.CACHE_DIR = str(_cache_folder(source))  # type: ignore[attr-defined]
-    compiler = numba.njit(cache=True, error_model="numpy", fastmath=fastmath, forceinline=forceinline)
+    # without _nrt a function would count references, or not, as the one that happens to call it first
+    compiler = numba.njit(  # type: ignore[call-overload]  # its stubs lack _nrt
+        cache=True,
+        error_model="numpy",
+        fastmath=fastmath,
+        forceinline=forceinline,
+        _nrt=not forceinline,
+    )
     return cast("Function", compiler(function))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from swarm_loc_estimator.core.filter.belief import BeliefArrays, to_map
@@ -9,6 +11,7 @@ from swarm_loc_estimator.core.filter.innovation import (
     InnovationBatch,
     body_columns,
     evaluate,
+    new_scratch,
     relative_motion,
 )
 from swarm_loc_estimator.core.filter.integrity.divergence import (
@@ -20,7 +23,13 @@ from swarm_loc_estimator.core.filter.integrity.divergence import (
 from swarm_loc_estimator.core.filter.integrity.surprises import assess, is_set_aside
 from swarm_loc_estimator.core.filter.measurement_model import MeasurementColumns
 from swarm_loc_estimator.core.filter.prediction import predict
-from swarm_loc_estimator.core.odometry.preintegration import Preintegrated, TrackArrays, look_up, new_sample
+from swarm_loc_estimator.core.odometry.preintegration import (
+    OdometrySample,
+    Preintegrated,
+    TrackArrays,
+    look_up,
+    new_sample,
+)
 from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.numerics.jit import compiled, inlined
 from swarm_loc_estimator.numerics.small_matrix import add_scaled, assign
@@ -46,37 +55,71 @@ def predict_all(
         uncertain: (N,) written: robots involved that no longer know where they are.
     """
     robots, sample = belief.tracked.size, new_sample(2)
-    covariance, jacobian = np.zeros((robots, 3, 3)), np.zeros((robots, 3, 3))
-    times, stamps = np.zeros(robots), np.zeros(robots)
+    sums = _Sums(np.zeros(robots), np.zeros(robots), np.zeros((robots, 3, 3)), np.zeros((robots, 3, 3)))
     for k in range(measurements.stamp_ns.size):
-        sides = (measurements.observer[k], measurements.target[k])
-        for i in range(2):
-            robot = sides[i]
-            if robot >= 0:
-                if not _is_of_same_image(measurements, k, i):
-                    look_up(tracks, robot, measurements.stamp_ns[k], sample, i)
-                assign(batch.pose[k, i], sample.pose[i])
-                times[robot] += 1.0
-                stamps[robot] += measurements.stamp_ns[k] - measurements.stamp_ns[0]
-                add_scaled(covariance[robot], sample.covariance[i], 1.0)
-                add_scaled(jacobian[robot], sample.jacobian[i], 1.0)
+        _look_up_both(measurements, k, tracks, sample, batch, sums)
     for robot in range(robots):
-        if times[robot] > 0.0:
-            mean_ns = measurements.stamp_ns[0] + round(stamps[robot] / times[robot])
+        if sums.times[robot] > 0.0:
+            mean_ns = measurements.stamp_ns[0] + round(sums.stamps[robot] / sums.times[robot])
             to = Preintegrated(mean_ns, np.zeros((3, 3)), np.zeros((3, 3)))
-            add_scaled(to.covariance, covariance[robot], 1.0 / times[robot])
-            add_scaled(to.jacobian, jacobian[robot], 1.0 / times[robot])
+            add_scaled(to.covariance, sums.covariance[robot], 1.0 / sums.times[robot])
+            add_scaled(to.jacobian, sums.jacobian[robot], 1.0 / sums.times[robot])
             predict(belief, robot, to)
     for k in range(measurements.stamp_ns.size):
-        sides = (measurements.observer[k], measurements.target[k])
-        for i in range(2):
-            robot = sides[i]
-            if robot >= 0:
-                to_map(belief, robot, batch.pose[k, i])
-                uncertain[robot] |= is_uncertain(belief, robot, batch.pose[k, i], limits)
-        if measurements.landmark[k] > 0:
-            assign(batch.pose[k, 1], belief.landmark[measurements.landmark[k] - 1])
-        relative_motion(measurements, k, tracks, belief, batch.pose[k], batch.motion[k])
+        _write_poses(measurements, k, tracks, belief, limits, batch, uncertain)
+
+
+class _Sums(NamedTuple):
+    """Sums over the measurements of each robot (N,): number, stamps since the first one, preintegrated."""
+
+    times: FloatArray
+    stamps: FloatArray
+    covariance: FloatArray
+    jacobian: FloatArray
+
+
+@inlined
+def _look_up_both(
+    measurements: MeasurementColumns,
+    k: int,
+    tracks: TrackArrays,
+    sample: OdometrySample,
+    batch: InnovationBatch,
+    sums: _Sums,
+) -> None:
+    """Look up the robots of measurement k at its stamp, in a sample of two, and add that to the sums."""
+    sides = (measurements.observer[k], measurements.target[k])
+    for i in range(2):
+        robot = sides[i]
+        if robot >= 0:
+            if not _is_of_same_image(measurements, k, i):
+                look_up(tracks, robot, measurements.stamp_ns[k], sample, i)
+            assign(batch.pose[k, i], sample.pose[i])
+            sums.times[robot] += 1.0
+            sums.stamps[robot] += measurements.stamp_ns[k] - measurements.stamp_ns[0]
+            add_scaled(sums.covariance[robot], sample.covariance[i], 1.0)
+            add_scaled(sums.jacobian[robot], sample.jacobian[i], 1.0)
+
+
+@inlined
+def _write_poses(
+    measurements: MeasurementColumns,
+    k: int,
+    tracks: TrackArrays,
+    belief: BeliefArrays,
+    limits: LossLimits,
+    batch: InnovationBatch,
+    uncertain: BoolArray,
+) -> None:
+    """Write what `predict_all` does of measurement k, by the belief predicted."""
+    sides = (measurements.observer[k], measurements.target[k])
+    for i in range(2):
+        if sides[i] >= 0:
+            to_map(belief, sides[i], batch.pose[k, i])
+            uncertain[sides[i]] |= is_uncertain(belief, sides[i], batch.pose[k, i], limits)
+    if measurements.landmark[k] > 0:
+        assign(batch.pose[k, 1], belief.landmark[measurements.landmark[k] - 1])
+    relative_motion(measurements, k, tracks, belief, batch.pose[k], batch.motion[k])
 
 
 @inlined
@@ -100,8 +143,9 @@ def body_columns_all(measurements: MeasurementColumns, belief: BeliefArrays) -> 
 @compiled
 def evaluate_all(measurements: MeasurementColumns, belief: BeliefArrays, batch: InnovationBatch) -> None:
     """Evaluate the innovations of all measurements (m,) against one belief, see `evaluate`."""
+    scratch = new_scratch()
     for k in range(measurements.stamp_ns.size):
-        evaluate(measurements, k, belief, batch, k)
+        evaluate(measurements, k, belief, batch, k, scratch)
 
 
 @compiled
@@ -118,7 +162,8 @@ def assess_all(
     """
     contradicted = np.zeros(belief.integrity.doubt.size, dtype=np.bool_)
     for k in range(passed.size):
-        source = assess(measurements, k, belief, limits.max_doubt, (looks[0][k], looks[1][k], looks[2][k]))
+        look = (looks[0][k], (looks[1][k, 0], looks[1][k, 1]), looks[2][k])
+        source = assess(measurements, k, belief, limits.max_doubt, look)
         if source >= 0:
             contradicted[source] = True
         passed[k] &= not is_set_aside(measurements, k, belief)

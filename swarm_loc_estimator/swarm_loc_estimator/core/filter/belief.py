@@ -83,7 +83,7 @@ class BeliefArrays(NamedTuple):
     pair_history: FloatArray
 
 
-@inlined
+@compiled
 def body_covariance(belief: BeliefArrays, column: int) -> FloatArray:
     """A view (3, 3) of the covariance of the body whose first column is given."""
     if belief.covariance.shape[0] > 0:
@@ -92,6 +92,14 @@ def body_covariance(belief: BeliefArrays, column: int) -> FloatArray:
     # all of it, but cut: compiled code wants views of one memory layout from both branches
     own: FloatArray = belief.marginal[column // 3][0:3, 0:3]
     return own
+
+
+@inlined
+def covariance_within(belief: BeliefArrays, column: int, i: int, j: int) -> float:
+    """A number of the covariance (3, 3) of the body whose first column is given."""
+    whole, own = belief.covariance, belief.marginal
+    within: float = whole[column + i, column + j] if whole.shape[0] > 0 else own[column // 3, i, j]
+    return within
 
 
 @inlined

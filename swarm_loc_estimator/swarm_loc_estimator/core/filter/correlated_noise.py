@@ -54,17 +54,30 @@ def inflate_noise(
     place = _place(measurements, k, belief)
     if place < 0 or belief.pair_robot[measurements.observer[k], place] != measurements.target[k]:
         return
-    weight, scale = np.empty(3), np.empty(3)
-    _write_weights(measurements, k, belief, place, predicted, weight)
-    for i in range(3):
-        p, c = predicted[i], measurements.covariance[k, i, i]
-        again = weight[i] * measurements.systematic_share[k, i] * c
-        new, scale[i] = p - again, 1.0 / _NOTHING_NEW
-        if new > _NOTHING_NEW * p:
-            scale[i] = math.sqrt(p * (p - again * again / c)) / new
+    weight = _weights(measurements, k, belief, place, predicted)
+    scale = (
+        _scale(measurements, k, 0, predicted, weight),
+        _scale(measurements, k, 1, predicted, weight),
+        _scale(measurements, k, 2, predicted, weight),
+    )
     for i in range(3):
         for j in range(3):
             noise[i, j] *= scale[i] * scale[j]
+
+
+@inlined
+def _scale(
+    measurements: MeasurementColumns,
+    k: int,
+    i: int,
+    predicted: FloatArray,
+    weight: tuple[float, float, float],
+) -> float:
+    """By what factor the standard deviation r of component i exceeds that of the measurement."""
+    p, c = predicted[i], measurements.covariance[k, i, i]
+    again = weight[i] * measurements.systematic_share[k, i] * c
+    new = p - again
+    return math.sqrt(p * (p - again * again / c)) / new if new > _NOTHING_NEW * p else 1.0 / _NOTHING_NEW
 
 
 @compiled
@@ -81,7 +94,7 @@ def record_pair(
         return
     observer, weight = measurements.observer[k], np.zeros(3)
     if belief.pair_robot[observer, place] == measurements.target[k]:
-        _write_weights(measurements, k, belief, place, predicted, weight)
+        weight[0], weight[1], weight[2] = _weights(measurements, k, belief, place, predicted)
     for i in range(3):
         gain = predicted[i] / (predicted[i] + noise[i, i])
         weight[i] += gain * (1.0 - weight[i])
@@ -127,25 +140,22 @@ def _place(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> in
     return best
 
 
-@compiled
-def _write_weights(
-    measurements: MeasurementColumns,
-    k: int,
-    belief: BeliefArrays,
-    place: int,
-    predicted: FloatArray,
-    weight: FloatArray,
-) -> None:
-    """Write with what weights (3,) errors that come again are in what is believed."""
+@inlined
+def _weights(
+    measurements: MeasurementColumns, k: int, belief: BeliefArrays, place: int, predicted: FloatArray
+) -> tuple[float, float, float]:
+    """With what weights errors that come again are in what is believed of range, bearing and heading."""
     known = belief.pair_history[measurements.observer[k], place]
     value = measurements.value[k]
     arrival = wrap(value[1] - known[_VALUE, 1]) / _FORGOTTEN
     departure = wrap(value[1] - value[2] - known[_VALUE, 1] + known[_VALUE, 2]) / _FORGOTTEN
     sensors, emitters = math.exp(-0.5 * arrival * arrival), math.exp(-0.5 * departure * departure)
-    for i in range(3):
-        same = sensors if i == 1 else 0.5 * (sensors + emitters)  # a bearing is of the sensors alone
-        lowered = min(predicted[i] / known[_VARIANCE, i], 1.0)
-        weight[i] = known[_WEIGHT, i] * same * lowered
+    both = 0.5 * (sensors + emitters)
+    return (
+        known[_WEIGHT, 0] * both * min(predicted[0] / known[_VARIANCE, 0], 1.0),
+        known[_WEIGHT, 1] * sensors * min(predicted[1] / known[_VARIANCE, 1], 1.0),  # of the sensors alone
+        known[_WEIGHT, 2] * both * min(predicted[2] / known[_VARIANCE, 2], 1.0),
+    )
 
 
 @compiled

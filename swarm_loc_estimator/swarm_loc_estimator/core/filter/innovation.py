@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.core.description.estimated_parameters import CAMERA_SCALE, CAMERA_YAW
-from swarm_loc_estimator.core.filter.belief import BeliefArrays, body_covariance
+from swarm_loc_estimator.core.filter.belief import BeliefArrays, covariance_within
 from swarm_loc_estimator.core.filter.correlated_noise import inflate_noise
 from swarm_loc_estimator.core.filter.gating import position_distance, soften_heading, squared_distance
 from swarm_loc_estimator.core.filter.integrity.hidden_noise import add_hidden_noise, stamp_variance
@@ -25,6 +25,24 @@ from swarm_loc_estimator.numerics.small_matrix import assign, assign_matrix
 
 DEPENDS_ON = 8
 """Filter columns that a measurement depends on: both bodies, observer first, yaw and scale of the camera."""
+
+
+class Scratch(NamedTuple):
+    """Where one evaluation after the other is worked out: memory of its own for each would cost more.
+
+    Attributes:
+        predicted: (3,) value.
+        other: (3,) innovation of the alternative.
+        chain: (3, 5) Jacobian of the value, see `measurement_model.predict`.
+        difference: (3, 3) covariance of xi_target - xi_observer.
+        expected: (3, 3) covariance of the innovation.
+    """
+
+    predicted: FloatArray
+    other: FloatArray
+    chain: FloatArray
+    difference: FloatArray
+    expected: FloatArray
 
 
 class InnovationBatch(NamedTuple):
@@ -81,9 +99,20 @@ def new_batch(count: int) -> InnovationBatch:
     )
 
 
+@compiled
+def new_scratch() -> Scratch:
+    """Room to evaluate measurements in."""
+    return Scratch(np.zeros(3), np.zeros(3), np.zeros((3, 5)), np.zeros((3, 3)), np.zeros((3, 3)))
+
+
 @inlined
 def evaluate(
-    measurements: MeasurementColumns, k: int, belief: BeliefArrays, batch: InnovationBatch, row: int
+    measurements: MeasurementColumns,
+    k: int,
+    belief: BeliefArrays,
+    batch: InnovationBatch,
+    row: int,
+    scratch: Scratch,
 ) -> None:
     """Linearise measurement k about the belief and gate it; of two planar solutions the likelier counts.
 
@@ -94,15 +123,15 @@ def evaluate(
         batch: Its `pose` and `motion` are read, all others written; `across` is read, too, unless the whole
             covariance is at hand.
         row: Where in the batch.
+        scratch: Written.
     """
     columns, jacobian, difference = batch.columns[row], batch.jacobian[row], batch.innovation[row]
     pose, motion, noise, variances = batch.pose[row], batch.motion[row], batch.noise[row], batch.variance[row]
     bodies = body_columns(measurements, k, belief)
     camera, camera_columns = _camera(belief, measurements.observer[k])
-    predicted, chain = np.empty(3), np.empty((3, 5))
+    predicted, chain, s = scratch.predicted, scratch.chain, scratch.expected
     predict_one(measurements, k, pose[0], pose[1], camera, predicted, chain)
     _write_jacobian(chain, bodies, camera_columns, columns, jacobian)
-    s = np.empty((3, 3))
     assign_matrix(noise, measurements.covariance[k])
     add_hidden_noise(measurements, k, belief, noise)
     of_stamp = stamp_variance(measurements, k, belief)
@@ -111,12 +140,12 @@ def evaluate(
     assign_matrix(s, noise)
     if belief.covariance.shape[0] > 0:
         _read_across(belief.covariance, bodies, batch.across[row])
-    _add_uncertainty(belief, bodies, camera_columns, chain, batch.across[row], s)
+    _add_uncertainty(belief, (bodies, camera_columns), chain, batch.across[row], scratch.difference, s)
     for i in range(3):
         variances[i] = s[i, i] - noise[i, i]
     innovation(measurements, k, measurements.value[k], predicted, difference)
     if measurements.has_alternative[k]:
-        other = np.empty(3)
+        other = scratch.other
         innovation(measurements, k, measurements.alternative[k], predicted, other)
         if squared_distance(other, s) < squared_distance(difference, s):
             assign(difference, other)
@@ -165,10 +194,10 @@ def relative_motion(
     motion.fill(0.0)
     if stamp_variance(measurements, k, belief) == 0.0:
         return
-    rate, sides = np.empty(3), (measurements.observer[k], measurements.target[k])
+    sides = (measurements.observer[k], measurements.target[k])
     for i in range(2):
         if sides[i] >= 0:
-            rate_at(tracks, sides[i], measurements.stamp_ns[k], rate)
+            rate = rate_at(tracks, sides[i], measurements.stamp_ns[k])
             cos, sin, sign = np.cos(pose[i, 2]), np.sin(pose[i, 2]), 2.0 * i - 1.0
             # the body's own velocity, seen from the origin of map
             motion[0] += sign * (cos * rate[0] - sin * rate[1] + rate[2] * pose[i, 1])
@@ -214,13 +243,17 @@ def _write_jacobian(
 @inlined
 def _add_stamp_noise(chain: FloatArray, motion: FloatArray, variance: float, noise: FloatArray) -> None:
     """Add to `noise` (3, 3) what a stamp of such variance does to a value that changes by `motion` (3,)."""
-    change = np.zeros(3)
-    for i in range(3):
-        for j in range(3):
-            change[i] += chain[i, j] * motion[j]
+    change = (_along(chain, 0, motion), _along(chain, 1, motion), _along(chain, 2, motion))
     for i in range(3):
         for j in range(3):
             noise[i, j] += variance * change[i] * change[j]
+
+
+@inlined
+def _along(chain: FloatArray, row: int, motion: FloatArray) -> float:
+    """How fast a component of the value changes."""
+    speed: float = chain[row, 0] * motion[0] + chain[row, 1] * motion[1] + chain[row, 2] * motion[2]
+    return speed
 
 
 @inlined
@@ -245,10 +278,10 @@ def _read_across(p: FloatArray, bodies: tuple[int, int], out: FloatArray) -> Non
 @inlined
 def _add_uncertainty(
     belief: BeliefArrays,
-    bodies: tuple[int, int],
-    camera: tuple[int, int],
+    columns: tuple[tuple[int, int], tuple[int, int]],
     chain: FloatArray,
     across: FloatArray,
+    difference: FloatArray,
     s: FloatArray,
 ) -> None:
     """Add H P H^T (3, 3), eq. (13) of the e-puck paper, where H is `chain` (3, 5) by xi_target - xi_observer.
@@ -257,20 +290,20 @@ def _add_uncertainty(
 
     Args:
         belief: Not changed.
-        bodies: First column of the observer and of the target, or -1.
-        camera: Columns of its parameters, or -1.
+        columns: First of the observer and of the target, and those of the camera's parameters; -1: none.
         chain: (3, 5).
         across: (3, 3) covariance of the observer's error with the target's.
+        difference: (3, 3) written: scratch.
         s: (3, 3) added to.
     """
+    bodies, camera = columns
     p, o, t = belief.covariance, max(bodies[0], 0), max(bodies[1], 0)
-    of_o, of_t = body_covariance(belief, o), body_covariance(belief, t)
     of_observer, of_target = 1.0 if bodies[0] >= 0 else 0.0, 1.0 if bodies[1] >= 0 else 0.0
-    difference = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
             both = of_target * of_observer * (across[j, i] + across[i, j])
-            difference[i, j] = of_target * of_t[i, j] + of_observer * of_o[i, j] - both
+            of_t, of_o = covariance_within(belief, t, i, j), covariance_within(belief, o, i, j)
+            difference[i, j] = of_target * of_t + of_observer * of_o - both
     for i in range(3):
         x, y, z = _turned(chain, i, difference)
         for j in range(3):

@@ -45,7 +45,7 @@ class _Drift(NamedTuple):
     shared: float
 
 
-@inlined
+@compiled
 def predict(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
     """Predict a robot, in place, to an instant."""
     added = np.empty((3, 3))
@@ -82,7 +82,7 @@ def write_predicted(
             covariance[i, j] += added[i, j]
 
 
-@inlined
+@compiled
 def _new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, added: FloatArray) -> bool:
     """Write Ad(T) (G2 - G1) Ad(T)^T (3, 3) and return True; or leave it when that is no covariance.
 

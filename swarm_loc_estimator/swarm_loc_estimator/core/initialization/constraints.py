@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.filter.belief import BeliefArrays, body_covariance
+from swarm_loc_estimator.core.filter.belief import BeliefArrays, covariance_within
 from swarm_loc_estimator.core.filter.measurement_model import NOBODY, POLAR, MeasurementArray
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.jit import compiled
@@ -252,7 +252,7 @@ def refreshed(constraints: ConstraintArray, belief: BeliefArrays) -> ConstraintA
         turn = _move(constraint, now)
         for i in range(3):
             for j in range(3):
-                shared[i, j] = body_covariance(belief, column)[i, j]
+                shared[i, j] = covariance_within(belief, column, i, j)
                 drift[i, j] = 0.0
                 if robot >= 0:
                     drift[i, j] = constraint.frame_noise[i, j] - belief.preintegrated_covariance[robot, i, j]

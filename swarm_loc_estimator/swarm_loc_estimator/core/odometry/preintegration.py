@@ -165,27 +165,25 @@ def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample,
     add_silence(model, silence_s, unknown, pose, rate, out.covariance[k])
 
 
-@compiled
-def rate_at(tracks: TrackArrays, robot: int, stamp_ns: int, rate: FloatArray) -> None:
-    """Write the velocity forward and left [m/s] and the turn rate [rad/s] (3,) of base_link at an instant.
+@inlined
+def rate_at(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[float, float, float]:
+    """The velocity forward and left [m/s] and the turn rate [rad/s] of base_link at an instant.
 
     Before the first row, and where the motion is unknown, it is zero.
     """
-    rate.fill(0.0)
     count = tracks.filled[robot]
     stamps, timeout_ns = tracks.stamp_ns[robot, :count], tracks.model[robot].timeout_s * 1e9
     row = min(np.searchsorted(stamps, stamp_ns, side="right"), count - 1)
     if row < 1 or stamp_ns < stamps[0]:
-        return
+        return 0.0, 0.0, 0.0
     if max(stamps[row], stamp_ns) - stamps[row - 1] > timeout_ns:
-        return
+        return 0.0, 0.0, 0.0
     before, after = tracks.pose[robot, row - 1], tracks.pose[robot, row]
     duration_s = (stamps[row] - stamps[row - 1]) * 1e-9
     turn = after[2] - before[2]
     cos, sin = math.cos(before[2] + 0.5 * turn), math.sin(before[2] + 0.5 * turn)
     dx, dy = after[0] - before[0], after[1] - before[1]
-    rate[0], rate[1] = (cos * dx + sin * dy) / duration_s, (cos * dy - sin * dx) / duration_s
-    rate[2] = turn / duration_s
+    return (cos * dx + sin * dy) / duration_s, (cos * dy - sin * dx) / duration_s, turn / duration_s
 
 
 @inlined

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.core.filter.belief import BeliefArrays, correct, to_map
 from swarm_loc_estimator.core.filter.correlated_noise import record_pair
 from swarm_loc_estimator.core.filter.dense.covariance import update_one
-from swarm_loc_estimator.core.filter.innovation import evaluate, new_batch, relative_motion
+from swarm_loc_estimator.core.filter.innovation import evaluate, new_batch, new_scratch, relative_motion
 from swarm_loc_estimator.core.filter.integrity.divergence import (
     LossLimits,
     confirm,
@@ -55,7 +55,7 @@ def update_in_order(
     Returns:
         The first measurement not dealt with, why, and the robot or landmark that it is about.
     """
-    batch, sample = new_batch(1), new_sample(2)
+    batch, sample, scratch = new_batch(1), new_sample(2), new_scratch()
     pose = batch.pose[0]
     for k in range(begin, measurements.stamp_ns.size):
         sides = (measurements.observer[k], measurements.target[k])
@@ -74,8 +74,8 @@ def update_in_order(
         if measurements.landmark[k] > 0:
             assign(pose[1], belief.landmark[measurements.landmark[k] - 1])
         relative_motion(measurements, k, tracks, belief, pose, batch.motion[0])
-        evaluate(measurements, k, belief, batch, 0)
-        look = (batch.distance[0], batch.whitened[0], batch.cause[0])
+        evaluate(measurements, k, belief, batch, 0, scratch)
+        look = (batch.distance[0], (batch.whitened[0, 0], batch.whitened[0, 1]), batch.cause[0])
         contradicted = assess(measurements, k, belief, limits.max_doubt, look)
         if contradicted >= 0:
             return k, CONTRADICTED, contradicted

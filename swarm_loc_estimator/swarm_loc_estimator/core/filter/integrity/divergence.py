@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from swarm_loc_estimator.core.filter.belief import BeliefArrays, IntegrityArrays, body_covariance
+from swarm_loc_estimator.core.filter.belief import BeliefArrays, IntegrityArrays, covariance_within
 from swarm_loc_estimator.core.filter.integrity.surprises import source_of
 from swarm_loc_estimator.core.filter.measurement_model import MeasurementColumns
 from swarm_loc_estimator.numerics.arrays import FloatArray
@@ -70,10 +70,13 @@ def _count_confirmation(state: IntegrityArrays, robot: int, stamp_ns: int) -> No
 @inlined
 def is_uncertain(belief: BeliefArrays, robot: int, pose: FloatArray, limits: LossLimits) -> bool:
     """Whether the standard deviation of the robot's position or heading at `pose` (3,) exceeds its limit."""
-    p = body_covariance(belief, 3 * robot)
-    x = p[0, 0] - 2.0 * pose[1] * p[0, 2] + pose[1] * pose[1] * p[2, 2]
-    y = p[1, 1] + 2.0 * pose[0] * p[1, 2] + pose[0] * pose[0] * p[2, 2]
-    uncertain: bool = max(x, y) > limits.position_sigma**2 or p[2, 2] > limits.heading_sigma**2
+    first = 3 * robot
+    xx, yy = covariance_within(belief, first, 0, 0), covariance_within(belief, first, 1, 1)
+    xt, yt = covariance_within(belief, first, 0, 2), covariance_within(belief, first, 1, 2)
+    tt = covariance_within(belief, first, 2, 2)
+    x = xx - 2.0 * pose[1] * xt + pose[1] * pose[1] * tt
+    y = yy + 2.0 * pose[0] * yt + pose[0] * pose[0] * tt
+    uncertain: bool = max(x, y) > limits.position_sigma**2 or tt > limits.heading_sigma**2
     return uncertain
 
 

@@ -91,7 +91,7 @@ def assess(
     k: int,
     belief: BeliefArrays,
     max_doubt: float,
-    look: tuple[float, FloatArray, int],
+    look: tuple[float, tuple[float, float], int],
 ) -> int:
     """Hold measurement k against what its observer and its source have shown lately.
 
@@ -171,7 +171,7 @@ def is_set_aside(measurements: MeasurementColumns, k: int, belief: BeliefArrays)
     return aside
 
 
-@compiled
+@inlined
 def cause_of(kind: int, innovation: FloatArray, predicted: FloatArray) -> int:
     """What may explain an innovation (3,) of a prediction (3,): NOISE, DESCRIPTION or ELSEWHERE."""
     if kind == POLAR:
@@ -263,7 +263,9 @@ def _surprises(state: IntegrityArrays, node: int, now_ns: int) -> tuple[int, flo
 
 
 @inlined
-def _weight_of_trend(state: IntegrityArrays, observer: int, place: int, whitened: FloatArray) -> float:
+def _weight_of_trend(
+    state: IntegrityArrays, observer: int, place: int, whitened: tuple[float, float]
+) -> float:
     """Take a whitened innovation (2,) into the pair's sum; what speaks against it when there are enough."""
     total = state.whitened[observer, place]
     for i in range(2):

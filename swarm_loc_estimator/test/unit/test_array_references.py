@@ -1,0 +1,55 @@
+"""Law: compiled code that counts no references neither keeps nor releases an array of anybody."""
+
+import gc
+from collections.abc import Iterator
+
+import pytest
+from core_messages import T0
+from core_run import on_time, play, settled, ticks
+from core_world import Plan, simulate
+from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]
+from numba.core.runtime.nrt import rtsys
+
+from swarm_loc_estimator.core.estimation import fusion
+from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.jit import inlined
+
+
+@pytest.fixture
+def counted() -> Iterator[None]:
+    """Numba counts what it allocates and frees."""
+    _nrt_python.memsys_enable_stats()
+    yield
+    _nrt_python.memsys_disable_stats()
+
+
+def held() -> int:
+    """How many arrays compiled code holds, beyond those of before it counted."""
+    gc.collect()
+    stats = rtsys.get_allocation_stats()  # type: ignore[no-untyped-call]
+    return int(stats.mi_alloc - stats.mi_free)
+
+
+@pytest.mark.usefixtures("counted")
+@pytest.mark.parametrize("many", [3, 1000])
+def test_a_run_leaves_no_array_behind(many: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of measurements used together, and one by one."""
+    monkeypatch.setattr(fusion, "_MANY", many)
+    world = simulate(Plan(3, 4.0), 1)
+    counts = []
+    for _ in range(3):
+        estimator = SwarmEstimator(world.swarm)
+        play(estimator, on_time(world), ticks(T0, int(world.stamp_ns[-1])))
+        assert settled(estimator)["USED"] > 20
+        del estimator
+        counts.append(held())
+    assert counts[0] == counts[1] == counts[2]
+
+
+def test_what_is_inlined_returns_no_array() -> None:
+    def view(array: FloatArray) -> FloatArray:
+        return array[:1]
+
+    with pytest.raises(TypeError, match="numbers only"):
+        inlined(view)
