@@ -90,6 +90,19 @@ def assert_same(a: Outcome, b: Outcome) -> None:
     lasting=0.0,
     sparse=True,
 )
+@example(  # the last of a period comes with the first of the next, or before it
+    seed=235,
+    robots=2,
+    content=POSE,
+    start_known=(True,),
+    fusion_period_s=0.5,
+    state_period_s=0.0,
+    outliers=0.0,
+    lost_after=2,
+    late_s=0.3,
+    lasting=0.0,
+    sparse=False,
+)
 def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
     seed: int,
     robots: int,

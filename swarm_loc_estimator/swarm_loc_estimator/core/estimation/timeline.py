@@ -181,8 +181,8 @@ class Timeline:
         What little has come of the newest period is fused with the one before, until there is more: nearly as
         good, and two thirds of the work.
         """
-        if self._joined_key is not None:
-            key, self._joined_key = min(key, self._joined_key), None
+        before, self._joined_key = self._joined_key, self._step_to_join()
+        key = min([key, *(joined for joined in (before, self._joined_key) if joined is not None)])
         if key <= self._head_key:
             while self._checkpoints[-1].key >= key:
                 self._checkpoints.pop()
@@ -190,14 +190,13 @@ class Timeline:
             self.state = self._checkpoints[-1].state.copy()
         buffer, begin = self._buffer, self._count_until(self._head_key)
         while begin < len(buffer):
-            end = self._end_of_steps(begin)
-            if self._is_joined(begin, end):
-                self._joined_key, end = self._key(int(buffer.stamp_ns[begin])), len(buffer)
+            is_joined = self._key(int(buffer.stamp_ns[begin])) == self._joined_key
+            end = len(buffer) if is_joined else self._end_of_steps(begin)
             rows = slice(begin, end)
             self._step(self.state, buffer.measurements[rows], buffer.verdicts[rows], buffer.nis[rows])
             self._head_key = self._key(int(buffer.stamp_ns[end - 1]))
             spaced = self._head_key - max(self._checkpoints[-1].key, -(2**62)) >= self._spacing_ns
-            if spaced and self._joined_key is None:
+            if spaced and not is_joined:
                 self._checkpoints.append(_Checkpoint(self._head_key, self.state.copy()))
             begin = end
 
@@ -207,12 +206,17 @@ class Timeline:
         next_ns = (int(stamps_ns[begin]) // length_ns + 1) * length_ns
         return stamps_ns.size if stamps_ns[-1] < next_ns else int(stamps_ns.searchsorted(next_ns))
 
-    def _is_joined(self, begin: int, end: int) -> bool:
-        """Whether all measurements behind those of a step are few, and of the period that follows."""
+    def _step_to_join(self) -> int | None:
+        """The step that what has come of the period behind it is fused with; None: no step.
+
+        It follows from the data alone, not from when they came, so that the result does, too.
+        """
         stamp_ns, period_ns = self._buffer.stamp_ns, self._fusion_period_ns
-        if not period_ns or not end < len(self._buffer) < end + _MIN_LAST_SHARE * (end - begin):
-            return False
-        return self._key(int(stamp_ns[-1])) == self._key(int(stamp_ns[end - 1])) + period_ns
+        if not period_ns or not stamp_ns.size:
+            return None
+        newest = self._key(int(stamp_ns[-1]))
+        begin, end = stamp_ns.searchsorted((newest - period_ns, newest)).tolist()
+        return newest - period_ns if stamp_ns.size - end < _MIN_LAST_SHARE * (end - begin) else None
 
     def _forget_before(self, key: int) -> None:
         """Keep one checkpoint before step `key` and only the measurements after it."""
