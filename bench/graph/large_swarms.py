@@ -43,7 +43,7 @@ def measure(sizes: Sequence[int], duration_s: float, seed: int) -> dict[str, flo
     """Run swarms of several sizes, print a table and draw it.
 
     Returns:
-        The figures, named `live<robots>.<figure>`.
+        The figures, named `live<robots>.<figure>`; without errors where no robot was located.
     """
     results = {}
     for robots in sizes:
@@ -52,7 +52,8 @@ def measure(sizes: Sequence[int], duration_s: float, seed: int) -> dict[str, flo
     if results:
         print(table(["robots", *_UNITS.values()], [[n, *one.values()] for n, one in results.items()]))
         draw(results)
-    return {f"live{n}.{name}": value for n, one in results.items() for name, value in one.items()}
+    named = {f"live{n}.{name}": value for n, one in results.items() for name, value in one.items()}
+    return {name: value for name, value in named.items() if np.isfinite(value)}
 
 
 def run(robots: int, duration_s: float, seed: int) -> dict[str, float]:
