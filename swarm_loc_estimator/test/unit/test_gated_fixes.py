@@ -54,6 +54,16 @@ def test_one_fix_that_is_wrong_is_forgiven_with_the_next_good_one() -> None:
         assert looked(state, 30, NOBODY, passed=False) == -1
 
 
+def test_a_fix_that_is_wrong_is_forgiven_with_a_landmark_in_its_place() -> None:
+    state = new_state()
+    assert looked(state, 0, NOBODY, passed=False) == -1
+    assert is_contradicted(state.integrity, ROOT)
+    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
+    one["stamp_ns"], one["observer"], one["target"] = T0 + SECOND, ROOT, NOBODY
+    assert count_gated(MeasurementColumns.of(one), 0, state.arrays(), True, LIMITS) == -1
+    assert not is_contradicted(state.integrity, ROOT)
+
+
 def test_a_robot_that_was_carried_away_is_not_told_as_tracked_until_it_is_found() -> None:
     estimator = SwarmEstimator(WALKER, EstimatorSettings())
     told, named = [], []

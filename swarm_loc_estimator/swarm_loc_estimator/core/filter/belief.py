@@ -36,7 +36,7 @@ class IntegrityArrays(NamedTuple):
         gated_in_a_row: (N,) times that another source was gated since the last accepted measurement.
         gated_source: (N,) the source that was gated last.
         gated_ns: (N,) when.
-        gated_fixes: (N,) absolute fixes that were gated since the last accepted one.
+        gated_fixes: (N,) absolute fixes that were gated since the last accepted one or the last landmark.
         gated_fix_ns: (N,) when such a fix was counted last.
         hidden_noise: (N,) units by which each robot's measurements scatter more than described, see
             `integrity/hidden_noise.py`.

@@ -120,23 +120,22 @@ def count_gated(
                 state.gated_source[side], state.gated_ns[side] = source, now_ns
             if state.gated_in_a_row[side] >= limits.gated_in_a_row:
                 lost = side
-    if observer < 0 and target >= 0 and _is_off_its_fixes(state, target, measurements.stamp_ns[k], passed):
+    if observer < 0 and not passed and _is_off_its_fixes(state, target, measurements.stamp_ns[k]):
         lost = target
     if passed and (observer < 0 or target < 0):
         fixed = max(observer, target)
+        state.gated_fixes[fixed] = 0
         belief.last_fix_ns[fixed] = max(belief.last_fix_ns[fixed], measurements.stamp_ns[k])
     return lost
 
 
 @compiled
-def _is_off_its_fixes(state: IntegrityArrays, robot: int, stamp_ns: int, passed: bool) -> bool:
-    """Count an absolute fix of a robot; whether it has had too many gated since the last accepted one.
+def _is_off_its_fixes(state: IntegrityArrays, robot: int, stamp_ns: int) -> bool:
+    """Count a gated fix of a robot; whether there are too many since the last accepted sight of the map.
 
     Robots that were located by way of this one agree with it wherever it is, so what they say does not count.
     """
-    if passed:
-        state.gated_fixes[robot] = 0
-    elif stamp_ns - state.gated_fix_ns[robot] > _GATED_AGAIN_NS:
+    if stamp_ns - state.gated_fix_ns[robot] > _GATED_AGAIN_NS:
         state.gated_fixes[robot] += 1
         state.gated_fix_ns[robot] = stamp_ns
     off: bool = state.gated_fixes[robot] >= _MAX_GATED_FIXES
