@@ -26,7 +26,7 @@ class Calibrated(NamedTuple):
         drive: What it was fitted to.
         hyperbola_cm: (D,) errors of depths read by it from true rows.
         logarithm_cm: Likewise by the logarithm of the paper.
-        window_cm: (W,) errors of single windows, read by the hyperbola.
+        window_cm: (W,) errors of single windows, as the calibration reads them.
     """
 
     truth: tuple[float, float]
@@ -49,14 +49,15 @@ def calibrate(seed: int) -> Calibrated:
     rows = row_at_infinity + focal_base / wanted
     read = found.focal_base / (rows - found.row_at_infinity)
     logarithm = np.array([logarithm_depth(a, b, row) for row in rows])
-    windows = found.focal_base / (drive.rows - found.row_at_infinity)
+    windows = np.array([found.distance(row, 0.0).distance - found.camera_x for row in drive.rows.tolist()])
+    is_read = np.isfinite(windows)
     return Calibrated(
         built.row,
         found,
         drive,
         100.0 * (read - wanted),
         100.0 * (logarithm - wanted),
-        100.0 * (windows - depths),
+        100.0 * (windows - depths)[is_read],
     )
 
 

@@ -57,7 +57,7 @@ class Scene(NamedTuple):
 def scene(noise_rate: float, depth: float, seed: int) -> Scene:
     """What an event camera sees of its laser at a depth [m]."""
     rng = np.random.default_rng(seed)
-    camera = EventCamera(CameraNoise(noise_rate=noise_rate), rng)
+    camera = EventCamera(CameraNoise(noise_rate=noise_rate), rng, seed)
     place = np.array([50.0, 75.0]) + 25.0 * rng.random(2)
     velocity = rng.uniform(-4.0, 4.0, 2)
     events, stamps, places = [], [], []

@@ -52,8 +52,8 @@ def test_what_a_killed_process_left_is_removed_and_what_a_living_one_has_is_not(
 
 def test_what_only_looks_like_one_is_left_alone(place: Path) -> None:
     (place / "target").mkdir()
-    (place / "epucks-link").symlink_to(place / "target")
-    (place / "epucks-file").touch()
+    (place / "swarm_loc-link").symlink_to(place / "target")
+    (place / "swarm_loc-file").touch()
     with link_folder():
         pass
-    assert {path.name for path in place.iterdir()} == {"target", "epucks-link", "epucks-file"}
+    assert {path.name for path in place.iterdir()} == {"target", "swarm_loc-link", "swarm_loc-file"}

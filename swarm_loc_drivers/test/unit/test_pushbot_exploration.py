@@ -181,7 +181,7 @@ def test_the_events_of_a_bag_show_the_distances_of_the_bag(tmp_path: Path) -> No
             )
             for report in tracker.track(events.x, events.y, events.is_on, stamp_ns + events.time_ns):
                 for seen in report.sightings:
-                    found = calibration.distance(seen.v, float(seen.covariance[1, 1]))
+                    found = calibration.distance(seen.v, float(seen.covariance[1, 1]), seen.locking)
                     read.append((seen.stamp_ns, *found))
     assert len(read) > 20
     stamps = np.array(sorted(told))

@@ -80,11 +80,13 @@ def _from(batch: MessageBatch, first: int) -> MessageBatch:
 
 
 def _missing(ingest: Ingest) -> list[str]:
-    """One sentence for every input that the bag does not have."""
+    """One sentence for every input that the bag does not have, nor one of all robots in its place."""
+    pairs = [*zip(ingest.topics, ingest.statistics, strict=True)]
+    shared = {topic.kind.stands_for for topic, statistics in pairs if statistics.received}
     return [
         f"The bag holds no message on {topic.name}."
-        for topic, statistics in zip(ingest.topics, ingest.statistics, strict=True)
-        if topic.expected and not statistics.received
+        for topic, statistics in pairs
+        if topic.expected and not statistics.received and topic.kind.rows not in shared
     ]
 
 

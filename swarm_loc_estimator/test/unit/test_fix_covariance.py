@@ -7,16 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from swarm_loc_estimator.core.description.swarm import OdometryModel
 from swarm_loc_estimator.core.mapping.exploration.goal import Goal
-from swarm_loc_estimator.core.mapping.settings import MapperSettings
 from swarm_loc_estimator.io.maps.fix_covariance import FixCovariances, pose_covariance
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
 ELEMENTS = st.floats(-0.3, 0.3)
 STOP = np.diag([0.01, 0.02, 0.01]) ** 2
-STILL = MapperSettings(
-    distance_noise=1e-9, heading_noise=1e-9, course_noise=0.0, turn_noise=1e-9
-)  # odometry that tells all there is, but for three millimetres
+STILL = OdometryModel(wheel_noise=0.0)
+"""Tells all there is, but for three millimetres."""
+USUAL = OdometryModel(wheel_separation=0.085, wheel_noise=1e-6, distance_noise=3e-4, turn_noise=2e-5)
 
 
 def goal(number: int, x: float = 0.0, y: float = 0.0) -> Goal:
@@ -28,7 +28,7 @@ def fused(known: FloatArray, told: FloatArray) -> FloatArray:
 
 
 def test_the_first_fix_is_told_as_the_mapper_knows_it() -> None:
-    told = FixCovariances(MapperSettings()).told(goal(1), STOP)
+    told = FixCovariances(USUAL).told(goal(1), STOP)
     np.testing.assert_allclose(told, pose_covariance(STOP))
 
 
@@ -42,8 +42,20 @@ def test_a_fix_that_adds_nothing_hardly_counts() -> None:
     assert (np.diag(before) > 0.6 * np.diag(pose_covariance(STOP))).all()
 
 
+def test_a_fix_counts_the_more_the_coarser_the_odometry_is() -> None:
+    """Whoever has forgotten the heading while the robot looked around is told it again."""
+    told = []
+    for noise in (1e-6, 2e-4, 2e-2):
+        fixes = FixCovariances(OdometryModel(wheel_separation=0.085, wheel_noise=noise))
+        fixes.told(goal(1), STOP)
+        told.append(fixes.told(goal(2, 0.5), STOP)[2, 2])
+    now = pose_covariance(STOP)[2, 2]
+    assert told[0] > told[1] > told[2] > now
+    assert told[2] < 1.05 * now
+
+
 def test_a_closed_loop_counts_in_full() -> None:
-    fixes = FixCovariances(MapperSettings())
+    fixes = FixCovariances(USUAL)
     fixes.told(goal(1), 400.0 * STOP)
     closed = fixes.told(goal(2, 0.5), STOP)
     np.testing.assert_allclose(np.diag(closed), np.diag(pose_covariance(STOP)), rtol=0.2)
@@ -60,7 +72,7 @@ def test_after_odometry_has_begun_anew_a_fix_counts_in_full() -> None:
 def test_what_is_told_is_a_covariance_and_never_less_than_the_mapper_has(
     first: FloatArray, second: FloatArray, x: float
 ) -> None:
-    fixes = FixCovariances(MapperSettings())
+    fixes = FixCovariances(USUAL)
     fixes.told(goal(1), first @ first.T)
     told = fixes.told(goal(2, x), second @ second.T)
     now = pose_covariance(second @ second.T)

@@ -29,7 +29,7 @@ from swarm_loc_msgs.msg import EventPacket, LaserDistance, LightBearing, LightBe
 from swarm_loc_vision.core.events.bearing import direction, direction_jacobian
 from swarm_loc_vision.core.events.settings import Sighting, WindowReport
 from swarm_loc_vision.core.events.windows import WindowedTracker
-from swarm_loc_vision.core.laser.calibration import UNKNOWN
+from swarm_loc_vision.core.laser.calibration import UNKNOWN, Distance
 from swarm_loc_vision.nodes.event_tracker_parameters import (
     EventTrackerParameters,
     laser_calibration,
@@ -125,13 +125,17 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
             self._counts["windows without the laser"] += 1
             return message
         self._laser_s = time.monotonic()
-        calibration = self._calibration
-        found = calibration.distance(seen.v, float(seen.covariance[1, 1])) if calibration else UNKNOWN
+        found = self._distance(seen)
         self._counts["distances"] += not math.isnan(found.distance)
         message.distance, message.sigma = found
         message.u_px, message.v_px, message.events = seen.u, seen.v, seen.events
         message.covariance = seen.covariance.ravel()
         return message
+
+    def _distance(self, seen: Sighting) -> Distance:
+        if self._calibration is None:
+            return UNKNOWN
+        return self._calibration.distance(seen.v, float(seen.covariance[1, 1]), seen.locking)
 
     def _light_message(self, seen: Sighting) -> LightBearing:
         lens = self.chosen.lens

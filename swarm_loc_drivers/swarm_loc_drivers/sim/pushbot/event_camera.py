@@ -81,13 +81,14 @@ class EventCamera:
 
     Args:
         noise: How far it is from an ideal one.
-        rng: Source of all that is random.
+        rng: Source of all that is random from event to event.
+        sensor: Which one: seed of what its pixels are like for good.
     """
 
-    def __init__(self, noise: CameraNoise, rng: np.random.Generator) -> None:
+    def __init__(self, noise: CameraNoise, rng: np.random.Generator, sensor: int) -> None:
         self._noise = noise
         self._rng = rng
-        spread = rng.standard_normal((SENSOR_PX, SENSOR_PX)) * noise.mismatch
+        spread = np.random.default_rng(sensor).standard_normal((SENSOR_PX, SENSOR_PX)) * noise.mismatch
         self._threshold = noise.threshold * np.exp(spread)
         self._told_us = np.full(2 * SENSOR_PX * SENSOR_PX, -1e9)
         self._bus_us = 0

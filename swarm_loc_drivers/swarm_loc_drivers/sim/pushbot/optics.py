@@ -43,10 +43,12 @@ class LaserOptics:
     Attributes:
         row: p_inf [px] and f b [px m] of the spot's row.
         column: Likewise of its column.
+        sensor: Seed of what the pixels of its event camera are like.
     """
 
     row: tuple[float, float]
     column: tuple[float, float]
+    sensor: int
 
     def spot(self, distance: float) -> tuple[float, float]:
         """Column and row [px] of the spot on what is so far from the camera [m]."""
@@ -59,6 +61,7 @@ def assembled(rng: np.random.Generator) -> LaserOptics:
     return LaserOptics(
         (CENTRE_PX + 0.5 + 1.5 * shift_row, FOCAL_PX * _BASE_ROW_M * (1.0 + 0.03 * turn_row)),
         (CENTRE_PX + 1.0 * shift_column, FOCAL_PX * _BASE_COLUMN_M * (1.0 + 0.1 * turn_column)),
+        int(rng.spawn(1)[0].integers(1 << 32)),
     )
 
 

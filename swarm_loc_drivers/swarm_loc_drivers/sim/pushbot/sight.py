@@ -44,7 +44,8 @@ class HallSight:
     ) -> None:
         self._walls = walls
         self._optics = built
-        self._cameras = [EventCamera(noise, one) for one in rng.spawn(len(built))]
+        robots = zip(rng.spawn(len(built)), built, strict=True)
+        self._cameras = [EventCamera(noise, own, one.sensor) for own, one in robots]
         self._corners = _corners(walls)
         self._contrast = rng.choice([-_CONTRAST, _CONTRAST], len(self._corners))
 

@@ -52,7 +52,7 @@ def drive_at_wall(
     rng: np.random.Generator, built: LaserOptics, settings: WallDriveSettings
 ) -> tuple[Drive, FloatArray]:
     """What odometry and tracker tell of a drive, and the true depths (N,) [m] at the same instants."""
-    camera = EventCamera(CameraNoise(noise_rate=settings.noise_rate), rng)
+    camera = EventCamera(CameraNoise(noise_rate=settings.noise_rate), rng, built.sensor)
     tracker = CentroidTracker([_LASER], (128, 128), TrackerSettings())
     step_m = settings.speed * _STEP_US * 1e-6
     depth = settings.start - CAMERA_X_M + settings.start_sigma * rng.standard_normal()

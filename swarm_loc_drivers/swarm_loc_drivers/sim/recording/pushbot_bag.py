@@ -98,7 +98,7 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
     fixes: dict[int, list[Goal]] = defaultdict(list)
     maps = MapNotes(BEGIN_NS)
     covariances: dict[int, list[FloatArray]] = defaultdict(list)
-    told = [FixCovariances(mapper.settings) for _ in range(settings.robots)]
+    told = [FixCovariances(_ODOMETRY) for _ in range(settings.robots)]
 
     def note_fix(arrival: Arrival) -> None:
         goal = mapper.goal(arrival.robot)

@@ -18,15 +18,14 @@ import numpy as np
 
 from swarm_loc_estimator.core.description.motion_response import MotionResponse
 from swarm_loc_estimator.core.description.swarm import Robot
+from swarm_loc_estimator.core.odometry.look_up import OdometrySample, look_up_all
 from swarm_loc_estimator.core.odometry.preintegration import (
     BEFORE_ALL_NS,
     MODEL_DTYPE,
     UNCHANGED_NS,
-    OdometrySample,
     TrackArrays,
     continue_tracks,
     integrate,
-    look_up_all,
 )
 from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.numerics.se2 import wrap_angle

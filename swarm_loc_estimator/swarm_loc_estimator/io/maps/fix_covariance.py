@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import astuple
+from typing import Any
 
 import numpy as np
 
+from swarm_loc_estimator.core.description.swarm import OdometryModel
 from swarm_loc_estimator.core.mapping.exploration.goal import Goal
 from swarm_loc_estimator.core.mapping.mapper import SCAN_TURN
-from swarm_loc_estimator.core.mapping.settings import MapperSettings
+from swarm_loc_estimator.core.odometry.preintegration import MODEL_DTYPE
+from swarm_loc_estimator.core.odometry.process_noise import OdometryStep, add_step_noise
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
 _LEAST_SIGMA = np.array([0.02, 0.02, 0.01])
@@ -29,43 +33,44 @@ class FixCovariances:
     subtracted, as in the information graphs of Chong, Mori and Chang, "Distributed multitarget multisensor
     tracking", 1990): together they make as sure as the mapper is.
 
+    The odometry is that of whoever fuses the fixes: the coarser it takes that to be, the more it has
+    forgotten of the fix before.
+
     Args:
-        settings: Of the mapper, whose odometry is meant.
+        odometry: Of the robot, as the swarm description has it.
     """
 
-    def __init__(self, settings: MapperSettings) -> None:
-        self._settings = settings
-        self._last: tuple[FloatArray, FloatArray] | None = None
+    def __init__(self, odometry: OdometryModel) -> None:
+        self._odometry: Any = np.array(astuple(odometry), MODEL_DTYPE)[()]  # as the compiled code takes it
+        self._last: tuple[Goal, FloatArray] | None = None
 
     def told(self, goal: Goal, covariance: FloatArray) -> FloatArray:
         """Covariance (3, 3) to be told of the newest fix.
 
         Args:
-            goal: With the pose.
+            goal: With pose and stamp.
             covariance: (3, 3) of its stop in the graph [m, rad].
         """
         now = pose_covariance(covariance)
-        before, self._last = self._last, (goal.pose, now)
+        before, self._last = self._last, (goal, now)
         if before is None or goal.number == 1:  # the first, or the first since odometry began anew
             return now
-        known = self._carried_on(*before, goal.pose)
+        known = self._carried_on(*before, goal)
         return _new_alone(now, known)
 
-    def _carried_on(self, pose: FloatArray, covariance: FloatArray, to: FloatArray) -> FloatArray:
-        """Covariance (3, 3) at another pose by that of one before and the odometry between them."""
-        noise = self._settings
-        dx, dy = (to - pose)[:2].tolist()
-        path = math.hypot(dx, dy)
+    def _carried_on(self, before: Goal, covariance: FloatArray, goal: Goal) -> FloatArray:
+        """Covariance (3, 3) at a goal by that at the one before, the drive between and the scan after it."""
+        dx, dy = (goal.pose - before.pose)[:2].tolist()
+        path, duration_s = math.hypot(dx, dy), 1e-9 * (goal.stamp_ns - before.stamp_ns)
         effect = np.eye(3)
         effect[0, 2], effect[1, 2] = -dy, dx
-        turns = SCAN_TURN / (2.0 * math.pi)
-        heading = math.hypot(
-            noise.heading_noise,
-            noise.course_noise * math.sqrt(path),
-            2.0 * math.pi * noise.turn_noise * math.sqrt(turns),
+        carried: FloatArray = effect @ covariance @ effect.T + _LEAST_SIGMA_MOVED**2 * np.diag(
+            [1.0, 1.0, 0.0]
         )
-        moved = noise.distance_noise * path + _LEAST_SIGMA_MOVED
-        carried: FloatArray = effect @ covariance @ effect.T + np.diag([moved**2, moved**2, heading**2])
+        drive = OdometryStep(path, 0.0, 0.0, 0.0, 0.0, -0.5 * dx, -0.5 * dy, math.atan2(dy, dx))
+        scan = OdometryStep(0.0, 0.0, SCAN_TURN, 0.0, duration_s, 0.0, 0.0, 0.0)
+        for step in (drive, scan):
+            add_step_noise(self._odometry, step, carried)
         return carried
 
 

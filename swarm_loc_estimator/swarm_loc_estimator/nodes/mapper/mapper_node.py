@@ -101,7 +101,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self._mapper.background = self._background
         self.feed = MapperFeed(self._robots, self._mapper, self._frequencies)
         self._told: dict[int, int] = {}
-        self._covariances = [FixCovariances(self.chosen.settings) for _ in self._robots]
+        self._covariances = [FixCovariances(robot.odometry) for robot in self._robots]
         self._published: OccupancyMap | None = None
 
     def _create_publishers(self) -> None:

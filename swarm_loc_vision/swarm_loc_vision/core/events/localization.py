@@ -52,9 +52,11 @@ class Localizer:
         """
         scatter = np.array([[row[_UU], row[_UV]], [row[_UV], row[_VV]]]) / row[_COUNT]
         at_a_switch = max(1.0, row[_COUNT] / self._switches[source])
-        lasting = _PIXEL_VARIANCE / at_a_switch + self._settings.sigma_floor**2
+        locking = float(_PIXEL_VARIANCE / at_a_switch)
+        lasting = locking + self._settings.sigma_floor**2
         covariance = scatter / max(row[_BURSTS], 1.0) + lasting * np.eye(2)
-        return Sighting(source, int(row[_TIME]), float(row[_U]), float(row[_V]), covariance, int(row[_COUNT]))
+        place = float(row[_U]), float(row[_V])
+        return Sighting(source, int(row[_TIME]), *place, covariance, locking, int(row[_COUNT]))
 
 
 def _without_echoes(sightings: list[Sighting], radius: float) -> list[Sighting]:

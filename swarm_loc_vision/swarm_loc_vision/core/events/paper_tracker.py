@@ -107,6 +107,7 @@ class PaperTracker(WindowedTracker):
                 float(u),
                 float(v),
                 self._paper.sigma**2 * np.eye(2),
+                0.0,
                 int(self._events[source]),
             )
             for source, (u, v) in enumerate(self._places)

@@ -58,6 +58,7 @@ class Sighting(NamedTuple):
         u: Column of its centre [px].
         v: Row [px].
         covariance: (2, 2) over u, v [px^2].
+        locking: What of each variance is the bias within pixels, the same whenever the light is there [px^2].
         events: That its place was computed from.
     """
 
@@ -66,6 +67,7 @@ class Sighting(NamedTuple):
     u: float
     v: float
     covariance: FloatArray
+    locking: float
     events: int
 
 

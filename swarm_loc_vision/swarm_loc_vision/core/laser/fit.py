@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.parameters.errors import UserError
 from swarm_loc_vision.core.laser.calibration import LaserCalibration
+from swarm_loc_vision.core.laser.row_bias import fit_row_bias
 
 MIN_SAMPLES = 50
 _MIN_SPREAD = 2.0
@@ -52,6 +53,7 @@ def fit_hyperbola(drive: Drive) -> LaserCalibration:
     """The calibration under which the rows are likeliest; outliers count little (Cauchy loss).
 
     The start is estimated besides, within what it was measured to: close to the wall millimetres are pixels.
+    What then remains as a function of the row is the bias of the tracker within pixels.
 
     Raises:
         CalibrationError: Too few samples, too little of the way, or rows that follow no hyperbola.
@@ -71,14 +73,22 @@ def fit_hyperbola(drive: Drive) -> LaserCalibration:
     for _ in range(3):  # the loss needs the noise, and the noise the fit
         found = least_squares(residuals, begin, loss="cauchy", f_scale=scale, x_scale=[1.0, 1.0, 0.01])
         begin = found.x
-        scale = max(1.4826 * float(np.median(np.abs(residuals(begin)[:-1]))), 1e-3)
+        scale = _scale_of(residuals(begin)[:-1])
     row_at_infinity, focal_base, shift = (float(value) for value in begin)
     if scale > _MAX_RESIDUAL_PX or focal_base <= 0.0:
         raise CalibrationError(
             f"the spot's rows follow no hyperbola: {scale:.2g} px off with f b = {focal_base:.3g} px m."
         )
+    wrong = residuals(begin)[:-1]
+    bias = fit_row_bias(drive.rows, wrong, scale)
+    noise = _scale_of(wrong - bias.at_each(drive.rows))
     near, far = float(depths.min() + shift), float(depths.max() + shift)
-    return LaserCalibration(row_at_infinity, focal_base, scale, drive.camera_x, 0.95 * near, 1.05 * far)
+    return LaserCalibration(row_at_infinity, focal_base, noise, drive.camera_x, 0.95 * near, 1.05 * far, bias)
+
+
+def _scale_of(residuals: FloatArray) -> float:
+    """Robust standard deviation of residuals [px], from their median magnitude."""
+    return max(1.4826 * float(np.median(np.abs(residuals))), 1e-3)
 
 
 def _check(depths: FloatArray) -> None:
