@@ -7,7 +7,7 @@ Folders hold recordings of Droplets under a camera (*.txt, see `import_droplets`
 those of the first and tested on those of the second; without them each recording of
 ../shared/data/droplet_2016 is tested with a board fitted to the others. Errors are those of pairs 5 to 20 cm
 apart with no other robot within 44 mm of the line between them. Headings of the truth are turned by what the
-fit found of each robot's fiducial.
+fit found of each robot's fiducial. At the end whole recordings go through the estimator, see `graph`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.droplet.real import firmware
+from bench.droplet.real import firmware, graph
+from bench.droplet.real.recordings import Recorded, read_folder
 from bench.shared.common import OUT, Cell, ProgressLine, table, write_figures
 from swarm_loc_estimator.calibration.infrared.board import (
     BoardCalibration,
@@ -31,19 +32,15 @@ from swarm_loc_estimator.calibration.infrared.board import (
     without_dead,
 )
 from swarm_loc_estimator.calibration.infrared.board_fit import BoardReadings, turned
-from swarm_loc_estimator.calibration.infrared.board_recording import MAX_RANGE, read_board
-from swarm_loc_estimator.calibration.recording import read_recording
+from swarm_loc_estimator.calibration.infrared.board_recording import MAX_RANGE
 from swarm_loc_estimator.cli.errors import exit_with_message
 from swarm_loc_estimator.core.infrared.board import IrPlatform
 from swarm_loc_estimator.core.infrared.solution import IrEstimator
 from swarm_loc_estimator.core.infrared.solvers.closed_form import ClosedForm
 from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
-from swarm_loc_estimator.io.droplets.bag import ImportSettings, import_recording
 from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.se2 import wrap_angle
-from swarm_loc_estimator.parameters.errors import UserError
 
 DEFAULT_FOLDER = OUT.parent.parent / "shared" / "data" / "droplet_2016"
 METHODS = ("firmware", "closed_form", "stock", "board")
@@ -51,14 +48,6 @@ RANGES = (0.05, 0.2)
 _CHI_SQUARE_99 = 11.345
 _UNITS = np.array([100.0, np.degrees(1.0), np.degrees(1.0)])
 _NAMES = ("range_cm", "bearing_deg", "heading_deg")
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """Clear pairs of a recording whose robots are numbered as in `names`."""
-
-    name: str
-    data: BoardReadings
 
 
 @dataclass
@@ -81,57 +70,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if len(options.folders) not in (0, 2):
         parser.error("give no folder, or FIT_FOLDER and TEST_FOLDER")
     names: list[str] = []
-    if options.folders:
-        fit, test = (read_folder(folder, names) for folder in options.folders)
-        tests = [(fit, test)]
-    else:
-        all_of_them = read_folder(DEFAULT_FOLDER, names)
-        tests = [([o for o in all_of_them if o is not one], [one]) for one in all_of_them]
-    results = {method: Results([], []) for method in METHODS}
-    for fit, test in tests:
-        measure(fit, test, len(names), results)
-    report(results)
+    with tempfile.TemporaryDirectory() as work:
+        if options.folders:
+            fit, test = (
+                read_folder(folder, names, Path(work) / kind)
+                for kind, folder in zip(("fit", "test"), options.folders, strict=True)
+            )
+            tests = [(fit, test)]
+        else:
+            all_of_them = read_folder(DEFAULT_FOLDER, names, Path(work) / "all")
+            tests = [([o for o in all_of_them if o is not one], [one]) for one in all_of_them]
+        results = {method: Results([], []) for method in METHODS}
+        believed = []
+        for fit, test in tests:
+            done = measure(fit, test, len(names), results)
+            believed += [(one, done) for one in test]
+        figures = report(results) | graph.measure(believed, names)
+    print(f"figures: {write_figures('droplet_real', figures)}")
     return 0
 
 
-def read_folder(folder: Path, names: list[str]) -> list[Recorded]:
-    """All recordings of a folder; robots that are new are added to the names.
-
-    Raises:
-        UserError: There is none.
-    """
-    paths = sorted(folder.glob("*.txt"))
-    if not paths:
-        raise UserError(f"'{folder}' holds no recording (*.txt).")
-    recordings = []
-    for path in paths:
-        progress = ProgressLine(path.name)
-        with tempfile.TemporaryDirectory() as temporary:
-            bag = Path(temporary) / "bag"
-            done = import_recording(path, bag, ImportSettings(), lambda _, what, p=progress: p(what))  # type: ignore[misc]
-            swarm = load_swarm(bag / "swarm.yaml")
-            board = read_board(read_recording(bag, swarm), swarm)
-        print(
-            f"\r{path.name}: {done.exchanges} exchanges, {done.with_truth} with truth;"
-            f" {' '.join(done.remarks)}"
-        )
-        of_robot = []
-        for index in board.robots:
-            name = swarm.robots[index].name
-            if name not in names:
-                names.append(name)
-            of_robot.append(names.index(name))
-        numbers = np.array(of_robot)
-        data = board.data.chosen(board.clear)
-        data = data._replace(receiver=numbers[data.receiver], transmitter=numbers[data.transmitter])
-        recordings.append(Recorded(path.name, data))
-    return recordings
-
-
-def measure(fit: list[Recorded], test: list[Recorded], robots: int, results: dict[str, Results]) -> None:
-    """Fit to some recordings, and add the errors on others to the results."""
+def measure(
+    fit: list[Recorded], test: list[Recorded], robots: int, results: dict[str, Results]
+) -> BoardCalibration:
+    """Fit to some recordings, and add the errors on others to the results; returns the fit."""
     joined = BoardReadings(
-        *(np.concatenate(columns) for columns in zip(*(one.data for one in fit), strict=True))
+        *(np.concatenate(columns) for columns in zip(*(one.clear for one in fit), strict=True))
     )
     near = joined.chosen(joined.poses[:, 0] < MAX_RANGE)
     said = ProgressLine(f"test on {', '.join(one.name for one in test)}")
@@ -139,11 +103,12 @@ def measure(fit: list[Recorded], test: list[Recorded], robots: int, results: dic
     done = calibrate_board(load_ir_platform("droplet_2016"), near, robots)
     said("solving")
     for one in test:
-        data = one.data
+        data = one.clear
         within = (data.poses[:, 0] > RANGES[0]) & (data.poses[:, 0] < RANGES[1])
         data = without_dead(data.chosen(within), {**done.dead_sensors, **dead_sensors(data, robots)})
         add(done, data, results)
     print()
+    return done
 
 
 def add(done: BoardCalibration, data: BoardReadings, results: dict[str, Results]) -> None:
@@ -185,8 +150,8 @@ def gather(result: Results, found: FloatArray, truth: FloatArray, covariances: F
         result.nees.append(np.sum(errors * half, axis=1))
 
 
-def report(results: dict[str, Results]) -> None:
-    """Print and write the figures."""
+def report(results: dict[str, Results]) -> dict[str, float]:
+    """Print the figures; returns them."""
     figures: dict[str, float] = {}
     rows: list[list[Cell]] = []
     for name, result in results.items():
@@ -208,7 +173,7 @@ def report(results: dict[str, Results]) -> None:
         f" {100.0 * figures['board.nees_beyond_99']:.1f} % beyond the 99 % bound"
         f" of {results['board'].asked} clear pairs"
     )
-    print(f"figures: {write_figures('droplet_real', figures)}")
+    return figures
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ class Exchange(NamedTuple):
     value: tuple[float, float, float] = VALUE
     transmitter: int = 1
     stamp_ns: int = 0
+    size: float = 1.0  # of its variances
 
     def row(self) -> MeasurementArray:
         """As the filter gets it."""
@@ -46,7 +47,7 @@ class Exchange(NamedTuple):
         one["value"], one["systematic_share"], one["covariance"] = (
             self.value,
             self.systematic_share,
-            np.diag(VARIANCES),
+            np.diag(VARIANCES * self.size),
         )
         return one
 
@@ -55,20 +56,34 @@ def pairs(places: int = 4) -> SwarmState:
     return SwarmState(ParameterTable.of([Robot(name) for name in "abcd"]), places)
 
 
-def noise_of(state: SwarmState, exchange: Exchange, predicted: FloatArray) -> FloatArray:
-    """The variances (3,) to use it with."""
-    noise = np.diag(VARIANCES)
-    inflate_noise(MeasurementColumns.of(exchange.row()), 0, state.arrays(), predicted, noise)
+def believed(value: tuple[float, float, float]) -> FloatArray:
+    """Poses (2, 3) in map of an observer and of a target that it has at so much."""
+    distance, bearing, heading = value
+    x, y, theta = 0.3, -0.2, 0.7
+    along = theta + bearing
+    target = (x + distance * np.cos(along), y + distance * np.sin(along), theta + heading)
+    return np.array([(x, y, theta), target])
+
+
+def noise_of(
+    state: SwarmState, exchange: Exchange, predicted: FloatArray, at: tuple[float, float, float] | None = None
+) -> FloatArray:
+    """The variances (3,) to use it with where the pair is believed to be, by default as it was measured."""
+    noise, pose = np.diag(VARIANCES * exchange.size), believed(at or exchange.value)
+    inflate_noise(MeasurementColumns.of(exchange.row()), 0, state.arrays(), pose, predicted, noise)
     variances: FloatArray = np.diag(noise).copy()
     return variances
 
 
-def used(state: SwarmState, exchange: Exchange, predicted: FloatArray) -> FloatArray:
+def used(
+    state: SwarmState, exchange: Exchange, predicted: FloatArray, at: tuple[float, float, float] | None = None
+) -> FloatArray:
     """Use it; returns the variances (3,) left."""
-    noise = noise_of(state, exchange, predicted)
+    noise = noise_of(state, exchange, predicted, at)
     left: FloatArray = predicted * noise / (predicted + noise)
     columns = MeasurementColumns.of(exchange.row())
-    record_pair(columns, 0, state.arrays(), predicted.copy(), np.diag(noise))
+    pose = believed(at or exchange.value)
+    record_pair(columns, 0, state.arrays(), pose, predicted.copy(), np.diag(noise))
     return left
 
 
@@ -82,6 +97,34 @@ def test_exchanges_of_robots_that_stand_count_once_but_for_their_noise(
     np.testing.assert_allclose(
         left, VARIANCES * (systematic_share + (1.0 - systematic_share) / count), rtol=1e-3
     )
+
+
+@given(
+    exchanges=st.lists(st.tuples(st.floats(0.01, 1.0), st.floats(0.2, 5.0)), min_size=2, max_size=20),
+    seed=st.integers(0, 10**6),
+)
+def test_robots_that_stand_are_never_surer_than_the_least_error_that_comes_again(
+    exchanges: list[tuple[float, float]], seed: int
+) -> None:
+    """However unlike exchanges are; and however values scatter, that is no turn of the robots."""
+    rng = np.random.default_rng(seed)
+    state, left = pairs(), UNKNOWN
+    for share, size in exchanges:
+        bearing, heading = rng.uniform(-3.0, 3.0, 2).tolist()
+        left = used(state, Exchange(share, (VALUE[0], bearing, heading), size=size), left, at=VALUE)
+    assert (left >= (1.0 - 1e-5) * min(share * size for share, size in exchanges) * VARIANCES).all()
+
+
+def test_an_exchange_that_seems_better_does_not_take_what_came_again_before_for_less() -> None:
+    """The mean still contains the errors of those before it, by their weight."""
+    state, left = pairs(), UNKNOWN
+    for _ in range(9):
+        left = used(state, Exchange(0.8), left)
+    before = left.copy()
+    left = used(state, Exchange(0.8, size=0.5), left)
+    better = 0.8 * (0.5**0.5 * 0.2 + 0.8) ** 2  # a tenth and somewhat more of the mean is the new one
+    assert (left > better * VARIANCES).all()
+    assert (left < before).all()
 
 
 @given(systematic_share=st.floats(0.0, 1.0), turn=st.floats(0.0, 3.0), more=st.floats(1.0, 4.0))

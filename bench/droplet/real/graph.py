@@ -1,0 +1,220 @@
+"""Whole recordings through the estimator: who is located, how well, and whether any pose misleads.
+
+Each recording is replayed with a board that was fitted to others; the shortest is played into the live graph
+besides, by the player over DDS to the estimator's node. A robot can be seen that lit its emitters several
+times within reach of a receiver, with nobody in between. Poses are held against the camera's while it saw a
+robot stand; misleading is what `bench.integrity` calls so.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from bench.droplet.real.recordings import Recorded
+from bench.integrity.scoring import Estimated, Score, scored
+from bench.shared.common import OUT, Cell, ProgressLine, new_plot, save_plot, table
+from swarm_loc_estimator.calibration.infrared.board import GAIN_SIGMA, BoardCalibration, dead_sensors
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.description.swarm import Swarm
+from swarm_loc_estimator.core.estimation.estimator import Status
+from swarm_loc_estimator.core.infrared.board import IrGains
+from swarm_loc_estimator.evaluation.replay import replay
+from swarm_loc_estimator.evaluation.result import ReplayResult
+from swarm_loc_estimator.io.swarm.board_writer import save_ir_platform
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.launching.graph import GraphOptions
+from swarm_loc_estimator.live.agreement import compare_with_replay
+from swarm_loc_estimator.live.run import play_live
+from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.numerics.se2 import wrap_angle
+from swarm_loc_estimator.numerics.trajectory import Trajectory, interpolate
+
+SETTINGS = EstimatorSettings(lost_heading_sigma=1.5, fix_window_s=60.0)
+"""Headings of robots that turn by themselves are seldom surer than the default; it is 7 to 20 s from one
+exchange of two robots to the next."""
+LIVE_RATE = 10.0
+REACH_M, MIN_EXCHANGES = 0.2, 5
+"""Who lit its emitters so often so near to a receiver can be seen."""
+_STOOD_S, _STOOD_M, _STOOD_RAD = 30.0, 0.0035, np.radians(8.0)
+"""Between two sightings so little apart the importer takes a robot to have stood."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A recording through the estimator.
+
+    Attributes:
+        score: As `bench.integrity` has it, of the instants with truth.
+        estimated: What it is of.
+        located_share: Share of the robots that can be seen that were located at all.
+        position_cm: (K,) errors of the poses told as tracked whose truth is known.
+        heading_deg: (K,) likewise, without sign.
+    """
+
+    score: Score
+    estimated: Estimated
+    located_share: float
+    position_cm: FloatArray
+    heading_deg: FloatArray
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """By their names."""
+        return {
+            "located_share": self.located_share,
+            "tracked_share": float(self.estimated.tracked.mean()),
+            "position_cm": float(np.median(self.position_cm)),
+            "position_p90_cm": float(np.quantile(self.position_cm, 0.9)),
+            "heading_deg": float(np.median(self.heading_deg)),
+            "nees": self.score.nees,
+            "misleading": self.score.misleading_share,
+        }
+
+
+def measure(tests: list[tuple[Recorded, BoardCalibration]], names: list[str]) -> dict[str, float]:
+    """Take recordings, each with the board to believe in, through the estimator; returns figures."""
+    outcomes: dict[str, Outcome] = {}
+    figures: dict[str, float] = {}
+    shortest = min(tests, key=lambda test: len(test[0].data.stamp_ns))[0]
+    for recorded, done in tests:
+        said, name = ProgressLine(f"graph: {recorded.name}"), recorded.name.rsplit("_", 1)[-1]
+        said("replay")
+        swarm_file = described(recorded, done, names)
+        yaw = dict(zip(names, done.model.truth_yaw.tolist(), strict=True))
+        seen = can_be_seen(recorded, names)
+        result = replay(recorded.bag, load_swarm(swarm_file), SETTINGS)
+        outcomes[name] = outcome_of(result, yaw, seen)
+        if recorded is shortest:
+            said("live")
+            outcomes[f"{name}.live"], agreement = lived(recorded, swarm_file, yaw, seen)
+            figures |= {f"graph.{name}.live.{key}": value for key, value in agreement.items()}
+        print()
+    report(outcomes, figures)
+    for name, outcome in outcomes.items():
+        figures |= {f"graph.{name}.{key}": value for key, value in outcome.figures.items()}
+    return figures
+
+
+def report(outcomes: dict[str, Outcome], agreement: dict[str, float]) -> None:
+    """Print the table, and how far live poses are from those of the replay; draw."""
+    rows: list[list[Cell]] = [[name, *one.figures.values()] for name, one in outcomes.items()]
+    head = ["graph", "located", "tracked", "cm", "90 % cm", "heading deg", "NEES", "misleading"]
+    print(table(head, rows))
+    print(table(["live beside replay", ""], [[name, value] for name, value in agreement.items()]))
+    print(f"plot: {draw(outcomes)}")
+
+
+def described(recorded: Recorded, done: BoardCalibration, names: list[str]) -> Path:
+    """Write the swarm with a board, gains and dead sensors beside the bag; returns the file.
+
+    Dead sensors are found in the recording itself, too: that needs no truth.
+    """
+    folder = recorded.bag.parent
+    board = folder / f"{recorded.name}_board.yaml"
+    save_ir_platform(done.model.platform, board)
+    dead = {**done.dead_sensors, **dead_sensors(recorded.data, len(names))}
+    robots = []
+    for robot in recorded.swarm.robots:
+        if robot.ir is None:
+            continue
+        ir = replace(robot.ir, platform=done.model.platform, source=str(board))
+        if robot.name in names:
+            place = names.index(robot.name)
+            ir = replace(ir, gains=_gains(done, place), dead_sensors=dead.get(place, ()))
+        robots.append(replace(robot, ir=ir))
+    path = folder / f"{recorded.name}_swarm.yaml"
+    save_swarm(Swarm(tuple(robots)), path)
+    return path
+
+
+def _gains(done: BoardCalibration, place: int) -> IrGains | None:
+    """What the fit found of a robot's sensors."""
+    factors = done.model.sensor_gains[place]
+    if not done.with_gains or np.all(factors == 1.0):
+        return None
+    found = tuple(np.clip(factors, 0.05, 20.0).round(4).tolist())
+    return IrGains(found, (1.0,) * len(found), GAIN_SIGMA)
+
+
+def can_be_seen(recorded: Recorded, names: list[str]) -> set[str]:
+    """Receivers, and who lit its emitters several times near one of them with nobody in between."""
+    near = recorded.clear.chosen(recorded.clear.poses[:, 0] < REACH_M)
+    often = np.bincount(near.transmitter, minlength=len(names)) >= MIN_EXCHANGES
+    often[near.receiver] = True
+    return {names[place] for place in np.flatnonzero(often)}
+
+
+def outcome_of(result: ReplayResult, yaw: dict[str, float], seen: set[str]) -> Outcome:
+    """Hold poses against the truth of robots whose headings are ahead of it by `yaw` [rad]."""
+    error = np.full(result.pose.shape, np.nan)
+    tracked = np.zeros(error.shape[:2], dtype=np.bool_)
+    robots = result.swarm.robots
+    for index, robot in enumerate(robots):
+        if robot.name in result.truth:
+            there, known = standing(result.truth[robot.name], result.stamp_ns)
+            error[known, index] = result.pose[known, index] - there[known]
+            error[known, index, 2] -= yaw.get(robot.name, 0.0)
+            tracked[:, index] = known
+    error[..., 2] = wrap_angle(error[..., 2])
+    if result.status is not None:
+        tracked &= result.status == Status.TRACKED
+    time_s: FloatArray = (result.stamp_ns - result.stamp_ns[0]).astype(np.float64) * 1e-9
+    estimated = Estimated(time_s, error, result.covariance, tracked)
+    located = [
+        np.isfinite(result.pose[:, k]).all(axis=1).any() for k, r in enumerate(robots) if r.name in seen
+    ]
+    told = error[tracked]
+    return Outcome(
+        scored(estimated),
+        estimated,
+        float(np.mean(located)),
+        100.0 * np.hypot(told[:, 0], told[:, 1]),
+        np.degrees(np.abs(told[:, 2])),
+    )
+
+
+def standing(truth: Trajectory, stamp_ns: IntArray) -> tuple[FloatArray, BoolArray]:
+    """Where a robot stood at some instants (T,), and whether the camera saw it stand then."""
+    places, known = interpolate(truth, stamp_ns, round(_STOOD_S * 1e9))
+    after = np.clip(np.searchsorted(truth.stamp_ns, stamp_ns), 1, max(len(truth.stamp_ns) - 1, 1))
+    after = np.minimum(after, len(truth.stamp_ns) - 1)
+    moved = truth.pose[after] - truth.pose[np.maximum(after - 1, 0)]
+    stood = (np.hypot(moved[:, 0], moved[:, 1]) < _STOOD_M) & (np.abs(wrap_angle(moved[:, 2])) < _STOOD_RAD)
+    return places, known & stood
+
+
+def lived(
+    recorded: Recorded, swarm_file: Path, yaw: dict[str, float], seen: set[str]
+) -> tuple[Outcome, dict[str, float]]:
+    """Play a recording into the live graph; also how far its poses are from those of a replay."""
+    parameters = swarm_file.with_suffix(".parameters.yaml")
+    chosen = {name: getattr(SETTINGS, name) for name in ("lost_heading_sigma", "fix_window_s")}
+    parameters.write_text(json.dumps({"estimator": {"ros__parameters": chosen}}), encoding="utf-8")
+    options = GraphOptions(
+        str(swarm_file), bag=str(recorded.bag), rate=LIVE_RATE, parameter_file=str(parameters)
+    )
+    live = play_live(options, log=OUT / "droplet_real" / f"{recorded.name}.log")
+    compared = compare_with_replay(live, recorded.bag, SETTINGS)
+    return outcome_of(live.result, yaw, seen), {
+        "difference_rms_m": compared.rms_m,
+        "equal_share": compared.equal_share,
+        "located_by_one_share": float(np.mean(np.isinf(compared.distance_m))),
+        "lost_messages": float(live.lost),
+    }
+
+
+def draw(outcomes: dict[str, Outcome]) -> Path:
+    """Errors of all robots over time, misleading ones marked, a plot per run."""
+    figure, axes = new_plot(len(outcomes), width=4.2)
+    for axis, (name, one) in zip(axes, outcomes.items(), strict=True):
+        score = one.score
+        axis.semilogy(score.time_s, 100.0 * score.error_m, color="0.6", linewidth=0.6)
+        ticks, robots = np.nonzero(score.misleading)
+        axis.semilogy(score.time_s[ticks], 100.0 * score.error_m[ticks, robots], "r.", markersize=2)
+        axis.set(title=name, xlabel="time [s]", ylabel="position error [cm]", ylim=(0.01, 50.0))
+    return save_plot(figure, "droplet_real")
