@@ -11,7 +11,6 @@ from swarm_loc_estimator.core.description.swarm import CameraMount, Landmark, Ro
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
 from swarm_loc_estimator.core.filter.dense.covariance import DenseFilter
 from swarm_loc_estimator.core.filter.joint_filter import Robots
-from swarm_loc_estimator.core.filter.sparse import dissection
 from swarm_loc_estimator.core.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.core.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
@@ -99,9 +98,8 @@ def neighbours(places: FloatArray, reach: float = 0.8) -> IntArray:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_with_a_full_pattern_it_is_exact(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All bodies are in one front, beside the copies; they join, leave, are placed anew and related."""
-    monkeypatch.setattr(dissection, "_LEAF", 24)
+def test_with_a_full_pattern_it_is_exact(seed: int) -> None:
+    """All bodies are in one front; they join, leave, are placed anew and related, and some are copied."""
     rng = np.random.default_rng(seed)
     both = Both(rng.uniform(0.0, 5.0, (16, 2)), seed)
     for step in range(30):

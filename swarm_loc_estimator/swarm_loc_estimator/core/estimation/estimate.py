@@ -13,7 +13,8 @@ from swarm_loc_estimator.core.filter.integrity.divergence import CONFIRMED, add_
 from swarm_loc_estimator.core.filter.integrity.surprises import is_contradicted
 from swarm_loc_estimator.core.filter.prediction import write_predicted
 from swarm_loc_estimator.core.filter.state import SwarmState
-from swarm_loc_estimator.core.odometry.preintegration import Preintegrated, TrackArrays, look_up, new_sample
+from swarm_loc_estimator.core.odometry.look_up import look_up, new_sample
+from swarm_loc_estimator.core.odometry.preintegration import Preintegrated, TrackArrays
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.jit import compiled
 from swarm_loc_estimator.numerics.se2_scalar import composed, wrap

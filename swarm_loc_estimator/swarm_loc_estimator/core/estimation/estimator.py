@@ -50,7 +50,8 @@ class SwarmEstimator:
         self._validator = InputValidator(swarm, self.settings)
         self._brightness = BrightnessConverter(swarm)
         self._fusion = Fusion(swarm, self.settings, self._tracks)
-        self._reach_ns = self._tracks.reach_ns + round(0.5e9 * self.settings.state_period_s)
+        grouped_s = self.settings.state_period_s + self.settings.fusion_period_s
+        self._reach_ns = self._tracks.reach_ns + round(0.5e9 * grouped_s)  # used so far from their stamps
         self._timeline = Timeline(self.settings, self._fusion.step, self._fusion.new_state(), self._reach_ns)
         self._horizon_ns = round(self.settings.horizon_s * 1e9)
         self._jump_back_ns = round(self.settings.jump_back_s * 1e9)

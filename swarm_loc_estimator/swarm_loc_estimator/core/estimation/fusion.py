@@ -18,6 +18,7 @@ from swarm_loc_estimator.core.filter.batch_update import (
     confirm_all,
     count_all_gated,
     evaluate_all,
+    middle_of_period,
     predict_all,
 )
 from swarm_loc_estimator.core.filter.belief import correct
@@ -79,7 +80,7 @@ class Fusion:
             settings.lost_sigma, settings.lost_heading_sigma, settings.lost_after, settings.max_doubt
         )
         self._sparse_from = settings.sparse_from
-        self._together = settings.fusion_period_s > 0.0
+        self._period_ns = round(settings.fusion_period_s * 1e9)
         self._starts = {
             i: (
                 np.array(r.start),
@@ -103,7 +104,7 @@ class Fusion:
     def is_sparse(self) -> bool:
         """Whether only covariances of neighbours are kept: in a large swarm without calibration."""
         count, is_calibrated = self._table.column.shape[0], bool(np.any(self._table.column >= 0))
-        return self._together and count >= self._sparse_from and not is_calibrated
+        return self._period_ns > 0 and count >= self._sparse_from and not is_calibrated
 
     def with_starts(self, state: SwarmState, stamp_ns: int) -> SwarmState:
         """The state, together with those robots at their starts about whom there was no measurement yet.
@@ -112,7 +113,7 @@ class Fusion:
         """
         ready = [
             robot
-            for robot in self._starts
+            for robot in np.flatnonzero(state.start_pending).tolist()
             if self._may_start(state, robot, stamp_ns) and not self._tracks.walks(robot)
         ]
         if ready:
@@ -159,7 +160,7 @@ class Fusion:
 
         One after the other, each at its exact stamp; or, where many share a period of `fusion_period_s`,
         together: each is related to the poses at its own stamp, but the noise gathered between the stamps
-        is taken at their mean per robot.
+        is taken in the middle of the period.
 
         Args:
             state: Changed in place.
@@ -185,7 +186,7 @@ class Fusion:
         """Fuse measurements that name their robots."""
         measured = measurements["kind"] < Kind.SET_POSE
         if state.filter.sequential:
-            if self._together and measurements.size >= _MANY and measured.all():
+            if self._period_ns and measurements.size >= _MANY and measured.all():
                 self._fuse_together(state, measurements, verdicts, nis)
             else:
                 self._fuse_in_order(state, measurements, verdicts, nis)
@@ -251,14 +252,15 @@ class Fusion:
         self._initialize_measured(state, measurements)
         known = np.append(state.tracked, True)  # NOBODY (-1) finds the last
         tied = known[measurements["observer"]] & known[measurements["target"]]
-        rows = np.flatnonzero(tied)
-        if rows.size:
-            batch, lost = self._predict(state, measurements[rows])
-            good = ~(lost[measurements["observer"][rows]] | lost[measurements["target"][rows]])
-            tied[rows[~good]] = False
-            rows = rows[good]
-            if rows.size:
-                verdicts[rows], nis[rows] = self._update(state, measurements[rows], chosen(batch, good))
+        if tied.any():
+            fields = MeasurementColumns.of(measurements if tied.all() else measurements[tied])
+            batch, lost = self._predict(state, fields)
+            good = ~(lost[fields.observer] | lost[fields.target])
+            if not good.all():
+                fields, batch = chosen(fields, good), chosen(batch, good)
+                tied[tied] = good
+            if good.any():
+                verdicts[tied], nis[tied] = self._update(state, fields, batch)
         untied = np.flatnonzero(~tied)
         sides = zip(measurements["observer"][untied], measurements["target"][untied], strict=True)
         for k, (observer, target) in zip(untied.tolist(), sides, strict=True):
@@ -268,45 +270,45 @@ class Fusion:
             else:
                 verdicts[k] = self._note(state, measurements[k : k + 1])
 
-    def _predict(
-        self, state: SwarmState, measurements: MeasurementArray
-    ) -> tuple[InnovationBatch, BoolArray]:
-        """Predict the robots involved to the mean of their measurements; those too uncertain leave.
+    def _predict(self, state: SwarmState, fields: MeasurementColumns) -> tuple[InnovationBatch, BoolArray]:
+        """Predict the robots involved to the middle of the period; those too uncertain leave.
 
         Returns:
             A batch (m,) with poses and motion, and (N + 1,) whether each robot, and nobody, was lost.
         """
-        batch, lost = new_batch(measurements.size), np.zeros(state.tracked.size + 1, dtype=bool)
-        columns = MeasurementColumns.of(measurements)
-        predict_all(columns, self._tracks.arrays, state.arrays(), self._limits, batch, lost[:-1])
+        batch, lost = new_batch(fields.stamp_ns.size), np.zeros(state.tracked.size + 1, dtype=bool)
+        stamp_ns = middle_of_period(int(fields.stamp_ns[0]), self._period_ns)
+        predict_all(fields, stamp_ns, self._tracks.arrays, state.arrays(), self._limits, batch, lost[:-1])
         for robot in np.flatnonzero(lost):
             state.lose(int(robot))
         return batch, lost
 
     def _update(
-        self, state: SwarmState, measurements: MeasurementArray, batch: InnovationBatch
+        self, state: SwarmState, fields: MeasurementColumns, batch: InnovationBatch
     ) -> tuple[NDArray[np.uint8], FloatArray]:
         """Hold measurements (m,) against one belief, use those that pass; return verdicts and their NIS."""
-        fields, passed = MeasurementColumns.of(measurements), batch.passed
+        belief, passed, newest_ns = state.arrays(), batch.passed, int(fields.stamp_ns[-1])
         if not state.filter.covariance.size:  # else they are read where all are
-            robots = self._robots(state, int(measurements["stamp_ns"][-1]))
-            batch.across[:] = state.filter.relate_pairs(body_columns_all(fields, state.arrays()), robots)
-        evaluate_all(fields, state.arrays(), batch)
-        systematic = (measurements["systematic_share"] > 0.0).any(axis=1)
+            robots = self._robots(state, newest_ns)
+            batch.across[:] = state.filter.relate_pairs(body_columns_all(fields, belief), robots)
+        evaluate_all(fields, belief, batch)
         looks = (batch.distance, batch.whitened, batch.cause)
-        contradicted = assess_all(fields, state.arrays(), self._limits, looks, passed)
-        lost = confirm_all(fields, state.arrays(), passed)
+        contradicted = assess_all(fields, belief, self._limits, looks, passed)
+        lost = confirm_all(fields, belief, passed)
+        systematic = (fields.systematic_share > 0.0).any(axis=1)
         for k in np.flatnonzero(passed & systematic).tolist():
-            record_pair(fields, k, state.arrays(), batch.variance[k], batch.noise[k])
+            record_pair(fields, k, belief, batch.pose[k], batch.variance[k], batch.noise[k])
         if passed.any():
-            used = chosen(batch, passed)
-            correction = state.filter.update(used.columns, used.jacobian, used.innovation, used.noise)
-            correct(state.arrays(), correction)
-        lost |= count_all_gated(fields, state.arrays(), passed, self._limits)
+            used = slice(None) if passed.all() else passed
+            evaluated = (batch.jacobian[used], batch.innovation[used], batch.noise[used])
+            correction = state.filter.update(batch.columns[used], *evaluated)
+            belief = state.arrays()  # the filter may have new ones
+            correct(belief, correction)
+        lost |= count_all_gated(fields, belief, passed, self._limits)
         for robot in np.flatnonzero(lost):
             state.lose(int(robot))
         for source in np.flatnonzero(contradicted).tolist():
-            self._open(state, source, int(measurements["stamp_ns"][-1]))
+            self._open(state, source, newest_ns)
         return np.where(passed, Verdict.USED, Verdict.GATED).astype(np.uint8), batch.nis
 
     def _robots(self, state: SwarmState, stamp_ns: int) -> Robots:

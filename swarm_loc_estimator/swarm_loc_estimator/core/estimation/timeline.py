@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.estimation.fusion import Verdict
 from swarm_loc_estimator.core.estimation.measurement_buffer import MeasurementBuffer
+from swarm_loc_estimator.core.filter.batch_update import middle_of_period
 from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.core.filter.state import SwarmState
 from swarm_loc_estimator.numerics.arrays import FloatArray
@@ -109,7 +110,9 @@ class Timeline:
             changed_from_ns: (N,) per robot the instant after which its track changed.
         """
         rows = self._buffer.measurements
-        first = _first_touched(self._buffer.stamp_ns, rows["observer"], rows["target"], changed_from_ns)
+        first = _first_touched(
+            self._buffer.stamp_ns, rows["observer"], rows["target"], changed_from_ns, self._fusion_period_ns
+        )
         if first < len(self._buffer):
             self._redo_from(int(self._buffer.stamp_ns[first]))
 
@@ -237,15 +240,23 @@ def _first_touched(
     observers: NDArray[np.int64],
     targets: NDArray[np.int64],
     changed_from_ns: NDArray[np.int64],
+    period_ns: int,
 ) -> int:
     """The first measurement (of m, by stamp) of a robot whose track (of N) changed before it; m when none.
 
-    One that names nobody, an anonymous detection, may be of any of them.
+    Or before the instant that the measurements of its period are predicted to. One that names nobody, an
+    anonymous detection, may be of any robot.
     """
-    for k in range(np.searchsorted(stamps_ns, changed_from_ns.min(), side="right"), stamps_ns.size):
+    if not stamps_ns.size:
+        return 0
+    earliest_ns = max(changed_from_ns.min(), stamps_ns[0] - 1) - period_ns
+    for k in range(np.searchsorted(stamps_ns, earliest_ns, side="right"), stamps_ns.size):
         if observers[k] < 0 and targets[k] < 0:
             return k
+        reach_ns = stamps_ns[k]
+        if period_ns:
+            reach_ns = max(reach_ns, middle_of_period(stamps_ns[k], period_ns))
         for robot in (observers[k], targets[k]):
-            if robot >= 0 and stamps_ns[k] > changed_from_ns[robot]:
+            if robot >= 0 and reach_ns > changed_from_ns[robot]:
                 return k
     return stamps_ns.size

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from swarm_loc_estimator.core.filter.belief import BeliefArrays, to_map
@@ -23,82 +21,52 @@ from swarm_loc_estimator.core.filter.integrity.divergence import (
 from swarm_loc_estimator.core.filter.integrity.surprises import assess, is_set_aside
 from swarm_loc_estimator.core.filter.measurement_model import MeasurementColumns
 from swarm_loc_estimator.core.filter.prediction import predict
-from swarm_loc_estimator.core.odometry.preintegration import (
-    OdometrySample,
-    Preintegrated,
-    TrackArrays,
-    look_up,
-    new_sample,
-)
+from swarm_loc_estimator.core.odometry.look_up import look_up, look_up_pose, new_sample
+from swarm_loc_estimator.core.odometry.preintegration import Preintegrated, TrackArrays
 from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.numerics.jit import compiled, inlined
-from swarm_loc_estimator.numerics.small_matrix import add_scaled, assign
+from swarm_loc_estimator.numerics.small_matrix import assign
+
+
+@compiled
+def middle_of_period(stamp_ns: int, period_ns: int) -> int:
+    """The instant to which robots are predicted for all measurements of the period of a stamp.
+
+    Not the mean of what has come: so more that comes of the period finds the same prediction.
+    """
+    return stamp_ns - stamp_ns % period_ns + period_ns // 2
 
 
 @compiled
 def predict_all(
     measurements: MeasurementColumns,
+    stamp_ns: int,
     tracks: TrackArrays,
     belief: BeliefArrays,
     limits: LossLimits,
     batch: InnovationBatch,
     uncertain: BoolArray,
 ) -> None:
-    """Predict every robot involved to the mean of its measurements.
+    """Predict every robot involved to one instant, and find where all were at their measurements' stamps.
 
     Args:
         measurements: (m,) between robots that are located.
+        stamp_ns: The instant.
         tracks: Odometry.
         belief: Changed in place.
         limits: Beyond which a robot is given up.
         batch: (m,) its `pose` and `motion` are written; nobody's pose is not.
         uncertain: (N,) written: robots involved that no longer know where they are.
     """
-    robots, sample = belief.tracked.size, new_sample(2)
-    sums = _Sums(np.zeros(robots), np.zeros(robots), np.zeros((robots, 3, 3)), np.zeros((robots, 3, 3)))
+    involved, sample = np.zeros(belief.tracked.size, dtype=np.bool_), new_sample(1)
     for k in range(measurements.stamp_ns.size):
-        _look_up_both(measurements, k, tracks, sample, batch, sums)
-    for robot in range(robots):
-        if sums.times[robot] > 0.0:
-            mean_ns = measurements.stamp_ns[0] + round(sums.stamps[robot] / sums.times[robot])
-            to = Preintegrated(mean_ns, np.zeros((3, 3)), np.zeros((3, 3)))
-            add_scaled(to.covariance, sums.covariance[robot], 1.0 / sums.times[robot])
-            add_scaled(to.jacobian, sums.jacobian[robot], 1.0 / sums.times[robot])
-            predict(belief, robot, to)
+        for robot in (measurements.observer[k], measurements.target[k]):
+            if robot >= 0 and not involved[robot]:
+                involved[robot] = True
+                look_up(tracks, robot, stamp_ns, sample, 0)
+                predict(belief, robot, Preintegrated(stamp_ns, sample.covariance[0], sample.jacobian[0]))
     for k in range(measurements.stamp_ns.size):
         _write_poses(measurements, k, tracks, belief, limits, batch, uncertain)
-
-
-class _Sums(NamedTuple):
-    """Sums over the measurements of each robot (N,): number, stamps since the first one, preintegrated."""
-
-    times: FloatArray
-    stamps: FloatArray
-    covariance: FloatArray
-    jacobian: FloatArray
-
-
-@inlined
-def _look_up_both(
-    measurements: MeasurementColumns,
-    k: int,
-    tracks: TrackArrays,
-    sample: OdometrySample,
-    batch: InnovationBatch,
-    sums: _Sums,
-) -> None:
-    """Look up the robots of measurement k at its stamp, in a sample of two, and add that to the sums."""
-    sides = (measurements.observer[k], measurements.target[k])
-    for i in range(2):
-        robot = sides[i]
-        if robot >= 0:
-            if not _is_of_same_image(measurements, k, i):
-                look_up(tracks, robot, measurements.stamp_ns[k], sample, i)
-            assign(batch.pose[k, i], sample.pose[i])
-            sums.times[robot] += 1.0
-            sums.stamps[robot] += measurements.stamp_ns[k] - measurements.stamp_ns[0]
-            add_scaled(sums.covariance[robot], sample.covariance[i], 1.0)
-            add_scaled(sums.jacobian[robot], sample.jacobian[i], 1.0)
 
 
 @inlined
@@ -115,8 +83,13 @@ def _write_poses(
     sides = (measurements.observer[k], measurements.target[k])
     for i in range(2):
         if sides[i] >= 0:
-            to_map(belief, sides[i], batch.pose[k, i])
-            uncertain[sides[i]] |= is_uncertain(belief, sides[i], batch.pose[k, i], limits)
+            pose = batch.pose[k, i]
+            if _is_of_same_image(measurements, k, i):
+                assign(pose, batch.pose[k - 1, i])
+                continue
+            look_up_pose(tracks, sides[i], measurements.stamp_ns[k], pose)
+            to_map(belief, sides[i], pose)
+            uncertain[sides[i]] |= is_uncertain(belief, sides[i], pose, limits)
     if measurements.landmark[k] > 0:
         assign(batch.pose[k, 1], belief.landmark[measurements.landmark[k] - 1])
     relative_motion(measurements, k, tracks, belief, batch.pose[k], batch.motion[k])

@@ -18,7 +18,8 @@ from swarm_loc_estimator.core.filter.integrity.surprises import (
     small_variances,
 )
 from swarm_loc_estimator.core.filter.measurement_model import MeasurementColumns, innovation, predict_one
-from swarm_loc_estimator.core.odometry.preintegration import TrackArrays, rate_at
+from swarm_loc_estimator.core.odometry.look_up import rate_at
+from swarm_loc_estimator.core.odometry.preintegration import TrackArrays
 from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.numerics.jit import compiled, inlined
 from swarm_loc_estimator.numerics.small_matrix import assign, assign_matrix
@@ -162,7 +163,7 @@ def evaluate(
             s[i, 2] += noise[i, 2] - before[i]
             if i < 2:
                 s[2, i] = s[i, 2]
-    inflate_noise(measurements, k, belief, variances, noise)
+    inflate_noise(measurements, k, belief, pose, variances, noise)
     scale = noise_of_frequent_looks(measurements, k, belief)
     for i in range(3):
         for j in range(3):

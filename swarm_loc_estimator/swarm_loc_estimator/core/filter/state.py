@@ -99,7 +99,7 @@ class SwarmState:
         self.all_opened = False
         self.pair_robot: NDArray[np.int64] = np.full((robots, pairs), -1)
         self.pair_stamp_ns: NDArray[np.int64] = np.full((robots, pairs), NEVER_NS)
-        self.pair_history: FloatArray = np.zeros((robots, pairs, 3, 3))
+        self.pair_history: FloatArray = np.zeros((robots, pairs, 4, 3))
         self.constraints: dict[int, NDArray[np.void]] = {}
         self.next_attempt_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
         self.images = IdentityMemory()

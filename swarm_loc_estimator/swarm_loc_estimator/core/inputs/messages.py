@@ -25,8 +25,19 @@ def chosen(rows: Rows, some: slice | NDArray[np.bool_]) -> Rows:
 
 
 def joined(parts: Sequence[Rows]) -> Rows:
-    """All rows of tuples of columns, one part after the other."""
-    return parts[0] if len(parts) == 1 else type(parts[0])(*map(np.concatenate, zip(*parts, strict=True)))
+    """All rows of tuples of columns, one part after the other; their types are those of the first."""
+    if len(parts) == 1:
+        return parts[0]
+    # records would lose their padding otherwise, and compiled code take them for others
+    columns = (np.concatenate(column, dtype=column[0].dtype) for column in zip(*parts, strict=True))
+    return type(parts[0])(*columns)
+
+
+def in_order_of_arrival(parts: Sequence[Rows]) -> Rows:
+    """All rows of tuples of columns; those that arrived together in the order of the parts."""
+    rows = joined(parts)
+    order = np.argsort(rows[-1], kind="stable")  # the last column is the arrival
+    return type(rows)(*(column[order] for column in rows))
 
 
 class OdometryRows(NamedTuple):

@@ -6,8 +6,8 @@ See `joint_filter.py` for what a filter is.
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import lapack
 
+from swarm_loc_estimator.core.filter.dense.inversion import InverseMemory, inverse
 from swarm_loc_estimator.core.filter.joint_filter import Robots
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 from swarm_loc_estimator.numerics.jit import compiled
@@ -19,6 +19,9 @@ class DenseFilter:
 
     Args:
         size: Number of columns; each starts with unit variance, independent.
+
+    Attributes:
+        inverses: Shared by all copies: what is computed again begins from a copy.
     """
 
     calibrates = True
@@ -27,11 +30,13 @@ class DenseFilter:
     def __init__(self, size: int) -> None:
         self.covariance: FloatArray = np.eye(size)
         self.marginal: FloatArray = np.zeros((0, 3, 3))
+        self.inverses = InverseMemory()
 
     def copy(self) -> DenseFilter:
         """An independent copy."""
         other = DenseFilter.__new__(DenseFilter)
         other.covariance, other.marginal = self.covariance.copy(), self.marginal
+        other.inverses = self.inverses
         return other
 
     def place(self, columns: IntArray, covariance: FloatArray) -> None:
@@ -76,7 +81,7 @@ class DenseFilter:
         """Use many measurements with independent errors at once; return the correction (n,) of all columns.
 
         Eqs. (11)-(14) of the e-puck paper in information form, P = (P^-1 + H^T R^-1 H)^-1: two inversions,
-        whose cost does not grow with the number of measurements.
+        whose cost does not grow with the number of measurements; one when others were used with the same P.
 
         Args:
             columns: (m, c) what each measurement depends on; a column may be named twice.
@@ -85,9 +90,9 @@ class DenseFilter:
             noise: (m, r, r) covariance of the measurement.
         """
         gradient = np.zeros(self.covariance.shape[0])
-        _invert(self.covariance)
-        _gather(self.covariance, gradient, columns, jacobian, innovation, noise)
-        _invert(self.covariance)
+        information = self.inverses.inverse_of(self.covariance).copy()
+        _gather(information, gradient, columns, jacobian, innovation, noise)
+        self.covariance = inverse(information)
         correction: FloatArray = self.covariance @ gradient
         return correction
 
@@ -188,25 +193,3 @@ def innovation_covariance(
             for j in range(3):
                 s[i, j] += jacobian[i, c] * projected[columns[c], j]
     return s
-
-
-def _invert(matrix: FloatArray) -> None:
-    """Invert a symmetric positive definite matrix where it stands, symmetric to the last bit.
-
-    Fresh memory for large matrices would cost about as much as the arithmetic.
-    """
-    # in Fortran order the upper triangle is faster, and the transpose of a symmetric matrix costs no copy
-    factor, info = lapack.dpotrf(matrix.T, lower=0, clean=0, overwrite_a=1)
-    if not info:
-        _, info = lapack.dpotri(factor, lower=0, overwrite_c=1)
-    if info:
-        raise np.linalg.LinAlgError("the covariance is not positive definite")
-    _mirror(matrix)
-
-
-@compiled
-def _mirror(matrix: FloatArray) -> None:
-    """Copy the lower triangle to the upper one."""
-    for i in range(matrix.shape[0]):
-        for j in range(i):
-            matrix[j, i] = matrix[i, j]

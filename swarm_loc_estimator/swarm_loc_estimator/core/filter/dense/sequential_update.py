@@ -18,7 +18,8 @@ from swarm_loc_estimator.core.filter.integrity.divergence import (
 from swarm_loc_estimator.core.filter.integrity.surprises import assess, is_set_aside
 from swarm_loc_estimator.core.filter.measurement_model import SET_POSE, MeasurementColumns
 from swarm_loc_estimator.core.filter.prediction import predict
-from swarm_loc_estimator.core.odometry.preintegration import Preintegrated, TrackArrays, look_up, new_sample
+from swarm_loc_estimator.core.odometry.look_up import look_up, new_sample
+from swarm_loc_estimator.core.odometry.preintegration import Preintegrated, TrackArrays
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.jit import compiled
 from swarm_loc_estimator.numerics.small_matrix import assign
@@ -86,7 +87,7 @@ def update_in_order(
             return k + 1, LOST, contradicted
         if passed:
             noise, jacobian = batch.noise[0], batch.jacobian[0]
-            record_pair(measurements, k, belief, batch.variance[0], noise)
+            record_pair(measurements, k, belief, batch.pose[0], batch.variance[0], noise)
             correct(
                 belief, update_one(belief.covariance, batch.columns[0], jacobian, batch.innovation[0], noise)
             )

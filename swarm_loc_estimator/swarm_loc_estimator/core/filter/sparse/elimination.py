@@ -10,15 +10,17 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import blas, lapack
 
-from swarm_loc_estimator.core.filter.sparse.factor import Factor, gathered
+from swarm_loc_estimator.core.filter.sparse.factor import Factor, gathered, new_factor
 from swarm_loc_estimator.core.filter.sparse.levers import Information
 from swarm_loc_estimator.core.filter.sparse.symbolic import Pattern
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 from swarm_loc_estimator.numerics.jit import compiled
 
-_LOOSER, _ATTEMPTS = 1e-10, 5
+_LOOSER = (0.0, 1e-10, 1e-8, 1e-6, 1e-4)
+"""By such shares variances are enlarged, one after the other, where rounding has left no covariance."""
+_PANEL = 24
+"""Rows that are solved for at once."""
 
 
 class Prior(NamedTuple):
@@ -33,86 +35,96 @@ class Prior(NamedTuple):
     place: IntArray
 
 
-def eliminate(pattern: Pattern, prior: Prior, measured: Information) -> tuple[Factor, FloatArray]:
-    """The factor of a prior and measurements, and the correction (n, 3) that they make."""
-    gains, spreads = [], []
-    updates: list[tuple[IntArray, FloatArray] | None] = [None] * pattern.fronts
-    children: list[list[int]] = [[] for _ in range(pattern.fronts)]
+def eliminate(pattern: Pattern, prior: Prior, measured: Information) -> Factor:
+    """The factor of a prior and measurements.
+
+    Raises:
+        LinAlgError: The prior is no covariance.
+    """
     earlier = np.minimum(pattern.front[measured.first], pattern.front[measured.second])
     order = np.argsort(earlier, kind="stable")
     begin = np.searchsorted(earlier[order], np.arange(pattern.fronts + 1))
-    local, gradient = np.zeros(pattern.front.size, dtype=np.int64), measured.gradient.copy()
-    for f in range(pattern.fronts):
-        border, pivots = pattern.border_of(f), pattern.pivots_of(f)
-        bodies, split = np.concatenate([border, pivots]), 3 * border.size
-        local[bodies] = np.arange(bodies.size)
-        places = prior.place[bodies]
-        information = _conditional(gathered(prior.covariance, places, places), split)
-        _add_blocks(information, local, measured, order[begin[f] : begin[f + 1]])
-        for child in children[f]:
-            update = updates[child]
-            if update is not None:
-                _add_update(information, local, *update)
-                updates[child] = None
-        spread = _inverse(information[split:, split:])
-        across = np.ascontiguousarray(information[:split, split:])
-        gain = -across @ spread
-        gains.append(gain)
-        spreads.append(spread)
-        if border.size:
-            updates[f] = border, information[:split, :split] + gain @ across.T
-            children[int(pattern.front[border].min())].append(f)
-            gradient[border] += (gain @ gradient[pivots].reshape(-1)).reshape(-1, 3)
-    factor = Factor(pattern, tuple(gains), tuple(spreads))
-    return factor, _solved(factor, gradient)
-
-
-def _solved(factor: Factor, gradient: FloatArray) -> FloatArray:
-    """The correction (n, 3), from the last front to the first, of gradients (n, 3) gathered upwards."""
-    correction, pattern = np.zeros_like(gradient), factor.pattern
-    for f in range(pattern.fronts - 1, -1, -1):
-        border, pivots = pattern.border_of(f), pattern.pivots_of(f)
-        moved = factor.spread[f] @ gradient[pivots].reshape(-1)
-        moved += factor.gain[f].T @ correction[border].reshape(-1)
-        correction[pivots] = moved.reshape(-1, 3)
-    return correction
-
-
-def _conditional(covariance: FloatArray, split: int) -> FloatArray:
-    """Information (d, d) of p(x_J | x_B) for a covariance (d, d), its border being the first `split` rows."""
-    upper = _cholesky(covariance)
-    root, info = lapack.dtrtri(np.asfortranarray(upper[split:, split:]), lower=0)  # (C_J^-1)^T
-    if info:
-        raise np.linalg.LinAlgError("the covariance of a front is singular")
-    root = np.triu(root)
-    columns = np.empty((covariance.shape[0], root.shape[0]), order="F")
-    columns[split:] = root
-    if split:
-        inner = -upper[:split, split:] @ root
-        columns[:split] = blas.dtrsm(1.0, upper[:split, :split], np.asfortranarray(inner), overwrite_b=1)
-    information: FloatArray = columns @ columns.T
-    return information
-
-
-def _cholesky(matrix: FloatArray) -> FloatArray:
-    """Upper factor U (d, d), anything below, of a symmetric matrix U^T U; rounding is made up for."""
-    for attempt in range(_ATTEMPTS):
-        upper, info = lapack.dpotrf(matrix.T, lower=0, clean=0)
-        if not info:
-            factor: FloatArray = upper
-            return factor
-        matrix = matrix + np.diag(_LOOSER * 100.0**attempt * np.diag(matrix))
+    factor = new_factor(pattern)
+    for looser in _LOOSER:
+        try:
+            _eliminate(factor, prior, measured, (order, begin), looser)
+        except np.linalg.LinAlgError:
+            continue
+        return factor
     raise np.linalg.LinAlgError("the covariance of a front is not positive definite")
 
 
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of a symmetric positive definite matrix."""
-    inverse, info = lapack.dpotri(_cholesky(matrix), lower=0, overwrite_c=1)
-    if info:
-        raise np.linalg.LinAlgError("the information of a front is singular")
-    upper = np.triu(inverse)
-    whole: FloatArray = upper + np.triu(inverse, 1).T
-    return whole
+@compiled
+def _eliminate(
+    factor: Factor, prior: Prior, measured: Information, blocks: tuple[IntArray, IntArray], looser: float
+) -> None:
+    """Write a factor; `blocks` is the order of what was measured, front by front, and where each begins."""
+    pattern = factor.pattern
+    fronts = pattern.pivot_begin.size - 1
+    updates = [np.empty((0, 0)) for _ in range(fronts)]
+    child, sibling = np.full(fronts, -1, dtype=np.int64), np.full(fronts, -1, dtype=np.int64)
+    local = np.zeros(pattern.front.size, dtype=np.int64)
+    for f in range(fronts):
+        border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+        bodies = np.concatenate((border, pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]))
+        split, size = 3 * border.size, 3 * (bodies.size - border.size)
+        for k in range(bodies.size):
+            local[bodies[k]] = k
+        places = prior.place[bodies]
+        information = _conditional(gathered(prior.covariance, places, places), size, looser)
+        _add_blocks(information, local, measured, blocks[0][blocks[1][f] : blocks[1][f + 1]])
+        below = child[f]
+        while below >= 0:
+            left = pattern.border[pattern.border_begin[below] : pattern.border_begin[below + 1]]
+            _add_update(information, local, left, updates[below])
+            updates[below] = np.empty((0, 0))
+            below = sibling[below]
+        spread = factor.spread[factor.spread_begin[f] : factor.spread_begin[f + 1]].reshape(size, size)
+        own: FloatArray = np.linalg.cholesky(np.ascontiguousarray(information[split:, split:]))
+        root = _last_columns(own, size)
+        np.dot(root, root.T, spread)
+        if split:
+            gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]].reshape(split, size)
+            across = -information[:split, split:]
+            np.dot(across, spread, gain)
+            updates[f] = information[:split, :split] - np.dot(gain, across.T)
+            parent = pattern.front[border].min()
+            sibling[f], child[parent] = child[parent], f
+
+
+@compiled
+def _conditional(covariance: FloatArray, size: int, looser: float) -> FloatArray:
+    """Information (d, d) of p(x_J | x_B) for a covariance (d, d), the pivots being the last `size` rows."""
+    for k in range(covariance.shape[0]):
+        covariance[k, k] *= 1.0 + looser
+    lower: FloatArray = np.linalg.cholesky(np.ascontiguousarray(covariance))
+    columns = _last_columns(lower, size)
+    information: FloatArray = np.dot(columns, columns.T)
+    return information
+
+
+@compiled
+def _last_columns(lower: FloatArray, size: int) -> FloatArray:
+    """The last columns (d, size) of the inverse of the transpose of a lower triangular matrix (d, d)."""
+    rows = lower.shape[0]
+    out = np.zeros((rows, size))
+    for k in range(size):
+        out[rows - size + k, k] = 1.0
+    end = rows
+    while end > 0:
+        begin = max(0, end - _PANEL)
+        if end < rows:
+            out[begin:end] -= np.dot(np.ascontiguousarray(lower[end:, begin:end].T), out[end:])
+        for r in range(end - 1, begin - 1, -1):
+            for q in range(r + 1, end):
+                factor = lower[q, r]
+                for c in range(size):
+                    out[r, c] -= factor * out[q, c]
+            scale = 1.0 / lower[r, r]
+            for c in range(size):
+                out[r, c] *= scale
+        end = begin
+    return out
 
 
 @compiled

@@ -36,24 +36,30 @@ class Factor(NamedTuple):
 
     Attributes:
         pattern: Its fronts.
-        gain: Of each front A (3 b, 3 j).
-        spread: Of each front D (3 j, 3 j).
+        gain: Of each front A (3 b, 3 j), one behind the other.
+        gain_begin: (F + 1,) where that of each front begins.
+        spread: Likewise of each front D (3 j, 3 j).
+        spread_begin: (F + 1,)
     """
 
     pattern: Pattern
-    gain: tuple[FloatArray, ...]
-    spread: tuple[FloatArray, ...]
-
-    @property
-    def bodies(self) -> int:
-        """How many numbers of bodies there are."""
-        return self.pattern.front.size
+    gain: FloatArray
+    gain_begin: IntArray
+    spread: FloatArray
+    spread_begin: IntArray
 
 
 _NONE: IntArray = np.zeros(0, dtype=np.int64)
 _FIRST: IntArray = np.zeros(1, dtype=np.int64)
-EMPTY = Factor(Pattern(_NONE, _FIRST, _NONE, _FIRST, _NONE), (), ())
+EMPTY = Factor(Pattern(_NONE, _FIRST, _NONE, _FIRST, _NONE), np.zeros(0), _FIRST, np.zeros(0), _FIRST)
 """Of no bodies."""
+
+
+def new_factor(pattern: Pattern) -> Factor:
+    """A factor to be written."""
+    pivots, border = 3 * np.diff(pattern.pivot_begin), 3 * np.diff(pattern.border_begin)
+    gain_begin, spread_begin = _begins(border * pivots), _begins(pivots * pivots)
+    return Factor(pattern, np.empty(gain_begin[-1]), gain_begin, np.empty(spread_begin[-1]), spread_begin)
 
 
 def with_derived(factor: Factor, derived: tuple[Derived, ...]) -> Factor:
@@ -62,19 +68,30 @@ def with_derived(factor: Factor, derived: tuple[Derived, ...]) -> Factor:
         return factor
     old, count = factor.pattern, len(derived)
     newest = derived[::-1]
-    bodies = factor.bodies + np.arange(count)
-    borders = np.cumsum([one.others.size for one in newest])
+    bodies = old.front.size + np.arange(count)
+    borders = _begins(np.array([one.others.size for one in newest]))
     pattern = Pattern(
         np.concatenate([bodies[::-1], old.pivot]),
         np.concatenate([np.arange(count), count + old.pivot_begin]),
         np.concatenate([*(one.others for one in newest), old.border]),
-        np.concatenate([[0], borders[:-1], borders[-1] + old.border_begin]),
+        np.concatenate([borders[:-1], borders[-1] + old.border_begin]),
         np.concatenate([np.where(old.front >= 0, old.front + count, -1), np.arange(count)[::-1]]),
     )
-    gain, spread = (one.gain for one in newest), (one.spread for one in newest)
-    return Factor(pattern, (*gain, *factor.gain), (*spread, *factor.spread))
+    return Factor(
+        pattern,
+        np.concatenate([*(one.gain.reshape(-1) for one in newest), factor.gain]),
+        np.concatenate([9 * borders[:-1], 9 * borders[-1] + factor.gain_begin]),
+        np.concatenate([*(one.spread.reshape(-1) for one in newest), factor.spread]),
+        np.concatenate([9 * np.arange(count), 9 * count + factor.spread_begin]),
+    )
 
 
+def _begins(sizes: IntArray) -> IntArray:
+    """Where each of some (k,) begins, and the last one ends (k + 1,)."""
+    return np.concatenate([[0], np.cumsum(sizes)])
+
+
+@compiled
 def write_covariances(factor: Factor, rows: tuple[IntArray, IntArray], covariance: FloatArray) -> None:
     """Write the covariances within all fronts, and those of wanted rows, from the last front to the first.
 
@@ -87,16 +104,56 @@ def write_covariances(factor: Factor, rows: tuple[IntArray, IntArray], covarianc
         covariance: (n, n, 3, 3) written; what is not wanted stays as it is.
     """
     pattern = factor.pattern
-    for f in range(pattern.fronts - 1, -1, -1):
-        pivots, border = pattern.pivots_of(f), pattern.border_of(f)
-        beside = np.concatenate([border, rows[0][rows[1][f] : rows[1][f + 1]]])
-        own, gain = factor.spread[f], factor.gain[f]
-        across = np.zeros((3 * beside.size, 3 * pivots.size))
+    for f in range(pattern.pivot_begin.size - 2, -1, -1):
+        pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
+        border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+        beside = np.concatenate((border, rows[0][rows[1][f] : rows[1][f + 1]]))
+        size, width = 3 * pivots.size, 3 * border.size
+        own = factor.spread[factor.spread_begin[f] : factor.spread_begin[f + 1]].reshape(size, size)
+        if width:
+            gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]].reshape(width, size)
+            across = np.dot(gathered(covariance, beside, border), gain)
+            own = own + np.dot(gain.T, across[:width])
+        else:
+            across = np.zeros((3 * beside.size, size))
+        _scatter(covariance, beside, pivots, across)
+        _scatter_own(covariance, pivots, own)
+
+
+@compiled
+def solve(factor: Factor, right: FloatArray) -> None:
+    """Multiply the factor's covariance by columns (3 n, c), in place."""
+    pattern, columns = factor.pattern, right.shape[1]
+    fronts = pattern.pivot_begin.size - 1
+    for f in range(fronts):
+        pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
+        border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
         if border.size:
-            across = gathered(covariance, beside, border) @ gain
-            own = own + gain.T @ across[: 3 * border.size]
-        scatter(covariance, beside, pivots, across)
-        _scatter_own(covariance, pivots, np.ascontiguousarray(own))
+            gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]]
+            added = np.dot(gain.reshape(3 * border.size, 3 * pivots.size), _rows_of(right, pivots))
+            for r in range(border.size):
+                for i in range(3):
+                    for c in range(columns):
+                        right[3 * border[r] + i, c] += added[3 * r + i, c]
+    for f in range(fronts - 1, -1, -1):
+        pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
+        border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+        spread = factor.spread[factor.spread_begin[f] : factor.spread_begin[f + 1]]
+        solved = np.dot(spread.reshape(3 * pivots.size, 3 * pivots.size), _rows_of(right, pivots))
+        if border.size:
+            gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]]
+            solved += np.dot(gain.reshape(3 * border.size, 3 * pivots.size).T, _rows_of(right, border))
+        for r in range(pivots.size):
+            right[3 * pivots[r] : 3 * pivots[r] + 3] = solved[3 * r : 3 * r + 3]
+
+
+@compiled
+def _rows_of(matrix: FloatArray, bodies: IntArray) -> FloatArray:
+    """The rows (3 k, c) of bodies (k,)."""
+    out = np.empty((3 * bodies.size, matrix.shape[1]))
+    for r in range(bodies.size):
+        out[3 * r : 3 * r + 3] = matrix[3 * bodies[r] : 3 * bodies[r] + 3]
+    return out
 
 
 @compiled
@@ -105,22 +162,21 @@ def gathered(covariance: FloatArray, rows: IntArray, columns: IntArray) -> Float
     out = np.empty((3 * rows.size, 3 * columns.size))
     for r in range(rows.size):
         for c in range(columns.size):
-            block = covariance[rows[r], columns[c]]
             for i in range(3):
                 for j in range(3):
-                    out[3 * r + i, 3 * c + j] = block[i, j]
+                    out[3 * r + i, 3 * c + j] = covariance[rows[r], columns[c], i, j]
     return out
 
 
 @compiled
-def scatter(covariance: FloatArray, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
+def _scatter(covariance: FloatArray, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
     """Write covariances (3 r, 3 c) of bodies (r,) with bodies (c,), either way."""
     for r in range(rows.size):
         for c in range(columns.size):
-            block, other = covariance[rows[r], columns[c]], covariance[columns[c], rows[r]]
             for i in range(3):
                 for j in range(3):
-                    block[i, j] = other[j, i] = values[3 * r + i, 3 * c + j]
+                    value = values[3 * r + i, 3 * c + j]
+                    covariance[rows[r], columns[c], i, j] = covariance[columns[c], rows[r], j, i] = value
 
 
 @compiled
@@ -128,8 +184,7 @@ def _scatter_own(covariance: FloatArray, bodies: IntArray, values: FloatArray) -
     """Write covariances (3 k, 3 k) among bodies (k,), symmetric to the last bit."""
     for r in range(bodies.size):
         for c in range(bodies.size):
-            block = covariance[bodies[r], bodies[c]]
             for i in range(3):
                 for j in range(3):
                     a, b = 3 * r + i, 3 * c + j
-                    block[i, j] = 0.5 * (values[a, b] + values[b, a])
+                    covariance[bodies[r], bodies[c], i, j] = 0.5 * (values[a, b] + values[b, a])

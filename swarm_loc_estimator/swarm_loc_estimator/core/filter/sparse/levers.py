@@ -93,6 +93,16 @@ def information_of(
     return Information(first[:count], second[:count], block[:count], gradient)
 
 
+def summed(measured: Information) -> Information:
+    """The same with one block for bodies that are named several times in this order."""
+    keys = measured.first * len(measured.gradient) + measured.second
+    order = np.argsort(keys, kind="stable")
+    begin = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    block = np.add.reduceat(measured.block[order], begin) if begin.size else measured.block
+    chosen = order[begin]
+    return Information(measured.first[chosen], measured.second[chosen], block, measured.gradient)
+
+
 @compiled
 def _about_place(jacobian: FloatArray, place: FloatArray, out: FloatArray) -> None:
     """Write the columns of a Jacobian by xi (3, 3) as rows by eta."""

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.numerics.jit import compiled
 
 _NEAREST = 6
 
@@ -26,11 +27,35 @@ class Adjacency(NamedTuple):
 
 def adjacency(count: int, pairs: IntArray) -> Adjacency:
     """Who the neighbours of `count` bodies are by pairs (k, 2), each named once or more."""
-    a, b = pairs[:, 0], pairs[:, 1]
-    apart = a != b
-    keys = np.unique(np.concatenate([a[apart] * count + b[apart], b[apart] * count + a[apart]]))
-    begin: IntArray = np.searchsorted(keys, count * np.arange(count + 1))
-    return Adjacency(begin, keys % count)
+    return _adjacency(count, np.ascontiguousarray(pairs))
+
+
+@compiled
+def _adjacency(count: int, pairs: IntArray) -> Adjacency:
+    """The neighbours of each in order, without sorting them."""
+    named = np.zeros(count + 1, dtype=np.int64)
+    for k in range(len(pairs)):
+        for body in pairs[k]:
+            named[body + 1] += 1
+    begin = np.cumsum(named)
+    naming, place = np.empty(begin[count], dtype=np.int64), begin[:count].copy()
+    for k in range(len(pairs)):
+        for side in range(2):
+            naming[place[pairs[k, side]]] = pairs[k, 1 - side]
+            place[pairs[k, side]] += 1
+    neighbour, place, last = np.empty_like(naming), begin[:count].copy(), np.full(count, -1)
+    for body in range(count):  # in order, so that each is written behind smaller ones
+        for other in naming[begin[body] : begin[body + 1]]:
+            if other != body and last[other] != body:
+                neighbour[place[other]] = last[other] = body
+                place[other] += 1
+    kept, written = np.zeros(count + 1, dtype=np.int64), 0
+    for body in range(count):
+        for k in range(begin[body], place[body]):
+            neighbour[written] = neighbour[k]
+            written += 1
+        kept[body + 1] = written
+    return Adjacency(kept, neighbour[:written].copy())
 
 
 def near_pairs(places: FloatArray) -> IntArray:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.core.filter.joint_filter import Robots
+from swarm_loc_estimator.core.filter.sparse import copies
 from swarm_loc_estimator.core.filter.sparse.dissection import Order, dissect
 from swarm_loc_estimator.core.filter.sparse.elimination import Prior, eliminate
 from swarm_loc_estimator.core.filter.sparse.factor import (
@@ -15,18 +16,22 @@ from swarm_loc_estimator.core.filter.sparse.factor import (
     with_derived,
     write_covariances,
 )
-from swarm_loc_estimator.core.filter.sparse.levers import carried, centre, information_of, levers
+from swarm_loc_estimator.core.filter.sparse.levers import (
+    carried,
+    centre,
+    information_of,
+    levers,
+    summed,
+)
 from swarm_loc_estimator.core.filter.sparse.neighbours import adjacency, near_pairs, spread
 from swarm_loc_estimator.core.filter.sparse.symbolic import Pattern, pattern_of, wanted_rows
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 
-_COPIES = 32
-_COPIED_SHARE = 8
+_COPIES = 64
+_COPIED_SHARE = 4
 """One of so many bodies is copied, at most."""
 _COPIED_AGAIN = 25
 """Updates after which other bodies are copied."""
-_COPY_SPREAD = np.diag(np.square([3e-5, 3e-5, 3e-4]))
-"""What keeps a copy apart from the body [m^2], [m^2], [rad^2]."""
 _ORDERED_AGAIN = 3
 _GROWN = 1.2
 """An order is replaced after so many updates, or when its largest front has grown so much."""
@@ -46,10 +51,11 @@ class _Ordering(NamedTuple):
 
 
 class _Prepared(NamedTuple):
-    """What an update needs: the pattern, the covariances before it, who is active."""
+    """What an update needs: the pattern, covariances and shares of copies before it, who is active."""
 
     pattern: Pattern
     prior: Prior
+    shares: FloatArray
     active: IntArray
 
 
@@ -70,8 +76,8 @@ class SparseFilter:
         self._settled = self.marginal.copy()
         self._place: FloatArray = np.zeros((count, 2))
         self._number: IntArray = np.full(count, -1)
-        self._factor, self._copies = EMPTY, np.zeros(0, dtype=np.int64)
-        self._copy_place: FloatArray = np.zeros((0, 2))
+        self._factor = EMPTY
+        self._shares: FloatArray = np.zeros((0, 3, 0))
         self._new: tuple[Derived, ...] = ()
         self._pairs: tuple[IntArray, ...] = ()
         self._ordering: _Ordering | None = None
@@ -97,7 +103,7 @@ class SparseFilter:
 
     def _append(self, body: int, derived: Derived) -> None:
         """Let a body be a new one."""
-        self._number[body] = self._factor.bodies + len(self._new)
+        self._number[body] = self._factor.pattern.front.size + len(self._new)
         self._new += (derived,)
 
     def add(self, columns: IntArray, covariance: FloatArray) -> None:
@@ -160,7 +166,7 @@ class SparseFilter:
         out = np.zeros((len(columns), 3, 3))
         first, second = pairs.T
         places, covariance = prepared.prior.place, prepared.prior.covariance
-        across = covariance[places[first], places[second]]
+        across = covariance[places[first], places[second]] + copies.shared(prepared.shares, first, second)
         back = levers(-self._place)
         out[tied] = back[first] @ across @ back[second].transpose(0, 2, 1)
         return out
@@ -173,18 +179,23 @@ class SparseFilter:
         )  # landmarks stand where they were placed
         active = np.flatnonzero(np.concatenate([robots.active, self._number[count:] >= 0]))
         self._move_far(active, places)
-        if self._updates % _COPIED_AGAIN == 0:
-            self._copy_some(active, places)
-        self._updates += 1
-        factor = with_derived(self._factor, self._new)
+        factor, shares = with_derived(self._factor, self._new), copies.with_derived(self._shares, self._new)
         pattern = self._pattern(pairs, active, places)
-        numbers = np.concatenate([self._number, self._copies])
-        rows = wanted_rows(factor.pattern, pattern, numbers, len(self._new))
-        covariance = self._room.of(factor.bodies)
+        rows = wanted_rows(factor.pattern, pattern, self._number, len(self._new))
+        covariance = self._room.of(factor.pattern.front.size)
         write_covariances(factor, rows, covariance)
+        if self._updates % _COPIED_AGAIN == 0:
+            copied = active[spread(places[active], min(_COPIES, active.size // _COPIED_SHARE))]
+            others = copies.renewed(factor, shares, self._number[copied])
+            copies.change_shared(covariance, pattern, self._number, (shares, others))
+            shares = others
+        self._updates += 1
+        numbers = self._number[active]
         added = carried(self._place[active], self.marginal[active] - self._settled[active])
-        covariance[numbers[active], numbers[active]] += added
-        self._prepared = _Prepared(pattern, Prior(covariance, numbers), active)
+        covariance[numbers, numbers] += added
+        by_body = np.zeros((self._number.size, 3, shares.shape[2]))
+        by_body[active] = shares[numbers]
+        self._prepared = _Prepared(pattern, Prior(covariance, self._number), by_body, active)
         return self._prepared
 
     def _move_far(self, active: IntArray, places: FloatArray) -> None:
@@ -196,16 +207,9 @@ class SparseFilter:
             self._append(body, Derived(self._number[[body]], turn.T.copy(), np.zeros((3, 3))))
             self._place[body] = places[body]
 
-    def _copy_some(self, active: IntArray, places: FloatArray) -> None:
-        """Have copies of bodies far from each other, which, unlike these, do not move on."""
-        copied = active[spread(places[active], min(_COPIES, active.size // _COPIED_SHARE))]
-        self._copies = self._factor.bodies + len(self._new) + np.arange(copied.size)
-        self._copy_place = self._place[copied]
-        self._new += tuple(Derived(self._number[[body]], np.eye(3), _COPY_SPREAD) for body in copied.tolist())
-
     def _pattern(self, pairs: IntArray, active: IntArray, places: FloatArray) -> Pattern:
         """A pattern in which all these pairs (k, 2) lie, in the order in use or a new one."""
-        count, copies, ordering = self._number.size, self._copies.size, self._ordering
+        count, ordering = self._number.size, self._ordering
         here = np.zeros(count, dtype=bool)
         here[active] = True
         self._pairs = (*self._pairs[1 - _PAIRS_KEPT :], pairs)
@@ -214,14 +218,14 @@ class SparseFilter:
         is_recent = ordering is not None and ordering.updates < _ORDERED_AGAIN
         if ordering is not None and is_recent and np.array_equal(np.sort(ordering.order.body), active):
             graph = adjacency(count, np.concatenate([recent, ordering.near]))
-            pattern = pattern_of(ordering.order, graph, copies)
+            pattern = pattern_of(ordering.order, graph)
             if pattern.width <= _GROWN * ordering.width:
                 self._ordering = ordering._replace(updates=ordering.updates + 1)
                 return pattern
         near = active[near_pairs(places[active])]
         graph = adjacency(count, np.concatenate([recent, near]))
         order = dissect(active, places, graph)
-        pattern = pattern_of(order, graph, copies)
+        pattern = pattern_of(order, graph)
         self._ordering = _Ordering(order, near, 1, pattern.width)
         return pattern
 
@@ -240,14 +244,13 @@ class SparseFilter:
         """
         if self._prepared is None:
             raise RuntimeError("the pairs of an update are related first")
-        (pattern, prior, active), self._prepared = self._prepared, None
-        places = np.concatenate([self._place, self._copy_place])
-        measured = information_of(columns, jacobian, innovation, noise, places)
-        self._factor, correction = eliminate(pattern, prior, measured)
+        (pattern, prior, shares, active), self._prepared = self._prepared, None
+        measured = summed(information_of(columns, jacobian, innovation, noise, self._place))
+        self._factor = eliminate(pattern, prior, measured)
+        self._shares, correction = copies.updated(self._factor, shares, measured)
         count = self._number.size
         self._number = np.full(count, -1)
         self._number[active] = active
-        self._copies = count + np.arange(self._copies.size)
         self._new = ()
         self._settle(active)
         moved = np.einsum("nij,nj->ni", levers(-self._place[active]), correction[active])
@@ -256,11 +259,12 @@ class SparseFilter:
         return out.reshape(-1)
 
     def _settle(self, active: IntArray) -> None:
-        """Have the marginals of the newest factor."""
+        """Have the marginals of the newest factor and copies."""
         none = np.zeros(0, dtype=np.int64), np.zeros(self._factor.pattern.fronts + 1, dtype=np.int64)
-        covariance = self._room.of(self._factor.bodies)
+        covariance = self._room.of(self._factor.pattern.front.size)
         write_covariances(self._factor, none, covariance)
-        self.marginal[active] = carried(-self._place[active], covariance[active, active])
+        own = covariance[active, active] + copies.shared(self._shares, active, active)
+        self.marginal[active] = carried(-self._place[active], own)
         self._settled[active] = self.marginal[active]
 
 

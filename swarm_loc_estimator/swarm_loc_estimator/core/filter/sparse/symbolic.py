@@ -38,37 +38,24 @@ class Pattern(NamedTuple):
         """How many there are."""
         return self.pivot_begin.size - 1
 
-    def pivots_of(self, front: int) -> IntArray:
-        """The bodies that a front eliminates."""
-        return self.pivot[self.pivot_begin[front] : self.pivot_begin[front + 1]]
-
-    def border_of(self, front: int) -> IntArray:
-        """The bodies that a front leaves."""
-        return self.border[self.border_begin[front] : self.border_begin[front + 1]]
-
     @property
     def width(self) -> int:
         """Bodies in the largest front."""
         return int((np.diff(self.pivot_begin) + np.diff(self.border_begin)).max(initial=0))
 
 
-def pattern_of(order: Order, adjacency: Adjacency, copies: int) -> Pattern:
-    """The fronts of an order of n bodies with so many copies, numbered behind them and in all fronts."""
-    count = adjacency.begin.size - 1
-    anchors = np.arange(count, count + copies)
-    pivot = np.concatenate([order.body, anchors])
-    begin = np.append(order.begin, pivot.size) if copies else order.begin
-    front = np.full(count + copies, -1, dtype=np.int64)
-    front[pivot] = np.repeat(np.arange(begin.size - 1), np.diff(begin))
-    border, border_begin = _borders(pivot, begin, front, adjacency, anchors)
-    return Pattern(pivot, begin, border, border_begin, front)
+def pattern_of(order: Order, adjacency: Adjacency) -> Pattern:
+    """The fronts of an order of n bodies."""
+    front = np.full(adjacency.begin.size - 1, -1, dtype=np.int64)
+    front[order.body] = np.repeat(np.arange(order.begin.size - 1), np.diff(order.begin))
+    border, border_begin = _borders(order, front, adjacency)
+    return Pattern(order.body, order.begin, border, border_begin, front)
 
 
 @compiled
-def _borders(
-    pivot: IntArray, begin: IntArray, front: IntArray, adjacency: Adjacency, anchors: IntArray
-) -> tuple[IntArray, IntArray]:
+def _borders(order: Order, front: IntArray, adjacency: Adjacency) -> tuple[IntArray, IntArray]:
     """The bodies of all borders, front by front, and where each begins (F + 1,)."""
+    pivot, begin = order.body, order.begin
     fronts, seen = begin.size - 1, np.full(front.size, -1, dtype=np.int64)
     borders, border_begin = np.empty(64 * front.size, dtype=np.int64), np.zeros(fronts + 1, dtype=np.int64)
     child, sibling = np.full(fronts, -1, dtype=np.int64), np.full(fronts, -1, dtype=np.int64)
@@ -78,14 +65,12 @@ def _borders(
             borders = np.concatenate((borders, np.empty_like(borders)))
         first = end
         for body in pivot[begin[f] : begin[f + 1]]:
-            if body < adjacency.begin.size - 1:
-                neighbours = adjacency.neighbour[adjacency.begin[body] : adjacency.begin[body + 1]]
-                end = _take(neighbours, f, front, seen, borders, end)
+            neighbours = adjacency.neighbour[adjacency.begin[body] : adjacency.begin[body + 1]]
+            end = _take(neighbours, f, front, seen, borders, end)
         below = child[f]
         while below >= 0:
             end = _take(borders[border_begin[below] : border_begin[below + 1]], f, front, seen, borders, end)
             below = sibling[below]
-        end = _take(anchors, f, front, seen, borders, end)
         border_begin[f + 1] = end
         if end > first:
             parent = front[borders[first:end]].min()

@@ -1,0 +1,59 @@
+"""Inverses of covariance and information matrices, and the memory of the last one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.lapack import invert_positive
+
+
+class InverseMemory:
+    """The inverse of the last matrix that was asked for.
+
+    The newest period is computed again with each datum that comes of it, from the same prediction.
+    """
+
+    def __init__(self) -> None:
+        self._matrix: FloatArray = np.zeros((0, 0))
+        self._inverse: FloatArray = np.zeros((0, 0))
+
+    def inverse_of(self, matrix: FloatArray) -> FloatArray:
+        """The inverse (n, n) of a symmetric positive definite matrix, to be read."""
+        if not _are_equal(matrix, self._matrix):
+            self._inverse, self._matrix = inverse(matrix), matrix.copy()
+        return self._inverse
+
+
+def inverse(matrix: FloatArray) -> FloatArray:
+    """The inverse (n, n) of a symmetric positive definite matrix, symmetric to the last bit.
+
+    Raises:
+        LinAlgError: The matrix is not positive definite.
+    """
+    inverted: FloatArray = matrix.copy()
+    if not invert_positive(inverted.reshape(-1), matrix.shape[0]):
+        raise np.linalg.LinAlgError("the covariance is not positive definite")
+    _mirror(inverted)
+    return inverted
+
+
+@compiled
+def _are_equal(one: FloatArray, other: FloatArray) -> bool:
+    """Whether two matrices are equal to the last bit."""
+    if one.shape != other.shape:
+        return False
+    for i in range(one.shape[0]):
+        for j in range(one.shape[1]):
+            if one[i, j] != other[i, j]:
+                return False
+    return True
+
+
+@compiled
+def _mirror(matrix: FloatArray) -> None:
+    """Copy the upper triangle, which is the lower one in Fortran's order, to the other one."""
+    for i in range(matrix.shape[0]):
+        for j in range(i):
+            matrix[i, j] = matrix[j, i]

@@ -1,0 +1,151 @@
+"""Errors that far bodies share: those of copies of some bodies, which, unlike these, do not move on.
+
+    x_i = G_i a + y_i,
+
+with combinations a of the errors of copies, independent and of variance 1, and with y, which is independent
+of a and what the factor is about. Measurements of x say with information T of y, with T G of both
+and with G^T T G of a: y is eliminated with T G on the right-hand side, and a is one dense part of the end.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import blas
+
+from swarm_loc_estimator.core.filter.sparse.factor import Derived, Factor, solve
+from swarm_loc_estimator.core.filter.sparse.levers import Information
+from swarm_loc_estimator.core.filter.sparse.symbolic import Pattern
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.numerics.jit import compiled, compiled_sums
+
+_COPY_SPREAD = np.diag(np.square([3e-5, 3e-5, 3e-4]))
+"""What keeps a copy apart from the body [m^2], [m^2], [rad^2]."""
+
+
+def with_derived(shares: FloatArray, derived: tuple[Derived, ...]) -> FloatArray:
+    """G (n, 3, k) with the shares of more bodies behind."""
+    if not derived:
+        return shares
+    out = np.concatenate([shares, np.zeros((len(derived), *shares.shape[1:]))])
+    for k, one in enumerate(derived):
+        others = out[one.others].reshape(3 * one.others.size, shares.shape[2])
+        out[len(shares) + k] = one.gain.T @ others
+    return out
+
+
+def renewed(factor: Factor, shares: FloatArray, copied: IntArray) -> FloatArray:
+    """G (n, 3, k) of copies of some bodies (m,) as they are, in place of those there were.
+
+    k is 3 m: fewer combinations of the errors of copies make robots with a single landmark too sure.
+    """
+    count, size = factor.pattern.front.size, 3 * copied.size
+    columns = (3 * copied[:, None] + np.arange(3)).reshape(-1)
+    across = np.zeros((3 * count, size))
+    across[columns, np.arange(size)] = 1.0
+    solve(factor, across)
+    before = shares.reshape(3 * count, -1)
+    across += before @ before[columns].T
+    covariance = across[columns] + np.kron(np.eye(copied.size), _COPY_SPREAD)
+    _whiten(across, 0.5 * (covariance + covariance.T))
+    return across.reshape(count, 3, size)
+
+
+def updated(factor: Factor, shares: FloatArray, measured: Information) -> tuple[FloatArray, FloatArray]:
+    """G after measurements, and the correction (n, 3) that they make.
+
+    Args:
+        factor: Of y, after them.
+        shares: (n, 3, k) G before them.
+        measured: What they say.
+    """
+    count, _, size = shares.shape
+    before, gradient = shares.reshape(3 * count, size), measured.gradient.reshape(-1)
+    right = np.empty((3 * count, size + 1))
+    right[:, size] = gradient
+    _weigh(measured, before, right)
+    weighted = right[:, :size].copy()
+    solve(factor, right)
+    after, correction = before - right[:, :size], right[:, size]
+    if size:
+        information = weighted.T @ after
+        pull = _whiten(after, np.eye(size) + 0.5 * (information + information.T), after.T @ gradient)
+        correction = correction + after @ pull
+    return after.reshape(count, 3, size), correction.reshape(count, 3)
+
+
+def _whiten(columns: FloatArray, matrix: FloatArray, right: FloatArray | None = None) -> FloatArray:
+    """Multiply columns (n, k) by K^-T, in place, where K K^T is a matrix (k, k); return K^-1 r for r (k,)."""
+    root = np.asfortranarray(np.linalg.cholesky(matrix))
+    blas.dtrsm(1.0, root, columns.T, lower=1, overwrite_b=1)
+    if right is None:
+        return np.zeros(0)
+    solved: FloatArray = blas.dtrsv(root, right, lower=1)
+    return solved
+
+
+@compiled
+def _weigh(measured: Information, shares: FloatArray, out: FloatArray) -> None:
+    """Write T G to the first columns of `out` (3 n, k + 1) for G (3 n, k)."""
+    size = shares.shape[1]
+    out[:, :size] = 0.0
+    for k in range(measured.first.size):
+        row, column = 3 * measured.first[k], 3 * measured.second[k]
+        for i in range(3):
+            for j in range(3):
+                factor = measured.block[k, i, j]
+                for c in range(size):
+                    out[row + i, c] += factor * shares[column + j, c]
+                if row != column:
+                    for c in range(size):
+                        out[column + j, c] += factor * shares[row + i, c]
+
+
+@compiled_sums
+def shared(shares: FloatArray, first: IntArray, second: IntArray) -> FloatArray:
+    """Covariances (m, 3, 3) that pairs of bodies (m,) have through the copies."""
+    out = np.zeros((first.size, 3, 3))
+    for k in range(first.size):
+        for i in range(3):
+            for j in range(3):
+                total = 0.0
+                for c in range(shares.shape[2]):
+                    total += shares[first[k], i, c] * shares[second[k], j, c]
+                out[k, i, j] = total
+    return out
+
+
+@compiled
+def change_shared(
+    covariance: FloatArray, pattern: Pattern, place: IntArray, shares: tuple[FloatArray, FloatArray]
+) -> None:
+    """Make the covariances of x into those of y by other copies, for all pairs of a pattern.
+
+    Args:
+        covariance: (n, n, 3, 3) of y by G, changed.
+        pattern: Whose pairs are wanted.
+        place: Numbers of the pattern's bodies there.
+        shares: (n, 3, k) G before and from now on.
+    """
+    for f in range(pattern.pivot_begin.size - 1):
+        pivots = place[pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]]
+        border = place[pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]]
+        bodies = np.concatenate((border, pivots))
+        change = np.dot(_chosen(shares[0], bodies), _chosen(shares[0], pivots).T)
+        change -= np.dot(_chosen(shares[1], bodies), _chosen(shares[1], pivots).T)
+        for r in range(bodies.size):
+            for c in range(pivots.size):
+                for i in range(3):
+                    for j in range(3):
+                        value = covariance[bodies[r], pivots[c], i, j] + change[3 * r + i, 3 * c + j]
+                        covariance[bodies[r], pivots[c], i, j] = value
+                        if r < border.size:
+                            covariance[pivots[c], bodies[r], j, i] = value
+
+
+@compiled
+def _chosen(shares: FloatArray, bodies: IntArray) -> FloatArray:
+    """The shares (3 m, k) of some bodies (m,)."""
+    out = np.empty((3 * bodies.size, shares.shape[2]))
+    for r in range(bodies.size):
+        out[3 * r : 3 * r + 3] = shares[bodies[r]]
+    return out

@@ -1,0 +1,76 @@
+"""Inverses of large matrices against LAPACK's, and the memory of the last one."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarm_loc_estimator.core.filter.dense.covariance import DenseFilter
+from swarm_loc_estimator.core.filter.dense.inversion import InverseMemory, inverse
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+
+def positive(rng: np.random.Generator, size: int) -> FloatArray:
+    factor = rng.standard_normal((size, size))
+    matrix: FloatArray = factor @ factor.T / size + 0.1 * np.eye(size)
+    return matrix
+
+
+@given(size=st.sampled_from([1, 2, 3, 59, 80, 81, 161, 300]), seed=st.integers(0, 10**6))
+def test_the_inverse_is_lapack_s_and_symmetric(size: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scale = 10.0 ** rng.uniform(-4.0, 4.0, size)  # of positions and of what is not known at all
+    scaled = positive(rng, size) * np.outer(scale, scale)
+    given = scaled.copy()
+    result = inverse(scaled)
+    np.testing.assert_array_equal(scaled, given)
+    np.testing.assert_array_equal(result, result.T)
+    unscaled = result * np.outer(scale, scale)
+    np.testing.assert_allclose(unscaled, np.linalg.inv(scaled / np.outer(scale, scale)), atol=1e-9)
+
+
+@pytest.mark.parametrize("place", [0, 99, 199])
+@pytest.mark.parametrize("value", [-1.0, np.nan])
+def test_what_is_not_positive_definite_is_refused(place: int, value: float) -> None:
+    matrix = np.eye(200)
+    matrix[place, place] = value
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+        inverse(matrix)
+
+
+def test_the_last_matrix_is_remembered_to_the_last_bit() -> None:
+    memory, matrix = InverseMemory(), positive(np.random.default_rng(0), 90)
+    first = memory.inverse_of(matrix)
+    assert memory.inverse_of(matrix.copy()) is first
+    matrix[7, 7] = np.nextafter(matrix[7, 7], 1.0)
+    assert memory.inverse_of(matrix) is not first
+    np.testing.assert_array_equal(memory.inverse_of(matrix), inverse(matrix))
+    np.testing.assert_array_equal(memory.inverse_of(np.eye(3)), np.eye(3))
+
+
+def test_an_update_done_again_from_a_copy_gives_the_same_bytes() -> None:
+    rng = np.random.default_rng(1)
+    columns, noise = np.array([[0, 1, 2, 3, 4, 5], [3, 4, 5, 6, 7, 8]]), np.array([np.eye(3)] * 2)
+    jacobian, innovation = rng.standard_normal((2, 3, 6)), rng.standard_normal((2, 3))
+    prior = DenseFilter(9)
+    prior.covariance = positive(rng, 9)
+    provisional, final, alone = prior.copy(), prior.copy(), DenseFilter(9)
+    alone.covariance = prior.covariance.copy()
+    provisional.update(columns[:1], jacobian[:1], innovation[:1], noise[:1])
+    corrections = [one.update(columns, jacobian, innovation, noise) for one in (final, alone)]
+    assert corrections[0].tobytes() == corrections[1].tobytes()
+    assert final.covariance.tobytes() == alone.covariance.tobytes()
+
+
+def test_compiled_code_from_the_cache_finds_lapack(tmp_path: Path) -> None:
+    inverting = "import numpy as np\nfrom swarm_loc_estimator.numerics.lapack import invert_positive\n"
+    inverting += "assert invert_positive(np.eye(90).reshape(-1), 90)"
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    for _ in ("compiled", "from the cache"):
+        subprocess.run([sys.executable, "-c", inverting], env=environment, check=True)
+    assert list(tmp_path.rglob("*.nbc"))

@@ -1,0 +1,173 @@
+"""Small swarms in the sparse filter: who joins, is lost, found, contradicted, named, as in the dense one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from core_geometry import nees, wrapped
+from core_messages import POSE, POSITION, SECOND, T0
+from core_run import on_time, play, settled, ticks
+from core_world import Plan, World, simulate
+from scipy.stats import chi2
+
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.core.filter.sparse.sparse_filter import SparseFilter
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+SPARSE = EstimatorSettings(sparse_from=2, fusion_period_s=0.2)
+DENSE = replace(SPARSE, sparse_from=1000)
+
+world_of = lru_cache(maxsize=16)(simulate)
+"""For tests that change nothing in it."""
+
+
+def run(
+    world: World, settings: EstimatorSettings = SPARSE, period_s: float = 0.2
+) -> tuple[SwarmEstimator, list[SwarmEstimate]]:
+    """A world through an estimator of its own, all in time."""
+    estimator = SwarmEstimator(world.swarm, settings)
+    end_ns = int(world.stamp_ns[-1])
+    return estimator, play(estimator, on_time(world), ticks(T0, end_ns, period_s))
+
+
+def is_sparse(estimator: SwarmEstimator) -> bool:
+    return isinstance(estimator._timeline.state.filter, SparseFilter)
+
+
+def distances(world: World, estimates: list[SwarmEstimate]) -> FloatArray:
+    """(T, N) between estimates and truth [m]; NaN where not located."""
+    return np.array([np.hypot(*(e.poses - world.at(e.stamp_ns))[:, :2].T) for e in estimates])
+
+
+def assert_chi_square(worlds: list[World]) -> None:
+    """The mean of normalised errors, one of each run and robot, is what three degrees of freedom give."""
+    squared = []
+    for world in worlds:
+        estimator, estimates = run(world, period_s=1.0)
+        assert is_sparse(estimator)
+        error = wrapped(np.array([e.poses - world.at(e.stamp_ns) for e in estimates]))
+        squared.append(nees(error, np.array([e.covariances for e in estimates]))[5:].mean(axis=0))
+    samples = np.concatenate(squared)
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 3 * samples.size) / samples.size
+    assert low < samples.mean() < high
+
+
+@pytest.mark.parametrize("content", [POSE, POSITION])
+def test_the_normalised_error_is_chi_square_distributed(content: int) -> None:
+    plan = Plan(12, 10.0, content=content, landmarks=6)
+    assert_chi_square([simulate(plan, 400 + seed) for seed in range(4)])
+
+
+@pytest.mark.parametrize("content", [POSE, POSITION])
+def test_landmarks_badly_surveyed_are_estimated(content: int) -> None:
+    plan = Plan(3, 20.0, content=content, survey=1.0, speed=0.15)
+    worlds = [world_of(plan, 500 + seed) for seed in range(4)]
+    assert_chi_square(worlds)
+    own, others = [], []
+    for world in worlds:
+        trusted = tuple(replace(mark, position_sigma=0.0, yaw_sigma=0.0) for mark in world.swarm.landmarks)
+        trusting = replace(world, swarm=replace(world.swarm, landmarks=trusted))
+        own.append(np.square(distances(world, run(world)[1])[25:]).mean())
+        others.append(np.square(distances(world, run(trusting)[1])[25:]).mean())
+    assert np.mean(own) < 0.7 * np.nanmean(others)  # not a number where it got lost
+
+
+def test_robots_described_with_sigmas_are_calibrated_as_in_a_small_swarm() -> None:
+    """Their filter stays dense, whatever the size, and learns the same."""
+    world = world_of(Plan(3, 12.0, lasting=1.0, speed=0.15), 600)
+    estimator, estimates = run(world)
+    other, expected = run(world, DENSE)
+    assert not is_sparse(estimator)
+    assert "because robots are calibrated" in estimator.note
+    np.testing.assert_array_equal(estimates[-1].poses, expected[-1].poses)
+    before = [robot.camera for robot in world.swarm.robots]
+    learned = [robot.camera for robot in estimator.learned().robots]
+    assert learned == [robot.camera for robot in other.learned().robots]
+    for camera, was in zip(learned, before, strict=True):
+        assert camera is not None
+        assert was is not None
+        assert camera.yaw != was.yaw
+        assert camera.yaw_sigma < 0.8 * was.yaw_sigma
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("content", [POSE, POSITION])
+def test_a_swarm_with_unknown_starts_finds_itself(content: int, seed: int) -> None:
+    world = simulate(Plan(3, 12.0, content=content, start_known=(False,), landmarks=5), seed)
+    estimator, estimates = run(world)
+    assert is_sparse(estimator)
+    assert (estimates[0].status == Status.WAITING).all()
+    assert (estimates[-1].status == Status.TRACKED).all()
+    assert distances(world, estimates)[-1].max() < 0.05
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_robot_that_sees_no_landmark_is_located_through_another(seed: int) -> None:
+    world = simulate(Plan(2, 15.0, start_known=(True, False), landmarks=4), seed)
+    for event in world.events:
+        if event.robot == 1:
+            event.detections["id"][event.detections["id"] >= 1000] = 99
+    estimates = run(world)[1]
+    distance = distances(world, estimates)
+    assert np.isfinite(distance[-1, 1])
+    assert np.nanmax(distance[:, 1]) < 0.3
+    assert estimates[-1].fix_age_s[1] == -1.0
+
+
+@pytest.mark.parametrize("content", [POSE, POSITION])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_robot_that_is_carried_away_is_lost_and_found_again_and_harms_nobody(
+    seed: int, content: int
+) -> None:
+    """It is lost because its sightings are gated and speak against it; its odometry knows nothing of it."""
+    world = simulate(Plan(4, 16.0, content=content, landmarks=6, carried=(0,)), seed)
+    estimator, estimates = run(world)
+    distance, status = distances(world, estimates), np.array([e.status for e in estimates])
+    carried, within = 41, 15  # ticks of 0.2 s
+    assert not distance[carried, 0] < 0.15  # not a number where it is lost already
+    assert Status.WAITING in status[carried : carried + within, 0]
+    assert Status.WAITING not in status[1:carried, 0]
+    assert settled(estimator)["GATED"] >= 3
+    assert distance[-1, 0] < 0.1
+    assert np.isfinite(distance[:, 1:]).all()
+    assert distance[:, 1:].max() < 0.15
+
+
+def misled(world: World, liar: int, from_ns: int, by: tuple[float, float]) -> World:
+    """The world where one robot sees all that it sees off by so much, in its camera's frame [m]."""
+    events = []
+    for event in world.events:
+        detections = event.detections
+        if event.robot == liar and detections.size and event.stamp_ns >= from_ns:
+            detections = detections.copy()
+            detections["position"][:, 0] += by[0]
+            detections["position"][:, 2] += by[1]
+        events.append(replace(event, detections=detections))
+    return replace(world, events=tuple(events))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_false_sightings_of_one_robot_are_gated_and_the_robot_is_named(seed: int) -> None:
+    plan = Plan(5, 14.0, landmarks=6)
+    world = misled(simulate(plan, 700 + seed), 2, T0 + 6 * SECOND, (0.5, 0.3))
+    estimator, estimates = run(world)
+    named = set()
+    for estimate in estimates[-5:]:
+        named |= {one.about for one in estimator.contradictions(estimate.stamp_ns)}
+    assert settled(estimator)["GATED"] > 10
+    honest = [k for k in range(5) if k != 2]
+    assert world.swarm.robots[2].name in named
+    assert not named & {world.swarm.robots[k].name for k in honest}
+    assert distances(world, estimates)[:, honest].max() < 0.1
+
+
+def test_a_robot_that_leaves_does_not_hold_the_others_up() -> None:
+    world = simulate(Plan(4, 10.0), 3)
+    left = [e for e in world.events if e.robot != 2 or e.stamp_ns < T0 + 3 * SECOND]
+    estimates = run(replace(world, events=tuple(left)))[1]
+    assert estimates[-1].status[2] != Status.TRACKED
+    assert distances(world, estimates)[-1, [0, 1, 3]].max() < 0.05
