@@ -3,8 +3,9 @@
     make bench-large_swarms
     make bench-large_swarms ARGS="--robots 1000 --duration 60"
 
-A recording of the grid of `bench-scaling` is played into the estimator by another process. A pose's
-age is that of its stamp when it is received here; the data behind it is older.
+A recording of the grid of `bench-scaling` is played into the estimator by another process: once with topics
+of each robot, once with topics that all share (`shared_topics`). A pose's age is that of its stamp when it is
+received here; the data behind it is older.
 """
 
 from __future__ import annotations
@@ -17,9 +18,12 @@ from pathlib import Path
 import numpy as np
 
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
+from swarm_loc_drivers.sim.common.record import SimulatedRun
 from swarm_loc_drivers.sim.recording.bag import write_bag
+from swarm_loc_drivers.sim.recording.shared_bag import write_shared_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.evaluation.metrics import pool, summarise
+from swarm_loc_estimator.io.inputs.thinning import SHED_REASONS
 from swarm_loc_estimator.launching.graph import GraphOptions
 from swarm_loc_estimator.live.run import play_live
 
@@ -27,10 +31,17 @@ SIZES = (100, 300, 1000)
 DURATION_S = 30.0
 SETTLING_S = 5.0
 """Errors count from here on."""
+OWN, SHARED = "own", "shared"
+LAYOUTS = (OWN, SHARED)
+"""Of topics."""
+_FIGURES_OF = {OWN: "live", SHARED: "shared"}
+"""What the names of their figures begin with."""
+_PARAMETERS = "estimator: {{ros__parameters: {{shared_topics: {shared}}}}}\n"
 _UNITS = {
     "start_up_s": "start-up [s]",
     "sent_messages": "messages sent",
     "lost_messages": "messages lost",
+    "shed_sightings": "sightings left out",
     "estimator_core": "estimator [core]",
     "memory_mb": "memory [MB]",
     "pose_age_ms": "pose age, 95 % [ms]",
@@ -39,31 +50,44 @@ _UNITS = {
 }
 
 
-def measure(sizes: Sequence[int], duration_s: float, seed: int) -> dict[str, float]:
+def measure(sizes: Sequence[int], layouts: Sequence[str], duration_s: float, seed: int) -> dict[str, float]:
     """Run swarms of several sizes, print a table and draw it.
 
     Returns:
-        The figures, named `live<robots>.<figure>`; without errors where no robot was located.
+        The figures, named `live<robots>.<figure>` with topics of each robot and `shared<robots>.<figure>`
+        with those that all share; without errors where no robot was located.
     """
-    results = {}
+    results: dict[str, dict[int, dict[str, float]]] = {layout: {} for layout in layouts}
     for robots in sizes:
-        print(f"{robots} robots over DDS, in real time ...", flush=True)
-        results[robots] = run(robots, duration_s, seed)
-    if results:
-        print(table(["robots", *_UNITS.values()], [[n, *one.values()] for n, one in results.items()]))
+        recording = simulate_grid(GridSettings(robots=robots, seed=seed, duration_s=duration_s))
+        for layout, figures in results.items():
+            print(f"{robots} robots over DDS, {layout} topics, in real time ...", flush=True)
+            figures[robots] = run(recording, shared=layout == SHARED)
+    rows: list[list[str | float]] = [
+        [n, layout, *one.values()] for layout, found in results.items() for n, one in found.items()
+    ]
+    if rows:
+        print(table(["robots", "topics", *_UNITS.values()], rows))
         draw(results)
-    named = {f"live{n}.{name}": value for n, one in results.items() for name, value in one.items()}
+    named = {
+        f"{_FIGURES_OF[layout]}{n}.{name}": value
+        for layout, found in results.items()
+        for n, one in found.items()
+        for name, value in one.items()
+    }
     return {name: value for name, value in named.items() if np.isfinite(value)}
 
 
-def run(robots: int, duration_s: float, seed: int) -> dict[str, float]:
+def run(recording: SimulatedRun, *, shared: bool) -> dict[str, float]:
     """All figures of one size, named as `_UNITS`."""
-    recording = simulate_grid(GridSettings(robots=robots, seed=seed, duration_s=duration_s))
+    robots = len(recording.swarm.robots)
     with tempfile.TemporaryDirectory() as work:
-        bag = Path(work, f"grid{robots}")
-        write_bag(recording, bag, "A simulated grid.")
-        log = OUT / "scaling" / f"nodes{robots}.log"
-        options = GraphOptions(str(bag / "swarm.yaml"), bag=str(bag))
+        bag, parameters = Path(work, f"grid{robots}"), Path(work, "parameters.yaml")
+        write = write_shared_bag if shared else write_bag
+        write(recording, bag, "A simulated grid.")
+        parameters.write_text(_PARAMETERS.format(shared=str(shared).lower()), encoding="utf-8")
+        log = OUT / "scaling" / f"nodes{robots}{'_shared' if shared else ''}.log"
+        options = GraphOptions(str(bag / "swarm.yaml"), bag=str(bag), parameter_file=str(parameters))
         live = play_live(options, log=log, inputs_only=True)
     settled = live.result.stamp_ns >= recording.start_ns + SETTLING_S * 1e9
     errors = summarise(pool(list(live.result.chosen(settled).errors.values())))
@@ -71,6 +95,7 @@ def run(robots: int, duration_s: float, seed: int) -> dict[str, float]:
         live.start_up_s,
         live.sent,
         live.lost,
+        sum(live.result.counters.get(reason, 0) for reason in SHED_REASONS),
         live.estimator_core,
         live.memory_mb,
         1e3 * np.percentile(live.age_s, 95.0),
@@ -80,13 +105,15 @@ def run(robots: int, duration_s: float, seed: int) -> dict[str, float]:
     return {name: float(value) for name, value in zip(_UNITS, figures, strict=True)}
 
 
-def draw(results: dict[int, dict[str, float]]) -> None:
+def draw(results: dict[str, dict[int, dict[str, float]]]) -> None:
     """What grows with the swarm."""
     names = ("start_up_s", "estimator_core", "memory_mb", "pose_age_ms")
     figure, axes = new_plot(len(names), width=3.4)
     for axis, name in zip(axes, names, strict=True):
-        axis.plot(list(results), [one[name] for one in results.values()], "o-")
+        for layout, found in results.items():
+            axis.plot(list(found), [one[name] for one in found.values()], "o-", label=layout)
         axis.set(xlabel="robots", ylabel=_UNITS[name], xlim=(0.0, None), ylim=(0.0, None))
+    axes[0].legend(title="topics")
     print(f"plot: {save_plot(figure, 'large_swarms')}")
 
 
@@ -94,10 +121,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--robots", type=int, nargs="+", default=SIZES, help="swarm sizes")
+    parser.add_argument("--topics", nargs="+", default=LAYOUTS, choices=LAYOUTS, help="layouts")
     parser.add_argument("--duration", type=float, default=DURATION_S, help="of a recording [s]")
     parser.add_argument("--seed", type=int, default=1, help="of the simulation")
     options = parser.parse_args(arguments)
-    figures = measure(options.robots, options.duration, options.seed)
+    figures = measure(options.robots, options.topics, options.duration, options.seed)
     print(f"figures: {write_figures('large_swarms', figures)}")
 
 

@@ -153,7 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             shaped[Shape(name), robots] = measure_shape(Shape(name), robots, runs)
     live = {}
     if not options.no_live:
-        live = large_swarms.measure(large_swarms.SIZES, options.duration, options.seed)
+        live = large_swarms.measure(large_swarms.SIZES, large_swarms.LAYOUTS, options.duration, options.seed)
     report(results, show(shaped), live)
 
 

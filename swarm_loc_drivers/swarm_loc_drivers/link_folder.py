@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-_PREFIX = "epucks-"
+_PREFIX = "swarm_loc-"
 
 
 @contextmanager

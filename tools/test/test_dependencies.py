@@ -14,6 +14,7 @@ ROOT = Path(__file__).parents[2]
 KEYS = {
     "PIL": "python3-pil",
     "cv2": "python3-opencv",
+    "llvmlite": "python3-numba",  # which stands on it
     "rosbags": "python3-rosbags-pip",
     "ruamel": "python3-ruamel.yaml",
     # rosdep has no keys of these three: they come with this one

@@ -14,7 +14,7 @@ from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
 from swarm_loc_estimator.core.estimation.estimator import Status
 from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.live.graph import LiveGraph
-from swarm_loc_estimator.live.recorder import Poses, read_poses
+from swarm_loc_estimator.live.recorder import Poses
 
 PATIENCE_S = 100.0
 PARAMETERS = "epuck_world: {ros__parameters: {aerial_width: 640, aerial_height: 480}}\n"
@@ -50,7 +50,7 @@ def test_robots_are_located_by_a_camera_that_cannot_tell_them_apart(tmp_path: Pa
             recorder.create_subscription(PoseStamped, f"{name}/ground_truth", on_truth, 1000)
 
         def tracked() -> list[Poses]:
-            return [one for one in map(read_poses, recorder.raw) if (one.status == Status.TRACKED).all()]
+            return [one for one in recorder.poses() if (one.status == Status.TRACKED).all()]
 
         graph.wait_for(lambda: len(tracked()) >= 20, "be located", PATIENCE_S)
     for one in tracked()[-10:]:

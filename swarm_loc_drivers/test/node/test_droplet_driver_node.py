@@ -65,6 +65,11 @@ def robots(tmp_path: Path) -> Iterator[Robots]:
         robots.process.kill()
 
 
+def values_of(message: DiagnosticArray) -> dict[str, str]:
+    """The figures of the driver."""
+    return {pair.key: pair.value for pair in message.status[0].values}
+
+
 def test_a_droplet_walks_measures_and_stands_at_the_end(ros: Ros, robots: Robots, tmp_path: Path) -> None:
     odometry: list[Odometry] = ros.listen(Odometry, "droplet1/odom")
     relayed: list[Odometry] = ros.listen(Odometry, "droplet3/odom")
@@ -76,6 +81,7 @@ def test_a_droplet_walks_measures_and_stands_at_the_end(ros: Ros, robots: Robots
         "partners": json.dumps([f"{robot:04X}" for robot in IDS[1:]]),
         "relayed": json.dumps([f"droplet3={IDS[2]:04X}"]),
         "exchange_rate": 0.0,
+        "reply_timeout_s": 10.0,  # the emulated robots wait for a processor, too
     }
     arguments = ("-r", "__ns:=/droplet1")
     log = tmp_path / "log"
@@ -95,7 +101,7 @@ def test_a_droplet_walks_measures_and_stands_at_the_end(ros: Ros, robots: Robots
         ros.until(lambda: len(matrices) == 4)
         timer = ros.tester.create_timer(0.05, lambda: publisher.publish(Twist(linear=Vector3(x=-0.01))))
         ros.until(lambda: odometry[-1].pose.pose.position.x < -0.004)
-        ros.until(lambda: transforms and diagnostics)
+        ros.until(lambda: transforms and diagnostics and values_of(diagnostics[-1]).get("exchanges") == "2")
         timer.cancel()
         assert program.end(signal.SIGINT) == 0, program.output
     first = robots.poses()
@@ -119,9 +125,8 @@ def test_a_droplet_walks_measures_and_stands_at_the_end(ros: Ros, robots: Robots
     frames = {one.transforms[0].child_frame_id for one in transforms}
     assert frames == {"droplet1/base_link", "droplet3/base_link"}
     status = diagnostics[-1].status[0]
-    values = {pair.key: pair.value for pair in status.values}
     assert (status.name, status.message) == ("droplet1/droplet_driver", "connected")
-    assert values["exchanges"] == "2"
+    assert values_of(diagnostics[-1])["exchanges"] == "2"
 
 
 def test_nobody_is_asked_while_the_link_is_down(ros: Ros, tmp_path: Path) -> None:

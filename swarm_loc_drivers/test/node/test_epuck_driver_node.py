@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -23,6 +24,7 @@ from nav_msgs.msg import Odometry
 from node_world import Program, Ros
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import Range
+from tcp_link import TcpLink
 from tf2_msgs.msg import TFMessage
 
 from swarm_loc_drivers.protocols.epuck.hardware import PROXIMITY_BEARINGS
@@ -245,10 +247,27 @@ def test_the_robot_stands_when_the_node_has_ended(
     program = driver(over, emulated.place)
     controller.velocity = (0.06, 0.3)
     ros.until(lambda: any(is_moving(message) for message in controller.odometry[-1:]))
-    assert any(emulated.truth()["rates"])
+    ros.until(lambda: any(emulated.truth()["rates"]))  # it stands for a while where commands came late
     assert program.end(number) == 0
     assert emulated.truth()["rates"] == [0.0, 0.0]
     assert "Traceback" not in program.output
+
+
+def test_the_robot_stands_also_where_its_link_is_down_at_the_signal(
+    ros: Ros, robot: Start, driver: Start
+) -> None:
+    controller, emulated = Controller(ros), robot("wifi")
+    with TcpLink(int(emulated.place)) as link:
+        program = driver("wifi", str(link.port))
+        controller.velocity = (0.06, 0.0)
+        ros.until(lambda: any(emulated.truth()["rates"]))
+        link.cut()
+        program.process.send_signal(signal.SIGINT)
+        down_s = time.monotonic()
+        ros.until(lambda: time.monotonic() > down_s + 1.2)
+        link.mend()
+        assert program.end() == 0
+        ros.until(lambda: not any(emulated.truth()["rates"]))
 
 
 @OVER

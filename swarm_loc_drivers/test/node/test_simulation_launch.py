@@ -67,4 +67,4 @@ def test_an_argument_that_cannot_be_used_ends_the_launch_with_an_error(
     assert status == 1
     assert sentence in said
     assert "process started" not in said
-    assert not list(tmp_path.glob("epucks-*"))
+    assert not list(tmp_path.glob("swarm_loc-*"))

@@ -14,7 +14,7 @@ from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
 from swarm_loc_estimator.core.estimation.estimator import Status
 from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.live.graph import LiveGraph
-from swarm_loc_estimator.live.recorder import Poses, read_poses
+from swarm_loc_estimator.live.recorder import Poses
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
 PATIENCE_S = 100.0
@@ -47,20 +47,27 @@ def test_robots_are_located_by_what_their_cameras_see(tmp_path: Path) -> None:
         recorder.create_subscription(PoseStamped, "epuck1/ground_truth", on_truth, 1000)
         recorder.create_subscription(MarkerDetectionArray, "epuck1/detections", seen.append, 1000)
 
-        def poses_with_truth() -> list[Poses]:
-            return [one for one in map(read_poses, recorder.raw) if min(truth) <= one.stamp_ns <= max(truth)]
-
         def has_driven() -> bool:
-            return bool(truth) and float(np.linalg.norm(list(truth.values())[-1] - start[0, :2])) > 0.1
+            return bool(truth) and float(np.linalg.norm(next(reversed(truth.values())) - start[0, :2])) > 0.1
 
         graph.wait_for(has_driven, "drive", PATIENCE_S)
-        graph.wait_for(lambda: len(poses_with_truth()) >= 20, "be located", PATIENCE_S)
-    poses = poses_with_truth()[-20:]
-    assert (poses[-1].status == Status.TRACKED).all()
+        driven_ns = max(truth)
+
+        def tracked() -> list[Poses]:
+            """Poses from then on at which all robots are tracked, and where the truth is known."""
+            newest_ns = next(reversed(truth))
+            return [
+                one
+                for one in recorder.poses()
+                if driven_ns <= one.stamp_ns <= newest_ns and (one.status == Status.TRACKED).all()
+            ]
+
+        graph.wait_for(lambda: len(tracked()) >= 20, "be located", PATIENCE_S)
+        located = tracked()[-20:]
     stamps, places = np.array(list(truth)), np.array(list(truth.values()))
     errors = [
         np.hypot(*(one.pose[0, axis] - np.interp(one.stamp_ns, stamps, places[:, axis]) for axis in (0, 1)))
-        for one in poses
+        for one in located
     ]
     assert np.median(errors) < 0.02
     assert sum(len(array.detections) for array in seen) > len(seen)

@@ -12,12 +12,9 @@ from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.evaluation.replay import replay
 from swarm_loc_estimator.evaluation.result import ReplayResult
 from swarm_loc_estimator.live.run import LiveRun
-from swarm_loc_estimator.nodes.player.playback import clock_step_ns
 from swarm_loc_estimator.numerics import se2
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
-_TRANSPORT_S = 0.01
-"""Longest that a message is on its way between two processes of a machine that is not overloaded."""
 _EQUAL_M = 1e-6
 
 
@@ -26,13 +23,14 @@ class Agreement:
     """Live poses beside those of a replay at the same stamps.
 
     A live estimator cannot know what is still on its way when it gives a pose: up to a step of the player's
-    clock and the transport. Only at settled stamps do both know the same, and the poses must be equal.
+    clock and the transport, which takes the longer the busier the machine is. Only at settled stamps is it
+    known that both know the same, and the poses must be equal.
 
     Attributes:
         replayed: The replay.
         distance_m: (T, N) between the positions; NaN where neither is located, infinite where one is not.
         turn_rad: (T, N) between the headings, likewise, without sign.
-        settled: (T,) whether nothing was on its way.
+        settled: (T,) whether the estimator has said that it knew just what had arrived by then in the bag.
     """
 
     replayed: ReplayResult
@@ -75,9 +73,15 @@ def compare_with_replay(live: LiveRun, bag: Path, settings: EstimatorSettings | 
 
 
 def _settled(live: LiveRun) -> NDArray[np.bool_]:
-    """(T,) whether all messages sent before a stamp were sent long enough before it to have arrived."""
-    way_ns = clock_step_ns(live.rate) + round(_TRANSPORT_S * live.rate * 1e9)
-    behind = np.searchsorted(live.arrival_ns, live.result.stamp_ns, side="right")
-    newest_ns = np.concatenate([[np.iinfo(np.int64).min // 2], live.arrival_ns])[behind]
-    settled: NDArray[np.bool_] = live.result.stamp_ns > newest_ns + way_ns
+    """(T,) whether the poses are known to be of all that had arrived by their stamp, and of nothing else."""
+    stamp_ns = live.result.stamp_ns
+    told_ns = np.array(sorted(live.taken), dtype=np.int64)
+    before = np.searchsorted(told_ns, stamp_ns, side="right")
+    behind = np.searchsorted(told_ns, stamp_ns, side="left") + 1
+    settled = np.ones(stamp_ns.size, dtype=bool)
+    for topic, arrival_ns in live.arrival_ns.items():
+        # the messages of a topic come in order: as many are the same ones
+        taken = np.array([0, *(live.taken[at].get(topic, 0) for at in told_ns.tolist()), arrival_ns.size])
+        arrived = np.searchsorted(arrival_ns, stamp_ns, side="right")
+        settled &= (taken[before] == arrived) & (taken[behind] == arrived)
     return settled

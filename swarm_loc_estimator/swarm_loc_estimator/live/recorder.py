@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
+from rclpy.time import Time
 
 from swarm_loc_estimator.io.inputs.topics import InputKind
 from swarm_loc_estimator.numerics.arrays import FloatArray
@@ -20,7 +21,7 @@ from swarm_loc_msgs.msg import SwarmPoses
 _DEEP = QoSProfile(depth=1000)
 _ESTIMATOR = "estimator"
 _DROPPED = "dropped: "
-_RECEIVED = tuple(f"{kind.topic} received" for kind in InputKind)
+_RECEIVED = {f"{kind.topic} received": kind for kind in InputKind}
 
 
 class Poses(NamedTuple):
@@ -64,9 +65,11 @@ class Recorder(Node):
     Attributes:
         raw: Serialized messages in order of reception.
         received_ns: The graph's time at each reception; with /clock it advances in steps of that.
-        inputs: Messages that the estimator has taken in, of all robots.
+        taken: Stamp of poses -> topic -> messages that the estimator had taken in for them; of those poses
+            of which /diagnostics told, about once a second.
+        inputs: Messages that it has taken in, of all topics.
         drops: Data that it did not use, by reason.
-        diagnostics: How many messages of /diagnostics have come.
+        diagnostics: How many messages of /diagnostics have come from it.
     """
 
     def __init__(self, **node_arguments: Any) -> None:
@@ -74,25 +77,47 @@ class Recorder(Node):
         super().__init__("recorder", parameter_overrides=[simulated], **node_arguments)
         self.raw: list[bytes] = []
         self.received_ns: list[int] = []
+        self._poses: list[Poses] = []
+        self.taken: dict[int, dict[str, int]] = {}
         self.inputs = 0
         self.drops: dict[str, int] = {}
         self.diagnostics = 0
         self.create_subscription(SwarmPoses, "swarm/poses", self._on_poses, _DEEP, raw=True)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, _DEEP)
 
+    def poses(self) -> Sequence[Poses]:
+        """The numbers of all messages so far, in order of reception; each is read once."""
+        self._poses.extend(map(read_poses, self.raw[len(self._poses) :]))
+        return self._poses
+
     def _on_poses(self, data: bytes) -> None:
         self.raw.append(data)
         self.received_ns.append(self.get_clock().now().nanoseconds)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        pairs = [(one.name, value.key, value.value) for one in message.status for value in one.values]
-        self.inputs = sum(int(value) for _, key, value in pairs if key in _RECEIVED)
+        own = [status for status in message.status if status.name == _ESTIMATOR]
+        if not own:  # of another node
+            return
+        taken = _taken(message.status)
+        self.taken[Time.from_msg(message.header.stamp).nanoseconds] = taken
+        self.inputs = sum(taken.values())
         self.drops = {
-            key.removeprefix(_DROPPED): int(value)
-            for name, key, value in pairs
-            if name == _ESTIMATOR and key.startswith(_DROPPED)
+            value.key.removeprefix(_DROPPED): int(value.value)
+            for value in own[0].values
+            if value.key.startswith(_DROPPED)
         }
         self.diagnostics += 1
+
+
+def _taken(statuses: Sequence[DiagnosticStatus]) -> dict[str, int]:
+    """Topic -> messages that the estimator has taken in, by its statuses: one per robot, and its own."""
+    taken = {}
+    for status in statuses:
+        robot = status.name.removeprefix(_ESTIMATOR).removeprefix(": ")
+        for value in status.values:
+            if (kind := _RECEIVED.get(value.key)) is not None:
+                taken[f"{robot}/{kind.topic}" if robot else kind.topic] = int(value.value)
+    return taken
 
 
 def read_poses(data: bytes) -> Poses:

@@ -34,8 +34,9 @@ class LiveRun:
 
     Attributes:
         result: Poses as received, ground truth of the bag, what the estimator dropped.
-        arrival_ns: (M,) increasing, when the messages for the estimator had arrived in the bag; the player
-            has published all of them.
+        arrival_ns: Topic for the estimator -> (M,) increasing, when its messages had arrived in the bag; the
+            player has published all of them.
+        taken: Stamp of poses -> topic -> messages that the estimator had taken in for them; of some poses.
         rate: Speed at which the bag was played.
         status: (T, N) of `SwarmPose.status`.
         received: Those that the estimator took in.
@@ -48,7 +49,8 @@ class LiveRun:
     """
 
     result: ReplayResult
-    arrival_ns: NDArray[np.int64]
+    arrival_ns: Mapping[str, NDArray[np.int64]]
+    taken: Mapping[int, Mapping[str, int]]
     rate: float
     status: NDArray[np.uint8]
     received: int
@@ -60,7 +62,7 @@ class LiveRun:
     @property
     def sent(self) -> int:
         """Messages for the estimator that were published."""
-        return len(self.arrival_ns)
+        return sum(map(len, self.arrival_ns.values()))
 
     @property
     def lost(self) -> int:
@@ -75,16 +77,14 @@ class BagContent:
     Attributes:
         begin_ns: First log time.
         end_ns: Last one.
-        inputs: The topics for the estimator.
-        arrival_ns: (M,) increasing, log times of their messages.
+        arrival_ns: Topic for the estimator -> (M,) increasing, log times of its messages.
         truth: Robot name -> ground truth.
         remarks: What could not be read, one sentence each.
     """
 
     begin_ns: int
     end_ns: int
-    inputs: tuple[str, ...]
-    arrival_ns: NDArray[np.int64]
+    arrival_ns: Mapping[str, NDArray[np.int64]]
     truth: Mapping[str, Trajectory]
     remarks: tuple[str, ...]
 
@@ -99,17 +99,18 @@ def read_bag(bag: Path, swarm: Swarm) -> BagContent:
         BagError: Nothing in the bag can be read.
     """
     truth, inputs = TruthReader(swarm), [topic.name for topic in input_topics(swarm)]
-    arrivals = [np.zeros(0, dtype=np.int64)]
     with BagReader(bag) as reader:
         begin_ns, end_ns = reader.time_range_ns
-        recorded = tuple(topic.name for topic in reader.topics if topic.name in set(inputs))
-        for batch in reader.batches([*truth.topics, *inputs]):
-            is_truth = batch.topic < len(truth.topics)
-            truth.add(batch.chosen(is_truth))
-            arrivals.append(batch.log_ns[~is_truth])
+        recorded = [topic.name for topic in reader.topics if topic.name in set(inputs)]
+        arrivals = [[np.zeros(0, dtype=np.int64)] for _ in recorded]
+        for batch in reader.batches([*truth.topics, *recorded]):
+            truth.add(batch.chosen(batch.topic < len(truth.topics)))
+            for number, parts in enumerate(arrivals, len(truth.topics)):
+                parts.append(batch.log_ns[batch.topic == number])
         tracks = truth.tracks()
         remarks = (*reader.losses, *truth.remarks())
-    return BagContent(begin_ns, end_ns, recorded, np.concatenate(arrivals), tracks, remarks)
+    arrival_ns = {topic: np.concatenate(parts) for topic, parts in zip(recorded, arrivals, strict=True)}
+    return BagContent(begin_ns, end_ns, arrival_ns, tracks, remarks)
 
 
 def play_live(
@@ -140,7 +141,7 @@ def play_live(
     content = read_bag(bag, swarm)
     nodes = graph_nodes(options)
     if inputs_only:
-        nodes = [_with_topics(node, content.inputs) if node.name == PLAYER else node for node in nodes]
+        nodes = [_with_topics(node, [*content.arrival_ns]) if node.name == PLAYER else node for node in nodes]
     begin_s = time.monotonic()
     with LiveGraph(nodes, log) as graph:
         recorder, estimator, player = graph.recorder, graph.process(ESTIMATOR), graph.process(PLAYER)
@@ -157,7 +158,7 @@ def play_live(
         core = (cpu_seconds(estimator.pid) - cpu_s) / played_s
         if player.returncode:
             raise LiveError(f"The player ended with status {player.returncode}; see {log}.")
-        _wait_for_the_rest(graph, len(content.arrival_ns), content.end_ns)
+        _wait_for_the_rest(graph, content)
         memory_mb = resident_mb(estimator.pid)
     history = read_history(recorder.raw)
     result = ReplayResult(
@@ -175,6 +176,7 @@ def play_live(
     return LiveRun(
         result,
         content.arrival_ns,
+        recorder.taken,
         options.rate,
         history.status,
         recorder.inputs,
@@ -196,9 +198,10 @@ def _ages(received_ns: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> FloatA
     return (received_ns - stamp_ns)[known].astype(np.float64) * 1e-9
 
 
-def _wait_for_the_rest(graph: LiveGraph, sent: int, end_ns: int) -> None:
+def _wait_for_the_rest(graph: LiveGraph, content: BagContent) -> None:
     """Wait for poses of the bag's end, and for what the estimator then says of its inputs."""
-    recorder, last_ns = graph.recorder, end_ns - round(EstimatorParameters().tick_period_s * 1e9)
+    sent = sum(map(len, content.arrival_ns.values()))
+    recorder, last_ns = graph.recorder, content.end_ns - round(EstimatorParameters().tick_period_s * 1e9)
     graph.wait_for(
         lambda: read_poses(recorder.raw[-1]).stamp_ns > last_ns,
         "publish poses of the bag's end",

@@ -22,6 +22,7 @@ from swarm_loc_estimator.nodes.wording import listed
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
 _FULL_LOAD = 0.95
+_IN_MAP = frozenset({InputKind.FIXES, InputKind.AERIAL, InputKind.SWARM_FIXES})
 _PATIENCE_S, _PATIENCE_PERIODS = 10.0, 5.0
 """An expected input that is silent for longer than so many seconds and of its mean periods may have died."""
 
@@ -51,17 +52,26 @@ class TickCost:
         count: How many.
         sum_s: Together.
         max_s: The longest.
+        sightings: How many measurements came.
+        shed: How many of them were left out.
     """
 
     count: int = 0
     sum_s: float = 0.0
     max_s: float = 0.0
+    sightings: int = 0
+    shed: int = 0
 
     def note(self, seconds: float) -> None:
         """Count one tick."""
         self.count += 1
         self.sum_s += seconds
         self.max_s = max(self.max_s, seconds)
+
+    def note_sightings(self, count: int, shed: int) -> None:
+        """Count measurements, and those of them that were left out."""
+        self.sightings += count
+        self.shed += shed
 
 
 Recent = tuple[MeasurementArray, NDArray[np.uint8], FloatArray]
@@ -154,7 +164,8 @@ class Diagnostics:
         elapsed_s = (now_ns - self._reported_ns) * 1e-9 if self._reported_ns is not None else 0.0
         self._reported_ns = now_ns
         used, nis = _used_per_robot(recent, len(self._swarm.robots))
-        common = self._rivals_on([*self._sole, *(topic.name for _, topic in self._of_swarm)])
+        of_one = [topic.name for _, topic in self._of_swarm if not topic.kind.stands_for]
+        common = self._rivals_on([*self._sole, *of_one])
         self.rivals = common.copy()
         reports = []
         for index, robot in enumerate(self._swarm.robots):
@@ -198,6 +209,8 @@ class Diagnostics:
         if status is Status.WAITING and not troubles:
             lost = "lost, " if self._was_located[index] else ""
             troubles.append(f"{lost}waiting for a sighting or a fix that locates it")
+        if status is Status.STALE and not troubles:
+            troubles.append("its odometry is silent")
         values["status"] = status.name.lower()
         values["fix age [s]"] = _figure(estimate.fix_age_s[index])
         sigma = np.sqrt(np.diagonal(estimate.covariances[index]))
@@ -217,10 +230,10 @@ class Diagnostics:
         if silent_s > _patience_s(topic, robot, statistics):
             troubles.append(f"{topic.name} is silent for {silent_s:.1f} s")
         map_frame = self._ingest.map_frame
-        if topic.kind in {InputKind.FIXES, InputKind.AERIAL} and found != map_frame:
+        if topic.kind in _IN_MAP and found != map_frame:
             troubles.append(f"{topic.name} is in frame '{found}' but must be in '{map_frame}'")
-        odom_frame = f"{robot.name}/{self._odom_frame}" if robot is not None else ""
-        if topic.kind is InputKind.ODOMETRY and found != odom_frame:
+        odom_frame = f"{robot.name}/{self._odom_frame}" if robot is not None else self._odom_frame
+        if topic.kind.rows == "odometry" and found != odom_frame:
             troubles.append(
                 f"{topic.name} is in frame '{found}' but transforms are published for '{odom_frame}'"
             )
@@ -269,6 +282,23 @@ def load_report(cost: TickCost, elapsed_s: float, period_s: float, fusion_period
         f" (now {fusion_period_s:g} s) or tick_period_s (now {period_s:g} s)"
     )
     return Report("load", advice, warning=True, values=values)
+
+
+def shedding_report(cost: TickCost) -> Report:
+    """How much of what was measured is left out.
+
+    Args:
+        cost: The ticks of the interval.
+    """
+    share = cost.shed / cost.sightings if cost.sightings else 0.0
+    values = {"sightings left out [1]": _figure(share)}
+    if not cost.shed:
+        return Report("shedding", "all sightings are used", values=values)
+    sentence = (
+        f"more comes than can be used: {cost.shed} of {cost.sightings} sightings ({100.0 * share:.0f} %)"
+        " were left out, evenly over all robots"
+    )
+    return Report("shedding", sentence, warning=True, values=values)
 
 
 def overload_report(count: int) -> Report:

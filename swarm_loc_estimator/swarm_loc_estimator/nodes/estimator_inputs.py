@@ -13,10 +13,19 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from swarm_loc_estimator.io.inputs.topics import InputKind, InputTopic
-from swarm_loc_msgs.msg import AnonymousDetectionArray, BrightnessMatrix, MarkerDetectionArray
+from swarm_loc_msgs.msg import (
+    AnonymousDetectionArray,
+    BrightnessMatrix,
+    MarkerDetectionArray,
+    SwarmDetections,
+    SwarmFixes,
+    SwarmOdometry,
+)
 
 DEPTH = 1000
 """So many messages of a topic wait for a tick at most: a busy moment as long as the horizon."""
+_SHARED_DEPTH = 500
+"""Likewise of a topic with the readings of many robots: its messages are large."""
 _MAX_PER_TAKE = 5000
 """What a tick may take of all topics, so that none takes long."""
 _MIN_PER_TOPIC = 100
@@ -29,6 +38,9 @@ _MESSAGE_CLASSES = {
     InputKind.BRIGHTNESS: BrightnessMatrix,
     InputKind.FIXES: PoseWithCovarianceStamped,
     InputKind.AERIAL: AnonymousDetectionArray,
+    InputKind.SWARM_ODOMETRY: SwarmOdometry,
+    InputKind.SWARM_DETECTIONS: SwarmDetections,
+    InputKind.SWARM_FIXES: SwarmFixes,
 }
 _LOST = {ReliabilityPolicy.RELIABLE: "overload", ReliabilityPolicy.BEST_EFFORT: "lost"}
 """Why messages are missing between two others of a publisher."""
@@ -55,11 +67,12 @@ class EstimatorInputs:
         self._quota = max(_MIN_PER_TOPIC, _MAX_PER_TAKE // len(topics))
         self._subscriptions = [self._subscribe(k, ReliabilityPolicy.RELIABLE) for k in range(len(topics))]
 
-    def take(self, now_ns: int) -> list[tuple[int, bytes, int]]:
+    def take(self, time_ns: Callable[[], int]) -> list[tuple[int, bytes, int]]:
         """Messages as handle, bytes and arrival, in order of arrival; what is too much now comes next time.
 
         Args:
-            now_ns: The node's time. By simulated time, all arrive now.
+            time_ns: Tells the node's time [ns], asked when they have been taken: asked before, it could be
+                behind their stamps. By simulated time, all arrive then.
         """
         taken = []
         for handle, subscription in enumerate(self._subscriptions):
@@ -72,6 +85,7 @@ class EstimatorInputs:
                 self._count_gap(handle, info["publication_sequence_number"])
                 taken.append((info["received_timestamp"], handle, data))
         taken.sort(key=lambda one: one[0])
+        now_ns = time_ns()
         # time must not seem to go back to where it was looked at before
         begin_ns = now_ns if self._node.get_clock().ros_time_is_active else self._looked_ns
         self._looked_ns = now_ns
@@ -91,7 +105,7 @@ class EstimatorInputs:
             _MESSAGE_CLASSES[topic.kind],
             topic.name,
             lambda _: None,
-            QoSProfile(depth=DEPTH, reliability=reliability),
+            QoSProfile(depth=_SHARED_DEPTH if topic.kind.stands_for else DEPTH, reliability=reliability),
             raw=True,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=partial(self._follow, handle)),
         )

@@ -3,7 +3,8 @@
     ./run swarm_loc_estimator estimator_node --ros-args -p swarm_file:=swarm.yaml
 
 It subscribes to `<robot>/odom`, `<robot>/detections`, `<robot>/brightness`, `<robot>/fix` and
-`<robot>/initialpose` of the robots in the swarm description, and to `aerial/detections`. It publishes
+`<robot>/initialpose` of the robots in the swarm description, and to `aerial/detections`; with `shared_topics`
+to `swarm/odom`, `swarm/detections` and `swarm/fixes` in their place. It publishes
 `swarm/poses`, `<robot>/pose`, `aerial/identities`, `/diagnostics`, and `/tf` (map to `<robot>/odom`, which no
 one else may publish).
 Services: `~/reset`, `~/set_robot_pose`. Parameters: see `doc/estimator_node.md`.
@@ -24,6 +25,7 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
+from rclpy.time import Time
 from std_srvs.srv import Trigger
 
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
@@ -31,6 +33,8 @@ from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.core.estimation.contradictions import Contradiction, Kind
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
 from swarm_loc_estimator.io.inputs.ingest import Ingest
+from swarm_loc_estimator.io.inputs.thinning import SHED_REASONS, Thinning
+from swarm_loc_estimator.io.inputs.topics import live_topics
 from swarm_loc_estimator.io.messages.message_batch import MessageBatch
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.nodes.estimator_diagnostics import (
@@ -42,15 +46,18 @@ from swarm_loc_estimator.nodes.estimator_diagnostics import (
     load_report,
     merged,
     overload_report,
+    shedding_report,
 )
 from swarm_loc_estimator.nodes.estimator_inputs import EstimatorInputs
 from swarm_loc_estimator.nodes.estimator_outputs import EstimateOutputs
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
-from swarm_loc_estimator.nodes.fusion_pace import FusionPace
+from swarm_loc_estimator.nodes.load.fusion_pace import FusionPace
+from swarm_loc_estimator.nodes.load.shedding import Shedding
 from swarm_loc_estimator.nodes.set_pose import NO_CLOCK, PoseCommands
 from swarm_loc_estimator.nodes.warm_up import WARM_UP, warm_up
 from swarm_loc_estimator.numerics.jit import is_warm
-from swarm_loc_estimator.ros.running import ConfiguredNode, run_node
+from swarm_loc_estimator.ros.newest_time import newest_time_ns
+from swarm_loc_estimator.ros.running import ConfiguredNode, Stop, run_node
 from swarm_loc_estimator.ros.static_transforms import StaticTransforms
 from swarm_loc_estimator.ros.ticks import Ticks
 from swarm_loc_estimator.ros.topic_graph import TopicGraph
@@ -72,9 +79,11 @@ _ORDINARY_DROPS = frozenset(
         "reset",
         "too_old",
         "not_localized",
+        *SHED_REASONS,
     }
 )
-"""Late, double or outlying data is a matter of course, and so is light of robots too far or too near."""
+"""Late, double or outlying data is a matter of course, and so is light of robots too far or too near; what is
+shed is told in a sentence of its own."""
 _MOST_TOLD = 8
 """So many new contradictions are logged one by one; where more come at once, something else is wrong."""
 _PATIENCE_S = 5.0
@@ -98,10 +107,13 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
             self.get_logger().info("compiling the estimator for this machine: about a minute")
         warm_up()
         self._estimator = create_estimator(self._swarm, self.chosen.settings)
-        self._ingest = Ingest(self._swarm, self.chosen.map_frame)
+        shared = self.chosen.shared_topics
+        self._ingest = Ingest(self._swarm, self.chosen.map_frame, live_topics(self._swarm, shared=shared))
         self._estimate: SwarmEstimate | None = None
         self._jumps = 0
         self._pace = FusionPace(self.chosen.fusion_load, self.chosen.settings.horizon_s)
+        self._shedding = Shedding(self.chosen.fusion_load)
+        self._thinning = self._create_thinning()
         self._cost = TickCost()
         self._diagnostics = self._create_diagnostics()
         self._outputs = EstimateOutputs(self, self._swarm, self.chosen)
@@ -119,13 +131,25 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         self._known_contradictions: set[tuple[str, Kind]] = set()
         self._inputs = EstimatorInputs(self, self._ingest.topics, self._estimator.drop)
         self.create_service(Trigger, "~/reset", self._on_reset)
-        PoseCommands(self, self._swarm, self._estimator, self.chosen.map_frame)
+        frame = self.chosen.map_frame
+        PoseCommands(self, self._swarm, self._estimator, frame, by_topics=not shared)
         self._start_timers()
+
+    def run(self, stop: Stop) -> int:
+        """Estimate until asked to stop, and be gone soon after, however many topics there are to give up."""
+        stop.leave_at_once()
+        return super().run(stop)
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
         """Those that an executor handles; the raw ones, the inputs, wait for the ticks."""
         return (one for one in super().subscriptions if not one.raw)
+
+    def _create_thinning(self) -> Thinning:
+        """Large swarms, whose measurements are fused together, lose those of whole periods."""
+        robots, settings = len(self._swarm.robots), self.chosen.settings
+        is_large = robots >= settings.sparse_from
+        return Thinning(robots, round(settings.fusion_period_s * 1e9) if is_large else 0)
 
     def _create_diagnostics(self) -> Diagnostics:
         sole = ["swarm/poses", *(["/clock"] if self.get_clock().ros_time_is_active else [])]
@@ -139,7 +163,9 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
     def _start_timers(self) -> None:
         self._ticks = Ticks(self, self.chosen.tick_period_s, self._on_tick)
         # what came before time goes back must not seem to come after
-        self._jumps_back = self.get_clock().create_jump_callback(_BACKWARDS, pre_callback=self._receive)
+        self._jumps_back = self.get_clock().create_jump_callback(
+            _BACKWARDS, pre_callback=partial(self._receive, self._time_ns)
+        )
         # by a clock that runs also while simulated time stands still
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_DIAGNOSTICS_PERIOD_S, self._on_diagnostics, clock=steady)
@@ -152,26 +178,35 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
 
     def _on_tick(self) -> None:
         begin_s = time.perf_counter()
-        now_ns = self.get_clock().now().nanoseconds
-        if not now_ns:
+        if not self._time_ns():
             return
-        self._receive()
+        self._shedding.begin_tick(begin_s)
+        self._receive(partial(newest_time_ns, self))
+        now_ns = self._time_ns()
         fuse = self._pace.is_due(begin_s, now_ns)  # large swarms: in between odometry leads on
-        begin_cpu_s = time.thread_time()
+        begin_cpu_s, begin_fusing_s = time.thread_time(), time.perf_counter()
         self._estimate = self._estimator.tick(now_ns, fuse=fuse)
+        fusing_s = time.perf_counter() - begin_fusing_s if fuse else 0.0
         if fuse:
             self._pace.note(begin_s, now_ns, time.thread_time() - begin_cpu_s)
         self._say_time_jumps()
         self._outputs.publish(self._estimate)
         self._outputs.publish_identities(self._estimator.identities)
         self._outputs.publish_sightings(self._estimator, now_ns)
-        self._cost.note(time.perf_counter() - begin_s)
+        busy_s = time.perf_counter() - begin_s
+        self._cost.note(busy_s)
+        self._shedding.note(busy_s, fusing_s)
 
-    def _receive(self) -> None:
-        """Hand what has come to the estimator."""
-        batch = MessageBatch.of(self._inputs.take(self.get_clock().now().nanoseconds))
+    def _time_ns(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
+
+    def _receive(self, time_ns: Callable[[], int]) -> None:
+        """Hand what has come to the estimator, or as much of it as there is time for."""
+        batch = MessageBatch.of(self._inputs.take(time_ns))
         for messages in self._ingest.read(batch):
-            self._estimator.receive(messages)
+            thinned = self._thinning.thin(messages, self._shedding.share)
+            self._cost.note_sightings(thinned.measurements, thinned.shed)
+            self._estimator.receive(thinned.messages)
 
     def _say_time_jumps(self) -> None:
         """The estimator itself begins anew when time has jumped back; say so, once per jump."""
@@ -180,6 +215,11 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
             self.get_logger().warning("time has jumped back: the estimator begins anew")
 
     def _on_diagnostics(self) -> None:
+        begin_s = time.perf_counter()
+        self._tell_diagnostics()
+        self._shedding.note(time.perf_counter() - begin_s)
+
+    def _tell_diagnostics(self) -> None:
         now_s = time.monotonic()
         elapsed_s, self._reported_s = now_s - self._reported_s, now_s
         cost, self._cost = self._cost, TickCost()
@@ -190,6 +230,10 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
             load = load_report(cost, elapsed_s, period_s, settings.fusion_period_s)
             if load.warning:
                 self.get_logger().warning(load.message, throttle_duration_sec=_THROTTLE_S)
+            shedding = shedding_report(cost)
+            if shedding.warning:
+                self.get_logger().warning(shedding.message, throttle_duration_sec=_THROTTLE_S)
+            load = merged([load, shedding], "load")
             reports = self._estimate_reports(load)
             self._warn_of_drops(now_s)
             self._warn_of_rivals()
@@ -255,8 +299,10 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
             self.get_logger().warning(f"waiting: {missing}")
 
     def _publish_diagnostics(self, reports: list[Report]) -> None:
+        now = self.get_clock().now()  # inputs are taken in for poses, and what is counted is of those
+        stamp = Time(nanoseconds=self._estimate.stamp_ns) if self._estimate is not None else now
         message = DiagnosticArray()
-        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.stamp = stamp.to_msg()
         message.status = [self._status_message(report) for report in reports]
         self._diagnostics_publisher.publish(message)
 
@@ -270,7 +316,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         )
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._estimator.drop("reset", len(self._inputs.take(self.get_clock().now().nanoseconds)))
+        self._estimator.drop("reset", len(self._inputs.take(self._time_ns)))
         self._estimator.reset()
         response.success, response.message = True, "All robots begin anew at their configured starts."
         self.get_logger().info("reset by service: the estimator begins anew")

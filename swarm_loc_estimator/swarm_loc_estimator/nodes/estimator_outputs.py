@@ -46,7 +46,7 @@ class EstimateOutputs:
         self._told: Identities | None = None
         self._robot_poses = [
             node.create_publisher(PoseWithCovarianceStamped, f"{name}/pose", _RELIABLE)
-            for name in (names if parameters.publish_robot_poses else [])
+            for name in (names if parameters.publish_robot_poses and not parameters.shared_topics else [])
         ]
         # tf2's listeners know this one absolute name, whatever the namespace
         self._tf = node.create_publisher(TFMessage, "/tf", _TF) if parameters.publish_tf else None

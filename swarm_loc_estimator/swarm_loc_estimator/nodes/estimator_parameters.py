@@ -25,7 +25,11 @@ class EstimatorParameters:
         "odom", "transforms go from map_frame to <robot>/odom_frame, the frame of its odometry", required=True
     )
     publish_tf: bool = flag(True, "publish these transforms")
-    publish_robot_poses: bool = flag(True, "publish <robot>/pose beside swarm/poses")
+    publish_robot_poses: bool = flag(True, "publish <robot>/pose beside swarm/poses, unless shared_topics")
+    shared_topics: bool = flag(
+        False,
+        "listen to swarm/odom, swarm/detections and swarm/fixes in place of topics of each robot",
+    )
     settings: EstimatorSettings = field(
         default_factory=EstimatorSettings, metadata={"numbers_of": EstimatorSettings}
     )

@@ -58,15 +58,18 @@ class PoseCommands:
         swarm: The robots.
         estimator: Is told.
         map_frame: The frame in which poses must be.
+        by_topics: Whether there is a topic for each robot beside the service.
     """
 
-    def __init__(self, node: Node, swarm: Swarm, estimator: SwarmEstimator, map_frame: str) -> None:
+    def __init__(
+        self, node: Node, swarm: Swarm, estimator: SwarmEstimator, map_frame: str, *, by_topics: bool
+    ) -> None:
         self._node = node
         self._swarm = swarm
         self._estimator = estimator
         self._map_frame = map_frame
         node.create_service(SetRobotPose, "~/set_robot_pose", self._on_request)
-        for index, robot in enumerate(swarm.robots):
+        for index, robot in enumerate(swarm.robots if by_topics else ()):
             on_pose = partial(self._on_initial_pose, index)
             node.create_subscription(
                 PoseWithCovarianceStamped, f"{robot.name}/initialpose", on_pose, QoSProfile(depth=10)

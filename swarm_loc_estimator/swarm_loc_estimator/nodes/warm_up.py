@@ -89,7 +89,7 @@ def _call_rare(swarm: Swarm) -> None:
     state = SwarmState(ParameterTable.of(swarm.robots, swarm.landmarks), pairs=2)
     is_elsewhere(state.integrity, 0)
     columns = MeasurementColumns.of(np.zeros(2, MEASUREMENT_DTYPE))
-    record_pair(columns, 0, state.arrays(), np.ones(3), np.eye(3))
+    record_pair(columns, 0, state.arrays(), np.zeros((2, 3)), np.ones(3), np.eye(3))
 
 
 def _board(number: int) -> RobotIr:

@@ -51,5 +51,7 @@ class Ticks:
 
     def _tick(self) -> None:
         self._is_due = False
-        self._ticked = self._number
+        if self._number == self._ticked:
+            return
         self._on_tick()
+        self._ticked = self._number  # which may have got to know a newer time meanwhile

@@ -2,25 +2,35 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from node_world import T0_NS, Ros
+from rclpy.time import Time
 
 from swarm_loc_estimator.cli.demo import main
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.estimation.estimator import Status
 from swarm_loc_estimator.io.bags.cut import copy_beginning
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.launching.graph import GraphOptions, graph_nodes
-from swarm_loc_estimator.live.agreement import compare_with_replay
+from swarm_loc_estimator.live.agreement import _settled, compare_with_replay
 from swarm_loc_estimator.live.graph import LiveError, LiveGraph
-from swarm_loc_estimator.live.recorder import read_poses
-from swarm_loc_estimator.live.run import ESTIMATOR, PLAYER, play_live, read_bag
+from swarm_loc_estimator.live.recorder import Recorder
+from swarm_loc_estimator.live.run import ESTIMATOR, play_live, read_bag
 from swarm_loc_estimator.numerics.trajectory import interpolate
 
 DEMO = Path(__file__).parents[3] / "bags" / "eight_five_robots"
 SWARM_FILE = DEMO / "swarm.yaml"
 PATIENCE_S = 60.0
+INPUTS = 400
+"""Of all robots in three seconds of the bag."""
+POSES = 40
+"""Of two seconds."""
 
 
 @pytest.fixture(scope="module")
@@ -32,39 +42,67 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_live_poses_are_those_of_replay(bag: Path, tmp_path: Path) -> None:
-    every_tick = tmp_path / "parameters.yaml"  # fuses, however slow the machine
-    every_tick.write_text("estimator:\n  ros__parameters:\n    fusion_load: 1.0\n", encoding="utf-8")
-    options = GraphOptions(str(SWARM_FILE), bag=str(bag), parameter_file=str(every_tick))
+    settings = EstimatorSettings(horizon_s=11.0)  # longer than the bag
+    # however slow the machine, every tick fuses and nothing is too old
+    patient = {"estimator": {"ros__parameters": {"fusion_load": 1.0, "horizon_s": settings.horizon_s}}}
+    (tmp_path / "parameters.yaml").write_text(json.dumps(patient), encoding="utf-8")
+    parameters = str(tmp_path / "parameters.yaml")
+    options = GraphOptions(str(SWARM_FILE), bag=str(bag), parameter_file=parameters)
     live = play_live(options, log=tmp_path / "nodes.log")
 
     assert live.received == live.sent > 1000
-    compared = compare_with_replay(live, bag)
+    compared = compare_with_replay(live, bag, settings)
     assert compared.settled[-1]
     assert compared.settled_max_m < 1e-6
     assert np.nanmax(compared.turn_rad[compared.settled]) < 1e-6
     assert np.nanmedian(compared.distance_m) < 1e-3
 
+    lacking = {at: {topic: count - 1 for topic, count in taken.items()} for at, taken in live.taken.items()}
+    assert not _settled(replace(live, taken=lacking)).any()
+
+
+def test_the_recorder_counts_inputs_by_the_estimators_diagnostics_alone(ros: Ros) -> None:
+    recorder = ros.add(Recorder())
+    own = [
+        DiagnosticStatus(name="estimator: alpha", values=[KeyValue(key="odom received", value="7")]),
+        DiagnosticStatus(
+            name="estimator",
+            values=[
+                KeyValue(key="aerial/detections received", value="2"),
+                KeyValue(key="dropped: too_old", value="3"),
+            ],
+        ),
+    ]
+    told = DiagnosticArray(status=own)
+    told.header.stamp = Time(nanoseconds=T0_NS).to_msg()
+    recorder._on_diagnostics(told)
+    recorder._on_diagnostics(DiagnosticArray(status=[DiagnosticStatus(name="watch")]))
+
+    assert recorder.taken == {T0_NS: {"alpha/odom": 7, "aerial/detections": 2}}
+    assert (recorder.inputs, recorder.drops, recorder.diagnostics) == (9, {"too_old": 3}, 1)
+
 
 def test_poses_come_back_after_the_estimator_was_killed(tmp_path: Path) -> None:
-    swarm, bag = load_swarm(SWARM_FILE), tmp_path / "bag"
-    copy_beginning(DEMO, bag, 7.0)
-    content = read_bag(bag, swarm)
-    options = GraphOptions(str(SWARM_FILE), bag=str(bag), rate=0.5)
+    swarm = load_swarm(SWARM_FILE)
+    content = read_bag(DEMO, swarm)
+    options = GraphOptions(str(SWARM_FILE), bag=str(DEMO), rate=0.5)
     with LiveGraph(graph_nodes(options), tmp_path / "nodes.log") as graph:
         recorder = graph.recorder
-        graph.wait_for(lambda: len(recorder.raw) > 20, "publish poses", PATIENCE_S)
-        before = len(recorder.raw)
+        graph.wait_for(lambda: recorder.inputs > INPUTS, "take in the bag", PATIENCE_S)
         graph.restart(ESTIMATOR)
-        graph.wait_for(lambda: len(recorder.raw) > before + 5, "publish poses again", PATIENCE_S)
-        ended = graph.process(PLAYER).poll
-        graph.wait_for(lambda: ended() is not None, "play on", PATIENCE_S, needed=[ESTIMATOR])
-        last = read_poses(recorder.raw[-1])
+        # poses of the killed one may still come, but its diagnostics do not begin anew
+        graph.wait_for(lambda: recorder.inputs < INPUTS, "begin anew", PATIENCE_S)
+        before = len(recorder.raw)
 
-    assert (last.status == Status.TRACKED).all()
+        def tracked_for_a_while() -> bool:
+            lately = recorder.poses()[before:][-POSES:]
+            return len(lately) == POSES and all((one.status == Status.TRACKED).all() for one in lately)
+
+        graph.wait_for(tracked_for_a_while, "track all robots again", PATIENCE_S)
+        last = recorder.poses()[-1]
+
     for robot, pose in zip(swarm.robots, last.pose, strict=True):
-        truth, _ = interpolate(
-            content.truth[robot.name], np.array([min(last.stamp_ns, content.end_ns)]), 200_000_000
-        )
+        truth, _ = interpolate(content.truth[robot.name], np.array([last.stamp_ns]), 200_000_000)
         assert np.hypot(*(pose - truth[0])[:2]) < 0.05, robot.name
 
 

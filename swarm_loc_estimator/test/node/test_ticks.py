@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from node_world import STEP_NS, T0_NS, Robots, Ros, stamp_ns
+from diagnostic_msgs.msg import DiagnosticArray
+from node_world import SECOND, STEP_NS, T0_NS, TRUE_POSES, Robots, Ros, odometry_bytes, stamp_ns
 from rclpy.duration import Duration
 from rosgraph_msgs.msg import Clock
+
+from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
+from swarm_loc_estimator.ros.ticks import _EACH_CHANGE
 
 BACKLOG = 20
 PATIENCE = Duration(seconds=60)
@@ -39,3 +43,33 @@ def test_time_told_again_and_again_before_the_tick_neither_repeats_nor_delays_it
 
     stamps = [stamp_ns(pose) for pose in robots.poses]
     assert sum(due_ns <= stamp < due_ns + STEP_NS for stamp in stamps) == 1
+
+
+def test_what_comes_with_a_time_that_waits_to_be_handled_is_not_of_the_future(
+    ros: Ros, robots: Robots, node: EstimatorNode
+) -> None:
+    heard = ros.listen(DiagnosticArray, "/diagnostics")
+    due_ns = robots.run(T0_NS, 4) + STEP_NS
+    later_ns = due_ns + SECOND
+
+    def go_on(_jump: object) -> None:
+        """Between the time that makes a tick due and the tick, time and robots go on."""
+        if node.get_clock().now().nanoseconds == due_ns:
+            robots.tell_time(later_ns)
+            for name, pose in TRUE_POSES.items():
+                robots.odometry(name, odometry_bytes(name, later_ns, pose))
+            robots.wait_until_told()
+            robots.wait_until_received()
+
+    jumps = node.get_clock().create_jump_callback(_EACH_CHANGE, post_callback=go_on)
+    robots.tell_time(due_ns)
+    ros.until(lambda: stamp_ns(robots.poses[-1]) == later_ns)
+    jumps.unregister()
+    robots.step(later_ns + STEP_NS)
+    ros.until(lambda: heard and stamp_ns(heard[-1]) == later_ns + STEP_NS)
+
+    stamps = [stamp_ns(pose) for pose in robots.poses]
+    assert len(set(stamps)) == len(stamps)
+    values = {pair.key: pair.value for status in heard[-1].status for pair in status.values}
+    assert "dropped: future_stamp" not in values
+    assert values["odom received"] == "6"

@@ -113,7 +113,13 @@ def test_each_topic_is_read_and_counted_and_malformed_ones_go_no_further() -> No
     ingest = Ingest(Swarm((Robot("a"), Robot("b", camera=None))))
     kinds = ("odom", "detections", "brightness", "fix")
     of_robots = [f"{name}/{kind}" for name in "ab" for kind in kinds]
-    assert [topic.name for topic in ingest.topics] == [*of_robots, "aerial/detections"]
+    assert [topic.name for topic in ingest.topics] == [
+        *of_robots,
+        "aerial/detections",
+        "swarm/odom",
+        "swarm/detections",
+        "swarm/fixes",
+    ]
     assert [topic.name for topic in ingest.topics if topic.expected] == ["a/odom", "a/detections", "b/odom"]
 
     odom, seen = ingest.handle_of["b/odom"], ingest.handle_of["a/detections"]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.description.estimated_parameters import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
 from swarm_loc_estimator.core.description.swarm import OdometryModel, RandomWalk, Robot
-from swarm_loc_estimator.core.odometry.preintegration import OdometrySample
+from swarm_loc_estimator.core.odometry.look_up import OdometrySample, look_up_pose
 from swarm_loc_estimator.core.odometry.tracks import OdometryTracks, TrackChange
 from swarm_loc_estimator.numerics import se2
 from swarm_loc_estimator.numerics.arrays import FloatArray
@@ -251,6 +251,18 @@ def test_a_silent_robot_runs_on_for_its_timeout_and_then_may_be_anywhere() -> No
     reach = PLAIN.max_speed * 10.0
     np.testing.assert_allclose(np.diag(late.covariance[0])[:2], reach**2 / 3, rtol=0.2)
     assert late.covariance[0, 2, 2] > 1.0
+
+
+@pytest.mark.parametrize("rows", [0, 1, 20])
+def test_a_pose_alone_is_that_of_the_whole_look_up(rows: int) -> None:
+    track, stamps = tracks(replace(PLAIN, timeout_s=0.3)), stamps_until(1.0)[:rows]
+    feed(track, stamps, arc(0.1, 1.3, (stamps - T0) * 1e-9))
+    if rows:  # behind a gap
+        feed(track, stamps[-1:] + SECOND, np.array([[0.2, 0.1, 0.4]]))
+    pose = np.empty(3)
+    for stamp_ns in range(T0 - SECOND // 2, T0 + 4 * SECOND, 17_000_000):
+        look_up_pose(track.arrays, 0, stamp_ns, pose)
+        np.testing.assert_array_equal(pose, look(track, stamp_ns).pose[0])
 
 
 def test_a_row_after_a_silence_changes_nothing_more_than_a_timeout_before_it() -> None:

@@ -143,7 +143,7 @@ def test_errors_are_admitted_where_stamps_err_and_are_not_by_who_trusts_them(
 ) -> None:
     monkeypatch.setattr(fusion, "_MANY", many)
     knowing, trusting = [], []
-    for seed in range(5):
+    for seed in range(12):
         rng = np.random.default_rng([seed, 7])
         world = simulate(Plan(3, 8.0, speed=0.4, turn_rate=1.5, reach=1.5), 400 + seed)
         events = [

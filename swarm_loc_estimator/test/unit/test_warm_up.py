@@ -10,12 +10,24 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
 from swarm_loc_estimator.core.inputs.messages import RawInputs
 from swarm_loc_estimator.evaluation.recorded_bag import read_bag, unwatched
+from swarm_loc_estimator.io.inputs.ingest import Ingest
+from swarm_loc_estimator.io.inputs.thinning import Thinning
+from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.io.messages.message_batch import MessageBatch
+from swarm_loc_estimator.io.messages.shared import (
+    SharedHead,
+    encode_shared_detections,
+    encode_shared_numbers,
+    swarm_key,
+)
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.nodes.warm_up import warm_up
 
@@ -45,6 +57,8 @@ def compiled_late() -> list[str]:
     run(BAGS / "eight_five_robots", EstimatorSettings(), late=True)
     run(BAGS / "eight_five_robots", EstimatorSettings(sparse_from=2))
     run(BAGS / "eight_five_robots", EstimatorSettings(), moved_landmarks=True)
+    for settings in (EstimatorSettings(fusion_period_s=0.1), EstimatorSettings(sparse_from=2)):
+        run(BAGS / "eight_five_robots", settings, relayed=True)
     return sorted(name for name, known in signatures().items() if known != before.get(name, 0))
 
 
@@ -55,13 +69,29 @@ def signatures() -> dict[str, int]:
     return {name: count for name, count in known.items() if ".io.bags." not in name}  # these only read bags
 
 
-def run(bag: Path, settings: EstimatorSettings, *, late: bool = False, moved_landmarks: bool = False) -> None:
-    """Estimate the beginning of a bag as the node does, with odometry out of order, or in a wrong map."""
+def run(
+    bag: Path,
+    settings: EstimatorSettings,
+    *,
+    late: bool = False,
+    moved_landmarks: bool = False,
+    relayed: bool = False,
+) -> None:
+    """Estimate the beginning of a bag as the node does.
+
+    Args:
+        bag: Of robots whose description is beside it.
+        settings: Of the estimator.
+        late: Whether odometry comes out of order.
+        moved_landmarks: Whether the map is wrong.
+        relayed: Whether robots share their topics, and half of what is seen is left out.
+    """
     swarm = load_swarm(bag / "swarm.yaml")
     if moved_landmarks:
         marks = (replace(mark, x=mark.x + 0.3 * (k % 3)) for k, mark in enumerate(swarm.landmarks))
         swarm = replace(swarm, landmarks=tuple(marks))
     estimator, begun_ns = SwarmEstimator(swarm, settings), list[int]()
+    thinning, ingest = Thinning(len(swarm.robots)), Ingest(swarm)
 
     def take(inputs: RawInputs) -> None:
         begun_ns.append(inputs.begin_ns)
@@ -69,12 +99,32 @@ def run(bag: Path, settings: EstimatorSettings, *, late: bool = False, moved_lan
             raise EnoughError
         rows = inputs.odometry
         turned = type(rows)(*(column[::-1].copy() for column in rows))
-        estimator.receive(inputs._replace(odometry=turned) if late else inputs)
+        inputs = inputs._replace(odometry=turned) if late else inputs
+        if relayed:
+            inputs = thinning.thin(shared(inputs, ingest, swarm), 0.5).messages
+        estimator.receive(inputs)
         estimator.tick(inputs.end_ns)
         estimator.contradictions(inputs.end_ns)
         estimator.recent()
 
     _quietly(lambda: read_bag(bag, swarm, take, unwatched))
+
+
+def shared(inputs: RawInputs, ingest: Ingest, swarm: Swarm) -> RawInputs:
+    """The same by topics that all robots share."""
+    key, now_ns = swarm_key(robot.name for robot in swarm.robots), inputs.end_ns
+    odometry, seen = (
+        SharedHead(now_ns, "odom", key, rows.robot, rows.stamp_ns)
+        for rows in (inputs.odometry, inputs.detections)
+    )
+    seen_detections = inputs.detections.detection if seen.robot.size else np.zeros(0, DETECTION_DTYPE)
+    messages = {
+        "swarm/odom": encode_shared_numbers(odometry, inputs.odometry.pose),
+        "swarm/detections": encode_shared_detections(seen, seen_detections),
+    }
+    batch = MessageBatch.of([(ingest.handle_of[name], data, now_ns) for name, data in messages.items()])
+    (relayed,) = ingest.read(batch)
+    return relayed
 
 
 def _quietly(work: Callable[[], object]) -> None:

@@ -4,8 +4,8 @@
 
 It steers by `<robot>/ground_truth` (geometry_msgs/PoseStamped, motion capture or simulation), so that the way
 does not depend on how well the robots are located, and publishes `<robot>/cmd_vel` at the poses' rate. The
-eight begins when the drivers of all robots listen, and with `wait_for_poses` when all who locate them are
-there.
+eight begins when all robots have told odometry, so that none is left behind, and with `wait_for_poses` when
+all who locate them are there.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Decode the raw messages of one kind of input to the columns that the estimator takes.
 
-A new kind of input is a member of `InputKind`, columns in `core/inputs/messages.py`, and a channel here.
+A new kind of input is a member of `InputKind`, columns in `core/inputs/messages.py`, and a channel here or,
+where its messages carry what many robots have sent, in `shared_channels.py`.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from swarm_loc_estimator.io.messages.cdr import (
 )
 from swarm_loc_estimator.io.messages.message_batch import MessageBatch
 from swarm_loc_estimator.io.messages.streams import DetectionReader, EachReader, PoseReader
-from swarm_loc_estimator.numerics.arrays import IntArray
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 
 HEADING_UNKNOWN = math.pi**2
 """A heading with such a variance [rad^2] or more was not measured: all headings there are vary by less."""
@@ -63,6 +64,20 @@ class Read(NamedTuple):
     dropped: Mapping[str, int] = MappingProxyType({})
 
 
+class Known(NamedTuple):
+    """What messages are held against.
+
+    Attributes:
+        map_frame: Name of the frame `map` in messages.
+        robots: How many robots the swarm has.
+        swarm: The number that messages of many robots name it by, see `swarm_key`.
+    """
+
+    map_frame: str
+    robots: int
+    swarm: int
+
+
 class Channel(Protocol):
     """All topics of one kind."""
 
@@ -76,7 +91,7 @@ class Channel(Protocol):
 class _OdometryChannel:
     """See `OdometryRows`."""
 
-    def __init__(self, topics: int, _map_frame: str) -> None:
+    def __init__(self, topics: int, _known: Known) -> None:
         self._reader = PoseReader(topics, decode_odometry, names=2)
 
     def frame_id(self, topic: int) -> str:
@@ -91,7 +106,7 @@ class _OdometryChannel:
 class _DetectionChannel:
     """See `DetectionRows`."""
 
-    def __init__(self, topics: int, _map_frame: str) -> None:
+    def __init__(self, topics: int, _known: Known) -> None:
         self._reader = DetectionReader(topics)
 
     def frame_id(self, topic: int) -> str:
@@ -109,7 +124,7 @@ class _DetectionChannel:
 class _BrightnessChannel:
     """See `BrightnessRows`."""
 
-    def __init__(self, topics: int, _map_frame: str) -> None:
+    def __init__(self, topics: int, _known: Known) -> None:
         self._reader = EachReader(topics, decode_brightness)
 
     def frame_id(self, topic: int) -> str:
@@ -139,12 +154,17 @@ class _BrightnessChannel:
         return Read(rows, found.stamp_ns, found.valid)
 
 
+def has_heading(covariance: FloatArray) -> NDArray[np.bool_]:
+    """Whether fixes with covariances (f, 3, 3) tell a heading (f,)."""
+    return np.asarray((covariance[:, 2, 2] > 0.0) & (covariance[:, 2, 2] < HEADING_UNKNOWN))
+
+
 class _FixChannel:
     """See `FixRows`; no heading was measured where its variance is no number, not positive, or very large."""
 
-    def __init__(self, topics: int, map_frame: str) -> None:
+    def __init__(self, topics: int, known: Known) -> None:
         self._reader = EachReader(topics, decode_fix)
-        self._map_frame = map_frame
+        self._map_frame = known.map_frame
 
     def frame_id(self, topic: int) -> str:
         return self._reader.frame_ids[topic]
@@ -154,7 +174,7 @@ class _FixChannel:
         messages: list[FixMessage] = found.messages
         pose = np.array([message.pose for message in messages], dtype=float).reshape(-1, 3)
         covariance = np.array([message.covariance for message in messages]).reshape(-1, 3, 3)
-        pose[~((covariance[:, 2, 2] > 0.0) & (covariance[:, 2, 2] < HEADING_UNKNOWN)), 2] = np.nan
+        pose[~has_heading(covariance), 2] = np.nan
         stamp_ns, arrival_ns = found.stamp_ns[found.valid], batch.log_ns[found.valid]
         rows = FixRows(robot[found.valid], stamp_ns, pose, covariance, arrival_ns)
         at_home = np.array([m.frame_id == self._map_frame for m in messages], dtype=bool)
@@ -165,9 +185,9 @@ class _FixChannel:
 class _AerialChannel:
     """See `AerialRows`."""
 
-    def __init__(self, topics: int, map_frame: str) -> None:
+    def __init__(self, topics: int, known: Known) -> None:
         self._reader = EachReader(topics, decode_anonymous)
-        self._map_frame = map_frame
+        self._map_frame = known.map_frame
 
     def frame_id(self, topic: int) -> str:
         return self._reader.frame_ids[topic]
@@ -192,11 +212,13 @@ class _AerialChannel:
         return Read(rows, found.stamp_ns, found.valid, dropped)
 
 
-CHANNELS: dict[InputKind, Callable[[int, str], Channel]] = {
+CreateChannel = Callable[[int, Known], Channel]
+
+CHANNELS: dict[InputKind, CreateChannel] = {
     InputKind.ODOMETRY: _OdometryChannel,
     InputKind.DETECTIONS: _DetectionChannel,
     InputKind.BRIGHTNESS: _BrightnessChannel,
     InputKind.FIXES: _FixChannel,
     InputKind.AERIAL: _AerialChannel,
 }
-"""How each kind is read; made from the number of topics and the name of the frame `map`."""
+"""How each kind of a robot's own topics is read; made from the number of topics and what is known."""

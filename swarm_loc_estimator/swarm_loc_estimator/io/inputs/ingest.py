@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.core.inputs.messages import RawInputs
-from swarm_loc_estimator.io.inputs.channels import CHANNELS
-from swarm_loc_estimator.io.inputs.topics import InputKind, input_topics
+from swarm_loc_estimator.core.inputs.messages import RawInputs, in_order_of_arrival
+from swarm_loc_estimator.io.inputs.channels import CHANNELS, Known
+from swarm_loc_estimator.io.inputs.shared_channels import SHARED_CHANNELS
+from swarm_loc_estimator.io.inputs.topics import InputKind, InputTopic, input_topics
 from swarm_loc_estimator.io.messages.message_batch import MessageBatch
+from swarm_loc_estimator.io.messages.shared import swarm_key
 from swarm_loc_estimator.numerics.arrays import IntArray
 from swarm_loc_estimator.numerics.jit import compiled
 
@@ -105,6 +107,7 @@ class Ingest:
     Args:
         swarm: Whose topics they are.
         map_frame: Name of the frame `map` in messages.
+        topics: Which of them there may be; None: all that a swarm may have.
 
     Attributes:
         topics: The inputs; their index here is the topic's number in a batch.
@@ -113,14 +116,18 @@ class Ingest:
         map_frame: Name of the frame `map`.
     """
 
-    def __init__(self, swarm: Swarm, map_frame: str = "map") -> None:
-        self.topics = input_topics(swarm)
+    def __init__(
+        self, swarm: Swarm, map_frame: str = "map", topics: tuple[InputTopic, ...] | None = None
+    ) -> None:
+        self.topics = input_topics(swarm) if topics is None else topics
         self.map_frame = map_frame
         self.handle_of: Mapping[str, int] = {topic.name: handle for handle, topic in enumerate(self.topics)}
         self._robot = np.array([topic.robot for topic in self.topics], dtype=np.int64)
         place = {kind: number for number, kind in enumerate(InputKind)}
         self._kind = np.array([place[topic.kind] for topic in self.topics], dtype=np.int64)
-        self._channels = {kind: CHANNELS[kind](len(self.topics), map_frame) for kind in InputKind}
+        known = Known(map_frame, len(swarm.robots), swarm_key(robot.name for robot in swarm.robots))
+        create = {**CHANNELS, **SHARED_CHANNELS}
+        self._channels = {kind: create[kind](len(self.topics), known) for kind in InputKind}
         self._counted = np.zeros(len(self.topics), dtype=_STATISTICS_DTYPE)
         self.statistics = [InputStatistics(self._counted[k : k + 1]) for k in range(len(self.topics))]
 
@@ -157,7 +164,9 @@ class Ingest:
             part = batch if present[number] == batch.size else batch.chosen(kinds == number)
             read = channel.read(part, self._robot[part.topic])
             _count(self._counted, part.topic, part.log_ns, read.stamp_ns, read.valid)
-            rows[kind.name.lower()] = read.rows
+            # the same may come of each robot alone and of many together
+            before = rows.get(kind.rows)
+            rows[kind.rows] = read.rows if before is None else in_order_of_arrival([before, read.rows])
             dropped.update(read.dropped, bad_message=int(np.sum(~read.valid)))
         return RawInputs(int(batch.log_ns[0]), int(batch.log_ns[-1]), dropped=+dropped, **rows)
 

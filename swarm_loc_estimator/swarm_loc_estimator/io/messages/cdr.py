@@ -157,7 +157,7 @@ DETECTION_GAP = 12
 """A detection that starts at a multiple of 8 has 4 bytes of padding here, before its first double."""
 
 
-class _Layout:
+class Layout:
     """Everything that depends on the byte order."""
 
     def __init__(self, order: str) -> None:
@@ -173,7 +173,7 @@ class _Layout:
         self.anonymous = _anonymous_dtype(order)
 
 
-_LAYOUTS = {b"\x00\x00": _Layout(">"), b"\x00\x01": _Layout("<")}
+_LAYOUTS = {b"\x00\x00": Layout(">"), b"\x00\x01": Layout("<")}
 _ODOMETRY_DOUBLES = 7 + 36 + 6 + 36
 
 
@@ -188,7 +188,7 @@ def _text(raw: bytes) -> str:
         raise CdrError("a string is not UTF-8.") from None
 
 
-def _layout(data: bytes) -> _Layout:
+def layout_of(data: bytes) -> Layout:
     """The byte order's layout, from the encapsulation header."""
     layout = _LAYOUTS.get(bytes(data[:2]))
     if layout is None or len(data) < ENCAPSULATION:
@@ -196,7 +196,7 @@ def _layout(data: bytes) -> _Layout:
     return layout
 
 
-def _string(data: bytes, layout: _Layout, offset: int) -> tuple[str, int]:
+def _string(data: bytes, layout: Layout, offset: int) -> tuple[str, int]:
     """A string field at or after `offset`, and the offset behind it."""
     offset += -offset % 4
     begin = offset + 4
@@ -208,7 +208,7 @@ def _string(data: bytes, layout: _Layout, offset: int) -> tuple[str, int]:
     return _text(bytes(data[begin:end])), end
 
 
-def _header(data: bytes, layout: _Layout) -> tuple[int, str, int]:
+def read_header(data: bytes, layout: Layout) -> tuple[int, str, int]:
     """Stamp [ns], frame and the offset behind a std_msgs/Header."""
     if len(data) < ENCAPSULATION + 12:
         raise CdrError(f"cut off after {len(data)} bytes.")
@@ -221,7 +221,7 @@ def _header(data: bytes, layout: _Layout) -> tuple[int, str, int]:
     return sec * _NANOSECONDS + nanosec, _text(bytes(data[ENCAPSULATION + 12 : end])), end
 
 
-def _check_end(data: bytes, end: int) -> None:
+def check_end(data: bytes, end: int) -> None:
     """Refuse a message that is too short for its type, or too long to be of it."""
     if len(data) < end:
         raise CdrError(f"cut off after {len(data)} of {end} bytes.")
@@ -234,7 +234,7 @@ def _pose2(x: float, y: float, qx: float, qy: float, qz: float, qw: float) -> tu
     return x, y, yaw_of(qx, qy, qz, qw)
 
 
-def _planar_covariance(data: bytes, layout: _Layout, offset: int) -> Array:
+def _planar_covariance(data: bytes, layout: Layout, offset: int) -> Array:
     """3x3 over x, y, yaw of the 6x6 at an offset."""
     whole = np.frombuffer(data, layout.double, 36, offset)
     return whole.reshape(6, 6)[PLANE].astype(np.float64, copy=False)
@@ -249,11 +249,11 @@ def decode_odometry(data: bytes) -> OdometryMessage:
     Raises:
         CdrError: The bytes are not one whole message.
     """
-    layout = _layout(data)
-    stamp_ns, frame_id, offset = _header(data, layout)
+    layout = layout_of(data)
+    stamp_ns, frame_id, offset = read_header(data, layout)
     child_frame_id, offset = _string(data, layout, offset)
     offset += -(offset - ENCAPSULATION) % 8
-    _check_end(data, offset + 8 * _ODOMETRY_DOUBLES)
+    check_end(data, offset + 8 * _ODOMETRY_DOUBLES)
     x, y, _, qx, qy, qz, qw = layout.pose.unpack_from(data, offset)
     vx, vy, _, _, _, rate = layout.twist.unpack_from(data, offset + 8 * 43)
     covariance = _planar_covariance(data, layout, offset + 56)
@@ -268,10 +268,10 @@ def decode_pose_stamped(data: bytes) -> PoseMessage:
     Raises:
         CdrError: The bytes are not one whole message.
     """
-    layout = _layout(data)
-    stamp_ns, frame_id, offset = _header(data, layout)
+    layout = layout_of(data)
+    stamp_ns, frame_id, offset = read_header(data, layout)
     offset += -(offset - ENCAPSULATION) % 8
-    _check_end(data, offset + 56)
+    check_end(data, offset + 56)
     x, y, _, qx, qy, qz, qw = layout.pose.unpack_from(data, offset)
     return PoseMessage(stamp_ns, frame_id, _pose2(x, y, qx, qy, qz, qw))
 
@@ -282,10 +282,10 @@ def decode_fix(data: bytes) -> FixMessage:
     Raises:
         CdrError: The bytes are not one whole message.
     """
-    layout = _layout(data)
-    stamp_ns, frame_id, offset = _header(data, layout)
+    layout = layout_of(data)
+    stamp_ns, frame_id, offset = read_header(data, layout)
     offset += -(offset - ENCAPSULATION) % 8
-    _check_end(data, offset + 8 * (7 + 36))
+    check_end(data, offset + 8 * (7 + 36))
     x, y, _, qx, qy, qz, qw = layout.pose.unpack_from(data, offset)
     covariance = _planar_covariance(data, layout, offset + 56)
     return FixMessage(stamp_ns, frame_id, _pose2(x, y, qx, qy, qz, qw), covariance)
@@ -297,8 +297,8 @@ def decode_brightness(data: bytes) -> BrightnessMessage:
     Raises:
         CdrError: The bytes are not one whole message.
     """
-    layout = _layout(data)
-    stamp_ns, frame_id, offset = _header(data, layout)
+    layout = layout_of(data)
+    stamp_ns, frame_id, offset = read_header(data, layout)
     offset += -offset % 4
     if offset + 16 > len(data):
         raise CdrError(f"cut off after {len(data)} bytes.")
@@ -306,7 +306,7 @@ def decode_brightness(data: bytes) -> BrightnessMessage:
     (count,) = layout.count.unpack_from(data, offset + 12)
     offset += 16
     end = offset + 4 * count
-    _check_end(data, end + 8)
+    check_end(data, end + 8)
     readings = np.frombuffer(data, layout.reading, count, offset).astype(np.int32)
     power, saturation = layout.power.unpack_from(data, end)
     return BrightnessMessage(stamp_ns, frame_id, receiver, transmitter, n, readings, power, saturation)
@@ -318,8 +318,8 @@ def decode_anonymous(data: bytes) -> AnonymousMessage:
     Raises:
         CdrError: The bytes are not one whole message.
     """
-    layout = _layout(data)
-    stamp_ns, frame_id, offset = _header(data, layout)
+    layout = layout_of(data)
+    stamp_ns, frame_id, offset = read_header(data, layout)
     offset += -offset % 4
     if offset + 4 > len(data):
         raise CdrError(f"cut off after {len(data)} bytes.")
@@ -327,7 +327,7 @@ def decode_anonymous(data: bytes) -> AnonymousMessage:
     offset += 4
     if count:
         offset += -(offset - ENCAPSULATION) % 8
-    _check_end(data, offset + count * ANONYMOUS_DTYPE.itemsize)
+    check_end(data, offset + count * ANONYMOUS_DTYPE.itemsize)
     detections = np.frombuffer(data, layout.anonymous, count, offset)
     return AnonymousMessage(stamp_ns, frame_id, detections.astype(ANONYMOUS_DTYPE))
 
@@ -341,26 +341,26 @@ def decode_detections(data: bytes) -> DetectionArrayMessage:
     Raises:
         CdrError: The bytes are not one whole message.
     """
-    layout = _layout(data)
-    stamp_ns, frame_id, offset = _header(data, layout)
+    layout = layout_of(data)
+    stamp_ns, frame_id, offset = read_header(data, layout)
     offset += -offset % 4
     if offset + 4 > len(data):
         raise CdrError(f"cut off after {len(data)} bytes.")
     (count,) = layout.count.unpack_from(data, offset)
-    return DetectionArrayMessage(stamp_ns, frame_id, _detections(data, layout, offset + 4, count))
+    return DetectionArrayMessage(stamp_ns, frame_id, read_detections(data, layout, offset + 4, count))
 
 
-def _detections(data: bytes, layout: _Layout, offset: int, count: int) -> npt.NDArray[np.void]:
+def read_detections(data: bytes, layout: Layout, offset: int, count: int) -> npt.NDArray[np.void]:
     """The sequence's elements, without the padding that the first one may have."""
     if count == 0:
-        _check_end(data, offset)
+        check_end(data, offset)
         return np.empty(0, DETECTION_DTYPE)
     end = offset + count * layout.detection.itemsize
     if (offset - ENCAPSULATION) % 8 == 0:
-        _check_end(data, end + 4)
+        check_end(data, end + 4)
         packed = bytearray(data[offset : offset + DETECTION_GAP]) + data[offset + DETECTION_GAP + 4 : end + 4]
     else:
-        _check_end(data, end)
+        check_end(data, end)
         packed = bytearray(data[offset:end])
     detections = np.frombuffer(packed, layout.detection)
     if layout.detection == DETECTION_DTYPE:

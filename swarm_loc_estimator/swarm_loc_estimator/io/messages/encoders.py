@@ -96,6 +96,12 @@ def encode_fix(frame_id: str, stamp_ns: int, pose: npt.ArrayLike, covariance: np
 def encode_detections(frame_id: str, stamp_ns: int, detections: npt.NDArray[np.void]) -> bytes:
     """Serialize one swarm_loc_msgs/MarkerDetectionArray from (n,) detections of `DETECTION_DTYPE`."""
     writer = CdrWriter.with_header(frame_id, stamp_ns)
+    add_detections(writer, detections)
+    return writer.message()
+
+
+def add_detections(writer: CdrWriter, detections: npt.NDArray[np.void]) -> None:
+    """Add a sequence of swarm_loc_msgs/MarkerDetection from (n,) detections of `DETECTION_DTYPE`."""
     writer.count(len(detections))
     if len(detections):
         rows = detections.astype(DETECTION_DTYPE).view(np.uint8).reshape(len(detections), -1)
@@ -103,7 +109,6 @@ def encode_detections(frame_id: str, stamp_ns: int, detections: npt.NDArray[np.v
         packed = rows.tobytes()
         writer.raw(4, packed[:DETECTION_GAP])
         writer.raw(8, packed[DETECTION_GAP:])
-    return writer.message()
 
 
 def encode_anonymous(frame_id: str, stamp_ns: int, detections: npt.NDArray[np.void]) -> bytes:

@@ -45,6 +45,7 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
 from swarm_loc_estimator.core.description.motion_response import MotionResponse, MotionResponseError
 from swarm_loc_estimator.core.description.swarm import (
     CameraMount,
@@ -95,7 +96,9 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _MAX_NAME = 64
 """Characters; topics and frames are built from names, and DDS bounds them."""
 MAX_ROBOTS = 1000
-"""The covariance of all poses is one dense matrix: 70 MB for so many."""
+"""So many have been simulated and run live; larger swarms are not known to work."""
+MAX_STATES = 10_000
+"""Of a filter whose covariance is one matrix: 800 MB for so many, and several of them are kept."""
 
 
 class SwarmFileError(UserError):
@@ -160,6 +163,11 @@ class _Loader(TreeChecks):
             raise self.said(f"robots names {len(named)} robots but must name at most {MAX_ROBOTS}")
         robots = tuple(self._robot(name, tree, defaults, types) for name, tree in named)
         landmarks = self._landmarks(sections.get("landmarks", {}), sections.get("defaults", {}))
+        states = ParameterTable.of(robots, landmarks).filter_size
+        if states > MAX_STATES:
+            raise self.said(
+                f"what has a sigma makes a filter of {states} states but must make at most {MAX_STATES}"
+            )
         try:
             return Swarm(robots, landmarks)
         except SwarmError as error:

@@ -1,0 +1,124 @@
+"""More comes over DDS than an estimator can use: it leaves sightings out, says so, and stays right."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from nav_msgs.msg import Odometry
+from node_world import TRUE_POSES, Ros, detection_bytes, odometry_bytes, overrides, sight
+
+from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.core.inputs.messages import RawInputs
+from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
+from swarm_loc_msgs.msg import MarkerDetectionArray, SwarmPose, SwarmPoses
+
+PERIOD_S = 0.05
+COST_S = 0.03
+"""Sixteen sightings come in a tick of 200 ms: they would take 480 ms."""
+
+
+class SlowEstimator(SwarmEstimator):
+    """Takes its time for each sighting that it fuses."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.cost_s = COST_S
+        self.taken = np.zeros(len(self.swarm.robots), dtype=int)
+        self.odometry = 0
+        self._waiting = 0
+
+    def receive(self, messages: RawInputs) -> None:
+        """Count what comes."""
+        self._waiting += messages.detections.robot.size
+        self.taken += np.bincount(messages.detections.robot, minlength=self.taken.size)
+        self.odometry += messages.odometry.robot.size
+        super().receive(messages)
+
+    def tick(self, now_ns: int, *, fuse: bool = True) -> SwarmEstimate:
+        """Fuse slowly."""
+        if fuse:
+            time.sleep(self.cost_s * self._waiting)
+            self._waiting = 0
+        return super().tick(now_ns, fuse=fuse)
+
+
+@contextmanager
+def driving(ros: Ros) -> Iterator[list[int]]:
+    """Robots that send odometry and an image 20 times a second, from a process of their own; how often."""
+    node, sent, end = ros.stranger(), [0], threading.Event()
+    odometry = {name: node.create_publisher(Odometry, f"{name}/odom", 1000) for name in TRUE_POSES}
+    images = {
+        name: node.create_publisher(MarkerDetectionArray, f"{name}/detections", 1000) for name in TRUE_POSES
+    }
+    publishers = [*odometry.values(), *images.values()]
+    ros.until(lambda: all(publisher.get_subscription_count() for publisher in publishers))
+
+    def send() -> None:
+        while not end.wait(PERIOD_S):
+            for name, pose in TRUE_POSES.items():
+                stamp_ns = time.time_ns()
+                odometry[name].publish(odometry_bytes(name, stamp_ns))
+                images[name].publish(detection_bytes(name, stamp_ns, sight(pose)))
+            sent[0] += 1
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        yield sent
+    finally:
+        end.set()
+        thread.join()
+
+
+def newest(heard: list[DiagnosticArray]) -> tuple[int, str, dict[str, str]]:
+    """Level, sentence and values of the estimator's newest status."""
+    (status,) = [one for one in heard[-1].status if one.name == "estimator"]
+    return status.level, status.message, {pair.key: pair.value for pair in status.values}
+
+
+def test_an_overloaded_estimator_sheds_sightings_evenly_and_says_so(ros: Ros, swarm_file: Any) -> None:
+    made: list[SlowEstimator] = []
+
+    def create(*arguments: Any) -> SlowEstimator:
+        made.append(SlowEstimator(*arguments))
+        return made[-1]
+
+    parameters = overrides(swarm_file=str(swarm_file), tick_period_s=0.2, fusion_load=0.5)
+    ros.add(EstimatorNode(create, parameter_overrides=parameters))
+    (slow,) = made
+    poses: list[SwarmPoses] = ros.listen(SwarmPoses, "swarm/poses")
+    heard: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
+
+    def left_out() -> float:
+        value = newest(heard)[2].get("sightings left out [1]", "-") if heard else "-"
+        return 0.0 if value == "-" else float(value)
+
+    with driving(ros) as sent:
+        ros.until(lambda: left_out() > 0.3)
+        level, sentence, values = newest(heard)
+        assert level == DiagnosticStatus.WARN
+        assert "sightings" in sentence
+        assert "were left out, evenly over all robots" in sentence
+        assert int(values["dropped: shed_detections"]) > 0
+
+        slow.taken[:] = 0
+        ros.until(lambda: slow.taken.sum() > 60)
+        assert slow.taken[0] == pytest.approx(slow.taken[1], abs=4)
+
+        slow.cost_s = 0.0  # the load falls
+        ros.until(lambda: bool(heard) and newest(heard)[2].get("sightings left out [1]") == "0")
+        assert "left out" not in newest(heard)[1]
+
+    ros.until(lambda: slow.odometry == 2 * sent[0])
+    assert "dropped: overload" not in newest(heard)[2]
+    for message in poses[-10:]:
+        for robot in message.robots:
+            assert robot.status == SwarmPose.STATUS_TRACKED
+            assert (robot.x, robot.y, robot.theta) == pytest.approx(TRUE_POSES[robot.name], abs=0.02)

@@ -1,0 +1,224 @@
+"""Messages with the readings of many robots: read as those of each robot alone, bad readings left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarm_loc_estimator.core.description.swarm import Robot, Swarm
+from swarm_loc_estimator.core.inputs.messages import RawInputs
+from swarm_loc_estimator.io.inputs.ingest import Ingest
+from swarm_loc_estimator.io.inputs.topics import InputKind, live_topics
+from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE, CdrError
+from swarm_loc_estimator.io.messages.encoders import encode_detections, encode_fix, encode_odometry
+from swarm_loc_estimator.io.messages.message_batch import MessageBatch
+from swarm_loc_estimator.io.messages.shared import (
+    SharedHead,
+    decode_shared_detections,
+    decode_shared_numbers,
+    encode_shared_detections,
+    encode_shared_numbers,
+    swarm_key,
+)
+from swarm_loc_estimator.io.messages.typestore import SWARM_DETECTIONS, SWARM_FIXES, SWARM_ODOMETRY, typestore
+from swarm_loc_estimator.numerics.arrays import IntArray
+
+SWARM = Swarm(tuple(Robot(name) for name in "abc"))
+KEY = swarm_key("abc")
+READINGS = st.lists(st.tuples(st.integers(0, 2), st.integers(0, 2**31 * 10**9 - 1)), max_size=9)
+
+
+def head(robot: Any, stamp_ns: Any, frame_id: str = "odom", swarm: int = KEY) -> SharedHead:
+    columns = (np.array(column, dtype=np.int64) for column in (robot, stamp_ns))
+    return SharedHead(5, frame_id, swarm, *columns)
+
+
+def markers(count: int) -> np.ndarray[Any, np.dtype[np.void]]:
+    rows = np.zeros(count, DETECTION_DTYPE)
+    rows["id"] = 7 + np.arange(count)
+    rows["position"] = np.arange(3 * count).reshape(-1, 3)
+    return rows
+
+
+def read(*messages: tuple[str, bytes]) -> RawInputs:
+    """What comes of messages by topic, one after the other."""
+    ingest = Ingest(SWARM)
+    rows = [(ingest.handle_of[topic], data, 10 + k) for k, (topic, data) in enumerate(messages)]
+    (inputs,) = ingest.read(MessageBatch.of(rows))
+    return inputs
+
+
+def big_endian(data: bytes, message_type: str) -> bytes:
+    store = typestore()
+    return bytes(
+        store.serialize_cdr(store.deserialize_cdr(data, message_type), message_type, little_endian=False)
+    )
+
+
+@given(READINGS, st.sampled_from(["", "odom", "a_frame"]), st.booleans())
+def test_what_is_written_is_read_by_us_and_by_others(
+    readings: list[tuple[int, int]], frame_id: str, swapped: bool
+) -> None:
+    robot, stamp_ns = [r for r, _ in readings], [s for _, s in readings]
+    n, first = len(readings), head(robot, stamp_ns, frame_id)
+    numbers = np.arange(12.0 * n).reshape(n, 12)
+    cases = (
+        (SWARM_ODOMETRY, encode_shared_numbers(first, numbers[:, :3]), (3,)),
+        (SWARM_FIXES, encode_shared_numbers(first, numbers[:, :3], numbers[:, 3:]), (3, 9)),
+        (SWARM_DETECTIONS, encode_shared_detections(first, markers(n)), None),
+    )
+    for message_type, data, widths in cases:
+        theirs: Any = typestore().deserialize_cdr(data, message_type)
+        assert theirs.robot.tolist() == robot
+        assert [time.sec * 10**9 + time.nanosec for time in theirs.stamp] == stamp_ns
+        sent = big_endian(data, message_type) if swapped else data
+        ours = decode_shared_numbers(sent, widths) if widths else decode_shared_detections(sent)
+        assert (ours.stamp_ns, ours.frame_id, ours.swarm) == (5, frame_id, KEY)
+        assert (ours.robot.tolist(), ours.reading_ns.tolist()) == (robot, stamp_ns)
+        if widths is None:
+            assert ours.columns[0]["id"].tolist() == markers(n)["id"].tolist()
+            assert np.array_equal(ours.columns[0]["position"], markers(n)["position"])
+        else:
+            assert np.array_equal(np.concatenate(ours.columns, axis=1), numbers[:, : sum(widths)])
+
+
+def test_a_message_of_many_says_what_each_would_have_said_alone() -> None:
+    pose, eye, many = np.array([[1.0, 2.0, 0.5], [3.0, 4.0, -0.5]]), np.eye(6), [2, 0]
+    own, shared = [], []
+    for k, robot in enumerate("ca"):
+        odometry = encode_odometry(
+            f"{robot}/odom", "base", np.array([k]), pose[k : k + 1], np.zeros((1, 3)), eye, eye
+        )
+        own += [
+            (f"{robot}/odom", odometry[0]),
+            (f"{robot}/detections", encode_detections("eye", k, markers(2)[k : k + 1])),
+            (f"{robot}/fix", encode_fix("map", k, pose[k], np.diag([1.0, 2.0, 3.0 + 97.0 * k]))),
+        ]
+    covariance = np.array([np.diag([1.0, 2.0, 3.0]), np.diag([1.0, 2.0, 100.0])]).reshape(2, 9)
+    shared += [
+        ("swarm/odom", encode_shared_numbers(head(many, [0, 1]), pose)),
+        ("swarm/detections", encode_shared_detections(head(many, [0, 1], ""), markers(2))),
+        ("swarm/fixes", encode_shared_numbers(head(many, [0, 1], "map"), pose, covariance)),
+    ]
+    one, other = read(*own), read(*shared)
+    for name in ("odometry", "detections", "fixes"):
+        for mine, theirs in zip(getattr(one, name)[:-1], getattr(other, name)[:-1], strict=True):
+            if mine.dtype.names:
+                assert mine.dtype == theirs.dtype
+                for field in mine.dtype.names:  # not the bytes between them, which may be any
+                    np.testing.assert_array_equal(mine[field], theirs[field])
+            else:
+                np.testing.assert_allclose(mine, theirs, atol=1e-15)
+    assert np.isnan(other.fixes.pose[1, 2])
+    assert other.odometry.arrival_ns.tolist() == [10, 10]
+    assert not other.dropped
+
+
+def test_readings_of_both_layouts_come_in_order_of_arrival() -> None:
+    alone = encode_detections("eye", 3, markers(1))
+    together = encode_shared_detections(head([1, 2], [1, 2]), markers(2))
+    inputs = read(("swarm/detections", together), ("a/detections", alone), ("swarm/detections", together))
+    assert inputs.detections.robot.tolist() == [1, 2, 0, 1, 2]
+    assert inputs.detections.arrival_ns.tolist() == [10, 10, 11, 12, 12]
+
+
+def test_bad_readings_are_left_out_and_counted_and_the_others_stay() -> None:
+    data = bytearray(encode_shared_numbers(head([0, 3, 1, 2], [1, 2, 3, 4]), np.arange(12.0).reshape(4, 3)))
+    (at,) = [k for k in range(0, len(data) - 24, 4) if data[k : k + 8] == bytes([4, 0, 0, 0, 0, 0, 0, 0])][
+        -1:
+    ]
+    data[at + 4 + 2 * 8 + 4 : at + 4 + 3 * 8] = (10**9).to_bytes(4, "little")  # of the third stamp
+    inputs = read(("swarm/odom", bytes(data)))
+    assert inputs.odometry.robot.tolist() == [0, 2]
+    assert inputs.odometry.stamp_ns.tolist() == [1, 4]
+    assert inputs.odometry.pose.tolist() == [[0.0, 1.0, 2.0], [9.0, 10.0, 11.0]]
+    assert inputs.dropped == {"unknown_robot": 1, "bad_stamp": 1}
+
+
+@pytest.mark.parametrize(
+    ("topic", "swarm", "frame_id", "reason"),
+    [
+        ("swarm/odom", KEY + 1, "odom", "other_swarm"),
+        ("swarm/fixes", KEY, "odom", "fix_frame"),
+        ("swarm/fixes", KEY, "map", ""),
+    ],
+)
+def test_indices_of_another_swarm_and_foreign_frames_are_refused(
+    topic: str, swarm: int, frame_id: str, reason: str
+) -> None:
+    columns = [np.zeros((2, 3)), *([np.zeros((2, 9))] if topic == "swarm/fixes" else [])]
+    inputs = read((topic, encode_shared_numbers(head([0, 1], [1, 2], frame_id, swarm), *columns)))
+    assert inputs.dropped == ({reason: 2} if reason else {})
+    assert inputs.odometry.robot.size + inputs.fixes.robot.size == (0 if reason else 2)
+
+
+def test_names_and_their_order_make_the_key() -> None:
+    keys = {swarm_key(names) for names in (["a", "b"], ["b", "a"], ["ab"], ["a", "b", "c"], ["a\nb"])}
+    assert len(keys) == 4, "a name has no line feed, so that the last one cannot come up"
+
+
+def numbers_of(n: int) -> bytes:
+    return encode_shared_numbers(head(range(n), range(n)), np.ones((n, 3)))
+
+
+def columns_of_other_lengths(which: int) -> bytes:
+    """A message of which one column is longer than the robots are many."""
+    robot: IntArray = np.arange(2)
+    stamp_ns: IntArray = np.arange(3 if which == 0 else 2)
+    pose = np.ones((3 if which == 1 else 2, 3))
+    return encode_shared_numbers(SharedHead(0, "odom", KEY, robot, stamp_ns), pose)
+
+
+@pytest.mark.parametrize("data", [columns_of_other_lengths(0), columns_of_other_lengths(1), b"", b"\x00\x01"])
+def test_columns_of_different_lengths_make_no_message(data: bytes) -> None:
+    with pytest.raises(CdrError):
+        decode_shared_numbers(data, (3,))
+
+
+@given(st.binary(max_size=200), st.integers(0, 200), st.integers(0, 3))
+def test_no_bytes_bring_the_reader_down(noise: bytes, cut: int, n: int) -> None:
+    whole = encode_shared_detections(head(range(n), range(n)), markers(n))
+    for data in (noise, whole[:cut] + noise, whole[: len(whole) - cut], numbers_of(n)[:cut] + noise):
+        for kind in ("swarm/odom", "swarm/detections", "swarm/fixes"):
+            inputs = read((kind, data))
+            assert inputs.odometry.robot.size <= n
+            assert set(inputs.dropped) <= {
+                "bad_message",
+                "other_swarm",
+                "unknown_robot",
+                "bad_stamp",
+                "fix_frame",
+            }
+
+
+def test_a_live_estimator_listens_to_few_topics_where_they_are_shared() -> None:
+    own = [topic.name for topic in live_topics(SWARM, shared=False)]
+    assert own == [
+        *(f"{robot}/{kind}" for robot in "abc" for kind in ("odom", "detections", "brightness", "fix")),
+        "aerial/detections",
+    ]
+    blind = Swarm(tuple(replace(robot, camera=None) for robot in SWARM.robots))
+    for swarm, expected in ((SWARM, [True, True]), (blind, [True, False])):
+        topics = live_topics(swarm, shared=True)
+        assert {topic.kind for topic in topics} == {
+            InputKind.AERIAL,
+            InputKind.SWARM_ODOMETRY,
+            InputKind.SWARM_DETECTIONS,
+            InputKind.SWARM_FIXES,
+        }
+        assert [t.expected for t in topics if t.kind.topic in ("swarm/odom", "swarm/detections")] == expected
+
+
+def test_a_robot_cannot_flood_the_memory_of_all() -> None:
+    """A message with more readings of one robot than wait of its own topic is dropped, and no other."""
+    many = np.arange(1001, dtype=np.int64)
+    one_robots = encode_shared_numbers(head(0 * many, many), np.zeros((1001, 3)))
+    both_robots = encode_shared_numbers(head(many[:1000] % 2, many[:1000]), np.zeros((1000, 3)))
+    inputs = read(("swarm/odom", one_robots), ("swarm/odom", both_robots))
+    assert inputs.odometry.robot.size == 1000
+    assert inputs.dropped == {"shared_too_many": 1001}
