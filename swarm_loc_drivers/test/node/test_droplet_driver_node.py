@@ -17,7 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from droplet_rig import IDS, TRIANGLE
 from geometry_msgs.msg import Twist, Vector3
 from nav_msgs.msg import Odometry
-from node_world import Program, Ros, overrides, stamp_ns
+from node_world import Program, Ros, overrides, stamp_ns, values_of
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
@@ -65,9 +65,9 @@ def robots(tmp_path: Path) -> Iterator[Robots]:
         robots.process.kill()
 
 
-def values_of(message: DiagnosticArray) -> dict[str, str]:
-    """The figures of the driver."""
-    return {pair.key: pair.value for pair in message.status[0].values}
+def frames_of(heard: list[TFMessage]) -> set[str]:
+    """The frames that have a parent."""
+    return {transform.child_frame_id for message in heard for transform in message.transforms}
 
 
 def test_a_droplet_walks_measures_and_stands_at_the_end(ros: Ros, robots: Robots, tmp_path: Path) -> None:
@@ -101,13 +101,15 @@ def test_a_droplet_walks_measures_and_stands_at_the_end(ros: Ros, robots: Robots
         ros.until(lambda: len(matrices) == 4)
         timer = ros.tester.create_timer(0.05, lambda: publisher.publish(Twist(linear=Vector3(x=-0.01))))
         ros.until(lambda: odometry[-1].pose.pose.position.x < -0.004)
-        ros.until(lambda: transforms and diagnostics and values_of(diagnostics[-1]).get("exchanges") == "2")
+        ros.until(lambda: frames_of(transforms) == {"droplet1/base_link", "droplet3/base_link"})
+        ros.until(lambda: diagnostics and values_of(diagnostics[-1].status[0]).get("exchanges") == "2")
         timer.cancel()
         assert program.end(signal.SIGINT) == 0, program.output
     first = robots.poses()
     assert (robots.poses() == first).all()
     moved = se2.between(TRIANGLE[0], first[0])
-    assert moved[0] == pytest.approx(odometry[-1].pose.pose.position.x, abs=4e-3)
+    # what it went until it stood is told until then
+    ros.until(lambda: odometry[-1].pose.pose.position.x == pytest.approx(moved[0], abs=4e-3))
     assert (first[1:] == TRIANGLE[1:]).all()
 
     platform = load_ir_platform("droplet")
@@ -122,11 +124,9 @@ def test_a_droplet_walks_measures_and_stands_at_the_end(ros: Ros, robots: Robots
             exact = np.clip(expected(platform, pose)[0, one.power], 0.0, 255.0)
             assert np.abs(np.reshape(one.readings, (6, 6)) - exact).max() < 0.51
     assert {one.transmitter for one in matrices} == set(IDS[1:])
-    frames = {one.transforms[0].child_frame_id for one in transforms}
-    assert frames == {"droplet1/base_link", "droplet3/base_link"}
     status = diagnostics[-1].status[0]
     assert (status.name, status.message) == ("droplet1/droplet_driver", "connected")
-    assert values_of(diagnostics[-1])["exchanges"] == "2"
+    assert values_of(status)["exchanges"] == "2"
 
 
 def test_nobody_is_asked_while_the_link_is_down(ros: Ros, tmp_path: Path) -> None:

@@ -40,6 +40,11 @@ def way_of(odometry: list[Odometry]) -> float:
     return float(np.hypot(place.x, place.y))
 
 
+def way_between(one: PoseStamped, other: PoseStamped) -> float:
+    first, last = one.pose.position, other.pose.position
+    return float(np.hypot(last.x - first.x, last.y - first.y))
+
+
 @pytest.mark.usefixtures("ros")
 def test_the_drivers_of_a_table_share_what_is_set_and_begin_when_all_are_made(
     swarm_file: Path, tmp_path: Path
@@ -77,14 +82,10 @@ def test_droplets_wander_and_measure_each_other(ros: Ros, swarm_file: Path, tmp_
         ros.until(lambda: any(one.twist.twist.linear.x or one.twist.twist.linear.y for one in odometry))
         ros.until(lambda: len({one.transmitter for one in matrices}) == 2 and len(fixes) > 5)
         ros.until(lambda: {one.power for one in matrices} == POWERS)
-        ros.until(
-            lambda: np.hypot(odometry[-1].pose.pose.position.x, odometry[-1].pose.pose.position.y) > 0.005
-        )
+        ros.until(lambda: way_of(odometry) > 0.005 and way_between(truth[0], truth[-1]) > 0.003)
         assert world.end(signal.SIGINT) == 0, world.output
     times = np.array([one.clock.sec + 1e-9 * one.clock.nanosec for one in clock])
     assert (np.diff(times) > 0).all()
-    first, last = truth[0].pose.position, truth[-1].pose.position
-    assert np.hypot(last.x - first.x, last.y - first.y) > 0.003
     assert {one.receiver for one in matrices} == {0x1001}
     assert all(stamp_ns(one) > 0 for one in matrices)
     there = starts(SETTINGS)[2]

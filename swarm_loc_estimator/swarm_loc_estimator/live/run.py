@@ -16,7 +16,7 @@ from swarm_loc_estimator.evaluation.truth import TruthReader
 from swarm_loc_estimator.io.bags.reader import BagReader
 from swarm_loc_estimator.io.inputs.topics import input_topics
 from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.launching.graph import GraphOptions, NodeSpec, graph_nodes
+from swarm_loc_estimator.launching.graph import GraphOptions, NodeSpec, ParameterValue, graph_nodes
 from swarm_loc_estimator.live.graph import START_PATIENCE_S, LiveError, LiveGraph, cpu_seconds, resident_mb
 from swarm_loc_estimator.live.recorder import Recorder, read_history, read_poses
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
@@ -139,9 +139,10 @@ def play_live(
         raise ValueError("there is no bag to play")
     bag, swarm = Path(options.bag), load_swarm(Path(options.swarm_file))
     content = read_bag(bag, swarm)
-    nodes = graph_nodes(options)
-    if inputs_only:
-        nodes = [_with_topics(node, [*content.arrival_ns]) if node.name == PLAYER else node for node in nodes]
+    nodes = [
+        _player_of(node, [*content.arrival_ns], inputs_only=inputs_only) if node.name == PLAYER else node
+        for node in graph_nodes(options)
+    ]
     begin_s = time.monotonic()
     with LiveGraph(nodes, log) as graph:
         recorder, estimator, player = graph.recorder, graph.process(ESTIMATOR), graph.process(PLAYER)
@@ -187,9 +188,12 @@ def play_live(
     )
 
 
-def _with_topics(player: NodeSpec, topics: Sequence[str]) -> NodeSpec:
-    """The player of some topics only."""
-    return replace(player, parameters={**player.parameters, "topics": [*topics]})
+def _player_of(player: NodeSpec, inputs: Sequence[str], *, inputs_only: bool) -> NodeSpec:
+    """A player that begins once all inputs are heard, however slowly they are discovered."""
+    chosen: dict[str, ParameterValue] = {"wait_for_subscribers": max(1, len(inputs))}
+    if inputs_only:
+        chosen["topics"] = [*inputs]
+    return replace(player, parameters={**player.parameters, **chosen})
 
 
 def _ages(received_ns: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> FloatArray:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.duration import Duration
@@ -226,6 +227,16 @@ class Robots:
             self.step(begin_ns + step * STEP_NS, poses(begin_ns + step * STEP_NS) if poses else None)
         return begin_ns + (steps - 1) * STEP_NS
 
+    def run_until(
+        self, begin_ns: int, condition: Callable[[], object], poses: Callable[[int], Poses] | None = None
+    ) -> int:
+        """Steps until something is so; returns the time of the last."""
+        now_ns, end_s = self.run(begin_ns, 1, poses), time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < end_s, "went on in vain"
+            now_ns = self.run(now_ns + STEP_NS, 1, poses)
+        return now_ns
+
     def tell_time(self, now_ns: int) -> None:
         """Publish the clock."""
         self._clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
@@ -261,6 +272,17 @@ class Robots:
 def stamp_ns(message: Any) -> int:
     """A message's stamp."""
     return int(Time.from_msg(message.header.stamp).nanoseconds)
+
+
+def newest_status(heard: Sequence[DiagnosticArray], name: str) -> DiagnosticStatus:
+    """The newest diagnostics of one name; empty ones before the first have come."""
+    found = [status for message in heard for status in message.status if status.name == name]
+    return found[-1] if found else DiagnosticStatus()
+
+
+def values_of(status: DiagnosticStatus) -> dict[str, str]:
+    """The figures of diagnostics."""
+    return {pair.key: pair.value for pair in status.values}
 
 
 class Program:

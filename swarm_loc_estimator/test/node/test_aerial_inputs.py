@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from node_world import STEP_NS, T0_NS, TRUE_POSES, Robots, Ros, stamp_ns
+from node_world import STEP_NS, T0_NS, TRUE_POSES, Robots, Ros, newest_status, stamp_ns, values_of
 
 from swarm_loc_estimator.io.messages.cdr import ANONYMOUS_DTYPE
 from swarm_loc_estimator.io.messages.encoders import encode_anonymous
@@ -37,11 +37,10 @@ def test_robots_seen_from_above_are_told_apart_and_a_wrong_frame_is_named(ros: R
     camera.publish(image("table", now_ns))
     last_ns = robots.run(now_ns + STEP_NS, 4)
     ros.until(lambda: reports and stamp_ns(reports[-1]) >= last_ns)
-    by_name = {status.name: status for status in reports[-1].status}
-    values = {pair.key: pair.value for pair in by_name["estimator"].values}
+    status = newest_status(reports, "estimator")
+    values = values_of(status)
     assert values["dropped: aerial_frame"] == "1"
     assert values["dropped: aerial_unassigned"] == "1"
     assert values["aerial/detections received"] == "2"
-    assert "aerial/detections is in frame 'table' but must be in 'map'" in by_name["estimator"].message
-    alpha = {pair.key: pair.value for pair in by_name["estimator: alpha"].values}
-    assert alpha["aerial detection"] == "1"
+    assert "aerial/detections is in frame 'table' but must be in 'map'" in status.message
+    assert values_of(newest_status(reports, "estimator: alpha"))["aerial detection"] == "1"

@@ -11,7 +11,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from node_world import SECOND, T0_NS, Ros, odometry_bytes, overrides, stamp_ns
+from node_world import SECOND, T0_NS, Ros, newest_status, odometry_bytes, overrides, stamp_ns, values_of
 from rclpy.publisher import Publisher
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
@@ -88,8 +88,8 @@ def droplets(ros: Ros, tmp_path: Path) -> Droplets:
 
 def report(heard: list[DiagnosticArray], name: str) -> tuple[DiagnosticStatus, dict[str, str]]:
     """The newest diagnostics of one name, and its values."""
-    (status,) = [status for status in heard[-1].status if status.name == name]
-    return status, {pair.key: pair.value for pair in status.values}
+    status = newest_status(heard, name)
+    return status, values_of(status)
 
 
 def until_told(ros: Ros, heard: list[DiagnosticArray], now_ns: int) -> None:

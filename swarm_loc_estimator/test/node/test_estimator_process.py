@@ -7,7 +7,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from node_world import SETTINGS, STEP_NS, T0_NS, Poses, Program, Robots, Ros, overrides
+from node_world import SETTINGS, STEP_NS, T0_NS, TRUE_POSES, Poses, Program, Robots, Ros, overrides
 from rclpy.parameter import Parameter
 
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
@@ -124,13 +124,13 @@ def test_an_estimator_that_was_killed_finds_all_robots_again(
     robots = Robots(ros)
     with _program(tmp_path, swarm_file=swarm_file, use_sim_time="true", **SETTINGS) as program:
         robots.wake_estimator(T0_NS)
-        now_ns = robots.run(T0_NS + STEP_NS, 20, driving)
-        assert robots.located("beta")
+        now_ns = robots.run_until(T0_NS + STEP_NS, lambda: robots.located("beta"), driving)
         program.end(signal.SIGKILL)
     with _program(tmp_path, swarm_file=swarm_file, use_sim_time="true", **SETTINGS) as program:
         begin_ns = now_ns + 40 * STEP_NS
         robots.wake_estimator(begin_ns)
-        now_ns = robots.run(begin_ns + STEP_NS, 40, driving)
+        now_ns = robots.run_until(begin_ns + STEP_NS, lambda: all(map(robots.located, TRUE_POSES)), driving)
+        now_ns = robots.run(now_ns + STEP_NS, 40, driving)
         assert program.end(signal.SIGTERM) == 0
     for name, pose in driving(now_ns).items():
         assert robots.located(name)

@@ -73,15 +73,15 @@ def test_every_message_arrives_unchanged_and_never_before_its_time(
         ros.until(lambda: player.process.poll() is not None)
         assert player.end() == 0
         summary = player.output.splitlines()[-1]
-    ros.until(lambda: len(odometry.heard) >= COUNT and len(detections.heard) >= COUNT)
-
     stamps = [T0_NS + step * STEP_NS for step in range(COUNT)]
+    ros.until(lambda: len(odometry.heard) >= COUNT and len(detections.heard) >= COUNT)
+    ros.until(lambda: times and times[-1] >= stamps[-1] + LATE_NS)
+
     assert odometry.heard == [odometry_bytes("alpha", stamp) for stamp in stamps]
     assert detections.heard == [detection_bytes("alpha", stamp, sight((0.0, 0.0, 0.0))) for stamp in stamps]
     assert summary.startswith(f"played {3 * COUNT} messages of {(COUNT - 1) * STEP_NS / SECOND:.1f} s in ")
     assert times == sorted(times)
     assert times[0] == T0_NS + LATE_NS
-    assert times[-1] >= stamps[-1] + LATE_NS
 
 
 def test_a_part_of_a_bag_under_other_names(ros: Ros, bag: Path, tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_a_loop_begins_anew_until_a_signal(ros: Ros, bag: Path, tmp_path: Path) 
     times = _clock(ros)
     Listener(ros, Odometry, "alpha/odom")
     with _player(bag, tmp_path, rate=50, wait_for_subscribers=1, loop="true") as player:
-        ros.until(lambda: times.count(T0_NS + LATE_NS) == 3)
+        ros.until(lambda: times.count(T0_NS + LATE_NS) >= 3)
         assert player.end(signal.SIGINT) == 0
         assert "Traceback" not in player.output
         assert "played" in player.output

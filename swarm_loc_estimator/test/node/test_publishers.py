@@ -20,8 +20,10 @@ from node_world import (
     Program,
     Robots,
     Ros,
+    newest_status,
     odometry_bytes,
     overrides,
+    values_of,
 )
 from rcl_interfaces.msg import Log, ParameterType
 from rcl_interfaces.msg import Parameter as ParameterMessage
@@ -48,12 +50,6 @@ FLOOD_S = 4.0
 MEGABYTE = 1 << 20
 
 
-def newest(heard: list[DiagnosticArray], name: str) -> DiagnosticStatus:
-    """The newest diagnostics of one name."""
-    (status,) = [status for status in heard[-1].status if status.name == name]
-    return status
-
-
 def test_best_effort_publishers_are_heard_and_named(ros: Ros, swarm_file: Path) -> None:
     log = ros.listen(Log, "/rosout")
     ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(swarm_file), use_sim_time=True)))
@@ -72,13 +68,13 @@ def test_publishers_that_should_not_be_are_named_once_per_change(ros: Ros, robot
     second = others.create_publisher(Odometry, "alpha/odom", 10)
     robots.run(T0_NS, 4)
     sentence = "alpha/odom has 2 publishers: /other, /tester"
-    ros.until(lambda: heard and sentence in newest(heard, "estimator: alpha").message)
-    assert newest(heard, "estimator: alpha").level == DiagnosticStatus.WARN
+    ros.until(lambda: sentence in newest_status(heard, "estimator: alpha").message)
+    assert newest_status(heard, "estimator: alpha").level == DiagnosticStatus.WARN
     count = len(heard)
     ros.until(lambda: len(heard) > count + 1)
     assert sum(entry.msg == sentence for entry in log) == 1
     others.destroy_publisher(second)
-    ros.until(lambda: "publishers" not in newest(heard, "estimator: alpha").message)
+    ros.until(lambda: "publishers" not in newest_status(heard, "estimator: alpha").message)
 
 
 def test_a_second_estimator_and_a_second_clock_are_named(ros: Ros, robots: Robots, swarm_file: Path) -> None:
@@ -92,7 +88,7 @@ def test_a_second_estimator_and_a_second_clock_are_named(ros: Ros, robots: Robot
         "swarm/poses has 2 publishers: /estimator, /estimator",
         "/clock has 2 publishers: /other, /tester",
     )  # the copy tells of the clocks alone
-    ros.until(lambda: heard and all(one in newest(heard, "estimator").message for one in sentences))
+    ros.until(lambda: all(one in newest_status(heard, "estimator").message for one in sentences))
 
 
 def test_a_static_transform_into_a_robots_odom_frame_is_named(ros: Ros, robots: Robots) -> None:
@@ -106,10 +102,10 @@ def test_a_static_transform_into_a_robots_odom_frame_is_named(ros: Ros, robots: 
     )
     robots.run(T0_NS, 4)
     sentence = "/tf_static has a transform from 'world' to 'alpha/odom', which only the estimator may publish"
-    ros.until(lambda: heard and sentence in newest(heard, "estimator").message)
-    assert newest(heard, "estimator").level == DiagnosticStatus.WARN
+    ros.until(lambda: sentence in newest_status(heard, "estimator").message)
+    assert newest_status(heard, "estimator").level == DiagnosticStatus.WARN
     ros.until(lambda: sum(entry.msg == sentence for entry in log) == 1)
-    assert "alpha/camera" not in newest(heard, "estimator").message
+    assert "alpha/camera" not in newest_status(heard, "estimator").message
 
 
 def test_the_clock_cannot_be_changed_while_the_node_runs(ros: Ros, robots: Robots) -> None:
@@ -163,8 +159,8 @@ def test_a_flood_is_dropped_and_counted_memory_stays_and_a_signal_ends_the_node(
         program.wait_for("ready")
         flood = subprocess.Popen(command)
         try:
-            ros.until(lambda: heard and "dropped: overload" in values(newest(heard, "estimator")))
-            assert "more come than can be used" in newest(heard, "estimator").message
+            ros.until(lambda: "more come than can be used" in newest_status(heard, "estimator").message)
+            assert "dropped: overload" in values_of(newest_status(heard, "estimator"))
             before, begin_s = resident_bytes(program.process.pid), time.monotonic()
             ros.until(lambda: time.monotonic() > begin_s + FLOOD_S)
             grown = resident_bytes(program.process.pid) - before
@@ -177,10 +173,6 @@ def test_a_flood_is_dropped_and_counted_memory_stays_and_a_signal_ends_the_node(
         assert "Traceback" not in program.output
     assert grown < 5 * MEGABYTE
     assert took_s < 2.0
-
-
-def values(status: DiagnosticStatus) -> dict[str, str]:
-    return {pair.key: pair.value for pair in status.values}
 
 
 def resident_bytes(pid: int) -> int:
