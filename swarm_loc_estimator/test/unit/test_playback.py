@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 
 from swarm_loc_estimator.io.bags.bag_file import RawMessage
@@ -32,6 +34,10 @@ class Player:
         """Keep the clock."""
         self.told_ns = now_ns
         self.clock.append(now_ns)
+
+    def pass_time(self, seconds: float) -> None:
+        """Something takes so long."""
+        self._now_s += seconds
 
     def now_s(self) -> float:
         """The test's own clock."""
@@ -71,6 +77,19 @@ def test_time_is_told_in_small_steps_also_where_the_bag_is_silent() -> None:
     assert player.clock[0] == T0_NS
     assert min(steps) > 0
     assert max(steps) <= LONGEST_STEP_NS
+
+
+def test_the_clock_starts_when_the_first_message_has_been_found() -> None:
+    player = Player()
+
+    def slow_to_open(messages: list[RawMessage]) -> Iterator[RawMessage]:
+        player.pass_time(1.0)
+        yield from messages
+
+    so_far = PlayedSoFar()
+    play(slow_to_open(bag(-0.5, 0.1, 0.3)), T0_NS, 1.0, player, so_far)
+    assert [wall_s for _, wall_s in player.sent] == pytest.approx([1.1, 1.3], abs=STEP_S + 1e-9)
+    assert so_far.latest_s <= STEP_S + 1e-9
 
 
 def test_being_late_once_does_not_shift_what_follows() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import chain, dropwhile, islice
 from typing import Protocol
 
 from swarm_loc_estimator.io.bags.bag_file import RawMessage
@@ -75,13 +76,14 @@ def play(
         so_far: Is kept up to date.
     """
     step_ns = clock_step_ns(rate)
+    # finding the first one takes a while in a large bag: not after the clock has begun to run
+    left = dropwhile(lambda message: message[2] < begin_ns, messages)
+    first = list(islice(left, 1))
     begin_s, clock_ns = output.now_s(), begin_ns
     bag_before_ns, wall_before_s = so_far.bag_ns, so_far.wall_s
     output.publish_clock(begin_ns)
-    for message in messages:
+    for message in chain(first, left):
         log_ns = message[2]
-        if log_ns < begin_ns:
-            continue
         while log_ns > clock_ns:
             clock_ns += step_ns
             output.wait_until(begin_s + (clock_ns - begin_ns) / (rate * _SECOND))
