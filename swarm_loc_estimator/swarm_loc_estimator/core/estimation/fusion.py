@@ -31,14 +31,14 @@ from swarm_loc_estimator.core.filter.integrity.surprises import is_elsewhere
 from swarm_loc_estimator.core.filter.joint_filter import JointFilter, Robots
 from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray, MeasurementColumns
 from swarm_loc_estimator.core.filter.sparse.sparse_filter import SparseFilter
-from swarm_loc_estimator.core.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.core.filter.state import InitialPose, Starts, SwarmState
 from swarm_loc_estimator.core.identification.assignment import AMBIGUOUS
 from swarm_loc_estimator.core.initialization.initializer import Initializer
 from swarm_loc_estimator.core.inputs.messages import chosen
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
 
 _SURER_AT_FIRST = 1.5
 """By this factor a heading must be surer than one that is lost, for a robot to be initialized."""
@@ -81,14 +81,10 @@ class Fusion:
         )
         self._sparse_from = settings.sparse_from
         self._period_ns = round(settings.fusion_period_s * 1e9)
-        self._starts = {
-            i: (
-                np.array(r.start),
-                np.diag(np.square([r.start_sigma.x, r.start_sigma.y, r.start_sigma.theta])),
-            )
-            for i, r in enumerate(swarm.robots)
-            if r.start is not None
-        }
+        self._has_start = np.array([r.start is not None for r in swarm.robots], dtype=bool)
+        self._start: FloatArray = np.array([r.start or (0.0, 0.0, 0.0) for r in swarm.robots]).reshape(-1, 3)
+        sigma = [(r.start_sigma.x, r.start_sigma.y, r.start_sigma.theta) for r in swarm.robots]
+        self._start_variance: FloatArray = np.square(sigma).reshape(-1, 3)
         surer = settings.lost_heading_sigma / _SURER_AT_FIRST
         self._initializer = Initializer(tracks, settings.fix_window_s, surer)
         self._pictures = PictureFusion(swarm, settings, tracks)
@@ -111,33 +107,27 @@ class Fusion:
 
         Not those that walk at random: nobody knows since when.
         """
-        ready = [
-            robot
-            for robot in np.flatnonzero(state.start_pending).tolist()
-            if self._may_start(state, robot, stamp_ns) and not self._tracks.walks(robot)
-        ]
-        if ready:
+        robots = np.flatnonzero(state.start_pending)
+        ready = robots[~self._tracks.walks(robots) & self._may_start(state, robots, stamp_ns)]
+        if ready.size:
             state = state.copy()
-            for robot in ready:
-                self._initialize_at_start(state, robot, stamp_ns)
+            self._initialize_at_start(state, ready, np.full(ready.size, stamp_ns))
         return state
 
-    def _may_start(self, state: SwarmState, robot: int, stamp_ns: int) -> bool:
-        """Whether the robot may start at its configured pose: its odometry has begun by `stamp_ns`."""
-        return (
-            bool(state.start_pending[robot]) and robot in self._starts and self._tracks.begun(robot, stamp_ns)
-        )
+    def _may_start(self, state: SwarmState, robots: IntArray, stamps_ns: IntArray | int) -> BoolArray:
+        """Whether robots (k,) may start at configured poses: their odometry has begun by instants (k,)."""
+        pending: BoolArray = state.start_pending[robots] & self._has_start[robots]
+        return pending & self._tracks.begun(robots, stamps_ns)
 
-    def _initialize_at_start(self, state: SwarmState, robot: int, stamp_ns: int) -> None:
-        """Where its track begins; or, if it walks at random, with the first measurement about it."""
-        start, covariance = self._starts[robot]
-        begin_ns, pose = self._tracks.arrays.begin_ns[robot], self._tracks.arrays.begin_pose[robot]
-        initial = InitialPose(se2.compose(start, se2.inverse(pose)), se2.error_covariance(start, covariance))
-        begin = Preintegrated.begin(int(begin_ns))
-        if self._tracks.walks(robot):
-            here = self._tracks.at(np.array([robot]), np.array([stamp_ns]))
-            begin = Preintegrated(stamp_ns, here.covariance[0], here.jacobian[0])
-        state.initialize(robot, initial, begin)
+    def _initialize_at_start(self, state: SwarmState, robots: IntArray, stamps_ns: IntArray) -> None:
+        """Where their tracks begin; or, if they walk at random, with the first measurements about them."""
+        tracks, start, walks = self._tracks.arrays, self._start[robots], self._tracks.walks(robots)
+        transform = se2.compose(start, se2.inverse(tracks.begin_pose[robots]))
+        error = se2.error_covariance(start, self._start_variance[robots][:, :, None] * np.eye(3))
+        begun_ns = np.where(walks, stamps_ns, tracks.begin_ns[robots])
+        covariance, jacobian = self._tracks.at(robots, stamps_ns)[2:4]
+        covariance[~walks], jacobian[~walks] = 0.0, 0.0  # where a track begins, nothing is preintegrated yet
+        state.start(robots, Starts(transform, error, begun_ns, covariance, jacobian))
 
     def _initialize_measured(self, state: SwarmState, measurements: MeasurementArray) -> bool:
         """Initialize robots at their starts with the first measurement (m,) about them; whether any was.
@@ -147,10 +137,12 @@ class Fusion:
         initialized = False
         for side in ("observer", "target"):
             new = np.append(state.start_pending, False)[measurements[side]]  # NOBODY (-1) finds the last
-            for robot, stamp_ns in zip(measurements[side][new], measurements["stamp_ns"][new], strict=True):
-                if self._may_start(state, int(robot), int(stamp_ns)):
-                    self._initialize_at_start(state, int(robot), int(stamp_ns))
-                    initialized = True
+            robots, stamps_ns = measurements[side][new], measurements["stamp_ns"][new]
+            ready = self._may_start(state, robots, stamps_ns)
+            chosen_robots, first = np.unique(robots[ready], return_index=True)
+            if chosen_robots.size:
+                self._initialize_at_start(state, chosen_robots, stamps_ns[ready][first])
+                initialized = True
         return initialized
 
     def step(
@@ -203,9 +195,10 @@ class Fusion:
         self, state: SwarmState, image: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
     ) -> None:
         """Fuse the anonymous detections of an aerial image."""
-        for robot in self._starts:
-            if self._may_start(state, robot, int(image["stamp_ns"][0])):
-                self._initialize_at_start(state, robot, int(image["stamp_ns"][0]))
+        robots, stamp_ns = np.flatnonzero(state.start_pending), int(image["stamp_ns"][0])
+        ready = robots[self._may_start(state, robots, stamp_ns)]
+        if ready.size:
+            self._initialize_at_start(state, ready, np.full(ready.size, stamp_ns))
         assignment = self._pictures.assigned(state, image)
         known = assignment.robot >= 0
         if known.any():

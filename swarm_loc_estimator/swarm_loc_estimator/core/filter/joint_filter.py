@@ -46,6 +46,9 @@ class JointFilter(Protocol):
     def place(self, columns: IntArray, covariance: FloatArray) -> None:
         """Give the columns (k,) this covariance (k, k), independent of the rest, whatever was known."""
 
+    def place_bodies(self, bodies: IntArray, covariances: FloatArray) -> None:
+        """Likewise the columns of bodies (k,), each with a covariance (k, 3, 3) of its own."""
+
     def add(self, columns: IntArray, covariance: FloatArray) -> None:
         """Add a covariance (k, k) to that of columns (k,): their errors are larger than was known."""
 

@@ -45,6 +45,24 @@ class InitialPose(NamedTuple):
     shares: FloatArray = _NO_SHARES
 
 
+class Starts(NamedTuple):
+    """Where and when the tracks of robots (k,) begin to count, whose errors are their own.
+
+    Attributes:
+        transform: (k, 3) T, from `map` to the tracks' frames.
+        covariance: (k, 3, 3) of their right-invariant errors.
+        stamp_ns: (k,) the instants.
+        preintegrated_covariance: (k, 3, 3) of the tracks by then.
+        preintegrated_jacobian: (k, 3, 3) likewise.
+    """
+
+    transform: FloatArray
+    covariance: FloatArray
+    stamp_ns: IntArray
+    preintegrated_covariance: FloatArray
+    preintegrated_jacobian: FloatArray
+
+
 class SwarmState:
     """Joint belief over all robots.
 
@@ -146,28 +164,34 @@ class SwarmState:
             at: The instant, and what its track has preintegrated by then.
             confirmations: How many sightings agree with that.
         """
-        if self.tracked[robot]:
-            self._forget_pairs(robot)
-        self.transform[robot] = initial.transform
-        self._isolate(robot, initial.covariance)
+        alone = (initial.transform, initial.covariance, at.stamp_ns, at.covariance, at.jacobian)
+        self.start(np.array([robot]), Starts(*(np.array([one]) for one in alone)), confirmations)
         others = (initial.columns[:, None] + np.arange(3)).reshape(-1)
         mapping = initial.shares.transpose(1, 0, 2).reshape(3, -1)
         self.filter.relate(robot_columns(np.array([robot]))[0], others, mapping)
-        self.predicted_to_ns[robot] = at.stamp_ns
-        self.preintegrated_covariance[robot] = at.covariance
-        self.preintegrated_jacobian[robot] = at.jacobian
-        self.tracked[robot] = True
-        self.start_pending[robot] = False
-        self._trust(robot, confirmations)
-        self.constraints.pop(robot, None)
+
+    def start(self, robots: IntArray, starts: Starts, confirmations: int = 0) -> None:
+        """Take robots (k,) into the estimate whose errors are their own, see `initialize`."""
+        for robot in robots[self.tracked[robots]].tolist():
+            self._forget_pairs(robot)
+        self.transform[robots] = starts.transform
+        self._isolate(robots, starts.covariance)
+        self.predicted_to_ns[robots] = starts.stamp_ns
+        self.preintegrated_covariance[robots] = starts.preintegrated_covariance
+        self.preintegrated_jacobian[robots] = starts.preintegrated_jacobian
+        self.tracked[robots] = True
+        self.start_pending[robots] = False
+        self._trust(robots, confirmations)
+        for robot in robots.tolist():
+            self.constraints.pop(robot, None)
 
     def lose(self, robot: int) -> None:
         """Take the robot out of the estimate; it waits for a fix."""
-        self._isolate(robot, np.eye(3))
+        self._isolate(np.array([robot]), np.eye(3)[None])
         self._forget_pairs(robot)
         self.tracked[robot] = False
         self.start_pending[robot] = False
-        self._trust(robot, 0)
+        self._trust(np.array([robot]), 0)
 
     def open(self, source: int, pose: FloatArray) -> None:
         """Estimate what a contradicted robot or landmark was described by, or estimate it anew.
@@ -231,25 +255,26 @@ class SwarmState:
         self.filter.grow(table.filter_size - self._table.filter_size)
         self._table = table
 
-    def _trust(self, robot: int, confirmations: int) -> None:
-        """Forget what was held against a robot that begins anew."""
-        self.integrity.gated_in_a_row[robot] = 0
-        self.integrity.gated_fixes[robot] = 0
-        self.integrity.doubt[robot] = 0.0
-        self.integrity.confirmations[robot] = confirmations
-        self.integrity.source[robot] = -1
-        self.integrity.evidence[self.integrity.source == robot] = 0.0
+    def _trust(self, robots: IntArray, confirmations: int) -> None:
+        """Forget what was held against robots (k,) that begin anew."""
+        self.integrity.gated_in_a_row[robots] = 0
+        self.integrity.gated_fixes[robots] = 0
+        self.integrity.doubt[robots] = 0.0
+        self.integrity.confirmations[robots] = confirmations
+        self.integrity.source[robots] = -1
+        self.integrity.evidence[np.isin(self.integrity.source, robots)] = 0.0
 
     def _forget_pairs(self, robot: int) -> None:
         """Forget what the robot has measured, and others of it: its errors now are others."""
         for gone in (self.pair_robot == robot, np.s_[robot]):
             self.pair_robot[gone], self.pair_stamp_ns[gone] = -1, NEVER_NS
 
-    def _isolate(self, robot: int, covariance: FloatArray) -> None:
-        """Give the pose this covariance (3, 3); what was learned of the robot's sensors stays."""
-        self.filter.place(robot_columns(np.array([robot]))[0], covariance)
-        columns = self._table.column[robot, self._table.column[robot] >= 0]
-        self.filter.place(columns, np.diag(np.diag(self.filter.block(columns))))
+    def _isolate(self, robots: IntArray, covariances: FloatArray) -> None:
+        """Give poses (k,) covariances (k, 3, 3); what was learned of the robots' sensors stays."""
+        self.filter.place_bodies(robots, covariances)
+        for robot in robots[(self._table.column[robots] >= 0).any(axis=1)].tolist():
+            columns = self._table.column[robot, self._table.column[robot] >= 0]
+            self.filter.place(columns, np.diag(np.diag(self.filter.block(columns))))
 
     def parameter_sigma(self, robot: int) -> FloatArray:
         """Standard deviations (PARAMETERS,) of a robot's parameters; zero of those not estimated."""

@@ -85,14 +85,15 @@ class OdometryTracks:
         timeout_ns = np.ceil(self._model["timeout_s"] * 1e9).astype(np.int64)
         return int(np.max(timeout_ns - np.minimum(0, self._delay_ns), initial=0))
 
-    def begun(self, robot: int, stamp_ns: int) -> bool:
-        """Whether the robot's odometry has begun by an instant; one without has always stood there."""
-        begun = self.arrays.filled[robot] and self.arrays.begin_ns[robot] <= stamp_ns
-        return bool(begun or self._stands[robot])
+    def begun(self, robots: IntArray | int, stamps_ns: IntArray | int) -> BoolArray:
+        """Whether the odometry of robots (k,) has begun by instants (k,); those without have always stood."""
+        arrays = self.arrays
+        begun = (arrays.filled[robots] > 0) & (arrays.begin_ns[robots] <= stamps_ns)
+        return np.asarray(begun | self._stands[robots])
 
-    def walks(self, robot: int) -> bool:
-        """Whether a robot walks at random, without odometry."""
-        return bool(self._walk[robot].any())
+    def walks(self, robots: IntArray | int) -> BoolArray:
+        """Whether robots (k,) walk at random, without odometry."""
+        return np.asarray(self._walk[robots].any(axis=-1))
 
     def contradict_themselves(self, now_ns: int) -> BoolArray:
         """Whether the odometry of each robot (N,) has jumped again and again of late."""
@@ -153,7 +154,7 @@ class OdometryTracks:
 
     def _allocated(self, capacity: int) -> TrackArrays:
         shape = (self._robots, capacity)
-        return TrackArrays(
+        arrays = TrackArrays(
             filled=np.zeros(self._robots, dtype=np.int64),
             stamp_ns=np.zeros(shape, dtype=np.int64),
             raw=np.zeros((*shape, 3)),
@@ -173,6 +174,9 @@ class OdometryTracks:
             stands=self._stands,
             walk=self._walk,
         )
+        for name in _ROWS:  # so that the system finds the memory now, and not when data are there
+            getattr(arrays, name).fill(0)
+        return arrays
 
     def _grow(self) -> None:
         old = self.arrays

@@ -45,6 +45,11 @@ class DenseFilter:
         self.covariance[:, columns] = 0.0
         self.covariance[columns[:, None], columns[None, :]] = covariance
 
+    def place_bodies(self, bodies: IntArray, covariances: FloatArray) -> None:
+        """Likewise the columns of bodies (k,), each with a covariance (k, 3, 3) of its own."""
+        for body, covariance in zip(bodies.tolist(), covariances, strict=True):
+            self.place(3 * body + np.arange(3), covariance)
+
     def add(self, columns: IntArray, covariance: FloatArray) -> None:
         """Add a covariance (k, k) to that of columns (k,): their errors are larger than was known."""
         self.covariance[columns[:, None], columns[None, :]] += covariance

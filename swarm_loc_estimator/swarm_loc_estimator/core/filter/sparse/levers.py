@@ -46,10 +46,11 @@ def carried(places: FloatArray, covariances: FloatArray) -> FloatArray:
     return out
 
 
-def centre(covariance: FloatArray) -> FloatArray:
-    """The place (2,) about which an error of covariance (3, 3) turns without moving, on average."""
-    place: FloatArray = np.array([-covariance[1, 2], covariance[0, 2]]) / covariance[2, 2]
-    return place
+def centres(covariances: FloatArray) -> FloatArray:
+    """The places (n, 2) about which errors of covariances (n, 3, 3) turn without moving, on average."""
+    across = np.column_stack([-covariances[:, 1, 2], covariances[:, 0, 2]])
+    places: FloatArray = across / covariances[:, 2, 2, None]
+    return places
 
 
 @compiled

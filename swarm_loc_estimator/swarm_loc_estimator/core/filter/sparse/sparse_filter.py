@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from swarm_loc_estimator.core.filter.sparse.factor import (
 )
 from swarm_loc_estimator.core.filter.sparse.levers import (
     carried,
-    centre,
+    centres,
     information_of,
     levers,
     summed,
@@ -83,7 +84,7 @@ class SparseFilter:
         self._ordering: _Ordering | None = None
         self._updates = 0
         self._prepared: _Prepared | None = None
-        self._room = _Room()
+        self._room = _Room(count)
 
     def copy(self) -> SparseFilter:
         """An independent copy; factors are shared, since they are never written to."""
@@ -95,16 +96,20 @@ class SparseFilter:
     def place(self, columns: IntArray, covariance: FloatArray) -> None:
         """Give a body's columns (3,) this covariance (3, 3), independent of the rest, whatever was known."""
         if columns.size:
-            body = int(columns[0]) // 3
-            self._place[body] = centre(covariance)
-            own = carried(self._place[body : body + 1], covariance[None])[0]
-            self._append(body, Derived(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), own))
-            self.marginal[body] = self._settled[body] = covariance
+            self.place_bodies(columns[:1] // 3, covariance[None])
 
-    def _append(self, body: int, derived: Derived) -> None:
-        """Let a body be a new one."""
-        self._number[body] = self._factor.pattern.front.size + len(self._new)
-        self._new += (derived,)
+    def place_bodies(self, bodies: IntArray, covariances: FloatArray) -> None:
+        """Likewise the columns of bodies (k,), each with a covariance (k, 3, 3) of its own."""
+        self._place[bodies] = centres(covariances)
+        own = carried(self._place[bodies], covariances)
+        nobody, nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+        self._append(bodies, [Derived(nobody, nothing, one) for one in own])
+        self.marginal[bodies] = self._settled[bodies] = covariances
+
+    def _append(self, bodies: IntArray, derived: Sequence[Derived]) -> None:
+        """Let bodies (k,) be new ones."""
+        self._number[bodies] = self._factor.pattern.front.size + len(self._new) + np.arange(len(derived))
+        self._new += tuple(derived)
 
     def add(self, columns: IntArray, covariance: FloatArray) -> None:
         """Add a covariance (3, 3) to that of a body's columns (3,): its error is larger than was known."""
@@ -139,16 +144,16 @@ class SparseFilter:
         alike = np.linalg.cholesky(carried(self._place[bodies], self.marginal[bodies]))
         common = np.sum(shares @ alike, axis=0)
         gain = shares.transpose(0, 2, 1).reshape(-1, 3)
-        self._append(body, Derived(self._number[bodies], gain, placed.spread))
+        self._append(columns[:1] // 3, [Derived(self._number[bodies], gain, placed.spread)])
         self.marginal[body] += carried(-self._place[[body]], (common @ common.T)[None])[0]
         self._settled[body] = self.marginal[body]
 
     def _take_in_noise(self, bodies: IntArray) -> None:
         """Take what bodies have erred by since the newest factor into their errors, so others share it."""
         added = carried(self._place[bodies], self.marginal[bodies] - self._settled[bodies])
-        for body, noise in zip(bodies.tolist(), added, strict=True):
+        for body, noise in zip(bodies[:, None], added, strict=True):
             if noise.any():
-                self._append(body, Derived(self._number[[body]], np.eye(3), noise))
+                self._append(body, [Derived(self._number[body], np.eye(3), noise)])
                 self._settled[body] = self.marginal[body]
 
     def block(self, columns: IntArray) -> FloatArray:
@@ -203,9 +208,9 @@ class SparseFilter:
         moved = places[active] - self._place[active]
         far = active[np.hypot(moved[:, 0], moved[:, 1]) > _FAR_M]
         turns = levers(places[far] - self._place[far])
-        for body, turn in zip(far.tolist(), turns, strict=True):
-            self._append(body, Derived(self._number[[body]], turn.T.copy(), np.zeros((3, 3))))
-            self._place[body] = places[body]
+        for body, turn in zip(far[:, None], turns, strict=True):
+            self._append(body, [Derived(self._number[body], turn.T.copy(), np.zeros((3, 3)))])
+        self._place[far] = places[far]
 
     def _pattern(self, pairs: IntArray, active: IntArray, places: FloatArray) -> Pattern:
         """A pattern in which all these pairs (k, 2) lie, in the order in use or a new one."""
@@ -269,14 +274,20 @@ class SparseFilter:
 
 
 class _Room:
-    """Where covariances are written between two factors, for a filter and all its copies."""
+    """Where covariances are written between two factors, for a filter and all its copies.
 
-    def __init__(self) -> None:
+    Args:
+        bodies: How many there are at first.
+    """
+
+    def __init__(self, bodies: int) -> None:
         self._blocks: FloatArray = np.zeros((0, 0, 3, 3))
+        self.of(bodies)
 
     def of(self, bodies: int) -> FloatArray:
         """Room for so many bodies (n, n, 3, 3); what stands there is not to be relied on."""
         if len(self._blocks) < bodies:
             size = bodies + bodies // 8
             self._blocks = np.zeros((size, size, 3, 3))
+            self._blocks.fill(0.0)  # so that the system finds the memory now, and not when data are there
         return self._blocks
