@@ -112,7 +112,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         self._estimate: SwarmEstimate | None = None
         self._jumps = 0
         self._pace = FusionPace(self.chosen.fusion_load, self.chosen.settings.horizon_s)
-        self._shedding = Shedding(self.chosen.fusion_load)
+        self._shedding = Shedding(self.chosen.fusion_load, self.chosen.settings.horizon_s)
         self._thinning = self._create_thinning()
         self._cost = TickCost()
         self._diagnostics = self._create_diagnostics()
@@ -180,15 +180,10 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         begin_s = time.perf_counter()
         if not self._time_ns():
             return
-        self._shedding.begin_tick(begin_s)
+        self._shedding.begin_tick(begin_s, self._pace.waited_s(self._time_ns()))
         self._receive(partial(newest_time_ns, self))
         now_ns = self._time_ns()
-        fuse = self._pace.is_due(begin_s, now_ns)  # large swarms: in between odometry leads on
-        begin_cpu_s, begin_fusing_s = time.thread_time(), time.perf_counter()
-        self._estimate = self._estimator.tick(now_ns, fuse=fuse)
-        fusing_s = time.perf_counter() - begin_fusing_s if fuse else 0.0
-        if fuse:
-            self._pace.note(begin_s, now_ns, time.thread_time() - begin_cpu_s)
+        self._estimate, fusing_s = self._estimate_at(now_ns, begin_s)
         self._say_time_jumps()
         self._outputs.publish(self._estimate)
         self._outputs.publish_identities(self._estimator.identities)
@@ -196,6 +191,24 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         busy_s = time.perf_counter() - begin_s
         self._cost.note(busy_s)
         self._shedding.note(busy_s, fusing_s)
+
+    def _estimate_at(self, now_ns: int, begin_s: float) -> tuple[SwarmEstimate, float]:
+        """Fuse what there is time for; the poses at an instant, and how long fusing took [s].
+
+        Fusing a large swarm takes longer than a tick: it is spread over several, and rests then. Meanwhile
+        odometry leads on.
+        """
+        is_due = not self._estimator.is_fusing and self._pace.is_due(begin_s, now_ns)
+        if is_due:
+            self._pace.begin(begin_s, now_ns)
+            self._shedding.begin_fusion()
+        begin_cpu_s, begin_fusing_s = time.thread_time(), time.perf_counter()
+        fuse, end_cpu_s = is_due or self._estimator.is_fusing, begin_cpu_s + self.chosen.tick_period_s
+        estimate = self._estimator.tick(now_ns, fuse=fuse, go_on=lambda: time.thread_time() < end_cpu_s)
+        if not fuse:
+            return estimate, 0.0
+        self._pace.note(time.thread_time() - begin_cpu_s)
+        return estimate, time.perf_counter() - begin_fusing_s
 
     def _time_ns(self) -> int:
         return int(self.get_clock().now().nanoseconds)

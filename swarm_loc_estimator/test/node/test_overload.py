@@ -15,6 +15,7 @@ from nav_msgs.msg import Odometry
 from node_world import TRUE_POSES, Ros, detection_bytes, odometry_bytes, overrides, sight
 
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.core.estimation.timeline import GoOn
 from swarm_loc_estimator.core.inputs.messages import RawInputs
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 from swarm_loc_msgs.msg import MarkerDetectionArray, SwarmPose, SwarmPoses
@@ -41,12 +42,12 @@ class SlowEstimator(SwarmEstimator):
         self.odometry += messages.odometry.robot.size
         super().receive(messages)
 
-    def tick(self, now_ns: int, *, fuse: bool = True) -> SwarmEstimate:
+    def tick(self, now_ns: int, *, fuse: bool = True, go_on: GoOn = lambda: True) -> SwarmEstimate:
         """Fuse slowly."""
         if fuse:
             time.sleep(self.cost_s * self._waiting)
             self._waiting = 0
-        return super().tick(now_ns, fuse=fuse)
+        return super().tick(now_ns, fuse=fuse, go_on=go_on)
 
 
 @contextmanager

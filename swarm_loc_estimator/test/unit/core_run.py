@@ -9,6 +9,7 @@ from core_world import World
 
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
 from swarm_loc_estimator.core.estimation.fusion import Verdict
+from swarm_loc_estimator.core.estimation.timeline import GoOn
 
 
 def play(
@@ -16,6 +17,7 @@ def play(
     events: Iterable[tuple[int, Event]],
     ticks_ns: Iterable[int],
     resting_ns: Container[int] = (),
+    go_on: GoOn = lambda: True,
 ) -> list[SwarmEstimate]:
     """Hand in events (arrival, event) as they arrive, and tick, not fusing at some; return all estimates."""
     waiting = sorted(events, key=lambda pair: pair[0])
@@ -26,7 +28,7 @@ def play(
             k += 1
         if k > begin:
             give(estimator, waiting[begin:k])
-        estimates.append(estimator.tick(now_ns, fuse=now_ns not in resting_ns))
+        estimates.append(estimator.tick(now_ns, fuse=now_ns not in resting_ns, go_on=go_on))
     return estimates
 
 

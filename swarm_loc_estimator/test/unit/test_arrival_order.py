@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.estimation import fusion
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate, SwarmEstimator
 
 Arrival = tuple[int, Event]
 EXACT = EstimatorSettings(fusion_period_s=0.0)
@@ -142,6 +142,53 @@ def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
             outcome(world, orderly, ticks(T0, end_ns, 0.25), chosen),
             outcome(world, arrivals, wild, chosen, resting),
         )
+
+
+@settings(max_examples=15)
+@given(
+    seed=st.integers(0, 10**6),
+    start_known=st.sampled_from([(True,), (False,), (True, False)]),
+    fusion_period_s=st.sampled_from([0.0, 0.2, 0.5]),
+    late_s=st.sampled_from([0.3, 1.0]),
+    part=st.sampled_from([0.0, 0.5, 0.8]),
+    sparse=st.booleans(),
+)
+def test_fusing_a_few_steps_at_each_tick_gives_the_same(
+    seed: int, start_known: Sequence[bool], fusion_period_s: float, late_s: float, part: float, sparse: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    world = simulate(Plan(4, 3.5, 0.2, start_known=start_known, outliers=0.1, flips=0.1), seed)
+    # so long a horizon that nothing is too old, however long it waits
+    chosen = EstimatorSettings(
+        fusion_period_s=fusion_period_s, sparse_from=2 if sparse else 250, horizon_s=20.0, lost_after=2
+    )
+    arrivals = [(event.stamp_ns + int(rng.uniform(0, late_s) * SECOND), event) for event in world.events]
+    at_ns = ticks(T0, T0 + 6 * SECOND, 0.09)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fusion, "_MANY", 5)
+        in_parts = SwarmEstimator(world.swarm, chosen)
+        estimates = play(in_parts, arrivals, at_ns, go_on=lambda: bool(rng.uniform() < part))
+        assert all(np.isfinite(one.poses[one.status != Status.WAITING]).all() for one in estimates)
+        for _ in range(2):  # what was begun, then what has come since
+            last = in_parts.tick(at_ns[-1])
+        assert not in_parts.is_fusing
+        assert_same(outcome(world, arrivals, at_ns, chosen), Outcome(in_parts, last))
+
+
+def test_poses_are_given_while_fusing_takes_several_ticks() -> None:
+    """By what was known before it began: never by less."""
+    world = small()
+    estimator = SwarmEstimator(world.swarm, replace(EXACT, fusion_period_s=0.2))
+    play(estimator, delayed(driving(world, 1.0), lambda _: 0.0), ticks(T0, T0 + SECOND))
+    late = [sighting(world, t, 0.1 * t) for t in (0.31, 0.51, 0.71, 0.91)]
+    arrivals = [(T0 + SECOND + 1, event) for event in late]
+    before = estimator.tick(T0 + SECOND).covariances
+    (estimate,), ticked = play(estimator, arrivals, [T0 + SECOND + 1], go_on=lambda: False), 1
+    while estimator.is_fusing:
+        np.testing.assert_allclose(estimate.covariances, before, rtol=1e-6)
+        estimate, ticked = estimator.tick(T0 + SECOND + 1, go_on=lambda: False), ticked + 1
+    assert ticked > 2
+    assert np.trace(estimate.covariances[0, :2, :2]) < 0.999 * np.trace(before[0, :2, :2])
 
 
 def small(robots: int = 1) -> World:

@@ -18,7 +18,8 @@ def _fusions(pace: FusionPace, cpu_s: float, ticks: int, rate: float = 1.0) -> l
         wall_s = tick * TICK_NS * 1e-9 / rate
         if pace.is_due(wall_s, now_ns):
             chosen.append(tick)
-            pace.note(wall_s, now_ns, cpu_s)
+            pace.begin(wall_s, now_ns)
+            pace.note(cpu_s)
     return chosen
 
 
@@ -34,6 +35,24 @@ def test_data_wait_for_a_quarter_of_the_horizon_at_most(rate: float) -> None:
 
 def test_time_that_jumps_back_is_not_waited_for() -> None:
     pace = FusionPace(0.1, 2.0)
-    pace.note(0.0, T0_NS, 1.0)
+    pace.begin(0.0, T0_NS)
+    pace.note(1.0)
     assert not pace.is_due(0.05, T0_NS + TICK_NS)
     assert pace.is_due(0.05, T0_NS - TICK_NS)
+
+
+def test_fusing_in_parts_rests_as_if_it_were_done_at_once() -> None:
+    pace = FusionPace(0.1, 2.0)
+    pace.begin(0.0, T0_NS)
+    for _ in range(4):
+        pace.note(0.005)
+    assert not pace.is_due(0.19, T0_NS + TICK_NS)
+    assert pace.is_due(0.21, T0_NS + TICK_NS)
+
+
+def test_it_tells_how_long_data_have_waited() -> None:
+    pace = FusionPace(0.1, 2.0)
+    assert pace.waited_s(T0_NS) == 0.0
+    pace.begin(0.0, T0_NS)
+    assert pace.waited_s(T0_NS + 4 * TICK_NS) == pytest.approx(0.2)
+    assert pace.waited_s(T0_NS - TICK_NS) == 0.0

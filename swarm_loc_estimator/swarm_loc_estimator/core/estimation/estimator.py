@@ -13,7 +13,7 @@ from swarm_loc_estimator.core.estimation.contradictions import Contradiction, co
 from swarm_loc_estimator.core.estimation.estimate import Status, SwarmEstimate, estimate_at
 from swarm_loc_estimator.core.estimation.fusion import Fusion, Verdict
 from swarm_loc_estimator.core.estimation.self_calibration import learned, learns
-from swarm_loc_estimator.core.estimation.timeline import Timeline
+from swarm_loc_estimator.core.estimation.timeline import GoOn, Timeline
 from swarm_loc_estimator.core.filter.belief import NEVER_NS
 from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.core.identification.memory import Identities, Outcome
@@ -174,15 +174,24 @@ class SwarmEstimator:
         """The swarm with cameras, odometry and landmarks as they are now estimated."""
         return learned(self.swarm, self._timeline.state)
 
-    def tick(self, now_ns: int, *, fuse: bool = True) -> SwarmEstimate:
-        """Use all that has arrived and give the poses at `now_ns`; measurements wait unless `fuse`."""
+    @property
+    def is_fusing(self) -> bool:
+        """Whether some of what the last `tick` began to fuse was left to the next ones."""
+        return self._timeline.is_under_way
+
+    def tick(self, now_ns: int, *, fuse: bool = True, go_on: GoOn = lambda: True) -> SwarmEstimate:
+        """Use all that has arrived and give the poses at `now_ns`; measurements wait unless `fuse`.
+
+        Fusing stops where `go_on` says that there is no time for another step, and goes on at the next tick;
+        until it is done, odometry leads on from what was known before it began.
+        """
         newest_ns = self._check_clock(now_ns)
         oldest_ns = newest_ns - self._horizon_ns
         self._tracks.trim(oldest_ns, oldest_ns - 2 * self._reach_ns)
         if self._odometry:
             self._use_odometry()
         if fuse:
-            self._timeline.advance(newest_ns)
+            self._timeline.advance(newest_ns, go_on)
             self._brightness.forget_before(oldest_ns)
         return self._estimate(now_ns)
 

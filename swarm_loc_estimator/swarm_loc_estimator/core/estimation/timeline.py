@@ -23,6 +23,8 @@ from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.jit import compiled
 
 Step = Callable[[SwarmState, MeasurementArray, NDArray[np.uint8], FloatArray], None]
+GoOn = Callable[[], bool]
+"""Whether there is time for another step."""
 
 _CHECKPOINTS = 40
 _FORGOTTEN_AT_ONCE = 4
@@ -48,6 +50,10 @@ class Timeline:
         state: Where to begin.
         reach_ns: How far before its stamp late odometry may change what measurements meant, and they may
             count; they are kept so much longer than the horizon.
+
+    Attributes:
+        state: The newest of which all is computed.
+        is_under_way: Whether steps are left to compute of what the last `advance` began.
     """
 
     def __init__(self, settings: EstimatorSettings, step: Step, state: SwarmState, reach_ns: int) -> None:
@@ -61,7 +67,8 @@ class Timeline:
 
     def restart(self, state: SwarmState) -> None:
         """Drop all measurements and go on from `state`."""
-        self.state = state
+        self.state = self._ahead = state
+        self.is_under_way = False
         self._head_key = _BEFORE_ALL
         self._joined_key: int | None = None
         self._checkpoints = [_Checkpoint(_BEFORE_ALL, state.copy())]
@@ -120,16 +127,24 @@ class Timeline:
         """How many measurements got each verdict since the start (len(Verdict),)."""
         return self.settled + np.bincount(self.verdicts, minlength=len(Verdict))
 
-    def advance(self, now_ns: int) -> None:
-        """Compute all steps that new or changed data touch, and let go of what lies beyond the horizon."""
-        if self._new:
-            self._merge(now_ns - self._horizon_ns)
-        if self._withdrawn:
-            self._remove(now_ns - self._horizon_ns)
-        if self._redo_from_ns is not None:
-            self._compute_from(self._key(self._redo_from_ns))
-            self._redo_from_ns = None
-        self._forget_before(self._key(now_ns - self._kept_ns))
+    def advance(self, now_ns: int, go_on: GoOn = lambda: True) -> None:
+        """Compute all steps that new or changed data touch, and let go of what lies beyond the horizon.
+
+        Where `go_on` says after a step that there is no time for another one, the rest is left to the next
+        calls, and what has come since waits until that is done.
+        """
+        if not self.is_under_way:
+            if self._new:
+                self._merge(now_ns - self._horizon_ns)
+            if self._withdrawn:
+                self._remove(now_ns - self._horizon_ns)
+            if self._redo_from_ns is not None:
+                self._go_back(self._key(self._redo_from_ns))
+                self._redo_from_ns = None
+        self.is_under_way = not self._compute(go_on)
+        if not self.is_under_way:
+            self.state = self._ahead
+            self._forget_before(self._key(now_ns - self._kept_ns))
 
     def _key(self, stamp_ns: int) -> int:
         """The step that a stamp belongs to, as the stamp at which the step begins."""
@@ -178,8 +193,8 @@ class Timeline:
             rows["stamp_ns"] = np.where(rows["kind"] == Kind.ANONYMOUS, stamp_ns, nearest_ns)
         return rows
 
-    def _compute_from(self, key: int) -> None:
-        """Go back to before step `key`, if it is not ahead, and do all steps that are due.
+    def _go_back(self, key: int) -> None:
+        """Go back to before step `key`, if it is not ahead.
 
         What little has come of the newest period is fused with the one before, until there is more: nearly as
         good, and two thirds of the work.
@@ -190,18 +205,24 @@ class Timeline:
             while self._checkpoints[-1].key >= key:
                 self._checkpoints.pop()
             self._head_key = self._checkpoints[-1].key
-            self.state = self._checkpoints[-1].state.copy()
+            self._ahead = self._checkpoints[-1].state.copy()
+
+    def _compute(self, go_on: GoOn) -> bool:
+        """Do the steps that are due, as long as there is time; whether all are done."""
         buffer, begin = self._buffer, self._count_until(self._head_key)
         while begin < len(buffer):
             is_joined = self._key(int(buffer.stamp_ns[begin])) == self._joined_key
             end = len(buffer) if is_joined else self._end_of_steps(begin)
             rows = slice(begin, end)
-            self._step(self.state, buffer.measurements[rows], buffer.verdicts[rows], buffer.nis[rows])
+            self._step(self._ahead, buffer.measurements[rows], buffer.verdicts[rows], buffer.nis[rows])
             self._head_key = self._key(int(buffer.stamp_ns[end - 1]))
             spaced = self._head_key - max(self._checkpoints[-1].key, -(2**62)) >= self._spacing_ns
             if spaced and not is_joined:
-                self._checkpoints.append(_Checkpoint(self._head_key, self.state.copy()))
+                self._checkpoints.append(_Checkpoint(self._head_key, self._ahead.copy()))
             begin = end
+            if begin < len(buffer) and not go_on():
+                return False
+        return True
 
     def _end_of_steps(self, begin: int) -> int:
         """Where those steps end that are computed together with the one at `begin`, up to a checkpoint."""

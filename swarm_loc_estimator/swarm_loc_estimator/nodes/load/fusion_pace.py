@@ -31,7 +31,14 @@ class FusionPace:
             return True
         return not 0 <= now_ns - self._fused_ns < self._longest_ns
 
-    def note(self, wall_s: float, now_ns: int, cpu_s: float) -> None:
-        """Fusing began at these times and took so much of a core [s]."""
-        self._rested_s = wall_s + cpu_s / self._load
-        self._fused_ns = now_ns
+    def waited_s(self, now_ns: int) -> float:
+        """How long data have waited at most since fusing began last [s]."""
+        return 0.0 if self._fused_ns is None else max(0, now_ns - self._fused_ns) * 1e-9
+
+    def begin(self, wall_s: float, now_ns: int) -> None:
+        """Fusing begins at these times."""
+        self._rested_s, self._fused_ns = wall_s, now_ns
+
+    def note(self, cpu_s: float) -> None:
+        """It took so much of a core [s], all of it or a part."""
+        self._rested_s += cpu_s / self._load
