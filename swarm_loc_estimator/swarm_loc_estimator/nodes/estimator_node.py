@@ -57,7 +57,7 @@ from swarm_loc_estimator.nodes.set_pose import NO_CLOCK, PoseCommands
 from swarm_loc_estimator.nodes.warm_up import WARM_UP, warm_up
 from swarm_loc_estimator.numerics.jit import is_warm
 from swarm_loc_estimator.ros.newest_time import newest_time_ns
-from swarm_loc_estimator.ros.running import ConfiguredNode, Stop, run_node
+from swarm_loc_estimator.ros.running import ConfiguredNode, run_node
 from swarm_loc_estimator.ros.static_transforms import StaticTransforms
 from swarm_loc_estimator.ros.ticks import Ticks
 from swarm_loc_estimator.ros.topic_graph import TopicGraph
@@ -134,11 +134,6 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         frame = self.chosen.map_frame
         PoseCommands(self, self._swarm, self._estimator, frame, by_topics=not shared)
         self._start_timers()
-
-    def run(self, stop: Stop) -> int:
-        """Estimate until asked to stop, and be gone soon after, however many topics there are to give up."""
-        stop.leave_at_once()
-        return super().run(stop)
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
@@ -336,4 +331,5 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         return response
 
 
-main = partial(run_node, "estimator_node", EstimatorNode)
+main = partial(run_node, "estimator_node", EstimatorNode, leaves_at_once=True)
+"""However many topics there are to give up, also before all are there."""

@@ -58,8 +58,6 @@ class Stop:
         Only for a node with nothing to finish: no robot to stop, no file to close.
         """
         self._leaves_at_once = True
-        if self.requested:
-            _leave_soon()
 
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
         if self._leaves_at_once and not self.requested:
@@ -105,18 +103,21 @@ class ConfiguredNode(Node, Generic[Parameters]):
         return spin(self, stop)
 
 
-def run_node(name: str, create: Callable[[], ConfiguredNode[Any]]) -> int:
+def run_node(name: str, create: Callable[[], ConfiguredNode[Any]], *, leaves_at_once: bool = False) -> int:
     """Create a node, let it work until SIGINT or SIGTERM, and end.
 
     Args:
         name: Name of the executable, for errors.
         create: Makes the node once ROS is up.
+        leaves_at_once: Whether the process ends soon after a signal whatever it does, see `Stop`.
 
     Returns:
         The exit status: that of the node's `run`, 0 when stopped before, 1 after a mistake of the user.
     """
     node: ConfiguredNode[Any] | None = None
     stop = Stop()
+    if leaves_at_once:
+        stop.leave_at_once()
     try:
         _start_ros()
         node = create()
@@ -126,6 +127,8 @@ def run_node(name: str, create: Callable[[], ConfiguredNode[Any]]) -> int:
         print(f"{name}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
+        if leaves_at_once:
+            _leave()  # giving up what there is of the node would hold everything else up, the timer, too
         return 0
     finally:
         stop.defer()

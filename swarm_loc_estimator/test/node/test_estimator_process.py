@@ -114,6 +114,19 @@ def test_a_signal_ends_the_node_cleanly(
         assert program.output.count(sign) == 1
 
 
+def test_a_signal_ends_the_node_also_while_it_starts(ros: Ros, tmp_path: Path) -> None:
+    """Thousands of subscriptions take seconds to make, and would take many more to give up one by one."""
+    path = tmp_path / "swarm.yaml"
+    model = "odometry: {wheel_separation: 0.053, wheel_noise: 0.00002}"
+    robots = "\n".join(f"  robot{number}: {{{model}}}" for number in range(1000))
+    path.write_text(f"fileversion: 1\nrobots:\n{robots}\n", encoding="utf-8")
+    with _program(tmp_path, swarm_file=path) as program:
+        ros.until(lambda: ros.tester.count_subscribers("robot990/odom") > 0)
+        assert "ready" not in program.output
+        assert program.seconds_to_end(signal.SIGINT) < 3.0
+        assert "Traceback" not in program.output
+
+
 def test_an_estimator_that_was_killed_finds_all_robots_again(
     ros: Ros, tmp_path: Path, swarm_file: Path
 ) -> None:

@@ -54,11 +54,12 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
                 f" which lasts {1e-9 * (last_ns - first_ns):g} s."
             )
         self._publisher_of: dict[str, Publisher] = {}
-        for topic in self._chosen_topics():
-            self._add_publisher(topic)
+        # first of all: others learn of publishers in this order, and of thousands the last one after long
         self._clock_publisher = (
             self.create_publisher(ClockMessage, "/clock", RELIABLE) if self.chosen.clock else None
         )
+        for topic in self._chosen_topics():
+            self._add_publisher(topic)
         self._own_executor = EventsExecutor()
         self._own_executor.add_node(self)
         self.so_far = PlayedSoFar()
