@@ -10,7 +10,7 @@ and with G^T T G of a: y is eliminated with T G on the right-hand side, and a is
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import blas
+from scipy.linalg import blas, lapack
 
 from swarm_loc_estimator.core.filter.sparse.factor import Derived, Factor, solve
 from swarm_loc_estimator.core.filter.sparse.levers import Information
@@ -20,6 +20,7 @@ from swarm_loc_estimator.numerics.jit import compiled, compiled_sums
 
 _COPY_SPREAD = np.diag(np.square([3e-5, 3e-5, 3e-4]))
 """What keeps a copy apart from the body [m^2], [m^2], [rad^2]."""
+_PANELS = 4
 
 
 def with_derived(shares: FloatArray, derived: tuple[Derived, ...]) -> FloatArray:
@@ -46,7 +47,7 @@ def renewed(factor: Factor, shares: FloatArray, copied: IntArray) -> FloatArray:
     before = shares.reshape(3 * count, -1)
     across += before @ before[columns].T
     covariance = across[columns] + np.kron(np.eye(copied.size), _COPY_SPREAD)
-    _whiten(across, 0.5 * (covariance + covariance.T))
+    _whiten(across, covariance)
     return across.reshape(count, 3, size)
 
 
@@ -67,20 +68,29 @@ def updated(factor: Factor, shares: FloatArray, measured: Information) -> tuple[
     solve(factor, right)
     after, correction = before - right[:, :size], right[:, size]
     if size:
-        information = weighted.T @ after
-        pull = _whiten(after, np.eye(size) + 0.5 * (information + information.T), after.T @ gradient)
-        correction = correction + after @ pull
+        _whiten(after, np.eye(size) + _lower_product(weighted, after))
+        correction = correction + after @ (after.T @ gradient)
     return after.reshape(count, 3, size), correction.reshape(count, 3)
 
 
-def _whiten(columns: FloatArray, matrix: FloatArray, right: FloatArray | None = None) -> FloatArray:
-    """Multiply columns (n, k) by K^-T, in place, where K K^T is a matrix (k, k); return K^-1 r for r (k,)."""
-    root = np.asfortranarray(np.linalg.cholesky(matrix))
-    blas.dtrsm(1.0, root, columns.T, lower=1, overwrite_b=1)
-    if right is None:
-        return np.zeros(0)
-    solved: FloatArray = blas.dtrsv(root, right, lower=1)
-    return solved
+def _lower_product(left: FloatArray, right: FloatArray) -> FloatArray:
+    """The lower triangle of left^T right for columns (n, k), in panels: some of the rest is not computed."""
+    size = left.shape[1]
+    out = np.zeros((size, size))
+    for panel in np.array_split(np.arange(size), min(_PANELS, size)):
+        begin, end = panel[0], panel[-1] + 1
+        np.matmul(left[:, begin:].T, right[:, begin:end], out=out[begin:, begin:end])
+    return out
+
+
+def _whiten(columns: FloatArray, matrix: FloatArray) -> None:
+    """Multiply columns (n, k) by K^-T, in place, where K K^T is a matrix (k, k) by its lower triangle.
+
+    By the inverse of K: a product takes half of the time that solving with so many columns does.
+    """
+    if matrix.size:
+        inverse, _ = lapack.dtrtri(np.asfortranarray(np.linalg.cholesky(matrix)), lower=1, overwrite_c=1)
+        blas.dtrmm(1.0, inverse, columns.T, lower=1, overwrite_b=1)
 
 
 @compiled

@@ -36,6 +36,8 @@ _COPIED_AGAIN = 25
 _ORDERED_AGAIN = 3
 _GROWN = 1.2
 """An order is replaced after so many updates, or when its largest front has grown so much."""
+_NEAR_AGAIN = 9
+"""After so many updates it is found out again who is near whom."""
 _PAIRS_KEPT = 3
 """Pairs of so many updates count as neighbours."""
 _FAR_M = 20.0
@@ -43,12 +45,21 @@ _FAR_M = 20.0
 
 
 class _Ordering(NamedTuple):
-    """An order of elimination in use: its pairs of near bodies, since how many updates, its first width."""
+    """An order of elimination in use.
+
+    Attributes:
+        order: Of all bodies that are active.
+        updates: For how many it has been used.
+        width: Of its largest front at first.
+        near: (k, 2) pairs of bodies that are near each other.
+        near_updates: For how many updates these have been used.
+    """
 
     order: Order
-    near: IntArray
     updates: int
     width: int
+    near: IntArray
+    near_updates: int
 
 
 class _Prepared(NamedTuple):
@@ -198,8 +209,12 @@ class SparseFilter:
         numbers = self._number[active]
         added = carried(self._place[active], self.marginal[active] - self._settled[active])
         covariance[numbers, numbers] += added
-        by_body = np.zeros((self._number.size, 3, shares.shape[2]))
-        by_body[active] = shares[numbers]
+        by_body = shares
+        if not np.array_equal(
+            numbers, np.arange(self._number.size)
+        ):  # not all are there, as they were before
+            by_body = np.zeros((self._number.size, 3, shares.shape[2]))
+            by_body[active] = shares[numbers]
         self._prepared = _Prepared(pattern, Prior(covariance, self._number), by_body, active)
         return self._prepared
 
@@ -215,23 +230,27 @@ class SparseFilter:
     def _pattern(self, pairs: IntArray, active: IntArray, places: FloatArray) -> Pattern:
         """A pattern in which all these pairs (k, 2) lie, in the order in use or a new one."""
         count, ordering = self._number.size, self._ordering
+        if ordering is not None and not np.array_equal(np.sort(ordering.order.body), active):
+            ordering = None  # who is there has changed
         here = np.zeros(count, dtype=bool)
         here[active] = True
         self._pairs = (*self._pairs[1 - _PAIRS_KEPT :], pairs)
         recent = np.concatenate(self._pairs)
         recent = recent[here[recent].all(axis=1)]
-        is_recent = ordering is not None and ordering.updates < _ORDERED_AGAIN
-        if ordering is not None and is_recent and np.array_equal(np.sort(ordering.order.body), active):
-            graph = adjacency(count, np.concatenate([recent, ordering.near]))
+        if ordering is None or ordering.near_updates >= _NEAR_AGAIN:
+            near, near_updates = active[near_pairs(places[active])], 1
+        else:
+            near, near_updates = ordering.near, ordering.near_updates + 1
+        graph = adjacency(count, np.concatenate([recent, near]))
+        if ordering is not None and ordering.updates < _ORDERED_AGAIN:
             pattern = pattern_of(ordering.order, graph)
             if pattern.width <= _GROWN * ordering.width:
-                self._ordering = ordering._replace(updates=ordering.updates + 1)
+                used = ordering.updates + 1
+                self._ordering = ordering._replace(updates=used, near=near, near_updates=near_updates)
                 return pattern
-        near = active[near_pairs(places[active])]
-        graph = adjacency(count, np.concatenate([recent, near]))
         order = dissect(active, places, graph)
         pattern = pattern_of(order, graph)
-        self._ordering = _Ordering(order, near, 1, pattern.width)
+        self._ordering = _Ordering(order, 1, pattern.width, near, near_updates)
         return pattern
 
     def update(
