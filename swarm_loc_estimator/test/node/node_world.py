@@ -155,11 +155,12 @@ class Ros:
             self.executor.spin_once(timeout_sec=0.02)
 
     def close(self) -> None:
-        """End all nodes."""
+        """End all nodes, once the executor has let go of them: it crashes with the events of what is gone."""
         for node in self.nodes:
             self.executor.remove_node(node)
-            node.destroy_node()
         self.executor.shutdown()
+        for node in self.nodes:
+            node.destroy_node()
         rclpy.shutdown()
         for stranger in self._strangers:
             stranger.destroy_node()
