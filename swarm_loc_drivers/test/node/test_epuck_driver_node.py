@@ -159,8 +159,7 @@ def driver(tmp_path: Path) -> Iterator[Start]:
             program = Program(
                 "epuck_driver_node",
                 tmp_path / "log",
-                # the emulated robots wait for a processor, too
-                {**chosen, "reply_timeout_s": 10.0, **parameters},
+                {**chosen, **parameters},
                 ("-r", "__ns:=/epuck1"),
                 package="swarm_loc_drivers",
             )

@@ -183,5 +183,7 @@ class Wire:
         self.found += found
         for one in found:
             if isinstance(one, Reading):
-                state = self.odometry.update(one.stamp_ns, one.left_counter, one.right_counter)
+                state = self.odometry.update(
+                    one.stamp_ns, one.left_counter, one.right_counter, doubt_ns=one.doubt_ns
+                )
                 self.states += [state] if state is not None else []

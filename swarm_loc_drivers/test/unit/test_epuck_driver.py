@@ -11,12 +11,9 @@ from pathlib import Path
 
 import pytest
 from epuck_body import GEOMETRY
-from epuck_rig import PATIENCE_S, SQUARE, Robots
-from epuck_rig import settings as hasty_settings
+from epuck_rig import PATIENCE_S, SQUARE, Robots, settings
 
-from swarm_loc_drivers.core.epuck.session import EpuckSettings
-from swarm_loc_drivers.protocols.epuck.hardware import EPUCK1, EPUCK2, EpuckModel
-from swarm_loc_drivers.transports.link import Address
+from swarm_loc_drivers.protocols.epuck.hardware import EPUCK1, EPUCK2
 from swarm_loc_estimator.numerics import se2
 
 
@@ -24,11 +21,6 @@ from swarm_loc_estimator.numerics import se2
 def robots(tmp_path: Path) -> Iterator[Robots]:
     with ExitStack() as emulators, ExitStack() as benches:  # drivers end while their robots answer
         yield Robots(tmp_path, emulators, benches)
-
-
-def settings(address: Address, model: EpuckModel) -> EpuckSettings:
-    """A link fails when a test breaks it, and not while an emulated robot waits for a processor."""
-    return replace(hasty_settings(address, model), reply_timeout_s=10.0)
 
 
 @pytest.mark.parametrize("over", ["serial", "wifi"])
@@ -59,7 +51,8 @@ def test_a_robot_switched_off_and_on_is_found_again(robots: Robots, over: str) -
     start = robots.serial if over == "serial" else robots.wifi
     emulator = start()
     address = robots.serial_address if over == "serial" else robots.tcp_address
-    bench = robots.bench(settings(address, EPUCK2))
+    # the link fails when it is broken here, and not while an emulated robot waits for a processor
+    bench = robots.bench(replace(settings(address, EPUCK2), reply_timeout_s=10.0))
     bench.drive(SQUARE[:1])
     emulator.kill()
     bench.until(lambda: bench.driver.trouble)

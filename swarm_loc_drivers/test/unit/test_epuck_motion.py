@@ -230,6 +230,23 @@ def test_a_command_that_takes_its_time_is_no_fault(odometry: WheelOdometry, coun
     assert not counts
 
 
+@given(st.lists(st.tuples(st.floats(0.0, 0.5), st.floats(0.0, 1.0)), min_size=1, max_size=20))
+def test_a_robot_may_read_its_counters_at_any_time_between_question_and_answer(
+    exchanges: list[tuple[float, float]],
+) -> None:
+    counts: Counter[str] = Counter()
+    odometry = WheelOdometry(GEOMETRY, NOISE, counts)
+    odometry.note_rates(SECOND, 600.0, 600.0)
+    odometry.update(SECOND, 0, 0)
+    asked_ns = SECOND + SECOND // 100
+    for took_s, share in exchanges:
+        way_ns = round(0.5 * took_s * SECOND)
+        steps = as_counter(math.floor(600.0 * (1e-9 * (asked_ns - SECOND) + share * took_s)))
+        assert odometry.update(asked_ns + way_ns, steps, steps, doubt_ns=way_ns) is not None
+        asked_ns += 2 * way_ns + SECOND // 100
+    assert not counts
+
+
 def test_a_robot_that_was_switched_off_is_counted_from_anew_and_less_sure(
     odometry: WheelOdometry, counts: Counter[str]
 ) -> None:

@@ -102,7 +102,8 @@ class EpuckDriver(RobotDriver[EpuckSession]):
             else:
                 self.counts["readings"] += 1
                 self._listeners.proximity(one.stamp_ns, one.proximity)
-                state = self._odometry.update(one.stamp_ns, one.left_counter, one.right_counter)
+                counters = one.left_counter, one.right_counter
+                state = self._odometry.update(one.stamp_ns, *counters, doubt_ns=one.doubt_ns)
                 if state is not None:
                     self._listeners.odometry(state)
 

@@ -105,7 +105,8 @@ class SerialSession:
         self._told = speeds
         self._way_ns = max(0, self._now_ns - asked_ns) // 2
         left, right, proximity = protocol.decode_readings(body)
-        self.found.append(Reading(asked_ns + self._way_ns, left, right, np.array(proximity, dtype=np.int64)))
+        stamp_ns, sensors = asked_ns + self._way_ns, np.array(proximity, dtype=np.int64)
+        self.found.append(Reading(stamp_ns, self._way_ns, left, right, sensors))
         return True
 
     def _image_is_due(self, camera: CameraSettings) -> bool:

@@ -69,12 +69,14 @@ class Reading:
 
     Attributes:
         stamp_ns: Acquisition [ns].
+        doubt_ns: It may have been so much earlier or later [ns].
         left_counter: Steps of the left wheel, 16 bits, wrapping.
         right_counter: Likewise of the right wheel.
         proximity: (8,) raw values of ps0..ps7.
     """
 
     stamp_ns: int
+    doubt_ns: int
     left_counter: int
     right_counter: int
     proximity: NDArray[np.int64]

@@ -18,7 +18,8 @@ from swarm_loc_drivers.protocols.epuck.hardware import as_counter, unwrapped_dif
 Rates = tuple[float, float]
 
 _TIMING_SLACK_S = 0.15
-"""Stamps are those of the computer; the robot may have read its counters so much earlier or later."""
+"""Stamps are those of the computer; the robot may have read its counters so much earlier or later still than
+a session knows."""
 _DELAY_NS = 500_000_000
 """A command may take so long to the robot, and a reading so long from it."""
 _MIN_PERIOD_NS = 4_000_000
@@ -48,6 +49,7 @@ class WheelOdometry:
         self._counts = counts
         self._reckoning = DeadReckoning(geometry.wheel_separation, wheel_noise, geometry.metres_per_step)
         self._last: tuple[int, int, int] | None = None
+        self._last_doubt_ns = 0
         self._rates: Rates = (0.0, 0.0)
         self._held: Rates = (0.0, 0.0)  # since the last reading; through a gap the robot goes on with them
         self._told = deque([_Told(0, self._rates, self._rates)])
@@ -69,11 +71,15 @@ class WheelOdometry:
         if (told.slowest, told.fastest) != (newest.slowest, newest.fastest):
             self._told.append(told)
 
-    def update(self, stamp_ns: int, left: int, right: int) -> OdometryState | None:
-        """Take counters of 16 bits; the state, or None when they tell nothing new or cannot be true."""
+    def update(self, stamp_ns: int, left: int, right: int, *, doubt_ns: int = 0) -> OdometryState | None:
+        """Take counters of 16 bits, read at a time or so much earlier or later.
+
+        Returns:
+            The state, or None when they tell nothing new or cannot be true.
+        """
         right, last = as_counter(self._right_sign * right), self._last
         if last is None:
-            self._restart(stamp_ns, left, right)
+            self._restart(stamp_ns, doubt_ns, left, right)
             return self._reckoning.state(stamp_ns, 0.0, 0.0, 0.0)
         if 0 <= stamp_ns - last[0] < _MIN_PERIOD_NS:
             return None
@@ -83,7 +89,8 @@ class WheelOdometry:
         elapsed_s = 0.0 if has_jumped else (stamp_ns - last[0]) * 1e-9
         if elapsed_s > _TIMING_SLACK_S:
             self._gap_ns = self._since_ns(last[0]), stamp_ns
-        longest_s = max(elapsed_s, (stamp_ns - self._since_ns(stamp_ns)) * 1e-9) + _TIMING_SLACK_S
+        longest_s = max(elapsed_s, (stamp_ns - self._since_ns(stamp_ns)) * 1e-9)
+        longest_s += _TIMING_SLACK_S + (self._last_doubt_ns + doubt_ns) * 1e-9
         steps = self._steps(left, right, elapsed_s)
         mirrored = self._steps(left, right, elapsed_s, right_sign=-1)
         paths = 0.0, 0.0
@@ -100,7 +107,7 @@ class WheelOdometry:
             self._counts["implausible_counters"] += 1
             self._doubtful = True
             return None
-        self._restart(stamp_ns, left, right)
+        self._restart(stamp_ns, doubt_ns, left, right)
         return self._reckoning.state(stamp_ns, *paths, elapsed_s)
 
     def _steps(self, left: int, right: int, elapsed_s: float, right_sign: int = 1) -> tuple[int, int]:
@@ -112,9 +119,9 @@ class WheelOdometry:
             unwrapped_difference(right_sign * last_right, right_sign * right, expected_right),
         )
 
-    def _restart(self, stamp_ns: int, left: int, right: int) -> None:
+    def _restart(self, stamp_ns: int, doubt_ns: int, left: int, right: int) -> None:
         """Count from here."""
-        self._last = (stamp_ns, left, right)
+        self._last, self._last_doubt_ns = (stamp_ns, left, right), doubt_ns
         self._held = self._rates
         first_ns, last_ns = self._since_ns(stamp_ns) - _DELAY_NS, stamp_ns + _DELAY_NS
         while len(self._told) > 1 and not first_ns < self._told[1].since_ns <= last_ns:

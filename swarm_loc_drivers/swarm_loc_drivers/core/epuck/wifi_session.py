@@ -109,7 +109,7 @@ class WifiSession:
             if self._is_due(stamp_ns):
                 values = message.sensors
                 left, right = int(values["left_counter"]), int(values["right_counter"])
-                self.found.append(Reading(stamp_ns, left, right, values["proximity"].astype(np.int64)))
+                self.found.append(Reading(stamp_ns, 0, left, right, values["proximity"].astype(np.int64)))
         if protocol.IMAGE_ID in newest:
             stamp_ns, message = newest[protocol.IMAGE_ID]
             pixels = decode_rgb565(message.payload, protocol.WIDTH, protocol.HEIGHT)
