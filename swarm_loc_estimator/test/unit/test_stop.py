@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -43,6 +45,13 @@ def test_a_process_that_is_busy_ends_within_two_seconds_of_a_signal() -> None:
     with subprocess.Popen([sys.executable, "-c", _BUSY], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "signalled\n"
-        begin_s = time.monotonic()
-        assert process.wait(60.0) == 0
-        assert time.monotonic() - begin_s < 2.0
+        begin_s, begin_waited_s = time.monotonic(), waited_s(process.pid)
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)  # its figures stay until it is reaped
+        took_s = time.monotonic() - begin_s - (waited_s(process.pid) - begin_waited_s)
+        assert process.wait() == 0
+        assert took_s < 2.0
+
+
+def waited_s(pid: int) -> float:
+    """How long a process could have run but had to wait, since others did: not its fault."""
+    return int(Path("/proc", str(pid), "schedstat").read_text(encoding="ascii").split()[1]) * 1e-9
