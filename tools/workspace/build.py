@@ -64,7 +64,7 @@ def ensure() -> None:
 
 
 def compile_estimator() -> None:
-    """Have the estimator's inner loops compiled, which its first run would otherwise spend a minute on.
+    """Have the estimator's inner loops compiled, which its first run would otherwise spend three minutes on.
 
     Raises:
         WorkspaceError: The estimator does not run.
@@ -74,7 +74,7 @@ def compile_estimator() -> None:
     stamp = Stamp(STATE / "stamps" / "compiled")
     if stamp.read() == inputs:
         return
-    say("  compiling the estimator, about a minute")
+    say("  compiling the estimator, about three minutes")
     program = "from swarm_loc_estimator.nodes.warm_up import warm_up; warm_up()"
     status, output = run_logged([VENV_PYTHON, "-c", program], "compile.log", lambda _: None, environment())
     if status:

@@ -25,7 +25,7 @@ from swarm_loc_estimator.live.recorder import Recorder
 from swarm_loc_estimator.parameters.errors import UserError
 
 START_PATIENCE_S = 600.0
-"""An estimator that must be compiled first takes a minute, and several where others are at work, too."""
+"""An estimator that must be compiled first takes three minutes, and more where others are at work, too."""
 _ALONE = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": ""}
 _WAKE_S = 0.05
 

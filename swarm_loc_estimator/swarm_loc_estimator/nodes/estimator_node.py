@@ -104,7 +104,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         super().__init__("estimator", EstimatorParameters, **node_arguments)
         self._swarm = load_swarm(Path(self.chosen.swarm_file))
         if not is_warm(WARM_UP):
-            self.get_logger().info("compiling the estimator for this machine: about a minute")
+            self.get_logger().info("compiling the estimator for this machine: about three minutes")
         warm_up()
         self._estimator = create_estimator(self._swarm, self.chosen.settings)
         shared = self.chosen.shared_topics

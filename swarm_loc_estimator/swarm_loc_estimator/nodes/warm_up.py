@@ -42,7 +42,7 @@ _AWAY = (0.0, 0.7, 0.0, 0.7)
 
 
 def warm_up() -> None:
-    """Run small estimators through all that they do: a minute unless `is_warm`, then a second."""
+    """Run small estimators through all that they do: three minutes unless `is_warm`, then a second."""
     for fusion_period_s in (0.0, 0.1):
         _run(EstimatorSettings(fusion_period_s=fusion_period_s))
     _run(EstimatorSettings(sparse_from=2))

@@ -32,7 +32,7 @@ def assert_good(result: ReplayResult, metres: float, degrees: float, nees: tuple
 
 
 def test_twenty_droplets_are_located_by_infrared_and_byte_for_byte_the_same_again(tmp_path: Path) -> None:
-    """3.6 mm, 1.3 degrees, NEES 2.4, two of them with fixes; again for half a minute."""
+    """3.1 mm, 1.3 degrees, NEES 1.2, two of them with fixes; again for half a minute."""
     result = replayed("droplets_twenty")
     assert_good(result, 0.0045, 1.7, (1.0, 4.5))
     assert np.isfinite(result.pose[-1]).all()
@@ -59,7 +59,7 @@ def test_five_robots_that_calibrate_themselves_are_located_to_millimetres() -> N
 
 
 def test_e_pucks_are_located_by_anonymous_detections_from_above_and_byte_for_byte_the_same_again() -> None:
-    """6.5 mm and 3.1 degrees, with unknown starts and nothing else."""
+    """6.4 mm and 3.1 degrees, with unknown starts and nothing else."""
     result, again = (replayed("aerial_five") for _ in range(2))
     assert_good(result, 0.008, 4.0, (1.5, 4.0))
     assert np.isnan(result.pose[0]).all()
