@@ -30,6 +30,13 @@ _BELIEVED = 2.0
 """A reading that costs less is no outlier."""
 
 
+_STRAY = 5.0
+"""Light that the model has not is so bright on average [sigma]."""
+_STRAY_DENSITY = math.log(_STRAY / math.sqrt(2.0 * math.pi))
+_SURELY = 6.0
+"""An explanation whose cost is higher by this is out of the question."""
+
+
 class Pair(NamedTuple):
     """The readings of one pair of robots.
 
@@ -254,7 +261,10 @@ def _of_reading(
     cost, pull, weight = 0.5 * square, more * slope, slope * slope
     if limit < math.inf:
         near = cost < _BELIEVED
-        cost, pull, weight = _of_outlier(cost, pull, weight, limit)
+        if more < 0.0:
+            cost, pull, weight = _of_bright(errors, reading - expected, cost, pull, weight)
+        else:
+            cost, pull, weight = _of_outlier(cost, pull, weight, limit)
         return cost, pull, weight, near and two_sided, lasting, square
     return cost, pull, weight, True, lasting, square
 
@@ -321,6 +331,23 @@ def _of_outlier(cost: float, pull: float, weight: float, limit: float) -> tuple[
         return cost, pull, weight
     seen = math.exp((_BELIEVED - cost) / limit)
     return _BELIEVED + limit * (1.0 - seen), seen * pull, seen * weight
+
+
+@compiled
+def _of_bright(
+    errors: ReadingErrors, more: float, cost: float, pull: float, weight: float
+) -> tuple[float, float, float]:
+    """The cost of a reading that is so much brighter than expected [count], and its derivatives.
+
+    Light that the model has not is seldom strong: how bright it is has an exponential distribution.
+    """
+    per_count = 1.0 / (_STRAY * errors.noise)
+    other = errors.bright + _STRAY_DENSITY + per_count * more
+    if cost < other - _SURELY:
+        return cost, pull, weight
+    own = 1.0 / (1.0 + math.exp(cost - other))
+    total = min(cost, other) - math.log1p(math.exp(-abs(cost - other)))
+    return total, own * pull - (1.0 - own) * per_count, own * weight
 
 
 @compiled

@@ -14,18 +14,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.core.infrared.board import IrModel, IrPlatform, PairGains
-from swarm_loc_estimator.core.infrared.solution import DARKEST, IrSolutions, Outcome, checked
+from swarm_loc_estimator.core.infrared.solution import IrSolutions, Outcome, checked
+from swarm_loc_estimator.core.infrared.solvers.coarse_posterior import add_spread
 from swarm_loc_estimator.core.infrared.solvers.cost import (
     DARK,
     MEASURED,
-    MISSING,
-    SATURATED,
     Pair,
     Scratch,
     new_scratch,
-    stabilized,
     with_stray_light,
 )
+from swarm_loc_estimator.core.infrared.solvers.readings import classify, compress_readings
 from swarm_loc_estimator.core.infrared.solvers.search import pose_covariance, search
 from swarm_loc_estimator.core.infrared.solvers.start_table import (
     Float32Array,
@@ -54,12 +53,16 @@ _SUSPICIOUS = 1.3
 _FEWEST = 9
 _FAINTEST = 6.0
 """Readings must be brighter than noise by so many sigmas of the sum of their squares."""
+_FAINTEST_OF_OUTLIERS = 3.0
+"""Likewise where the probability of all poses is known besides; noise alone then gives none."""
 _EXPLAINED = 0.5
 """The share of what is read, in squares, that a pose must explain."""
 _EXPLAINED_OF_OUTLIERS = 0.2
 """Likewise where readings may be blocked or too bright."""
 _WIDEST = 1.0
-"""A bearing or heading less sure than this is open [rad]."""
+"""A bearing or heading less sure than this, by the best minimum alone, is open [rad]."""
+_WIDEST_OF_ALL = 0.9
+"""Likewise by the probability of all poses."""
 _APART = 0.1
 """Two minima farther apart than this, in bearing, heading [rad] or relative in range, are two poses."""
 _AROUND = [(b, h) for b in (-0.2, 0.0, 0.2) for h in (-0.2, 0.0, 0.2) if b or h]
@@ -194,13 +197,15 @@ def _write_prior(sigma: FloatArray, n: int, prior: FloatArray) -> bool:
 @compiled
 def _solve_one(models: Models, pair: Pair, room: _Room, out: IrSolutions, k: int) -> int:
     """One pair; returns the outcome."""
-    measured, saturated, bright = _classify(models.exact, pair)
+    measured, saturated, bright = classify(models.exact, pair)
     if measured < _FEWEST:
         return _UNDETERMINED if saturated > 0 else _TOO_FEW
-    if bright < measured + _FAINTEST * math.sqrt(2.0 * measured):
+    two_sided = models.exact.errors.bright < math.inf
+    faintest = _FAINTEST_OF_OUTLIERS if two_sided else _FAINTEST
+    if bright < measured + faintest * math.sqrt(2.0 * measured):
         return _TOO_WEAK
     _find_minima(models, pair, room, measured)
-    if models.exact.errors.bright < math.inf:
+    if two_sided:
         _weigh_minima(models.exact, pair, room)
     best, other = room.minima[0], room.minima[1]
     covariance, odds = room.covariance, math.exp(best[3] - other[3])
@@ -210,12 +215,15 @@ def _solve_one(models: Models, pair: Pair, room: _Room, out: IrSolutions, k: int
         return _MISFIT
     if not determined:
         return _UNDETERMINED
-    share = odds / (1.0 + odds)
+    share = 0.0 if two_sided else odds / (1.0 + odds)
     for p in range(3):
         for q in range(3):
             apart = _apart(best, other, p) * _apart(best, other, q) if share > 0.0 else 0.0
             covariance[p, q] = models.exact.scale * max(misfit, 1.0) * covariance[p, q] + share * apart
-    if max(covariance[1, 1], covariance[2, 2]) > models.exact.scale * _WIDEST * _WIDEST:
+    if two_sided:
+        if add_spread(models.table, room.start, best, covariance) > _WIDEST_OF_ALL**2:
+            return _UNDETERMINED
+    elif max(covariance[1, 1], covariance[2, 2]) > models.exact.scale * _WIDEST * _WIDEST:
         return _UNDETERMINED
     out.misfits[k], out.odds[k] = misfit, odds
     assign(out.systematic_share[k], room.full.of_gains)
@@ -330,7 +338,7 @@ def _list_starts(models: Models, pair: Pair, room: _Room) -> int:
     First where the soft model's search ends, then the best of the table, then others that fit there nearly as
     well. More are in `_ASIDE`, and at last those for readings of which some are blocked.
     """
-    _compress(models.exact, pair, room.pattern, room.present)
+    compress_readings(models.exact, pair, room.pattern, room.present)
     starts, found = room.starts, room.starts[1 : 1 + _TABLE_STARTS]
     outliers = math.inf if models.exact.errors.bright < math.inf else -math.inf
     count = 1 + find_starts(models.table, room.pattern, room.present, outliers, room.start, found)
@@ -355,46 +363,3 @@ def _keep(minima: FloatArray, pose: FloatArray, cost: float) -> bool:
         place = best if better else other
         place[0], place[1], place[2], place[3] = pose[0], wrap(pose[1]), wrap(pose[2]), cost
     return bool(better)
-
-
-@compiled
-def _compress(model: IrModel, pair: Pair, pattern: Float32Array, present: Float32Array) -> None:
-    """Write the readings as they would be without the elements' gains, in the form of the table."""
-    f = 0
-    for m in range(pair.readings.shape[0]):
-        for i in range(pair.sensor.size):
-            for j in range(pair.emitter.size):
-                there = pair.kinds[m, i, j] != MISSING
-                gain = pair.sensor[i] * pair.emitter[j]
-                pattern[f] = compress(model, pair.readings[m, i, j] / gain) if there else 0.0
-                present[f] = 1.0 if there else 0.0
-                f += 1
-
-
-@compiled
-def _classify(model: IrModel, pair: Pair) -> tuple[int, int, float]:
-    """Write `kinds` and `stable`; returns how many are measured, how many saturated, and how bright all are.
-
-    Returns:
-        The brightness is the sum of squares in sigmas.
-    """
-    readings, kinds = pair.readings, pair.kinds
-    measured, saturated, bright = 0, 0, 0.0
-    for m in range(readings.shape[0]):
-        for i in range(readings.shape[1]):
-            for j in range(readings.shape[2]):
-                reading = readings[m, i, j]
-                dead = math.isnan(pair.sensor[i] * pair.emitter[j])
-                if dead or not math.isfinite(reading) or reading < DARKEST * model.noise:
-                    kinds[m, i, j] = MISSING
-                    continue
-                sigmas = min(reading, pair.saturation[m]) / model.noise
-                bright += sigmas * sigmas
-                pair.stable[m, i, j] = stabilized(model.errors, min(reading, pair.saturation[m]))[0]
-                if reading >= pair.saturation[m]:
-                    kinds[m, i, j] = SATURATED
-                    saturated += 1
-                else:
-                    kinds[m, i, j] = MEASURED
-                    measured += 1
-    return measured, saturated, bright

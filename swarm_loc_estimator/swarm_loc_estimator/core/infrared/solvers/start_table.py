@@ -31,8 +31,10 @@ _SHOWN = 2.0
 
 _BLOCKED = np.float32(0.2)
 """What a blocked reading adds to the misfit at most."""
-_OUTLIER = np.float32(1.0)
-"""Likewise one that may be blocked or too bright; more than the step from one range to the next does."""
+_PER_SIGMA = np.float32(_KNEE)
+"""What one standard deviation of noise is on the table's scale, to the power of -1."""
+_DARKEST = np.float32(3.0)
+"""The cost of a reading that may be blocked, at most, where others may be too bright."""
 _BLUR = 0.1
 """By how much `blurred` softens the curves [rad]."""
 _BLUR_NOISE = 0.1
@@ -64,11 +66,13 @@ class StartRoom(NamedTuple):
         misfit: (D * D,).
         level: (D * D,) the range of each direction.
         totals: (L,).
+        costs: (D * D, L) of every pose, where readings may be too bright.
     """
 
     misfit: Float32Array
     level: NDArray[np.int64]
     totals: Float32Array
+    costs: Float32Array
 
 
 @compiled
@@ -76,7 +80,10 @@ def new_start_room(table: StartTable) -> StartRoom:
     """Room for one table."""
     directions, levels = table.totals.shape
     return StartRoom(
-        np.empty(directions, np.float32), np.empty(directions, np.int64), np.empty(levels, np.float32)
+        np.empty(directions, np.float32),
+        np.empty(directions, np.int64),
+        np.empty(levels, np.float32),
+        np.empty((directions, levels), np.float32),
     )
 
 
@@ -146,6 +153,14 @@ def find_starts(
         count += present[f]
     for d in range(room.misfit.size):
         patterns = table.patterns[d]
+        if dark == math.inf:
+            level, costs = 0, room.costs[d]
+            for k in range(costs.size):
+                costs[k] = _cost_with_outliers(patterns[k], pattern, present)
+                if costs[k] < costs[level]:
+                    level = k
+            room.level[d], room.misfit[d] = level, costs[level]
+            continue
         if dark > -math.inf:
             room.level[d], room.misfit[d] = _best_level(patterns, pattern, present, np.float32(dark))
             continue
@@ -184,12 +199,9 @@ def _best_level(
     patterns: Float32Array, pattern: Float32Array, present: Float32Array, dark: np.float32
 ) -> tuple[int, np.float32]:
     """The range of patterns (L, modes * n * n) that fits best, and how badly it does."""
-    best, least, outliers = 0, np.float32(math.inf), dark == math.inf
+    best, least = 0, np.float32(math.inf)
     for level in range(patterns.shape[0]):
-        if outliers:
-            misfit = _misfit_of_outliers(patterns[level], pattern, present)
-        else:
-            misfit = _misfit(patterns[level], pattern, present, dark)
+        misfit = _misfit(patterns[level], pattern, present, dark)
         if misfit < least:
             best, least = level, misfit
     return best, least
@@ -220,14 +232,18 @@ def _misfit(
 
 
 @compiled_sums
-def _misfit_of_outliers(
+def _cost_with_outliers(
     expected_here: Float32Array, pattern: Float32Array, present: Float32Array
 ) -> np.float32:
-    """Likewise where each may be blocked or too bright."""
+    """The negative log likelihood of readings each of which may be blocked or too bright.
+
+    How bright one is that is too bright has an exponential distribution.
+    """
     total: np.float32 = np.float32(0.0)
     for f in range(pattern.size):
-        difference = pattern[f] - expected_here[f]
-        total += present[f] * min(difference * difference, _OUTLIER)
+        z = _PER_SIGMA * (pattern[f] - expected_here[f])
+        square = np.float32(0.5) * z * z
+        total += present[f] * min(square, z if z > np.float32(0.0) else _DARKEST)
     return total
 
 

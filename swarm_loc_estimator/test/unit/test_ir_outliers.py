@@ -1,0 +1,78 @@
+"""Boards whose readings may be blocked or too bright: poses are honest, and none is read into noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ir_world import nees, pose_errors, random_poses, readings_of
+
+from swarm_loc_estimator.core.infrared.solution import Outcome
+from swarm_loc_estimator.core.infrared.solvers.cost import MEASURED, Pair, cost_of, new_scratch, stabilized
+from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+BOARD = load_ir_platform("droplet_2016")
+ESTIMATOR = MaximumLikelihood(BOARD)
+_CHI_SQUARE_99 = 11.345
+
+
+def with_faults(poses: FloatArray, seed: int) -> FloatArray:
+    """Readings (k, 1, 6, 6) of which now and then a whole emitter is dark, or one reading too bright."""
+    rng = np.random.default_rng(seed)
+    readings = readings_of(BOARD, poses, seed)
+    readings *= np.exp(BOARD.relative * rng.standard_normal(readings.shape))
+    for k in np.flatnonzero(rng.random(len(poses)) < 0.5).tolist():
+        readings[k, 0, :, rng.integers(6)] = BOARD.noise * rng.standard_normal(6)
+    bright = rng.random(readings.shape) < 0.01
+    readings[bright] += rng.exponential(5.0 * BOARD.noise, readings.shape)[bright]
+    return np.minimum(readings, BOARD.saturation)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_dark_emitters_and_light_from_elsewhere_do_not_mislead(seed: int) -> None:
+    poses = random_poses(600, seed, low=0.06, high=0.18)
+    solutions = ESTIMATOR.solve(with_faults(poses, seed))
+    found = solutions.outcomes == Outcome.FOUND
+    assert np.mean(found) > 0.85
+    errors = pose_errors(solutions.poses[found], poses[found])
+    assert np.mean(nees(errors, solutions.covariances[found]) > _CHI_SQUARE_99) < 0.03
+    assert np.all(np.median(np.abs(errors), axis=0) < [0.01, np.radians(5.0), np.radians(10.0)])
+
+
+def test_noise_alone_is_no_robot() -> None:
+    noise = BOARD.noise * np.random.default_rng(4).standard_normal((500, 1, 6, 6))
+    outcomes = ESTIMATOR.solve(noise).outcomes
+    assert np.mean(outcomes == Outcome.FOUND) < 0.01
+
+
+def test_covariances_say_of_other_poses_that_are_likely() -> None:
+    """Faint robots, of which bearing or heading is often another one."""
+    poses = random_poses(600, 5, low=0.2, high=0.3)
+    solutions = ESTIMATOR.solve(with_faults(poses, 5))
+    found = solutions.outcomes == Outcome.FOUND
+    errors = pose_errors(solutions.poses[found], poses[found])
+    assert np.mean(nees(errors, solutions.covariances[found]) > _CHI_SQUARE_99) < 0.05
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_costs_gradient_is_its_slope_also_of_outliers(seed: int) -> None:
+    pose = random_poses(1, seed, low=0.08, high=0.16)
+    readings = np.roll(with_faults(pose, seed)[0], 1, axis=1)  # most are outliers now
+    model = BOARD.model
+    stable = np.array([stabilized(model.errors, value)[0] for value in readings.flat]).reshape(1, 6, 6)
+    kinds = np.full(readings.shape, MEASURED, np.int8)
+    ones = np.ones(6)
+    pair = Pair(readings, stable, np.full(1, 1e9), kinds, ones, ones, np.zeros((2, 2)), 0.044, 1.0)
+    room = new_scratch(1, 6, False)
+
+    def cost_at(at: FloatArray) -> tuple[float, FloatArray]:
+        cost = cost_of(model, pair, at, room, room.gradients[0], room.hessians[0])
+        return cost, room.gradients[0].copy()
+
+    _, gradient = cost_at(pose[0])
+    for p in range(3):
+        step = np.zeros(3)
+        step[p] = 1e-7
+        slope = (cost_at(pose[0] + step)[0] - cost_at(pose[0] - step)[0]) / 2e-7
+        assert gradient[p] == pytest.approx(slope, rel=1e-3, abs=0.05)
