@@ -50,6 +50,21 @@ def test_any_order_gives_the_same_each_once(parts: list[list[Row]], order: rando
     np.testing.assert_array_equal(buffer.measurements["stamp_ns"], buffer.stamp_ns)
 
 
+@given(st.lists(st.lists(ROW, max_size=8), max_size=8))
+def test_what_was_computed_goes_with_its_measurement(parts: list[list[Row]]) -> None:
+    """It is read while what has come since is fused, which takes a while."""
+    buffer = MeasurementBuffer()
+    computed: dict[bytes, tuple[int, float]] = {}
+    for part in parts:
+        buffer.merge(measurements(part))
+        for k, row in enumerate(buffer.measurements):
+            verdict, nis = computed.setdefault(row.tobytes(), (0, np.nan))
+            assert buffer.verdicts[k] == verdict
+            np.testing.assert_equal(buffer.nis[k], nis)
+            buffer.verdicts[k], buffer.nis[k] = 1 + len(computed) % 3, float(len(computed))
+            computed[row.tobytes()] = int(buffer.verdicts[k]), float(buffer.nis[k])
+
+
 def test_what_was_computed_stays_with_what_lies_before_and_space_is_used_again() -> None:
     buffer = MeasurementBuffer()
     for lap in range(200):

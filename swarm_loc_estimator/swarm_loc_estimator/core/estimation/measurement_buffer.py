@@ -6,6 +6,7 @@ a stamp: these are ordered by all their numbers. What is equal to the last bit i
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,6 +38,8 @@ def _words_in_order() -> tuple[IntArray, NDArray[np.bool_]]:
 
 _ORDER, _IS_FLOAT = _words_in_order()
 _FIRST_CAPACITY = 1024
+_Columns = tuple[IntArray, IntArray, NDArray[np.uint8], FloatArray]
+"""Rows as words (n, w), their stamps (n,), verdicts and normalised innovations squared."""
 
 
 class Merged(NamedTuple):
@@ -54,7 +57,7 @@ class Merged(NamedTuple):
 class MeasurementBuffer:
     """Measurements that come and go like a queue, but may enter anywhere.
 
-    What was computed of a measurement belongs to its place until others are merged in before it.
+    What was computed of a measurement goes with it; of new ones nothing is as yet.
     """
 
     def __init__(self) -> None:
@@ -88,7 +91,8 @@ class MeasurementBuffer:
         """Sort measurements (k,) in."""
         self._make_room(new.size)
         words = np.ascontiguousarray(new).view(np.int64).reshape(-1, _WORDS)
-        count, first_ns = _merge(self._words, self._stamp_ns, self._begin, self._end, words)
+        columns = self._words, self._stamp_ns, self._verdicts, self._nis
+        count, first_ns = _merge(columns, self._begin, self._end, words)
         self._end += count
         return Merged(first_ns if count else None, new.size - count)
 
@@ -132,12 +136,13 @@ class MeasurementBuffer:
 
 
 @compiled
-def _merge(rows: IntArray, stamps_ns: IntArray, begin: int, end: int, new: IntArray) -> tuple[int, int]:
-    """Merge new rows into rows[begin:end], which has room behind.
+def _merge(columns: _Columns, begin: int, end: int, new: IntArray) -> tuple[int, int]:
+    """Merge new rows into those from `begin` to `end`, which have room behind.
 
     Returns:
         How many it has more now, and the stamp of the first one it has more.
     """
+    rows, stamps_ns, verdicts, nis = columns
     order = np.argsort(new[:, 0], kind="mergesort")
     for k in range(1, order.size):  # those that share a stamp
         row, place = order[k], k
@@ -160,11 +165,11 @@ def _merge(rows: IntArray, stamps_ns: IntArray, begin: int, end: int, new: IntAr
         row = order[k]
         while old >= begin and _compared(new[row], rows[old]) < 0:
             _copy(rows[place], rows[old])
-            stamps_ns[place] = stamps_ns[old]
+            stamps_ns[place], verdicts[place], nis[place] = stamps_ns[old], verdicts[old], nis[old]
             old -= 1
             place -= 1
         _copy(rows[place], new[row])
-        stamps_ns[place] = new[row, 0]
+        stamps_ns[place], verdicts[place], nis[place] = new[row, 0], 0, math.nan
         place -= 1
     return kept, new[order[0], 0] if kept else 0
 
