@@ -90,6 +90,19 @@ def assert_same(a: Outcome, b: Outcome) -> None:
     lasting=0.0,
     sparse=True,
 )
+@example(  # a sighting at the very stamp of the newest odometry
+    seed=3312,
+    robots=4,
+    content=POSE,
+    start_known=(True,),
+    fusion_period_s=0.2,
+    state_period_s=0.0,
+    outliers=0.1,
+    lost_after=2,
+    late_s=1.0,
+    lasting=0.0,
+    sparse=True,
+)
 @example(  # the last of a period comes with the first of the next, or before it
     seed=235,
     robots=2,

@@ -115,12 +115,13 @@ def _find_step(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[int, flo
 def rate_at(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[float, float, float]:
     """The velocity forward and left [m/s] and the turn rate [rad/s] of base_link at an instant.
 
-    Before the first row, and where the motion is unknown, it is zero.
+    At a row it is that of the step to it, so what comes later does not change it. Up to the first row, and
+    where the motion is unknown, it is zero.
     """
     count = tracks.filled[robot]
     stamps, timeout_ns = tracks.stamp_ns[robot, :count], tracks.model[robot].timeout_s * 1e9
-    row = min(np.searchsorted(stamps, stamp_ns, side="right"), count - 1)
-    if row < 1 or stamp_ns < stamps[0]:
+    row = min(np.searchsorted(stamps, stamp_ns), count - 1)
+    if row < 1:
         return 0.0, 0.0, 0.0
     if max(stamps[row], stamp_ns) - stamps[row - 1] > timeout_ns:
         return 0.0, 0.0, 0.0
