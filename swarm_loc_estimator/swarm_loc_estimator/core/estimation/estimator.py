@@ -187,7 +187,7 @@ class SwarmEstimator:
         """
         newest_ns = self._check_clock(now_ns)
         oldest_ns = newest_ns - self._horizon_ns
-        self._tracks.trim(oldest_ns, oldest_ns - 2 * self._reach_ns)
+        self._tracks.trim(oldest_ns, self._timeline.oldest_due_ns(oldest_ns) - 2 * self._reach_ns)
         if self._odometry:
             self._use_odometry()
         if fuse:

@@ -110,6 +110,13 @@ class Timeline:
         """How many measurements wait for the next `advance`."""
         return sum(measurements.size for measurements in self._new)
 
+    def oldest_due_ns(self, otherwise_ns: int) -> int:
+        """The instant of the oldest measurement that is left to compute, if it is before another instant."""
+        due_ns = [otherwise_ns] if self._redo_from_ns is None else [otherwise_ns, self._redo_from_ns]
+        if self.is_under_way:
+            due_ns.append(int(self._buffer.stamp_ns[self._count_until(self._head_key)]))
+        return min(due_ns)
+
     def invalidate(self, changed_from_ns: NDArray[np.int64]) -> None:
         """Have the steps computed again whose robots' tracks have changed.
 
