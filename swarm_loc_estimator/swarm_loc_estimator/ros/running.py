@@ -60,6 +60,8 @@ class Stop:
         self._leaves_at_once = True
 
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
+        if self._leaves_at_once and not self._noted_only:
+            _leave()  # an exception might be swallowed where a compiler or ROS has called back
         if self._leaves_at_once and not self.requested:
             _leave_soon()
         self.requested = True
@@ -127,8 +129,6 @@ def run_node(name: str, create: Callable[[], ConfiguredNode[Any]], *, leaves_at_
         print(f"{name}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        if leaves_at_once:
-            _leave()  # giving up what there is of the node would hold everything else up, the timer, too
         return 0
     finally:
         stop.defer()

@@ -52,6 +52,26 @@ def test_a_process_that_is_busy_ends_within_two_seconds_of_a_signal() -> None:
         assert took_s < 2.0
 
 
+_COMPILING = """
+import signal
+from swarm_loc_estimator.ros import running
+
+def create():
+    try:
+        signal.raise_signal(signal.SIGTERM)
+    except KeyboardInterrupt:
+        pass  # as compilers do that have called back
+    raise RuntimeError("nothing is compiled")
+
+running._start_ros = lambda: None
+running.run_node("compiling", create, leaves_at_once=True)
+"""
+
+
+def test_a_signal_while_the_node_is_made_ends_the_process_with_status_0() -> None:
+    assert subprocess.run([sys.executable, "-c", _COMPILING], check=False).returncode == 0
+
+
 def waited_s(pid: int) -> float:
     """How long a process could have run but had to wait, since others did: not its fault."""
     return int(Path("/proc", str(pid), "schedstat").read_text(encoding="ascii").split()[1]) * 1e-9

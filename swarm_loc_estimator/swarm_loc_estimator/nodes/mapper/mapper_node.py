@@ -41,6 +41,8 @@ from swarm_loc_estimator.nodes.mapper.mapper_parameters import (
     MapperParameters,
     chosen_robots,
 )
+from swarm_loc_estimator.nodes.mapper.warm_up import WARM_UP, warm_up
+from swarm_loc_estimator.numerics.jit import is_warm
 from swarm_loc_estimator.ros.running import ConfiguredNode, run_node
 from swarm_loc_estimator.ros.topic_graph import TopicGraph
 from swarm_loc_msgs.msg import LaserDistance, LightBearingArray
@@ -77,6 +79,9 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self._frequencies = led_frequencies(self.chosen.led_frequencies, names)
         path = self.chosen.load_map
         self._background: OccupancyMap | None = load_map(Path(path), CELL) if path else None
+        if not is_warm(WARM_UP):
+            self.get_logger().info("compiling the mapper for this machine: about half a minute")
+        warm_up()
         self._graph = TopicGraph(self)
         self._known_drops: dict[str, int] = {}
         self._since_s, self._has_said_missing = time.monotonic(), False

@@ -1,0 +1,65 @@
+"""Compile the mapper before data comes; it would fall behind the robots meanwhile. No ROS here."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from swarm_loc_estimator.core.mapping.mapper import SCAN_TURN, START_TURN, CooperativeMapper
+from swarm_loc_estimator.core.mapping.matching.correlative_search import Lattice, search_offsets
+from swarm_loc_estimator.core.mapping.readings import Readings
+from swarm_loc_estimator.core.mapping.settings import MapperSettings
+from swarm_loc_estimator.io.messages.planar import yaw_of
+from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.jit import note_warm
+from swarm_loc_estimator.numerics.se2 import wrap_angle
+
+WARM_UP = Path(__file__)
+"""What all compiled code that this module imports is remembered by, see `is_warm`."""
+_ROOM = (1.7, 1.1)
+"""How far its walls are to the east and west, north and south of the middle [m]."""
+_PERIOD_NS, _TURN_RATE, _SPEED = 20_000_000, 1.0, 0.2
+_STOPS = 4
+_SIGMA = 0.016
+"""Of an inverse distance [1/m]."""
+
+
+def warm_up() -> None:
+    """Let a robot look around in a room, several times: a minute unless `is_warm`, then a second."""
+    mapper = CooperativeMapper(MapperSettings())
+    robot = mapper.join(np.zeros(3), np.array([0.01, 0.01, 0.01]))
+    pose, stamp_ns = np.zeros(3), 0
+    for stop in range(_STOPS):
+        turn = np.array([0.0, 0.0, START_TURN if stop == 0 else SCAN_TURN])
+        aside = np.array([0.0, 0.0, 0.5 * math.pi - wrap_angle(pose[2] + turn[2])])
+        ahead = np.array([0.0, 0.4 if stop % 2 == 0 else -0.4, 0.0])
+        for way, speed in ((turn, _TURN_RATE), (aside, _TURN_RATE), (ahead, _SPEED)):
+            poses = _along(pose, way, speed)
+            stamps = stamp_ns + _PERIOD_NS * np.arange(1, len(poses) + 1)
+            mapper.add_readings(robot, Readings(stamps, poses, _inverse_distances(poses), _SIGMA))
+            pose, stamp_ns = poses[-1], int(stamps[-1])
+            mapper.goal(robot)
+        mapper.covariance(robot)
+        mapper.visits.on(mapper.occupancy())
+    # what is called where a robot comes to an old stop again
+    search_offsets(mapper.graph.scans, np.array([1]), np.array([0]), Lattice(0.06, 0.06, 0.03, 0.03))
+    yaw_of(0.0, 0.0, 0.0, 1.0)  # what reads odometry
+    note_warm(WARM_UP)
+
+
+def _along(pose: FloatArray, way: FloatArray, speed: float) -> FloatArray:
+    """Poses (n, 3) on the way from one that a speed [m/s] or [rad/s] allows, one for each reading."""
+    count = max(2, round(float(np.abs(way).max()) / (speed * _PERIOD_NS * 1e-9)))
+    poses = pose + way * (np.arange(1, count + 1)[:, None] / count)
+    poses[:, 2] = wrap_angle(poses[:, 2])
+    return poses
+
+
+def _inverse_distances(poses: FloatArray) -> FloatArray:
+    """Inverse distances (n,) of the walls ahead of poses (n, 3) [1/m]."""
+    direction = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=-1)
+    ways = (np.copysign(_ROOM, direction) - poses[:, :2]) / np.where(direction == 0.0, 1e-12, direction)
+    inverse: FloatArray = 1.0 / ways.min(axis=1)
+    return inverse

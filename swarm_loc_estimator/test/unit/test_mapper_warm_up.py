@@ -1,0 +1,44 @@
+"""Once it is warm, the mapper compiles nothing: meanwhile robots would drive on, and fixes come too late."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from test_warm_up import signatures
+
+from swarm_loc_estimator.core.mapping.settings import MapperSettings
+from swarm_loc_estimator.evaluation.map_replay import replay_map
+from swarm_loc_estimator.io.maps.fix_covariance import FixCovariances
+from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.nodes.mapper.warm_up import warm_up
+
+BAG = Path(__file__).parents[3] / "bags" / "pushbots_two"
+FREQUENCIES = {"pushbot1": 1000.0, "pushbot2": 1050.0}
+
+
+def test_nothing_is_compiled_once_robots_report() -> None:
+    done = subprocess.run([sys.executable, __file__], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == []
+
+
+def compiled_late() -> list[str]:
+    """What is compiled when robots are replayed though all is warm; in a process of its own."""
+    warm_up()
+    before = signatures()
+    robots = load_swarm(BAG / "swarm.yaml").robots
+    mapper, feed = replay_map(BAG, robots, MapperSettings(), FREQUENCIES, lambda _share, _what: None)
+    for index, robot in enumerate(robots):
+        number = feed.number(index)
+        goal = None if number is None else mapper.goal(number)
+        if number is not None and goal is not None:
+            FixCovariances(robot.odometry).told(goal, mapper.covariance(number))
+        mapper.visits.on(mapper.occupancy())
+    return sorted(name for name, known in signatures().items() if known != before.get(name, 0))
+
+
+if __name__ == "__main__":
+    json.dump(compiled_late(), sys.stdout)
