@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
-from test_warm_up import signatures
+from compiled_code import compiled_since, signatures, told_by_process
 
 from swarm_loc_estimator.core.mapping.settings import MapperSettings
 from swarm_loc_estimator.evaluation.map_replay import replay_map
@@ -20,9 +19,7 @@ FREQUENCIES = {"pushbot1": 1000.0, "pushbot2": 1050.0}
 
 
 def test_nothing_is_compiled_once_robots_report() -> None:
-    done = subprocess.run([sys.executable, __file__], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == []
+    assert told_by_process(__file__) == []
 
 
 def compiled_late() -> list[str]:
@@ -37,7 +34,7 @@ def compiled_late() -> list[str]:
         if number is not None and goal is not None:
             FixCovariances(robot.odometry).told(goal, mapper.covariance(number))
         mapper.visits.on(mapper.occupancy())
-    return sorted(name for name, known in signatures().items() if known != before.get(name, 0))
+    return compiled_since(before)
 
 
 if __name__ == "__main__":

@@ -7,9 +7,9 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
+from processor_wait import waited_s
 
 running = pytest.importorskip("swarm_loc_estimator.ros.running", exc_type=ImportError)
 
@@ -70,8 +70,3 @@ running.run_node("compiling", create, leaves_at_once=True)
 
 def test_a_signal_while_the_node_is_made_ends_the_process_with_status_0() -> None:
     assert subprocess.run([sys.executable, "-c", _COMPILING], check=False).returncode == 0
-
-
-def waited_s(pid: int) -> float:
-    """How long a process could have run but had to wait, since others did: not its fault."""
-    return int(Path("/proc", str(pid), "schedstat").read_text(encoding="ascii").split()[1]) * 1e-9

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import gc
 import json
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numba.core.dispatcher import Dispatcher
+from compiled_code import compiled_since, signatures, told_by_process
 
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.description.swarm import Swarm
@@ -42,9 +40,7 @@ class EnoughError(Exception):
 
 
 def test_nothing_is_compiled_once_data_come() -> None:
-    done = subprocess.run([sys.executable, __file__], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == []
+    assert told_by_process(__file__) == []
 
 
 def compiled_late() -> list[str]:
@@ -59,14 +55,7 @@ def compiled_late() -> list[str]:
     run(BAGS / "eight_five_robots", EstimatorSettings(), moved_landmarks=True)
     for settings in (EstimatorSettings(fusion_period_s=0.1), EstimatorSettings(sparse_from=2)):
         run(BAGS / "eight_five_robots", settings, relayed=True)
-    return sorted(name for name, known in signatures().items() if known != before.get(name, 0))
-
-
-def signatures() -> dict[str, int]:
-    """Compiled function -> for how many kinds of arguments it was compiled as called by what is not."""
-    found = [one for one in gc.get_objects() if isinstance(one, Dispatcher)]
-    known = {f"{one.py_func.__module__}.{one.py_func.__qualname__}": len(one.signatures) for one in found}
-    return {name: count for name, count in known.items() if ".io.bags." not in name}  # these only read bags
+    return compiled_since(before)
 
 
 def run(

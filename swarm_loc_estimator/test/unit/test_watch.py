@@ -6,13 +6,13 @@ import asyncio
 import re
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import aiohttp
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from processor_wait import THIS_THREAD, waited_s
 
 from swarm_loc_estimator.core.description.swarm import Robot, Swarm
 from swarm_loc_estimator.io.watch.about import about
@@ -141,11 +141,6 @@ def test_wrong_words_of_a_page_are_answered(server: WatchServer) -> None:
     assert asyncio.run(talk()) == [unread, unread, "There is no robot number 7.", unread, "done: reset"]
 
 
-def waited_s() -> float:
-    """How long this thread could have run but had to wait, since other processes did."""
-    return int(Path("/proc/thread-self/schedstat").read_text(encoding="ascii").split()[1]) * 1e-9
-
-
 def test_a_page_that_does_not_read_costs_nothing_and_others_see_the_newest(server: WatchServer) -> None:
     frames = [pack("poses", k * SECOND, {"x": np.zeros(MEGABYTE // 8)}) for k in range(1, 101)]
 
@@ -155,10 +150,10 @@ def test_a_page_that_does_not_read_costs_nothing_and_others_see_the_newest(serve
             sleeper = await session.ws_connect(f"{server.url}socket", max_msg_size=0)
             reader = await session.ws_connect(f"{server.url}socket", max_msg_size=0)
             await reader.receive_json()
-            begin_s = time.perf_counter() - waited_s()
+            begin_s = time.perf_counter() - waited_s(THIS_THREAD)
             for frame in frames:
                 server.publish(frame)
-            took_s = time.perf_counter() - waited_s() - begin_s
+            took_s = time.perf_counter() - waited_s(THIS_THREAD) - begin_s
             while unpack(await reader.receive_bytes())[0]["stamp"] != pytest.approx(100e3):
                 await reader.send_str("+")
             await reader.close()
