@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from swarm_loc_estimator.core.estimation.fusion_period import end_of_period
 from swarm_loc_estimator.core.inputs.messages import (
     AerialRows,
     BrightnessRows,
@@ -90,9 +91,14 @@ def test_of_a_large_swarm_whole_periods_are_left_out_in_whatever_order_they_come
     period_ns, periods = 4, 1000
     thinning, kept = Thinning(ROBOTS, period_ns), np.zeros((periods, ROBOTS, SEEN))
     rng = np.random.default_rng(1)
-    for stamp_ns in rng.permutation(period_ns * periods).tolist():  # late ones share the fate of their period
+    stamps_ns = 1 + rng.permutation(period_ns * periods)
+    for stamp_ns in stamps_ns.tolist():  # late ones share the fate of their period
         left = thinning.thin(images(stamp_ns, range(ROBOTS)), share).messages
-        seen = (stamp_ns // period_ns, left.detections.robot, left.detections.detection["id"])
+        seen = (
+            end_of_period(stamp_ns, period_ns) // period_ns - 1,
+            left.detections.robot,
+            left.detections.detection["id"],
+        )
         np.add.at(kept, seen, 1)
     assert set(kept.ravel().tolist()) == {0.0, float(period_ns)}
     used = np.all(kept == period_ns, axis=(1, 2))

@@ -12,13 +12,13 @@ from swarm_loc_estimator.core.description.estimated_parameters import ParameterT
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.core.estimation.aerial import PictureFusion, as_fixes, relieve_seen
+from swarm_loc_estimator.core.estimation.fusion_period import middle_of_period
 from swarm_loc_estimator.core.filter.batch_update import (
     assess_all,
     body_columns_all,
     confirm_all,
     count_all_gated,
     evaluate_all,
-    middle_of_period,
     predict_all,
 )
 from swarm_loc_estimator.core.filter.belief import correct

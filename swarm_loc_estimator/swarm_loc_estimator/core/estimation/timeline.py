@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.estimation.fusion import Verdict
+from swarm_loc_estimator.core.estimation.fusion_period import end_of_period, middle_of_period
 from swarm_loc_estimator.core.estimation.measurement_buffer import MeasurementBuffer
-from swarm_loc_estimator.core.filter.batch_update import middle_of_period
 from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.core.filter.state import SwarmState
 from swarm_loc_estimator.numerics.arrays import FloatArray
@@ -154,14 +154,12 @@ class Timeline:
             self._forget_before(self._key(now_ns - self._kept_ns))
 
     def _key(self, stamp_ns: int) -> int:
-        """The step that a stamp belongs to, as the stamp at which the step begins."""
-        return stamp_ns - stamp_ns % self._fusion_period_ns if self._fusion_period_ns else stamp_ns
+        """The step that a stamp belongs to, as the last stamp that is of the step."""
+        return end_of_period(stamp_ns, self._fusion_period_ns) if self._fusion_period_ns else stamp_ns
 
     def _count_until(self, key: int) -> int:
         """How many measurements belong to steps up to `key`."""
-        if key == _BEFORE_ALL:
-            return 0
-        return int(self._buffer.stamp_ns.searchsorted(key + max(self._fusion_period_ns, 1)))
+        return int(self._buffer.stamp_ns.searchsorted(key, side="right"))
 
     def _redo_from(self, stamp_ns: int) -> None:
         """Have the steps from that of a stamp on computed at the next `advance`."""
@@ -234,8 +232,10 @@ class Timeline:
     def _end_of_steps(self, begin: int) -> int:
         """Where those steps end that are computed together with the one at `begin`, up to a checkpoint."""
         stamps_ns, length_ns = self._buffer.stamp_ns, self._fusion_period_ns or self._spacing_ns
-        next_ns = (int(stamps_ns[begin]) // length_ns + 1) * length_ns
-        return stamps_ns.size if stamps_ns[-1] < next_ns else int(stamps_ns.searchsorted(next_ns))
+        last_ns = end_of_period(int(stamps_ns[begin]), length_ns)
+        return (
+            stamps_ns.size if stamps_ns[-1] <= last_ns else int(stamps_ns.searchsorted(last_ns, side="right"))
+        )
 
     def _step_to_join(self) -> int | None:
         """The step that what has come of the period behind it is fused with; None: no step.
@@ -246,7 +246,8 @@ class Timeline:
         if not period_ns or not stamp_ns.size:
             return None
         newest = self._key(int(stamp_ns[-1]))
-        begin, end = stamp_ns.searchsorted((newest - period_ns, newest)).tolist()
+        before = (newest - 2 * period_ns, newest - period_ns)
+        begin, end = stamp_ns.searchsorted(before, side="right").tolist()
         return newest - period_ns if stamp_ns.size - end < _MIN_LAST_SHARE * (end - begin) else None
 
     def _forget_before(self, key: int) -> None:

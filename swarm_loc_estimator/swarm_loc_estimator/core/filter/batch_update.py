@@ -29,15 +29,6 @@ from swarm_loc_estimator.numerics.small_matrix import assign
 
 
 @compiled
-def middle_of_period(stamp_ns: int, period_ns: int) -> int:
-    """The instant to which robots are predicted for all measurements of the period of a stamp.
-
-    Not the mean of what has come: so more that comes of the period finds the same prediction.
-    """
-    return stamp_ns - stamp_ns % period_ns + period_ns // 2
-
-
-@compiled
 def predict_all(
     measurements: MeasurementColumns,
     stamp_ns: int,

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_estimator.core.estimation.fusion_period import end_of_period
 from swarm_loc_estimator.core.inputs.messages import AerialRows, BrightnessRows, RawInputs, chosen
 from swarm_loc_estimator.numerics.arrays import IntArray
 
@@ -94,7 +95,7 @@ class Thinning:
 
     def _in_periods(self, stamp_ns: IntArray, share: float) -> NDArray[np.bool_]:
         """Whether to use measurements (u,) with stamps (u,) [ns]: those of some periods."""
-        number = (stamp_ns // self._period_ns).astype(np.uint64)
+        number = (end_of_period(stamp_ns, self._period_ns) // self._period_ns).astype(np.uint64)
         fraction = (number * _GOLDEN).astype(np.float64) / _WHOLE
         return np.asarray((fraction < share) | (share >= 1.0))
 
