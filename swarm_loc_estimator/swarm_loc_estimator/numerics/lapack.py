@@ -54,6 +54,14 @@ def invert_positive(numbers: FloatArray, size: int) -> bool:
     return _invert(numbers, size, _plan(size))
 
 
+def invert_factor(numbers: FloatArray, size: int) -> bool:
+    """Replace a symmetric positive definite matrix (size, size) by the inverse of its Cholesky factor.
+
+    Its lower triangle counts and is written; for arguments and result see `invert_positive`.
+    """
+    return _invert_factor(numbers, size, _plan(size))
+
+
 @cache
 def _plan(size: int) -> IntArray:
     """The steps (s, 3) that invert the factor of a matrix: which, the first row, number of rows."""
@@ -72,8 +80,19 @@ def _steps(begin: int, rows: int) -> list[tuple[int, int, int]]:
 
 @compiled
 def _invert(numbers: FloatArray, size: int, plan: IntArray) -> bool:
-    """Invert a matrix in steps; not by recursion, which numba's cache does not survive."""
-    sizes = np.empty(4, dtype=np.int32)
+    """Invert a matrix."""
+    if not _invert_factor(numbers, size, plan):
+        return False
+    sizes = np.empty(2, dtype=np.int32)
+    sizes[0] = size
+    _dlauum(_LOWER.ctypes, sizes.ctypes, numbers.ctypes, sizes.ctypes, sizes[1:].ctypes)
+    return True
+
+
+@compiled
+def _invert_factor(numbers: FloatArray, size: int, plan: IntArray) -> bool:
+    """Invert the factor in steps; not by recursion, which numba's cache does not survive."""
+    sizes = np.empty(3, dtype=np.int32)
     for k in range(plan.shape[0]):
         step, begin, rows = plan[k, 0], plan[k, 1] * (size + 1), plan[k, 2]
         if step == _WHOLE:
@@ -81,8 +100,6 @@ def _invert(numbers: FloatArray, size: int, plan: IntArray) -> bool:
                 return False
         else:
             _join_halves(numbers, begin, rows, size, sizes, step == _FIRST)
-    sizes[0] = size
-    _dlauum(_LOWER.ctypes, sizes.ctypes, numbers.ctypes, sizes.ctypes, sizes[3:].ctypes)
     return True
 
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from swarm_loc_estimator.core.filter.dense.covariance import DenseFilter
 from swarm_loc_estimator.core.filter.dense.inversion import InverseMemory, inverse
 from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.lapack import invert_factor
 
 
 def positive(rng: np.random.Generator, size: int) -> FloatArray:
@@ -32,6 +33,16 @@ def test_the_inverse_is_lapack_s_and_symmetric(size: int, seed: int) -> None:
     np.testing.assert_array_equal(result, result.T)
     unscaled = result * np.outer(scale, scale)
     np.testing.assert_allclose(unscaled, np.linalg.inv(scaled / np.outer(scale, scale)), atol=1e-9)
+
+
+@given(size=st.sampled_from([1, 2, 40, 41, 80, 81, 192]), seed=st.integers(0, 10**6))
+def test_the_inverse_of_the_factor_is_lapack_s(size: int, seed: int) -> None:
+    matrix = positive(np.random.default_rng(seed), size)
+    written = matrix.copy()
+    assert invert_factor(written.reshape(-1), size)
+    expected = np.linalg.inv(np.linalg.cholesky(matrix))
+    np.testing.assert_allclose(np.tril(written.T), expected, atol=1e-9)
+    assert not invert_factor(-matrix.reshape(-1), size)
 
 
 @pytest.mark.parametrize("place", [0, 99, 199])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.equality import are_equal
 from swarm_loc_estimator.numerics.jit import compiled
 from swarm_loc_estimator.numerics.lapack import invert_positive
 
@@ -21,7 +22,7 @@ class InverseMemory:
 
     def inverse_of(self, matrix: FloatArray) -> FloatArray:
         """The inverse (n, n) of a symmetric positive definite matrix, to be read."""
-        if not _are_equal(matrix, self._matrix):
+        if not are_equal(matrix.reshape(-1), self._matrix.reshape(-1)):
             self._inverse, self._matrix = inverse(matrix), matrix.copy()
         return self._inverse
 
@@ -37,18 +38,6 @@ def inverse(matrix: FloatArray) -> FloatArray:
         raise np.linalg.LinAlgError("the covariance is not positive definite")
     _mirror(inverted)
     return inverted
-
-
-@compiled
-def _are_equal(one: FloatArray, other: FloatArray) -> bool:
-    """Whether two matrices are equal to the last bit."""
-    if one.shape != other.shape:
-        return False
-    for i in range(one.shape[0]):
-        for j in range(one.shape[1]):
-            if one[i, j] != other[i, j]:
-                return False
-    return True
 
 
 @compiled

@@ -253,7 +253,10 @@ def _surprises(state: IntegrityArrays, node: int, now_ns: int) -> tuple[int, flo
     robots, places = state.source.shape
     bad, count = 0, 0
     for robot in range(robots):
-        for place in range(places):
+        named = 0
+        for place in range(places):  # most robots have not looked at it, which is soon found out like this
+            named += state.source[robot, place] == node
+        for place in range(places if named or robot == node else 0):
             source = state.source[robot, place]
             about = source >= 0 and node in (robot, source)
             if about and now_ns - state.source_ns[robot, place] < RECENT_NS:

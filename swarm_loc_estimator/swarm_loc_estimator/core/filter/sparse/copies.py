@@ -10,13 +10,14 @@ and with G^T T G of a: y is eliminated with T G on the right-hand side, and a is
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import blas, lapack
+from scipy.linalg import blas
 
 from swarm_loc_estimator.core.filter.sparse.factor import Derived, Factor, solve
 from swarm_loc_estimator.core.filter.sparse.levers import Information
 from swarm_loc_estimator.core.filter.sparse.symbolic import Pattern
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
-from swarm_loc_estimator.numerics.jit import compiled, compiled_sums
+from swarm_loc_estimator.numerics.jit import compiled, compiled_sums, inlined
+from swarm_loc_estimator.numerics.lapack import invert_factor
 
 _COPY_SPREAD = np.diag(np.square([3e-5, 3e-5, 3e-4]))
 """What keeps a copy apart from the body [m^2], [m^2], [rad^2]."""
@@ -87,9 +88,14 @@ def _whiten(columns: FloatArray, matrix: FloatArray) -> None:
     """Multiply columns (n, k) by K^-T, in place, where K K^T is a matrix (k, k) by its lower triangle.
 
     By the inverse of K: a product takes half of the time that solving with so many columns does.
+
+    Raises:
+        LinAlgError: The matrix is not positive definite.
     """
     if matrix.size:
-        inverse, _ = lapack.dtrtri(np.asfortranarray(np.linalg.cholesky(matrix)), lower=1, overwrite_c=1)
+        inverse = np.array(matrix, order="F")
+        if not invert_factor(inverse.reshape(-1, order="F"), len(inverse)):
+            raise np.linalg.LinAlgError("what is told of copies is not positive definite")
         blas.dtrmm(1.0, inverse, columns.T, lower=1, overwrite_b=1)
 
 
@@ -99,15 +105,19 @@ def _weigh(measured: Information, shares: FloatArray, out: FloatArray) -> None:
     size = shares.shape[1]
     out[:, :size] = 0.0
     for k in range(measured.first.size):
-        row, column = 3 * measured.first[k], 3 * measured.second[k]
+        row, column, block = 3 * measured.first[k], 3 * measured.second[k], measured.block[k]
         for i in range(3):
-            for j in range(3):
-                factor = measured.block[k, i, j]
-                for c in range(size):
-                    out[row + i, c] += factor * shares[column + j, c]
-                if row != column:
-                    for c in range(size):
-                        out[column + j, c] += factor * shares[row + i, c]
+            _add_rows(shares[column : column + 3], block[i, 0], block[i, 1], block[i, 2], out[row + i, :size])
+            if row != column:
+                other = out[column + i, :size]
+                _add_rows(shares[row : row + 3], block[0, i], block[1, i], block[2, i], other)
+
+
+@inlined
+def _add_rows(rows: FloatArray, first: float, second: float, third: float, out: FloatArray) -> None:
+    """Add three rows (3, k), each times a factor, to one (k,)."""
+    for c in range(out.size):
+        out[c] += first * rows[0, c] + second * rows[1, c] + third * rows[2, c]
 
 
 @compiled_sums

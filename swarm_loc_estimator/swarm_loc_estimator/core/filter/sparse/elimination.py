@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarm_loc_estimator.core.filter.sparse.factor import Factor, gathered, new_factor
+from swarm_loc_estimator.core.filter.sparse.factor import EMPTY, Factor, gathered, new_factor
 from swarm_loc_estimator.core.filter.sparse.levers import Information
 from swarm_loc_estimator.core.filter.sparse.symbolic import Pattern
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.numerics.equality import are_equal
 from swarm_loc_estimator.numerics.jit import compiled
 
 _LOOSER = (0.0, 1e-10, 1e-8, 1e-6, 1e-4)
@@ -35,7 +36,96 @@ class Prior(NamedTuple):
     place: IntArray
 
 
-def eliminate(pattern: Pattern, prior: Prior, measured: Information) -> Factor:
+class Projection(NamedTuple):
+    """A prior projected on a pattern, front by front.
+
+    Attributes:
+        pattern: Its fronts.
+        begin: (F + 1,) where the numbers of each front begin.
+        covariance: What is known before of a front's bodies (d, d), those of the border first.
+        information: Of p(x_J | x_B) (d, d), which follows from it.
+    """
+
+    pattern: Pattern
+    begin: IntArray
+    covariance: FloatArray
+    information: FloatArray
+
+
+class ProjectionMemory:
+    """The newest projection: fronts of which the same is known as then need not be projected again.
+
+    A period is fused again with what comes late of it, from the same prediction.
+    """
+
+    def __init__(self) -> None:
+        nothing = np.zeros(0)
+        self._newest = Projection(EMPTY.pattern, np.zeros(1, dtype=np.int64), nothing, nothing)
+        self._spare = nothing, nothing
+
+    def project(self, pattern: Pattern, prior: Prior, looser: float) -> Projection:
+        """Project a prior, variances being enlarged by a share; it is there until the call after the next.
+
+        Raises:
+            LinAlgError: The prior is no covariance.
+        """
+        bodies = np.diff(pattern.pivot_begin) + np.diff(pattern.border_begin)
+        begin = np.concatenate([[0], np.cumsum(9 * bodies * bodies)])
+        if self._spare[0].size < begin[-1]:
+            room = int(1.2 * begin[-1])
+            self._spare = np.empty(room), np.empty(room)
+        projection = Projection(pattern, begin, *self._spare)
+        _project(projection, prior, looser, self._newest)
+        self._spare = self._newest.covariance, self._newest.information
+        self._newest = projection
+        return projection
+
+
+@compiled
+def _project(out: Projection, prior: Prior, looser: float, before: Projection) -> None:
+    """Write a projection."""
+    pattern = out.pattern
+    for f in range(pattern.pivot_begin.size - 1):
+        pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
+        border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+        places = prior.place[np.concatenate((border, pivots))]
+        here = slice(out.begin[f], out.begin[f + 1])
+        covariance = out.covariance[here].reshape(3 * places.size, 3 * places.size)
+        covariance[:] = gathered(prior.covariance, places, places)
+        for k in range(covariance.shape[0]):
+            covariance[k, k] *= 1.0 + looser
+        same = _same_front(out, f, before)
+        if same >= 0:
+            out.information[here] = before.information[before.begin[same] : before.begin[same + 1]]
+        else:
+            lower: FloatArray = np.linalg.cholesky(np.ascontiguousarray(covariance))
+            columns = _last_columns(lower, 3 * pivots.size)
+            np.dot(columns, columns.T, out.information[here].reshape(covariance.shape))
+
+
+@compiled
+def _same_front(one: Projection, f: int, other: Projection) -> int:
+    """The front of another projection of which the same is known as of front f of this one; -1: none."""
+    first = one.pattern.pivot[one.pattern.pivot_begin[f]]
+    g = other.pattern.front[first] if first < other.pattern.front.size else -1
+    if g < 0:
+        return -1
+    mine, its = one.pattern, other.pattern
+    same = are_equal(
+        mine.pivot[mine.pivot_begin[f] : mine.pivot_begin[f + 1]],
+        its.pivot[its.pivot_begin[g] : its.pivot_begin[g + 1]],
+    )
+    same = same and are_equal(
+        mine.border[mine.border_begin[f] : mine.border_begin[f + 1]],
+        its.border[its.border_begin[g] : its.border_begin[g + 1]],
+    )
+    same = same and are_equal(
+        one.covariance[one.begin[f] : one.begin[f + 1]], other.covariance[other.begin[g] : other.begin[g + 1]]
+    )
+    return g if same else -1
+
+
+def eliminate(pattern: Pattern, prior: Prior, measured: Information, memory: ProjectionMemory) -> Factor:
     """The factor of a prior and measurements.
 
     Raises:
@@ -47,7 +137,7 @@ def eliminate(pattern: Pattern, prior: Prior, measured: Information) -> Factor:
     factor = new_factor(pattern)
     for looser in _LOOSER:
         try:
-            _eliminate(factor, prior, measured, (order, begin), looser)
+            _eliminate(factor, memory.project(pattern, prior, looser), measured, (order, begin))
         except np.linalg.LinAlgError:
             continue
         return factor
@@ -56,7 +146,7 @@ def eliminate(pattern: Pattern, prior: Prior, measured: Information) -> Factor:
 
 @compiled
 def _eliminate(
-    factor: Factor, prior: Prior, measured: Information, blocks: tuple[IntArray, IntArray], looser: float
+    factor: Factor, prior: Projection, measured: Information, blocks: tuple[IntArray, IntArray]
 ) -> None:
     """Write a factor; `blocks` is the order of what was measured, front by front, and where each begins."""
     pattern = factor.pattern
@@ -70,8 +160,8 @@ def _eliminate(
         split, size = 3 * border.size, 3 * (bodies.size - border.size)
         for k in range(bodies.size):
             local[bodies[k]] = k
-        places = prior.place[bodies]
-        information = _conditional(gathered(prior.covariance, places, places), size, looser)
+        known = prior.information[prior.begin[f] : prior.begin[f + 1]]
+        information = known.reshape(3 * bodies.size, 3 * bodies.size).copy()
         _add_blocks(information, local, measured, blocks[0][blocks[1][f] : blocks[1][f + 1]])
         below = child[f]
         while below >= 0:
@@ -90,17 +180,6 @@ def _eliminate(
             updates[f] = information[:split, :split] - np.dot(gain, across.T)
             parent = pattern.front[border].min()
             sibling[f], child[parent] = child[parent], f
-
-
-@compiled
-def _conditional(covariance: FloatArray, size: int, looser: float) -> FloatArray:
-    """Information (d, d) of p(x_J | x_B) for a covariance (d, d), the pivots being the last `size` rows."""
-    for k in range(covariance.shape[0]):
-        covariance[k, k] *= 1.0 + looser
-    lower: FloatArray = np.linalg.cholesky(np.ascontiguousarray(covariance))
-    columns = _last_columns(lower, size)
-    information: FloatArray = np.dot(columns, columns.T)
-    return information
 
 
 @compiled

@@ -92,11 +92,33 @@ def _begins(sizes: IntArray) -> IntArray:
 
 
 @compiled
-def write_covariances(factor: Factor, rows: tuple[IntArray, IntArray], covariance: FloatArray) -> None:
-    """Write the covariances within all fronts, and those of wanted rows, from the last front to the first.
+def write_fronts(factor: Factor, covariance: FloatArray) -> None:
+    """Write the covariances within all fronts, from the last front to the first.
 
     Takahashi et al., "Formation of a sparse bus impedance matrix and its application to short circuit study"
-    (1973), for fronts and extended to rows outside of the pattern.
+    (1973), for fronts.
+
+    Args:
+        factor: Of n bodies.
+        covariance: (n, n, 3, 3) written; what is in no front stays as it is.
+    """
+    pattern = factor.pattern
+    for f in range(pattern.pivot_begin.size - 2, -1, -1):
+        pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
+        border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+        width, size = 3 * border.size, 3 * pivots.size
+        own = factor.spread[factor.spread_begin[f] : factor.spread_begin[f + 1]].reshape(size, size)
+        if width:
+            gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]].reshape(width, size)
+            across = np.dot(gathered(covariance, border, border), gain)
+            own = own + np.dot(gain.T, across)
+            _scatter(covariance, border, pivots, across)
+        _scatter_own(covariance, pivots, own)
+
+
+@compiled
+def write_rows(factor: Factor, rows: tuple[IntArray, IntArray], covariance: FloatArray) -> None:
+    """Write the covariances of wanted rows, likewise, where those within all fronts stand already.
 
     Args:
         factor: Of n bodies.
@@ -105,19 +127,17 @@ def write_covariances(factor: Factor, rows: tuple[IntArray, IntArray], covarianc
     """
     pattern = factor.pattern
     for f in range(pattern.pivot_begin.size - 2, -1, -1):
+        wanted = rows[0][rows[1][f] : rows[1][f + 1]]
+        if not wanted.size:
+            continue
         pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
         border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
-        beside = np.concatenate((border, rows[0][rows[1][f] : rows[1][f + 1]]))
-        size, width = 3 * pivots.size, 3 * border.size
-        own = factor.spread[factor.spread_begin[f] : factor.spread_begin[f + 1]].reshape(size, size)
-        if width:
-            gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]].reshape(width, size)
-            across = np.dot(gathered(covariance, beside, border), gain)
-            own = own + np.dot(gain.T, across[:width])
-        else:
-            across = np.zeros((3 * beside.size, size))
-        _scatter(covariance, beside, pivots, across)
-        _scatter_own(covariance, pivots, own)
+        across = np.zeros((3 * wanted.size, 3 * pivots.size))
+        if border.size:
+            gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]]
+            gain_of = gain.reshape(3 * border.size, 3 * pivots.size)
+            np.dot(gathered(covariance, wanted, border), gain_of, across)
+        _scatter(covariance, wanted, pivots, across)
 
 
 @compiled

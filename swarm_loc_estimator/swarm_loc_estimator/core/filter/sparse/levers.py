@@ -41,8 +41,23 @@ def levers(places: FloatArray) -> FloatArray:
 
 def carried(places: FloatArray, covariances: FloatArray) -> FloatArray:
     """Covariances (n, 3, 3) of Lev(r) e for errors e of covariances (n, 3, 3)."""
-    lever = levers(places)
-    out: FloatArray = lever @ covariances @ lever.transpose(0, 2, 1)
+    return carried_pairs(places, covariances, places)
+
+
+@compiled
+def carried_pairs(places: FloatArray, across: FloatArray, others: FloatArray) -> FloatArray:
+    """Lev(r) C Lev(s)^T (n, 3, 3) for places r (n, 2), matrices C (n, 3, 3) and other places s (n, 2)."""
+    out = np.empty((across.shape[0], 3, 3))
+    for k in range(across.shape[0]):
+        x, y = places[k, 0], places[k, 1]
+        for j in range(3):
+            out[k, 0, j] = across[k, 0, j] - y * across[k, 2, j]
+            out[k, 1, j] = across[k, 1, j] + x * across[k, 2, j]
+            out[k, 2, j] = across[k, 2, j]
+        x, y = others[k, 0], others[k, 1]
+        for i in range(3):
+            out[k, i, 0] -= y * out[k, i, 2]
+            out[k, i, 1] += x * out[k, i, 2]
     return out
 
 
@@ -94,14 +109,39 @@ def information_of(
     return Information(first[:count], second[:count], block[:count], gradient)
 
 
+@compiled
 def summed(measured: Information) -> Information:
-    """The same with one block for bodies that are named several times in this order."""
-    keys = measured.first * len(measured.gradient) + measured.second
-    order = np.argsort(keys, kind="stable")
-    begin = np.flatnonzero(np.diff(keys[order], prepend=-1))
-    block = np.add.reduceat(measured.block[order], begin) if begin.size else measured.block
-    chosen = order[begin]
-    return Information(measured.first[chosen], measured.second[chosen], block, measured.gradient)
+    """The same with one block for bodies that are named several times in this order, by the first of them."""
+    count, bodies = measured.first.size, len(measured.gradient)
+    newest, before, kept = (
+        np.full(bodies, -1),
+        np.empty(count, dtype=np.int64),
+        np.empty(count, dtype=np.int64),
+    )
+    place_of, pairs = np.empty(count, dtype=np.int64), 0
+    for k in range(count):
+        place = newest[measured.first[k]]
+        while place >= 0 and measured.second[kept[place]] != measured.second[k]:
+            place = before[place]
+        if place < 0:
+            place, pairs = pairs, pairs + 1
+            kept[place], before[place], newest[measured.first[k]] = k, newest[measured.first[k]], place
+        place_of[k] = place
+    number, written = np.empty(pairs, dtype=np.int64), 0
+    for body in range(bodies):
+        place = newest[body]
+        while place >= 0:
+            number[place] = written
+            place, written = before[place], written + 1
+    first, second = np.empty(pairs, dtype=np.int64), np.empty(pairs, dtype=np.int64)
+    block = np.zeros((pairs, 3, 3))
+    for k in range(count):
+        place = number[place_of[k]]
+        first[place], second[place] = measured.first[k], measured.second[k]
+        for i in range(3):
+            for j in range(3):
+                block[place, i, j] += measured.block[k, i, j]
+    return Information(first, second, block, measured.gradient)
 
 
 @compiled

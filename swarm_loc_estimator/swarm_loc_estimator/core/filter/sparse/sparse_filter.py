@@ -9,23 +9,26 @@ import numpy as np
 
 from swarm_loc_estimator.core.filter.joint_filter import Robots
 from swarm_loc_estimator.core.filter.sparse import copies
-from swarm_loc_estimator.core.filter.sparse.dissection import Order, dissect
-from swarm_loc_estimator.core.filter.sparse.elimination import Prior, eliminate
+from swarm_loc_estimator.core.filter.sparse.elimination import Prior, ProjectionMemory, eliminate
 from swarm_loc_estimator.core.filter.sparse.factor import (
     EMPTY,
     Derived,
+    Factor,
     with_derived,
-    write_covariances,
+    write_fronts,
+    write_rows,
 )
 from swarm_loc_estimator.core.filter.sparse.levers import (
     carried,
+    carried_pairs,
     centres,
     information_of,
     levers,
     summed,
 )
-from swarm_loc_estimator.core.filter.sparse.neighbours import adjacency, near_pairs, spread
-from swarm_loc_estimator.core.filter.sparse.symbolic import Pattern, pattern_of, wanted_rows
+from swarm_loc_estimator.core.filter.sparse.neighbours import spread
+from swarm_loc_estimator.core.filter.sparse.ordering import Ordering, Situation, ordered
+from swarm_loc_estimator.core.filter.sparse.symbolic import Pattern, wanted_rows
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 
 _COPIES = 64
@@ -33,33 +36,10 @@ _COPIED_SHARE = 4
 """One of so many bodies is copied, at most."""
 _COPIED_AGAIN = 25
 """Updates after which other bodies are copied."""
-_ORDERED_AGAIN = 3
-_GROWN = 1.2
-"""An order is replaced after so many updates, or when its largest front has grown so much."""
-_NEAR_AGAIN = 9
-"""After so many updates it is found out again who is near whom."""
 _PAIRS_KEPT = 3
 """Pairs of so many updates count as neighbours."""
 _FAR_M = 20.0
 """A body so far from where its error is held about is held about another place."""
-
-
-class _Ordering(NamedTuple):
-    """An order of elimination in use.
-
-    Attributes:
-        order: Of all bodies that are active.
-        updates: For how many it has been used.
-        width: Of its largest front at first.
-        near: (k, 2) pairs of bodies that are near each other.
-        near_updates: For how many updates these have been used.
-    """
-
-    order: Order
-    updates: int
-    width: int
-    near: IntArray
-    near_updates: int
 
 
 class _Prepared(NamedTuple):
@@ -92,10 +72,11 @@ class SparseFilter:
         self._shares: FloatArray = np.zeros((0, 3, 0))
         self._new: tuple[Derived, ...] = ()
         self._pairs: tuple[IntArray, ...] = ()
-        self._ordering: _Ordering | None = None
+        self._ordering: Ordering | None = None
         self._updates = 0
         self._prepared: _Prepared | None = None
         self._room = _Room(count)
+        self._projections = ProjectionMemory()
 
     def copy(self) -> SparseFilter:
         """An independent copy; factors are shared, since they are never written to."""
@@ -183,8 +164,7 @@ class SparseFilter:
         first, second = pairs.T
         places, covariance = prepared.prior.place, prepared.prior.covariance
         across = covariance[places[first], places[second]] + copies.shared(prepared.shares, first, second)
-        back = levers(-self._place)
-        out[tied] = back[first] @ across @ back[second].transpose(0, 2, 1)
+        out[tied] = carried_pairs(-self._place[first], across, -self._place[second])
         return out
 
     def _prepare(self, pairs: IntArray, robots: Robots) -> _Prepared:
@@ -198,8 +178,9 @@ class SparseFilter:
         factor, shares = with_derived(self._factor, self._new), copies.with_derived(self._shares, self._new)
         pattern = self._pattern(pairs, active, places)
         rows = wanted_rows(factor.pattern, pattern, self._number, len(self._new))
-        covariance = self._room.of(factor.pattern.front.size)
-        write_covariances(factor, rows, covariance)
+        covariance = self._room.with_fronts(factor)
+        write_rows(factor, rows, covariance)
+        self._room.holds = None  # since noise is added to it
         if self._updates % _COPIED_AGAIN == 0:
             copied = active[spread(places[active], min(_COPIES, active.size // _COPIED_SHARE))]
             others = copies.renewed(factor, shares, self._number[copied])
@@ -229,29 +210,13 @@ class SparseFilter:
 
     def _pattern(self, pairs: IntArray, active: IntArray, places: FloatArray) -> Pattern:
         """A pattern in which all these pairs (k, 2) lie, in the order in use or a new one."""
-        count, ordering = self._number.size, self._ordering
-        if ordering is not None and not np.array_equal(np.sort(ordering.order.body), active):
-            ordering = None  # who is there has changed
-        here = np.zeros(count, dtype=bool)
+        here = np.zeros(self._number.size, dtype=bool)
         here[active] = True
         self._pairs = (*self._pairs[1 - _PAIRS_KEPT :], pairs)
         recent = np.concatenate(self._pairs)
-        recent = recent[here[recent].all(axis=1)]
-        if ordering is None or ordering.near_updates >= _NEAR_AGAIN:
-            near, near_updates = active[near_pairs(places[active])], 1
-        else:
-            near, near_updates = ordering.near, ordering.near_updates + 1
-        graph = adjacency(count, np.concatenate([recent, near]))
-        if ordering is not None and ordering.updates < _ORDERED_AGAIN:
-            pattern = pattern_of(ordering.order, graph)
-            if pattern.width <= _GROWN * ordering.width:
-                used = ordering.updates + 1
-                self._ordering = ordering._replace(updates=used, near=near, near_updates=near_updates)
-                return pattern
-        order = dissect(active, places, graph)
-        pattern = pattern_of(order, graph)
-        self._ordering = _Ordering(order, 1, pattern.width, near, near_updates)
-        return pattern
+        situation = Situation(active, places, recent[here[recent].all(axis=1)])
+        self._ordering = ordered(situation, self._ordering)
+        return self._ordering.pattern
 
     def update(
         self, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
@@ -270,7 +235,7 @@ class SparseFilter:
             raise RuntimeError("the pairs of an update are related first")
         (pattern, prior, shares, active), self._prepared = self._prepared, None
         measured = summed(information_of(columns, jacobian, innovation, noise, self._place))
-        self._factor = eliminate(pattern, prior, measured)
+        self._factor = eliminate(pattern, prior, measured, self._projections)
         self._shares, correction = copies.updated(self._factor, shares, measured)
         count = self._number.size
         self._number = np.full(count, -1)
@@ -284,9 +249,7 @@ class SparseFilter:
 
     def _settle(self, active: IntArray) -> None:
         """Have the marginals of the newest factor and copies."""
-        none = np.zeros(0, dtype=np.int64), np.zeros(self._factor.pattern.fronts + 1, dtype=np.int64)
-        covariance = self._room.of(self._factor.pattern.front.size)
-        write_covariances(self._factor, none, covariance)
+        covariance = self._room.with_fronts(self._factor)
         own = covariance[active, active] + copies.shared(self._shares, active, active)
         self.marginal[active] = carried(-self._place[active], own)
         self._settled[active] = self.marginal[active]
@@ -297,16 +260,28 @@ class _Room:
 
     Args:
         bodies: How many there are at first.
+
+    Attributes:
+        holds: The factor of whose fronts all covariances stand there.
     """
 
     def __init__(self, bodies: int) -> None:
         self._blocks: FloatArray = np.zeros((0, 0, 3, 3))
-        self.of(bodies)
+        self.holds: Factor | None = None
+        self._blocks_of(bodies)
 
-    def of(self, bodies: int) -> FloatArray:
-        """Room for so many bodies (n, n, 3, 3); what stands there is not to be relied on."""
+    def with_fronts(self, factor: Factor) -> FloatArray:
+        """Room (n, n, 3, 3) with the covariances within all fronts of a factor; others do not matter."""
+        blocks = self._blocks_of(factor.pattern.front.size)
+        if factor is not self.holds:
+            write_fronts(factor, blocks)
+            self.holds = factor
+        return blocks
+
+    def _blocks_of(self, bodies: int) -> FloatArray:
+        """Room for so many bodies."""
         if len(self._blocks) < bodies:
             size = bodies + bodies // 8
-            self._blocks = np.zeros((size, size, 3, 3))
+            self._blocks, self.holds = np.zeros((size, size, 3, 3)), None
             self._blocks.fill(0.0)  # so that the system finds the memory now, and not when data are there
         return self._blocks

@@ -1,0 +1,117 @@
+"""What the sparse filter keeps for an update done again, and the sums that it makes of many measurements."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarm_loc_estimator.core.filter.sparse import elimination, ordering
+from swarm_loc_estimator.core.filter.sparse.elimination import Prior, ProjectionMemory, eliminate
+from swarm_loc_estimator.core.filter.sparse.levers import Information, carried_pairs, levers, summed
+from swarm_loc_estimator.core.filter.sparse.ordering import Situation, ordered
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+
+COUNT = 60
+
+
+def grid() -> FloatArray:
+    index = np.arange(COUNT)
+    return 0.5 * np.column_stack([index % 8, index // 8]).astype(float)
+
+
+def situation(pairs: list[tuple[int, int]]) -> Situation:
+    return Situation(np.arange(COUNT), grid(), np.array(pairs, dtype=np.int64).reshape(-1, 2))
+
+
+def prior(rng: np.random.Generator) -> Prior:
+    root = rng.standard_normal((3 * COUNT, 3 * COUNT))
+    covariance = (root @ root.T / COUNT).reshape(COUNT, 3, COUNT, 3).transpose(0, 2, 1, 3)
+    return Prior(np.ascontiguousarray(covariance), np.arange(COUNT))
+
+
+def measured(rng: np.random.Generator, pairs: IntArray) -> Information:
+    root = rng.standard_normal((len(pairs), 3, 3))
+    return Information(pairs[:, 0], pairs[:, 0], root @ root.transpose(0, 2, 1), np.zeros((COUNT, 3)))
+
+
+PAIR = st.tuples(st.integers(0, COUNT - 1), st.integers(0, COUNT - 1))
+
+
+@given(st.integers(0, 10**6), st.integers(0, COUNT - 1), st.lists(PAIR, max_size=3))
+def test_fronts_are_projected_again_where_anything_of_them_has_changed(
+    seed: int, changed: int, pairs: list[tuple[int, int]]
+) -> None:
+    """The factor is that without a memory, to the last bit."""
+    rng, memory = np.random.default_rng(seed), ProjectionMemory()
+    known, seen = prior(rng), measured(rng, np.array([[0, 1], [20, 21]]))
+    first = ordered(situation([]), None).pattern
+    eliminate(first, known, seen, memory)
+    known.covariance[changed, changed] += 0.1 * np.eye(3)
+    pattern = ordered(situation(pairs), None).pattern if pairs else first
+    again, alone = (eliminate(pattern, known, seen, one) for one in (memory, ProjectionMemory()))
+    np.testing.assert_array_equal(again.gain, alone.gain)
+    np.testing.assert_array_equal(again.spread, alone.spread)
+
+
+def test_what_is_known_as_before_is_not_projected_again() -> None:
+    rng, memory = np.random.default_rng(0), ProjectionMemory()
+    known, pattern = prior(rng), ordered(situation([]), None).pattern
+    one = memory.project(pattern, known, 0.0)
+    assert [elimination._same_front(one, f, one) for f in range(pattern.fronts)] == list(
+        range(pattern.fronts)
+    )
+    body = int(pattern.pivot[0])
+    known.covariance[body, body, 2, 2] = np.nextafter(known.covariance[body, body, 2, 2], 9.0)
+    other = memory.project(pattern, known, 0.0)
+    assert elimination._same_front(other, 0, one) < 0
+    assert elimination._same_front(other, pattern.fronts - 1, one) == pattern.fronts - 1
+
+
+@given(st.lists(st.lists(PAIR, max_size=6), min_size=12, max_size=12), st.lists(PAIR, max_size=6))
+def test_the_next_order_does_not_depend_on_what_is_measured_then(
+    earlier: list[list[tuple[int, int]]], late: list[tuple[int, int]]
+) -> None:
+    before = None
+    for pairs in earlier:
+        now = situation(pairs)
+        one, other = ordered(now, before), ordered(situation(pairs + late), before)
+        if before is not None and before.updates >= ordering._ORDERED_AGAIN:
+            assert one.order is other.order
+            assert one.near is other.near
+        for a, b in pairs + late:  # whatever the order is, all pairs lie in the pattern
+            assert in_pattern(other, a, b)
+        before = one
+
+
+def in_pattern(one: ordering.Ordering, a: int, b: int) -> bool:
+    pattern = one.pattern
+    f, g = sorted((int(pattern.front[a]), int(pattern.front[b])))
+    later = a if pattern.front[a] == g else b
+    return f == g or later in pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+
+
+@given(st.integers(0, 10**6), st.integers(0, 40))
+def test_blocks_of_the_same_bodies_are_summed(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    first, second = rng.integers(0, 6, (2, count))
+    one = Information(first, second, rng.standard_normal((count, 3, 3)), rng.standard_normal((6, 3)))
+    result, total, expected = summed(one), np.zeros((6, 6, 3, 3)), np.zeros((6, 6, 3, 3))
+    np.add.at(expected, (first, second), one.block)
+    total[result.first, result.second] = result.block
+    np.testing.assert_allclose(total, expected, atol=1e-12)
+    assert len(set(zip(result.first.tolist(), result.second.tolist(), strict=True))) == result.first.size
+    assert np.all(np.diff(result.first) >= 0)
+    np.testing.assert_array_equal(result.gradient, one.gradient)
+
+
+@given(st.integers(0, 10**6))
+def test_covariances_are_carried_by_the_levers_of_their_bodies(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    places, others, across = (
+        rng.normal(0.0, 9.0, (5, 2)),
+        rng.normal(0.0, 9.0, (5, 2)),
+        rng.normal(0, 1, (5, 3, 3)),
+    )
+    expected = levers(places) @ across @ levers(others).transpose(0, 2, 1)
+    np.testing.assert_allclose(carried_pairs(places, across, others), expected, atol=1e-9)
