@@ -1,7 +1,8 @@
 """How far one core carries: simulated swarms of growing size, beside filterpy and gtsam on the same data.
 
 The swarm is a grid with about three neighbours in view of each robot (`sim.scenarios.grid`):
-odometry at 20 Hz, cameras at 7.5 Hz, 150-300 ms late. Everybody gives all poses ten times a second and uses
+odometry at 20 Hz, cameras at 7.5 Hz, 150-300 ms late; for one figure (`prompt_cpu_s_per_s`) nothing is late.
+Everybody gives all poses ten times a second and uses
 new measurements five times a second, as the live node does with a large swarm. Measured is CPU time of this
 process per simulated second, without reading messages; the optimum is gtsam's batch solution of all data that
 have arrived by the same moment. Swarms of several shapes are compared with the exact filter (`shapes.py`). At
@@ -20,7 +21,7 @@ from bench.graph import large_swarms
 from bench.peers import filterpy_ekf, gtsam_batch, gtsam_lag
 from bench.peers.shapes import ShapeRuns, measure_shape, show
 from bench.shared.common import new_plot, save_plot, table, write_figures
-from bench.shared.simulated_run import errors_of, mean_nees, position_rmse, run_core, ticks
+from bench.shared.simulated_run import errors_of, mean_nees, position_rmse, run_core, ticks, without_delay
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.scenarios.grid_shapes import Shape
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
@@ -50,10 +51,12 @@ def measure(robots: int, duration_s: float, seed: int, settings: EstimatorSettin
     run = simulate_grid(GridSettings(robots=robots, seed=seed, duration_s=duration_s))
     tick_ns = ticks(run)
     core = run_core(run, tick_ns, settings, FUSE_NS)
+    prompt = run_core(without_delay(run), tick_ns, settings, FUSE_NS)
     settled = tick_ns >= run.start_ns + SETTLING_S * 1e9
     errors = errors_of(core.poses, run, tick_ns)[settled]
     figures = {
         "cpu_s_per_s": core.cpu_s / run.duration_s,
+        "prompt_cpu_s_per_s": prompt.cpu_s / run.duration_s,
         "position_rmse_mm": 1e3 * position_rmse(errors),
         "heading_rmse_deg": float(np.degrees(np.sqrt(np.mean(errors[..., 2] ** 2)))),
         "nees": mean_nees(errors, core.covariances[settled]),
@@ -61,6 +64,7 @@ def measure(robots: int, duration_s: float, seed: int, settings: EstimatorSettin
     part = first_part(run, min(duration_s, max(2.0, PEER_ROBOT_SECONDS / robots)))
     for name, peer in (("filterpy", filterpy_ekf), ("gtsam", gtsam_lag)):
         figures[f"{name}_cpu_s_per_s"] = peer.solve(part, ticks(part)).cpu_s / part.duration_s
+        figures[f"{name}_cpu_ratio"] = figures[f"{name}_cpu_s_per_s"] / figures["cpu_s_per_s"]
     if robots <= LARGEST_FOR_BATCH:
         chosen = np.flatnonzero(settled)[:: max(1, int(settled.sum()) * robots // 240)]
         best = gtsam_batch.solve(run, tick_ns[chosen])
@@ -106,8 +110,10 @@ def report(results: dict[int, dict[str, float]], shapes: dict[str, float], live:
     """Print the tables, draw the plot and write the figures."""
     keys = {
         "cpu_s_per_s": "CPU s/s",
+        "prompt_cpu_s_per_s": "without delay s/s",
         "filterpy_cpu_s_per_s": "filterpy s/s",
         "gtsam_cpu_s_per_s": "gtsam s/s",
+        "gtsam_cpu_ratio": "gtsam / own",
         "position_rmse_mm": "RMSE mm",
         "heading_rmse_deg": "RMSE deg",
         "position_rmse_ratio_to_batch": "RMSE / batch",

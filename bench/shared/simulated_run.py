@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from swarm_loc_drivers.sim.common.record import in_order_of_arrival
 from swarm_loc_drivers.sim.recording.detections import as_detections
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
 from swarm_loc_estimator.core.inputs.messages import DetectionRows, OdometryRows, RawInputs, chosen
@@ -72,6 +73,19 @@ def inputs_between(run: SimulatedRun, tick_ns: NDArray[np.int64]) -> list[RawInp
         parts.append(RawInputs(now_ns, now_ns, chosen(odometry, first), chosen(seen, second)))
         begin = ends
     return parts
+
+
+def without_delay(run: SimulatedRun) -> SimulatedRun:
+    """The run as if everything arrived at the moment at which it happens."""
+    odometry, frames = run.odometry.copy(), run.frames.copy()
+    odometry["arrival_ns"], frames["arrival_ns"] = odometry["stamp_ns"], frames["stamp_ns"]
+    of_sighting = np.repeat(frames["arrival_ns"], frames["count"])
+    image_of = np.repeat(np.arange(len(frames)), frames["count"])
+    sightings = run.sightings[np.lexsort((image_of, of_sighting))]
+    frames = in_order_of_arrival(frames, run.end_ns)
+    frames["first"] = np.cumsum(frames["count"]) - frames["count"]
+    odometry = in_order_of_arrival(odometry, run.end_ns)
+    return replace(run, odometry=odometry, frames=frames, sightings=sightings)
 
 
 def ticks(run: SimulatedRun) -> NDArray[np.int64]:

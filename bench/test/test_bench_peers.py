@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bench.peers.problem import Moves, Odometry, no_moves, relative_poses, sightings_of, starts_of
+from bench.shared.simulated_run import without_delay
 from swarm_loc_drivers.sim.common.error_model import W0
 from swarm_loc_drivers.sim.common.record import SimulatedRun
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
@@ -114,3 +115,21 @@ def test_a_peer_localizes_a_small_swarm(name: str) -> None:
     error = result.poses - run.truth.all_at(output_ns)
     assert np.sqrt((error[..., :2] ** 2).sum(axis=-1).mean()) < 0.006
     assert result.cpu_s > 0.0
+
+
+def test_without_delay_all_is_there_in_the_order_in_which_it_happened(grid: SimulatedRun) -> None:
+    run = without_delay(grid)
+    for late, prompt in ((grid.odometry, run.odometry), (grid.frames, run.frames)):
+        assert len(late) == len(prompt)
+        assert np.all(np.diff(prompt["stamp_ns"]) >= 0)
+        np.testing.assert_array_equal(prompt["arrival_ns"], prompt["stamp_ns"])
+    assert sorted(seen_by(run)) == sorted(seen_by(grid))
+    assert seen_by(run) != seen_by(grid)
+
+
+def seen_by(run: SimulatedRun) -> list[tuple[int, int, tuple[float, ...]]]:
+    """Who saw each sighting when, and what."""
+    who = (np.repeat(run.frames[name], run.frames["count"]).tolist() for name in ("robot", "stamp_ns"))
+    first = np.cumsum(run.frames["count"]) - run.frames["count"]
+    np.testing.assert_array_equal(run.frames["first"], first)
+    return list(zip(*who, map(tuple, run.sightings["value"].tolist()), strict=True))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from swarm_loc_estimator.core.filter.dense.inversion import InverseMemory, inverse
+from swarm_loc_estimator.core.filter.dense.inversion import InverseMemory, invert
 from swarm_loc_estimator.core.filter.joint_filter import Robots
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 from swarm_loc_estimator.numerics.jit import compiled
@@ -97,7 +97,8 @@ class DenseFilter:
         gradient = np.zeros(self.covariance.shape[0])
         information = self.inverses.inverse_of(self.covariance).copy()
         _gather(information, gradient, columns, jacobian, innovation, noise)
-        self.covariance = inverse(information)
+        invert(information)
+        self.covariance = information
         correction: FloatArray = self.covariance @ gradient
         return correction
 

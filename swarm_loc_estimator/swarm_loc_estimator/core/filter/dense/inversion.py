@@ -34,10 +34,15 @@ def inverse(matrix: FloatArray) -> FloatArray:
         LinAlgError: The matrix is not positive definite.
     """
     inverted: FloatArray = matrix.copy()
-    if not invert_positive(inverted.reshape(-1), matrix.shape[0]):
-        raise np.linalg.LinAlgError("the covariance is not positive definite")
-    _mirror(inverted)
+    invert(inverted)
     return inverted
+
+
+def invert(matrix: FloatArray) -> None:
+    """Invert a matrix (n, n) where it stands; see `inverse`."""
+    if not invert_positive(matrix.reshape(-1), matrix.shape[0]):
+        raise np.linalg.LinAlgError("the covariance is not positive definite")
+    _mirror(matrix)
 
 
 @compiled

@@ -99,34 +99,43 @@ def write_fronts(factor: Factor, covariance: FloatArray) -> None:
     (1973), for fronts.
 
     Args:
-        factor: Of n bodies.
+        factor: Of n bodies, none of them derived.
         covariance: (n, n, 3, 3) written; what is in no front stays as it is.
     """
-    pattern = factor.pattern
-    for f in range(pattern.pivot_begin.size - 2, -1, -1):
-        pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
-        border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
-        width, size = 3 * border.size, 3 * pivots.size
-        own = factor.spread[factor.spread_begin[f] : factor.spread_begin[f + 1]].reshape(size, size)
-        if width:
-            gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]].reshape(width, size)
-            across = np.dot(gathered(covariance, border, border), gain)
-            own = own + np.dot(gain.T, across)
-            _scatter(covariance, border, pivots, across)
-        _scatter_own(covariance, pivots, own)
+    for f in range(factor.pattern.pivot_begin.size - 2, -1, -1):
+        _write_front(factor, f, covariance)
 
 
 @compiled
-def write_rows(factor: Factor, rows: tuple[IntArray, IntArray], covariance: FloatArray) -> None:
-    """Write the covariances of wanted rows, likewise, where those within all fronts stand already.
+def _write_front(factor: Factor, f: int, covariance: FloatArray) -> None:
+    """Write the covariances of the pivots of front f with it, where those of its border stand."""
+    pattern = factor.pattern
+    pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
+    border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+    width, size = 3 * border.size, 3 * pivots.size
+    own = factor.spread[factor.spread_begin[f] : factor.spread_begin[f + 1]].reshape(size, size)
+    if width:
+        gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]].reshape(width, size)
+        across = np.dot(gathered(covariance, border, border), gain)
+        own = own + np.dot(gain.T, across)
+        _scatter(covariance, border, pivots, across)
+    _scatter_own(covariance, pivots, own)
+
+
+@compiled
+def write_rows(factor: Factor, derived: int, rows: tuple[IntArray, IntArray], covariance: FloatArray) -> None:
+    """Write the covariances of wanted rows, and of bodies derived, where those within other fronts stand.
 
     Args:
         factor: Of n bodies.
+        derived: So many of the first fronts are of bodies derived: pairs of their borders may be in no front.
         rows: As `symbolic.wanted_rows` gives them.
         covariance: (n, n, 3, 3) written; what is not wanted stays as it is.
     """
     pattern = factor.pattern
     for f in range(pattern.pivot_begin.size - 2, -1, -1):
+        if f < derived:
+            _write_front(factor, f, covariance)
         wanted = rows[0][rows[1][f] : rows[1][f + 1]]
         if not wanted.size:
             continue

@@ -178,8 +178,8 @@ class SparseFilter:
         factor, shares = with_derived(self._factor, self._new), copies.with_derived(self._shares, self._new)
         pattern = self._pattern(pairs, active, places)
         rows = wanted_rows(factor.pattern, pattern, self._number, len(self._new))
-        covariance = self._room.with_fronts(factor)
-        write_rows(factor, rows, covariance)
+        covariance = self._room.with_fronts(self._factor, len(self._new))
+        write_rows(factor, len(self._new), rows, covariance)
         self._room.holds = None  # since noise is added to it
         if self._updates % _COPIED_AGAIN == 0:
             copied = active[spread(places[active], min(_COPIES, active.size // _COPIED_SHARE))]
@@ -268,20 +268,22 @@ class _Room:
     def __init__(self, bodies: int) -> None:
         self._blocks: FloatArray = np.zeros((0, 0, 3, 3))
         self.holds: Factor | None = None
-        self._blocks_of(bodies)
+        self._make(bodies)
 
-    def with_fronts(self, factor: Factor) -> FloatArray:
-        """Room (n, n, 3, 3) with the covariances within all fronts of a factor; others do not matter."""
-        blocks = self._blocks_of(factor.pattern.front.size)
-        if factor is not self.holds:
-            write_fronts(factor, blocks)
-            self.holds = factor
-        return blocks
+    def with_fronts(self, factor: Factor, more: int = 0) -> FloatArray:
+        """Room (n, n, 3, 3) with the covariances within all fronts of a factor; others do not matter.
 
-    def _blocks_of(self, bodies: int) -> FloatArray:
-        """Room for so many bodies."""
+        There is room for `more` bodies than the factor has.
+        """
+        bodies = factor.pattern.front.size + more
         if len(self._blocks) < bodies:
-            size = bodies + bodies // 8
-            self._blocks, self.holds = np.zeros((size, size, 3, 3)), None
-            self._blocks.fill(0.0)  # so that the system finds the memory now, and not when data are there
+            self._make(bodies)
+        if factor is not self.holds:
+            write_fronts(factor, self._blocks)
+            self.holds = factor
         return self._blocks
+
+    def _make(self, bodies: int) -> None:
+        size = bodies + bodies // 8
+        self._blocks, self.holds = np.zeros((size, size, 3, 3)), None
+        self._blocks.fill(0.0)  # so that the system finds the memory now, and not when data are there
