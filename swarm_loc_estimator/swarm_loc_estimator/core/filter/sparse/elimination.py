@@ -30,10 +30,12 @@ class Prior(NamedTuple):
     Attributes:
         covariance: (s, s, 3, 3) by the bodies' numbers there.
         place: (n,) the numbers of the pattern's bodies there.
+        added: (n, 3, 3) by what they are larger than what follows from the factor before.
     """
 
     covariance: FloatArray
     place: IntArray
+    added: FloatArray
 
 
 class Projection(NamedTuple):
@@ -42,91 +44,52 @@ class Projection(NamedTuple):
     Attributes:
         pattern: Its fronts.
         begin: (F + 1,) where the numbers of each front begin.
-        covariance: What is known before of a front's bodies (d, d), those of the border first.
-        information: Of p(x_J | x_B) (d, d), which follows from it.
+        information: Of p(x_J | x_B) (d, d), those of the border first.
+        added: That of the prior.
     """
 
     pattern: Pattern
     begin: IntArray
-    covariance: FloatArray
     information: FloatArray
+    added: FloatArray
 
 
 class ProjectionMemory:
-    """The newest projection: fronts of which the same is known as then need not be projected again.
+    """The projection of a prior that came first from a factor: the next ones from there are like it.
 
     A period is fused again with what comes late of it, from the same prediction.
     """
 
     def __init__(self) -> None:
-        nothing = np.zeros(0)
-        self._newest = Projection(EMPTY.pattern, np.zeros(1, dtype=np.int64), nothing, nothing)
-        self._spare = nothing, nothing
+        self._origin: Factor | None = None
+        self._kept = Projection(EMPTY.pattern, np.zeros(1, dtype=np.int64), np.zeros(0), np.zeros((0, 3, 3)))
 
-    def project(self, pattern: Pattern, prior: Prior, looser: float) -> Projection:
-        """Project a prior, variances being enlarged by a share; it is there until the call after the next.
+    def of(self, pattern: Pattern, prior: Prior, origin: Factor | None) -> tuple[Projection, bool]:
+        """What is kept of the same factor, and True; or room to keep this projection.
 
-        Raises:
-            LinAlgError: The prior is no covariance.
+        Args:
+            pattern: To project on.
+            prior: To project.
+            origin: The factor from which the prior follows but for what is added; None: not from one alone.
         """
+        if origin is not None and origin is self._origin:
+            return self._kept, True
         bodies = np.diff(pattern.pivot_begin) + np.diff(pattern.border_begin)
-        begin = np.concatenate([[0], np.cumsum(9 * bodies * bodies)])
-        if self._spare[0].size < begin[-1]:
-            room = int(1.2 * begin[-1])
-            self._spare = np.empty(room), np.empty(room)
-        projection = Projection(pattern, begin, *self._spare)
-        _project(projection, prior, looser, self._newest)
-        self._spare = self._newest.covariance, self._newest.information
-        self._newest = projection
-        return projection
+        begin, room = np.concatenate([[0], np.cumsum(9 * bodies * bodies)]), self._kept.information
+        if room.size < begin[-1]:
+            room = np.empty(int(1.2 * begin[-1]))
+        self._kept, self._origin = Projection(pattern, begin, room, prior.added), origin
+        return self._kept, False
+
+    def forget(self) -> None:
+        """Keep nothing."""
+        self._origin = None
 
 
-@compiled
-def _project(out: Projection, prior: Prior, looser: float, before: Projection) -> None:
-    """Write a projection."""
-    pattern = out.pattern
-    for f in range(pattern.pivot_begin.size - 1):
-        pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
-        border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
-        places = prior.place[np.concatenate((border, pivots))]
-        here = slice(out.begin[f], out.begin[f + 1])
-        covariance = out.covariance[here].reshape(3 * places.size, 3 * places.size)
-        covariance[:] = gathered(prior.covariance, places, places)
-        for k in range(covariance.shape[0]):
-            covariance[k, k] *= 1.0 + looser
-        same = _same_front(out, f, before)
-        if same >= 0:
-            out.information[here] = before.information[before.begin[same] : before.begin[same + 1]]
-        else:
-            lower: FloatArray = np.linalg.cholesky(np.ascontiguousarray(covariance))
-            columns = _last_columns(lower, 3 * pivots.size)
-            np.dot(columns, columns.T, out.information[here].reshape(covariance.shape))
-
-
-@compiled
-def _same_front(one: Projection, f: int, other: Projection) -> int:
-    """The front of another projection of which the same is known as of front f of this one; -1: none."""
-    first = one.pattern.pivot[one.pattern.pivot_begin[f]]
-    g = other.pattern.front[first] if first < other.pattern.front.size else -1
-    if g < 0:
-        return -1
-    mine, its = one.pattern, other.pattern
-    same = are_equal(
-        mine.pivot[mine.pivot_begin[f] : mine.pivot_begin[f + 1]],
-        its.pivot[its.pivot_begin[g] : its.pivot_begin[g + 1]],
-    )
-    same = same and are_equal(
-        mine.border[mine.border_begin[f] : mine.border_begin[f + 1]],
-        its.border[its.border_begin[g] : its.border_begin[g + 1]],
-    )
-    same = same and are_equal(
-        one.covariance[one.begin[f] : one.begin[f + 1]], other.covariance[other.begin[g] : other.begin[g + 1]]
-    )
-    return g if same else -1
-
-
-def eliminate(pattern: Pattern, prior: Prior, measured: Information, memory: ProjectionMemory) -> Factor:
-    """The factor of a prior and measurements.
+def eliminate(
+    pattern: Pattern, prior: Prior, measured: Information, memory: ProjectionMemory, origin: Factor | None
+) -> Factor:
+    """The factor of a prior and measurements; for memory and origin see `ProjectionMemory.of`.
 
     Raises:
         LinAlgError: The prior is no covariance.
@@ -136,9 +99,12 @@ def eliminate(pattern: Pattern, prior: Prior, measured: Information, memory: Pro
     begin = np.searchsorted(earlier[order], np.arange(pattern.fronts + 1))
     factor = new_factor(pattern)
     for looser in _LOOSER:
+        kept, is_kept = memory.of(pattern, prior, origin)
         try:
-            _eliminate(factor, memory.project(pattern, prior, looser), measured, (order, begin))
+            _eliminate(factor, prior, measured, (order, begin), (kept, is_kept), looser)
         except np.linalg.LinAlgError:
+            memory.forget()
+            origin = None
             continue
         return factor
     raise np.linalg.LinAlgError("the covariance of a front is not positive definite")
@@ -146,10 +112,18 @@ def eliminate(pattern: Pattern, prior: Prior, measured: Information, memory: Pro
 
 @compiled
 def _eliminate(
-    factor: Factor, prior: Projection, measured: Information, blocks: tuple[IntArray, IntArray]
+    factor: Factor,
+    prior: Prior,
+    measured: Information,
+    blocks: tuple[IntArray, IntArray],
+    memory: tuple[Projection, bool],
+    looser: float,
 ) -> None:
-    """Write a factor; `blocks` is the order of what was measured, front by front, and where each begins."""
-    pattern = factor.pattern
+    """Write a factor, and what is to be kept of it.
+
+    `blocks` is the order of what was measured, front by front, and where each begins.
+    """
+    pattern, kept, is_kept = factor.pattern, memory[0], memory[1]
     fronts = pattern.pivot_begin.size - 1
     updates = [np.empty((0, 0)) for _ in range(fronts)]
     child, sibling = np.full(fronts, -1, dtype=np.int64), np.full(fronts, -1, dtype=np.int64)
@@ -160,8 +134,15 @@ def _eliminate(
         split, size = 3 * border.size, 3 * (bodies.size - border.size)
         for k in range(bodies.size):
             local[bodies[k]] = k
-        known = prior.information[prior.begin[f] : prior.begin[f + 1]]
-        information = known.reshape(3 * bodies.size, 3 * bodies.size).copy()
+        same = _same_front(pattern, prior, f, kept) if is_kept else -1
+        if same >= 0:
+            known = kept.information[kept.begin[same] : kept.begin[same + 1]]
+            information = known.reshape(split + size, split + size).copy()
+        else:
+            places = prior.place[bodies]
+            information = _conditional(gathered(prior.covariance, places, places), size, looser)
+            if not is_kept:
+                kept.information[kept.begin[f] : kept.begin[f + 1]] = information.reshape(-1)
         _add_blocks(information, local, measured, blocks[0][blocks[1][f] : blocks[1][f + 1]])
         below = child[f]
         while below >= 0:
@@ -180,6 +161,34 @@ def _eliminate(
             updates[f] = information[:split, :split] - np.dot(gain, across.T)
             parent = pattern.front[border].min()
             sibling[f], child[parent] = child[parent], f
+
+
+@compiled
+def _same_front(pattern: Pattern, prior: Prior, f: int, kept: Projection) -> int:
+    """Which front of a projection of the same factor is as front f of a prior would be; -1: none."""
+    pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
+    border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+    other = kept.pattern
+    g = other.front[pivots[0]]
+    if g < 0:
+        return -1
+    same = are_equal(pivots, other.pivot[other.pivot_begin[g] : other.pivot_begin[g + 1]])
+    same = same and are_equal(border, other.border[other.border_begin[g] : other.border_begin[g + 1]])
+    for bodies in (border, pivots):
+        for body in bodies:
+            same = same and are_equal(prior.added[body].reshape(-1), kept.added[body].reshape(-1))
+    return g if same else -1
+
+
+@compiled
+def _conditional(covariance: FloatArray, size: int, looser: float) -> FloatArray:
+    """Information (d, d) of p(x_J | x_B) for a covariance (d, d), the pivots being the last `size` rows."""
+    for k in range(covariance.shape[0]):
+        covariance[k, k] *= 1.0 + looser
+    lower: FloatArray = np.linalg.cholesky(np.ascontiguousarray(covariance))
+    columns = _last_columns(lower, size)
+    information: FloatArray = np.dot(columns, columns.T)
+    return information
 
 
 @compiled

@@ -43,12 +43,16 @@ _FAR_M = 20.0
 
 
 class _Prepared(NamedTuple):
-    """What an update needs: the pattern, covariances and shares of copies before it, who is active."""
+    """What an update needs: the pattern, covariances and shares of copies before it, who is active.
+
+    And the factor from which the covariances follow but for what is added; None: not from one alone.
+    """
 
     pattern: Pattern
     prior: Prior
     shares: FloatArray
     active: IntArray
+    origin: Factor | None
 
 
 class SparseFilter:
@@ -181,22 +185,24 @@ class SparseFilter:
         covariance = self._room.with_fronts(self._factor, len(self._new))
         write_rows(factor, len(self._new), rows, covariance)
         self._room.holds = None  # since noise is added to it
+        origin: Factor | None = factor
         if self._updates % _COPIED_AGAIN == 0:
             copied = active[spread(places[active], min(_COPIES, active.size // _COPIED_SHARE))]
             others = copies.renewed(factor, shares, self._number[copied])
             copies.change_shared(covariance, pattern, self._number, (shares, others))
-            shares = others
+            shares, origin = others, None
         self._updates += 1
-        numbers = self._number[active]
-        added = carried(self._place[active], self.marginal[active] - self._settled[active])
-        covariance[numbers, numbers] += added
+        numbers, added = self._number[active], np.zeros_like(self.marginal)
+        added[active] = carried(self._place[active], self.marginal[active] - self._settled[active])
+        covariance[numbers, numbers] += added[active]
         by_body = shares
         if not np.array_equal(
             numbers, np.arange(self._number.size)
         ):  # not all are there, as they were before
             by_body = np.zeros((self._number.size, 3, shares.shape[2]))
             by_body[active] = shares[numbers]
-        self._prepared = _Prepared(pattern, Prior(covariance, self._number), by_body, active)
+        prior = Prior(covariance, self._number, added)
+        self._prepared = _Prepared(pattern, prior, by_body, active, origin)
         return self._prepared
 
     def _move_far(self, active: IntArray, places: FloatArray) -> None:
@@ -233,9 +239,9 @@ class SparseFilter:
         """
         if self._prepared is None:
             raise RuntimeError("the pairs of an update are related first")
-        (pattern, prior, shares, active), self._prepared = self._prepared, None
+        (pattern, prior, shares, active, origin), self._prepared = self._prepared, None
         measured = summed(information_of(columns, jacobian, innovation, noise, self._place))
-        self._factor = eliminate(pattern, prior, measured, self._projections)
+        self._factor = eliminate(pattern, prior, measured, self._projections, origin)
         self._shares, correction = copies.updated(self._factor, shares, measured)
         count = self._number.size
         self._number = np.full(count, -1)
