@@ -10,7 +10,7 @@ import numpy as np
 from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
 from swarm_loc_estimator.core.description.robot_ir import IrMethod, RobotIr
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import Face, Landmark, Robot, Swarm
+from swarm_loc_estimator.core.description.swarm import Face, Landmark, OdometryModel, Robot, Swarm
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
 from swarm_loc_estimator.core.filter.correlated_noise import record_pair
 from swarm_loc_estimator.core.filter.integrity.surprises import is_elsewhere
@@ -51,7 +51,8 @@ def warm_up() -> None:
 
 def _run(settings: EstimatorSettings) -> None:
     robots = [Robot(name, faces=(Face("front", k, yaw=0.0),)) for k, name in enumerate("ab")]
-    robots.append(Robot("c", faces=(Face("front", 2, yaw=0.0),), start=(0.0, 0.0, 0.0)))
+    calibrated = OdometryModel(distance_scale_sigma=0.01)
+    robots.append(Robot("c", odometry=calibrated, faces=(Face("front", 2, yaw=0.0),), start=(0.0, 0.0, 0.0)))
     robots = [replace(robot, ir=_board(k)) for k, robot in enumerate(robots)]
     places = range(_LANDMARKS)
     marks = tuple(Landmark(_FIRST_LANDMARK + k, x=1.0, y=0.2 * k, yaw=3.1) for k in places)

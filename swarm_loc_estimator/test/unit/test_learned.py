@@ -32,10 +32,11 @@ def run(world: World, settings: EstimatorSettings | None = None) -> tuple[Swarm,
     return estimator.learned(), wrapped(np.array([e.poses - world.at(e.stamp_ns) for e in estimates]))
 
 
+@pytest.mark.parametrize("sparse_from", [2, 250])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_what_is_learned_is_near_the_truth_and_as_sure_as_it_says(seed: int) -> None:
+def test_what_is_learned_is_near_the_truth_and_as_sure_as_it_says(seed: int, sparse_from: int) -> None:
     world, true = simulate(PLAN, seed), lasting_errors(PLAN, seed)
-    taught, _ = run(world)
+    taught, _ = run(world, EstimatorSettings(sparse_from=sparse_from))
     off, before = [], []
     for i, (robot, described) in enumerate(zip(taught.robots, world.swarm.robots, strict=True)):
         odometry, sensor = robot.odometry, robot.sensor

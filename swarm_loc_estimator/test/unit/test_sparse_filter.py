@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
+from swarm_loc_estimator.core.description.estimated_parameters import CAMERA_YAW, ParameterTable
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.description.swarm import CameraMount, Landmark, Robot, Swarm
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
@@ -28,7 +28,8 @@ class Both:
         self.rng = np.random.default_rng(seed)
         self.places = places
         self.active = np.ones(len(places), dtype=bool)
-        self.filters = DenseFilter(3 * len(places)), SparseFilter(3 * len(places))
+        table = ParameterTable.of([Robot(str(body)) for body in range(len(places))], in_blocks=True)
+        self.filters = DenseFilter(table.filter_size), SparseFilter(table)
         for body in range(len(places)):
             self.place(body)
 
@@ -69,9 +70,12 @@ class Both:
         noise = np.tile(np.diag(SIGMA**2), (count, 1, 1))
         first = np.where(pairs >= 0, 3 * pairs, -1)
         robots = Robots(self.places, self.active)
-        across = [one.relate_pairs(first, robots)[(pairs >= 0).all(axis=1)] for one in self.filters]
+        dense, sparse = self.filters
+        across = sparse.relate_pairs(np.column_stack([first, np.full(count, -1)]), robots)[:, :, :3]
+        for k in np.flatnonzero((pairs >= 0).all(axis=1)).tolist():
+            across[k] -= dense.covariance[columns[k, :3, None], columns[k, 3:6]]
         corrections = [one.update(columns, jacobian, innovation, noise) for one in self.filters]
-        return corrections[0], corrections[1], across[0] - across[1]
+        return corrections[0], corrections[1], across
 
     def marginals(self) -> tuple[FloatArray, FloatArray]:
         """Covariances (n, 3, 3) of poses by either filter."""
@@ -144,7 +148,7 @@ def test_a_copy_goes_its_own_way() -> None:
     other = sparse.copy()
     robots = Robots(both.places, both.active)
     first = 3 * pairs[:10]
-    other.relate_pairs(first, robots)
+    other.relate_pairs(np.column_stack([first, np.full(10, -1)]), robots)
     jacobian, noise = np.tile(np.hstack([-np.eye(3), np.eye(3)]), (10, 1, 1)), np.tile(np.eye(3), (10, 1, 1))
     columns = (first[:, :, None] + np.arange(3)).reshape(10, 6)
     other.update(columns, jacobian, np.ones((10, 3)), 1e-6 * noise)
@@ -152,32 +156,37 @@ def test_a_copy_goes_its_own_way() -> None:
     assert not np.array_equal(other.marginal, before)
 
 
-def test_what_is_contradicted_becomes_less_certain_and_a_landmark_is_estimated() -> None:
-    robots, mark = [Robot(name) for name in "ab"], Landmark(1, 1.0, 0.5, yaw=0.0)
-    table = ParameterTable.of(robots, [mark])
-    state = SwarmState(table, joint=SparseFilter(table.filter_size))
+def test_what_is_contradicted_is_estimated() -> None:
+    robots, mark = [Robot(name, camera=CameraMount()) for name in "ab"], Landmark(1, 1.0, 0.5, yaw=0.0)
+    table = ParameterTable.of(robots, [mark], in_blocks=True)
+    state = SwarmState(table, joint=SparseFilter(table))
     for robot in range(2):
         state.initialize(robot, InitialPose(np.array([robot, 0.0, 0.0]), START), Preintegrated.begin(0))
     before = state.filter.block(np.arange(3))
     state.open(0, np.zeros(3))
     assert np.linalg.eigvalsh(state.filter.block(np.arange(3)) - before).min() > 1e-4
-    assert state.integrity.hidden_noise[0] == 1.0
+    assert (state.parameter_sigma(0)[1:] > 0.01).all()
+    assert not state.parameter_sigma(1).any()
     state.open(2, np.zeros(3))
-    column = state.landmark_column(0)
+    column, yaw = state.landmark_column(0), int(state.arrays().table.column[0, CAMERA_YAW])
     assert np.linalg.eigvalsh(state.landmark_covariance(0)).min() > 1e-5
-    pairs = np.array([[0, column], [0, 3]])
-    across = state.filter.relate_pairs(pairs, Robots(np.zeros((2, 2)), state.tracked))
+    assert isinstance(state.filter, SparseFilter)
+    related = np.array([[0, column, yaw], [0, 3, yaw]])
+    across = state.filter.relate_pairs(related, Robots(np.zeros((2, 2)), state.tracked))
     np.testing.assert_allclose(across, 0.0, atol=1e-12)
     jacobian = np.zeros((1, 3, 8))
     jacobian[0, :, :3], jacobian[0, :, 3:6] = -np.eye(3), np.eye(3)
-    columns = np.array([[0, 1, 2, column, column + 1, column + 2, 0, 0]])
+    jacobian[0, 2, 6] = 1.0
+    columns = np.array([[0, 1, 2, column, column + 1, column + 2, yaw, 0]])
     correction = state.filter.update(columns, jacobian, np.full((1, 3), 0.01), 1e-4 * np.eye(3)[None])
     assert correction[0] < 0.0 < correction[column]
+    assert correction[yaw] > 0.0
     assert not correction[3:6].any()
 
 
 @pytest.mark.parametrize("yaw_sigma", [0.0, 0.01])
-def test_a_large_swarm_that_is_calibrated_stays_dense_and_says_so(yaw_sigma: float) -> None:
+def test_a_large_swarm_is_sparse_whether_it_is_calibrated_or_not(yaw_sigma: float) -> None:
     robots = tuple(Robot(f"r{k}", camera=CameraMount(yaw_sigma=yaw_sigma)) for k in range(3))
-    estimator = SwarmEstimator(Swarm(robots, ()), EstimatorSettings(sparse_from=3))
-    assert ("because robots are calibrated" in estimator.note) == (yaw_sigma > 0.0)
+    assert SwarmEstimator(Swarm(robots, ()), EstimatorSettings(sparse_from=3)).note == ""
+    one_by_one = EstimatorSettings(sparse_from=3, fusion_period_s=0.0)
+    assert "because fusion_period_s is 0" in SwarmEstimator(Swarm(robots, ()), one_by_one).note

@@ -22,7 +22,8 @@ def grid() -> FloatArray:
 
 
 def situation(pairs: list[tuple[int, int]]) -> Situation:
-    return Situation(np.arange(COUNT), grid(), np.array(pairs, dtype=np.int64).reshape(-1, 2))
+    blocks = np.zeros(0, dtype=np.int64)
+    return Situation(np.arange(COUNT), blocks, grid(), np.array(pairs, dtype=np.int64).reshape(-1, 2))
 
 
 def prior(rng: np.random.Generator) -> Prior:

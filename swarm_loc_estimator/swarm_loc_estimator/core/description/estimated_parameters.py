@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.description.swarm import Landmark, Robot
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.numerics.se2 import error_covariance
 
 TURN_BIAS = 0
@@ -34,6 +34,10 @@ CAMERA_SCALE = 4
 DRIVES = 3
 """So many, the first, act through the motion."""
 PARAMETERS = 5
+BLOCKS = -(-PARAMETERS // DRIVES)
+"""A robot's parameters are so many blocks of as many columns as a pose has: of its motion, of its camera."""
+_BLOCK, _SLOT = np.divmod(np.arange(PARAMETERS), DRIVES)
+"""In which block each stands, and where there."""
 
 _DOUBTED_SIGMA = (0.0, 0.05, 0.1, 0.03, 0.03)
 """Standard deviations of parameters that were taken to be exact, once they are contradicted."""
@@ -53,6 +57,7 @@ class ParameterTable(NamedTuple):
         turn_bias_time_s: (N,) time constant of TURN_BIAS; the others do not change.
         survey_column: (L,) of each landmark the first of its three columns; -1: not estimated.
         survey: (L, 3, 3) covariance of its right-invariant error when it is opened.
+        in_blocks: Whether a robot's parameters stand in blocks of three columns, some of them of nothing.
     """
 
     column: NDArray[np.int64]
@@ -60,9 +65,12 @@ class ParameterTable(NamedTuple):
     turn_bias_time_s: FloatArray
     survey_column: NDArray[np.int64]
     survey: FloatArray
+    in_blocks: bool
 
     @classmethod
-    def of(cls, robots: Sequence[Robot], landmarks: Sequence[Landmark] = ()) -> ParameterTable:
+    def of(
+        cls, robots: Sequence[Robot], landmarks: Sequence[Landmark] = (), *, in_blocks: bool = False
+    ) -> ParameterTable:
         """What the descriptions of robots and landmarks ask for."""
         sigma = np.zeros((len(robots), PARAMETERS))
         for i, robot in enumerate(robots):
@@ -74,27 +82,49 @@ class ParameterTable(NamedTuple):
                 sigma[i, CAMERA_YAW] = robot.camera.yaw_sigma
                 sigma[i, CAMERA_SCALE] = robot.sensor.distance_scale_sigma
         wanted = sigma > 0.0
-        column = np.full(sigma.shape, -1)
-        column[wanted] = 3 * len(robots) + np.arange(wanted.sum())
         doubted = np.where(wanted, sigma, _DOUBTED_SIGMA)
         doubted[[robot.camera is None for robot in robots], DRIVES:] = 0.0
         times = np.array([robot.odometry.turn_bias_time_s for robot in robots], dtype=float)
-        surveyed = np.array([mark.is_estimated for mark in landmarks], dtype=bool)
-        survey_column = np.full(len(landmarks), -1)
-        survey_column[surveyed] = 3 * len(robots) + wanted.sum() + 3 * np.arange(surveyed.sum())
         surveys = np.array([_survey(mark) for mark in landmarks]).reshape(-1, 3, 3)
-        return cls(column, doubted, times, survey_column, surveys)
+        column, survey_column = np.full(sigma.shape, -1), np.full(len(landmarks), -1)
+        table = cls(column, doubted, times, survey_column, surveys, in_blocks).with_parameters(wanted)
+        surveyed = np.array([mark.is_estimated for mark in landmarks], dtype=bool)
+        survey_column[surveyed] = table.filter_size + 3 * np.arange(surveyed.sum())
+        return table
 
     @property
     def filter_size(self) -> int:
         """How many columns the filter has: three per pose, one per parameter and three per landmark."""
-        return int(3 * self.column.shape[0] + np.sum(self.column >= 0) + 3 * np.sum(self.survey_column >= 0))
+        parameters, landmarks = self.column.max(initial=-1) + 1, self.survey_column.max(initial=-3) + 3
+        if self.in_blocks:
+            parameters = -(-parameters // DRIVES) * DRIVES
+        return int(max(3 * self.column.shape[0], parameters, landmarks))
 
     def with_robot(self, robot: int) -> ParameterTable:
         """The table with all parameters of a robot estimated that may be."""
-        column, new = self.column.copy(), (self.column[robot] < 0) & (self.sigma[robot] > 0.0)
-        column[robot, new] = self.filter_size + np.arange(new.sum())
+        new = np.zeros(self.column.shape, dtype=bool)
+        new[robot] = (self.column[robot] < 0) & (self.sigma[robot] > 0.0)
+        return self.with_parameters(new)
+
+    def with_parameters(self, new: BoolArray) -> ParameterTable:
+        """The table with more parameters (N, PARAMETERS) estimated."""
+        column = self.column.copy()
+        if not self.in_blocks:
+            column[new] = self.filter_size + np.arange(new.sum())
+            return self._replace(column=column)
+        first = self.block_columns
+        begun = np.stack([new[:, block == _BLOCK].any(axis=1) for block in range(BLOCKS)], axis=1) & (
+            first < 0
+        )
+        first[begun] = self.filter_size + DRIVES * np.arange(begun.sum())
+        column[new] = (first[:, _BLOCK] + _SLOT)[new]
         return self._replace(column=column)
+
+    @property
+    def block_columns(self) -> IntArray:
+        """The first columns (N, BLOCKS) of the robots' blocks of parameters; -1: there is none."""
+        first = np.where(self.column >= 0, self.column - _SLOT, -1)
+        return np.stack([first[:, block == _BLOCK].max(axis=1) for block in range(BLOCKS)], axis=1)
 
     def with_landmark(self, landmark: int) -> ParameterTable:
         """The table with a landmark estimated."""

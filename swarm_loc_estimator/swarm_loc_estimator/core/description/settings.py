@@ -35,7 +35,7 @@ class EstimatorSettings:
         "1",
         2,
         1_000_000,
-        "from so many robots on only covariances of neighbours are kept, unless robots are calibrated",
+        "from so many robots on only covariances of neighbours are kept",
     )
     state_period_s: float = number(
         0.0,

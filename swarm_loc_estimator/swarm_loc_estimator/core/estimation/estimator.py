@@ -83,10 +83,10 @@ class SwarmEstimator:
         count, largest = len(self.swarm.robots), self.settings.sparse_from
         if count < largest or self._fusion.is_sparse:
             return ""
-        why = "fusion_period_s is 0" if self.settings.fusion_period_s == 0.0 else "robots are calibrated"
         return (
             f"{count} robots are estimated with a full covariance, which grows with the cube of their number,"
-            f" because {why}; otherwise {largest} robots and more (sparse_from) would take a sparse one."
+            f" because fusion_period_s is 0; otherwise {largest} robots and more (sparse_from) would take a"
+            " sparse one."
         )
 
     def validate(self, messages: RawInputs) -> ValidInputs:

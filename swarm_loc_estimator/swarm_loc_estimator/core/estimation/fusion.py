@@ -15,11 +15,11 @@ from swarm_loc_estimator.core.estimation.aerial import PictureFusion, as_fixes, 
 from swarm_loc_estimator.core.estimation.fusion_period import middle_of_period
 from swarm_loc_estimator.core.filter.batch_update import (
     assess_all,
-    body_columns_all,
     confirm_all,
     count_all_gated,
     evaluate_all,
     predict_all,
+    related_columns,
 )
 from swarm_loc_estimator.core.filter.belief import correct
 from swarm_loc_estimator.core.filter.correlated_noise import record_constraint, record_pair
@@ -72,6 +72,9 @@ class Fusion:
         swarm: Who takes part.
         settings: Limits for giving a robot up.
         tracks: The robots' odometry.
+
+    Attributes:
+        is_sparse: Whether only covariances of neighbours are kept: in a large swarm.
     """
 
     def __init__(self, swarm: Swarm, settings: EstimatorSettings, tracks: OdometryTracks) -> None:
@@ -79,8 +82,8 @@ class Fusion:
         self._limits = LossLimits(
             settings.lost_sigma, settings.lost_heading_sigma, settings.lost_after, settings.max_doubt
         )
-        self._sparse_from = settings.sparse_from
         self._period_ns = round(settings.fusion_period_s * 1e9)
+        self.is_sparse = self._period_ns > 0 and len(swarm.robots) >= settings.sparse_from
         self._has_start = np.array([r.start is not None for r in swarm.robots], dtype=bool)
         self._start: FloatArray = np.array([r.start or (0.0, 0.0, 0.0) for r in swarm.robots]).reshape(-1, 3)
         sigma = [(r.start_sigma.x, r.start_sigma.y, r.start_sigma.theta) for r in swarm.robots]
@@ -88,19 +91,13 @@ class Fusion:
         surer = settings.lost_heading_sigma / _SURER_AT_FIRST
         self._initializer = Initializer(tracks, settings.fix_window_s, surer)
         self._pictures = PictureFusion(swarm, settings, tracks)
-        self._table = ParameterTable.of(swarm.robots, swarm.landmarks)
+        self._table = ParameterTable.of(swarm.robots, swarm.landmarks, in_blocks=self.is_sparse)
         self._pairs = _PAIRS_PER_ROBOT if any(robot.ir is not None for robot in swarm.robots) else 0
 
     def new_state(self) -> SwarmState:
         """Nothing is known yet."""
-        joint: JointFilter | None = SparseFilter(self._table.filter_size) if self.is_sparse else None
+        joint: JointFilter | None = SparseFilter(self._table) if self.is_sparse else None
         return SwarmState(self._table, self._pairs, joint)
-
-    @property
-    def is_sparse(self) -> bool:
-        """Whether only covariances of neighbours are kept: in a large swarm without calibration."""
-        count, is_calibrated = self._table.column.shape[0], bool(np.any(self._table.column >= 0))
-        return self._period_ns > 0 and count >= self._sparse_from and not is_calibrated
 
     def with_starts(self, state: SwarmState, stamp_ns: int) -> SwarmState:
         """The state, together with those robots at their starts about whom there was no measurement yet.
@@ -281,9 +278,9 @@ class Fusion:
     ) -> tuple[NDArray[np.uint8], FloatArray]:
         """Hold measurements (m,) against one belief, use those that pass; return verdicts and their NIS."""
         belief, passed, newest_ns = state.arrays(), batch.passed, int(fields.stamp_ns[-1])
-        if not state.filter.covariance.size:  # else they are read where all are
+        if isinstance(state.filter, SparseFilter):  # a dense one has them all
             robots = self._robots(state, newest_ns)
-            batch.across[:] = state.filter.relate_pairs(body_columns_all(fields, belief), robots)
+            batch.across[:] = state.filter.relate_pairs(related_columns(fields, belief), robots)
         evaluate_all(fields, belief, batch)
         looks = (batch.distance, batch.whitened, batch.cause)
         contradicted = assess_all(fields, belief, self._limits, looks, passed)
@@ -329,8 +326,7 @@ class Fusion:
         poses = self._poses(state, stamp_ns)
         state.contradicted_ns[source] = stamp_ns
         lately = np.sum(state.contradicted_ns > stamp_ns - _CONTRADICTED_WITHIN_NS)
-        some = robots > _MAX_ROBOTS_OPENED or not state.filter.calibrates
-        if lately < _CONTRADICTED_DESCRIPTION or state.all_opened or some:
+        if lately < _CONTRADICTED_DESCRIPTION or state.all_opened or robots > _MAX_ROBOTS_OPENED:
             state.open(source, poses[min(source, robots - 1)])
         else:
             state.open_all(poses)

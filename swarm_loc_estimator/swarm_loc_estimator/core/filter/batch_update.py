@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from swarm_loc_estimator.core.description.estimated_parameters import CAMERA_SCALE, CAMERA_YAW
 from swarm_loc_estimator.core.filter.belief import BeliefArrays, to_map
 from swarm_loc_estimator.core.filter.innovation import (
     InnovationBatch,
@@ -96,11 +97,16 @@ def _is_of_same_image(measurements: MeasurementColumns, k: int, side: int) -> bo
 
 
 @compiled
-def body_columns_all(measurements: MeasurementColumns, belief: BeliefArrays) -> IntArray:
-    """The first columns (m, 2) of the observers and targets of measurements (m,); -1: has none."""
-    columns = np.empty((measurements.stamp_ns.size, 2), dtype=np.int64)
+def related_columns(measurements: MeasurementColumns, belief: BeliefArrays) -> IntArray:
+    """The first columns (m, 3) of observers, targets and observers' cameras; -1: there is none."""
+    columns = np.empty((measurements.stamp_ns.size, 3), dtype=np.int64)
     for k in range(columns.shape[0]):
         columns[k, 0], columns[k, 1] = body_columns(measurements, k, belief)
+        columns[k, 2] = -1
+        for m in (CAMERA_YAW, CAMERA_SCALE):
+            column = belief.table.column[max(measurements.observer[k], 0), m]
+            if measurements.observer[k] >= 0 and column >= 0:
+                columns[k, 2] = column - (m - CAMERA_YAW)
     return columns
 
 

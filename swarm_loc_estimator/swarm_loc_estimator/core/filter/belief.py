@@ -69,6 +69,7 @@ class BeliefArrays(NamedTuple):
     transform: FloatArray
     covariance: FloatArray
     marginal: FloatArray
+    driven: FloatArray
     parameter: FloatArray
     landmark: FloatArray
     table: ParameterTable
@@ -84,14 +85,21 @@ class BeliefArrays(NamedTuple):
 
 
 @compiled
-def body_covariance(belief: BeliefArrays, column: int) -> FloatArray:
-    """A view (3, 3) of the covariance of the body whose first column is given."""
+def own_covariance(belief: BeliefArrays, robot: int) -> FloatArray:
+    """The covariance, to be changed in place, in which `own_columns` are those of a robot."""
     if belief.covariance.shape[0] > 0:
-        whole: FloatArray = belief.covariance[column : column + 3, column : column + 3]
-        return whole
-    # all of it, but cut: compiled code wants views of one memory layout from both branches
-    own: FloatArray = belief.marginal[column // 3][0:3, 0:3]
+        return belief.covariance
+    own: FloatArray = belief.marginal[robot]
     return own
+
+
+@inlined
+def own_column(belief: BeliefArrays, robot: int, which: int) -> int:
+    """A column of `own_covariance`: of the robot's pose, or, from 3 on, of its parameters; -1: has none."""
+    column: int = 3 * robot + which if which < 3 else belief.table.column[robot, which - 3]
+    if belief.covariance.shape[0] == 0 and column >= 0:
+        column = which
+    return column
 
 
 @inlined
@@ -100,6 +108,17 @@ def covariance_within(belief: BeliefArrays, column: int, i: int, j: int) -> floa
     whole, own = belief.covariance, belief.marginal
     within: float = whole[column + i, column + j] if whole.shape[0] > 0 else own[column // 3, i, j]
     return within
+
+
+@inlined
+def own_within(belief: BeliefArrays, robot: int, i: int, j: int) -> float:
+    """A number of the covariance of a robot's pose and parameters, by `own_column`."""
+    whole, own = belief.covariance, belief.marginal
+    if whole.shape[0] > 0:
+        within: float = whole[own_column(belief, robot, i), own_column(belief, robot, j)]
+        return within
+    alone: float = own[robot, i, j]
+    return alone
 
 
 @inlined

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.core.description.estimated_parameters import CAMERA_SCALE, CAMERA_YAW
-from swarm_loc_estimator.core.filter.belief import BeliefArrays, covariance_within
+from swarm_loc_estimator.core.filter.belief import BeliefArrays, covariance_within, own_within
 from swarm_loc_estimator.core.filter.correlated_noise import inflate_noise
 from swarm_loc_estimator.core.filter.gating import position_distance, soften_heading, squared_distance
 from swarm_loc_estimator.core.filter.integrity.hidden_noise import add_hidden_noise, stamp_variance
@@ -52,7 +52,8 @@ class InnovationBatch(NamedTuple):
     Attributes:
         pose: (m, 2, 3) observers and targets in `map` at the stamps, or by what a landmark is moved.
         motion: (m, 3) how fast xi_target - xi_observer changes by driving [1/s], see `relative_motion`.
-        across: (m, 3, 3) covariance of the observer's error with the target's.
+        across: (m, 3, 5) covariance of the observer's error with the target's, and of the target's with those
+            of yaw and scale of the observer's camera.
         columns: (m, DEPENDS_ON) what each depends on.
         jacobian: (m, 3, DEPENDS_ON) of the innovation.
         innovation: (m, 3) measured minus predicted.
@@ -86,7 +87,7 @@ def new_batch(count: int) -> InnovationBatch:
     return InnovationBatch(
         np.zeros((count, 2, 3)),
         np.zeros((count, 3)),
-        np.zeros((count, 3, 3)),
+        np.zeros((count, 3, 5)),
         np.zeros((count, DEPENDS_ON), dtype=np.int64),
         np.zeros((count, 3, DEPENDS_ON)),
         np.zeros((count, 3)),
@@ -140,7 +141,7 @@ def evaluate(
         _add_stamp_noise(chain, motion, of_stamp, noise)
     assign_matrix(s, noise)
     if belief.covariance.shape[0] > 0:
-        _read_across(belief.covariance, bodies, batch.across[row])
+        _read_across(belief.covariance, bodies, camera_columns, batch.across[row])
     _add_uncertainty(belief, (bodies, camera_columns), chain, batch.across[row], scratch.difference, s)
     for i in range(3):
         variances[i] = s[i, i] - noise[i, i]
@@ -268,12 +269,14 @@ def body_columns(measurements: MeasurementColumns, k: int, belief: BeliefArrays)
 
 
 @inlined
-def _read_across(p: FloatArray, bodies: tuple[int, int], out: FloatArray) -> None:
-    """Write the covariance (3, 3) of the observer's error with the target's; of nobody it does not matter."""
+def _read_across(p: FloatArray, bodies: tuple[int, int], camera: tuple[int, int], out: FloatArray) -> None:
+    """Write the covariances `across` (3, 5) of one measurement; those of nobody do not matter."""
     o, t = max(bodies[0], 0), max(bodies[1], 0)
     for i in range(3):
         for j in range(3):
             out[i, j] = p[o + i, t + j]
+        for k in range(2):
+            out[i, 3 + k] = p[t + i, max(camera[k], 0)]
 
 
 @inlined
@@ -293,12 +296,12 @@ def _add_uncertainty(
         belief: Not changed.
         columns: First of the observer and of the target, and those of the camera's parameters; -1: none.
         chain: (3, 5).
-        across: (3, 3) covariance of the observer's error with the target's.
+        across: (3, 5) covariances of the observer, the target and the camera, see `InnovationBatch`.
         difference: (3, 3) written: scratch.
         s: (3, 3) added to.
     """
     bodies, camera = columns
-    p, o, t = belief.covariance, max(bodies[0], 0), max(bodies[1], 0)
+    o, t = max(bodies[0], 0), max(bodies[1], 0)
     of_observer, of_target = 1.0 if bodies[0] >= 0 else 0.0, 1.0 if bodies[1] >= 0 else 0.0
     for i in range(3):
         for j in range(3):
@@ -312,14 +315,15 @@ def _add_uncertainty(
     for k in range(2):
         if camera[k] >= 0:
             for a in range(3):
-                of_side = of_target * p[t + a, camera[k]] - of_observer * p[o + a, camera[k]]
-                difference[a, 0] = of_side
+                own = own_within(belief, o // 3, a, 3 + CAMERA_YAW + k)
+                difference[a, 0] = of_target * across[a, 3 + k] - of_observer * own
             for i in range(3):
                 beside = chain[i, 0] * difference[0, 0] + chain[i, 1] * difference[1, 0]
                 beside += chain[i, 2] * difference[2, 0]
                 for other in range(2):  # its own variance, and its covariance with the other parameter
                     if camera[other] >= 0:
-                        beside += 0.5 * chain[i, 3 + other] * p[camera[other], camera[k]]
+                        both = own_within(belief, o // 3, 3 + CAMERA_YAW + other, 3 + CAMERA_YAW + k)
+                        beside += 0.5 * chain[i, 3 + other] * both
                 for j in range(3):
                     s[i, j] += beside * chain[j, 3 + k]
                     s[j, i] += beside * chain[j, 3 + k]

@@ -1,14 +1,15 @@
 """What the estimator asks of a filter: a joint covariance of errors, of which two implementations exist.
 
 A filter knows columns and Jacobians, not robots or sensors. The mean lives outside: an update gives the
-correction, which its owner applies on the manifold. Columns 3i..3i+2 are the error of body i, a twist; single
-columns of parameters are behind those of the robots.
+correction, which its owner applies on the manifold. Columns 3i..3i+2 are the error of body i, a twist; those
+of parameters are behind those of the robots.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
+from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
 from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
@@ -28,46 +29,52 @@ class JointFilter(Protocol):
     """The covariance of the errors of all bodies and parameters.
 
     Attributes:
-        covariance: (n, n) of all columns; (0, 0) where only parts of it are kept.
-        marginal: (bodies, 3, 3) of each body's error; (0, 3, 3) where `covariance` has it. Either is written
-            to by predictions.
-        calibrates: Whether it may have columns of parameters.
+        covariance: (n, n) of all columns; (0, 0) where only parts of it are kept. Predictions write to it.
         sequential: Whether measurements may also be used one by one, by `dense/sequential_update.py`.
     """
 
     covariance: FloatArray
-    marginal: FloatArray
-    calibrates: bool
     sequential: bool
+
+    @property
+    def marginal(self) -> FloatArray:
+        """(bodies, w, w) of each body's error; (0, 3, 3) where `covariance` has it.
+
+        Where anything is calibrated w is 9, of each robot's pose and its parameters, else 3. Either is
+        written to by predictions.
+        """
+
+    @property
+    def driven(self) -> FloatArray:
+        """(robots, 4, DRIVES) how predictions have moved errors since the last update, besides by noise.
+
+        Those of a pose by those of the parameters of its motion (3, DRIVES), and what is left of the latter
+        (DRIVES,). Where it is not needed it is of no robot.
+        """
 
     def copy(self) -> JointFilter:
         """An independent copy."""
 
     def place(self, columns: IntArray, covariance: FloatArray) -> None:
-        """Give the columns (k,) this covariance (k, k), independent of the rest, whatever was known."""
+        """Give columns (k,) this covariance (k, k), independent of the rest, whatever was known.
+
+        They are those of one body, or of parameters, independent of each other.
+        """
 
     def place_bodies(self, bodies: IntArray, covariances: FloatArray) -> None:
         """Likewise the columns of bodies (k,), each with a covariance (k, 3, 3) of its own."""
 
     def add(self, columns: IntArray, covariance: FloatArray) -> None:
-        """Add a covariance (k, k) to that of columns (k,): their errors are larger than was known."""
+        """Add a covariance (k, k) to that of columns (k,) as of `block`: errors are larger than was known."""
 
-    def grow(self, count: int) -> None:
-        """Append columns without error."""
+    def grow(self, table: ParameterTable) -> None:
+        """Append the columns that a table has more, without error as yet: they are placed next."""
 
     def relate(self, columns: IntArray, others: IntArray, mapping: FloatArray) -> None:
         """Add the errors of other columns (m,), mapped by (k, m), to those of columns (k,) just placed."""
 
     def block(self, columns: IntArray) -> FloatArray:
-        """Covariance (k, k) of columns (k,): of one body, or of parameters."""
-
-    def relate_pairs(self, columns: IntArray, robots: Robots, /) -> FloatArray:
-        """Cross-covariances (m, 3, 3) of pairs of bodies before an update with measurements (m,) of them.
-
-        Args:
-            columns: (m, 2) the first columns of both bodies; -1: there is none.
-            robots: Where all are.
-        """
+        """Covariance (k, k) of columns (k,): of one body, or of one robot's parameters."""
 
     def update(
         self, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray

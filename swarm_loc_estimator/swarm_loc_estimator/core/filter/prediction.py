@@ -19,12 +19,17 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.core.description.estimated_parameters import DRIVES, TURN_BIAS
-from swarm_loc_estimator.core.filter.belief import BeliefArrays, body_covariance
+from swarm_loc_estimator.core.filter.belief import (
+    BeliefArrays,
+    covariance_within,
+    own_column,
+    own_covariance,
+)
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 from swarm_loc_estimator.numerics.jit import compiled, inlined
 from swarm_loc_estimator.numerics.se2_scalar import adjoint_of, carry, moved_by_twist
-from swarm_loc_estimator.numerics.small_matrix import add_scaled, assign, assign_matrix, factor_numbers
+from swarm_loc_estimator.numerics.small_matrix import assign, assign_matrix, factor_numbers
 
 
 class _Drift(NamedTuple):
@@ -55,7 +60,10 @@ def predict(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
         drift = _new_drift(belief, robot, to)
         _move(drift.twist, belief.transform[robot])
         _drive(belief, robot, drift)
-    add_scaled(body_covariance(belief, 3 * robot), added, 1.0)
+    own, first = own_covariance(belief, robot), own_column(belief, robot, 0)
+    for i in range(3):
+        for j in range(3):
+            own[first + i, first + j] += added[i, j]
     assign_matrix(belief.preintegrated_covariance[robot], to.covariance)
     assign_matrix(belief.preintegrated_jacobian[robot], to.jacobian)
     belief.predicted_to_ns[robot] = max(to.stamp_ns, belief.predicted_to_ns[robot])
@@ -68,7 +76,9 @@ def write_predicted(
     """Write T (3,) and the covariance (3, 3) of its error where `predict` would take them; change nothing."""
     added = np.empty((3, 3))
     assign(transform, belief.transform[robot])
-    assign_matrix(covariance, body_covariance(belief, 3 * robot))
+    for i in range(3):
+        for j in range(3):
+            covariance[i, j] = covariance_within(belief, 3 * robot, i, j)
     if not _new_noise(belief, robot, to.covariance, added):
         return
     if _has_drives(belief, robot):
@@ -76,7 +86,7 @@ def write_predicted(
         _move(drift.twist, transform)
         columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))
         count = _own(belief, robot, drift, columns, weight)
-        _block(belief.covariance, columns, weight, count, drift, covariance)
+        _block(own_covariance(belief, robot), columns, weight, count, drift, covariance)
     for i in range(3):
         for j in range(3):
             covariance[i, j] += added[i, j]
@@ -145,7 +155,7 @@ def _own(belief: BeliefArrays, robot: int, drift: _Drift, columns: IntArray, wei
     """Write which columns (3 + DRIVES,) the pose's error comes from, with what weight; return how many."""
     count = 0
     for m in range(3 + DRIVES):
-        column = 3 * robot + m if m < 3 else belief.table.column[robot, m - 3]
+        column = own_column(belief, robot, m)
         if column >= 0:
             columns[count] = column
             for i in range(3):
@@ -171,7 +181,8 @@ def _block(
 @compiled
 def _drive(belief: BeliefArrays, robot: int, drift: _Drift) -> None:
     """Apply a drift to the covariance of the pose's error with everything, and let the bias decay."""
-    first, p, size = 3 * robot, belief.covariance, belief.covariance.shape[0]
+    first, p = own_column(belief, robot, 0), own_covariance(belief, robot)
+    size = p.shape[0]
     columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))
     rows, block = np.zeros((3, size)), np.empty((3, 3))
     count = _own(belief, robot, drift, columns, weight)
@@ -180,7 +191,9 @@ def _drive(belief: BeliefArrays, robot: int, drift: _Drift) -> None:
         for a in range(count):
             for j in range(size):
                 rows[i, j] += weight[i, a] * p[columns[a], j]
-    bias = belief.table.column[robot, TURN_BIAS]
+    if belief.covariance.shape[0] == 0:
+        _note_driven(belief, robot, drift)
+    bias = own_column(belief, robot, 3 + TURN_BIAS)
     if bias >= 0:
         belief.parameter[robot, TURN_BIAS] *= drift.left
         for j in range(size):
@@ -195,6 +208,18 @@ def _drive(belief: BeliefArrays, robot: int, drift: _Drift) -> None:
     for i in range(3):
         for j in range(3):
             p[first + i, first + j] = block[i, j]
+
+
+@compiled
+def _note_driven(belief: BeliefArrays, robot: int, drift: _Drift) -> None:
+    """Note how the drift changes the covariance of the pose's error with those of others."""
+    driven = belief.driven[robot]
+    for m in range(DRIVES):
+        if belief.table.column[robot, m] >= 0:
+            for i in range(3):
+                driven[i, m] += drift.drive[i, m] * driven[3, m]
+    if belief.table.column[robot, TURN_BIAS] >= 0:
+        driven[3, TURN_BIAS] *= drift.left
 
 
 @compiled

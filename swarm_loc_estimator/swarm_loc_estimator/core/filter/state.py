@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.core.description.estimated_parameters import PARAMETERS, ParameterTable
 from swarm_loc_estimator.core.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.core.filter.dense.covariance import DenseFilter
-from swarm_loc_estimator.core.filter.integrity.hidden_noise import MAX_UNITS, doubt_noise
+from swarm_loc_estimator.core.filter.integrity.hidden_noise import doubt_noise
 from swarm_loc_estimator.core.filter.integrity.surprises import new_integrity
 from swarm_loc_estimator.core.filter.joint_filter import JointFilter
 from swarm_loc_estimator.core.filter.measurement_model import NOBODY
@@ -101,11 +101,7 @@ class SwarmState:
         landmarks = table.survey_column.size
         self.landmark: FloatArray = np.zeros((landmarks, 3))
         self.filter: JointFilter = DenseFilter(table.filter_size) if joint is None else joint
-        estimated = table.column >= 0
-        self.filter.place(table.column[estimated], np.diag(table.sigma[estimated] ** 2))
-        for first, survey in zip(table.survey_column, table.survey, strict=True):
-            if first >= 0:
-                self.filter.place(first + np.arange(3), survey)
+        self._place_described()
         self.predicted_to_ns: NDArray[np.int64] = np.zeros(robots, dtype=np.int64)
         self.preintegrated_covariance: FloatArray = np.zeros((robots, 3, 3))
         self.preintegrated_jacobian: FloatArray = np.zeros((robots, 3, 3))
@@ -137,6 +133,7 @@ class SwarmState:
             self.transform,
             self.filter.covariance,
             self.filter.marginal,
+            self.filter.driven,
             self.parameter,
             self.landmark,
             self._table,
@@ -196,8 +193,6 @@ class SwarmState:
     def open(self, source: int, pose: FloatArray) -> None:
         """Estimate what a contradicted robot or landmark was described by, or estimate it anew.
 
-        Where no parameters of robots can be estimated, what the robot measures counts with more noise.
-
         Args:
             source: The robot, or N plus the landmark.
             pose: (3,) of the robot in `map`, which becomes less certain, too.
@@ -208,19 +203,16 @@ class SwarmState:
         if source < robots:
             self.integrity.evidence[source] = 0.0
         if source >= robots:
-            self._use_table(self._table.with_landmark(source - robots))
-            self.filter.add(
-                self.landmark_column(source - robots) + np.arange(3), self._table.survey[source - robots]
-            )
+            self._open_landmark(source - robots)
             return
-        if self.filter.calibrates:
-            self._use_table(self._table.with_robot(source))
-        else:
-            units = self.integrity.hidden_noise[source]
-            self.integrity.hidden_noise[source] = min(units + 1.0, MAX_UNITS)
-        estimated = np.flatnonzero(self._table.column[source] >= 0)
-        sigma = self._table.sigma[source, estimated]
-        self.filter.add(self._table.column[source, estimated], np.diag(sigma**2))
+        before = self._table.column[source]
+        self._use_table(self._table.with_robot(source))
+        columns, variances = self._table.column[source], self._table.sigma[source] ** 2
+        for estimated, change in (
+            ((columns >= 0) & (before < 0), self.filter.place),
+            (before >= 0, self.filter.add),
+        ):
+            change(columns[estimated], np.diag(variances[estimated]))
         doubt = error_covariance(pose, np.diag(np.square(_DOUBTED_POSE_SIGMA)))
         self.filter.add(robot_columns(np.array([source]))[0], doubt)
 
@@ -238,22 +230,33 @@ class SwarmState:
         for landmark in range(landmarks):
             table = table.with_landmark(landmark)
         self._use_table(table)
-        self.parameter[:], self.landmark[:], self.filter.covariance[:] = 0.0, 0.0, 0.0
-        for robot in range(robots):
-            sigma = np.diag(np.square(_REOPENED_POSE_SIGMA))
-            covariance = error_covariance(poses[robot], sigma) if self.tracked[robot] else np.eye(3)
-            self.filter.add(robot_columns(np.array([robot]))[0], covariance)
-            estimated = np.flatnonzero(table.column[robot] >= 0)
-            self.filter.add(table.column[robot, estimated], np.diag(table.sigma[robot, estimated] ** 2))
-        for first, survey in zip(table.survey_column, table.survey, strict=True):
-            self.filter.add(first + np.arange(3), survey)
+        self.parameter[:], self.landmark[:] = 0.0, 0.0
+        sigma = np.diag(np.square(_REOPENED_POSE_SIGMA))
+        covariances = np.where(self.tracked[:, None, None], error_covariance(poses, sigma), np.eye(3))
+        self.filter.place_bodies(np.arange(robots), covariances)
+        self._place_described()
         self.integrity.doubt[:], self.integrity.evidence[:] = 0.0, 0.0
         doubt_noise(self.integrity)
 
     def _use_table(self, table: ParameterTable) -> None:
-        """Go on with more columns; the new ones are exact as yet."""
-        self.filter.grow(table.filter_size - self._table.filter_size)
+        """Go on with more columns."""
+        self.filter.grow(table)
         self._table = table
+
+    def _open_landmark(self, landmark: int) -> None:
+        """Estimate a landmark, or estimate it anew."""
+        is_new = self.landmark_column(landmark) < 0
+        self._use_table(self._table.with_landmark(landmark))
+        columns = self.landmark_column(landmark) + np.arange(3)
+        (self.filter.place if is_new else self.filter.add)(columns, self._table.survey[landmark])
+
+    def _place_described(self) -> None:
+        """Let all that is estimated besides poses be as certain as it is described."""
+        estimated = self._table.column >= 0
+        self.filter.place(self._table.column[estimated], np.diag(self._table.sigma[estimated] ** 2))
+        for first, survey in zip(self._table.survey_column, self._table.survey, strict=True):
+            if first >= 0:
+                self.filter.place(first + np.arange(3), survey)
 
     def _trust(self, robots: IntArray, confirmations: int) -> None:
         """Forget what was held against robots (k,) that begin anew."""
@@ -271,10 +274,11 @@ class SwarmState:
 
     def _isolate(self, robots: IntArray, covariances: FloatArray) -> None:
         """Give poses (k,) covariances (k, 3, 3); what was learned of the robots' sensors stays."""
-        self.filter.place_bodies(robots, covariances)
-        for robot in robots[(self._table.column[robots] >= 0).any(axis=1)].tolist():
+        known = robots[self.tracked[robots]]  # what is estimated of others has nothing to do with anything
+        for robot in known[(self._table.column[known] >= 0).any(axis=1)].tolist():
             columns = self._table.column[robot, self._table.column[robot] >= 0]
             self.filter.place(columns, np.diag(np.diag(self.filter.block(columns))))
+        self.filter.place_bodies(robots, covariances)
 
     def parameter_sigma(self, robot: int) -> FloatArray:
         """Standard deviations (PARAMETERS,) of a robot's parameters; zero of those not estimated."""

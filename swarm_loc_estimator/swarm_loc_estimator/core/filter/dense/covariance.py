@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from swarm_loc_estimator.core.description.estimated_parameters import DRIVES, ParameterTable
 from swarm_loc_estimator.core.filter.dense.inversion import InverseMemory, invert
-from swarm_loc_estimator.core.filter.joint_filter import Robots
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 from swarm_loc_estimator.numerics.jit import compiled
 from swarm_loc_estimator.numerics.small_matrix import assign_matrix, cholesky3, solve3
@@ -24,18 +24,19 @@ class DenseFilter:
         inverses: Shared by all copies: what is computed again begins from a copy.
     """
 
-    calibrates = True
     sequential = True
 
     def __init__(self, size: int) -> None:
         self.covariance: FloatArray = np.eye(size)
         self.marginal: FloatArray = np.zeros((0, 3, 3))
+        self.driven: FloatArray = np.zeros((0, 4, DRIVES))
         self.inverses = InverseMemory()
 
     def copy(self) -> DenseFilter:
         """An independent copy."""
         other = DenseFilter.__new__(DenseFilter)
         other.covariance, other.marginal = self.covariance.copy(), self.marginal
+        other.driven = self.driven
         other.inverses = self.inverses
         return other
 
@@ -54,10 +55,10 @@ class DenseFilter:
         """Add a covariance (k, k) to that of columns (k,): their errors are larger than was known."""
         self.covariance[columns[:, None], columns[None, :]] += covariance
 
-    def grow(self, count: int) -> None:
-        """Append columns without error."""
+    def grow(self, table: ParameterTable) -> None:
+        """Append the columns that a table has more, without error as yet: they are placed next."""
         size = self.covariance.shape[0]
-        grown = np.zeros((size + count, size + count))
+        grown = np.zeros((table.filter_size, table.filter_size))
         grown[:size, :size] = self.covariance
         self.covariance = grown
 
@@ -73,12 +74,6 @@ class DenseFilter:
         """Covariance (k, k) of columns (k,)."""
         covariance: FloatArray = self.covariance[np.ix_(columns, columns)]
         return covariance
-
-    def relate_pairs(self, columns: IntArray, _robots: Robots) -> FloatArray:
-        """Cross-covariances (m, 3, 3) of pairs of bodies by their first columns (m, 2); -1: there is none."""
-        rows = np.maximum(columns, 0)[:, :, None] + np.arange(3)
-        across: FloatArray = self.covariance[rows[:, 0, :, None], rows[:, 1, None, :]]
-        return across
 
     def update(
         self, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray

@@ -75,24 +75,29 @@ def information_of(
     """What measurements say of bodies, each about its own place.
 
     Args:
-        columns: (m, c) filter columns that each depends on: those of two bodies, first of all.
+        columns: (m, c) filter columns that each depends on: those of two bodies first of all, then some of
+            one block of parameters.
         jacobian: (m, 3, c), zero for a body that there is none of.
         innovation: (m, 3) measured minus predicted.
         noise: (m, 3, 3) covariances.
         places: (n, 2) of all bodies.
     """
     measurements, count = columns.shape[0], 0
-    first, second = np.empty(3 * measurements, dtype=np.int64), np.empty(3 * measurements, dtype=np.int64)
-    block, gradient = np.zeros((3 * measurements, 3, 3)), np.zeros((len(places), 3))
-    by, weighted = np.empty((2, 3, 3)), np.empty((2, 3, 3))
+    first, second = np.empty(6 * measurements, dtype=np.int64), np.empty(6 * measurements, dtype=np.int64)
+    block, gradient = np.zeros((6 * measurements, 3, 3)), np.zeros((len(places), 3))
+    by, weighted, bodies = np.empty((3, 3, 3)), np.empty((3, 3, 3)), np.empty(3, dtype=np.int64)
     for k in range(measurements):
         factor = cholesky3(noise[k])
         for side in range(2):
-            _about_place(jacobian[k, :, 3 * side : 3 * side + 3], places[columns[k, 3 * side] // 3], by[side])
+            bodies[side] = columns[k, 3 * side] // 3
+            _about_place(jacobian[k, :, 3 * side : 3 * side + 3], places[bodies[side]], by[side])
+        bodies[2] = _by_parameters(columns[k], jacobian[k], by[2])
+        sides = 3 if bodies[2] >= 0 else 2
+        for side in range(sides):
             for a in range(3):
                 solve3(factor, by[side, a], weighted[side, a])
-        for side in range(2):
-            body = columns[k, 3 * side] // 3
+        for side in range(sides):
+            body = bodies[side]
             if not _depends(by[side]):
                 continue
             for a in range(3):
@@ -100,7 +105,7 @@ def information_of(
                     gradient[body, a] += weighted[side, a, i] * innovation[k, i]
             for other in range(side + 1):
                 if _depends(by[other]):
-                    first[count], second[count] = body, columns[k, 3 * other] // 3
+                    first[count], second[count] = body, bodies[other]
                     for a in range(3):
                         for b in range(3):
                             for i in range(3):
@@ -150,6 +155,20 @@ def _about_place(jacobian: FloatArray, place: FloatArray, out: FloatArray) -> No
     for i in range(3):
         out[0, i], out[1, i] = jacobian[i, 0], jacobian[i, 1]
         out[2, i] = jacobian[i, 2] + place[1] * jacobian[i, 0] - place[0] * jacobian[i, 1]
+
+
+@compiled
+def _by_parameters(columns: IntArray, jacobian: FloatArray, out: FloatArray) -> int:
+    """Write the columns of a Jacobian (3, c) by parameters as rows of their block; return it, -1: of none."""
+    block = -1
+    for c in range(6, columns.size):
+        if jacobian[0, c] != 0.0 or jacobian[1, c] != 0.0 or jacobian[2, c] != 0.0:
+            if block < 0:
+                out[:] = 0.0
+            block = columns[c] // 3
+            for i in range(3):
+                out[columns[c] % 3, i] = jacobian[i, c]
+    return block
 
 
 @compiled

@@ -28,18 +28,20 @@ class Situation(NamedTuple):
     """What an order is sought for.
 
     Attributes:
-        active: Bodies that are there, ascending.
+        bodies: Those that are there, ascending.
+        blocks: Of parameters, which are eliminated before all bodies, each in a front of its own.
         places: (n, 2) of all bodies.
-        pairs: (k, 2) bodies of which one has measured the other of late.
+        pairs: (k, 2) bodies of which one has measured the other of late, and those that follow from blocks.
     """
 
-    active: IntArray
+    bodies: IntArray
+    blocks: IntArray
     places: FloatArray
     pairs: IntArray
 
     def near(self) -> IntArray:
         """Pairs (k, 2) of bodies that are near each other."""
-        pairs: IntArray = self.active[near_pairs(self.places[self.active])]
+        pairs: IntArray = self.bodies[near_pairs(self.places[self.bodies])]
         return pairs
 
     def pattern(self, order: Order, near: IntArray) -> Pattern:
@@ -49,7 +51,15 @@ class Situation(NamedTuple):
     def order(self, near: IntArray) -> Order:
         """An order of its own."""
         graph = adjacency(len(self.places), np.concatenate([self.pairs, near]))
-        return dissect(self.active, self.places, graph)
+        count, dissected = self.blocks.size, dissect(self.bodies, self.places, graph)
+        return Order(
+            np.concatenate([self.blocks, dissected.body]),
+            np.concatenate([np.arange(count), count + dissected.begin]),
+        )
+
+    def has_same(self, other: Situation) -> bool:
+        """Whether the same are there as in another one."""
+        return np.array_equal(self.bodies, other.bodies) and np.array_equal(self.blocks, other.blocks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +69,7 @@ class Ordering:
     Attributes:
         situation: At the update.
         pattern: In which all pairs of the situation lie.
-        order: Of all active bodies.
+        order: Of all active bodies and blocks.
         updates: For how many it has been used.
         work: What elimination by it cost at first.
         near: (k, 2) pairs of bodies that are near each other.
@@ -89,7 +99,7 @@ class Ordering:
 
 def ordered(situation: Situation, before: Ordering | None) -> Ordering:
     """The ordering of an update after another one; None: there was none."""
-    if before is None or not np.array_equal(before.situation.active, situation.active):
+    if before is None or not situation.has_same(before.situation):
         near = situation.near()
         return _begun(situation, situation.order(near), (near, 1))
     if before.updates >= _ORDERED_AGAIN:

@@ -1,12 +1,13 @@
-"""The sparse filter: errors of bodies on a chordal pattern, which follows who sees whom."""
+"""The sparse filter: errors of bodies and of parameters on a chordal pattern, which follows who sees whom."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from swarm_loc_estimator.core.description.estimated_parameters import BLOCKS, ParameterTable
 from swarm_loc_estimator.core.filter.joint_filter import Robots
 from swarm_loc_estimator.core.filter.sparse import copies
 from swarm_loc_estimator.core.filter.sparse.elimination import Prior, ProjectionMemory, eliminate
@@ -26,8 +27,16 @@ from swarm_loc_estimator.core.filter.sparse.levers import (
     levers,
     summed,
 )
+from swarm_loc_estimator.core.filter.sparse.marginals import Marginals, derived_by
 from swarm_loc_estimator.core.filter.sparse.neighbours import spread
 from swarm_loc_estimator.core.filter.sparse.ordering import Ordering, Situation, ordered
+from swarm_loc_estimator.core.filter.sparse.parameters import (
+    Groups,
+    active_blocks,
+    block_pairs,
+    move,
+    moved_shares,
+)
 from swarm_loc_estimator.core.filter.sparse.symbolic import Pattern, wanted_rows
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 
@@ -40,6 +49,7 @@ _PAIRS_KEPT = 3
 """Pairs of so many updates count as neighbours."""
 _FAR_M = 20.0
 """A body so far from where its error is held about is held about another place."""
+_NOBODY: IntArray = np.zeros(0, dtype=np.int64)
 
 
 class _Prepared(NamedTuple):
@@ -54,22 +64,27 @@ class _Prepared(NamedTuple):
     active: IntArray
     origin: Factor | None
 
+    def covariance_of(self, first: IntArray, second: IntArray) -> FloatArray:
+        """Covariances (k, 3, 3) of pairs of the pattern."""
+        places, covariance = self.prior.place, self.prior.covariance
+        return covariance[places[first], places[second]] + copies.shared(self.shares, first, second)
+
 
 class SparseFilter:
     """Errors of bodies, of which those of bodies that are not neighbours are known through others.
 
+    Three columns each are those of a body, or of a block of a robot's parameters.
+
     Args:
-        size: Number of columns, three for each body; each starts with unit variance, independent.
+        table: Which columns there are, in blocks; each starts with unit variance, independent.
     """
 
-    calibrates = False
     sequential = False
 
-    def __init__(self, size: int) -> None:
-        count = size // 3
+    def __init__(self, table: ParameterTable) -> None:
+        count = table.filter_size // 3
         self.covariance: FloatArray = np.zeros((0, 0))
-        self.marginal: FloatArray = np.tile(np.eye(3), (count, 1, 1))
-        self._settled = self.marginal.copy()
+        self._marginals = Marginals(Groups.of(table))
         self._place: FloatArray = np.zeros((count, 2))
         self._number: IntArray = np.full(count, -1)
         self._factor = EMPTY
@@ -85,44 +100,78 @@ class SparseFilter:
     def copy(self) -> SparseFilter:
         """An independent copy; factors are shared, since they are never written to."""
         other = SparseFilter.__new__(SparseFilter)
-        copied = {name: vars(self)[name].copy() for name in ("marginal", "_settled", "_place", "_number")}
+        copied = {name: vars(self)[name].copy() for name in ("_marginals", "_place", "_number")}
         vars(other).update(vars(self) | copied | {"_prepared": None})
         return other
 
+    @property
+    def marginal(self) -> FloatArray:
+        """See `JointFilter`."""
+        return self._marginals.current
+
+    @property
+    def driven(self) -> FloatArray:
+        """See `JointFilter`."""
+        return self._marginals.driven
+
+    @property
+    def _groups(self) -> Groups:
+        """Which bodies have blocks."""
+        return self._marginals.groups
+
     def place(self, columns: IntArray, covariance: FloatArray) -> None:
-        """Give a body's columns (3,) this covariance (3, 3), independent of the rest, whatever was known."""
-        if columns.size:
+        """Give columns (k,) this covariance (k, k), independent of the rest, whatever was known."""
+        if columns.size and self._groups.part[columns[0] // 3]:
+            blocks, variances = columns // 3, np.diag(covariance)
+            for block in np.unique(blocks).tolist():
+                here = blocks == block
+                self._place_parameters(columns[here], variances[here])
+        elif columns.size:
             self.place_bodies(columns[:1] // 3, covariance[None])
+
+    def _place_parameters(self, columns: IntArray, variances: FloatArray) -> None:
+        """Likewise parameters (k,) of one block; what else stands there stays as it is."""
+        (robot, own), block = self._groups.columns(columns), columns[:1] // 3
+        spread, kept = np.ones(3), np.ones(3)
+        kept[columns % 3] = 0.0
+        if self._number[block[0]] < 0:
+            others, gain = _NOBODY, np.zeros((0, 3))
+        else:
+            self._take_in(robot)
+            others, gain, spread = self._number[block], np.diag(kept), np.zeros(3)
+        spread[columns % 3] = variances
+        self._append(block, [Derived(others, gain, np.diag(spread))])
+        self._marginals.place(np.array([robot]), own, np.diag(variances)[None])
 
     def place_bodies(self, bodies: IntArray, covariances: FloatArray) -> None:
         """Likewise the columns of bodies (k,), each with a covariance (k, 3, 3) of its own."""
         self._place[bodies] = centres(covariances)
         own = carried(self._place[bodies], covariances)
-        nobody, nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-        self._append(bodies, [Derived(nobody, nothing, one) for one in own])
-        self.marginal[bodies] = self._settled[bodies] = covariances
+        self._append(bodies, [Derived(_NOBODY, np.zeros((0, 3)), one) for one in own])
+        self._marginals.place(bodies, np.arange(3), covariances)
 
     def _append(self, bodies: IntArray, derived: Sequence[Derived]) -> None:
         """Let bodies (k,) be new ones."""
-        self._number[bodies] = self._factor.pattern.front.size + len(self._new) + np.arange(len(derived))
+        self._number[bodies] = self._next_number + np.arange(len(derived))
         self._new += tuple(derived)
 
-    def add(self, columns: IntArray, covariance: FloatArray) -> None:
-        """Add a covariance (3, 3) to that of a body's columns (3,): its error is larger than was known."""
-        if columns.size:
-            body = int(columns[0]) // 3
-            if self._number[body] < 0:
-                self.place(columns, covariance)
-            else:
-                self.marginal[body] += covariance
+    @property
+    def _next_number(self) -> int:
+        """That of the next body to come."""
+        return self._factor.pattern.front.size + len(self._new)
 
-    def grow(self, count: int) -> None:
-        """Append columns without error, three for each body."""
-        bodies = count // 3
-        self.marginal = np.concatenate([self.marginal, np.zeros((bodies, 3, 3))])
-        self._settled = np.concatenate([self._settled, np.zeros((bodies, 3, 3))])
-        self._place = np.concatenate([self._place, np.zeros((bodies, 2))])
-        self._number = np.concatenate([self._number, np.full(bodies, -1)])
+    def add(self, columns: IntArray, covariance: FloatArray) -> None:
+        """Add a covariance (k, k) to that of columns (k,): their errors are larger than was known."""
+        if columns.size:
+            body, own = self._groups.columns(columns)
+            self.marginal[body, own[:, None], own] += covariance
+
+    def grow(self, table: ParameterTable) -> None:
+        """Append the columns that a table has more, without error as yet: they are placed next."""
+        more = table.filter_size // 3 - self._number.size
+        self._marginals.grow(Groups.of(table))
+        self._place = np.concatenate([self._place, np.zeros((more, 2))])
+        self._number = np.concatenate([self._number, np.full(more, -1)])
         self._ordering = None
 
     def relate(self, columns: IntArray, others: IntArray, mapping: FloatArray) -> None:
@@ -134,68 +183,93 @@ class SparseFilter:
             return
         body, bodies = int(columns[0]) // 3, others[::3] // 3
         placed, self._new = self._new[-1], self._new[:-1]
-        self._take_in_noise(bodies)
+        for other in np.unique(bodies).tolist():
+            self._take_in(other)
         lever, back = levers(self._place[[body]])[0], levers(-self._place[bodies])
         shares = lever @ mapping.reshape(3, -1, 3).transpose(1, 0, 2) @ back
-        alike = np.linalg.cholesky(carried(self._place[bodies], self.marginal[bodies]))
+        alike = np.linalg.cholesky(carried(self._place[bodies], self.marginal[bodies, :3, :3]))
         common = np.sum(shares @ alike, axis=0)
         gain = shares.transpose(0, 2, 1).reshape(-1, 3)
         self._append(columns[:1] // 3, [Derived(self._number[bodies], gain, placed.spread)])
-        self.marginal[body] += carried(-self._place[[body]], (common @ common.T)[None])[0]
-        self._settled[body] = self.marginal[body]
+        more = carried(-self._place[[body]], (common @ common.T)[None])
+        own = self.marginal[[body], :3, :3] + more
+        self._marginals.place(np.array([body]), np.arange(3), own)
 
-    def _take_in_noise(self, bodies: IntArray) -> None:
-        """Take what bodies have erred by since the newest factor into their errors, so others share it."""
-        added = carried(self._place[bodies], self.marginal[bodies] - self._settled[bodies])
-        for body, noise in zip(bodies[:, None], added, strict=True):
-            if noise.any():
-                self._append(body, [Derived(self._number[body], np.eye(3), noise)])
-                self._settled[body] = self.marginal[body]
+    def _take_in(self, body: int) -> None:
+        """Take what a body's errors have become since the newest factor into them, so others share it."""
+        noise, moves = self._marginals.since(np.array([body]), self._place)
+        if not noise.any() and moves.beside[body] < 0:
+            return
+        is_robot = body < len(self.driven)
+        blocks = self._groups.member[body] if is_robot else np.array([body] + BLOCKS * [-1])
+        numbers = np.where(blocks >= 0, self._number[blocks], -1)
+        derived = derived_by(
+            moves, (int(body), int(blocks[1])), noise[0], np.append(numbers, self._next_number)
+        )
+        present = blocks[[*range(1, 1 + BLOCKS), 0]]
+        self._append(present[(present >= 0) & (self._number[present] >= 0)], derived)
+        self._marginals.settle(np.array([body]))
 
     def block(self, columns: IntArray) -> FloatArray:
-        """Covariance (3, 3) of a body's columns (3,); (0, 0) of none."""
+        """Covariance (k, k) of columns (k,) of a body or of one robot's parameters; (0, 0) of none."""
         if columns.size == 0:
             return np.zeros((0, 0))
-        covariance: FloatArray = self.marginal[int(columns[0]) // 3].copy()
+        body, own = self._groups.columns(columns)
+        covariance: FloatArray = self.marginal[body][np.ix_(own, own)]
         return covariance
 
     def relate_pairs(self, columns: IntArray, robots: Robots) -> FloatArray:
-        """Cross-covariances (m, 3, 3) of pairs of bodies before an update with measurements (m,) of them."""
-        tied = (columns >= 0).all(axis=1)
-        pairs = columns[tied] // 3
-        prepared = self._prepare(pairs, robots)
-        out = np.zeros((len(columns), 3, 3))
-        first, second = pairs.T
-        places, covariance = prepared.prior.place, prepared.prior.covariance
-        across = covariance[places[first], places[second]] + copies.shared(prepared.shares, first, second)
-        out[tied] = carried_pairs(-self._place[first], across, -self._place[second])
+        """Covariances of what measurements (m,) depend on, before an update with them.
+
+        Args:
+            columns: (m, 3) the first columns of observers, targets and observers' cameras; -1: there is none.
+            robots: Where all are.
+
+        Returns:
+            (m, 3, 5) of the observers' errors with the targets', and of these with those of the cameras.
+        """
+        tied = (columns[:, :2] >= 0).all(axis=1)
+        bodies = columns // 3
+        prepared = self._prepare(bodies[tied, :2], robots)
+        out = np.zeros((len(columns), 3, 5))
+        out[tied, :, :3] = self._about_map(prepared.covariance_of, *bodies[tied, :2].T)
+        seen = (columns[:, 1:] >= 0).all(axis=1)
+        out[seen, :, 3:] = self._about_map(prepared.covariance_of, *bodies[seen, 1:].T)[:, :, :2]
         return out
 
     def _prepare(self, pairs: IntArray, robots: Robots) -> _Prepared:
         """Have the covariances of all pairs of a pattern that pairs (k, 2) fit into."""
         count = robots.active.size
-        places = np.concatenate(
-            [robots.places, self._place[count:]]
-        )  # landmarks stand where they were placed
+        # landmarks stand where they were placed
+        places = np.concatenate([robots.places, self._place[count:]])
         active = np.flatnonzero(np.concatenate([robots.active, self._number[count:] >= 0]))
-        self._move_far(active, places)
+        bodies = active[self._groups.part[active] == 0]
+        self._move_far(bodies, places)
         factor, shares = with_derived(self._factor, self._new), copies.with_derived(self._shares, self._new)
         pattern = self._pattern(pairs, active, places)
-        rows = wanted_rows(factor.pattern, pattern, self._number, len(self._new))
+        noise, moves = self._marginals.since(bodies, self._place)
+        rows = wanted_rows(factor.pattern, pattern, self._number, len(self._new), moves.beside)
         covariance = self._room.with_fronts(self._factor, len(self._new))
         write_rows(factor, len(self._new), rows, covariance)
         self._room.holds = None  # since noise is added to it
-        origin: Factor | None = factor
+        origin, others = None if moves.any() else factor, None
         if self._updates % _COPIED_AGAIN == 0:
-            copied = active[spread(places[active], min(_COPIES, active.size // _COPIED_SHARE))]
+            copied = bodies[spread(places[bodies], min(_COPIES, bodies.size // _COPIED_SHARE))]
             others = copies.renewed(factor, shares, self._number[copied])
+        if moves.any():
+            move(covariance, pattern, self._number, moves)
+            shares = moved_shares(shares, self._number, moves)
+            others = None if others is None else moved_shares(others, self._number, moves)
+        if others is not None:
             copies.change_shared(covariance, pattern, self._number, (shares, others))
             shares, origin = others, None
         self._updates += 1
-        numbers, added = self._number[active], np.zeros_like(self.marginal)
-        added[active] = carried(self._place[active], self.marginal[active] - self._settled[active])
-        covariance[numbers, numbers] += added[active]
-        by_body = shares
+        added = np.zeros((self._number.size, 3, 3))
+        for (row, column), of, first, second in self._marginals.within(bodies):
+            covariance[self._number[first], self._number[second]] += noise[of, row, column]
+            if row == column:  # noise of a body with its block is gained by moves alone
+                added[first] = noise[of, row, column]
+        numbers, by_body = self._number[active], shares
         if not np.array_equal(
             numbers, np.arange(self._number.size)
         ):  # not all are there, as they were before
@@ -220,9 +294,18 @@ class SparseFilter:
         here[active] = True
         self._pairs = (*self._pairs[1 - _PAIRS_KEPT :], pairs)
         recent = np.concatenate(self._pairs)
-        situation = Situation(active, places, recent[here[recent].all(axis=1)])
+        recent = recent[here[recent].all(axis=1)]
+        pairs = np.concatenate([recent, block_pairs(self._groups, here, recent)])
+        bodies = active[self._groups.part[active] == 0]
+        situation = Situation(bodies, active_blocks(self._groups, here), places, pairs)
         self._ordering = ordered(situation, self._ordering)
         return self._ordering.pattern
+
+    def _about_map(
+        self, covariance_of: Callable[[IntArray, IntArray], FloatArray], first: IntArray, second: IntArray
+    ) -> FloatArray:
+        """Covariances (k, 3, 3) of pairs, of errors as the filter's columns are."""
+        return carried_pairs(-self._place[first], covariance_of(first, second), -self._place[second])
 
     def update(
         self, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
@@ -256,9 +339,12 @@ class SparseFilter:
     def _settle(self, active: IntArray) -> None:
         """Have the marginals of the newest factor and copies."""
         covariance = self._room.with_fronts(self._factor)
-        own = covariance[active, active] + copies.shared(self._shares, active, active)
-        self.marginal[active] = carried(-self._place[active], own)
-        self._settled[active] = self.marginal[active]
+        bodies = active[self._groups.part[active] == 0]
+        for (row, column), of, first, second in self._marginals.within(bodies):
+            own = covariance[first, second] + copies.shared(self._shares, first, second)
+            own = carried_pairs(-self._place[first], own, -self._place[second])
+            self.marginal[bodies[of], row, column] = own
+        self._marginals.settle(bodies)
 
 
 class _Room:

@@ -90,7 +90,9 @@ def _take(bodies: IntArray, f: int, front: IntArray, seen: IntArray, borders: In
     return end
 
 
-def wanted_rows(old: Pattern, new: Pattern, place: IntArray, derived: int) -> tuple[IntArray, IntArray]:
+def wanted_rows(
+    old: Pattern, new: Pattern, place: IntArray, derived: int, beside: IntArray
+) -> tuple[IntArray, IntArray]:
     """What has to be known of an old factor besides its own pattern, for a new pattern to be.
 
     Args:
@@ -98,26 +100,41 @@ def wanted_rows(old: Pattern, new: Pattern, place: IntArray, derived: int) -> tu
         new: Whose pairs are wanted.
         place: (n,) the numbers of the new pattern's bodies in the old one.
         derived: So many of the first fronts have borders whose pairs may be in no front.
+        beside: (n,) a body that is wanted wherever another one is; -1: none.
 
     Returns:
         Bodies, front by front of the old pattern, whose covariances with its pivots are wanted, and where
         those of each front begin (F + 1,).
     """
     wanted = np.zeros((old.fronts, old.front.size), dtype=np.bool_)
-    _want_pairs(old, new, place, wanted)
+    _want_pairs(old, new, place, beside, wanted)
     return _close(old, wanted, derived)
 
 
 @compiled
-def _want_pairs(old: Pattern, new: Pattern, place: IntArray, wanted: BoolArray) -> None:
-    """Note all pairs of the new pattern at the earlier one's front."""
+def _want_pairs(old: Pattern, new: Pattern, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
+    """Note all pairs of the new pattern, and of those beside, at the earlier one's front."""
     for f in range(new.pivot_begin.size - 1):
         for k in range(new.pivot_begin[f], new.pivot_begin[f + 1]):
-            a = place[new.pivot[k]]
+            a = new.pivot[k]
+            if beside[a] >= 0:
+                _want(old.front, place[a], place[beside[a]], wanted)
             for q in range(k + 1, new.pivot_begin[f + 1]):
-                _want(old.front, a, place[new.pivot[q]], wanted)
+                _want_with(old.front, a, new.pivot[q], place, beside, wanted)
             for q in range(new.border_begin[f], new.border_begin[f + 1]):
-                _want(old.front, a, place[new.border[q]], wanted)
+                _want_with(old.front, a, new.border[q], place, beside, wanted)
+
+
+@compiled
+def _want_with(front: IntArray, a: int, b: int, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
+    """Note a pair of bodies, with those beside them."""
+    _want(front, place[a], place[b], wanted)
+    if beside[a] >= 0:
+        _want(front, place[beside[a]], place[b], wanted)
+        if beside[b] >= 0:
+            _want(front, place[beside[a]], place[beside[b]], wanted)
+    if beside[b] >= 0:
+        _want(front, place[a], place[beside[b]], wanted)
 
 
 @compiled
