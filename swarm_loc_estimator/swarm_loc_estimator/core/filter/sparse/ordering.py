@@ -19,7 +19,7 @@ from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 
 _ORDERED_AGAIN = 3
 _GROWN = 1.2
-"""An order is replaced after so many updates, or when elimination costs so much more than at first."""
+"""An order is replaced after so many updates, or when its largest front has grown so much."""
 _NEAR_AGAIN = 9
 """After so many updates it is found out again who is near whom."""
 
@@ -71,7 +71,7 @@ class Ordering:
         pattern: In which all pairs of the situation lie.
         order: Of all active bodies and blocks.
         updates: For how many it has been used.
-        work: What elimination by it cost at first.
+        width: Of its largest front at first.
         near: (k, 2) pairs of bodies that are near each other.
         near_updates: For how many updates these have been used.
     """
@@ -80,7 +80,7 @@ class Ordering:
     pattern: Pattern
     order: Order
     updates: int
-    work: int
+    width: int
     near: IntArray
     near_updates: int
 
@@ -106,12 +106,12 @@ def ordered(situation: Situation, before: Ordering | None) -> Ordering:
         return _begun(situation, before.next_order, before.next_near)
     near, near_updates = before.near, before.near_updates + 1
     pattern = situation.pattern(before.order, near)
-    if pattern.work > _GROWN * before.work:
+    if pattern.width > _GROWN * before.width:
         return _begun(situation, situation.order(near), (near, near_updates))
-    return Ordering(situation, pattern, before.order, before.updates + 1, before.work, near, near_updates)
+    return Ordering(situation, pattern, before.order, before.updates + 1, before.width, near, near_updates)
 
 
 def _begun(situation: Situation, order: Order, near: tuple[IntArray, int]) -> Ordering:
     """An ordering with a new order."""
     pattern = situation.pattern(order, near[0])
-    return Ordering(situation, pattern, order, 1, pattern.work, *near)
+    return Ordering(situation, pattern, order, 1, pattern.width, *near)

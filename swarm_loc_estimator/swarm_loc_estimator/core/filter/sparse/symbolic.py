@@ -39,10 +39,9 @@ class Pattern(NamedTuple):
         return self.pivot_begin.size - 1
 
     @property
-    def work(self) -> int:
-        """What its elimination costs, in multiplications, but for a factor."""
-        pivots, border = np.diff(self.pivot_begin), np.diff(self.border_begin)
-        return int(np.sum(pivots * (pivots + border) ** 2))
+    def width(self) -> int:
+        """Bodies in the largest front."""
+        return int((np.diff(self.pivot_begin) + np.diff(self.border_begin)).max(initial=0))
 
 
 def pattern_of(order: Order, adjacency: Adjacency) -> Pattern:
