@@ -12,7 +12,7 @@ from swarm_loc_estimator.core.description.robot_ir import IrMethod, RobotIr
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.description.swarm import Face, Landmark, OdometryModel, Robot, Swarm
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
-from swarm_loc_estimator.core.filter.correlated_noise import record_pair
+from swarm_loc_estimator.core.filter.correlated_noise import PAIR_ROWS, record_pair
 from swarm_loc_estimator.core.filter.integrity.surprises import is_elsewhere
 from swarm_loc_estimator.core.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns
 from swarm_loc_estimator.core.filter.state import SwarmState
@@ -90,7 +90,7 @@ def _call_rare(swarm: Swarm) -> None:
     state = SwarmState(ParameterTable.of(swarm.robots, swarm.landmarks), pairs=2)
     is_elsewhere(state.integrity, 0)
     columns = MeasurementColumns.of(np.zeros(2, MEASUREMENT_DTYPE))
-    record_pair(columns, 0, state.arrays(), np.zeros((2, 3)), np.ones(3), np.eye(3))
+    record_pair(columns, 0, state.arrays(), np.zeros((PAIR_ROWS, 3)))
 
 
 def _board(number: int) -> RobotIr:

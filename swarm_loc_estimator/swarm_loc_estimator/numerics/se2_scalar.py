@@ -48,6 +48,15 @@ def composed(
 
 
 @compiled
+def between(
+    ax: float, ay: float, atheta: float, bx: float, by: float, btheta: float
+) -> tuple[float, float, float]:
+    """The pose b seen from the pose a, both given in one frame; heading not wrapped."""
+    cos, sin = math.cos(atheta), math.sin(atheta)
+    return cos * (bx - ax) + sin * (by - ay), cos * (by - ay) - sin * (bx - ax), btheta - atheta
+
+
+@compiled
 def moved_by_twist(
     rho_x: float, rho_y: float, phi: float, x: float, y: float, theta: float
 ) -> tuple[float, float, float]:

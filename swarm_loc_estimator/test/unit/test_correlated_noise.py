@@ -1,4 +1,4 @@
-"""Laws of what a pair of robots tells again: it counts once, until the robots have turned."""
+"""Laws of what a pair of robots tells again: its mean counts, and once, until the robots have turned."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
 from swarm_loc_estimator.core.description.swarm import Robot
-from swarm_loc_estimator.core.filter.correlated_noise import inflate_noise, record_constraint, record_pair
+from swarm_loc_estimator.core.filter.correlated_noise import (
+    PAIR_ROWS,
+    record_constraint,
+    record_pair,
+    use_mean,
+)
 from swarm_loc_estimator.core.filter.measurement_model import (
     MEASUREMENT_DTYPE,
     Kind,
@@ -19,11 +24,13 @@ from swarm_loc_estimator.core.filter.measurement_model import (
     MeasurementColumns,
 )
 from swarm_loc_estimator.core.filter.state import SwarmState
+from swarm_loc_estimator.numerics import se2
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
 VARIANCES = np.array([1e-4, 2e-3, 5e-3])
 VALUE = (0.15, 0.4, -2.0)
-UNKNOWN = 1e6 * VARIANCES
+UNSURE, SURE = 4.0 * VARIANCES, 1e-6 * VARIANCES
+TOLD = slice(3, 6)
 
 
 class Exchange(NamedTuple):
@@ -56,47 +63,103 @@ def pairs(places: int = 4) -> SwarmState:
     return SwarmState(ParameterTable.of([Robot(name) for name in "abcd"]), places)
 
 
-def believed(value: tuple[float, float, float]) -> FloatArray:
+def standing(value: tuple[float, float, float]) -> FloatArray:
     """Poses (2, 3) in map of an observer and of a target that it has at so much."""
     distance, bearing, heading = value
-    x, y, theta = 0.3, -0.2, 0.7
-    along = theta + bearing
-    target = (x + distance * np.cos(along), y + distance * np.sin(along), theta + heading)
-    return np.array([(x, y, theta), target])
+    observer = np.array([0.3, -0.2, 0.7])
+    seen = np.array([distance * np.cos(bearing), distance * np.sin(bearing), heading])
+    return np.array([observer, se2.compose(observer, seen)])
 
 
-def noise_of(
-    state: SwarmState, exchange: Exchange, predicted: FloatArray, at: tuple[float, float, float] | None = None
-) -> FloatArray:
-    """The variances (3,) to use it with where the pair is believed to be, by default as it was measured."""
-    noise, pose = np.diag(VARIANCES * exchange.size), believed(at or exchange.value)
-    inflate_noise(MeasurementColumns.of(exchange.row()), 0, state.arrays(), pose, predicted, noise)
-    variances: FloatArray = np.diag(noise).copy()
-    return variances
+class Use(NamedTuple):
+    """What becomes of an exchange."""
+
+    innovation: FloatArray
+    noise: FloatArray
+    pair: FloatArray
 
 
-def used(
-    state: SwarmState, exchange: Exchange, predicted: FloatArray, at: tuple[float, float, float] | None = None
-) -> FloatArray:
-    """Use it; returns the variances (3,) left."""
-    noise = noise_of(state, exchange, predicted, at)
-    left: FloatArray = predicted * noise / (predicted + noise)
-    columns = MeasurementColumns.of(exchange.row())
-    pose = believed(at or exchange.value)
-    record_pair(columns, 0, state.arrays(), pose, predicted.copy(), np.diag(noise))
+def use_of(
+    state: SwarmState,
+    exchange: Exchange,
+    variances: FloatArray,
+    predicted: FloatArray | None = None,
+    poses: FloatArray | None = None,
+) -> Use:
+    """How an exchange is used where robots are at `poses`, by default at what it measured."""
+    value = np.array(exchange.value)
+    expected = (
+        standing(exchange.value) if poses is None else poses,
+        value if predicted is None else predicted,
+        variances,
+    )
+    innovation = value - expected[1]
+    innovation[1:] = se2.wrap_angle(innovation[1:])
+    use = Use(innovation, np.diag(VARIANCES * exchange.size), np.zeros((PAIR_ROWS, 3)))
+    use_mean(MeasurementColumns.of(exchange.row()), 0, state.arrays(), expected, *use)
+    return use
+
+
+def noise_of(state: SwarmState, exchange: Exchange, variances: FloatArray) -> FloatArray:
+    """The variances (3,) to use it with."""
+    noise: FloatArray = np.diag(use_of(state, exchange, variances).noise).copy()
+    return noise
+
+
+class Belief:
+    """A Kalman filter of one pair's relative pose, which stands."""
+
+    def __init__(self, state: SwarmState, variances: FloatArray) -> None:
+        self.state, self.value, self.variances = state, np.array(VALUE), variances
+
+    def use(self, exchange: Exchange) -> None:
+        """Let an exchange correct it."""
+        use = use_of(self.state, exchange, self.variances, self.value, standing(VALUE))
+        record_pair(MeasurementColumns.of(exchange.row()), 0, self.state.arrays(), use.pair)
+        noise = np.diag(use.noise)
+        self.value = self.value + self.variances / (self.variances + noise) * use.innovation
+        self.variances = self.variances * noise / (self.variances + noise)
+
+    @property
+    def told(self) -> FloatArray:
+        """The information (3,) of the pair."""
+        told: FloatArray = np.diag(self.state.pair_history[0, 0, TOLD]).copy()
+        return told
+
+
+def used(state: SwarmState, exchange: Exchange, variances: FloatArray) -> FloatArray:
+    """Use it where it measured; returns the variances (3,) left."""
+    use = use_of(state, exchange, variances)
+    record_pair(MeasurementColumns.of(exchange.row()), 0, state.arrays(), use.pair)
+    left: FloatArray = variances * np.diag(use.noise) / (variances + np.diag(use.noise))
     return left
 
 
-@given(systematic_share=st.floats(0.0, 1.0), count=st.integers(1, 30))
-def test_exchanges_of_robots_that_stand_count_once_but_for_their_noise(
-    systematic_share: float, count: int
+@given(share=st.floats(0.01, 1.0), count=st.integers(1, 30), seed=st.integers(0, 10**6))
+def test_robots_that_stand_are_believed_to_be_where_the_mean_of_their_exchanges_says(
+    share: float, count: int, seed: int
 ) -> None:
-    state, left = pairs(), UNKNOWN
-    for _ in range(count):
-        left = used(state, Exchange(systematic_share), left)
-    np.testing.assert_allclose(
-        left, VARIANCES * (systematic_share + (1.0 - systematic_share) / count), rtol=1e-3
-    )
+    """Whatever was told first; and no surer than the mean is."""
+    belief = Belief(pairs(), UNSURE)
+    values = VALUE + 0.5 * np.sqrt(VARIANCES) * np.random.default_rng(seed).standard_normal((count, 3))
+    for value in values.tolist():
+        belief.use(Exchange(share, tuple(value)))
+    own = 1.0 - share
+    mean = values.mean(axis=0) if own > 0.0 else values[0]
+    expected = (belief.told * mean + VALUE / UNSURE) / (belief.told + 1.0 / UNSURE)
+    np.testing.assert_allclose(belief.value, expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(belief.variances, 1.0 / (belief.told + 1.0 / UNSURE), rtol=1e-6)
+    assert (belief.told * VARIANCES * (share + own / count) <= 1.0 + 1e-6).all()
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.9])
+def test_after_many_exchanges_nearly_all_is_told_that_their_mean_tells(share: float) -> None:
+    belief = Belief(pairs(), UNSURE)
+    for _ in range(60):
+        belief.use(Exchange(share))
+    most = 1.0 / (VARIANCES * (share + (1.0 - share) / 60))
+    assert (belief.told > 0.75 * most).all()
+    assert (belief.told < most).all()
 
 
 @given(
@@ -108,35 +171,55 @@ def test_robots_that_stand_are_never_surer_than_the_least_error_that_comes_again
 ) -> None:
     """However unlike exchanges are; and however values scatter, that is no turn of the robots."""
     rng = np.random.default_rng(seed)
-    state, left = pairs(), UNKNOWN
+    belief = Belief(pairs(), 1e6 * VARIANCES)
     for share, size in exchanges:
         bearing, heading = rng.uniform(-3.0, 3.0, 2).tolist()
-        left = used(state, Exchange(share, (VALUE[0], bearing, heading), size=size), left, at=VALUE)
-    assert (left >= (1.0 - 1e-5) * min(share * size for share, size in exchanges) * VARIANCES).all()
+        belief.use(Exchange(share, (VALUE[0], bearing, heading), size=size))
+    least = min(share * size for share, size in exchanges) * VARIANCES
+    assert (belief.variances >= (1.0 - 1e-5) * least).all()
 
 
 def test_an_exchange_that_seems_better_does_not_take_what_came_again_before_for_less() -> None:
     """The mean still contains the errors of those before it, by their weight."""
-    state, left = pairs(), UNKNOWN
+    belief = Belief(pairs(), UNSURE)
     for _ in range(9):
-        left = used(state, Exchange(0.8), left)
-    before = left.copy()
-    left = used(state, Exchange(0.8, size=0.5), left)
+        belief.use(Exchange(0.8))
+    before = belief.told
+    belief.use(Exchange(0.8, size=0.5))
     better = 0.8 * (0.5**0.5 * 0.2 + 0.8) ** 2  # a tenth and somewhat more of the mean is the new one
-    assert (left > better * VARIANCES).all()
-    assert (left < before).all()
+    assert (belief.told < 1.0 / (better * VARIANCES)).all()
+    assert (belief.told > before).all()
 
 
-@given(systematic_share=st.floats(0.0, 1.0), turn=st.floats(0.0, 3.0), more=st.floats(1.0, 4.0))
+@given(share=st.floats(0.0, 1.0), turn=st.floats(0.0, 3.0), more=st.floats(1.0, 4.0))
 def test_what_is_told_again_never_counts_more_than_the_first_time(
-    systematic_share: float, turn: float, more: float
+    share: float, turn: float, more: float
 ) -> None:
     state = pairs()
-    left = used(state, Exchange(systematic_share), UNKNOWN)
+    left = more * used(state, Exchange(share), SURE)
     distance, bearing, heading = VALUE
-    again = noise_of(state, Exchange(systematic_share, (distance, bearing + turn, heading)), more * left)
+    turned = Exchange(share, (distance, bearing + turn, heading))
+    again = noise_of(state, turned, left)
     assert (again >= VARIANCES * (1.0 - 1e-9)).all()
-    assert (again <= noise_of(state, Exchange(systematic_share), more * left) * (1.0 + 1e-9)).all()
+    assert (again <= noise_of(state, Exchange(share), left) * (1.0 + 1e-6)).all()
+
+
+@given(
+    move=st.tuples(st.floats(-0.1, 0.1), st.floats(0.001, 0.1), st.floats(-3.0, 3.0)),
+    side=st.integers(0, 1),
+    share=st.floats(0.05, 0.95),
+)
+def test_where_robots_have_moved_a_new_mean_begins(
+    move: tuple[float, float, float], side: int, share: float
+) -> None:
+    """Odometry errs: what was measured elsewhere is no value to come back to."""
+    state, belief = pairs(), standing(VALUE)
+    first = use_of(state, Exchange(share), UNSURE)
+    record_pair(MeasurementColumns.of(Exchange(share).row()), 0, state.arrays(), first.pair)
+    belief[side] = se2.compose(belief[side], np.array(move))
+    value = np.array([0.16, 0.3, -1.9])
+    use = use_of(state, Exchange(share, (0.17, 0.2, -1.8)), UNSURE, value, belief)
+    np.testing.assert_allclose(use.innovation, (0.01, -0.1, 0.1), atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -148,38 +231,43 @@ def test_robots_that_have_turned_tell_something_new(
 ) -> None:
     """A bearing errs by the gains of sensors, range and heading by those of emitters besides."""
     state = pairs()
-    left = used(state, Exchange(0.9), UNKNOWN)
+    left = used(state, Exchange(0.9), 1e-3 * VARIANCES)
     distance, bearing, heading = VALUE
-    turned = (distance, bearing - receiver_turns, heading - receiver_turns + transmitter_turns)
-    noise = noise_of(state, Exchange(0.9, turned), left)
-    np.testing.assert_array_equal(noise < 1.1 * VARIANCES, new)
+    turned = Exchange(0.9, (distance, bearing - receiver_turns, heading - receiver_turns + transmitter_turns))
+    poses = standing(VALUE)
+    poses[:, 2] += receiver_turns, transmitter_turns
+    noise = np.diag(use_of(state, turned, left, poses=poses).noise)
+    np.testing.assert_array_equal(noise < 1.1 * noise_of(pairs(), turned, left), new)
 
 
 def test_what_others_tell_makes_room_for_what_a_pair_tells_again() -> None:
     state = pairs()
-    left = used(state, Exchange(1.0), UNKNOWN)
+    left = used(state, Exchange(1.0), 9.0 * SURE)
     lowered = noise_of(state, Exchange(1.0), 0.1 * left)
-    moved = used(state, Exchange(1.0), 0.1 * left)
-    again = noise_of(state, Exchange(1.0), moved + left)
+    moved = used(state, Exchange(1.0), 0.1 * left) + left
     assert (lowered > 1e6 * VARIANCES).all()
-    assert (again < 2.0 * VARIANCES).all()
+    assert (noise_of(state, Exchange(1.0), moved) < 2.0 * VARIANCES).all()
 
 
 def test_a_pair_is_forgotten_when_either_robot_is_lost_or_others_take_its_place() -> None:
+    new = noise_of(pairs(), Exchange(1.0), SURE)
     for lost in (0, 1):
         state = pairs()
-        left = used(state, Exchange(1.0), UNKNOWN)
+        used(state, Exchange(1.0), SURE)
         state.lose(lost)
-        np.testing.assert_allclose(noise_of(state, Exchange(1.0), left), VARIANCES)
+        np.testing.assert_allclose(noise_of(state, Exchange(1.0), SURE), new)
     state = pairs(places=2)
     for transmitter, stamp_ns in ((1, 1), (2, 2), (3, 3)):
-        left = used(state, Exchange(1.0, transmitter=transmitter, stamp_ns=stamp_ns), UNKNOWN)
-    known = [(noise_of(state, Exchange(1.0, transmitter=k), left) > VARIANCES).all() for k in (1, 2, 3)]
-    assert known == [False, True, True]
+        left = used(state, Exchange(1.0, transmitter=transmitter, stamp_ns=stamp_ns), SURE)
+    again = [noise_of(state, Exchange(1.0, transmitter=k), left) for k in (1, 2, 3)]
+    assert [bool((noise > 1e6 * VARIANCES).all()) for noise in again] == [False, True, True]
 
 
 def test_what_has_located_a_robot_counts_as_told() -> None:
     state = pairs()
-    record_constraint(MeasurementColumns.of(Exchange(1.0).row()), 0, state.arrays())
-    assert (noise_of(state, Exchange(1.0), VARIANCES) > 1e6 * VARIANCES).all()
+    exchange = MeasurementColumns.of(Exchange(1.0).row())
+    record_constraint(exchange, 0, state.arrays(), standing(VALUE))
+    told = np.diag(state.pair_history[0, 0, TOLD])
+    assert (told > 0.4 / VARIANCES).all()  # not all of it
+    assert (noise_of(state, Exchange(1.0), VARIANCES) > noise_of(pairs(), Exchange(1.0), VARIANCES)).all()
     np.testing.assert_allclose(noise_of(state, Exchange(0.0), VARIANCES), VARIANCES)

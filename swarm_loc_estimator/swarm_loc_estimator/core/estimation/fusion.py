@@ -22,7 +22,7 @@ from swarm_loc_estimator.core.filter.batch_update import (
     related_columns,
 )
 from swarm_loc_estimator.core.filter.belief import correct
-from swarm_loc_estimator.core.filter.correlated_noise import record_constraint, record_pair
+from swarm_loc_estimator.core.filter.correlated_noise import at_first, record_constraint, record_pair
 from swarm_loc_estimator.core.filter.dense import sequential_update
 from swarm_loc_estimator.core.filter.dense.sequential_update import update_in_order
 from swarm_loc_estimator.core.filter.innovation import InnovationBatch, new_batch
@@ -287,7 +287,7 @@ class Fusion:
         lost = confirm_all(fields, belief, passed)
         systematic = (fields.systematic_share > 0.0).any(axis=1)
         for k in np.flatnonzero(passed & systematic).tolist():
-            record_pair(fields, k, belief, batch.pose[k], batch.variance[k], batch.noise[k])
+            record_pair(fields, k, belief, batch.pair[k])
         if passed.any():
             used = slice(None) if passed.all() else passed
             evaluated = (batch.jacobian[used], batch.innovation[used], batch.noise[used])
@@ -312,9 +312,12 @@ class Fusion:
 
     def _note(self, state: SwarmState, one: MeasurementArray) -> Verdict:
         """Keep a measurement (1,) as a constraint if it ties a waiting robot to something located."""
-        if not self._initializer.note(state, one):
+        if not self._initializer.note(state, at_first(one)):
             return Verdict.NOT_LOCALIZED
-        record_constraint(MeasurementColumns.of(one), 0, state.arrays())
+        sides = np.array([one["observer"][0], one["target"][0]])
+        if self._pairs and (sides >= 0).all():
+            tracks = self._tracks.at(sides, np.repeat(one["stamp_ns"], 2)).pose
+            record_constraint(MeasurementColumns.of(one), 0, state.arrays(), tracks)
         return Verdict.CONSTRAINT
 
     def _open(self, state: SwarmState, source: int, stamp_ns: int) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from swarm_loc_estimator.core.description.estimated_parameters import CAMERA_SCALE, CAMERA_YAW
 from swarm_loc_estimator.core.filter.belief import BeliefArrays, covariance_within, own_within
-from swarm_loc_estimator.core.filter.correlated_noise import inflate_noise
+from swarm_loc_estimator.core.filter.correlated_noise import PAIR_ROWS, use_mean
 from swarm_loc_estimator.core.filter.gating import position_distance, soften_heading, squared_distance
 from swarm_loc_estimator.core.filter.integrity.hidden_noise import add_hidden_noise, stamp_variance
 from swarm_loc_estimator.core.filter.integrity.surprises import (
@@ -37,6 +37,7 @@ class Scratch(NamedTuple):
         chain: (3, 5) Jacobian of the value, see `measurement_model.predict`.
         difference: (3, 3) covariance of xi_target - xi_observer.
         expected: (3, 3) covariance of the innovation.
+        variances: (3,) of the predicted value.
     """
 
     predicted: FloatArray
@@ -44,6 +45,7 @@ class Scratch(NamedTuple):
     chain: FloatArray
     difference: FloatArray
     expected: FloatArray
+    variances: FloatArray
 
 
 class InnovationBatch(NamedTuple):
@@ -58,7 +60,7 @@ class InnovationBatch(NamedTuple):
         jacobian: (m, 3, DEPENDS_ON) of the innovation.
         innovation: (m, 3) measured minus predicted.
         noise: (m, 3, 3) covariances of the measurements, as they are used.
-        variance: (m, 3) of what was to be expected.
+        pair: (m, PAIR_ROWS, 3) what to remember of its pair when it is used, see `correlated_noise`.
         distance: (m,) squared Mahalanobis distance of the position, small errors left out.
         whitened: (m, 2) position innovation over its standard deviation, likewise.
         cause: (m,) what may explain the innovation, see `integrity.cause_of`.
@@ -73,7 +75,7 @@ class InnovationBatch(NamedTuple):
     jacobian: FloatArray
     innovation: FloatArray
     noise: FloatArray
-    variance: FloatArray
+    pair: FloatArray
     distance: FloatArray
     whitened: FloatArray
     cause: IntArray
@@ -92,7 +94,7 @@ def new_batch(count: int) -> InnovationBatch:
         np.zeros((count, 3, DEPENDS_ON)),
         np.zeros((count, 3)),
         np.zeros((count, 3, 3)),
-        np.zeros((count, 3)),
+        np.zeros((count, PAIR_ROWS, 3)),
         np.zeros(count),
         np.zeros((count, 2)),
         np.zeros(count, dtype=np.int64),
@@ -104,7 +106,9 @@ def new_batch(count: int) -> InnovationBatch:
 @compiled
 def new_scratch() -> Scratch:
     """Room to evaluate measurements in."""
-    return Scratch(np.zeros(3), np.zeros(3), np.zeros((3, 5)), np.zeros((3, 3)), np.zeros((3, 3)))
+    return Scratch(
+        np.zeros(3), np.zeros(3), np.zeros((3, 5)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
+    )
 
 
 @inlined
@@ -128,10 +132,10 @@ def evaluate(
         scratch: Written.
     """
     columns, jacobian, difference = batch.columns[row], batch.jacobian[row], batch.innovation[row]
-    pose, motion, noise, variances = batch.pose[row], batch.motion[row], batch.noise[row], batch.variance[row]
+    pose, motion, noise = batch.pose[row], batch.motion[row], batch.noise[row]
     bodies = body_columns(measurements, k, belief)
     camera, camera_columns = _camera(belief, measurements.observer[k])
-    predicted, chain, s = scratch.predicted, scratch.chain, scratch.expected
+    predicted, chain, s, variances = scratch.predicted, scratch.chain, scratch.expected, scratch.variances
     predict_one(measurements, k, pose[0], pose[1], camera, predicted, chain)
     _write_jacobian(chain, bodies, camera_columns, columns, jacobian)
     assign_matrix(noise, measurements.covariance[k])
@@ -164,12 +168,12 @@ def evaluate(
             s[i, 2] += noise[i, 2] - before[i]
             if i < 2:
                 s[2, i] = s[i, 2]
-    inflate_noise(measurements, k, belief, pose, variances, noise)
+    batch.nis[row] = squared_distance(difference, s)
     scale = noise_of_frequent_looks(measurements, k, belief)
     for i in range(3):
         for j in range(3):
             noise[i, j] *= scale
-    batch.nis[row] = squared_distance(difference, s)
+    use_mean(measurements, k, belief, (pose, predicted, variances), difference, noise, batch.pair[row])
 
 
 @inlined

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.core.description.estimated_parameters import PARAMETERS, ParameterTable
 from swarm_loc_estimator.core.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
+from swarm_loc_estimator.core.filter.correlated_noise import PAIR_ROWS
 from swarm_loc_estimator.core.filter.dense.covariance import DenseFilter
 from swarm_loc_estimator.core.filter.integrity.hidden_noise import doubt_noise
 from swarm_loc_estimator.core.filter.integrity.surprises import new_integrity
@@ -87,7 +88,7 @@ class SwarmState:
         all_opened: Whether everything was, at once.
         pair_robot: (N, pairs) whom each has measured; -1: nobody.
         pair_stamp_ns: (N, pairs) when last.
-        pair_history: (N, pairs, 3, 3) what was measured, see `correlated_noise.py`.
+        pair_history: (N, pairs, PAIR_ROWS, 3) what was measured, see `correlated_noise.py`.
         constraints: Per robot that is not tracked, sightings which may locate it (see `initializer.py`).
         next_attempt_ns: (N,) before this instant nothing more is made of its constraints.
         images: What is remembered of aerial images.
@@ -113,7 +114,7 @@ class SwarmState:
         self.all_opened = False
         self.pair_robot: NDArray[np.int64] = np.full((robots, pairs), -1)
         self.pair_stamp_ns: NDArray[np.int64] = np.full((robots, pairs), NEVER_NS)
-        self.pair_history: FloatArray = np.zeros((robots, pairs, 4, 3))
+        self.pair_history: FloatArray = np.zeros((robots, pairs, PAIR_ROWS, 3))
         self.constraints: dict[int, NDArray[np.void]] = {}
         self.next_attempt_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
         self.images = IdentityMemory()

@@ -87,7 +87,7 @@ def update_in_order(
             return k + 1, LOST, contradicted
         if passed:
             noise, jacobian = batch.noise[0], batch.jacobian[0]
-            record_pair(measurements, k, belief, batch.pose[0], batch.variance[0], noise)
+            record_pair(measurements, k, belief, batch.pair[0])
             correct(
                 belief, update_one(belief.covariance, batch.columns[0], jacobian, batch.innovation[0], noise)
             )
