@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,6 +51,21 @@ def assert_same(a: Outcome, b: Outcome) -> None:
     assert settled(a.estimator) == settled(b.estimator)
 
 
+USUAL: dict[str, Any] = {
+    "robots": 4,
+    "content": POSE,
+    "start_known": (True,),
+    "fusion_period_s": 0.2,
+    "state_period_s": 0.0,
+    "outliers": 0.0,
+    "lost_after": 2,
+    "late_s": 1.0,
+    "lasting": 0.0,
+    "sparse": False,
+}
+"""What the examples below have in common."""
+
+
 @settings(max_examples=15)
 @given(
     seed=st.integers(0, 10**6),
@@ -65,56 +81,16 @@ def assert_same(a: Outcome, b: Outcome) -> None:
     sparse=st.booleans(),
 )
 @example(  # a sighting within the horizon, the state closest to it beyond
-    seed=163,
-    robots=4,
-    content=POSE,
-    start_known=(True,),
-    fusion_period_s=0.0,
-    state_period_s=0.13,
-    outliers=0.0,
-    lost_after=2,
-    late_s=1.9,
-    lasting=0.0,
-    sparse=False,
+    **(USUAL | {"seed": 163, "fusion_period_s": 0.0, "state_period_s": 0.13, "late_s": 1.9})
 )
 @example(  # robots that start unknown, are gated and lost, in the sparse filter
-    seed=7,
-    robots=4,
-    content=POSE,
-    start_known=(True, False),
-    fusion_period_s=0.2,
-    state_period_s=0.0,
-    outliers=0.1,
-    lost_after=2,
-    late_s=1.0,
-    lasting=0.0,
-    sparse=True,
+    **(USUAL | {"seed": 7, "start_known": (True, False), "outliers": 0.1, "sparse": True})
 )
 @example(  # a sighting at the very stamp of the newest odometry
-    seed=3312,
-    robots=4,
-    content=POSE,
-    start_known=(True,),
-    fusion_period_s=0.2,
-    state_period_s=0.0,
-    outliers=0.1,
-    lost_after=2,
-    late_s=1.0,
-    lasting=0.0,
-    sparse=True,
+    **(USUAL | {"seed": 3312, "outliers": 0.1, "sparse": True})
 )
 @example(  # the last of a period comes with the first of the next, or before it
-    seed=235,
-    robots=2,
-    content=POSE,
-    start_known=(True,),
-    fusion_period_s=0.5,
-    state_period_s=0.0,
-    outliers=0.0,
-    lost_after=2,
-    late_s=0.3,
-    lasting=0.0,
-    sparse=False,
+    **(USUAL | {"seed": 235, "robots": 2, "fusion_period_s": 0.5, "late_s": 0.3})
 )
 def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
     seed: int,

@@ -316,7 +316,7 @@ class Fusion:
             return Verdict.NOT_LOCALIZED
         sides = np.array([one["observer"][0], one["target"][0]])
         if self._pairs and (sides >= 0).all():
-            tracks = self._tracks.at(sides, np.repeat(one["stamp_ns"], 2)).pose
+            tracks = self._tracks.at(sides, np.repeat(one["stamp_ns"], 2))
             record_constraint(MeasurementColumns.of(one), 0, state.arrays(), tracks)
         return Verdict.CONSTRAINT
 

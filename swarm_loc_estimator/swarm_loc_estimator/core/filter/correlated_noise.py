@@ -33,22 +33,23 @@ import numpy as np
 
 from swarm_loc_estimator.core.filter.belief import BeliefArrays
 from swarm_loc_estimator.core.filter.measurement_model import MeasurementArray, MeasurementColumns
+from swarm_loc_estimator.core.odometry.look_up import OdometrySample
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.jit import compiled, inlined
 from swarm_loc_estimator.numerics.se2_scalar import between, composed, wrap
 from swarm_loc_estimator.numerics.small_matrix import assign, assign_matrix, cholesky3
 
-PAIR_ROWS = 9
+PAIR_ROWS = 10
 """Rows of three numbers that are remembered of a pair."""
-_MEAN, _OBSERVER, _TARGET, _TOLD, _VARIANCE, _OWN, _LASTING = 0, 1, 2, 3, 6, 7, 8
+_MEAN, _OBSERVER, _TARGET, _TOLD, _VARIANCE, _OWN, _LASTING, _NOISE = 0, 1, 2, 3, 6, 7, 8, 9
 """The mean z; where both robots were on their tracks; the rows of L; the variances of their relative pose
-that were left in the belief; w; s."""
+that were left in the belief; w; s; the variances that the two tracks had gathered, and nothing."""
 _FORGOTTEN = 0.5
 """After a turn of so much, errors have a correlation of exp(-1/2) with those before [rad]."""
 _AT_FIRST = 1.5
 """By so much the variances of a measurement are enlarged that locates a robot."""
 _STILL = 1e-4
-"""Robots that have moved by less stand [m, rad]."""
+"""Robots stand whose tracks have gathered a smaller standard deviation [m, rad]."""
 _NOTHING_NEW = 1e-8
 """The share of a measurement's information below which something does not count."""
 
@@ -91,6 +92,8 @@ def use_mean(
     poses, predicted, variances = expected
     _write_track(belief.transform[observer], poses[0], pair[_OBSERVER])
     _write_track(belief.transform[target], poses[1], pair[_TARGET])
+    pair[_NOISE, 0] = _gathered(belief.preintegrated_covariance[observer])
+    pair[_NOISE, 1] = _gathered(belief.preintegrated_covariance[target])
     for i in range(3):
         again = min(measurements.systematic_share[k, i], 1.0) * measurements.covariance[k, i, i]
         pair[_OWN, i], pair[_LASTING, i] = max(noise[i, i] - again, 0.0), again
@@ -220,12 +223,14 @@ def _carried(known: FloatArray, pair: FloatArray) -> FloatArray:
 
 @compiled
 def _stand(known: FloatArray, pair: FloatArray) -> bool:
-    """Whether neither robot has moved since the pair was last recorded."""
-    moved = 0.0
-    for i in range(3):
-        moved = max(moved, abs(pair[_OBSERVER, i] - known[_OBSERVER, i]))
-        moved = max(moved, abs(pair[_TARGET, i] - known[_TARGET, i]))
-    return moved < _STILL
+    """Whether neither robot may have moved since the pair was last recorded.
+
+    Where a robot is on its track does not tell: without odometry it may be anywhere.
+    """
+    gathered = 0.0
+    for i in range(2):
+        gathered = max(gathered, abs(pair[_NOISE, i] - known[_NOISE, i]))
+    return gathered < _STILL * _STILL
 
 
 @compiled
@@ -253,6 +258,12 @@ def _write_track(transform: FloatArray, pose: FloatArray, out: FloatArray) -> No
     out[0], out[1], out[2] = between(transform[0], transform[1], transform[2], pose[0], pose[1], pose[2])
 
 
+@inlined
+def _gathered(covariance: FloatArray) -> float:
+    """The variance that a track has gathered: the trace of its covariance (3, 3)."""
+    return covariance[0, 0] + covariance[1, 1] + covariance[2, 2]
+
+
 @compiled
 def record_pair(measurements: MeasurementColumns, k: int, belief: BeliefArrays, pair: FloatArray) -> None:
     """Record that a measurement was used, with what `use_mean` has written of its pair (PAIR_ROWS, 3)."""
@@ -263,7 +274,7 @@ def record_pair(measurements: MeasurementColumns, k: int, belief: BeliefArrays, 
 
 @compiled
 def record_constraint(
-    measurements: MeasurementColumns, k: int, belief: BeliefArrays, tracks: FloatArray
+    measurements: MeasurementColumns, k: int, belief: BeliefArrays, tracks: OdometrySample
 ) -> None:
     """Record that a measurement may locate a robot, which then errs as the measurement does.
 
@@ -271,14 +282,15 @@ def record_constraint(
         measurements: (m,).
         k: Which.
         belief: Its memory of pairs is changed.
-        tracks: (2, 3) where observer and target are on their tracks.
+        tracks: (2,) of observer and target.
     """
     place = _place(measurements, k, belief)
     if place < 0:
         return
-    pair, noise = np.empty((PAIR_ROWS, 3)), measurements.covariance[k].copy()
+    pair, noise = np.zeros((PAIR_ROWS, 3)), measurements.covariance[k].copy()
     assign(pair[_MEAN], measurements.value[k])
-    assign_matrix(pair[_OBSERVER : _TARGET + 1], tracks)
+    assign_matrix(pair[_OBSERVER : _TARGET + 1], tracks.pose)
+    pair[_NOISE, 0], pair[_NOISE, 1] = _gathered(tracks.covariance[0]), _gathered(tracks.covariance[1])
     for i in range(3):
         again = min(measurements.systematic_share[k, i], 1.0) * noise[i, i]
         pair[_OWN, i], pair[_LASTING, i] = noise[i, i] - again, again
