@@ -261,7 +261,7 @@ def _write_track(transform: FloatArray, pose: FloatArray, out: FloatArray) -> No
 @inlined
 def _gathered(covariance: FloatArray) -> float:
     """The variance that a track has gathered: the trace of its covariance (3, 3)."""
-    return covariance[0, 0] + covariance[1, 1] + covariance[2, 2]
+    return float(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
 
 
 @compiled
