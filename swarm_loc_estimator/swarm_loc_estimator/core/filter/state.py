@@ -209,11 +209,9 @@ class SwarmState:
         before = self._table.column[source]
         self._use_table(self._table.with_robot(source))
         columns, variances = self._table.column[source], self._table.sigma[source] ** 2
-        for estimated, change in (
-            ((columns >= 0) & (before < 0), self.filter.place),
-            (before >= 0, self.filter.add),
-        ):
-            change(columns[estimated], np.diag(variances[estimated]))
+        again, new = before >= 0, (before < 0) & (columns >= 0)
+        self.filter.add(columns[again], np.diag(variances[again]))
+        self.filter.place(columns[new], np.diag(variances[new]))
         doubt = error_covariance(pose, np.diag(np.square(_DOUBTED_POSE_SIGMA)))
         self.filter.add(robot_columns(np.array([source]))[0], doubt)
 
@@ -249,7 +247,10 @@ class SwarmState:
         is_new = self.landmark_column(landmark) < 0
         self._use_table(self._table.with_landmark(landmark))
         columns = self.landmark_column(landmark) + np.arange(3)
-        (self.filter.place if is_new else self.filter.add)(columns, self._table.survey[landmark])
+        if is_new:
+            self.filter.place(columns, self._table.survey[landmark])
+        else:
+            self.filter.add(columns, self._table.survey[landmark])
 
     def _place_described(self) -> None:
         """Let all that is estimated besides poses be as certain as it is described."""
