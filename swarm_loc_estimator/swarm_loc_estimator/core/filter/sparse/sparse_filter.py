@@ -264,20 +264,32 @@ class SparseFilter:
             copies.change_shared(covariance, pattern, self._number, (shares, others))
             shares, origin = others, None
         self._updates += 1
+        prior = Prior(covariance, self._number, self._add_noise(covariance, bodies, noise))
+        shares = self._by_body(shares, active)
+        self._prepared = _Prepared(pattern, prior, shares, active, origin)
+        return self._prepared
+
+    def _add_noise(self, covariance: FloatArray, bodies: IntArray, noise: FloatArray) -> FloatArray:
+        """Add what bodies (k,) have gained, with their blocks, to covariances by number.
+
+        Returns:
+            (n, 3, 3) what each body or block has gained by itself.
+        """
         added = np.zeros((self._number.size, 3, 3))
         for (row, column), of, first, second in self._marginals.within(bodies):
             covariance[self._number[first], self._number[second]] += noise[of, row, column]
             if row == column:  # noise of a body with its block is gained by moves alone
                 added[first] = noise[of, row, column]
-        numbers, by_body = self._number[active], shares
-        if not np.array_equal(
-            numbers, np.arange(self._number.size)
-        ):  # not all are there, as they were before
-            by_body = np.zeros((self._number.size, 3, shares.shape[2]))
-            by_body[active] = shares[numbers]
-        prior = Prior(covariance, self._number, added)
-        self._prepared = _Prepared(pattern, prior, by_body, active, origin)
-        return self._prepared
+        return added
+
+    def _by_body(self, shares: FloatArray, active: IntArray) -> FloatArray:
+        """Shares of copies (n, 3, r) of all bodies, from those by number."""
+        numbers = self._number[active]
+        if np.array_equal(numbers, np.arange(self._number.size)):
+            return shares  # all are there, as they were before
+        by_body = np.zeros((self._number.size, 3, shares.shape[2]))
+        by_body[active] = shares[numbers]
+        return by_body
 
     def _move_far(self, active: IntArray, places: FloatArray) -> None:
         """Hold the errors of bodies that have gone far about where they are now."""
