@@ -18,6 +18,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
+from processor_wait import waited_s
 from rclpy.duration import Duration
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
@@ -333,15 +334,10 @@ class Program:
 
     def seconds_to_end(self, number: signal.Signals) -> float:
         """Send a signal and wait for the end; how long that took but for waiting for a processor."""
-        begin_s, waited_s = time.monotonic(), self._waited_s()
+        begin_s, begin_waited_s = time.monotonic(), waited_s(self.process.pid)
         self.process.send_signal(number)
         os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOWAIT)  # its figures stay until it is reaped
-        return time.monotonic() - begin_s - (self._waited_s() - waited_s)
-
-    def _waited_s(self) -> float:
-        """How long it could have run but had to wait, since others did: not its fault on a busy machine."""
-        figures = Path("/proc", str(self.process.pid), "schedstat").read_text(encoding="ascii").split()
-        return int(figures[1]) * 1e-9
+        return time.monotonic() - begin_s - (waited_s(self.process.pid) - begin_waited_s)
 
     def __enter__(self) -> Self:
         return self
