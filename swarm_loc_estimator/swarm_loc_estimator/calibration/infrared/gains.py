@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from swarm_loc_estimator.calibration.infrared.dead_elements import ElementVerdicts, find_dead_elements
 from swarm_loc_estimator.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.calibration.sightings import DENSE_GAP_NS
 from swarm_loc_estimator.core.description.swarm import Robot, Swarm
@@ -49,10 +50,12 @@ class BoardFit:
     Attributes:
         group: Who, and what was read.
         fit: Gains, by place in the group's `robots`.
+        elements: Which elements are dead or shaded, likewise; they are not used.
     """
 
     group: BoardGroup
     fit: GainsFit
+    elements: ElementVerdicts
 
     def of_robot(self, place: int) -> tuple[int, float, float]:
         """How many exchanges of a robot were used, and the rms residuals before and after [sigma]."""
@@ -66,7 +69,7 @@ class InfraredCalibration:
     """Everything that a calibration of infrared boards gives.
 
     Attributes:
-        swarm: With the gains that were found.
+        swarm: With the gains and dead elements that were found.
         boards: How they came about, kind by kind.
         remarks: What could not be used or calibrated, one sentence each.
     """
@@ -95,7 +98,7 @@ def calibrate_infrared(
     boards: list[BoardFit] = []
     for number, (group, _) in enumerate(groups):
         try:
-            boards.append(BoardFit(group, _fit(group, _Share(progress, number, len(groups)))))
+            boards.append(_fit(group, _Share(progress, number, len(groups))))
         except (CalibrationError, GainsError) as error:
             remarks.append(f"Platform {group.source}: {error}")
     if not boards:
@@ -134,8 +137,8 @@ class _Share:
         self._begin, self._left = self._begin + 0.25 * self._left, 0.75 * self._left
 
 
-def _fit(group: BoardGroup, progress: _Share) -> GainsFit:
-    """The gains of one kind of board.
+def _fit(group: BoardGroup, progress: _Share) -> BoardFit:
+    """The gains and dead elements of one kind of board.
 
     Raises:
         CalibrationError: There are too few exchanges.
@@ -144,7 +147,10 @@ def _fit(group: BoardGroup, progress: _Share) -> GainsFit:
     count = len(group.exchanges.receiver)
     if count < MIN_EXCHANGES:
         raise CalibrationError(f"{count} exchanges are too few, {MIN_EXCHANGES} are the least.")
-    return estimate_gains(group.platform, len(group.robots), group.exchanges, progress)
+    progress("dead elements")
+    elements = find_dead_elements(group.platform, len(group.robots), group.exchanges)
+    alive = elements.without(group.exchanges)
+    return BoardFit(group, estimate_gains(group.platform, len(group.robots), alive, progress), elements)
 
 
 def _groups(
@@ -218,14 +224,29 @@ def _with_fits(
     for board in boards:
         for place, index in enumerate(board.group.robots):
             gains = board.fit.gains[place]
+            changed[index] = _without_dead(robots[index], board.elements, place)
             if not board.of_robot(place)[0]:
                 left.setdefault("In no exchange that could be used", []).append(robots[index].name)
             elif gains == IrGains.unknown(board.group.platform):
                 why = "What they read contradicts itself or the ground truth"
                 left.setdefault(why, []).append(robots[index].name)
             else:
-                changed[index] = _with_gains(robots[index], gains)
+                changed[index] = _with_gains(changed[index], gains)
     return tuple(changed), left
+
+
+def _without_dead(robot: Robot, elements: ElementVerdicts, place: int) -> Robot:
+    """The robot with its dead elements; one described as dead stays so unless it works for sure."""
+    if robot.ir is None:
+        return robot
+    described = (robot.ir.dead_sensors, robot.ir.dead_emitters)
+    dead = [
+        tuple(sorted({*found, *(k for k in before if not works[k])}))
+        for found, before, works in zip(
+            elements.numbers(place), described, elements.works[:, place], strict=True
+        )
+    ]
+    return replace(robot, ir=replace(robot.ir, dead_sensors=dead[0], dead_emitters=dead[1]))
 
 
 def _with_gains(robot: Robot, gains: IrGains) -> Robot:

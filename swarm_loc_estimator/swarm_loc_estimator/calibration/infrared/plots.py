@@ -37,7 +37,26 @@ def text_of(done: InfraredCalibration) -> str:
             f"platform {board.group.source}: {int(used.sum())} of {used.size} exchanges used, {known} of them"
             f" with ground truth; residuals {before:.2f} before, {after:.2f} after"
         )
+        lines += _elements(board, [done.swarm.robots[index].name for index in board.group.robots])
     return "\n".join([*lines, *done.remarks])
+
+
+def _elements(board: BoardFit, names: list[str]) -> list[str]:
+    """A line per robot that has dead elements, and one for elements of which not enough was read."""
+    lines = []
+    for place, name in enumerate(names):
+        found = zip(("sensors", "emitters"), board.elements.numbers(place), strict=True)
+        said = [f"{what} {list(numbers)}" for what, numbers in found if numbers]
+        if said:
+            lines.append(f"{name}: dead or shaded, left out: {', '.join(said)}")
+    sensors, emitters = board.elements.undecided.sum(axis=(1, 2)).tolist()
+    if sensors or emitters:
+        count = board.elements.dead[0].size
+        lines.append(
+            f"not enough exchanges to say whether they are dead: {sensors} of {count} sensors,"
+            f" {emitters} of {count} emitters"
+        )
+    return lines
 
 
 def draw(done: InfraredCalibration, path: Path) -> Path:
