@@ -40,6 +40,9 @@ _BRIGHT = 10.0
 _MIN_BLOCKED = 0.05
 """Geometries in which something is in between, where the board says that fewer readings are blocked."""
 
+_MIN_SIGMA = 0.05
+"""By how much elements that work differ at least, relative."""
+
 
 @dataclass(frozen=True)
 class ElementVerdicts:
@@ -135,7 +138,7 @@ def _score(
 
 def _log_prior(platform: IrPlatform) -> FloatArray:
     """Log probabilities of the shares of elements that work: gains differ by the board's `element_sigma`."""
-    sigma = max(platform.element_sigma, _MIN_BLOCKED)
+    sigma = max(platform.element_sigma, _MIN_SIGMA)
     log = -0.5 * (np.log(SHARES[_WHOLE_SHARES]) / sigma) ** 2
     return np.asarray(log - np.logaddexp.reduce(log))
 
