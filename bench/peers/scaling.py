@@ -43,15 +43,14 @@ PEER_ROBOT_SECONDS = 1500.0
 """Peers get the first part of a large swarm's run: their cost per second does not change with its length."""
 SETTLING_S = 3.0
 """Errors count from here on."""
-FUSE_NS = 200_000_000
 
 
 def measure(robots: int, duration_s: float, seed: int, settings: EstimatorSettings) -> dict[str, float]:
     """All figures of one size."""
     run = simulate_grid(GridSettings(robots=robots, seed=seed, duration_s=duration_s))
     tick_ns = ticks(run)
-    core = run_core(run, tick_ns, settings, FUSE_NS)
-    prompt = run_core(without_delay(run), tick_ns, settings, FUSE_NS)
+    core = run_core(run, tick_ns, settings)
+    prompt = run_core(without_delay(run), tick_ns, settings)
     settled = tick_ns >= run.start_ns + SETTLING_S * 1e9
     errors = errors_of(core.poses, run, tick_ns)[settled]
     figures = {
@@ -145,7 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     settings = EstimatorSettings()
     warm_up = simulate_grid(GridSettings(robots=4, duration_s=2.0))
-    run_core(warm_up, ticks(warm_up), settings, FUSE_NS)  # compiles what is not compiled yet
+    run_core(warm_up, ticks(warm_up), settings)  # compiles what is not compiled yet
     results = {}
     for robots in options.robots:
         print(f"{robots} robots ...", flush=True)

@@ -17,7 +17,6 @@ from swarm_loc_drivers.sim.scenarios.grid_shapes import Shape
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 
 _NEVER = 1_000_000
-_FUSE_NS = 200_000_000
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ def _scored(grid: GridSettings, settings: EstimatorSettings) -> dict[str, float]
     """CPU time of a run, and the errors of its second half."""
     run = simulate_grid(grid)
     at_ns = ticks(run)
-    core = run_core(run, at_ns, settings, _FUSE_NS)
+    core = run_core(run, at_ns, settings)
     counted = np.arange(at_ns.size) >= at_ns.size // 2
     errors = errors_of(core.poses, run, at_ns)[counted]
     return {

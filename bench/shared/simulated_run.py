@@ -42,11 +42,9 @@ class CoreResult:
     covariances: FloatArray
 
 
-def run_core(
-    run: SimulatedRun, tick_ns: NDArray[np.int64], settings: EstimatorSettings, fuse_ns: int
-) -> CoreResult:
-    """Feed a run in order of arrival to the estimator, and tick it; it fuses at multiples of `fuse_ns`."""
-    runner = Runner(SwarmEstimator(run.swarm, settings), ListedSchedule(tick_ns), fuse_ns)
+def run_core(run: SimulatedRun, tick_ns: NDArray[np.int64], settings: EstimatorSettings) -> CoreResult:
+    """Feed a run in order of arrival to the estimator, and tick it."""
+    runner = Runner(SwarmEstimator(run.swarm, settings), ListedSchedule(tick_ns))
     parts = inputs_between(run, tick_ns)
     begun = time.process_time()
     for inputs in parts:

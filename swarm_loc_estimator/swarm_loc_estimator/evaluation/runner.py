@@ -102,7 +102,6 @@ class Runner:
     Args:
         estimator: To run, which nobody else feeds.
         schedule: When it ticks.
-        fuse_period_ns: Measurements are fused at the ticks that are multiples of this.
         keep_sightings: Whether what the robots and cameras above them see is kept, too.
     """
 
@@ -110,13 +109,11 @@ class Runner:
         self,
         estimator: SwarmEstimator,
         schedule: Schedule,
-        fuse_period_ns: int = 1,
         *,
         keep_sightings: bool = False,
     ) -> None:
         self._estimator = estimator
         self._schedule = schedule
-        self._fuse_period_ns = fuse_period_ns
         self._began_s = time.perf_counter()
         self._spool = Spool()
         robots = len(estimator.swarm.robots)
@@ -187,7 +184,7 @@ class Runner:
         )
 
     def _tick(self, now_ns: int) -> None:
-        estimate = self._estimator.tick(now_ns, fuse=now_ns % self._fuse_period_ns == 0)
+        estimate = self._estimator.tick(now_ns)
         k, self._filled = self._filled, self._filled + 1
         self._stamp_ns[k], self._pose[k], self._covariance[k] = now_ns, estimate.poses, estimate.covariances
         self._status[k] = estimate.status

@@ -30,6 +30,13 @@ class EstimatorSettings:
         1.0,
         "where a large swarm has many measurements in such a period, they are fused together; 0: never",
     )
+    fusion_delay_s: float = number(
+        0.3,
+        "s",
+        0.0,
+        1.0,
+        "how long they wait after the period's end for what comes late; sooner costs up to twice the work",
+    )
     sparse_from: int = number(
         250,
         "1",

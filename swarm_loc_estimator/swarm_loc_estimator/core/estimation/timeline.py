@@ -28,9 +28,9 @@ GoOn = Callable[[], bool]
 
 _CHECKPOINTS = 40
 _FORGOTTEN_AT_ONCE = 4
-_MIN_LAST_SHARE = 0.25
-"""A newest period with fewer measurements than this share of those of the one before is fused with it."""
-_BEFORE_ALL = np.iinfo(np.int64).min
+_LARGE = 64
+"""Robots of a swarm whose periods are worth waiting for: fusing a smaller one anew takes little."""
+_BEFORE_ALL, _AFTER_ALL = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,8 @@ class Timeline:
         self._horizon_ns = round(settings.horizon_s * 1e9)
         self._state_period_ns = round(settings.state_period_s * 1e9)
         self._fusion_period_ns = round(settings.fusion_period_s * 1e9)
+        waits = self._fusion_period_ns and state.tracked.size >= _LARGE
+        self._fusion_delay_ns = round(settings.fusion_delay_s * 1e9) if waits else None
         self._kept_ns = self._horizon_ns + reach_ns
         self._spacing_ns = self._kept_ns // _CHECKPOINTS
         self.restart(state)
@@ -70,7 +72,6 @@ class Timeline:
         self.state = self._ahead = state
         self.is_under_way = False
         self._head_key = _BEFORE_ALL
-        self._joined_key: int | None = None
         self._checkpoints = [_Checkpoint(_BEFORE_ALL, state.copy())]
         self._new: list[MeasurementArray] = []
         self._withdrawn: list[MeasurementArray] = []
@@ -113,8 +114,7 @@ class Timeline:
     def oldest_due_ns(self, otherwise_ns: int) -> int:
         """The instant of the oldest measurement that is left to compute, if it is before another instant."""
         due_ns = [otherwise_ns] if self._redo_from_ns is None else [otherwise_ns, self._redo_from_ns]
-        if self.is_under_way:
-            due_ns.append(int(self._buffer.stamp_ns[self._count_until(self._head_key)]))
+        due_ns += self._buffer.stamp_ns[self._count_until(self._head_key) :][:1].tolist()
         return min(due_ns)
 
     def invalidate(self, changed_from_ns: NDArray[np.int64]) -> None:
@@ -137,8 +137,9 @@ class Timeline:
     def advance(self, now_ns: int, go_on: GoOn = lambda: True) -> None:
         """Compute all steps that new or changed data touch, and let go of what lies beyond the horizon.
 
-        Where `go_on` says after a step that there is no time for another one, the rest is left to the next
-        calls, and what has come since waits until that is done.
+        A period of a large swarm waits for `fusion_delay_s` after its end, until most of it has come. Where
+        `go_on` says after a step that there is no time for another one, the rest is left to the next calls,
+        and what has come since waits until that is done.
         """
         if not self.is_under_way:
             if self._new:
@@ -148,7 +149,8 @@ class Timeline:
             if self._redo_from_ns is not None:
                 self._go_back(self._key(self._redo_from_ns))
                 self._redo_from_ns = None
-        self.is_under_way = not self._compute(go_on)
+        due_ns = _AFTER_ALL if self._fusion_delay_ns is None else now_ns - self._fusion_delay_ns
+        self.is_under_way = not self._compute(due_ns, go_on)
         if not self.is_under_way:
             self.state = self._ahead
             self._forget_before(self._key(now_ns - self._kept_ns))
@@ -199,31 +201,26 @@ class Timeline:
         return rows
 
     def _go_back(self, key: int) -> None:
-        """Go back to before step `key`, if it is not ahead.
-
-        What little has come of the newest period is fused with the one before, until there is more: nearly as
-        good, and two thirds of the work.
-        """
-        before, self._joined_key = self._joined_key, self._step_to_join()
-        key = min([key, *(joined for joined in (before, self._joined_key) if joined is not None)])
+        """Go back to before step `key`, if it is not ahead."""
         if key <= self._head_key:
             while self._checkpoints[-1].key >= key:
                 self._checkpoints.pop()
             self._head_key = self._checkpoints[-1].key
             self._ahead = self._checkpoints[-1].state.copy()
 
-    def _compute(self, go_on: GoOn) -> bool:
-        """Do the steps that are due, as long as there is time; whether all are done."""
+    def _compute(self, due_ns: int, go_on: GoOn) -> bool:
+        """Do the steps that end until `due_ns`, as long as there is time; whether all of them are done."""
         buffer, begin = self._buffer, self._count_until(self._head_key)
         while begin < len(buffer):
-            is_joined = self._key(int(buffer.stamp_ns[begin])) == self._joined_key
-            end = len(buffer) if is_joined else self._end_of_steps(begin)
+            end = self._end_of_steps(begin)
+            key = self._key(int(buffer.stamp_ns[end - 1]))
+            if key > due_ns:
+                break
             rows = slice(begin, end)
             self._step(self._ahead, buffer.measurements[rows], buffer.verdicts[rows], buffer.nis[rows])
-            self._head_key = self._key(int(buffer.stamp_ns[end - 1]))
-            spaced = self._head_key - max(self._checkpoints[-1].key, -(2**62)) >= self._spacing_ns
-            if spaced and not is_joined:
-                self._checkpoints.append(_Checkpoint(self._head_key, self._ahead.copy()))
+            self._head_key = key
+            if key - max(self._checkpoints[-1].key, -(2**62)) >= self._spacing_ns:
+                self._checkpoints.append(_Checkpoint(key, self._ahead.copy()))
             begin = end
             if begin < len(buffer) and not go_on():
                 return False
@@ -236,19 +233,6 @@ class Timeline:
         return (
             stamps_ns.size if stamps_ns[-1] <= last_ns else int(stamps_ns.searchsorted(last_ns, side="right"))
         )
-
-    def _step_to_join(self) -> int | None:
-        """The step that what has come of the period behind it is fused with; None: no step.
-
-        It follows from the data alone, not from when they came, so that the result does, too.
-        """
-        stamp_ns, period_ns = self._buffer.stamp_ns, self._fusion_period_ns
-        if not period_ns or not stamp_ns.size:
-            return None
-        newest = self._key(int(stamp_ns[-1]))
-        before = (newest - 2 * period_ns, newest - period_ns)
-        begin, end = stamp_ns.searchsorted(before, side="right").tolist()
-        return newest - period_ns if stamp_ns.size - end < _MIN_LAST_SHARE * (end - begin) else None
 
     def _forget_before(self, key: int) -> None:
         """Keep one checkpoint before step `key` and only the measurements after it."""
