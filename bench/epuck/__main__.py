@@ -191,7 +191,7 @@ def outcome(task: tuple[Case, int]) -> tuple[str, Outcome]:
     case, seed = task
     run = simulate(case, seed)
     stamp_ns = np.arange(run.start_ns + TICK_NS, run.end_ns + 1, TICK_NS)
-    result = run_core(run, stamp_ns, FILTERS[case.filter][1], TICK_NS)
+    result = run_core(run, stamp_ns, FILTERS[case.filter][1])
     settled = stamp_ns >= run.start_ns + SETTLING_S * 1e9
     robots = np.arange(len(run.swarm.robots)) if case.robots else blind_robots()
     errors = errors_of(result.poses, run, stamp_ns)[settled][:, robots]

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.core.filter.dense.covariance import DenseFilter
-from swarm_loc_estimator.core.filter.dense.inversion import InverseMemory, inverse
+from swarm_loc_estimator.core.filter.dense.inversion import inverse
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.lapack import invert_factor
 
@@ -52,16 +52,6 @@ def test_what_is_not_positive_definite_is_refused(place: int, value: float) -> N
     matrix[place, place] = value
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
         inverse(matrix)
-
-
-def test_the_last_matrix_is_remembered_to_the_last_bit() -> None:
-    memory, matrix = InverseMemory(), positive(np.random.default_rng(0), 90)
-    first = memory.inverse_of(matrix)
-    assert memory.inverse_of(matrix.copy()) is first
-    matrix[7, 7] = np.nextafter(matrix[7, 7], 1.0)
-    assert memory.inverse_of(matrix) is not first
-    np.testing.assert_array_equal(memory.inverse_of(matrix), inverse(matrix))
-    np.testing.assert_array_equal(memory.inverse_of(np.eye(3)), np.eye(3))
 
 
 def test_an_update_done_again_from_a_copy_gives_the_same_bytes() -> None:

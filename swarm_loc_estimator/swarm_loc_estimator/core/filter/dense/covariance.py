@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from swarm_loc_estimator.core.description.estimated_parameters import DRIVES, ParameterTable
-from swarm_loc_estimator.core.filter.dense.inversion import InverseMemory, invert
+from swarm_loc_estimator.core.filter.dense.inversion import inverse, invert
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 from swarm_loc_estimator.numerics.jit import compiled
 from swarm_loc_estimator.numerics.small_matrix import assign_matrix, cholesky3, solve3
@@ -19,9 +19,6 @@ class DenseFilter:
 
     Args:
         size: Number of columns; each starts with unit variance, independent.
-
-    Attributes:
-        inverses: Shared by all copies: what is computed again begins from a copy.
     """
 
     sequential = True
@@ -30,14 +27,12 @@ class DenseFilter:
         self.covariance: FloatArray = np.eye(size)
         self.marginal: FloatArray = np.zeros((0, 3, 3))
         self.driven: FloatArray = np.zeros((0, 4, DRIVES))
-        self.inverses = InverseMemory()
 
     def copy(self) -> DenseFilter:
         """An independent copy."""
         other = DenseFilter.__new__(DenseFilter)
         other.covariance, other.marginal = self.covariance.copy(), self.marginal
         other.driven = self.driven
-        other.inverses = self.inverses
         return other
 
     def place(self, columns: IntArray, covariance: FloatArray) -> None:
@@ -81,7 +76,7 @@ class DenseFilter:
         """Use many measurements with independent errors at once; return the correction (n,) of all columns.
 
         Eqs. (11)-(14) of the e-puck paper in information form, P = (P^-1 + H^T R^-1 H)^-1: two inversions,
-        whose cost does not grow with the number of measurements; one when others were used with the same P.
+        whose cost does not grow with the number of measurements.
 
         Args:
             columns: (m, c) what each measurement depends on; a column may be named twice.
@@ -90,7 +85,7 @@ class DenseFilter:
             noise: (m, r, r) covariance of the measurement.
         """
         gradient = np.zeros(self.covariance.shape[0])
-        information = self.inverses.inverse_of(self.covariance).copy()
+        information = inverse(self.covariance)
         _gather(information, gradient, columns, jacobian, innovation, noise)
         invert(information)
         self.covariance = information

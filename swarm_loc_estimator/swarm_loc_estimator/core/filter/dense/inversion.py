@@ -1,30 +1,12 @@
-"""Inverses of covariance and information matrices, and the memory of the last one."""
+"""Inverses of covariance and information matrices."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.equality import are_equal
 from swarm_loc_estimator.numerics.jit import compiled
 from swarm_loc_estimator.numerics.lapack import invert_positive
-
-
-class InverseMemory:
-    """The inverse of the last matrix that was asked for.
-
-    The newest period is computed again with each datum that comes of it, from the same prediction.
-    """
-
-    def __init__(self) -> None:
-        self._matrix: FloatArray = np.zeros((0, 0))
-        self._inverse: FloatArray = np.zeros((0, 0))
-
-    def inverse_of(self, matrix: FloatArray) -> FloatArray:
-        """The inverse (n, n) of a symmetric positive definite matrix, to be read."""
-        if not are_equal(matrix.reshape(-1), self._matrix.reshape(-1)):
-            self._inverse, self._matrix = inverse(matrix), matrix.copy()
-        return self._inverse
 
 
 def inverse(matrix: FloatArray) -> FloatArray:

@@ -11,11 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarm_loc_estimator.core.filter.sparse.factor import EMPTY, Factor, gathered, new_factor
+from swarm_loc_estimator.core.filter.sparse.factor import Factor, gathered, new_factor
 from swarm_loc_estimator.core.filter.sparse.levers import Information
 from swarm_loc_estimator.core.filter.sparse.symbolic import Pattern
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
-from swarm_loc_estimator.numerics.equality import are_equal
 from swarm_loc_estimator.numerics.jit import compiled
 
 _LOOSER = (0.0, 1e-10, 1e-8, 1e-6, 1e-4)
@@ -30,66 +29,14 @@ class Prior(NamedTuple):
     Attributes:
         covariance: (s, s, 3, 3) by the bodies' numbers there.
         place: (n,) the numbers of the pattern's bodies there.
-        added: (n, 3, 3) by what they are larger than what follows from the factor before.
     """
 
     covariance: FloatArray
     place: IntArray
-    added: FloatArray
 
 
-class Projection(NamedTuple):
-    """A prior projected on a pattern, front by front.
-
-    Attributes:
-        pattern: Its fronts.
-        begin: (F + 1,) where the numbers of each front begin.
-        information: Of p(x_J | x_B) (d, d), those of the border first.
-        added: That of the prior.
-    """
-
-    pattern: Pattern
-    begin: IntArray
-    information: FloatArray
-    added: FloatArray
-
-
-class ProjectionMemory:
-    """The projection of a prior that came first from a factor: the next ones from there are like it.
-
-    A period is fused again with what comes late of it, from the same prediction.
-    """
-
-    def __init__(self) -> None:
-        self._origin: Factor | None = None
-        self._kept = Projection(EMPTY.pattern, np.zeros(1, dtype=np.int64), np.zeros(0), np.zeros((0, 3, 3)))
-
-    def of(self, pattern: Pattern, prior: Prior, origin: Factor | None) -> tuple[Projection, bool]:
-        """What is kept of the same factor, and True; or room to keep this projection.
-
-        Args:
-            pattern: To project on.
-            prior: To project.
-            origin: The factor from which the prior follows but for what is added; None: not from one alone.
-        """
-        if origin is not None and origin is self._origin:
-            return self._kept, True
-        bodies = np.diff(pattern.pivot_begin) + np.diff(pattern.border_begin)
-        begin, room = np.concatenate([[0], np.cumsum(9 * bodies * bodies)]), self._kept.information
-        if room.size < begin[-1]:
-            room = np.empty(int(1.2 * begin[-1]))
-        self._kept, self._origin = Projection(pattern, begin, room, prior.added), origin
-        return self._kept, False
-
-    def forget(self) -> None:
-        """Keep nothing."""
-        self._origin = None
-
-
-def eliminate(
-    pattern: Pattern, prior: Prior, measured: Information, memory: ProjectionMemory, origin: Factor | None
-) -> Factor:
-    """The factor of a prior and measurements; for memory and origin see `ProjectionMemory.of`.
+def eliminate(pattern: Pattern, prior: Prior, measured: Information) -> Factor:
+    """The factor of a prior and measurements.
 
     Raises:
         LinAlgError: The prior is no covariance.
@@ -99,12 +46,9 @@ def eliminate(
     begin = np.searchsorted(earlier[order], np.arange(pattern.fronts + 1))
     factor = new_factor(pattern)
     for looser in _LOOSER:
-        kept, is_kept = memory.of(pattern, prior, origin)
         try:
-            _eliminate(factor, prior, measured, (order, begin), (kept, is_kept), looser)
+            _eliminate(factor, prior, measured, (order, begin), looser)
         except np.linalg.LinAlgError:
-            memory.forget()
-            origin = None
             continue
         return factor
     raise np.linalg.LinAlgError("the covariance of a front is not positive definite")
@@ -116,14 +60,10 @@ def _eliminate(
     prior: Prior,
     measured: Information,
     blocks: tuple[IntArray, IntArray],
-    memory: tuple[Projection, bool],
     looser: float,
 ) -> None:
-    """Write a factor, and what is to be kept of it.
-
-    `blocks` is the order of what was measured, front by front, and where each begins.
-    """
-    pattern, kept, is_kept = factor.pattern, memory[0], memory[1]
+    """Write a factor; `blocks` is the order of what was measured, front by front, and where each begins."""
+    pattern = factor.pattern
     fronts = pattern.pivot_begin.size - 1
     updates = [np.empty((0, 0)) for _ in range(fronts)]
     child, sibling = np.full(fronts, -1, dtype=np.int64), np.full(fronts, -1, dtype=np.int64)
@@ -134,15 +74,8 @@ def _eliminate(
         split, size = 3 * border.size, 3 * (bodies.size - border.size)
         for k in range(bodies.size):
             local[bodies[k]] = k
-        same = _same_front(pattern, prior, f, kept) if is_kept else -1
-        if same >= 0:
-            known = kept.information[kept.begin[same] : kept.begin[same + 1]]
-            information = known.reshape(split + size, split + size).copy()
-        else:
-            places = prior.place[bodies]
-            information = _conditional(gathered(prior.covariance, places, places), size, looser)
-            if not is_kept:
-                kept.information[kept.begin[f] : kept.begin[f + 1]] = information.reshape(-1)
+        places = prior.place[bodies]
+        information = _conditional(gathered(prior.covariance, places, places), size, looser)
         _add_blocks(information, local, measured, blocks[0][blocks[1][f] : blocks[1][f + 1]])
         below = child[f]
         while below >= 0:
@@ -161,23 +94,6 @@ def _eliminate(
             updates[f] = information[:split, :split] - np.dot(gain, across.T)
             parent = pattern.front[border].min()
             sibling[f], child[parent] = child[parent], f
-
-
-@compiled
-def _same_front(pattern: Pattern, prior: Prior, f: int, kept: Projection) -> int:
-    """Which front of a projection of the same factor is as front f of a prior would be; -1: none."""
-    pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
-    border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
-    other = kept.pattern
-    g = other.front[pivots[0]]
-    if g < 0:
-        return -1
-    same = are_equal(pivots, other.pivot[other.pivot_begin[g] : other.pivot_begin[g + 1]])
-    same = same and are_equal(border, other.border[other.border_begin[g] : other.border_begin[g + 1]])
-    for bodies in (border, pivots):
-        for body in bodies:
-            same = same and are_equal(prior.added[body].reshape(-1), kept.added[body].reshape(-1))
-    return g if same else -1
 
 
 @compiled

@@ -10,7 +10,7 @@ import numpy as np
 from swarm_loc_estimator.core.description.estimated_parameters import BLOCKS, ParameterTable
 from swarm_loc_estimator.core.filter.joint_filter import Robots
 from swarm_loc_estimator.core.filter.sparse import copies
-from swarm_loc_estimator.core.filter.sparse.elimination import Prior, ProjectionMemory, eliminate
+from swarm_loc_estimator.core.filter.sparse.elimination import Prior, eliminate
 from swarm_loc_estimator.core.filter.sparse.factor import (
     EMPTY,
     Derived,
@@ -53,16 +53,12 @@ _NOBODY: IntArray = np.zeros(0, dtype=np.int64)
 
 
 class _Prepared(NamedTuple):
-    """What an update needs: the pattern, covariances and shares of copies before it, who is active.
-
-    And the factor from which the covariances follow but for what is added; None: not from one alone.
-    """
+    """What an update needs: the pattern, covariances and shares of copies before it, who is active."""
 
     pattern: Pattern
     prior: Prior
     shares: FloatArray
     active: IntArray
-    origin: Factor | None
 
     def covariance_of(self, first: IntArray, second: IntArray) -> FloatArray:
         """Covariances (k, 3, 3) of pairs of the pattern."""
@@ -95,7 +91,6 @@ class SparseFilter:
         self._updates = 0
         self._prepared: _Prepared | None = None
         self._room = _Room(count)
-        self._projections = ProjectionMemory()
 
     def copy(self) -> SparseFilter:
         """An independent copy; factors are shared, since they are never written to."""
@@ -252,7 +247,7 @@ class SparseFilter:
         covariance = self._room.with_fronts(self._factor, len(self._new))
         write_rows(factor, len(self._new), rows, covariance)
         self._room.holds = None  # since noise is added to it
-        origin, others = None if moves.any() else factor, None
+        others = None
         if self._updates % _COPIED_AGAIN == 0:
             copied = bodies[spread(places[bodies], min(_COPIES, bodies.size // _COPIED_SHARE))]
             others = copies.renewed(factor, shares, self._number[copied])
@@ -262,25 +257,17 @@ class SparseFilter:
             others = None if others is None else moved_shares(others, self._number, moves)
         if others is not None:
             copies.change_shared(covariance, pattern, self._number, (shares, others))
-            shares, origin = others, None
+            shares = others
         self._updates += 1
-        prior = Prior(covariance, self._number, self._add_noise(covariance, bodies, noise))
-        shares = self._by_body(shares, active)
-        self._prepared = _Prepared(pattern, prior, shares, active, origin)
+        self._add_noise(covariance, bodies, noise)
+        prior = Prior(covariance, self._number)
+        self._prepared = _Prepared(pattern, prior, self._by_body(shares, active), active)
         return self._prepared
 
-    def _add_noise(self, covariance: FloatArray, bodies: IntArray, noise: FloatArray) -> FloatArray:
-        """Add what bodies (k,) have gained, with their blocks, to covariances by number.
-
-        Returns:
-            (n, 3, 3) what each body or block has gained by itself.
-        """
-        added = np.zeros((self._number.size, 3, 3))
+    def _add_noise(self, covariance: FloatArray, bodies: IntArray, noise: FloatArray) -> None:
+        """Add what bodies (k,) have gained, with their blocks, to covariances by number."""
         for (row, column), of, first, second in self._marginals.within(bodies):
             covariance[self._number[first], self._number[second]] += noise[of, row, column]
-            if row == column:  # noise of a body with its block is gained by moves alone
-                added[first] = noise[of, row, column]
-        return added
 
     def _by_body(self, shares: FloatArray, active: IntArray) -> FloatArray:
         """Shares of copies (n, 3, r) of all bodies, from those by number."""
@@ -334,9 +321,9 @@ class SparseFilter:
         """
         if self._prepared is None:
             raise RuntimeError("the pairs of an update are related first")
-        (pattern, prior, shares, active, origin), self._prepared = self._prepared, None
+        (pattern, prior, shares, active), self._prepared = self._prepared, None
         measured = summed(information_of(columns, jacobian, innovation, noise, self._place))
-        self._factor = eliminate(pattern, prior, measured, self._projections, origin)
+        self._factor = eliminate(pattern, prior, measured)
         self._shares, correction = copies.updated(self._factor, shares, measured)
         count = self._number.size
         self._number = np.full(count, -1)

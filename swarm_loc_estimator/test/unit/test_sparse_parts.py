@@ -1,4 +1,4 @@
-"""What the sparse filter keeps for an update done again, and the sums that it makes of many measurements."""
+"""What the sparse filter sums of many measurements, carries from place to place, and orders ahead."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.core.filter.sparse import ordering
-from swarm_loc_estimator.core.filter.sparse.elimination import Prior, ProjectionMemory, eliminate
-from swarm_loc_estimator.core.filter.sparse.factor import EMPTY
 from swarm_loc_estimator.core.filter.sparse.levers import Information, carried_pairs, levers, summed
 from swarm_loc_estimator.core.filter.sparse.ordering import Situation, ordered
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 COUNT = 60
 
@@ -26,51 +24,7 @@ def situation(pairs: list[tuple[int, int]]) -> Situation:
     return Situation(np.arange(COUNT), blocks, grid(), np.array(pairs, dtype=np.int64).reshape(-1, 2))
 
 
-def prior(rng: np.random.Generator) -> Prior:
-    root = rng.standard_normal((3 * COUNT, 3 * COUNT))
-    covariance = (root @ root.T / COUNT).reshape(COUNT, 3, COUNT, 3).transpose(0, 2, 1, 3)
-    return Prior(np.ascontiguousarray(covariance), np.arange(COUNT), np.zeros((COUNT, 3, 3)))
-
-
-def measured(rng: np.random.Generator, pairs: IntArray) -> Information:
-    root = rng.standard_normal((len(pairs), 3, 3))
-    return Information(pairs[:, 0], pairs[:, 0], root @ root.transpose(0, 2, 1), np.zeros((COUNT, 3)))
-
-
 PAIR = st.tuples(st.integers(0, COUNT - 1), st.integers(0, COUNT - 1))
-
-
-@given(st.integers(0, 10**6), st.lists(st.integers(0, COUNT - 1), max_size=3), st.lists(PAIR, max_size=3))
-def test_fronts_are_projected_again_where_anything_of_them_has_changed(
-    seed: int, driven: list[int], pairs: list[tuple[int, int]]
-) -> None:
-    """The factor is that without a memory, to the last bit."""
-    rng, memory, factor = np.random.default_rng(seed), ProjectionMemory(), EMPTY
-    known, seen = prior(rng), measured(rng, np.array([[0, 1], [20, 21]]))
-    first = ordered(situation([]), None).pattern
-    eliminate(first, known, seen, memory, factor)
-    later = known._replace(covariance=known.covariance.copy(), added=known.added.copy())
-    for body in driven:
-        later.covariance[body, body] += 0.1 * np.eye(3)
-        later.added[body] += 0.1 * np.eye(3)
-    pattern = ordered(situation(pairs), None).pattern if pairs else first
-    again, alone = (eliminate(pattern, later, seen, one, factor) for one in (memory, ProjectionMemory()))
-    np.testing.assert_array_equal(again.gain, alone.gain)
-    np.testing.assert_array_equal(again.spread, alone.spread)
-
-
-def test_what_follows_from_the_same_factor_is_not_projected_again_and_from_another_it_is() -> None:
-    rng, memory, factor = np.random.default_rng(0), ProjectionMemory(), EMPTY
-    known, pattern = prior(rng), ordered(situation([]), None).pattern
-    other = prior(rng)
-    seen = measured(rng, np.array([[0, 1]]))
-    first = eliminate(pattern, known, seen, memory, factor)
-    unread = known._replace(covariance=np.full_like(known.covariance, np.nan))
-    again = eliminate(pattern, unread, seen, memory, factor)
-    np.testing.assert_array_equal(again.spread, first.spread)
-    for origin in (factor._replace(), None):
-        alone = eliminate(pattern, other, seen, ProjectionMemory(), origin)
-        np.testing.assert_array_equal(eliminate(pattern, other, seen, memory, origin).spread, alone.spread)
 
 
 @given(st.lists(st.lists(PAIR, max_size=6), min_size=12, max_size=12), st.lists(PAIR, max_size=6))
