@@ -15,7 +15,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.estimation import fusion
+from swarm_loc_estimator.core.estimation import fusion, timeline
 from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate, SwarmEstimator
 
 Arrival = tuple[int, Event]
@@ -56,6 +56,7 @@ USUAL: dict[str, Any] = {
     "content": POSE,
     "start_known": (True,),
     "fusion_period_s": 0.2,
+    "delay_s": None,
     "state_period_s": 0.0,
     "outliers": 0.0,
     "lost_after": 2,
@@ -73,6 +74,7 @@ USUAL: dict[str, Any] = {
     content=st.sampled_from([POSE, POSITION, POSE_TWO]),
     start_known=st.sampled_from([(True,), (False,), (True, False), (True, True, False)]),
     fusion_period_s=st.sampled_from([0.0, 0.2, 0.5]),
+    delay_s=st.sampled_from([None, 0.0, 0.3, 1.0]),
     state_period_s=st.sampled_from([0.0, 0.0, 0.13]),
     outliers=st.sampled_from([0.0, 0.1, 0.6]),
     lost_after=st.sampled_from([2, 12]),
@@ -92,12 +94,16 @@ USUAL: dict[str, Any] = {
 @example(  # the last of a period comes with the first of the next, or before it
     **(USUAL | {"seed": 235, "robots": 2, "fusion_period_s": 0.5, "late_s": 0.3})
 )
+@example(  # periods of a large swarm, which wait
+    **(USUAL | {"seed": 11, "delay_s": 0.3, "late_s": 0.3, "sparse": True})
+)
 def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
     seed: int,
     robots: int,
     content: int,
     start_known: Sequence[bool],
     fusion_period_s: float,
+    delay_s: float | None,
     state_period_s: float,
     outliers: float,
     lost_after: int,
@@ -110,6 +116,7 @@ def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
     world = simulate(replace(plan, lasting=lasting, survey=lasting), seed)
     chosen = EstimatorSettings(
         fusion_period_s=fusion_period_s,
+        fusion_delay_s=delay_s or 0.0,
         sparse_from=2 if sparse else 250,
         state_period_s=state_period_s,
         lost_after=lost_after,
@@ -127,6 +134,8 @@ def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
     wild = sorted({*ticks(T0, end_ns, 0.09), *resting})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fusion, "_MANY", 5)  # so that a small swarm's measurements are fused together, too
+        if delay_s is not None:
+            patch.setattr(timeline, "_LARGE", 1)  # and wait
         assert_same(
             outcome(world, orderly, ticks(T0, end_ns, 0.25), chosen),
             outcome(world, arrivals, wild, chosen, resting),

@@ -1,15 +1,22 @@
-"""Fusion periods are closed at their end: what is measured when it is fused belongs to what ends then."""
+"""Fusion periods: what belongs to one, and when those of large and of small swarms are fused."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from core_messages import SECOND, T0
+from core_run import on_time, play, ticks
+from core_world import Plan, simulate
 from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.description.swarm import Robot
+from swarm_loc_estimator.core.estimation import timeline
+from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
 from swarm_loc_estimator.core.estimation.fusion_period import end_of_period, middle_of_period
 from swarm_loc_estimator.core.estimation.timeline import Timeline
 from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray
@@ -18,6 +25,7 @@ from swarm_loc_estimator.core.inputs.validation import about_robots
 from swarm_loc_estimator.numerics.arrays import IntArray
 
 PERIOD_NS = SECOND // 5
+SMALLEST_LARGE = timeline._LARGE
 
 
 @given(st.integers(0, 2**62), st.integers(1, 10**10))
@@ -31,23 +39,90 @@ def test_a_period_holds_its_last_instant_and_not_its_first(stamp_ns: int, period
     assert middle_of_period(stamp_ns, period_ns) == end_ns - period_ns + period_ns // 2
 
 
-@given(st.sets(st.integers(1, PERIOD_NS - 1), max_size=9), st.sets(st.integers(1, 9)))
-def test_what_is_not_late_is_fused_once(offsets_ns: set[int], resting: set[int]) -> None:
-    """Also what is measured at the very instants of fusing, whichever of these there are."""
-    fused: list[int] = []
+class Fused:
+    """A timeline that keeps the stamps of what it fuses, and with them when it did."""
 
-    def step(_state: SwarmState, rows: MeasurementArray, _verdicts: object, _nis: object) -> None:
+    def __init__(self, robots: int, delay_s: float = 0.0) -> None:
+        self.stamp_ns: list[int] = []
+        self.at_ns: list[int] = []
+        self._now_ns = 0
+        state = SwarmState(ParameterTable.of(([Robot(f"robot{k}") for k in range(robots)]), ()))
+        chosen = EstimatorSettings(fusion_period_s=1e-9 * PERIOD_NS, fusion_delay_s=delay_s)
+        self.timeline = Timeline(chosen, self._step, state, 0)
+
+    def advance(self, now_ns: int) -> None:
+        """Fuse what is due."""
+        self._now_ns = now_ns
+        self.timeline.advance(now_ns)
+
+    def _step(self, _state: SwarmState, rows: MeasurementArray, _verdicts: object, _nis: object) -> None:
         assert np.unique(end_of_period(rows["stamp_ns"], PERIOD_NS)).size == 1
-        fused.extend(rows["stamp_ns"].tolist())
+        self.stamp_ns.extend(rows["stamp_ns"].tolist())
+        self.at_ns.extend(rows.size * [self._now_ns])
 
-    state = SwarmState(ParameterTable.of((Robot("a"),), ()))
-    timeline = Timeline(EstimatorSettings(fusion_period_s=1e-9 * PERIOD_NS), step, state, 0)
+
+@given(
+    st.sampled_from([1, SMALLEST_LARGE]),
+    st.sets(st.integers(1, PERIOD_NS - 1), max_size=9),
+    st.sets(st.integers(1, 9)),
+)
+def test_what_is_not_late_is_fused_once(robots: int, offsets_ns: set[int], resting: set[int]) -> None:
+    """Also what is measured at the very instants of fusing, whichever of these there are."""
+    fused = Fused(robots)
     stamp_ns = np.add.outer(T0 + PERIOD_NS * np.arange(10), [*sorted(offsets_ns), PERIOD_NS])
     for k, measured_ns in enumerate(stamp_ns, 1):
-        timeline.add(fixes(measured_ns))
+        fused.timeline.add(fixes(measured_ns))
         if k not in resting:
-            timeline.advance(int(measured_ns[-1]))
-    assert fused == stamp_ns.ravel().tolist()
+            fused.advance(int(measured_ns[-1]))
+    assert fused.stamp_ns == stamp_ns.ravel().tolist()
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 10 * PERIOD_NS), st.integers(0, PERIOD_NS)),
+        min_size=1,
+        max_size=40,
+        unique_by=lambda pair: pair[0],
+    ),
+    st.integers(1, 3),
+)
+def test_a_large_swarm_s_periods_wait_for_what_comes_late(
+    measured: list[tuple[int, int]], ticks: int
+) -> None:
+    """All that comes within the delay is fused once, and not before it is over."""
+    fused, delay_ns = Fused(SMALLEST_LARGE, 1e-9 * PERIOD_NS), PERIOD_NS
+    arrivals = sorted((T0 + offset_ns + late_ns, T0 + offset_ns) for offset_ns, late_ns in measured)
+    for now_ns in range(T0, T0 + 13 * PERIOD_NS, PERIOD_NS // ticks):
+        while arrivals and arrivals[0][0] <= now_ns:
+            fused.timeline.add(fixes(np.array([arrivals.pop(0)[1]])))
+        fused.advance(now_ns)
+    assert fused.stamp_ns == sorted(T0 + offset_ns for offset_ns, _ in measured)
+    waited_ns = np.array(fused.at_ns) - end_of_period(np.array(fused.stamp_ns), PERIOD_NS)
+    assert np.all((waited_ns >= delay_ns) & (waited_ns < delay_ns + PERIOD_NS // ticks + ticks))
+
+
+def test_a_small_swarm_does_not_wait() -> None:
+    fused = Fused(SMALLEST_LARGE - 1, 1.0)
+    fused.timeline.add(fixes(np.array([T0 + 1])))
+    fused.advance(T0 + 1)
+    assert fused.stamp_ns == [T0 + 1]
+
+
+def test_odometry_is_kept_for_what_waits_beyond_the_horizon() -> None:
+    world = simulate(Plan(4, 18.0, 0.2), seed=3)
+    robots = tuple(replace(one, odometry=replace(one.odometry, timeout_s=0.1)) for one in world.swarm.robots)
+    world = replace(world, swarm=replace(world.swarm, robots=robots))
+    chosen = EstimatorSettings(fusion_period_s=1.0, fusion_delay_s=1.0, horizon_s=0.05)
+    at_ns = ticks(T0, T0 + 20 * SECOND)
+    at_once = SwarmEstimator(world.swarm, chosen)
+    expected = play(at_once, on_time(world), at_ns)[-1]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(timeline, "_LARGE", 4)
+        waiting = SwarmEstimator(world.swarm, chosen)
+        found = play(waiting, on_time(world), at_ns)[-1]
+    assert waiting.used == at_once.used > 100
+    np.testing.assert_allclose(found.poses, expected.poses, atol=1e-9)
+    np.testing.assert_allclose(found.covariances, expected.covariances, atol=1e-9)
 
 
 def fixes(stamp_ns: IntArray) -> MeasurementArray:

@@ -35,7 +35,7 @@ class EstimatorSettings:
         "s",
         0.0,
         1.0,
-        "how long they wait after the period's end for what comes late; sooner costs up to twice the work",
+        "from 64 robots on a period is fused so long after its end; what comes later has it fused again",
     )
     sparse_from: int = number(
         250,
