@@ -21,6 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 from swarm_loc_estimator.parameters.errors import UserError
 from swarm_loc_estimator.ros.clock_guard import drop_negative_clocks
 from swarm_loc_estimator.ros.declare import Parameters, declare_parameters
+from swarm_loc_estimator.ros.task_errors import end_at_task_errors
 
 
 class RosArgumentsError(UserError):
@@ -142,6 +143,7 @@ def _start_ros() -> None:
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         drop_negative_clocks()
+        end_at_task_errors()
     except rclpy_implementation.UnknownROSArgsError as error:
         raise RosArgumentsError(f"ROS does not know the arguments {error}.") from error
     except rclpy_implementation.RCLError as error:

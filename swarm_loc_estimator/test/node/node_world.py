@@ -34,6 +34,7 @@ from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
 from swarm_loc_estimator.io.messages.encoders import encode_detections, encode_odometry
 from swarm_loc_estimator.launching.processes import executable_path
 from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.ros.task_errors import end_at_task_errors
 from swarm_loc_msgs.msg import MarkerDetectionArray, SwarmPose, SwarmPoses
 
 SECOND = 1_000_000_000
@@ -116,6 +117,7 @@ class Ros:
 
     def __init__(self) -> None:
         rclpy.init(args=[])
+        end_at_task_errors()
         self.executor = EventsExecutor()
         self.nodes: list[Node] = []
         self._strangers: list[Node] = []

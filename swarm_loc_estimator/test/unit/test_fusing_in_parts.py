@@ -8,8 +8,37 @@ from core_messages import SECOND, T0
 from core_run import play, ticks
 from core_world import Plan, simulate
 
+from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.description.swarm import Robot
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.core.estimation.timeline import Timeline
+from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray
+from swarm_loc_estimator.core.filter.state import SwarmState
+from swarm_loc_estimator.core.inputs.validation import about_robots
+
+PERIOD_NS = SECOND // 5
+
+
+def test_what_is_to_be_fused_again_is_not_forgotten_while_fusing_takes_several_ticks() -> None:
+    """Odometry changes what was measured, and until fusing ends this has grown too old."""
+    stepped: list[int] = []
+
+    def step(_state: SwarmState, rows: MeasurementArray, _verdicts: object, _nis: object) -> None:
+        stepped.extend(rows["stamp_ns"].tolist())
+
+    state = SwarmState(ParameterTable.of((Robot("a"),), ()))
+    timeline = Timeline(EstimatorSettings(fusion_period_s=1e-9 * PERIOD_NS, horizon_s=1.0), step, state, 0)
+    stamp_ns = T0 + PERIOD_NS * np.arange(1, 6, dtype=np.int64)
+    every = np.tile(np.eye(3), (stamp_ns.size, 1, 1))
+    timeline.add(about_robots(0, stamp_ns, np.zeros((stamp_ns.size, 3)), every, Kind.CARTESIAN))
+    timeline.advance(int(stamp_ns[-1]), lambda: False)
+    assert stepped == [stamp_ns[0]]
+    timeline.invalidate(np.array([T0]))
+    for k in range(10):
+        timeline.advance(int(stamp_ns[-1]) + k * SECOND, lambda: False)
+    assert not timeline.is_under_way
+    assert stepped == 2 * stamp_ns.tolist()
 
 
 @pytest.mark.parametrize("sparse", [False, True])

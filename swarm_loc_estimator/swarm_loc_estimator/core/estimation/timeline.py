@@ -153,7 +153,7 @@ class Timeline:
         self.is_under_way = not self._compute(due_ns, go_on)
         if not self.is_under_way:
             self.state = self._ahead
-            self._forget_before(self._key(now_ns - self._kept_ns))
+            self._forget_before(self._key(self.oldest_due_ns(now_ns - self._kept_ns)))
 
     def _key(self, stamp_ns: int) -> int:
         """The step that a stamp belongs to, as the last stamp that is of the step."""
