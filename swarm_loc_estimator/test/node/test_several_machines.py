@@ -1,7 +1,7 @@
 """Robots and estimator in different networks, with a router between them, as on several machines.
 
-Each machine is a network namespace. Multicast does not pass the router, so nodes find each other only through
-the discovery server. Left out where namespaces cannot be made.
+Multicast does not pass the router, so nodes find each other only through the discovery server. Left out where
+there can be no namespaces.
 """
 
 from __future__ import annotations
@@ -9,84 +9,31 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from machines import PORT, Machines, Radio
 
 from swarm_loc_estimator.io.bags.cut import copy_beginning
 from swarm_loc_estimator.launching.graph import NodeSpec, ParameterValue
 from swarm_loc_estimator.launching.processes import node_command
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_five_robots"
-PORT = 11811
 INPUTS = 10
 """Odometry and detections of five robots."""
 PATIENCE_S = 120.0
 SERVER = "fast-discovery-server"
 
 
-class Machines:
-    """Three machines: `robots` and `estimator`, and between them `router`."""
-
-    def __init__(self, stack: ExitStack) -> None:
-        self._tag, self._stack = f"sl{os.getpid()}", stack
-        self.address = {"robots": "10.77.1.2", "estimator": "10.77.2.2"}
-        self.gateway = {"robots": "10.77.1.1", "estimator": "10.77.2.1"}
-        for name in ("router", *self.address):
-            self._ip("netns", "add", self._of(name))
-            stack.callback(self._ip, "netns", "del", self._of(name))
-            self._in(name, "ip", "link", "set", "lo", "up")
-        for name, address in self.address.items():
-            here, there = f"{self._tag}{name[0]}", f"{self._tag}{name[0]}r"
-            ends = ("netns", self._of(name), "type", "veth", "peer", "name", there, "netns")
-            self._ip("link", "add", here, *ends, self._of("router"))
-            for machine, link, own in ((name, here, address), ("router", there, self.gateway[name])):
-                self._in(machine, "ip", "addr", "add", f"{own}/24", "dev", link)
-                self._in(machine, "ip", "link", "set", link, "up")
-            self._in(name, "ip", "route", "add", "default", "via", self.gateway[name])
-        self._in("router", "sysctl", "-qw", "net.ipv4.ip_forward=1")
-
-    def start(self, name: str, command: list[str], server: bool) -> subprocess.Popen[str]:
-        """Start a command on a machine; it ends with the test."""
-        env: Mapping[str, str] = {
-            **os.environ,
-            # on one machine in truth, nodes would find a way past the router by shared memory
-            "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
-            **({"ROS_DISCOVERY_SERVER": f"{self.gateway[name]}:{PORT}"} if server else {}),
-        }
-        process = self._stack.enter_context(
-            subprocess.Popen(
-                ["ip", "netns", "exec", self._of(name), *command],
-                env=env,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-            )
-        )
-        self._stack.callback(process.kill)
-        return process
-
-    def _of(self, name: str) -> str:
-        return f"{self._tag}-{name}"
-
-    def _in(self, name: str, *command: str) -> None:
-        self._ip("netns", "exec", self._of(name), *command)
-
-    @staticmethod
-    def _ip(*arguments: str) -> None:
-        subprocess.run(["ip", *arguments], check=True, capture_output=True)
-
-
 @pytest.fixture
-def machines() -> Iterator[Machines]:
+def machines(request: pytest.FixtureRequest) -> Iterator[Machines]:
     if os.geteuid() or not shutil.which("ip") or not shutil.which(SERVER):
         pytest.skip("needs root, ip and the discovery server")
     with ExitStack() as stack:
         try:
-            made = Machines(stack)
+            made = Machines(stack, getattr(request, "param", None))
         except subprocess.CalledProcessError as error:
             pytest.skip(f"no network namespaces here: {error.stderr.decode().strip()}")
         yield made
@@ -114,7 +61,9 @@ def player(folder: Path) -> list[str]:
     return node_command(NodeSpec("swarm_loc_estimator", "play", "player", parameters=parameters))
 
 
+@pytest.mark.parametrize("machines", [None, Radio(0.02, 0.03, 0.05)], indirect=True, ids=["cable", "radio"])
 def test_a_discovery_server_joins_what_a_router_parts(machines: Machines, tmp_path: Path) -> None:
+    """Also where the robots' radio loses each twentieth packet: all that is said is heard."""
     addresses = [word for address in machines.gateway.values() for word in ("-l", address, "-p", str(PORT))]
     server = machines.start("router", [SERVER, "-i", "0", *addresses], server=False)
     assert "running" in said_until(server, "running")
