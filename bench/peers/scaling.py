@@ -41,12 +41,15 @@ LARGEST_FOR_BATCH = 50
 DURATION_S = 20.0
 PEER_ROBOT_SECONDS = 1500.0
 """Peers get the first part of a large swarm's run: their cost per second does not change with its length."""
+WARM_UP_S = 2.0
 SETTLING_S = 3.0
 """Errors count from here on."""
 
 
 def measure(robots: int, duration_s: float, seed: int, settings: EstimatorSettings) -> dict[str, float]:
     """All figures of one size."""
+    warm_up = simulate_grid(GridSettings(robots=robots, duration_s=WARM_UP_S))
+    run_core(warm_up, ticks(warm_up), settings)  # compiles what is not compiled yet, or loads it
     run = simulate_grid(GridSettings(robots=robots, seed=seed, duration_s=duration_s))
     tick_ns = ticks(run)
     core = run_core(run, tick_ns, settings)
@@ -143,8 +146,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--no-live", action="store_true", help="leave the live graph out")
     options = parser.parse_args(arguments)
     settings = EstimatorSettings()
-    warm_up = simulate_grid(GridSettings(robots=4, duration_s=2.0))
-    run_core(warm_up, ticks(warm_up), settings)  # compiles what is not compiled yet
     results = {}
     for robots in options.robots:
         print(f"{robots} robots ...", flush=True)
