@@ -71,7 +71,9 @@ class Both:
         first = np.where(pairs >= 0, 3 * pairs, -1)
         robots = Robots(self.places, self.active)
         dense, sparse = self.filters
-        across = sparse.relate_pairs(np.column_stack([first, np.full(count, -1)]), robots)[:, :, :3]
+        related = np.zeros((count, 3, 5))
+        sparse.relate_pairs(np.column_stack([first, np.full(count, -1)]), robots, related)
+        across = related[:, :, :3]
         for k in np.flatnonzero((pairs >= 0).all(axis=1)).tolist():
             across[k] -= dense.covariance[columns[k, :3, None], columns[k, 3:6]]
         corrections = [one.update(columns, jacobian, innovation, noise) for one in self.filters]
@@ -148,7 +150,7 @@ def test_a_copy_goes_its_own_way() -> None:
     other = sparse.copy()
     robots = Robots(both.places, both.active)
     first = 3 * pairs[:10]
-    other.relate_pairs(np.column_stack([first, np.full(10, -1)]), robots)
+    other.relate_pairs(np.column_stack([first, np.full(10, -1)]), robots, np.zeros((10, 3, 5)))
     jacobian, noise = np.tile(np.hstack([-np.eye(3), np.eye(3)]), (10, 1, 1)), np.tile(np.eye(3), (10, 1, 1))
     columns = (first[:, :, None] + np.arange(3)).reshape(10, 6)
     other.update(columns, jacobian, np.ones((10, 3)), 1e-6 * noise)
@@ -172,7 +174,8 @@ def test_what_is_contradicted_is_estimated() -> None:
     assert np.linalg.eigvalsh(state.landmark_covariance(0)).min() > 1e-5
     assert isinstance(state.filter, SparseFilter)
     related = np.array([[0, column, yaw], [0, 3, yaw]])
-    across = state.filter.relate_pairs(related, Robots(np.zeros((2, 2)), state.tracked))
+    across = np.ones((2, 3, 5))
+    state.filter.relate_pairs(related, Robots(np.zeros((2, 2)), state.tracked), across)
     np.testing.assert_allclose(across, 0.0, atol=1e-12)
     jacobian = np.zeros((1, 3, 8))
     jacobian[0, :, :3], jacobian[0, :, 3:6] = -np.eye(3), np.eye(3)

@@ -111,7 +111,8 @@ class Both:
         dense, sparse = (state.filter for state in self.states)
         assert isinstance(sparse, SparseFilter)
         tracked = self.states[1].tracked
-        across = sparse.relate_pairs(related[1], Robots(self.poses[:, :2], tracked.copy()))
+        across = np.zeros((len(pairs), 3, 5))
+        sparse.relate_pairs(related[1], Robots(self.poses[:, :2], tracked.copy()), across)
         gaps = []
         for k, (observer, target, _) in enumerate(related[0].tolist()):
             exact = np.zeros((3, 5))

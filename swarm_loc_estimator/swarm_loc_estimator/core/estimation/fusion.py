@@ -278,9 +278,9 @@ class Fusion:
     ) -> tuple[NDArray[np.uint8], FloatArray]:
         """Hold measurements (m,) against one belief, use those that pass; return verdicts and their NIS."""
         belief, passed, newest_ns = state.arrays(), batch.passed, int(fields.stamp_ns[-1])
-        if isinstance(state.filter, SparseFilter):  # a dense one has them all
-            robots = self._robots(state, newest_ns)
-            batch.across[:] = state.filter.relate_pairs(related_columns(fields, belief), robots)
+        state.filter.relate_pairs(
+            related_columns(fields, belief), self._robots(state, newest_ns), batch.across
+        )
         evaluate_all(fields, belief, batch)
         looks = (batch.distance, batch.whitened, batch.cause)
         contradicted = assess_all(fields, belief, self._limits, looks, passed)

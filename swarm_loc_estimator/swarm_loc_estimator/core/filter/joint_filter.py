@@ -76,10 +76,22 @@ class JointFilter(Protocol):
     def block(self, columns: IntArray) -> FloatArray:
         """Covariance (k, k) of columns (k,): of one body, or of one robot's parameters."""
 
+    def relate_pairs(self, columns: IntArray, robots: Robots, across: FloatArray) -> None:
+        """Prepare an update, and write covariances of what its measurements (m,) depend on.
+
+        Args:
+            columns: (m, 3) the first columns of observers, targets and observers' cameras; -1: there is none.
+            robots: Where all are.
+            across: (m, 3, 5) written, unless `covariance` has them: of the observers' errors with the
+                targets', and of these with those of the cameras.
+        """
+
     def update(
         self, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
     ) -> FloatArray:
         """Use measurements (m,) with independent errors at once; return the correction (n,) of all columns.
+
+        `relate_pairs` comes before each update.
 
         Args:
             columns: (m, c) what each depends on, the two bodies' first; a column may be named twice.

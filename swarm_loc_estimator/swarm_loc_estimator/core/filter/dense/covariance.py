@@ -9,6 +9,7 @@ import numpy as np
 
 from swarm_loc_estimator.core.description.estimated_parameters import DRIVES, ParameterTable
 from swarm_loc_estimator.core.filter.dense.inversion import inverse, invert
+from swarm_loc_estimator.core.filter.joint_filter import Robots
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 from swarm_loc_estimator.numerics.jit import compiled
 from swarm_loc_estimator.numerics.small_matrix import assign_matrix, cholesky3, solve3
@@ -69,6 +70,9 @@ class DenseFilter:
         """Covariance (k, k) of columns (k,)."""
         covariance: FloatArray = self.covariance[np.ix_(columns, columns)]
         return covariance
+
+    def relate_pairs(self, columns: IntArray, robots: Robots, across: FloatArray) -> None:
+        """Leave all as it is: `covariance` has every pair."""
 
     def update(
         self, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray

@@ -213,24 +213,21 @@ class SparseFilter:
         covariance: FloatArray = self.marginal[body][np.ix_(own, own)]
         return covariance
 
-    def relate_pairs(self, columns: IntArray, robots: Robots) -> FloatArray:
-        """Covariances of what measurements (m,) depend on, before an update with them.
+    def relate_pairs(self, columns: IntArray, robots: Robots, across: FloatArray) -> None:
+        """Write covariances of what measurements (m,) depend on, before an update with them.
 
         Args:
             columns: (m, 3) the first columns of observers, targets and observers' cameras; -1: there is none.
             robots: Where all are.
-
-        Returns:
-            (m, 3, 5) of the observers' errors with the targets', and of these with those of the cameras.
+            across: (m, 3, 5) written: of the observers' errors with the targets', and of these with those of
+                the cameras; those that there are none of do not matter.
         """
         tied = (columns[:, :2] >= 0).all(axis=1)
         bodies = columns // 3
         prepared = self._prepare(bodies[tied, :2], robots)
-        out = np.zeros((len(columns), 3, 5))
-        out[tied, :, :3] = self._about_map(prepared.covariance_of, *bodies[tied, :2].T)
+        across[tied, :, :3] = self._about_map(prepared.covariance_of, *bodies[tied, :2].T)
         seen = (columns[:, 1:] >= 0).all(axis=1)
-        out[seen, :, 3:] = self._about_map(prepared.covariance_of, *bodies[seen, 1:].T)[:, :, :2]
-        return out
+        across[seen, :, 3:] = self._about_map(prepared.covariance_of, *bodies[seen, 1:].T)[:, :, :2]
 
     def _prepare(self, pairs: IntArray, robots: Robots) -> _Prepared:
         """Have the covariances of all pairs of a pattern that pairs (k, 2) fit into."""
