@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
@@ -18,7 +19,7 @@ from swarm_loc_estimator.core.identification.own_motion import fit_chains, own_d
 from swarm_loc_estimator.core.identification.picture import Picture, TrackPoint, gathered_between
 from swarm_loc_estimator.core.identification.random_motion import identify_by_way
 from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 
 SECOND = 10**9
 SIGMA = 0.01
@@ -107,9 +108,22 @@ def drive(rng: np.random.Generator, robots: int, images: int) -> tuple[FloatArra
     return se2.compose(start, tracks), tracks
 
 
-@settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 10**6), headings=st.booleans())
-def test_chains_find_the_robot_its_heading_and_the_scale(seed: int, headings: bool) -> None:
+class Found(NamedTuple):
+    """What chains have made of five images of four robots, of which they look for the first.
+
+    Attributes:
+        chains: After the newest image.
+        order: (4,) which robot each detection of it is.
+        pose: (3,) of the robot there, by the image's scale.
+    """
+
+    chains: Chains
+    order: IntArray
+    pose: FloatArray
+
+
+def found(seed: int, *, headings: bool) -> Found:
+    """Look for a robot in images that show headings or not."""
     rng = np.random.default_rng(seed)
     truth, own = drive(rng, 4, 5)
     scale = 1.0 + 0.02 * rng.standard_normal()
@@ -119,14 +133,32 @@ def test_chains_find_the_robot_its_heading_and_the_scale(seed: int, headings: bo
         positions = scale * truth[k, order, :2] + SIGMA * rng.standard_normal((4, 2))
         shown = truth[k, order, 2] + 0.05 * rng.standard_normal(4) if headings else None
         chains = chains.advanced(picture(positions, shown), point(own[k, 0]), k * SECOND)
+    return Found(chains, order, np.append(scale * truth[4, 0, :2], truth[4, 0, 2]))
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6), headings=st.booleans())
+@example(seed=5661, headings=False)  # the newest detection is off by more than usual: it may be another robot
+def test_chains_find_the_robot_its_heading_and_the_scale(seed: int, headings: bool) -> None:
+    chains, order, pose = found(seed, headings=headings)
     answer = chains.answer()
     assert answer is not None
     assert order[answer.place] == 0
-    assert answer.probability > 0.9
-    error = answer.pose - np.append(scale * truth[4, 0, :2], truth[4, 0, 2])
+    error = answer.pose - pose
     error[2] = se2.wrap_angle(error[2])
     assert error @ np.linalg.solve(answer.covariance, error) < 30.0  # of 3 degrees of freedom: once in 10^6
     assert chains.probabilities.sum() <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("headings", [False, True])
+def test_chains_are_sure_of_the_robot_unless_its_detection_is_an_outlier(headings: bool) -> None:
+    """A detection far from where it is predicted may rather be of a robot that moves alike.
+
+    A squared Mahalanobis distance of two degrees of freedom exceeds 7 three times in a hundred.
+    """
+    runs = [found(seed, headings=headings) for seed in range(200)]
+    sure = np.array([chains.probabilities.max() > 0.9 for chains, _, _ in runs])
+    assert (~sure).mean() <= 0.03
 
 
 @settings(max_examples=10, deadline=None)
