@@ -291,7 +291,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         for text in new[:_MOST_TOLD]:
             self.get_logger().warning(text)
         if len(new) > _MOST_TOLD:
-            self.get_logger().warning(f"{len(new) - _MOST_TOLD} more contradictions: see /diagnostics")
+            self.get_logger().warning(f"more contradictions, see /diagnostics: {len(new) - _MOST_TOLD}")
         self._known_contradictions = {(one.about, one.kind) for one in contradictions}
 
     def _say_what_is_missing(self, now_s: float) -> None:

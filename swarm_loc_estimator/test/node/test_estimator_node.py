@@ -29,6 +29,7 @@ from rcl_interfaces.msg import Log
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
+from swarm_loc_estimator.core.estimation.contradictions import Contradiction, Kind
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate
 from swarm_loc_estimator.core.estimation.timeline import GoOn
 from swarm_loc_estimator.core.inputs.messages import RawInputs
@@ -221,6 +222,29 @@ def test_drops_of_a_second_kind_are_told_once_the_throttle_allows(
         told.drops = drops
         node._warn_of_drops(now_s)
     assert lines == ["dropped so far: 3 absurd", "dropped so far: 3 absurd, 40 non_finite"]
+
+
+def test_eight_new_contradictions_are_told_one_by_one_and_more_in_a_sentence(
+    ros: Ros, swarm_file: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each once, until it has gone."""
+    told: Any = StandIn()
+    node = ros.add(EstimatorNode(lambda *_: told, parameter_overrides=overrides(swarm_file=str(swarm_file))))
+    lines: list[str] = []
+    monkeypatch.setattr(node, "get_logger", lambda: SimpleNamespace(warning=lines.append))
+    all_of = [Contradiction(f"robot{k}", Kind.POSE, f"robot{k} is elsewhere") for k in range(19)]
+    texts = [one.text for one in all_of]
+    other = Contradiction("robot0", Kind.NOISE, "robot0 is noisy")
+    for now, expected in (
+        (all_of[:8], texts[:8]),
+        (all_of[:9], texts[8:9]),
+        (all_of[:18], [*texts[9:17], "more contradictions, see /diagnostics: 1"]),
+        ([*all_of[1:18], other], [other.text]),
+        (all_of, [texts[0], texts[18]]),
+    ):
+        lines.clear()
+        node._warn_of_contradictions(now)
+        assert lines == expected
 
 
 def test_diagnostics_name_what_is_missing_and_why(ros: Ros, swarm_file: Any) -> None:
