@@ -34,12 +34,12 @@ _NOISE_RATIO = 1.2
 """Exchanges whose noise differs by less are compared with one table."""
 _NEGLIGIBLE = 8.0
 """Poses whose log likelihoods are lower by this are left out."""
-_BRIGHT_SPAN = 20.0
+BRIGHT_SPAN = 20.0
 """Light from elsewhere is as likely at any brightness on a span of so many sigmas."""
-_MIN_SHARE = 1e-3
+MIN_SHARE = 1e-3
 """Of outliers, where a board is said to have fewer."""
-_PEAK = 1.0 / math.sqrt(2.0 * math.pi)
-_LOWEST = 1e-300
+PEAK = 1.0 / math.sqrt(2.0 * math.pi)
+LOWEST = 1e-300
 _FAR_OFF = 8.0
 """Readings off by more sigmas have no density to speak of."""
 
@@ -79,7 +79,7 @@ def element_likelihoods(
     bright = np.nan_to_num(readings, nan=0.0).max(axis=(1, 2))
     noise = np.hypot(platform.noise, platform.stray_noise * np.minimum(bright, saturation))
     level = np.rint(np.log(noise / platform.noise) / math.log(_NOISE_RATIO)).astype(np.int64)
-    blocked, stray = max(platform.blocked_share, _MIN_SHARE), max(platform.bright_share, _MIN_SHARE)
+    blocked, stray = max(platform.blocked_share, MIN_SHARE), max(platform.bright_share, MIN_SHARE)
     for one in np.unique(level).tolist():
         rows = np.flatnonzero(level == one)
         sigma = platform.noise * _NOISE_RATIO**one
@@ -89,8 +89,8 @@ def element_likelihoods(
         saturated = present & (readings[rows] >= limit)
         stable = _stabilized(np.where(present, np.minimum(readings[rows], limit), 0.0), sigma, relative)
         kinds = present.astype(np.int8) + saturated
-        dark = np.where(saturated, 0.0, blocked * _PEAK * np.exp(-0.5 * np.square(stable, dtype=np.float64)))
-        outlier = dark + stray / _BRIGHT_SPAN
+        dark = np.where(saturated, 0.0, blocked * PEAK * np.exp(-0.5 * np.square(stable, dtype=np.float64)))
+        outlier = dark + stray / BRIGHT_SPAN
         part, places = np.empty((rows.size, 2, n, SHARES.size)), np.zeros(rows.size, dtype=np.int64)
         _marginalize(table, log_prior, stable.astype(np.float64), kinds, outlier, part, places)
         found[rows], best[rows] = part, places
@@ -180,7 +180,7 @@ def _marginalize(
         for side in range(2):
             for e in range(n):
                 for s in range(shares):
-                    found[k, side, e, s] = base + math.log(max(found[k, side, e, s], _LOWEST))
+                    found[k, side, e, s] = base + math.log(max(found[k, side, e, s], LOWEST))
 
 
 @compiled
@@ -216,11 +216,11 @@ def _by_side(
             if kinds[i, j] == 2:
                 density += 0.5 * math.erfc(off / math.sqrt(2.0))
             elif abs(off) < _FAR_OFF:
-                density += _PEAK * math.exp(-0.5 * off * off)
+                density += PEAK * math.exp(-0.5 * off * off)
             row *= density
             sides[1, j] *= density
-        sides[0, i] = math.log(max(row, _LOWEST))
+        sides[0, i] = math.log(max(row, LOWEST))
         total += sides[0, i]
     for e in range(n):
-        sides[1, e] = math.log(max(sides[1, e], _LOWEST))
+        sides[1, e] = math.log(max(sides[1, e], LOWEST))
     return total

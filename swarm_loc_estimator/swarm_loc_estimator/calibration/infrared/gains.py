@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from swarm_loc_estimator.calibration.infrared.dead_elements import ElementVerdicts, find_dead_elements
+from swarm_loc_estimator.calibration.infrared.gain_validation import helpful_gains
 from swarm_loc_estimator.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.calibration.sightings import DENSE_GAP_NS
 from swarm_loc_estimator.core.description.swarm import Robot, Swarm
@@ -17,7 +18,7 @@ from swarm_loc_estimator.core.infrared.solvers.gains import Exchanges, GainsErro
 from swarm_loc_estimator.core.inputs.exchanges import ExchangeKey, MatrixScreening, Readings
 from swarm_loc_estimator.evaluation.recorded_bag import Progress
 from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.numerics.trajectory import interpolate
 
 MIN_EXCHANGES = 20
@@ -51,11 +52,13 @@ class BoardFit:
         group: Who, and what was read.
         fit: Gains, by place in the group's `robots`.
         elements: Which elements are dead or shaded, likewise; they are not used.
+        helps: (robots,) whether a robot's gains help in blocks of time that they were not estimated from.
     """
 
     group: BoardGroup
     fit: GainsFit
     elements: ElementVerdicts
+    helps: BoolArray
 
     def of_robot(self, place: int) -> tuple[int, float, float]:
         """How many exchanges of a robot were used, and the rms residuals before and after [sigma]."""
@@ -105,7 +108,7 @@ def calibrate_infrared(
         raise CalibrationError(f"recording '{recording.name}': {' '.join(remarks)}")
     robots, left = _with_fits(swarm.robots, boards)
     remarks += [f"{why}, and as they were: {', '.join(names)}." for why, names in left.items()]
-    if sum(map(len, left.values())) == sum(len(board.group.robots) for board in boards):
+    if robots == swarm.robots:
         raise CalibrationError(f"recording '{recording.name}': {' '.join(remarks)}")
     return InfraredCalibration(replace(swarm, robots=robots), tuple(boards), tuple(remarks))
 
@@ -150,7 +153,9 @@ def _fit(group: BoardGroup, progress: _Share) -> BoardFit:
     progress("dead elements")
     elements = find_dead_elements(group.platform, len(group.robots), group.exchanges)
     alive = elements.without(group.exchanges)
-    return BoardFit(group, estimate_gains(group.platform, len(group.robots), alive, progress), elements)
+    platform, robots = group.platform, len(group.robots)
+    fit = estimate_gains(platform, robots, alive, progress)
+    return BoardFit(group, fit, elements, helpful_gains(platform, robots, alive, progress))
 
 
 def _groups(
@@ -229,6 +234,9 @@ def _with_fits(
                 left.setdefault("In no exchange that could be used", []).append(robots[index].name)
             elif gains == IrGains.unknown(board.group.platform):
                 why = "What they read contradicts itself or the ground truth"
+                left.setdefault(why, []).append(robots[index].name)
+            elif not board.helps[place]:
+                why = "Gains do not help in exchanges that they were not estimated from"
                 left.setdefault(why, []).append(robots[index].name)
             else:
                 changed[index] = _with_gains(changed[index], gains)

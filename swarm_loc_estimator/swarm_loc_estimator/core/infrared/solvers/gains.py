@@ -28,7 +28,7 @@ Progress = Callable[[str], None]
 _ROUNDS = 8
 _STILL = 1e-3
 """Rounds end when no log-gain moves by more."""
-_POSE_SIGMA = (0.0005, 0.005, 0.005)
+POSE_SIGMA = (0.0005, 0.005, 0.005)
 """How well known poses are known: range [m], bearing, heading [rad]."""
 _BACKGROUND = 0.5
 """How much of the ambient light a sensor may read besides, one standard deviation [sigma of a reading]."""
@@ -64,6 +64,16 @@ class Exchanges(NamedTuple):
     readings: FloatArray
     saturation: FloatArray
     poses: FloatArray
+
+    def chosen(self, rows: NDArray[np.bool_]) -> Exchanges:
+        """Those that are marked (k,)."""
+        return Exchanges(
+            self.receiver[rows],
+            self.transmitter[rows],
+            self.readings[rows],
+            self.saturation[rows],
+            self.poses[rows],
+        )
 
 
 @dataclass(frozen=True)
@@ -161,7 +171,7 @@ def _poses(
     if not used.any():
         raise GainsError(f"None of {len(used)} exchanges determines a pose.")
     poses, both = np.where(known[:, None], exchanges.poses, solutions.poses), found & known
-    prior = np.diag(np.square(_POSE_SIGMA))
+    prior = np.diag(np.square(POSE_SIGMA))
     share = prior @ np.linalg.inv(prior + solutions.covariances[both])
     poses[both] += np.einsum("kab,kb->ka", share, _apart(solutions.poses[both], poses[both]))
     return poses, used
@@ -291,11 +301,11 @@ def _without_pose(linear: _Linear, to_known: FloatArray, background: float) -> t
     to_pose = np.concatenate([mixed.sum(axis=(1, 3)), mixed.sum(axis=(1, 2))], axis=1)
     pose = np.einsum("kmij,kmija,kmijb->kab", weight, slopes, slopes)
     known = np.isfinite(to_known[:, 0])
-    pose[known] += np.diag(1.0 / np.square(_POSE_SIGMA))
+    pose[known] += np.diag(1.0 / np.square(POSE_SIGMA))
     of_gains = bright * linear.residual
     pull = np.concatenate([of_gains.sum(axis=(1, 3)), of_gains.sum(axis=(1, 2))], axis=1)
     of_pose = np.einsum("kmij,kmija->ka", weight * linear.residual, slopes)
-    of_pose[known] += to_known[known] / np.square(_POSE_SIGMA)
+    of_pose[known] += to_known[known] / np.square(POSE_SIGMA)
     dark = _of_background(linear, background)
     gains, to_pose = gains - dark[:, :-4, :-4], to_pose - dark[:, :-4, -4:-1]
     pose, pull, of_pose = pose - dark[:, -4:-1, -4:-1], pull - dark[:, :-4, -1], of_pose - dark[:, -4:-1, -1]
