@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
-from swarm_loc_estimator.core.description.swarm import Robot
+from swarm_loc_estimator.core.description.robot_ir import RobotIr
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.core.description.swarm import Robot, StartSigma, Swarm
+from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
 from swarm_loc_estimator.core.filter.correlated_noise import (
     PAIR_ROWS,
     record_constraint,
@@ -25,6 +29,7 @@ from swarm_loc_estimator.core.filter.measurement_model import (
 )
 from swarm_loc_estimator.core.filter.state import SwarmState
 from swarm_loc_estimator.core.odometry.look_up import new_sample
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.numerics import se2
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
@@ -275,3 +280,70 @@ def test_what_has_located_a_robot_counts_as_told() -> None:
     assert (told > 0.4 / VARIANCES).all()  # not all of it
     assert (noise_of(state, Exchange(1.0), VARIANCES) > noise_of(pairs(), Exchange(1.0), VARIANCES)).all()
     np.testing.assert_allclose(noise_of(state, Exchange(0.0), VARIANCES), VARIANCES)
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0])
+def test_a_pair_whose_relative_pose_is_known_exactly_tells_nothing(share: float) -> None:
+    """Neither where rounding leaves nothing of its variances, or less."""
+    state = pairs()
+    for variances in (np.zeros(3), np.zeros(3), np.full(3, -1e-20), np.full(3, 1e-20)):
+        use = use_of(state, Exchange(share), variances)
+        assert np.isfinite(use.innovation).all()
+        assert (np.diag(use.noise) >= share * VARIANCES * (1.0 - 1e-6)).all()
+        record_pair(MeasurementColumns.of(Exchange(share).row()), 0, state.arrays(), use.pair)
+        assert np.isfinite(state.pair_history).all()
+
+
+class StandingPair:
+    """An estimator of two robots that stand where `VALUE` says, their starts known so well."""
+
+    def __init__(self, sigma: float, settings: EstimatorSettings) -> None:
+        robots = [
+            Robot(
+                f"r{k}",
+                camera=None,
+                start=(float(pose[0]), float(pose[1]), float(pose[2])),
+                start_sigma=StartSigma(sigma, sigma, sigma),
+                stands=True,
+                ir=RobotIr(k + 1, load_ir_platform("droplet"), "droplet"),
+            )
+            for k, pose in enumerate(standing(VALUE))
+        ]
+        self.estimator = SwarmEstimator(Swarm(tuple(robots)), settings)
+
+    def hear(self, stamps_ns: Sequence[int], share: float) -> SwarmEstimate:
+        """Fuse exchanges at instants, together; return the estimate at the last one."""
+        rows = np.concatenate([Exchange(share, stamp_ns=stamp_ns).row() for stamp_ns in stamps_ns])
+        rows["gate"] = 9.0
+        self.estimator._timeline.add(rows)
+        return self.estimator.tick(stamps_ns[-1])
+
+    @property
+    def told(self) -> FloatArray:
+        """The information (3,) of the pair."""
+        told: FloatArray = np.diag(self.estimator._timeline.state.pair_history[0, 0, TOLD]).copy()
+        return told
+
+
+@pytest.mark.parametrize("sigma", [1e-6, 1e-12])
+@pytest.mark.parametrize("sparse_from", [2, 250])
+def test_robots_whose_starts_are_as_good_as_exact_stay_there(sparse_from: int, sigma: float) -> None:
+    pair = StandingPair(sigma, EstimatorSettings(sparse_from=sparse_from))
+    for second in range(1, 6):
+        estimate = pair.hear([second * 10**9], 0.9)
+    np.testing.assert_allclose(estimate.poses, standing(VALUE), atol=1e-9)
+    assert pair.estimator.used == 5
+
+
+def test_exchanges_that_are_fused_together_tell_no_more_than_their_mean() -> None:
+    """Those of one pair in one period, too: as much as one after the other."""
+    share, stamps_ns = 0.9, [10**9 + k * 10**8 for k in range(1, 10)]
+    one_by_one = StandingPair(0.1, EstimatorSettings(fusion_period_s=0.0))
+    together = StandingPair(0.1, EstimatorSettings(fusion_period_s=1.0, sparse_from=2))
+    covariances = []
+    for pair in (one_by_one, together):
+        covariances.append(pair.hear(stamps_ns, share).covariances)
+        assert pair.estimator.used == len(stamps_ns)
+        assert (pair.told * VARIANCES < 1.0 / share).all()
+    np.testing.assert_allclose(together.told, one_by_one.told, rtol=1e-6)
+    np.testing.assert_allclose(covariances[1], covariances[0], atol=1e-9)

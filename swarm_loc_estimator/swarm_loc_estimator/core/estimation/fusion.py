@@ -239,6 +239,26 @@ class Fusion:
     def _fuse_together(
         self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
     ) -> None:
+        for part in self._parts(measurements):
+            self._fuse_part(state, measurements[part], verdicts[part], nis[part])
+
+    def _parts(self, measurements: MeasurementArray) -> list[slice]:
+        """Parts of measurements (m,) in which no pair tells twice what comes again: its mean is to count."""
+        edges, told = [0], set[tuple[int, int]]()
+        if self._pairs:
+            comes_again: BoolArray = measurements["systematic_share"].max(axis=1) > 0.0
+            pairs = zip(measurements["observer"].tolist(), measurements["target"].tolist(), strict=True)
+            for k, pair in itertools.compress(enumerate(pairs), comes_again):
+                if pair in told:
+                    edges.append(k)
+                    told.clear()
+                told.add(pair)
+        return [slice(begin, end) for begin, end in itertools.pairwise([*edges, measurements.size])]
+
+    def _fuse_part(
+        self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        """Fuse measurements (m,) together, against one belief."""
         self._initialize_measured(state, measurements)
         known = np.append(state.tracked, True)  # NOBODY (-1) finds the last
         tied = known[measurements["observer"]] & known[measurements["target"]]

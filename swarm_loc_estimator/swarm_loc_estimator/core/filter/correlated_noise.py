@@ -98,7 +98,7 @@ def use_mean(
         again = min(measurements.systematic_share[k, i], 1.0) * measurements.covariance[k, i, i]
         pair[_OWN, i], pair[_LASTING, i] = max(noise[i, i] - again, 0.0), again
         pair[_MEAN, i] = predicted[i] + innovation[i]
-        pair[_VARIANCE, i] = variances[i]
+        pair[_VARIANCE, i] = max(variances[i], 0.0)  # a difference, which rounding may have made less
     if belief.pair_robot[observer, place] == target:
         _join(belief.pair_history[observer, place], predicted, innovation, noise, pair)
     else:
@@ -248,7 +248,9 @@ def _left(known: FloatArray, carried: FloatArray, variances: FloatArray) -> Floa
     left = np.full(3, 0.5 * (sensors + emitters))
     left[1] = sensors  # a bearing errs by them alone
     for i in range(3):
-        left[i] = max(left[i] * min(known[_VARIANCE, i] / variances[i], 1.0), _NOTHING_NEW)
+        if variances[i] > known[_VARIANCE, i]:  # never where both are zero
+            left[i] *= known[_VARIANCE, i] / variances[i]
+        left[i] = max(left[i], _NOTHING_NEW)
     return left
 
 
