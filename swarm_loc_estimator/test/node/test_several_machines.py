@@ -61,6 +61,7 @@ def player(folder: Path) -> list[str]:
     return node_command(NodeSpec("swarm_loc_estimator", "play", "player", parameters=parameters))
 
 
+@pytest.mark.timeout(300)  # what a radio loses is said again only every few seconds
 @pytest.mark.parametrize("machines", [None, Radio(0.02, 0.03, 0.05)], indirect=True, ids=["cable", "radio"])
 def test_a_discovery_server_joins_what_a_router_parts(machines: Machines, tmp_path: Path) -> None:
     """Also where the robots' radio loses each twentieth packet: all that is said is heard."""

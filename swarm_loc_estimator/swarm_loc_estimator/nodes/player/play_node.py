@@ -34,7 +34,9 @@ _POLL_S = 0.05
 _SETTLED_S = 0.5
 """A node's subscriptions are discovered one by one; no new one for so long, and all are there."""
 _SAY_EVERY_S = 5.0
-_LAST_WORDS_S = 10.0
+_LAST_WORDS_S = 30.0
+"""Longer than the 20 s after which DDS forgets a subscriber that has gone: who lives acknowledges in time,
+also by a radio, whose lost packets are asked for again only every 3 s."""
 _AT_ONCE = Duration(nanoseconds=0)
 _RUN_ON_S = 0.25
 """The clock runs on for so long behind the last message, so that nodes that work by timers use it, too."""
@@ -160,10 +162,14 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
             self._own_executor.spin_once(timeout_sec=_POLL_S)
 
     def _wait_for_acknowledgements(self, stop: Stop) -> None:
-        """Stay until everyone has received the last message, or somebody stops it."""
-        silent, end_s = self._publisher_of, time.monotonic() + _LAST_WORDS_S
-        while silent and not stop.requested and time.monotonic() < end_s:
+        """Stay until everyone has received the last message, or somebody stops it; say what is waited for."""
+        silent, begin_s = self._publisher_of, time.monotonic()
+        said_s = begin_s
+        while silent and not stop.requested and (now_s := time.monotonic()) < begin_s + _LAST_WORDS_S:
             silent = {name: one for name, one in silent.items() if not one.wait_for_all_acked(_AT_ONCE)}
+            if silent and now_s > said_s + _SAY_EVERY_S:
+                said_s = now_s
+                self.get_logger().info(f"waiting until all is received on {listed([*silent])}")
             if silent:
                 self._own_executor.spin_once(timeout_sec=_POLL_S)
         if silent and not stop.requested:
