@@ -1,7 +1,7 @@
 """Large swarms of several shapes: what the estimator costs, and how near it comes to the exact filter.
 
 The same data go through the estimator as it is and through the exact dense filter, whatever the size. Errors
-of the second half of a run count.
+of the second half of a run count, of the poses told as tracked.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from bench.shared.simulated_run import errors_of, mean_nees, position_rmse, run_
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.scenarios.grid_shapes import Shape
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.numerics.arrays import FloatArray
 
 _NEVER = 1_000_000
 
@@ -49,21 +50,33 @@ def _measure(grid: GridSettings, exact_s: float) -> dict[str, float]:
     exact = _scored(compared, EstimatorSettings(sparse_from=_NEVER))
     beside = _scored(compared, EstimatorSettings()) if is_long else own
     ratio = beside["position_rmse_mm"] / exact["position_rmse_mm"]
-    reference = {f"exact_{name}": exact[name] for name in ("nees", "cpu_s_per_s")}
+    reference = {f"exact_{name}": exact[name] for name in ("nees", "tracked_share", "cpu_s_per_s")}
     return own | {"position_rmse_ratio_to_exact": ratio} | reference
 
 
 def _scored(grid: GridSettings, settings: EstimatorSettings) -> dict[str, float]:
-    """CPU time of a run, and the errors of its second half."""
+    """CPU time of a run, and the figures of its second half."""
     run = simulate_grid(grid)
     at_ns = ticks(run)
     core = run_core(run, at_ns, settings)
     counted = np.arange(at_ns.size) >= at_ns.size // 2
-    errors = errors_of(core.poses, run, at_ns)[counted]
+    errors = errors_of(core.poses, run, at_ns)
+    cost = {"cpu_s_per_s": core.cpu_s / run.duration_s}
+    return cost | scored(errors[counted], core.covariances[counted])
+
+
+def scored(errors: FloatArray, covariances: FloatArray) -> dict[str, float]:
+    """The share of poses that are tracked, and how exact these are.
+
+    Args:
+        errors: (K, N, 3) x, y [m], theta [rad]; not finite where a pose is not told as tracked.
+        covariances: (K, N, 3, 3) of them.
+    """
+    tracked = np.isfinite(errors).all(axis=-1)
     return {
-        "cpu_s_per_s": core.cpu_s / run.duration_s,
-        "position_rmse_mm": 1e3 * position_rmse(errors),
-        "nees": mean_nees(errors, core.covariances[counted]),
+        "tracked_share": float(np.mean(tracked)),
+        "position_rmse_mm": 1e3 * position_rmse(errors[tracked]),
+        "nees": mean_nees(errors[tracked], covariances[tracked]),
     }
 
 
