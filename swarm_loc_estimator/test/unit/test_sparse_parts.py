@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -48,6 +51,23 @@ def in_pattern(one: ordering.Ordering, a: int, b: int) -> bool:
     f, g = sorted((int(pattern.front[a]), int(pattern.front[b])))
     later = a if pattern.front[a] == g else b
     return f == g or later in pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+
+
+@pytest.mark.parametrize("grown", [0.0, math.inf])
+def test_who_is_near_whom_is_found_out_again_however_soon_orders_are_replaced(
+    monkeypatch: pytest.MonkeyPatch, grown: float
+) -> None:
+    monkeypatch.setattr(ordering, "_GROWN", grown)
+    robot, now = 0, None
+    for update in range(3 * ordering._NEAR_AGAIN):
+        here = situation([])
+        here.places[robot] = (3.6, 0.1 + 0.05 * min(update, ordering._NEAR_AGAIN))
+        now = ordered(here, now)
+    assert now is not None
+    for a, b in now.near:
+        if robot in (a, b):
+            assert np.linalg.norm(here.places[a] - here.places[b]) < 2.0
+    assert now.near_updates <= ordering._NEAR_AGAIN + ordering._ORDERED_AGAIN
 
 
 @given(st.integers(0, 10**6), st.integers(0, 40))

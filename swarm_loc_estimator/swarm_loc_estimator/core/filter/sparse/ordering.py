@@ -107,7 +107,7 @@ def ordered(situation: Situation, before: Ordering | None) -> Ordering:
     near, near_updates = before.near, before.near_updates + 1
     pattern = situation.pattern(before.order, near)
     if pattern.width > _GROWN * before.width:
-        return _begun(situation, situation.order(near), (near, near_updates))
+        return _begun(situation, situation.order(before.next_near[0]), before.next_near)
     return Ordering(situation, pattern, before.order, before.updates + 1, before.width, near, near_updates)
 
 
