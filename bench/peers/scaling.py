@@ -19,9 +19,9 @@ import numpy as np
 
 from bench.graph import large_swarms
 from bench.peers import filterpy_ekf, gtsam_batch, gtsam_lag
-from bench.peers.shapes import ShapeRuns, measure_shape, show
+from bench.peers.shapes import ShapeRuns, measure_shape, scored, show
 from bench.shared.common import new_plot, save_plot, table, write_figures
-from bench.shared.simulated_run import errors_of, mean_nees, position_rmse, run_core, ticks, without_delay
+from bench.shared.simulated_run import errors_of, position_rmse, run_core, ticks, without_delay
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.scenarios.grid_shapes import Shape
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
@@ -59,10 +59,9 @@ def measure(robots: int, duration_s: float, seed: int, settings: EstimatorSettin
     figures = {
         "cpu_s_per_s": core.cpu_s / run.duration_s,
         "prompt_cpu_s_per_s": prompt.cpu_s / run.duration_s,
-        "position_rmse_mm": 1e3 * position_rmse(errors),
-        "heading_rmse_deg": float(np.degrees(np.sqrt(np.mean(errors[..., 2] ** 2)))),
-        "nees": mean_nees(errors, core.covariances[settled]),
+        "heading_rmse_deg": float(np.degrees(np.sqrt(np.nanmean(errors[..., 2] ** 2)))),
     }
+    figures |= scored(errors, core.covariances[settled])
     part = first_part(run, min(duration_s, max(2.0, PEER_ROBOT_SECONDS / robots)))
     for name, peer in (("filterpy", filterpy_ekf), ("gtsam", gtsam_lag)):
         figures[f"{name}_cpu_s_per_s"] = peer.solve(part, ticks(part)).cpu_s / part.duration_s
@@ -120,6 +119,7 @@ def report(results: dict[int, dict[str, float]], shapes: dict[str, float], live:
         "heading_rmse_deg": "RMSE deg",
         "position_rmse_ratio_to_batch": "RMSE / batch",
         "nees": "NEES",
+        "tracked_share": "tracked",
     }
     rows = [[robots, *(figures.get(key) for key in keys)] for robots, figures in results.items()]
     print(table(["robots", *keys.values()], rows))
