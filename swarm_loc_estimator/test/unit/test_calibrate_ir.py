@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -121,6 +122,11 @@ def test_gains_come_out_within_their_sigmas_and_are_written(
     assert f"{out} written" in shown
     assert all(f"\n{name} " in shown for name in "abc")
     assert "of 300 exchanges used" in shown
+    assert re.search(r"\na, by sensor: saturation \[count\] \[((255|-) ?){6}\]\n", shown)
+    saturated = re.search(r"\nexchanges tell where (\d+) of 18 sensors saturate, and the noise of 0\n", shown)
+    assert saturated
+    assert int(saturated[1]) >= 6
+    assert "saturate lower" not in shown
     assert (", 0 of them with ground truth" in shown) == bool(options)
     found = [gains for gains in gains_of(out) if gains is not None]
     error = np.log([[gains.sensor for gains in found], [gains.emitter for gains in found]]) - logs
@@ -237,6 +243,19 @@ def test_robots_are_not_blamed_where_the_curves_of_their_board_are_wrong(
     assert "Platform droplet: its curves do not hold" in said
     assert "`calibrate_ir --board`." in said
     assert not (tmp_path / "out.yaml").exists()
+
+
+def test_a_saturation_that_is_lower_than_described_is_told_where_gains_fail_by_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robots = described(("a", "b", "c"), droplet(SPREAD), "droplet")
+    with BagWriter(tmp_path / "bag") as bag:
+        add_topics(bag, robots)
+        write_exchanges(bag, robots, 300, 14, truly=replace(droplet(SPREAD), saturation=180.0))
+    save_swarm(Swarm(tuple(robots)), tmp_path / "bag" / "swarm.yaml")
+    said = error_of(capsys, tmp_path / "bag", "--out", tmp_path / "out.yaml", "--without-truth")
+    assert "Platform droplet: Sensors saturate lower than board and matrices say: a [0, " in said
+    assert " at 180 of 255 counts" in said
 
 
 @pytest.mark.parametrize(

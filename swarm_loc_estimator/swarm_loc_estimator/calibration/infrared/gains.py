@@ -10,6 +10,11 @@ import numpy as np
 
 from swarm_loc_estimator.calibration.infrared.dead_elements import ElementVerdicts, find_dead_elements
 from swarm_loc_estimator.calibration.infrared.gain_validation import helpful_gains
+from swarm_loc_estimator.calibration.infrared.reading_limits import (
+    ReadingLimits,
+    contradictions,
+    find_reading_limits,
+)
 from swarm_loc_estimator.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.calibration.sightings import DENSE_GAP_NS
 from swarm_loc_estimator.core.description.swarm import Robot, Swarm
@@ -52,12 +57,14 @@ class BoardFit:
         group: Who, and what was read.
         fit: Gains, by place in the group's `robots`.
         elements: Which elements are dead or shaded, likewise; they are not used.
+        limits: Where their sensors saturate and how noisy they are, likewise.
         helps: (robots,) whether a robot's gains help in blocks of time that they were not estimated from.
     """
 
     group: BoardGroup
     fit: GainsFit
     elements: ElementVerdicts
+    limits: ReadingLimits
     helps: BoolArray
 
     def of_robot(self, place: int) -> tuple[int, float, float]:
@@ -100,8 +107,12 @@ def calibrate_infrared(
     remarks = [f"Matrices not used: {_counts(dropped)}."] if dropped else []
     boards: list[BoardFit] = []
     for number, (group, _) in enumerate(groups):
+        limits = find_reading_limits(group.platform, len(group.robots), group.exchanges)
+        names = [swarm.robots[index].name for index in group.robots]
+        said = contradictions(group.platform, group.exchanges, limits, names)
+        remarks += [f"Platform {group.source}: {sentence}" for sentence in said]
         try:
-            boards.append(_fit(group, _Share(progress, number, len(groups))))
+            boards.append(_fit(group, limits, _Share(progress, number, len(groups))))
         except (CalibrationError, GainsError) as error:
             remarks.append(f"Platform {group.source}: {error}")
     if not boards:
@@ -140,7 +151,7 @@ class _Share:
         self._begin, self._left = self._begin + 0.25 * self._left, 0.75 * self._left
 
 
-def _fit(group: BoardGroup, progress: _Share) -> BoardFit:
+def _fit(group: BoardGroup, limits: ReadingLimits, progress: _Share) -> BoardFit:
     """The gains and dead elements of one kind of board.
 
     Raises:
@@ -155,7 +166,8 @@ def _fit(group: BoardGroup, progress: _Share) -> BoardFit:
     alive = elements.without(group.exchanges)
     platform, robots = group.platform, len(group.robots)
     fit = estimate_gains(platform, robots, alive, progress)
-    return BoardFit(group, fit, elements, helpful_gains(platform, robots, alive, progress))
+    helps = helpful_gains(platform, robots, alive, progress)
+    return BoardFit(group, fit, elements, limits, helps)
 
 
 def _groups(

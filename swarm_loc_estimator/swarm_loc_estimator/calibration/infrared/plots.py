@@ -37,7 +37,8 @@ def text_of(done: InfraredCalibration) -> str:
             f"platform {board.group.source}: {int(used.sum())} of {used.size} exchanges used, {known} of them"
             f" with ground truth; residuals {before:.2f} before, {after:.2f} after"
         )
-        lines += _elements(board, [done.swarm.robots[index].name for index in board.group.robots])
+        names = [done.swarm.robots[index].name for index in board.group.robots]
+        lines += _elements(board, names) + _limits(board, names)
     return "\n".join([*lines, *done.remarks])
 
 
@@ -57,6 +58,34 @@ def _elements(board: BoardFit, names: list[str]) -> list[str]:
             f" {emitters} of {count} emitters"
         )
     return lines
+
+
+def _limits(board: BoardFit, names: list[str]) -> list[str]:
+    """A line per robot with what exchanges tell of saturation and noise, and of how many sensors they do."""
+    limits, lines = board.limits, []
+    told = (
+        ("saturation [count]", limits.saturation + board.group.platform.dark_level, 0),
+        ("noise [count]", limits.noise, 2),
+        ("relative noise [%]", 100.0 * limits.relative_noise, 1),
+    )
+    for place, name in enumerate(names):
+        said = [
+            f"{what} {_told(values[place], digits)}"
+            for what, values, digits in told
+            if np.isfinite(values[place]).any()
+        ]
+        if said:
+            lines.append(f"{name}, by sensor: {', '.join(said)}")
+    saturated, noisy = (int(np.isfinite(part).sum()) for part in (limits.saturation, limits.noise))
+    lines.append(
+        f"exchanges tell where {saturated} of {limits.noise.size} sensors saturate, and the noise of {noisy}"
+    )
+    return lines
+
+
+def _told(values: FloatArray, digits: int) -> str:
+    """Numbers in brackets, a dash where there is none."""
+    return f"[{' '.join(f'{value:.{digits}f}' if np.isfinite(value) else '-' for value in values)}]"
 
 
 def draw(done: InfraredCalibration, path: Path) -> Path:
@@ -96,6 +125,18 @@ def _by_brightness(axis: Any, board: BoardFit) -> None:
     ):
         levels, sizes = _sizes(readings, residuals)
         axis.plot(levels, sizes, color=colour, marker=".", label=label)
+    platform, limits = board.group.platform, board.limits
+    noise, relative = (
+        np.nanmedian(part) if np.isfinite(part).any() else np.nan
+        for part in (limits.noise, limits.relative_noise)
+    )
+    bright = np.array(levels)
+    repeated = np.hypot(noise, relative * bright) / np.hypot(platform.noise, platform.relative * bright)
+    (line,) = axis.plot(bright, repeated, color=colour_of(2), linewidth=0.8)
+    if np.isfinite(noise):
+        axis.legend([line], ["noise where robots stand"], frameon=False, fontsize=9)
+    for ceiling in limits.saturation[np.isfinite(limits.saturation)].tolist():
+        axis.axvline(ceiling, color=SOFT, linewidth=0.3)
     axis.axhline(1.0, color=SOFT, linewidth=0.8, linestyle="--")
     axis.set_ylim(bottom=0.0)
     axis.set_xlabel("reading [count]", color=SOFT, fontsize=9)
