@@ -10,7 +10,7 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 from swarm_loc_estimator.numerics.jit import compiled
 
-_NEAREST = 6
+_NEAREST = 8
 
 
 class Adjacency(NamedTuple):

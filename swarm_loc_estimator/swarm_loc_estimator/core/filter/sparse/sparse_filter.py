@@ -43,7 +43,7 @@ from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 _COPIES = 64
 _COPIED_SHARE = 4
 """One of so many bodies is copied, at most."""
-_COPIED_AGAIN = 25
+_COPIED_AGAIN = 100
 """Updates after which other bodies are copied."""
 _PAIRS_KEPT = 3
 """Pairs of so many updates count as neighbours."""
