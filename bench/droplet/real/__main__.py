@@ -27,7 +27,6 @@ from bench.shared.common import OUT, Cell, ProgressLine, table, write_figures
 from swarm_loc_estimator.calibration.infrared.board import (
     BoardCalibration,
     calibrate_board,
-    dead_sensors,
     pair_gains,
     without_dead,
 )
@@ -105,7 +104,7 @@ def measure(
     for one in test:
         data = one.clear
         within = (data.poses[:, 0] > RANGES[0]) & (data.poses[:, 0] < RANGES[1])
-        data = without_dead(data.chosen(within), {**done.dead_sensors, **dead_sensors(data, robots)})
+        data = without_dead(done.model.platform, data, robots)[1].chosen(within)
         add(done, data, results)
     print()
     return done

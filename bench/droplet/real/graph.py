@@ -17,7 +17,7 @@ import numpy as np
 from bench.droplet.real.recordings import Recorded
 from bench.integrity.scoring import Estimated, Score, scored
 from bench.shared.common import OUT, Cell, ProgressLine, new_plot, save_plot, table
-from swarm_loc_estimator.calibration.infrared.board import GAIN_SIGMA, BoardCalibration, dead_sensors
+from swarm_loc_estimator.calibration.infrared.board import GAIN_SIGMA, BoardCalibration, without_dead
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.core.estimation.estimator import Status
@@ -110,14 +110,14 @@ def report(outcomes: dict[str, Outcome], agreement: dict[str, float]) -> None:
 
 
 def described(recorded: Recorded, done: BoardCalibration, names: list[str]) -> Path:
-    """Write the swarm with a board, gains and dead sensors beside the bag; returns the file.
+    """Write the swarm with a board, gains and dead elements beside the bag; returns the file.
 
-    Dead sensors are found in the recording itself, too: that needs no truth.
+    Dead elements are found in the recording itself.
     """
     folder = recorded.bag.parent
     board = folder / f"{recorded.name}_board.yaml"
     save_ir_platform(done.model.platform, board)
-    dead = {**done.dead_sensors, **dead_sensors(recorded.data, len(names))}
+    elements, _ = without_dead(done.model.platform, recorded.clear, len(names))
     robots = []
     for robot in recorded.swarm.robots:
         if robot.ir is None:
@@ -125,7 +125,8 @@ def described(recorded: Recorded, done: BoardCalibration, names: list[str]) -> P
         ir = replace(robot.ir, platform=done.model.platform, source=str(board))
         if robot.name in names:
             place = names.index(robot.name)
-            ir = replace(ir, gains=_gains(done, place), dead_sensors=dead.get(place, ()))
+            sensors, emitters = elements.numbers(place)
+            ir = replace(ir, gains=_gains(done, place), dead_sensors=sensors, dead_emitters=emitters)
         robots.append(replace(robot, ir=ir))
     path = folder / f"{recorded.name}_swarm.yaml"
     save_swarm(Swarm(tuple(robots)), path)

@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 from ir_world import random_poses
 
-from swarm_loc_estimator.calibration.infrared.board import (
-    dead_sensors,
-    errors_of,
-    without_dead,
-)
+from swarm_loc_estimator.calibration.infrared.board import errors_of, without_dead
 from swarm_loc_estimator.calibration.infrared.board_fit import BoardReadings, _Problem, fit_board, turned
 from swarm_loc_estimator.core.infrared.board import PairGains
 from swarm_loc_estimator.core.infrared.brightness import expected
@@ -76,14 +72,33 @@ def test_curves_yaw_and_gains_are_found_again(seed: int) -> None:
     assert 10.0 < model.platform.noise < 20.0
 
 
-def test_a_dead_sensor_is_found_from_the_exchanges_alone() -> None:
-    data = recorded(60, 4)
-    data.readings[:, 2] = 15.0 * np.random.default_rng(4).standard_normal((60, 6))
-    assert dead_sensors(data, ROBOTS) == {0: (2,)}
-    masked = without_dead(data, {0: (2,)})
-    assert np.isnan(masked.readings[:, 2]).all()
-    assert np.isfinite(masked.readings[:, [0, 1, 3, 4, 5]]).all()
-    assert dead_sensors(recorded(60, 5), ROBOTS) == {}
+def dark_sensor(data: BoardReadings, sensor: int, seed: int) -> BoardReadings:
+    """The same, of one sensor of robot 0 nothing but noise."""
+    readings = data.readings.copy()
+    readings[:, sensor] = 15.0 * np.random.default_rng(seed).standard_normal(readings[:, sensor].shape)
+    return data._replace(readings=readings)
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_a_dead_sensor_is_found_and_left_out_though_the_curves_to_begin_with_are_wrong(seed: int) -> None:
+    paper, data = load_ir_platform("droplet"), dark_sensor(recorded(300, seed), 2, seed)
+    narrow = replace(PLATFORM, sensor=paper.sensor, emitter=paper.emitter)
+    elements, alive = without_dead(fit_board(narrow, data, ROBOTS).platform, data, ROBOTS)
+    assert np.argwhere(elements.dead).tolist() == [[0, 0, 2]]
+    assert np.isnan(alive.readings[:, 2]).all()
+    assert np.isfinite(alive.readings[:, [0, 1, 3, 4, 5]]).all()
+    assert not without_dead(PLATFORM, recorded(300, seed), ROBOTS)[0].dead.any()
+
+
+@pytest.mark.parametrize("seed", [6, 7])
+def test_sensors_that_nobody_faced_are_not_called_dead(seed: int) -> None:
+    """All robots are ahead of the receiver; its sensors 2 and 3 look back."""
+    data = recorded(600, seed)
+    ahead = data.chosen(np.abs(data.poses[:, 1]) < 1.2)
+    brightest = np.quantile(ahead.readings.max(axis=2), 0.95, axis=0)
+    assert brightest[[2, 3]].max() < 0.2 * np.median(brightest)
+    elements, _ = without_dead(fit_board(PLATFORM, ahead, ROBOTS).platform, ahead, ROBOTS)
+    assert not elements.dead.any()
 
 
 def with_stray_light(data: BoardReadings, share: float, seed: int) -> BoardReadings:

@@ -13,10 +13,12 @@ from swarm_loc_estimator.calibration.infrared.board_fit import (
     fit_board,
     turned,
 )
+from swarm_loc_estimator.calibration.infrared.dead_elements import ElementVerdicts, find_dead_elements
 from swarm_loc_estimator.calibration.recording import CalibrationError
 from swarm_loc_estimator.core.infrared.board import IrPlatform, PairGains
 from swarm_loc_estimator.core.infrared.brightness import expected
 from swarm_loc_estimator.core.infrared.solution import Outcome
+from swarm_loc_estimator.core.infrared.solvers.gains import Exchanges
 from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
 from swarm_loc_estimator.numerics.arrays import FloatArray
 from swarm_loc_estimator.numerics.se2 import wrap_angle
@@ -34,9 +36,6 @@ _STRAY = (0.0, 0.01, 0.02, 0.03, 0.04, 0.06)
 """Stray light that is tried."""
 _MISFIT = 3.0
 """Where the stock platform's residuals are beyond so many sigmas, its curves are wrong, not the robots."""
-_DEAD_SHARE = 0.2
-"""An element that shows less than this share of the light expected of it is dead."""
-_MIN_LIT = 20
 _TAIL_SHARE, _TAIL_BOUND = 0.97, 11.345
 """Covariances are grown until this share of errors is within the bound that 99 % of normal ones are in."""
 _MAX_SCALE = 30.0
@@ -84,7 +83,7 @@ class BoardCalibration:
         stock_sigma: RMS residual of the platform to begin with, at the true poses [sigma].
         held_out: Errors of the fitted board in blocks that it has not seen.
         with_gains: Whether gains of sensors helped there and are kept.
-        dead_sensors: Robot -> numbers of its dead sensors.
+        elements: Which are dead or shaded, by the fitted board.
         saturation: (n,) the largest count each sensor read, by sensor.
     """
 
@@ -92,7 +91,7 @@ class BoardCalibration:
     stock_sigma: float
     held_out: HeldOut
     with_gains: bool
-    dead_sensors: dict[int, tuple[int, ...]]
+    elements: ElementVerdicts
     saturation: FloatArray
 
     @property
@@ -117,14 +116,15 @@ def calibrate_board(start: IrPlatform, data: BoardReadings, robots: int) -> Boar
             f"{len(data.receiver)} exchanges with ground truth are too few for a board,"
             f" {MIN_EXCHANGES} are the least."
         )
-    dead = dead_sensors(data, robots)
-    alive = without_dead(data, dead)
+    # the curves to begin with may be wrong, and outliers hardly count in a fit
+    first = fit_board(start, data, robots)
+    elements, alive = without_dead(first.platform, data, robots)
     validated = _cross_validated(start, alive, robots)
     stray = min(validated, key=lambda one: validated[one][True].badness)
     tried = validated[stray]
     ranges = {known: one.medians[0] / max(one.solved_share, 0.01) for known, one in tried.items()}
     gains = bool(ranges[True] < ranges[False])
-    model, held = fit_board(start, alive, robots), tried[gains]
+    model, held = fit_board(start, alive, robots) if elements.dead.any() else first, tried[gains]
     # robots whose gains are not known have the platform, too
     scales = [np.quantile(one.nees, _TAIL_SHARE) / _TAIL_BOUND for one in tried.values() if one.nees.size]
     scale = round(float(np.clip(max(scales, default=1.0), 1.0, _MAX_SCALE)), 2)
@@ -132,7 +132,7 @@ def calibrate_board(start: IrPlatform, data: BoardReadings, robots: int) -> Boar
     held = replace(held, nees=held.nees / scale)
     brightest = np.nanmax(np.nan_to_num(data.readings), axis=(0, 2))
     sigma = stock_residual(start, alive)
-    return BoardCalibration(replace(model, platform=platform), sigma, held, gains, dead, brightest)
+    return BoardCalibration(replace(model, platform=platform), sigma, held, gains, elements, brightest)
 
 
 def pair_gains(model: BoardModel, data: BoardReadings, *, known: bool = True) -> PairGains:
@@ -172,31 +172,19 @@ def stock_residual(platform: IrPlatform, data: BoardReadings) -> float:
     )
 
 
-def dead_sensors(data: BoardReadings, robots: int) -> dict[int, tuple[int, ...]]:
-    """Sensors that stay dark whatever faces them, from the exchanges alone: robot -> numbers.
+def without_dead(
+    platform: IrPlatform, data: BoardReadings, robots: int
+) -> tuple[ElementVerdicts, BoardReadings]:
+    """Which elements are dead or shaded, from the exchanges alone, and the exchanges without them.
 
-    A sensor is dead whose brightest readings, their 95 % quantile, are below a fifth of the median of those
-    of the same robot's sensors.
+    The platform's share of readings that something in between darkens counts, too: that of a fitted board is
+    of exchanges with nobody in between.
     """
-    dead: dict[int, tuple[int, ...]] = {}
-    for robot in range(robots):
-        own = data.readings[data.receiver == robot]
-        if len(own) < _MIN_LIT:
-            continue
-        brightest = np.nanquantile(np.nanmax(np.nan_to_num(own), axis=2), 0.95, axis=0)
-        found = np.flatnonzero(brightest < _DEAD_SHARE * np.median(brightest))
-        if found.size:
-            dead[robot] = tuple(found.tolist())
-    return dead
-
-
-def without_dead(data: BoardReadings, dead: dict[int, tuple[int, ...]]) -> BoardReadings:
-    """The exchanges with what dead sensors read left out."""
-    readings = data.readings.copy()
-    for robot, sensors in dead.items():
-        rows: NDArray[np.int64] = np.flatnonzero(data.receiver == robot)
-        readings[np.ix_(rows, np.array(sensors))] = np.nan
-    return data._replace(readings=readings)
+    count = len(data.receiver)
+    limits, unknown = np.full((count, 1), platform.saturation), np.full((count, 3), np.nan)
+    exchanges = Exchanges(data.receiver, data.transmitter, data.readings[:, None], limits, unknown)
+    elements = find_dead_elements(platform, robots, exchanges)
+    return elements, data._replace(readings=elements.without(exchanges).readings[:, 0])
 
 
 def _cross_validated(start: IrPlatform, data: BoardReadings, robots: int) -> dict[float, dict[bool, HeldOut]]:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from swarm_loc_estimator.calibration.infrared.board import BLOCKS, BoardCalibration
 from swarm_loc_estimator.calibration.infrared.board_recording import BoardRecording
+from swarm_loc_estimator.calibration.infrared.plots import dead_lines
 from swarm_loc_estimator.core.description.swarm import Swarm
 from swarm_loc_estimator.core.infrared.curves import AngleCurve, curve_at
 from swarm_loc_estimator.evaluation.report.style import SOFT, TRUTH, colour_of, save, style
@@ -39,7 +40,7 @@ def board_text(board: BoardRecording, done: BoardCalibration, swarm: Swarm) -> s
         f"covariances grown by {platform.covariance_scale:g}",
         f"gains of sensors are {'kept' if done.with_gains else 'not kept'}, by what they do there",
     ]
-    lines += [f"{names[robot]}: dead sensors {list(found)}" for robot, found in done.dead_sensors.items()]
+    lines += dead_lines(done.elements, names)
     turned = np.degrees(done.model.truth_yaw)
     lines.append("yaw ahead of ground truth [deg]: " + ", ".join(map("{} {:+.1f}".format, names, turned)))
     if done.curves_wrong:

@@ -81,7 +81,7 @@ def calibrate_from(
 
 
 def with_board(swarm: Swarm, board: BoardRecording, done: BoardCalibration, path: Path) -> Swarm:
-    """The swarm with the board that was found, in a file at `path`, and robots' gains and dead sensors."""
+    """The swarm with the board that was found, in a file at `path`, and robots' gains and dead elements."""
     robots = list(swarm.robots)
     for place, index in enumerate(board.robots):
         ir = robots[index].ir
@@ -97,7 +97,7 @@ def with_board(swarm: Swarm, board: BoardRecording, done: BoardCalibration, path
             str(path.resolve()),
             ir.estimator,
             gains,
-            done.dead_sensors.get(place, ()),
+            *done.elements.numbers(place),
         )
         robots[index] = replace(robots[index], ir=replace(found, gate_probability=ir.gate_probability))
     return replace(swarm, robots=tuple(robots))

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from swarm_loc_estimator.calibration.infrared.dead_elements import ElementVerdicts
 from swarm_loc_estimator.calibration.infrared.gains import BoardFit, InfraredCalibration, rms
 from swarm_loc_estimator.evaluation.report.style import INK, SOFT, TRUTH, colour_of, save, style
 from swarm_loc_estimator.numerics.arrays import FloatArray
@@ -38,21 +39,21 @@ def text_of(done: InfraredCalibration) -> str:
             f" with ground truth; residuals {before:.2f} before, {after:.2f} after"
         )
         names = [done.swarm.robots[index].name for index in board.group.robots]
-        lines += _elements(board, names) + _limits(board, names)
+        lines += dead_lines(board.elements, names) + _limits(board, names)
     return "\n".join([*lines, *done.remarks])
 
 
-def _elements(board: BoardFit, names: list[str]) -> list[str]:
+def dead_lines(elements: ElementVerdicts, names: list[str]) -> list[str]:
     """A line per robot that has dead elements, and one for elements of which not enough was read."""
     lines = []
     for place, name in enumerate(names):
-        found = zip(("sensors", "emitters"), board.elements.numbers(place), strict=True)
+        found = zip(("sensors", "emitters"), elements.numbers(place), strict=True)
         said = [f"{what} {list(numbers)}" for what, numbers in found if numbers]
         if said:
             lines.append(f"{name}: dead or shaded, left out: {', '.join(said)}")
-    sensors, emitters = board.elements.undecided.sum(axis=(1, 2)).tolist()
+    sensors, emitters = elements.undecided.sum(axis=(1, 2)).tolist()
     if sensors or emitters:
-        count = board.elements.dead[0].size
+        count = elements.dead[0].size
         lines.append(
             f"not enough exchanges to say whether they are dead: {sensors} of {count} sensors,"
             f" {emitters} of {count} emitters"
