@@ -112,12 +112,12 @@ def report(outcomes: dict[str, Outcome], agreement: dict[str, float]) -> None:
 def described(recorded: Recorded, done: BoardCalibration, names: list[str]) -> Path:
     """Write the swarm with a board, gains and dead elements beside the bag; returns the file.
 
-    Dead elements are found in the recording itself.
+    Dead elements are found in the recording itself, from all exchanges: truth tells which pairs are clear.
     """
     folder = recorded.bag.parent
     board = folder / f"{recorded.name}_board.yaml"
     save_ir_platform(done.model.platform, board)
-    elements, _ = without_dead(done.model.platform, recorded.clear, len(names))
+    elements, _ = without_dead(done.model.platform, recorded.data, len(names))
     robots = []
     for robot in recorded.swarm.robots:
         if robot.ir is None:

@@ -127,14 +127,12 @@ def _by_brightness(axis: Any, board: BoardFit) -> None:
         levels, sizes = _sizes(readings, residuals)
         axis.plot(levels, sizes, color=colour, marker=".", label=label)
     platform, limits = board.group.platform, board.limits
-    noise, relative = (
-        np.nanmedian(part) if np.isfinite(part).any() else np.nan
-        for part in (limits.noise, limits.relative_noise)
-    )
-    bright = np.array(levels)
-    repeated = np.hypot(noise, relative * bright) / np.hypot(platform.noise, platform.relative * bright)
-    (line,) = axis.plot(bright, repeated, color=colour_of(2), linewidth=0.8)
+    noise, relative = limits.typical_noise
     if np.isfinite(noise):
+        bright = np.array(levels)
+        repeated = np.hypot(noise, np.nan_to_num(relative) * bright)
+        repeated /= np.hypot(platform.noise, platform.relative * bright)
+        (line,) = axis.plot(bright, repeated, color=colour_of(2), linewidth=0.8)
         axis.legend([line], ["noise where robots stand"], frameon=False, fontsize=9)
     for ceiling in limits.saturation[np.isfinite(limits.saturation)].tolist():
         axis.axvline(ceiling, color=SOFT, linewidth=0.3)

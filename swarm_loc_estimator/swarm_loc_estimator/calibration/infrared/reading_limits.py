@@ -78,6 +78,11 @@ class ReadingLimits:
     noise: FloatArray
     relative_noise: FloatArray
 
+    @property
+    def typical_noise(self) -> tuple[float, float]:
+        """Medians of noise [count] and relative noise of the sensors that tell it; NaN where none does."""
+        return _median_of_known(self.noise), _median_of_known(self.relative_noise)
+
 
 class _Repeats(NamedTuple):
     """Two exchanges in a row of one receiver with one transmitter.
@@ -137,7 +142,7 @@ def contradictions(
     found = []
     if low:
         found.append(f"Sensors saturate lower than board and matrices say: {', '.join(low)}.")
-    noise, relative = _typical(limits.noise), _typical(limits.relative_noise)
+    noise, relative = limits.typical_noise  # NaN contradicts nothing
     if max(noise / platform.noise, platform.noise / noise) > _FACTOR:
         found.append(
             f"Where robots stand, dark readings scatter by {noise:.3g} counts, but noise of the board is"
@@ -151,8 +156,8 @@ def contradictions(
     return found
 
 
-def _typical(values: FloatArray) -> float:
-    """The median of those that there are; NaN, which contradicts nothing, where most are not."""
+def _median_of_known(values: FloatArray) -> float:
+    """The median of the values that are not NaN; NaN where all are."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if known.size else math.nan
 

@@ -44,7 +44,7 @@ _COPIES = 64
 _COPIED_SHARE = 4
 """One of so many bodies is copied, at most."""
 _COPIED_AGAIN = 100
-"""Updates after which other bodies are copied."""
+"""Updates after which other bodies are copied: copies grow old, but each new choice forgets something."""
 _PAIRS_KEPT = 3
 """Pairs of so many updates count as neighbours."""
 _FAR_M = 20.0
