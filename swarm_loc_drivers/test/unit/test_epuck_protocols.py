@@ -277,6 +277,14 @@ def test_a_picture_cut_short_does_not_swallow_the_sensor_values_behind_it() -> N
     assert found == [sensors, *rest]
 
 
+def test_a_picture_that_lacks_bytes_does_not_swallow_the_sensor_values_behind_it() -> None:
+    """Also where it seems to end at a byte that another picture could begin with: seed 1, 473 bytes."""
+    sensors, image, *rest = stream("siss" + "sss", 1)
+    for lost in range(1, 526, 4):
+        found = parsed(StreamParser(), [sensors + image[:1] + image[1 + lost :] + b"".join(rest)])
+        assert [message for message in rest if message not in found] in ([], rest[:1], rest[:2]), lost
+
+
 def test_messages_carry_the_arrival_of_their_first_byte() -> None:
     data = b"".join(stream("sss", 5))
     parser = StreamParser()

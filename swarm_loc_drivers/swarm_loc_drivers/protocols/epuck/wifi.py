@@ -155,7 +155,7 @@ class StreamParser:
             following = self._length_at(length)
             if following == _BAD or (following == _UNDECIDED and (is_image or not self._synced)):
                 length = following
-        if length == _UNDECIDED and is_image and self._holds_sensor_values():
+        if is_image and self._holds_sensor_values():
             return _BAD
         return length
 
@@ -178,9 +178,9 @@ class StreamParser:
         return begin < len(self._buffer) and self._buffer[begin] == IMAGE_ID
 
     def _holds_sensor_values(self) -> bool:
-        """Whether two messages of sensor values in a row lie within an image: then its end was lost."""
+        """Whether two messages of sensor values in a row lie within an image: then part of it was lost."""
         size = 1 + _SIZES[SENSORS_ID]
-        last = len(self._buffer) - 2 * size
+        last = min(len(self._buffer), 1 + IMAGE_SIZE) - 2 * size
         candidate = self._buffer.find(SENSORS_ID, max(1, self._searched))
         while 0 <= candidate <= last:
             after = candidate + size
