@@ -22,6 +22,8 @@ import numpy as np
 
 _TUNSETIFF, _IFF_TUN, _IFF_NO_PI = 0x400454CA, 0x0001, 0x1000
 _LARGEST = 65536
+_MAX_WAITING = 10_000
+"""Packets; what is more is lost, as in any radio's queue."""
 
 
 def _opened(device: str) -> int:
@@ -32,20 +34,25 @@ def _opened(device: str) -> int:
 
 
 def forward(device: int, other: socket.socket, delay_s: tuple[float, float], loss: float, seed: int) -> None:
-    """Hand packets on for ever; `delay_s` is the least and by how much it differs at most."""
+    """Hand packets on for ever; `delay_s` is the least and by how much it differs at most.
+
+    Nothing waits for room at the other end: two ends that did so, both full, would wait for each other.
+    """
     rng = np.random.default_rng(seed)
     waiting: list[tuple[float, bytes]] = []
+    other.setblocking(False)
     while True:
-        timeout_s = max(0.0, waiting[0][0] - time.monotonic()) if waiting else None
-        ready, _, _ = select.select([device, other.fileno()], [], [], timeout_s)
+        due_in_s = waiting[0][0] - time.monotonic() if waiting else None
+        due = due_in_s is not None and due_in_s <= 0.0
+        ready, room, _ = select.select([device, other], [other] if due else [], [], None if due else due_in_s)
         if device in ready:
             packet = os.read(device, _LARGEST)
-            if rng.random() >= loss:
+            if rng.random() >= loss and len(waiting) < _MAX_WAITING:
                 due_s = time.monotonic() + delay_s[0] + delay_s[1] * rng.random()
                 heapq.heappush(waiting, (due_s, packet))
-        if other.fileno() in ready:
+        if other in ready:
             os.write(device, other.recv(_LARGEST))
-        while waiting and waiting[0][0] <= time.monotonic():
+        if room:
             other.send(heapq.heappop(waiting)[1])
 
 
