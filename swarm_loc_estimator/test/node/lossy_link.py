@@ -9,6 +9,7 @@ device. The kernel's own means for it, netem, is missing on many machines.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import heapq
 import os
@@ -33,6 +34,15 @@ def _opened(device: str) -> int:
     return number
 
 
+def _put(device: int, packet: bytes) -> None:
+    """Let a packet arrive; at a device that is down it is lost."""
+    try:
+        os.write(device, packet)
+    except OSError as error:
+        if error.errno != errno.EIO:
+            raise
+
+
 def forward(device: int, other: socket.socket, delay_s: tuple[float, float], loss: float, seed: int) -> None:
     """Hand packets on for ever; `delay_s` is the least and by how much it differs at most.
 
@@ -51,7 +61,7 @@ def forward(device: int, other: socket.socket, delay_s: tuple[float, float], los
                 due_s = time.monotonic() + delay_s[0] + delay_s[1] * rng.random()
                 heapq.heappush(waiting, (due_s, packet))
         if other in ready:
-            os.write(device, other.recv(_LARGEST))
+            _put(device, other.recv(_LARGEST))
         if room:
             other.send(heapq.heappop(waiting)[1])
 
@@ -59,9 +69,9 @@ def forward(device: int, other: socket.socket, delay_s: tuple[float, float], los
 def main() -> None:
     """Be one end until killed."""
     device, number, delay_s, jitter_s, loss, seed = sys.argv[1:]
-    other = socket.socket(fileno=int(number))
+    opened, other = _opened(device), socket.socket(fileno=int(number))
     print("up", flush=True)
-    forward(_opened(device), other, (float(delay_s), float(jitter_s)), float(loss), int(seed))
+    forward(opened, other, (float(delay_s), float(jitter_s)), float(loss), int(seed))
 
 
 if __name__ == "__main__":

@@ -45,6 +45,7 @@ class Machines:
 
     def __init__(self, stack: ExitStack, radio: Radio | None = None) -> None:
         self._tag, self._stack = f"sl{os.getpid()}", stack
+        self._ends: dict[str, _Ends] = {}
         self.address = {"robots": "10.77.1.2", "estimator": "10.77.2.2"}
         self.gateway = {"robots": "10.77.1.1", "estimator": "10.77.2.1"}
         for name in ("router", *self.address):
@@ -60,6 +61,7 @@ class Machines:
             for (machine, link), own in zip(ends, (address, self.gateway[name]), strict=True):
                 self._in(machine, "ip", "addr", "add", f"{own}/24", "dev", link)
                 self._in(machine, "ip", "link", "set", link, "up")
+            self._ends[name] = ends
             self._in(name, "ip", "route", "add", "default", "via", self.gateway[name])
         self._in("router", "sysctl", "-qw", "net.ipv4.ip_forward=1")
 
@@ -89,6 +91,11 @@ class Machines:
             **({"ROS_DISCOVERY_SERVER": f"{self.gateway[name]}:{PORT}"} if server else {}),
         }
         return self._run(name, command, env)
+
+    def switch(self, name: str, state: str) -> None:
+        """Set the router's end of a machine's link `up` or `down`."""
+        router, link = self._ends[name][1]
+        self._in(router, "ip", "link", "set", link, state)
 
     def _run(
         self, name: str, command: list[str], env: Mapping[str, str], pass_fds: tuple[int, ...] = ()

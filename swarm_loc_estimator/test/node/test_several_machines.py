@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -50,6 +51,27 @@ def said_until(process: subprocess.Popen[str], *texts: str) -> str:
     return said
 
 
+def knock(machines: Machines, name: str) -> subprocess.Popen[str]:
+    """Send a packet to the router each tenth of a second, say "sent", and "answered" at its first answer."""
+    code = f"""
+import socket
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as knocking:
+    knocking.settimeout(0.1)
+    knocking.connect(("{machines.gateway[name]}", 9))
+    while True:
+        try:
+            knocking.send(b"x")
+            print("sent", flush=True)
+            knocking.recv(1)
+        except ConnectionRefusedError:
+            break
+        except TimeoutError:
+            pass
+print("answered", flush=True)
+"""
+    return machines.start(name, [sys.executable, "-c", code], server=False)
+
+
 def estimator() -> list[str]:
     parameters: dict[str, ParameterValue] = {"swarm_file": str(BAG / "swarm.yaml"), "use_sim_time": True}
     return node_command(NodeSpec("swarm_loc_estimator", "estimator_node", "estimator", parameters=parameters))
@@ -77,6 +99,19 @@ def test_a_discovery_server_joins_what_a_router_parts(machines: Machines, tmp_pa
     assert playing.wait(PATIENCE_S) == 0
     assert "played" in said
     assert "not everything was received" not in said  # the estimator has acknowledged each message
+
+
+@pytest.mark.parametrize("machines", [Radio(0.02, 0.03, 0.05)], indirect=True, ids=["radio"])
+def test_a_radio_goes_on_when_its_far_end_has_been_down(machines: Machines) -> None:
+    assert "answered" in said_until(knock(machines, "robots"), "answered")
+    machines.switch("robots", "down")
+    knocking = knock(machines, "robots")
+    for _ in range(10):
+        assert "answered" not in said_until(knocking, "sent")
+
+    machines.switch("robots", "up")
+
+    assert "answered" in said_until(knocking, "answered")
 
 
 def test_without_it_they_do_not_find_each_other(machines: Machines, tmp_path: Path) -> None:
