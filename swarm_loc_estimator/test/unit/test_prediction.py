@@ -11,7 +11,7 @@ from swarm_loc_estimator.core.description.estimated_parameters import (
     ParameterTable,
 )
 from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot
-from swarm_loc_estimator.core.filter.prediction import predict, write_predicted
+from swarm_loc_estimator.core.filter.prediction import new_scratch, predict, write_predicted
 from swarm_loc_estimator.core.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
@@ -51,7 +51,7 @@ def preintegrated(tracks: OdometryTracks, robot: int, stamp_ns: int) -> Preinteg
 
 def to(state: SwarmState, tracks: OdometryTracks, seconds: float, robot: int = 0) -> None:
     stamp_ns = T0 + round(seconds * 1e9)
-    predict(state.arrays(), robot, preintegrated(tracks, robot, stamp_ns))
+    predict(state.arrays(), robot, preintegrated(tracks, robot, stamp_ns), new_scratch())
 
 
 @pytest.mark.parametrize(("speed", "turn_rate"), [(0.1, 0.0), (0.1, 0.4)])
@@ -96,7 +96,7 @@ def test_the_read_out_is_what_the_prediction_would_be() -> None:
     before = state.copy()
     at = preintegrated(tracks, 0, T0 + 3 * SECOND)
     transform, covariance = np.empty(3), np.empty((3, 3))
-    write_predicted(state.arrays(), 0, at, transform, covariance)
+    write_predicted(state.arrays(), 0, at, new_scratch(), transform, covariance)
     np.testing.assert_array_equal(state.transform, before.transform)
     np.testing.assert_array_equal(state.filter.covariance, before.filter.covariance)
     to(state, tracks, 3.0)

@@ -24,7 +24,7 @@ from swarm_loc_estimator.core.description.swarm import (
 from swarm_loc_estimator.core.filter.batch_update import related_columns
 from swarm_loc_estimator.core.filter.joint_filter import Robots
 from swarm_loc_estimator.core.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns
-from swarm_loc_estimator.core.filter.prediction import predict
+from swarm_loc_estimator.core.filter.prediction import new_scratch, predict
 from swarm_loc_estimator.core.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.core.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
@@ -91,7 +91,7 @@ class Both:
             to = Preintegrated(self.now_ns, self.covariance[robot].copy(), self.jacobian[robot].copy())
             for state in self.states:
                 if state.tracked[robot]:
-                    predict(state.arrays(), robot, to)
+                    predict(state.arrays(), robot, to, new_scratch())
 
     def update(self, pairs: IntArray) -> tuple[FloatArray, FloatArray]:
         """Use a measurement of each pair (m, 2), N + l being landmark l; return the sparse filter's gaps.

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.core.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.core.filter.integrity.divergence import CONFIRMED, add_hidden_errors
 from swarm_loc_estimator.core.filter.integrity.surprises import is_contradicted
-from swarm_loc_estimator.core.filter.prediction import write_predicted
+from swarm_loc_estimator.core.filter.prediction import new_scratch, write_predicted
 from swarm_loc_estimator.core.filter.state import SwarmState
 from swarm_loc_estimator.core.odometry.look_up import look_up, new_sample
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated, TrackArrays
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import compiled, inlined
 from swarm_loc_estimator.numerics.se2_scalar import composed, wrap
 
 
@@ -84,7 +84,7 @@ def _new_estimate(now_ns: int, robots: int) -> SwarmEstimate:
 @compiled
 def _write_all(belief: BeliefArrays, tracks: TrackArrays, timeout_s: FloatArray, out: SwarmEstimate) -> None:
     """Fill an estimate."""
-    sample, t, error = new_sample(1), np.empty(3), np.empty((3, 3))
+    sample, scratch, t, error = new_sample(1), new_scratch(), np.empty(3), np.empty((3, 3))
     track, raw = sample.pose[0], sample.raw[0]
     for i in range(belief.tracked.size):
         if belief.last_fix_ns[i] != NEVER_NS:
@@ -94,7 +94,7 @@ def _write_all(belief: BeliefArrays, tracks: TrackArrays, timeout_s: FloatArray,
         look_up(tracks, i, out.stamp_ns, sample, 0)
         out.status[i] = _status(belief.integrity, i, sample.silence_s[0] > timeout_s[i])
         to = Preintegrated(out.stamp_ns, sample.covariance[0], sample.jacobian[0])
-        write_predicted(belief, i, to, t, error)
+        write_predicted(belief, i, to, scratch, t, error)
         x, y, theta = composed(t[0], t[1], t[2], track[0], track[1], track[2])
         out.poses[i, 0], out.poses[i, 1], out.poses[i, 2] = x, y, wrap(theta)
         _pose_covariance(x, y, error, out.covariances[i])
@@ -105,7 +105,7 @@ def _write_all(belief: BeliefArrays, tracks: TrackArrays, timeout_s: FloatArray,
         out.map_to_odom[i, 2] = wrap(theta - raw[2])
 
 
-@compiled
+@inlined
 def _status(integrity: IntegrityArrays, robot: int, silent: bool) -> int:
     """The status of a robot that is located."""
     if silent:
@@ -115,7 +115,7 @@ def _status(integrity: IntegrityArrays, robot: int, silent: bool) -> int:
     return _CONTRADICTED if is_contradicted(integrity, robot) else _TRACKED
 
 
-@compiled
+@inlined
 def _pose_covariance(x: float, y: float, error: FloatArray, out: FloatArray) -> None:
     """Write the covariance (3, 3) of x, y, theta from that of the right-invariant error."""
     shear = (-y, x, 0.0)

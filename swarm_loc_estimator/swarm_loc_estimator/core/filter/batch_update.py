@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from swarm_loc_estimator.core.description.estimated_parameters import CAMERA_SCALE, CAMERA_YAW
+from swarm_loc_estimator.core.filter import prediction
 from swarm_loc_estimator.core.filter.belief import BeliefArrays, to_map
 from swarm_loc_estimator.core.filter.innovation import (
     InnovationBatch,
@@ -21,7 +22,6 @@ from swarm_loc_estimator.core.filter.integrity.divergence import (
 )
 from swarm_loc_estimator.core.filter.integrity.surprises import assess, is_set_aside
 from swarm_loc_estimator.core.filter.measurement_model import MeasurementColumns
-from swarm_loc_estimator.core.filter.prediction import predict
 from swarm_loc_estimator.core.odometry.look_up import look_up, look_up_pose, new_sample
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated, TrackArrays
 from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -51,12 +51,14 @@ def predict_all(
         uncertain: (N,) written: robots involved that no longer know where they are.
     """
     involved, sample = np.zeros(belief.tracked.size, dtype=np.bool_), new_sample(1)
+    scratch = prediction.new_scratch()
     for k in range(measurements.stamp_ns.size):
         for robot in (measurements.observer[k], measurements.target[k]):
             if robot >= 0 and not involved[robot]:
                 involved[robot] = True
                 look_up(tracks, robot, stamp_ns, sample, 0)
-                predict(belief, robot, Preintegrated(stamp_ns, sample.covariance[0], sample.jacobian[0]))
+                to = Preintegrated(stamp_ns, sample.covariance[0], sample.jacobian[0])
+                prediction.predict(belief, robot, to, scratch)
     for k in range(measurements.stamp_ns.size):
         _write_poses(measurements, k, tracks, belief, limits, batch, uncertain)
 

@@ -51,55 +51,82 @@ class _Drift(NamedTuple):
 
 
 @compiled
-def predict(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
-    """Predict a robot, in place, to an instant."""
-    added = np.empty((3, 3))
-    if not _new_noise(belief, robot, to.covariance, added):
+def new_scratch() -> FloatArray:
+    """Room (3, 3, 3) to predict in: memory of its own for each robot would cost more."""
+    return np.empty((3, 3, 3))
+
+
+@inlined
+def predict(belief: BeliefArrays, robot: int, to: Preintegrated, scratch: FloatArray) -> None:
+    """Predict a robot, in place, to an instant; `scratch` is from `new_scratch`."""
+    if not _new_noise(belief, robot, to.covariance, scratch):
         return
     if _has_drives(belief, robot):
-        drift = _new_drift(belief, robot, to)
-        _move(drift.twist, belief.transform[robot])
-        _drive(belief, robot, drift)
-    own, first = own_covariance(belief, robot), own_column(belief, robot, 0)
+        _drive(belief, robot, to)
+    whole, own, first = belief.covariance, belief.marginal, 3 * robot
     for i in range(3):
         for j in range(3):
-            own[first + i, first + j] += added[i, j]
+            if whole.shape[0] > 0:
+                whole[first + i, first + j] += scratch[0, i, j]
+            else:
+                own[robot, i, j] += scratch[0, i, j]
     assign_matrix(belief.preintegrated_covariance[robot], to.covariance)
     assign_matrix(belief.preintegrated_jacobian[robot], to.jacobian)
     belief.predicted_to_ns[robot] = max(to.stamp_ns, belief.predicted_to_ns[robot])
 
 
-@compiled
+@inlined
 def write_predicted(
-    belief: BeliefArrays, robot: int, to: Preintegrated, transform: FloatArray, covariance: FloatArray
+    belief: BeliefArrays,
+    robot: int,
+    to: Preintegrated,
+    scratch: FloatArray,
+    transform: FloatArray,
+    covariance: FloatArray,
 ) -> None:
-    """Write T (3,) and the covariance (3, 3) of its error where `predict` would take them; change nothing."""
-    added = np.empty((3, 3))
+    """Write T (3,) and the covariance (3, 3) of its error where `predict` would take them; change nothing.
+
+    Args:
+        belief: Where all are.
+        robot: Whose T it is.
+        to: The instant.
+        scratch: From `new_scratch`.
+        transform: (3,) written.
+        covariance: (3, 3) written.
+    """
     assign(transform, belief.transform[robot])
     for i in range(3):
         for j in range(3):
             covariance[i, j] = covariance_within(belief, 3 * robot, i, j)
-    if not _new_noise(belief, robot, to.covariance, added):
+    if not _new_noise(belief, robot, to.covariance, scratch):
         return
     if _has_drives(belief, robot):
-        drift = _new_drift(belief, robot, to)
-        _move(drift.twist, transform)
-        columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))
-        count = _own(belief, robot, drift, columns, weight)
-        _block(own_covariance(belief, robot), columns, weight, count, drift, covariance)
+        _write_drifted(belief, robot, to, transform, covariance)
     for i in range(3):
         for j in range(3):
-            covariance[i, j] += added[i, j]
+            covariance[i, j] += scratch[0, i, j]
 
 
 @compiled
-def _new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, added: FloatArray) -> bool:
-    """Write Ad(T) (G2 - G1) Ad(T)^T (3, 3) and return True; or leave it when that is no covariance.
+def _write_drifted(
+    belief: BeliefArrays, robot: int, to: Preintegrated, transform: FloatArray, covariance: FloatArray
+) -> None:
+    """Move T (3,) as the parameters of its motion do, and write the covariance (3, 3) of its error there."""
+    drift = _new_drift(belief, robot, to)
+    _move(drift.twist, transform)
+    columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))
+    count = _own(belief, robot, drift, columns, weight)
+    _block(own_covariance(belief, robot), columns, weight, count, drift, covariance)
 
-    The latter happens only when odometry comes so late that more was assumed of a silence beyond the horizon.
+
+@inlined
+def _new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, scratch: FloatArray) -> bool:
+    """Write Ad(T) (G2 - G1) Ad(T)^T to `scratch[0]`, and return whether it is a covariance.
+
+    It is none only when odometry comes so late that more was assumed of a silence beyond the horizon.
     """
-    before = belief.preintegrated_covariance[robot]
-    difference, work, rounding = np.empty((3, 3)), np.empty((3, 3)), 1e-12
+    before, difference, work = belief.preintegrated_covariance[robot], scratch[1], scratch[2]
+    rounding = 1e-12
     for i in range(3):
         rounding += 1e-9 * abs(noise[i, i] - before[i, i])
     for i in range(3):
@@ -109,7 +136,7 @@ def _new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, added: Float
     first, _, second, _, _, third = factor_numbers(work)
     if not math.isfinite(first + second + third):
         return False
-    carry(belief.transform[robot], difference, added)
+    carry(belief.transform[robot], difference, scratch[0])
     return True
 
 
@@ -179,8 +206,10 @@ def _block(
 
 
 @compiled
-def _drive(belief: BeliefArrays, robot: int, drift: _Drift) -> None:
-    """Apply a drift to the covariance of the pose's error with everything, and let the bias decay."""
+def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
+    """Apply the drift to T and to the covariance of its error with everything, and let the bias decay."""
+    drift = _new_drift(belief, robot, to)
+    _move(drift.twist, belief.transform[robot])
     first, p = own_column(belief, robot, 0), own_covariance(belief, robot)
     size = p.shape[0]
     columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))

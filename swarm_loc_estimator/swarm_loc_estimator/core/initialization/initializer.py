@@ -14,7 +14,7 @@ import numpy as np
 from swarm_loc_estimator.core.description.estimated_parameters import CAMERA_SCALE, CAMERA_YAW
 from swarm_loc_estimator.core.filter.integrity.divergence import CONFIRMED
 from swarm_loc_estimator.core.filter.measurement_model import NOBODY, MeasurementArray
-from swarm_loc_estimator.core.filter.prediction import predict
+from swarm_loc_estimator.core.filter.prediction import new_scratch, predict
 from swarm_loc_estimator.core.filter.state import SwarmState
 from swarm_loc_estimator.core.initialization.alignment import HEADING_SIGMA, MIN_CONSTRAINTS, align
 from swarm_loc_estimator.core.initialization.constraints import (
@@ -96,6 +96,6 @@ class Initializer:
         sample = self._tracks.at(np.array([other]), one["stamp_ns"])
         at = Preintegrated(int(one["stamp_ns"][0]), sample.covariance[0], sample.jacobian[0])
         # so that how it erred until now is shared by all that are located by it
-        predict(state.arrays(), other, at)
+        predict(state.arrays(), other, at, new_scratch())
         transform = state.transform[other].copy()
         return OtherSide(other, -1, se2.compose(transform, sample.pose[0]), transform, at.covariance)

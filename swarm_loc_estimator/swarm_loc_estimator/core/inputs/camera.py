@@ -25,7 +25,7 @@ from swarm_loc_estimator.core.filter.measurement_model import (
     MeasurementColumns,
 )
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import compiled, inlined
 from swarm_loc_estimator.numerics.small_matrix import assign
 
 CONTENT_POSITION = 1
@@ -211,7 +211,7 @@ def _convert_all(
         out.covariance[k, 1, 1] += markers.variance[place]
 
 
-@compiled
+@inlined
 def _fate(
     detections: _Detections, k: int, cameras: _Cameras, markers: _Markers, robot: int, place: int
 ) -> int:

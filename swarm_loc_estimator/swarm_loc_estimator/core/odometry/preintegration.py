@@ -17,7 +17,7 @@ from swarm_loc_estimator.core.odometry.process_noise import (
     add_step_noise,
 )
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import compiled, inlined
 from swarm_loc_estimator.numerics.se2_scalar import wrap
 from swarm_loc_estimator.numerics.small_matrix import add_scaled, assign, assign_matrix
 
@@ -150,7 +150,7 @@ def integrate(
             assign(tracks.pose[robot, 0], raw[k])
             tracks.covariance[robot, 0].fill(0.0)
             tracks.jacobian[robot, 0].fill(0.0)
-            assign(tracks.rate[robot, 0], np.zeros(3))
+            tracks.rate[robot, 0].fill(0.0)
             assign(tracks.begin_pose[robot], raw[k])
             tracks.begin_ns[robot] = tracks.known_ns[robot, 0] = stamps_ns[k]
             tracks.jump_ns[robot, 0, 0] = tracks.jump_ns[robot, 0, 1] = BEFORE_ALL_NS // 2
@@ -163,7 +163,7 @@ def integrate(
     return duplicates, jumps
 
 
-@compiled
+@inlined
 def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
     """Fill a row from the row before and its raw pose; return whether no robot can drive so fast."""
     model = tracks.model[robot]
@@ -187,13 +187,9 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
     contradictory = stamp_ns - jumps_ns[1] < _CONTRADICTORY_NS
     if jump or contradictory or duration_s > model.timeout_s:  # where it went is unknown
         assign(tracks.pose[robot, row], start)
-        assign(rate, np.zeros(3))
-        before_s, now_s = (tracks.stamp_ns[robot, row - 1] - known_ns) * 1e-9, (stamp_ns - known_ns) * 1e-9
-        add_silence(model, now_s, True, start, rate, covariance)
-        if before_s > 0.0:  # it has grown so far already
-            known = np.zeros((3, 3))
-            add_silence(model, before_s, True, start, rate, known)
-            add_scaled(covariance, known, -1.0)
+        rate.fill(0.0)
+        unknown_s = (tracks.stamp_ns[robot, row - 1] - known_ns) * 1e-9, (stamp_ns - known_ns) * 1e-9
+        _add_unknown(model, unknown_s, (start, rate), covariance)
         tracks.known_ns[robot, row] = known_ns if contradictory else stamp_ns
         return bool(jump)
     tracks.known_ns[robot, row] = stamp_ns
@@ -219,6 +215,28 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
 
 
 @compiled
+def _add_unknown(
+    model: OdometryModel,
+    unknown_s: tuple[float, float],
+    at: tuple[FloatArray, FloatArray],
+    covariance: FloatArray,
+) -> None:
+    """Add the noise of a motion that goes on being unknown, at a pose (3,) and rate (3,).
+
+    Args:
+        model: The robot's.
+        unknown_s: For how long it was unknown at the row before, and at this one [s].
+        at: The pose and the rate.
+        covariance: (3, 3) added to.
+    """
+    add_silence(model, unknown_s[1], True, at[0], at[1], covariance)
+    if unknown_s[0] > 0.0:  # it has grown so far already
+        known = np.zeros((3, 3))
+        add_silence(model, unknown_s[0], True, at[0], at[1], known)
+        add_scaled(covariance, known, -1.0)
+
+
+@inlined
 def _true_motion(
     tracks: TrackArrays,
     robot: int,
@@ -238,30 +256,39 @@ def _true_motion(
     if model.lag_s > 0.0:
         remaining = math.exp(-duration_s / model.lag_s)
         mean = (1.0 - remaining) * model.lag_s / duration_s
-    moved = np.empty(3)
-    for k in range(3):
-        behind = before_rate[k] - true_rate[k]
-        rate[k] = true_rate[k] + remaining * behind
-        moved[k] = (true_rate[k] + mean * behind) * duration_s
-    return moved[0], moved[1], moved[2]
+    forward, left, turn = (
+        before_rate[0] - true_rate[0],
+        before_rate[1] - true_rate[1],
+        before_rate[2] - true_rate[2],
+    )
+    rate[0], rate[1] = true_rate[0] + remaining * forward, true_rate[1] + remaining * left
+    rate[2] = true_rate[2] + remaining * turn
+    return (
+        (true_rate[0] + mean * forward) * duration_s,
+        (true_rate[1] + mean * left) * duration_s,
+        (true_rate[2] + mean * turn) * duration_s,
+    )
 
 
-@compiled
+@inlined
 def _response(tracks: TrackArrays, robot: int, speed: float, turn_rate: float) -> tuple[float, float]:
     """Shares of speed and turn rate that are true, bilinear in the grid of the robot's response."""
     i, a = _bracket(tracks.response_speed[robot], speed)
     j, b = _bracket(tracks.response_turn_rate[robot], turn_rate)
     table = tracks.response[robot]
-    ii, jj = min(i + 1, table.shape[1] - 1), min(j + 1, table.shape[2] - 1)
-    shares = np.empty(2)
-    for k in range(2):
-        low = table[k, i, j] * (1.0 - b) + table[k, i, jj] * b
-        high = table[k, ii, j] * (1.0 - b) + table[k, ii, jj] * b
-        shares[k] = low * (1.0 - a) + high * a
-    return shares[0], shares[1]
+    return _bilinear(table[0], i, j, a, b), _bilinear(table[1], i, j, a, b)
 
 
-@compiled
+@inlined
+def _bilinear(table: FloatArray, i: int, j: int, a: float, b: float) -> float:
+    """A number of a table (V, W), by shares a and b of the way to the next row and column."""
+    ii, jj = min(i + 1, table.shape[0] - 1), min(j + 1, table.shape[1] - 1)
+    low: float = table[i, j] * (1.0 - b) + table[i, jj] * b
+    high: float = table[ii, j] * (1.0 - b) + table[ii, jj] * b
+    return low * (1.0 - a) + high * a
+
+
+@inlined
 def _bracket(axis: FloatArray, value: float) -> tuple[int, float]:
     """The interval of an ascending axis nearest to the value, and how far in the value lies (0 to 1)."""
     i = max(0, min(np.searchsorted(axis, value, side="right") - 1, axis.size - 1))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_estimator.core.filter import prediction
 from swarm_loc_estimator.core.filter.belief import BeliefArrays, correct, to_map
 from swarm_loc_estimator.core.filter.correlated_noise import record_pair
 from swarm_loc_estimator.core.filter.dense.covariance import update_one
@@ -17,7 +18,6 @@ from swarm_loc_estimator.core.filter.integrity.divergence import (
 )
 from swarm_loc_estimator.core.filter.integrity.surprises import assess, is_set_aside
 from swarm_loc_estimator.core.filter.measurement_model import SET_POSE, MeasurementColumns
-from swarm_loc_estimator.core.filter.prediction import predict
 from swarm_loc_estimator.core.odometry.look_up import look_up, new_sample
 from swarm_loc_estimator.core.odometry.preintegration import Preintegrated, TrackArrays
 from swarm_loc_estimator.numerics.arrays import FloatArray
@@ -56,7 +56,7 @@ def update_in_order(
     Returns:
         The first measurement not dealt with, why, and the robot or landmark that it is about.
     """
-    batch, sample, scratch = new_batch(1), new_sample(2), new_scratch()
+    batch, sample, scratch, room = new_batch(1), new_sample(2), new_scratch(), prediction.new_scratch()
     pose = batch.pose[0]
     for k in range(begin, measurements.stamp_ns.size):
         sides = (measurements.observer[k], measurements.target[k])
@@ -67,7 +67,7 @@ def update_in_order(
             if sides[i] >= 0:
                 look_up(tracks, sides[i], measurements.stamp_ns[k], sample, i)
                 to = Preintegrated(measurements.stamp_ns[k], sample.covariance[i], sample.jacobian[i])
-                predict(belief, sides[i], to)
+                prediction.predict(belief, sides[i], to, room)
                 assign(pose[i], sample.pose[i])
                 to_map(belief, sides[i], pose[i])
                 if is_uncertain(belief, sides[i], pose[i], limits):

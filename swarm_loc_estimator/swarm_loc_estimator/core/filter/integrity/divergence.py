@@ -80,7 +80,7 @@ def is_uncertain(belief: BeliefArrays, robot: int, pose: FloatArray, limits: Los
     return uncertain
 
 
-@compiled
+@inlined
 def add_hidden_errors(state: IntegrityArrays, robot: int, covariance: FloatArray) -> None:
     """Add to a pose's covariance (3, 3) what its sensors may hide."""
     if state.doubt[robot] > _DOUBTFUL or state.confirmations[robot] < WELL_CONFIRMED:

@@ -193,11 +193,12 @@ def small_variances(kind: int, predicted: FloatArray) -> tuple[float, float]:
     return small, (small / max(distance * distance, 1e-6) if kind == POLAR else small)
 
 
-@compiled
+@inlined
 def is_elsewhere(state: IntegrityArrays, robot: int, within_ns: int = RECENT_NS) -> bool:
     """Whether most of what a robot has measured last can only mean that it is somewhere else."""
-    newest_ns = state.source_ns[robot].max()
-    elsewhere, count = 0, 0
+    newest_ns, elsewhere, count = state.source_ns[robot, 0], 0, 0
+    for place in range(state.source.shape[1]):
+        newest_ns = max(newest_ns, state.source_ns[robot, place])
     for place in range(state.source.shape[1]):
         recent = newest_ns - state.source_ns[robot, place] < within_ns
         if recent and state.source[robot, place] >= 0 and state.evidence[robot, place] < _ASIDE:
@@ -206,7 +207,7 @@ def is_elsewhere(state: IntegrityArrays, robot: int, within_ns: int = RECENT_NS)
     return 2 * elsewhere > count
 
 
-@compiled
+@inlined
 def is_contradicted(state: IntegrityArrays, robot: int) -> bool:
     """Whether the newest measurements speak against a robot's pose: it is not told as tracked."""
     contradicted: bool = (
