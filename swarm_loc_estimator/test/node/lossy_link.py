@@ -48,19 +48,19 @@ def forward(device: int, other: socket.socket, delay_s: tuple[float, float], los
 
     Nothing waits for room at the other end: two ends that did so, both full, would wait for each other.
     """
-    rng, ends = np.random.default_rng(seed), (device, other.fileno())
+    rng, far = np.random.default_rng(seed), other.fileno()
     waiting: list[tuple[float, bytes]] = []
     other.setblocking(False)
     while True:
         due_in_s = waiting[0][0] - time.monotonic() if waiting else None
         due = due_in_s is not None and due_in_s <= 0.0
-        ready, room, _ = select.select(ends, ends[1:] if due else (), (), None if due else due_in_s)
+        ready, room, _ = select.select((device, far), (far,) if due else (), (), None if due else due_in_s)
         if device in ready:
             packet = os.read(device, _LARGEST)
             if rng.random() >= loss and len(waiting) < _MAX_WAITING:
                 due_s = time.monotonic() + delay_s[0] + delay_s[1] * rng.random()
                 heapq.heappush(waiting, (due_s, packet))
-        if other.fileno() in ready:
+        if far in ready:
             _put(device, other.recv(_LARGEST))
         if room:
             other.send(heapq.heappop(waiting)[1])
