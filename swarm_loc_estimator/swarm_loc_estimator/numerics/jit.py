@@ -56,20 +56,22 @@ def compiled(function: Function) -> Function:
     return _compiled(function, fastmath=False)
 
 
-def inlined(function: Function) -> Function:
-    """The same for functions of large tuples of arrays, written out where they are called.
+def borrowing(function: Function) -> Function:
+    """The same for functions of large tuples of arrays, to whose arrays no references are counted.
 
-    A call, and numba's counting of references to every array touched, would cost more than the arithmetic. So
-    nothing is counted within: such a function borrows the arrays of its caller. It cannot allocate one, which
-    does not compile; and it and all that it calls return numbers, for nobody would release an array.
+    Numba's counting for every array touched would cost more than the arithmetic. So nothing is counted
+    within: such a function borrows the arrays of its caller. It cannot allocate one, which does not compile;
+    and it and all that it calls return numbers, for nobody would release an array.
 
     Raises:
         TypeError: It is declared to return something else.
     """
-    returned = inspect.formatannotation(function.__annotations__["return"])
-    if not _NUMBERS.issuperset(re.findall(r"\w+", returned)):
-        raise TypeError(f"{function.__qualname__} returns {returned}: inlined functions return numbers only")
-    return _compiled(function, fastmath=False, forceinline=True)
+    return _borrowing(function, forceinline=False)
+
+
+def inlined(function: Function) -> Function:
+    """The same as `borrowing`, and written out where it is called, if even the call would cost too much."""
+    return _borrowing(function, forceinline=True)
 
 
 def compiled_sums(function: Function) -> Function:
@@ -77,7 +79,18 @@ def compiled_sums(function: Function) -> Function:
     return _compiled(function, fastmath={"reassoc", "contract"})
 
 
-def _compiled(function: Function, *, fastmath: bool | set[str], forceinline: bool = False) -> Function:
+def _borrowing(function: Function, *, forceinline: bool) -> Function:
+    returned = inspect.formatannotation(function.__annotations__["return"])
+    if not _NUMBERS.issuperset(re.findall(r"\w+", returned)):
+        raise TypeError(
+            f"{function.__qualname__} returns {returned}: functions that borrow return numbers only"
+        )
+    return _compiled(function, fastmath=False, forceinline=forceinline, nrt=False)
+
+
+def _compiled(
+    function: Function, *, fastmath: bool | set[str], forceinline: bool = False, nrt: bool = True
+) -> Function:
     """Compile a function, with a cache of its module."""
     # one cache, whether a package is found by a link or not: numba has another one for every path
     source = Path(function.__code__.co_filename).resolve()
@@ -89,7 +102,7 @@ def _compiled(function: Function, *, fastmath: bool | set[str], forceinline: boo
         error_model="numpy",
         fastmath=fastmath,
         forceinline=forceinline,
-        _nrt=not forceinline,
+        _nrt=nrt,
     )
     return cast("Function", compiler(function))
 

@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from swarm_loc_estimator.core.infrared.board import IrPlatform, PairGains
+from swarm_loc_estimator.core.infrared.board import IrModel, IrPlatform, PairGains
 from swarm_loc_estimator.core.infrared.brightness import expected
+from swarm_loc_estimator.core.infrared.solvers.cost import Pair, new_costs, write_costs
+from swarm_loc_estimator.core.infrared.solvers.readings import classify
 from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
@@ -96,3 +98,30 @@ def nees(errors: FloatArray, covariances: FloatArray) -> FloatArray:
     """(k,) normalised errors squared."""
     solved = np.linalg.solve(covariances, errors[..., None])[..., 0]
     return np.asarray(np.sum(errors * solved, axis=-1))
+
+
+def pair_of(
+    model: IrModel,
+    readings: FloatArray,
+    saturation: float,
+    gains: FloatArray | None = None,
+    prior: FloatArray | None = None,
+) -> Pair:
+    """A pair's readings (modes, n, n) as the likelihood takes them; gains (2, n) of sensors and emitters."""
+    size, n = readings.size, readings.shape[1]
+    sensor, emitter = np.ones((2, n)) if gains is None else gains
+    pair = Pair(
+        readings.ravel(),
+        np.zeros(size),
+        np.zeros(size),
+        np.zeros(size, np.int8),
+        new_costs(size),
+        sensor,
+        emitter,
+        np.zeros((2, 2)) if prior is None else prior,
+        nearest=0.044,
+        farthest=1.0,
+    )
+    classify(model, np.full(len(readings), saturation), pair)
+    write_costs(model.errors, pair)
+    return pair

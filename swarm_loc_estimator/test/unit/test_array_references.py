@@ -1,19 +1,21 @@
 """Law: compiled code that counts no references neither keeps nor releases an array of anybody."""
 
 import gc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 from core_messages import T0
 from core_run import on_time, play, settled, ticks
 from core_world import Plan, simulate
+from ir_world import droplet, random_poses, readings_of
 from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]
 from numba.core.runtime.nrt import rtsys
 
 from swarm_loc_estimator.core.estimation import fusion
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
+from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.jit import inlined
+from swarm_loc_estimator.numerics.jit import borrowing, inlined
 
 
 @pytest.fixture
@@ -47,9 +49,23 @@ def test_a_run_leaves_no_array_behind(many: int, monkeypatch: pytest.MonkeyPatch
     assert counts[0] == counts[1] == counts[2]
 
 
-def test_what_is_inlined_returns_no_array() -> None:
+@pytest.mark.usefixtures("counted")
+@pytest.mark.parametrize("element_sigma", [0.0, 0.1])
+def test_solving_pairs_leaves_no_array_behind(element_sigma: float) -> None:
+    """Neither of calls nor of pairs."""
+    estimator = MaximumLikelihood(droplet(element_sigma))
+    readings = readings_of(droplet(), random_poses(20, 1), 1)
+    counts = []
+    for pairs in (1, 20, 20):
+        estimator.solve(readings[:pairs])
+        counts.append(held())
+    assert counts[0] == counts[1] == counts[2]
+
+
+@pytest.mark.parametrize("borrow", [borrowing, inlined])
+def test_what_borrows_arrays_returns_none(borrow: Callable[[Callable[..., object]], object]) -> None:
     def view(array: FloatArray) -> FloatArray:
         return array[:1]
 
     with pytest.raises(TypeError, match="numbers only"):
-        inlined(view)
+        borrow(view)

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ir_world import droplet, nees, pose_errors, random_poses, readings_of
+from ir_world import droplet, nees, pair_of, pose_errors, random_poses, readings_of
 from scipy.integrate import quad
 from scipy.optimize import minimize
 
@@ -18,9 +18,10 @@ from swarm_loc_estimator.core.infrared.brightness import expected
 from swarm_loc_estimator.core.infrared.cramer_rao import information
 from swarm_loc_estimator.core.infrared.solution import IrEstimator, Outcome, ReadingsError
 from swarm_loc_estimator.core.infrared.solvers.closed_form import ClosedForm
-from swarm_loc_estimator.core.infrared.solvers.cost import MEASURED, SATURATED, Pair, cost_of, new_scratch
+from swarm_loc_estimator.core.infrared.solvers.cost import cost_of, new_scratch
 from swarm_loc_estimator.core.infrared.solvers.gains import Exchanges, estimate_gains
 from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.core.infrared.solvers.reading_cost import SATURATED
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
 LIMIT = 240.0
@@ -58,11 +59,8 @@ def test_the_cost_is_that_of_the_likelihood_with_tails_integrated(seed: int) -> 
     """Also where saturated readings are expected below the limit."""
     pose = random_poses(1, seed, low=0.1, high=0.13)
     readings = cut_readings(pose, seed)[0]
-    kinds = np.where(readings >= LIMIT, SATURATED, MEASURED).astype(np.int8)
-    assert (kinds == SATURATED).any()
-    ones, room = np.ones(6), new_scratch(2, 6, False)
-    stable = np.minimum(readings, LIMIT) / droplet().noise
-    pair = Pair(readings, stable, np.full(2, LIMIT), kinds, ones, ones, np.zeros((2, 2)), 0.044, 1.0)
+    pair, room = pair_of(NEVER_BLOCKED.model, readings, LIMIT), new_scratch(2, 6, False)
+    assert (pair.kinds == SATURATED).any()
     rng = np.random.default_rng(seed)
     for scale in (0.0, 0.003, 0.01, 0.03):
         at = pose[0] + scale * np.array([0.1, 1.0, 1.0]) * rng.standard_normal(3)

@@ -15,6 +15,7 @@ from ir_world import (
     differing_gains,
     droplet,
     nees,
+    pair_of,
     pose_errors,
     random_poses,
     readings_of,
@@ -27,7 +28,7 @@ from swarm_loc_estimator.core.infrared.brightness import expected
 from swarm_loc_estimator.core.infrared.cramer_rao import information
 from swarm_loc_estimator.core.infrared.curves import TabulatedCurve
 from swarm_loc_estimator.core.infrared.solution import IrEstimator, Outcome, ReadingsError
-from swarm_loc_estimator.core.infrared.solvers.cost import MEASURED, SATURATED, Pair, cost_of, new_scratch
+from swarm_loc_estimator.core.infrared.solvers.cost import Pair, cost_of, new_scratch
 from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
 from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.numerics.arrays import FloatArray
@@ -266,11 +267,9 @@ def test_the_costs_gradient_is_its_slope(seed: int) -> None:
     rng = np.random.default_rng(seed)
     pose = random_poses(1, seed, low=0.08, high=0.16)
     readings = readings_of(droplet(), pose, seed)[0]
-    kinds = np.where(readings >= 255.0, SATURATED, MEASURED).astype(np.int8)
     prior = np.array([[100.0, 0.1], [50.0, 0.15]])
     gains = rng.uniform(0.9, 1.1, (2, 6))
-    stable = np.minimum(readings, 255.0) / droplet().noise
-    pair = Pair(readings, stable, np.full(2, 255.0), kinds, gains[0], gains[1], prior, 0.044, 1.0)
+    pair = pair_of(droplet().model, readings, 255.0, gains, prior)
     at = np.concatenate([0.05 * rng.standard_normal(12), pose[0] * [1.01, 1.0, 1.0] + [0.0, 0.01, 0.02]])
     _, gradient, hessian = cost_at(pair, at)
     for p in range(at.size):
@@ -281,7 +280,7 @@ def test_the_costs_gradient_is_its_slope(seed: int) -> None:
         assert gradient[p] == pytest.approx(slope, rel=1e-3, abs=0.05)
     assert np.linalg.eigvalsh(hessian).min() > 0.0
     prior_part = np.linalg.inv(np.linalg.inv(100.0 * (np.eye(6) - 0.1)))  # what two log-gains have in common
-    without = pair._replace(kinds=np.zeros_like(kinds))
+    without = pair_of(droplet().model, np.full_like(readings, np.nan), 255.0, gains, prior)
     np.testing.assert_allclose(cost_at(without, at)[2][:6, :6], prior_part, atol=1e-9)
 
 

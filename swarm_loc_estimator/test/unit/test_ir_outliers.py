@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from ir_world import nees, pose_errors, random_poses, readings_of
+from ir_world import nees, pair_of, pose_errors, random_poses, readings_of
 
 from swarm_loc_estimator.core.infrared.solution import Outcome
-from swarm_loc_estimator.core.infrared.solvers.cost import MEASURED, Pair, cost_of, new_scratch, stabilized
+from swarm_loc_estimator.core.infrared.solvers.cost import cost_of, new_scratch
 from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
 from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.numerics.arrays import FloatArray
@@ -60,11 +60,7 @@ def test_the_costs_gradient_is_its_slope_also_of_outliers(seed: int) -> None:
     pose = random_poses(1, seed, low=0.08, high=0.16)
     readings = np.roll(with_faults(pose, seed)[0], 1, axis=1)  # most are outliers now
     model = BOARD.model
-    stable = np.array([stabilized(model.errors, value)[0] for value in readings.flat]).reshape(1, 6, 6)
-    kinds = np.full(readings.shape, MEASURED, np.int8)
-    ones = np.ones(6)
-    pair = Pair(readings, stable, np.full(1, 1e9), kinds, ones, ones, np.zeros((2, 2)), 0.044, 1.0)
-    room = new_scratch(1, 6, False)
+    pair, room = pair_of(model, readings, 1e9), new_scratch(1, 6, False)
 
     def cost_at(at: FloatArray) -> tuple[float, FloatArray]:
         cost = cost_of(model, pair, at, room, room.gradients[0], room.hessians[0])

@@ -18,7 +18,9 @@ from swarm_loc_estimator.core.infrared.curves import (
     PowerPiece,
     TabulatedCurve,
     amplitude_at,
+    amplitudes_at,
     curve_at,
+    curves_at,
     distance_at,
 )
 from swarm_loc_estimator.io.swarm.board_file import (
@@ -218,3 +220,19 @@ def test_an_unknown_name_lists_those_that_there_are() -> None:
         IrPlatformFileError, match=r"'dropled' is no packaged .* \(droplet, droplet_2016, epuck_twelve\)"
     ):
         load_ir_platform("dropled")
+
+
+def test_many_angles_at_once_have_the_values_of_each_alone() -> None:
+    angles = np.concatenate([np.linspace(-9.0, 9.0, 501), [0.6186, -0.6186, np.pi, -np.pi]])
+    for curve in (droplet().sensor, droplet().emitter, TabulatedCurve((-1.0, 0.0, 1.2), (0.1, 1.0, 0.2))):
+        found = np.empty((2, angles.size))
+        curves_at(curve.table(), angles.copy(), np.empty(angles.size), *found)
+        np.testing.assert_allclose(found.T, values(curve, angles), rtol=1e-14)
+
+
+@pytest.mark.parametrize("exponent", [2.0, 1.7])
+def test_many_distances_at_once_have_the_amplitudes_of_each_alone(exponent: float) -> None:
+    law, distances = np.array([1.4, -0.03, exponent, -1.0, 0.035]), np.linspace(0.001, 0.6, 101)
+    found = np.empty((2, distances.size))
+    amplitudes_at(law, distances, *found)
+    np.testing.assert_allclose(found.T, [amplitude_at(law, r) for r in distances], rtol=1e-14)

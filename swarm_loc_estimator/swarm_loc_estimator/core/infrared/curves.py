@@ -192,8 +192,40 @@ def curve_at(table: CurveTable, angle: float) -> tuple[float, float]:
     per_radian = table.per_radian[piece]
     place = (a - edges[piece]) * per_radian
     cell = min(max(int(place), 0), table.cubics.shape[1] - 1)
-    t = place - cell
-    c = table.cubics[piece, cell]
+    return _cubic_at(table.cubics[piece, cell], place - cell, per_radian)
+
+
+@compiled
+def curves_at(
+    table: CurveTable, angles: FloatArray, piece: FloatArray, values: FloatArray, slopes: FloatArray
+) -> None:
+    """Write the values and slopes of `curve_at` at many angles (k,), without a branch.
+
+    Args:
+        table: Of the curve.
+        angles: Of any size; wrapped when it returns [rad].
+        piece: (k,) room for the pieces of the curve that the angles are in.
+        values: (k,) written.
+        slopes: (k,) written [1/rad].
+    """
+    edges, cells = table.edges, table.cubics.shape[1]
+    for k in range(angles.size):
+        angles[k] -= 2.0 * math.pi * math.floor(angles[k] * (0.5 / math.pi) + 0.5)
+        piece[k] = 0.0
+    for edge in edges[1:-1]:
+        for k in range(angles.size):
+            piece[k] += 1.0 if angles[k] >= edge else 0.0
+    for k in range(angles.size):
+        here = int(piece[k])
+        per_radian = table.per_radian[here]
+        place = (angles[k] - edges[here]) * per_radian
+        cell = min(max(int(place), 0), cells - 1)
+        values[k], slopes[k] = _cubic_at(table.cubics[here, cell], place - cell, per_radian)
+
+
+@compiled
+def _cubic_at(c: FloatArray, t: float, per_radian: float) -> tuple[float, float]:
+    """The value and slope [1/rad] of one cell's cubic, of which the share t is passed."""
     return c[0] + t * (c[1] + t * (c[2] + t * c[3])), (c[1] + t * (2.0 * c[2] + 3.0 * t * c[3])) * per_radian
 
 
@@ -205,8 +237,32 @@ def amplitude_at(law: FloatArray, r: float) -> tuple[float, float]:
         law: (5,) the fields of `Amplitude` in their order.
         r: The distance.
     """
-    closeness = 1.0 / (max(r, law[4]) + law[1])
-    value = law[0] * (closeness * closeness if law[2] == 2.0 else closeness ** law[2])
+    closeness = _closeness(law, r)
+    return _amplitude(law, r, closeness, closeness * closeness if law[2] == 2.0 else closeness ** law[2])
+
+
+@compiled
+def amplitudes_at(law: FloatArray, r: FloatArray, values: FloatArray, slopes: FloatArray) -> None:
+    """Write the values and slopes of `amplitude_at` at many distances (k,)."""
+    if law[2] == 2.0:  # apart, since a loop that may raise to a power is not vectorized
+        for k in range(r.size):
+            closeness = _closeness(law, r[k])
+            values[k], slopes[k] = _amplitude(law, r[k], closeness, closeness * closeness)
+    else:
+        for k in range(r.size):
+            values[k], slopes[k] = amplitude_at(law, r[k])
+
+
+@compiled
+def _closeness(law: FloatArray, r: float) -> float:
+    """One over the distance from the law's pole [1/m]."""
+    return 1.0 / float(max(r, law[4]) + law[1])
+
+
+@compiled
+def _amplitude(law: FloatArray, r: float, closeness: float, power: float) -> tuple[float, float]:
+    """The law's value and slope, with the power of the closeness."""
+    value = law[0] * power
     slope = -law[2] * value * closeness
     return value + law[3] + slope * min(r - law[4], 0.0), slope
 

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.core.infrared.board import IrPlatform, PairGains
 from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.numerics.jit import compiled
 
 DARKEST = -6.0
 """What a sensor reads below is no light, and counts as missing [sigma]."""
@@ -50,16 +51,21 @@ class IrSolutions(NamedTuple):
     @classmethod
     def none(cls, count: int) -> IrSolutions:
         """Without any pose."""
-        nothing = np.full((6, count, 3), np.nan)
-        return cls(
-            nothing[0],
-            nothing[1:4].reshape(count, 3, 3),
-            np.zeros(count, np.int64),
-            nothing[4],
-            np.zeros(count),
-            nothing[5],
-            np.full(count, np.nan),
-        )
+        return no_solutions(count)
+
+
+@compiled
+def no_solutions(count: int) -> IrSolutions:
+    """Of so many pairs without any pose, also for compiled code."""
+    return IrSolutions(
+        np.full((count, 3), np.nan),
+        np.full((count, 3, 3), np.nan),
+        np.zeros(count, np.int64),
+        np.full((count, 3), np.nan),
+        np.zeros(count),
+        np.full((count, 3), np.nan),
+        np.full(count, np.nan),
+    )
 
 
 class ReadingsError(ValueError):

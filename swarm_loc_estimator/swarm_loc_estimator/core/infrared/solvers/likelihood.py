@@ -11,37 +11,28 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from swarm_loc_estimator.core.infrared.board import IrModel, IrPlatform, PairGains
-from swarm_loc_estimator.core.infrared.solution import IrSolutions, Outcome, checked
+from swarm_loc_estimator.core.infrared.solution import IrSolutions, Outcome, checked, no_solutions
 from swarm_loc_estimator.core.infrared.solvers.coarse_posterior import add_spread
-from swarm_loc_estimator.core.infrared.solvers.cost import (
-    DARK,
-    MEASURED,
-    Pair,
-    Scratch,
-    new_scratch,
-    with_stray_light,
-)
+from swarm_loc_estimator.core.infrared.solvers.cost import Pair, with_stray_light, write_costs
+from swarm_loc_estimator.core.infrared.solvers.reading_cost import DARK, MEASURED
 from swarm_loc_estimator.core.infrared.solvers.readings import classify, compress_readings
+from swarm_loc_estimator.core.infrared.solvers.room import TABLE_STARTS, Room, new_room
 from swarm_loc_estimator.core.infrared.solvers.search import pose_covariance, search
 from swarm_loc_estimator.core.infrared.solvers.start_table import (
-    Float32Array,
-    StartRoom,
     StartTable,
     blurred,
     compress,
     find_starts,
-    new_start_room,
     start_table,
 )
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import borrowing, compiled
 from swarm_loc_estimator.numerics.se2_scalar import wrap
 from swarm_loc_estimator.numerics.small_matrix import assign, assign_matrix
 
-_TABLE_STARTS = 3
 _WORSE = 2.0
 """A start that fits worse than the best one by more than this factor is not tried."""
 _LOOSE, _STILL = 0.1, 1e-4
@@ -96,9 +87,8 @@ class MaximumLikelihood:
     ) -> IrSolutions:
         """Relative poses of k pairs, see `solution.IrEstimator`."""
         values, known, limits = checked(self._platform, readings, gains, saturation)
-        solutions = IrSolutions.none(len(values))
-        _solve_all(self._models, values, known, limits, solutions)
-        return solutions
+        flat = values.reshape(len(values), math.prod(values.shape[1:]))
+        return _solve_all(self._models, flat, known, limits)
 
 
 class Models(NamedTuple):
@@ -115,95 +105,69 @@ class Models(NamedTuple):
     table: StartTable
 
 
-class _Room(NamedTuple):
-    """Room to work in.
-
-    Attributes:
-        plain: To search the pose only.
-        full: To search gains besides where they are not known, else the same.
-        start: To look for starts.
-        starts: (S, 4) range, bearing, heading, misfit.
-        pattern: (modes * n * n,) compressed readings.
-        present: (modes * n * n,) 1 where there is a reading, else 0.
-        kinds: (modes, n, n) of the readings.
-        stable: (modes, n, n) the readings by `stabilized`.
-        minima: (2, 4) range, bearing, heading and cost of the best two minima that lie apart.
-        best: (P,) the best with its gains.
-        covariance: (3, 3) of its pose.
-    """
-
-    plain: Scratch
-    full: Scratch
-    start: StartRoom
-    starts: FloatArray
-    pattern: Float32Array
-    present: Float32Array
-    kinds: NDArray[np.int8]
-    stable: FloatArray
-    minima: FloatArray
-    best: FloatArray
-    covariance: FloatArray
+@compiled
+def _solve_all(models: Models, readings: FloatArray, gains: PairGains, saturation: FloatArray) -> IrSolutions:
+    """All pairs, first those of known gains, then the others, each kind with room of its own."""
+    out = no_solutions(len(readings))
+    for known in (True, False):
+        some = [k for k in range(len(readings)) if known == (gains.sigma[k].max() == 0.0)]
+        if len(some) > 0:
+            room = new_room(models.table, saturation.shape[1], gains.sensor.shape[1], known)
+            for k in some:
+                _solve_at(models, readings, gains, saturation, room, out, k)
+    return out
 
 
 @compiled
-def _new_room(table: StartTable, modes: int, n: int, known: bool) -> _Room:
-    """Room for one platform, with gains known or not."""
-    plain = new_scratch(modes, n, False)
-    full = plain if known else new_scratch(modes, n, True)
-    return _Room(
-        plain,
-        full,
-        new_start_room(table),
-        np.empty((1 + _TABLE_STARTS, 4)),
-        np.empty(modes * n * n, np.float32),
-        np.empty(modes * n * n, np.float32),
-        np.empty((modes, n, n), np.int8),
-        np.empty((modes, n, n)),
-        np.empty((2, 4)),
-        np.empty(full.at.size),
-        np.empty((3, 3)),
-    )
-
-
-@compiled
-def _solve_all(
-    models: Models, readings: FloatArray, gains: PairGains, saturation: FloatArray, out: IrSolutions
+def _solve_at(
+    models: Models,
+    readings: FloatArray,
+    gains: PairGains,
+    saturation: FloatArray,
+    room: Room,
+    out: IrSolutions,
+    k: int,
 ) -> None:
-    """All pairs, one after the other."""
-    modes, n = readings.shape[1], readings.shape[2]
-    rooms = [_new_room(models.table, modes, n, known > 0) for known in range(2)]
-    nearest, farthest = models.table.ranges[0], 2.0 * models.table.ranges[-1]
-    prior = np.empty((2, 2))
-    for k in range(readings.shape[0]):
-        room = rooms[1 if _write_prior(gains.sigma[k], n, prior) else 0]
-        sensor, emitter = gains.sensor[k], gains.emitter[k]
-        pair = Pair(
-            readings[k], room.stable, saturation[k], room.kinds, sensor, emitter, prior, nearest, farthest
-        )
-        exact = with_stray_light(models.exact, readings[k])
-        soft = with_stray_light(models.blurred, readings[k])
-        out.outcomes[k] = _solve_one(Models(exact, soft, models.table), pair, room, out, k)
+    """One pair."""
+    pair = Pair(
+        readings[k],
+        room.cut,
+        room.stable,
+        room.kinds,
+        room.exact,
+        gains.sensor[k],
+        gains.emitter[k],
+        room.prior,
+        models.table.ranges[0],
+        2.0 * models.table.ranges[-1],
+    )
+    _write_prior(gains.sigma[k], pair.sensor.size, room.prior)
+    exact = with_stray_light(models.exact, pair.readings)
+    soft = with_stray_light(models.blurred, pair.readings)
+    out.outcomes[k] = _solve_one(Models(exact, soft, models.table), saturation[k], pair, room, out, k)
 
 
-@compiled
-def _write_prior(sigma: FloatArray, n: int, prior: FloatArray) -> bool:
-    """Write `Pair.prior` for the sigmas (4,) of `PairGains`; whether the gains are known, all sigmas zero."""
+@borrowing
+def _write_prior(sigma: FloatArray, n: int, prior: FloatArray) -> None:
+    """Write `Pair.prior` for the sigmas (4,) of `PairGains`."""
     for side in range(2):
         own, common = max(sigma[2 * side], _EXACT) ** 2, sigma[2 * side + 1] ** 2
         prior[side, 0], prior[side, 1] = 1.0 / own, common / (own + n * common)
-    return bool(max(sigma[0], sigma[1], sigma[2], sigma[3]) == 0.0)
 
 
-@compiled
-def _solve_one(models: Models, pair: Pair, room: _Room, out: IrSolutions, k: int) -> int:
+@borrowing
+def _solve_one(
+    models: Models, saturation: FloatArray, pair: Pair, room: Room, out: IrSolutions, k: int
+) -> int:
     """One pair; returns the outcome."""
-    measured, saturated, bright = classify(models.exact, pair)
+    measured, saturated, bright = classify(models.exact, saturation, pair)
     if measured < _FEWEST:
         return _UNDETERMINED if saturated > 0 else _TOO_FEW
     two_sided = models.exact.errors.bright < math.inf
     faintest = _FAINTEST_OF_OUTLIERS if two_sided else _FAINTEST
     if bright < measured + faintest * math.sqrt(2.0 * measured):
         return _TOO_WEAK
+    write_costs(models.exact.errors, pair)
     _find_minima(models, pair, room, measured)
     if two_sided:
         _weigh_minima(models.exact, pair, room)
@@ -235,8 +199,8 @@ def _solve_one(models: Models, pair: Pair, room: _Room, out: IrSolutions, k: int
     return _FOUND
 
 
-@compiled
-def _weigh_minima(model: IrModel, pair: Pair, room: _Room) -> None:
+@borrowing
+def _weigh_minima(model: IrModel, pair: Pair, room: Room) -> None:
     """Judge the two minima by the probability around them, not its density; writes the better one first.
 
     A pose that takes most readings for outliers can fit the few others in a tiny region only.
@@ -248,7 +212,8 @@ def _weigh_minima(model: IrModel, pair: Pair, room: _Room) -> None:
         return
     best[3] -= _log_volume(room.covariance)
     cost = search(model, pair, other, _STILL, room.full, _NO_MINIMUM)
-    found = at.copy()
+    found = room.found
+    assign(found, at)
     if not pose_covariance(model, pair, found, room.full, room.covariance):
         return
     for p in range(3):
@@ -260,7 +225,7 @@ def _weigh_minima(model: IrModel, pair: Pair, room: _Room) -> None:
         assign(room.best, found)
 
 
-@compiled
+@borrowing
 def _log_volume(covariance: FloatArray) -> float:
     """Half the logarithm of the determinant of a covariance (3, 3)."""
     c = covariance
@@ -270,35 +235,36 @@ def _log_volume(covariance: FloatArray) -> float:
     return 0.5 * math.log(max(size, 1e-30))
 
 
-@compiled
-def _unexplained(model: IrModel, pair: Pair, room: _Room, bright: float) -> bool:
+@borrowing
+def _unexplained(model: IrModel, pair: Pair, room: Room, bright: float) -> bool:
     """Whether a pose leaves most of what was read, mean square `bright`, unexplained."""
     tally = room.full.tally
     if model.errors.bright == math.inf:
         misfit = tally[0] / max(tally[1], 1.0)
         return bool(misfit - 1.0 > (1.0 - _EXPLAINED) * max(bright - 1.0, 0.0))
     total, count = 0.0, 0
-    for kind, stable in zip(pair.kinds.flat, pair.stable.flat):  # noqa: B905 (not compiled)
-        if kind == MEASURED:
-            total += stable**2
+    for f in range(pair.kinds.size):
+        if pair.kinds[f] == MEASURED:
+            total += pair.stable[f] ** 2
             count += 1
     return bool(tally[2] - count > (1.0 - _EXPLAINED_OF_OUTLIERS) * max(total - count, 0.0))
 
 
-@compiled
+@borrowing
 def _apart(a: FloatArray, b: FloatArray, p: int) -> float:
     """The difference of two poses in range, bearing or heading."""
     return wrap(a[p] - b[p]) if p > 0 else a[p] - b[p]
 
 
-@compiled
-def _find_minima(models: Models, pair: Pair, room: _Room, measured: int) -> None:
+@borrowing
+def _find_minima(models: Models, pair: Pair, room: Room, measured: int) -> None:
     """Search from all starts that are worth it; writes the best minimum of all and another one."""
     room.minima[:, 3] = math.inf
     reached = 0
     for s in range(_list_starts(models, pair, room)):
         reached = _search_from(models, pair, room, room.starts[s], reached)
-    first, start = room.starts[1].copy(), room.starts[0]
+    first, start = room.first, room.starts[0]
+    assign(first, room.starts[1])
     for aside in range(_ASIDE.shape[0]):
         of_second = aside < _OF_SECOND
         if _in_doubt(room, reached, measured) or (of_second and room.full.at.size > 3):  # gains are sought
@@ -309,18 +275,18 @@ def _find_minima(models: Models, pair: Pair, room: _Room, measured: int) -> None
     if _in_doubt(room, reached, measured) and models.exact.errors.blocked < math.inf:
         dark = compress(models.exact, DARK * models.exact.noise)
         blocked = find_starts(models.table, room.pattern, room.present, dark, room.start, room.starts)
-        for s in range(min(blocked, _TABLE_STARTS)):
+        for s in range(min(blocked, TABLE_STARTS)):
             reached = _search_from(models, pair, room, room.starts[s], reached)
 
 
-@compiled
-def _in_doubt(room: _Room, reached: int, measured: int) -> bool:
+@borrowing
+def _in_doubt(room: Room, reached: int, measured: int) -> bool:
     """Whether the best minimum may not be the best of all: reached but once, or it fits badly."""
     return reached < 2 or 2.0 * room.minima[0, 3] > _SUSPICIOUS * (measured - 3)
 
 
-@compiled
-def _search_from(models: Models, pair: Pair, room: _Room, start: FloatArray, reached: int) -> int:
+@borrowing
+def _search_from(models: Models, pair: Pair, room: Room, start: FloatArray, reached: int) -> int:
     """Search from a start, keep where it ends; how often the best minimum was reached, before and now."""
     at, best = room.full.at, room.minima[0, 3]
     cost = search(models.exact, pair, start, _STILL, room.full, room.minima[0])
@@ -331,26 +297,46 @@ def _search_from(models: Models, pair: Pair, room: _Room, start: FloatArray, rea
     return 1 if cost < best else reached
 
 
-@compiled
-def _list_starts(models: Models, pair: Pair, room: _Room) -> int:
+@borrowing
+def _list_starts(models: Models, pair: Pair, room: Room) -> int:
     """Write poses to begin at; returns how many.
 
     First where the soft model's search ends, then the best of the table, then others that fit there nearly as
     well. More are in `_ASIDE`, and at last those for readings of which some are blocked.
     """
     compress_readings(models.exact, pair, room.pattern, room.present)
-    starts, found = room.starts, room.starts[1 : 1 + _TABLE_STARTS]
+    starts, found = room.starts, room.starts[1 : 1 + TABLE_STARTS]
     outliers = math.inf if models.exact.errors.bright < math.inf else -math.inf
     count = 1 + find_starts(models.table, room.pattern, room.present, outliers, room.start, found)
-    search(models.blurred, pair, found[0], _LOOSE, room.plain, room.minima[0])
-    for p in range(3):
-        starts[0, p] = room.plain.at[p]
+    _search_blurred(models.blurred, pair, room, found[0])
     while starts[count - 1, 3] > _WORSE * starts[1, 3]:
         count -= 1
     return count
 
 
-@compiled
+@borrowing
+def _search_blurred(model: IrModel, pair: Pair, room: Room, start: FloatArray) -> None:
+    """Write where the soft model's search ends as the first start."""
+    p = pair
+    soft = Pair(
+        p.readings,
+        p.cut,
+        p.stable,
+        p.kinds,
+        room.soft,
+        p.sensor,
+        p.emitter,
+        p.prior,
+        p.nearest,
+        p.farthest,
+    )
+    write_costs(model.errors, soft)
+    search(model, soft, start, _LOOSE, room.plain, room.minima[0])
+    for c in range(3):
+        room.starts[0, c] = room.plain.at[c]
+
+
+@borrowing
 def _keep(minima: FloatArray, pose: FloatArray, cost: float) -> bool:
     """Sort a minimum into the best two that lie apart (2, 4); whether it is the best."""
     best, other = minima[0], minima[1]

@@ -11,8 +11,9 @@ import math
 from swarm_loc_estimator.core.infrared.board import IrModel
 from swarm_loc_estimator.core.infrared.solvers.cost import Pair, Scratch, cost_of
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import borrowing
 from swarm_loc_estimator.numerics.se2_scalar import wrap
+from swarm_loc_estimator.numerics.small_matrix import assign_matrix
 
 _ROUNDS = 40
 _FIRST_DAMPING = 1e-3
@@ -35,7 +36,7 @@ _AROUND = (
 """Where to: the corners of a tetrahedron."""
 
 
-@compiled
+@borrowing
 def search(
     model: IrModel, pair: Pair, start: FloatArray, still: float, room: Scratch, known: FloatArray
 ) -> float:
@@ -74,7 +75,7 @@ def search(
     return cost
 
 
-@compiled
+@borrowing
 def _beside(known: FloatArray, at: FloatArray) -> bool:
     """Whether a search has come to a known minimum."""
     x = at.size - 3
@@ -82,7 +83,7 @@ def _beside(known: FloatArray, at: FloatArray) -> bool:
     return bool(max(turned, abs(at[x] / known[0] - 1.0)) < _BESIDE)
 
 
-@compiled
+@borrowing
 def _step(pair: Pair, room: Scratch, gradient: FloatArray, hessian: FloatArray, damping: float) -> float:
     """Write the next trial; returns by how much the quadratic model lowers the cost there."""
     step, size = room.step, room.step.size
@@ -116,7 +117,7 @@ def _step(pair: Pair, room: Scratch, gradient: FloatArray, hessian: FloatArray, 
     return -slope - bend
 
 
-@compiled
+@borrowing
 def _factorize(matrix: FloatArray, damping: float, factor: FloatArray, held: bool) -> bool:
     """Cholesky of the lower triangle with its diagonal grown by a share; whether it is positive definite.
 
@@ -143,7 +144,7 @@ def _factorize(matrix: FloatArray, damping: float, factor: FloatArray, held: boo
     return True
 
 
-@compiled
+@borrowing
 def _solve(factor: FloatArray, vector: FloatArray) -> None:
     """Solve factor factor^T x = vector in place."""
     size = vector.size
@@ -157,7 +158,7 @@ def _solve(factor: FloatArray, vector: FloatArray) -> None:
         vector[p] /= factor[p, p]
 
 
-@compiled
+@borrowing
 def pose_covariance(
     model: IrModel, pair: Pair, at: FloatArray, room: Scratch, covariance: FloatArray
 ) -> bool:
@@ -174,7 +175,8 @@ def pose_covariance(
         return False
     _write_share_of_gains(pair, room)
     _add_square(room.root, covariance, 1.0 / (1.0 + len(_AROUND)), 0.0)
-    root, x = room.root.copy(), at.size - 3
+    root, x = room.first_root, at.size - 3
+    assign_matrix(root, room.root)
     for direction in _AROUND:
         for p in range(at.size):
             room.trial[p] = at[p]
@@ -190,7 +192,7 @@ def pose_covariance(
     return True
 
 
-@compiled
+@borrowing
 def _write_share_of_gains(pair: Pair, room: Scratch) -> None:
     """Write which share of the pose's variances, by the factor, comes from errors of the gains.
 
@@ -215,7 +217,7 @@ def _write_share_of_gains(pair: Pair, room: Scratch) -> None:
             room.of_gains[p] += part / row[x + p]
 
 
-@compiled
+@borrowing
 def _share_of_lasting(room: Scratch, p: int) -> float:
     """Which share of a pose's variance, by the factor, comes from noise that is the same every time."""
     row, part = room.step, 0.0
@@ -228,7 +230,7 @@ def _share_of_lasting(room: Scratch, p: int) -> float:
     return float(part / row[p])
 
 
-@compiled
+@borrowing
 def _invert(information: FloatArray, room: Scratch) -> bool:
     """Write the inverse of the pose's part of the information's factor; whether there is one."""
     if not _factorize(information, 0.0, room.factor, False):
@@ -242,7 +244,7 @@ def _invert(information: FloatArray, room: Scratch) -> bool:
     return True
 
 
-@compiled
+@borrowing
 def _add_square(root: FloatArray, matrix: FloatArray, weight: float, keep: float) -> None:
     """Matrix becomes keep * matrix + weight * root^T root, all (3, 3)."""
     for p in range(3):

@@ -19,7 +19,7 @@ from swarm_loc_estimator.core.infrared.board import IrModel, IrPlatform
 from swarm_loc_estimator.core.infrared.brightness import expected
 from swarm_loc_estimator.core.infrared.curves import AngleCurve, TabulatedCurve, curve_at, distance_at
 from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.jit import compiled, compiled_sums
+from swarm_loc_estimator.numerics.jit import borrowing, compiled, compiled_sums
 
 _DIRECTIONS = (16, 24)
 """Bearings, and headings, at least and at most; between them two per element."""
@@ -127,7 +127,7 @@ def start_table(platform: IrPlatform) -> StartTable:
     return StartTable(ranges.astype(np.float64), angles, patterns, totals)
 
 
-@compiled
+@borrowing
 def find_starts(
     table: StartTable,
     pattern: Float32Array,
@@ -175,29 +175,27 @@ def find_starts(
     return _best_minima(table, room, starts)
 
 
-@compiled
+@borrowing
 def compress(model: IrModel, reading: float) -> float:
     """A reading as the table has it."""
     return math.asinh(min(reading, model.saturation) / (_KNEE * model.noise))
 
 
 @compiled
-def _level(totals: Float32Array, total: float) -> int:
-    """Where among falling totals one is nearest."""
-    low, high = 0, totals.size - 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        if totals[middle] >= total:
-            low = middle
-        else:
-            high = middle
-    return low if totals[low] - total < total - totals[high] else high
+def _level(totals: Float32Array, total: np.float32) -> int:
+    """Where among falling totals one is nearest, halving without a branch, which could not be predicted."""
+    low, size = 0, totals.size - 1
+    while size > 1:
+        half = size // 2
+        low += half if totals[low + half] >= total else 0
+        size -= half
+    return low if totals[low] - total < total - totals[low + 1] else low + 1
 
 
-@compiled
+@borrowing
 def _best_level(
     patterns: Float32Array, pattern: Float32Array, present: Float32Array, dark: np.float32
-) -> tuple[int, np.float32]:
+) -> tuple[int, float]:
     """The range of patterns (L, modes * n * n) that fits best, and how badly it does."""
     best, least = 0, np.float32(math.inf)
     for level in range(patterns.shape[0]):
@@ -247,7 +245,7 @@ def _cost_with_outliers(
     return total
 
 
-@compiled
+@borrowing
 def _best_minima(table: StartTable, room: StartRoom, starts: FloatArray) -> int:
     """The directions that no neighbour betters, the best `starts` of them."""
     misfit, size, found = room.misfit, table.angles.size, 0
@@ -269,12 +267,13 @@ def _best_minima(table: StartTable, room: StartRoom, starts: FloatArray) -> int:
     return found
 
 
-@compiled
+@borrowing
 def _is_minimum(misfit: Float32Array, size: int, b: int, h: int) -> bool:
     """Whether no neighbour on the torus of directions is better."""
     here = misfit[b * size + h]
-    for down in range(-1, 2):
-        for right in range(-1, 2):
-            if misfit[(b + down) % size * size + (h + right) % size] < here:
-                return False
+    left, right = (h if h > 0 else size) - 1, h + 1 if h + 1 < size else 0
+    for row in ((b if b > 0 else size) - 1, b, b + 1 if b + 1 < size else 0):
+        first = row * size
+        if min(misfit[first + left], misfit[first + h], misfit[first + right]) < here:
+            return False
     return True

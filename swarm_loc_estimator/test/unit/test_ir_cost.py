@@ -1,0 +1,87 @@
+"""The likelihood's cost is the sum over readings, each by itself, however it is computed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ir_world import droplet, pair_of, random_poses, readings_of
+
+from swarm_loc_estimator.core.infrared.board import IrModel
+from swarm_loc_estimator.core.infrared.brightness import expected_with_slopes
+from swarm_loc_estimator.core.infrared.solvers.cost import Pair, Scratch, cost_of, new_scratch
+from swarm_loc_estimator.core.infrared.solvers.reading_cost import MEASURED, MISSING, SATURATED, reading_cost
+from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.numerics.arrays import FloatArray
+
+PLATFORMS = {
+    "blocked": droplet(),
+    "never blocked": replace(droplet(), blocked_share=0.0),
+    "relative": replace(droplet(), relative_noise=0.1),
+    "lasting": replace(droplet(), relative_noise=0.05, curve_sigma=0.1),
+    "bright": load_ir_platform("droplet_2016"),
+}
+
+
+def one_by_one(
+    model: IrModel, pair: Pair, bright: FloatArray, slopes: FloatArray
+) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Cost, gradient (3,), Hessian (3, 3), tally (3,) and lasting information (3, 3), reading by reading."""
+    total, gradient, tally = 0.0, np.zeros(3), np.array([0.0, -3.0, 0.0])
+    hessian, lasting = np.zeros((2, 3, 3))
+    for f in np.flatnonzero(pair.kinds != MISSING):
+        cost, pull, weight, sure, share, square = reading_cost(
+            model.errors, pair.kinds[f], pair.cut[f], pair.stable[f], bright[f]
+        )
+        both = np.outer(slopes[f], slopes[f])
+        total += cost
+        gradient += pull * slopes[f]
+        hessian += weight * both
+        lasting += share * weight * both
+        tally += [2.0 * cost * sure, sure and pair.kinds[f] == MEASURED, square]
+    return total, gradient, hessian, tally, lasting
+
+
+def costs_at(model: IrModel, pair: Pair, pose: FloatArray) -> tuple[float, Scratch]:
+    """By `cost_of`."""
+    room = new_scratch(model.amplitudes.shape[0], model.angles.size, False)
+    return cost_of(model, pair, pose, room, room.gradients[0], room.hessians[0]), room
+
+
+@pytest.mark.parametrize("name", PLATFORMS)
+@pytest.mark.parametrize("away", [0.0, 0.3])
+def test_the_cost_is_the_sum_over_readings(name: str, away: float) -> None:
+    """Near the pose, and where many readings are outliers; with saturated, missing and blocked ones."""
+    platform, rng = PLATFORMS[name], np.random.default_rng(5)
+    model, gains = platform.model, rng.uniform(0.9, 1.1, (2, 6))
+    for pose in random_poses(20, 5, low=0.06, high=0.2):
+        readings = readings_of(platform, pose[None], 5)[0]
+        readings[rng.random(readings.shape) < 0.1] = 0.0
+        readings[rng.random(readings.shape) < 0.1] = math.nan
+        pair = pair_of(model, readings, 0.6 * float(np.nanmax(readings)), gains)
+        assert {MISSING, MEASURED, SATURATED} == set(pair.kinds.tolist())
+        at = pose + away * np.array([0.03, 1.0, -1.0])
+        bright, slopes = expected_with_slopes(platform, at)
+        factor = np.outer(*gains)
+        wanted = one_by_one(
+            model, pair, (factor * bright[0]).ravel(), (factor[..., None] * slopes[0]).reshape(-1, 3)
+        )
+        cost, room = costs_at(model, pair, at)
+        hessian = np.tril(room.hessians[0]) + np.tril(room.hessians[0], -1).T
+        found = (cost, room.gradients[0], hessian, room.tally, room.lasting)
+        for one, other in zip(map(np.asarray, found), map(np.asarray, wanted), strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-9 * max(float(np.abs(other).max()), 1.0))
+
+
+def test_what_a_dead_element_reads_does_not_count() -> None:
+    model, pose = droplet().model, random_poses(1, 6, low=0.1)[0]
+    readings = readings_of(droplet(), pose[None], 6)[0]
+    gains = np.ones((2, 6))
+    gains[0, 2], gains[1, 4] = math.nan, math.nan
+    missing = readings.copy()
+    missing[:, 2], missing[:, :, 4] = math.nan, math.nan
+    dead, _ = costs_at(model, pair_of(model, readings, 255.0, gains), pose)
+    without, _ = costs_at(model, pair_of(model, missing, 255.0), pose)
+    assert dead == without
