@@ -12,11 +12,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import blas
 
-from swarm_loc_estimator.core.filter.sparse.factor import Derived, Factor, solve
+from swarm_loc_estimator.core.filter.sparse.factor import Derived, Factor, add_rows, solve
 from swarm_loc_estimator.core.filter.sparse.levers import Information
 from swarm_loc_estimator.core.filter.sparse.symbolic import Pattern
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
-from swarm_loc_estimator.numerics.jit import compiled, compiled_sums, inlined
+from swarm_loc_estimator.numerics.jit import compiled, compiled_sums
 from swarm_loc_estimator.numerics.lapack import invert_factor
 
 _COPY_SPREAD = np.diag(np.square([3e-5, 3e-5, 3e-4]))
@@ -107,17 +107,10 @@ def _weigh(measured: Information, shares: FloatArray, out: FloatArray) -> None:
     for k in range(measured.first.size):
         row, column, block = 3 * measured.first[k], 3 * measured.second[k], measured.block[k]
         for i in range(3):
-            _add_rows(shares[column : column + 3], block[i, 0], block[i, 1], block[i, 2], out[row + i, :size])
+            add_rows(shares[column : column + 3], block[i, 0], block[i, 1], block[i, 2], out[row + i, :size])
             if row != column:
                 other = out[column + i, :size]
-                _add_rows(shares[row : row + 3], block[0, i], block[1, i], block[2, i], other)
-
-
-@inlined
-def _add_rows(rows: FloatArray, first: float, second: float, third: float, out: FloatArray) -> None:
-    """Add three rows (3, k), each times a factor, to one (k,)."""
-    for c in range(out.size):
-        out[c] += first * rows[0, c] + second * rows[1, c] + third * rows[2, c]
+                add_rows(shares[row : row + 3], block[0, i], block[1, i], block[2, i], other)
 
 
 @compiled_sums

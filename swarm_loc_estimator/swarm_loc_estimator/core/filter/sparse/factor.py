@@ -14,7 +14,10 @@ import numpy as np
 
 from swarm_loc_estimator.core.filter.sparse.symbolic import Pattern
 from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.numerics.jit import compiled, inlined
+
+_FEW = 2
+"""Products of so few pivots with many columns take less time as loops than as calls of BLAS."""
 
 
 class Derived(NamedTuple):
@@ -152,28 +155,67 @@ def write_rows(factor: Factor, derived: int, rows: tuple[IntArray, IntArray], co
 @compiled
 def solve(factor: Factor, right: FloatArray) -> None:
     """Multiply the factor's covariance by columns (3 n, c), in place."""
-    pattern, columns = factor.pattern, right.shape[1]
-    fronts = pattern.pivot_begin.size - 1
+    fronts = factor.pattern.pivot_begin.size - 1
     for f in range(fronts):
-        pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
-        border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
-        if border.size:
-            gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]]
-            added = np.dot(gain.reshape(3 * border.size, 3 * pivots.size), _rows_of(right, pivots))
-            for r in range(border.size):
-                for i in range(3):
-                    for c in range(columns):
-                        right[3 * border[r] + i, c] += added[3 * r + i, c]
+        _substitute(factor, f, right)
     for f in range(fronts - 1, -1, -1):
-        pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
-        border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
-        spread = factor.spread[factor.spread_begin[f] : factor.spread_begin[f + 1]]
-        solved = np.dot(spread.reshape(3 * pivots.size, 3 * pivots.size), _rows_of(right, pivots))
-        if border.size:
-            gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]]
-            solved += np.dot(gain.reshape(3 * border.size, 3 * pivots.size).T, _rows_of(right, border))
-        for r in range(pivots.size):
-            right[3 * pivots[r] : 3 * pivots[r] + 3] = solved[3 * r : 3 * r + 3]
+        _substitute_back(factor, f, right)
+
+
+@compiled
+def _substitute(factor: Factor, f: int, right: FloatArray) -> None:
+    """Add to the border of front f what its pivots' columns say of it."""
+    pattern, columns = factor.pattern, right.shape[1]
+    pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
+    border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+    rows, size = 3 * border.size, 3 * pivots.size
+    gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]].reshape(rows, size)
+    if pivots.size <= _FEW:
+        for r in range(rows):
+            out = right[3 * border[r // 3] + r % 3]
+            for p in range(0, size, 3):
+                of_pivot = right[3 * pivots[p // 3] : 3 * pivots[p // 3] + 3]
+                add_rows(of_pivot, gain[r, p], gain[r, p + 1], gain[r, p + 2], out)
+    elif border.size:
+        added = np.dot(gain, _rows_of(right, pivots))
+        for r in range(rows):
+            row = 3 * border[r // 3] + r % 3
+            for c in range(columns):
+                right[row, c] += added[r, c]
+
+
+@compiled
+def _substitute_back(factor: Factor, f: int, right: FloatArray) -> None:
+    """Make the columns of the pivots of front f the solution, where those of its border are."""
+    pattern = factor.pattern
+    pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
+    border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+    rows, size = 3 * border.size, 3 * pivots.size
+    gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]].reshape(rows, size)
+    spread = factor.spread[factor.spread_begin[f] : factor.spread_begin[f + 1]].reshape(size, size)
+    own = _rows_of(right, pivots)
+    if pivots.size <= _FEW:
+        for p in range(size):
+            out = right[3 * pivots[p // 3] + p % 3]
+            out[:] = 0.0
+            for q in range(0, size, 3):
+                add_rows(own[q : q + 3], spread[p, q], spread[p, q + 1], spread[p, q + 2], out)
+            for r in range(0, rows, 3):
+                of_border = right[3 * border[r // 3] : 3 * border[r // 3] + 3]
+                add_rows(of_border, gain[r, p], gain[r + 1, p], gain[r + 2, p], out)
+        return
+    solved = np.dot(spread, own)
+    if border.size:
+        solved += np.dot(gain.T, _rows_of(right, border))
+    for r in range(pivots.size):
+        right[3 * pivots[r] : 3 * pivots[r] + 3] = solved[3 * r : 3 * r + 3]
+
+
+@inlined
+def add_rows(rows: FloatArray, first: float, second: float, third: float, out: FloatArray) -> None:
+    """Add three rows (3, k), each times a factor, to one (k,)."""
+    for c in range(out.size):
+        out[c] += first * rows[0, c] + second * rows[1, c] + third * rows[2, c]
 
 
 @compiled
@@ -187,25 +229,29 @@ def _rows_of(matrix: FloatArray, bodies: IntArray) -> FloatArray:
 
 @compiled
 def gathered(covariance: FloatArray, rows: IntArray, columns: IntArray) -> FloatArray:
-    """Covariances (3 r, 3 c) of bodies (r,) with bodies (c,)."""
+    """Covariances (3 r, 3 c) of bodies (r,) with bodies (c,), which stand there either way."""
     out = np.empty((3 * rows.size, 3 * columns.size))
-    for r in range(rows.size):
-        for c in range(columns.size):
+    for c in range(columns.size):  # rows are many: those of one column stand together
+        for r in range(rows.size):
             for i in range(3):
                 for j in range(3):
-                    out[3 * r + i, 3 * c + j] = covariance[rows[r], columns[c], i, j]
+                    out[3 * r + i, 3 * c + j] = covariance[columns[c], rows[r], j, i]
     return out
 
 
 @compiled
 def _scatter(covariance: FloatArray, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
     """Write covariances (3 r, 3 c) of bodies (r,) with bodies (c,), either way."""
+    for c in range(columns.size):
+        for r in range(rows.size):
+            for i in range(3):
+                for j in range(3):
+                    covariance[columns[c], rows[r], j, i] = values[3 * r + i, 3 * c + j]
     for r in range(rows.size):
         for c in range(columns.size):
             for i in range(3):
                 for j in range(3):
-                    value = values[3 * r + i, 3 * c + j]
-                    covariance[rows[r], columns[c], i, j] = covariance[columns[c], rows[r], j, i] = value
+                    covariance[rows[r], columns[c], i, j] = values[3 * r + i, 3 * c + j]
 
 
 @compiled

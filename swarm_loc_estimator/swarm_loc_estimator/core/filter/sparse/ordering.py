@@ -29,13 +29,13 @@ class Situation(NamedTuple):
 
     Attributes:
         bodies: Those that are there, ascending.
-        blocks: Of parameters, which are eliminated before all bodies, each in a front of its own.
+        blocks: Of parameters, which are eliminated before all bodies.
         places: (n, 2) of all bodies.
         pairs: (k, 2) bodies of which one has measured the other of late, and those that follow from blocks.
     """
 
     bodies: IntArray
-    blocks: IntArray
+    blocks: Order
     places: FloatArray
     pairs: IntArray
 
@@ -51,15 +51,16 @@ class Situation(NamedTuple):
     def order(self, near: IntArray) -> Order:
         """An order of its own."""
         graph = adjacency(len(self.places), np.concatenate([self.pairs, near]))
-        count, dissected = self.blocks.size, dissect(self.bodies, self.places, graph)
+        blocks, dissected = self.blocks, dissect(self.bodies, self.places, graph)
         return Order(
-            np.concatenate([self.blocks, dissected.body]),
-            np.concatenate([np.arange(count), count + dissected.begin]),
+            np.concatenate([blocks.body, dissected.body]),
+            np.concatenate([blocks.begin[:-1], blocks.begin[-1] + dissected.begin]),
         )
 
     def has_same(self, other: Situation) -> bool:
         """Whether the same are there as in another one."""
-        return np.array_equal(self.bodies, other.bodies) and np.array_equal(self.blocks, other.blocks)
+        same = np.array_equal(self.bodies, other.bodies)
+        return same and np.array_equal(self.blocks.body, other.blocks.body)
 
 
 @dataclass(frozen=True, eq=False)

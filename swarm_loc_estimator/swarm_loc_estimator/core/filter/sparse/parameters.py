@@ -4,8 +4,8 @@ Between two updates the errors x of a robot's pose and z of the parameters of it
 
     x + A z + w,    L z + v,    L diagonal,
 
-where the noises w and v may be correlated. Blocks are eliminated before all bodies, each in a front of its
-own whose border is the robot and what it has measured of late.
+where the noises w and v may be correlated. Blocks are eliminated before all bodies, those of each robot in a
+front of their own whose border is the robot and what it has measured of late.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.core.description.estimated_parameters import BLOCKS, DRIVES, ParameterTable
+from swarm_loc_estimator.core.filter.sparse.dissection import Order
 from swarm_loc_estimator.core.filter.sparse.symbolic import Pattern
 from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.numerics.jit import compiled, inlined
@@ -69,11 +70,12 @@ class Moves(NamedTuple):
         return bool((self.beside >= 0).any() or (self.left != 1.0).any())
 
 
-def active_blocks(groups: Groups, active: BoolArray) -> IntArray:
-    """The blocks that are active, in the order of their elimination: a robot's last one first."""
-    blocks = groups.member[:, :0:-1]
-    chosen: IntArray = blocks[(blocks >= 0) & active[blocks]]
-    return chosen
+def active_blocks(groups: Groups, active: BoolArray) -> Order:
+    """The blocks that are active, in the order of their elimination: those of a robot together."""
+    blocks = groups.member[:, 1:]
+    there = (blocks >= 0) & active[blocks]
+    counts = there.sum(axis=1)
+    return Order(blocks[there], np.concatenate([[0], np.cumsum(counts[counts > 0])]))
 
 
 def block_pairs(groups: Groups, active: BoolArray, measured: IntArray) -> IntArray:

@@ -45,8 +45,8 @@ _COPIED_SHARE = 4
 """One of so many bodies is copied, at most."""
 _COPIED_AGAIN = 100
 """Updates after which other bodies are copied: copies grow old, but each new choice forgets something."""
-_PAIRS_KEPT = 3
-"""Pairs of so many updates count as neighbours."""
+_PAIRS_KEPT, _PAIRS_KEPT_WITH_BLOCKS = 3, 2
+"""Pairs of so many updates count as neighbours; with blocks all that a robot has measured are neighbours."""
 _FAR_M = 20.0
 """A body so far from where its error is held about is held about another place."""
 _NOBODY: IntArray = np.zeros(0, dtype=np.int64)
@@ -288,7 +288,8 @@ class SparseFilter:
         """A pattern in which all these pairs (k, 2) lie, in the order in use or a new one."""
         here = np.zeros(self._number.size, dtype=bool)
         here[active] = True
-        self._pairs = (*self._pairs[1 - _PAIRS_KEPT :], pairs)
+        kept = _PAIRS_KEPT_WITH_BLOCKS if self._groups.part.any() else _PAIRS_KEPT
+        self._pairs = (*self._pairs[1 - kept :], pairs)
         recent = np.concatenate(self._pairs)
         recent = recent[here[recent].all(axis=1)]
         pairs = np.concatenate([recent, block_pairs(self._groups, here, recent)])

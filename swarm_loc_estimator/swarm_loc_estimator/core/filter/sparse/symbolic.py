@@ -105,67 +105,91 @@ def wanted_rows(
         Bodies, front by front of the old pattern, whose covariances with its pivots are wanted, and where
         those of each front begin (F + 1,).
     """
-    wanted = np.zeros((old.fronts, old.front.size), dtype=np.bool_)
-    _want_pairs(old, new, place, beside, wanted)
-    return _close(old, wanted, derived)
+    position = np.empty_like(old.front)
+    position[old.pivot] = np.arange(old.pivot.size)
+    wanted = np.zeros((old.fronts, old.pivot.size), dtype=np.bool_)
+    _want_pairs(_Sequence(old.front, position), new, place, beside, wanted)
+    return _close(old, position, wanted, derived)
+
+
+class _Sequence(NamedTuple):
+    """When each body is eliminated: in which front, and as which one."""
+
+    front: IntArray
+    position: IntArray
 
 
 @compiled
-def _want_pairs(old: Pattern, new: Pattern, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
+def _want_pairs(old: _Sequence, new: Pattern, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
     """Note all pairs of the new pattern, and of those beside, at the earlier one's front."""
     for f in range(new.pivot_begin.size - 1):
         for k in range(new.pivot_begin[f], new.pivot_begin[f + 1]):
             a = new.pivot[k]
             if beside[a] >= 0:
-                _want(old.front, place[a], place[beside[a]], wanted)
+                _want(old, place[a], place[beside[a]], wanted)
             for q in range(k + 1, new.pivot_begin[f + 1]):
-                _want_with(old.front, a, new.pivot[q], place, beside, wanted)
+                _want_with(old, a, new.pivot[q], place, beside, wanted)
             for q in range(new.border_begin[f], new.border_begin[f + 1]):
-                _want_with(old.front, a, new.border[q], place, beside, wanted)
+                _want_with(old, a, new.border[q], place, beside, wanted)
 
 
 @compiled
-def _want_with(front: IntArray, a: int, b: int, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
+def _want_with(old: _Sequence, a: int, b: int, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
     """Note a pair of bodies, with those beside them."""
-    _want(front, place[a], place[b], wanted)
+    _want(old, place[a], place[b], wanted)
     if beside[a] >= 0:
-        _want(front, place[beside[a]], place[b], wanted)
+        _want(old, place[beside[a]], place[b], wanted)
         if beside[b] >= 0:
-            _want(front, place[beside[a]], place[beside[b]], wanted)
+            _want(old, place[beside[a]], place[beside[b]], wanted)
     if beside[b] >= 0:
-        _want(front, place[a], place[beside[b]], wanted)
+        _want(old, place[a], place[beside[b]], wanted)
 
 
 @compiled
-def _want(front: IntArray, a: int, b: int, wanted: BoolArray) -> None:
+def _want(old: _Sequence, a: int, b: int, wanted: BoolArray) -> None:
     """Note a pair of bodies; those of one front are known."""
-    if front[a] < front[b]:
-        wanted[front[a], b] = True
-    elif front[b] < front[a]:
-        wanted[front[b], a] = True
+    if old.front[a] < old.front[b]:
+        wanted[old.front[a], old.position[b]] = True
+    elif old.front[b] < old.front[a]:
+        wanted[old.front[b], old.position[a]] = True
 
 
 @compiled
-def _close(old: Pattern, wanted: BoolArray, derived: int) -> tuple[IntArray, IntArray]:
+def _close(old: Pattern, position: IntArray, wanted: BoolArray, derived: int) -> tuple[IntArray, IntArray]:
     """Add what the wanted ones follow from: a pair of a pivot follows from those of its border."""
-    fronts, count = wanted.shape
+    sequence, fronts = _Sequence(old.front, position), old.pivot_begin.size - 1
     begin, end = np.zeros(fronts + 1, dtype=np.int64), 0
     for f in range(fronts):
         border = old.border[old.border_begin[f] : old.border_begin[f + 1]]
         for body in border:
-            wanted[f, body] = False
+            wanted[f, position[body]] = False
             for other in border if f < derived else border[:0]:
-                _want(old.front, body, other, wanted)
-        for body in range(count):
-            if wanted[f, body]:
-                end += 1
-                for other in border:
-                    _want(old.front, body, other, wanted)
+                _want(sequence, body, other, wanted)
+        end += _follow(old, position, wanted, f)
         begin[f + 1] = end
     rows, end = np.empty(end, dtype=np.int64), 0
     for f in range(fronts):
-        for body in range(count):
-            if wanted[f, body]:
-                rows[end] = body
+        for k in range(old.pivot_begin[f + 1], old.pivot.size):
+            if wanted[f, k]:
+                rows[end] = old.pivot[k]
                 end += 1
     return rows, begin
+
+
+@compiled
+def _follow(old: Pattern, position: IntArray, wanted: BoolArray, f: int) -> int:
+    """Want the pairs of the border of front f with all that are wanted there; return how many these are."""
+    border = old.border[old.border_begin[f] : old.border_begin[f + 1]]
+    for body in border:  # those that are eliminated after it
+        front = old.front[body]
+        for k in range(old.pivot_begin[front + 1], old.pivot.size):
+            wanted[front, k] |= wanted[f, k]
+    count, newest = 0, -1
+    for k in range(old.pivot_begin[f + 1], old.pivot.size):
+        if wanted[f, k]:
+            count, front = count + 1, old.front[old.pivot[k]]
+            for body in border if front != newest else border[:0]:
+                if old.front[body] > front:
+                    wanted[front, position[body]] = True
+            newest = front
+    return count
