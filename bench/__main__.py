@@ -7,6 +7,7 @@ import sys
 
 BENCHMARKS = {
     "aerial": "bench.aerial",
+    "calibrated": "bench.peers.calibrated",
     "droplet": "bench.droplet",
     "droplet_real": "bench.droplet.real",
     "epuck": "bench.epuck",
