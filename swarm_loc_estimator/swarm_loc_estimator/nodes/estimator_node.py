@@ -142,7 +142,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
 
     def _create_thinning(self) -> Thinning:
         """Large swarms, whose measurements are fused together, lose those of whole periods."""
-        robots, settings = len(self._swarm.robots), self.chosen.settings
+        robots, settings = len(self._swarm.robots), self._estimator.settings
         is_large = robots >= settings.sparse_from
         return Thinning(robots, round(settings.fusion_period_s * 1e9) if is_large else 0)
 
@@ -234,7 +234,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         if not self.get_clock().now().nanoseconds:
             reports = [Report("estimator", NO_CLOCK, warning=True)]
         else:
-            period_s, settings = self.chosen.tick_period_s, self.chosen.settings
+            period_s, settings = self.chosen.tick_period_s, self._estimator.settings
             load = load_report(cost, elapsed_s, period_s, settings.fusion_period_s)
             if load.warning:
                 self.get_logger().warning(load.message, throttle_duration_sec=_THROTTLE_S)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import Robot
+from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot, Swarm
 from swarm_loc_estimator.core.estimation import timeline
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
 from swarm_loc_estimator.core.estimation.fusion_period import end_of_period, middle_of_period
@@ -129,3 +129,16 @@ def fixes(stamp_ns: IntArray) -> MeasurementArray:
     return about_robots(
         0, stamp_ns, np.zeros((stamp_ns.size, 3)), np.tile(np.eye(3), (stamp_ns.size, 1, 1)), Kind.CARTESIAN
     )
+
+
+@pytest.mark.parametrize(
+    ("calibrated", "given_s", "period_s"),
+    [(0, -1.0, 0.2), (249, -1.0, 0.2), (250, -1.0, 0.4), (600, -1.0, 0.5), (600, 0.2, 0.2), (600, 0.0, 0.0)],
+)
+def test_many_calibrated_robots_have_longer_periods_unless_one_is_given(
+    calibrated: int, given_s: float, period_s: float
+) -> None:
+    kinds = [OdometryModel(distance_scale_sigma=0.03)] * calibrated + [OdometryModel()] * (700 - calibrated)
+    swarm = Swarm(tuple(Robot(f"r{k}", odometry=kind) for k, kind in enumerate(kinds)), ())
+    estimator = SwarmEstimator(swarm, EstimatorSettings(fusion_period_s=given_s))
+    assert estimator.settings.fusion_period_s == period_s

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from swarm_loc_estimator.parameters.errors import UserError
 from swarm_loc_estimator.parameters.number_spec import number, number_specs
+
+if TYPE_CHECKING:
+    from swarm_loc_estimator.core.description.swarm import Swarm
+
+_USUAL_PERIODS_S = ((600, 0.5), (250, 0.4), (0, 0.2))
+"""The usual fusion period where odometry of so many robots and more is calibrated."""
 
 
 class SettingsError(UserError):
@@ -24,11 +31,12 @@ class EstimatorSettings:
         2.0, "s", 0.05, 60.0, "data up to this late count at their own time; older are dropped"
     )
     fusion_period_s: float = number(
-        0.2,
+        -1.0,
         "s",
-        0.0,
+        -1.0,
         1.0,
-        "where a large swarm has many measurements in such a period, they are fused together; 0: never",
+        "where a large swarm has many measurements in such a period, they are fused together; 0: never;"
+        " below: 0.2, or 0.4 where odometry of 250 robots and more is calibrated, 0.5 from 600 on",
     )
     fusion_delay_s: float = number(
         0.3,
@@ -97,3 +105,11 @@ class EstimatorSettings:
             value = getattr(self, name)
             if not spec.allows(value):
                 raise SettingsError(f"parameter {name} = {value} must lie in {spec.range_text}.")
+
+    def chosen_for(self, swarm: Swarm) -> EstimatorSettings:
+        """The same with the fusion period that is usual for a swarm, where none is given."""
+        if self.fusion_period_s >= 0.0:
+            return self
+        calibrated = sum(robot.odometry.is_calibrated for robot in swarm.robots)
+        period_s = next(period_s for count, period_s in _USUAL_PERIODS_S if calibrated >= count)
+        return replace(self, fusion_period_s=period_s)

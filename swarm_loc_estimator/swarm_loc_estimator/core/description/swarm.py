@@ -89,6 +89,11 @@ class OdometryModel:
         2.0, "rad/s/s^0.5", 0.0, 1000.0, "random walk of the turn rate past the newest message"
     )
 
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether anything of it is estimated from the start."""
+        return max(self.distance_scale_sigma, self.turn_scale_sigma, self.turn_bias_sigma) > 0.0
+
 
 @dataclass(frozen=True)
 class SensorModel:

@@ -44,7 +44,7 @@ class SwarmEstimator:
 
     def __init__(self, swarm: Swarm, settings: EstimatorSettings | None = None) -> None:
         self.swarm = swarm
-        self.settings = settings or EstimatorSettings()
+        self.settings = (settings or EstimatorSettings()).chosen_for(swarm)
         self._timeout_s = np.array([robot.odometry.timeout_s for robot in swarm.robots])
         self._tracks = OdometryTracks(swarm.robots)
         self._validator = InputValidator(swarm, self.settings)
