@@ -266,7 +266,7 @@ def load_report(cost: TickCost, elapsed_s: float, period_s: float, fusion_period
         cost: The ticks of the interval.
         elapsed_s: Length of the interval by the wall clock.
         period_s: Parameter tick_period_s.
-        fusion_period_s: Parameter fusion_period_s.
+        fusion_period_s: The fusion period in force [s].
     """
     load = cost.sum_s / elapsed_s if elapsed_s > 0.0 else 0.0
     values = {

@@ -7,8 +7,10 @@ import pytest
 from ir_world import nees, pair_of, pose_errors, random_poses, readings_of
 
 from swarm_loc_estimator.core.infrared.solution import Outcome
+from swarm_loc_estimator.core.infrared.solvers.coarse_posterior import add_spread
 from swarm_loc_estimator.core.infrared.solvers.cost import cost_of, new_scratch
 from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.core.infrared.solvers.start_table import new_start_room
 from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.numerics.arrays import FloatArray
 
@@ -38,6 +40,19 @@ def test_dark_emitters_and_light_from_elsewhere_do_not_mislead(seed: int) -> Non
     errors = pose_errors(solutions.poses[found], poses[found])
     assert np.mean(nees(errors, solutions.covariances[found]) > _CHI_SQUARE_99) < 0.03
     assert np.all(np.median(np.abs(errors), axis=0) < [0.01, np.radians(5.0), np.radians(10.0)])
+
+
+def test_covariances_say_of_the_same_direction_at_another_range() -> None:
+    table = ESTIMATOR._models.table
+    room = new_start_room(table)
+    room.costs[:] = 100.0
+    room.costs[3 * table.angles.size + 5, [2, 10]] = 0.0
+    pose, covariance = np.array([table.ranges[10], table.angles[3], table.angles[5]]), np.zeros((3, 3))
+    add_spread(table, room, pose, covariance)
+    near, far = table.ranges[2], table.ranges[10]
+    weight = near**2 / (near**2 + far**2)
+    assert covariance[0, 0] == pytest.approx(weight * (far - near) ** 2, rel=1e-5)
+    np.testing.assert_allclose(covariance[1:, 1:], 0.0, atol=1e-12)
 
 
 def test_noise_alone_is_no_robot() -> None:

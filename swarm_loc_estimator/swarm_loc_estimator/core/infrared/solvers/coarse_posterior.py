@@ -16,7 +16,7 @@ from swarm_loc_estimator.numerics.se2_scalar import wrap
 _NEGLIGIBLE = 16.0
 """Poses whose costs are higher by this are left out."""
 _BESIDE = 1.5
-"""What is nearer than so many steps of the table, in bearing and heading, is the same minimum."""
+"""What is nearer than so many steps of the table, in range, bearing and heading, is the same minimum."""
 
 
 @compiled
@@ -37,6 +37,7 @@ def add_spread(table: StartTable, room: StartRoom, pose: FloatArray, covariance:
     """
     size, least = table.angles.size, room.costs.min()
     step = 2.0 * math.pi / size
+    near = _BESIDE * math.log(table.ranges[1] / table.ranges[0])
     total, all_b, all_h = 0.0, 0.0, 0.0
     rr, rb, rh, bb, bh, hh = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for d in range(room.costs.shape[0]):
@@ -49,7 +50,7 @@ def add_spread(table: StartTable, room: StartRoom, pose: FloatArray, covariance:
             weight = table.ranges[k] ** 2 * math.exp(-above)
             total += weight
             all_b, all_h = all_b + weight * b * b, all_h + weight * h * h
-            if beside:
+            if beside and abs(math.log(table.ranges[k] / pose[0])) < near:
                 continue
             r = table.ranges[k] - pose[0]
             rr, rb, rh = rr + weight * r * r, rb + weight * r * b, rh + weight * r * h
