@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.peers.shapes import scored
-from bench.shared.common import table, write_figures
+from bench.shared.common import new_plot, save_plot, table, write_figures
 from bench.shared.simulated_run import errors_of, run_core, ticks
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.core.description.settings import EstimatorSettings
@@ -106,6 +106,22 @@ def measure(robots: int, seed: int) -> dict[str, float]:
     return {"cpu_s_per_s": core.cpu_s / run.duration_s} | scored(errors, core.covariances[counted])
 
 
+def draw(results: dict[tuple[int, int], dict[str, float]]) -> None:
+    """CPU time and consistency against swarm size."""
+    figure, (speed, quality) = new_plot(2)
+    for seed in sorted({seed for _, seed in results}):
+        sizes = [robots for robots, of in results if of == seed]
+        for axes, name in ((speed, "cpu_s_per_s"), (quality, "nees")):
+            axes.plot(sizes, [results[robots, seed][name] for robots in sizes], "o-", label=f"seed {seed}")
+    speed.axhline(1.0, color="0.5", linestyle=":", label="real time")
+    speed.set(xscale="log", yscale="log", xlabel="calibrated robots", ylabel="CPU seconds per second")
+    quality.axhline(3.0, color="0.5", linestyle=":", label="ideal")
+    quality.set(xscale="log", xlabel="calibrated robots", ylabel="NEES", ylim=(0.0, 6.0))
+    for axes in (speed, quality):
+        axes.legend()
+    print(f"plot: {save_plot(figure, 'calibrated')}")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -117,6 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     results = {(n, seed): measure(n, seed) for n in options.robots for seed in options.seeds}
     names = list(next(iter(results.values())))
     print(table(["robots", "seed", *names], [[*run, *one.values()] for run, one in results.items()]))
+    draw(results)
     flat = {f"n{n}.seed{s}.{name}": v for (n, s), one in results.items() for name, v in one.items()}
     print(f"figures: {write_figures('calibrated', flat)}")
 
