@@ -7,7 +7,8 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from workspace import install, tf2_msgs
@@ -75,14 +76,33 @@ def compile_estimator() -> None:
     if stamp.read() == inputs:
         return
     say("  compiling the estimator, about three minutes")
-    program = "from swarm_loc_estimator.nodes.warm_up import warm_up; warm_up()"
-    status, output = run_logged([VENV_PYTHON, "-c", program], "compile.log", lambda _: None, environment())
+    program, env = "from swarm_loc_estimator.nodes.warm_up import warm_up; warm_up()", environment()
+    with _compiling_beside(env):
+        status, output = run_logged([VENV_PYTHON, "-c", program], "compile.log", lambda _: None, env)
     if status:
         reason = output.strip().splitlines()[-1:] or ["no output"]
         raise WorkspaceError(
             f"The estimator does not start: {reason[0]} (whole output: {LOGS / 'compile.log'})."
         )
     stamp.write(inputs)
+
+
+@contextmanager
+def _compiling_beside(env: Mapping[str, str]) -> Iterator[None]:
+    """Have another process compile what the estimator needs last, and the detector, meanwhile.
+
+    Should it fail, they are compiled when they are first needed.
+    """
+    program = "from swarm_loc_estimator.nodes.warm_up import warm_up_infrared; warm_up_infrared()\n"
+    program += "from swarm_loc_vision.core.warm_up import warm_up; warm_up()"
+    silent = subprocess.DEVNULL
+    beside = subprocess.Popen([VENV_PYTHON, "-c", program], env=env, stdout=silent, stderr=silent)
+    with beside:
+        try:
+            yield
+        except BaseException:
+            beside.kill()
+            raise
 
 
 def environment() -> dict[str, str]:

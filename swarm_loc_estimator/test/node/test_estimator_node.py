@@ -29,6 +29,7 @@ from rcl_interfaces.msg import Log
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
+from swarm_loc_estimator.core.description.settings import EstimatorSettings
 from swarm_loc_estimator.core.estimation.contradictions import Contradiction, Kind
 from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate
 from swarm_loc_estimator.core.estimation.timeline import GoOn
@@ -298,6 +299,7 @@ class StandIn:
         self.identities = None
         self.is_fusing = False
         self.note = ""
+        self.settings = EstimatorSettings()
 
     def receive(self, messages: RawInputs) -> None:
         """Remember whose and when."""
