@@ -79,11 +79,11 @@ def compile_estimator() -> None:
     program, env = "from swarm_loc_estimator.nodes.warm_up import warm_up; warm_up()", environment()
     with _compiling_beside(env):
         status, output = run_logged([VENV_PYTHON, "-c", program], "compile.log", lambda _: None, env)
-    if status:
-        reason = output.strip().splitlines()[-1:] or ["no output"]
-        raise WorkspaceError(
-            f"The estimator does not start: {reason[0]} (whole output: {LOGS / 'compile.log'})."
-        )
+        if status:
+            reason = output.strip().splitlines()[-1:] or ["no output"]
+            raise WorkspaceError(
+                f"The estimator does not start: {reason[0]} (whole output: {LOGS / 'compile.log'})."
+            )
     stamp.write(inputs)
 
 

@@ -6,6 +6,7 @@ functions cost ten to fifty times the arithmetic. Compiled code is cached in the
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import inspect
 import os
@@ -14,11 +15,11 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numba
 
@@ -104,7 +105,29 @@ def _compiled(
         forceinline=forceinline,
         _nrt=nrt,
     )
-    return cast("Function", compiler(function))
+    dispatcher = compiler(function)
+    _let_one_save_at_a_time(dispatcher, _cache_folder(source))
+    return cast("Function", dispatcher)
+
+
+def _let_one_save_at_a_time(dispatcher: Any, folder: Path) -> None:
+    """Let processes that compile a function at once save it one after the other.
+
+    Numba writes index and code apart, without a lock: one process's index could name another one's code.
+    """
+    if not hasattr(dispatcher, "_cache"):  # numba is told not to compile
+        return
+    save = dispatcher._cache.save_overload  # noqa: SLF001 - numba has no other way in
+
+    def save_overload(signature: object, result: object) -> None:
+        with ExitStack() as stack:
+            with suppress(OSError):  # where nothing can be kept, there is nothing to lock
+                folder.mkdir(parents=True, exist_ok=True)
+                lock = stack.enter_context((folder / "lock").open("a"))
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            save(signature, result)
+
+    dispatcher._cache.save_overload = save_overload  # noqa: SLF001
 
 
 def _mark(source: Path) -> Path:

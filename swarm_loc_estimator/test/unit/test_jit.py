@@ -1,5 +1,6 @@
 """The cache of compiled code: used again, and never for other sources than those it was made of."""
 
+import fcntl
 import os
 import subprocess
 import sys
@@ -59,3 +60,44 @@ def test_caches_of_sources_long_gone_are_deleted(tmp_path: Path) -> None:
     os.utime(own, times=(0.0, 0.0))
     assert run(tmp_path, tmp_path / "cache")[0] == "True"  # in use, however old
     assert own.stat().st_mtime > time.time() - 86400.0
+
+
+SAVING = """
+from pathlib import Path
+from swarm_loc_estimator.numerics.jit import _cache_folder, compiled
+
+@compiled
+def one() -> float:
+    return 1.0
+
+print(_cache_folder(Path(__file__)), flush=True)
+input()
+print(one())
+"""
+
+
+def test_what_is_compiled_is_saved_by_one_process_at_a_time(tmp_path: Path) -> None:
+    (tmp_path / "saving.py").write_text(SAVING, encoding="utf-8")
+    env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    command = [sys.executable, str(tmp_path / "saving.py")]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, env=env, stdin=pipe, stdout=pipe, text=True) as process:
+        assert process.stdout is not None
+        folder = Path(process.stdout.readline().strip())
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / "lock").open("a") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            assert process.stdin is not None
+            process.stdin.write("\n")
+            process.stdin.flush()
+            while not waits_for_a_lock(process.pid):
+                assert process.poll() is None
+                time.sleep(0.01)
+            assert not [*folder.rglob("*.nbi")]
+        assert process.communicate()[0] == "1.0\n"
+    assert [*folder.rglob("*.nbi")]
+
+
+def waits_for_a_lock(pid: int) -> bool:
+    lines = Path("/proc/locks").read_text(encoding="utf-8").splitlines()
+    return any("->" in line and str(pid) in line.split() for line in lines)
