@@ -82,9 +82,8 @@ def _run(settings: EstimatorSettings, *, infrared: bool) -> None:
         backlog.append((ingest.handle_of["a/detections"], one, now_ns))
         fix = encode_fix("map", now_ns, (0.0, 0.0, 0.0), np.eye(3))
         backlog.append((ingest.handle_of["a/fix"], fix, now_ns))
-        for number, robot in enumerate(
-            robots[:2] if infrared else ()
-        ):  # the powers of an exchange in different steps
+        # the powers of an exchange in different steps
+        for number, robot in enumerate(robots[:2] if infrared else ()):
             for power, stamp_ns in enumerate((now_ns, now_ns - _SECOND // 4)):
                 light = encode_brightness("", stamp_ns, (1 + number, 3), _LIGHT[power], power)
                 backlog.append((ingest.handle_of[f"{robot.name}/brightness"], light, now_ns))
