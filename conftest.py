@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import HealthCheck, settings
 
-from swarm_loc_estimator.numerics.jit import is_warm
-from swarm_loc_vision.core.warm_up import WARM_UP, warm_up
+from swarm_loc_estimator.common.jit import is_warm
+from swarm_loc_vision.markers.precompile import WARM_UP, warm_up
 
 if TYPE_CHECKING:
     from node_world import Ros  # unit tests do without ROS

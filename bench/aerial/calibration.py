@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from bench.aerial.worlds import PERIOD_NS, Conditions, picture_of, simulate
-from swarm_loc_estimator.core.identification.anchors import Scale
-from swarm_loc_estimator.core.identification.chain import ChainModel, Chains
+from swarm_loc_estimator.identification.anchors import Scale
+from swarm_loc_estimator.identification.chain import ChainModel, Chains
 
 if TYPE_CHECKING:
     from bench.aerial.rates import Results
-    from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray
+    from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 
 _SURE = 0.99
 _ROBOTS_PER_WORLD = 4

@@ -15,10 +15,10 @@ import numpy as np
 
 from bench.aerial.pictures import DIAMETER, Look, Picture, draw_picture
 from bench.shared.common import Cell, ProgressLine, table
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.aerial.detector import AerialDetections, AerialDetector
-from swarm_loc_vision.core.aerial.settings import AerialSettings
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.aerial.detector import AerialDetections, AerialDetector
+from swarm_loc_vision.aerial.settings import AerialSettings
 
 SEEDS = 5
 _MATCHED = 0.3

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.aerial.ground.ground_camera import GroundCamera
-from swarm_loc_vision.core.aerial.pattern import MARGIN, inside_mark
-from swarm_loc_vision.core.imaging.camera import Camera
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.aerial.ground.ground_camera import GroundCamera
+from swarm_loc_vision.aerial.pattern import MARGIN, inside_mark
+from swarm_loc_vision.common.camera import Camera
 
 Plain = NDArray[np.float32]
 

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from swarm_loc_estimator.numerics.se2 import wrap_angle
+from swarm_loc_estimator.common.se2 import wrap_angle
 
 if TYPE_CHECKING:
-    from swarm_loc_estimator.core.identification.own_motion import ComplexArray
-    from swarm_loc_estimator.numerics.arrays import FloatArray
+    from swarm_loc_estimator.common.arrays import FloatArray
+    from swarm_loc_estimator.identification.own_motion import ComplexArray
 
 
 def algorithm_1(first: FloatArray, second: FloatArray, own_turn: float) -> int:

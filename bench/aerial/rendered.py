@@ -23,16 +23,16 @@ from bench.shared.common import OUT, Cell, ProgressLine, table
 from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
 from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
-from swarm_loc_drivers.simulation import SimulationOptions, seen_from_above, simulation_nodes
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.core.estimation.estimator import Status
-from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.launching.graph import NodeSpec
-from swarm_loc_estimator.live.graph import LiveGraph
-from swarm_loc_estimator.live.recorder import read_history
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.trajectory import interpolate
+from swarm_loc_drivers.sim.simulation import SimulationOptions, seen_from_above, simulation_nodes
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.launching.graph import NodeSpec
+from swarm_loc_estimator.common.trajectory import interpolate
+from swarm_loc_estimator.offline.live.graph import LiveGraph
+from swarm_loc_estimator.offline.live.recorder import read_history
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.timeline.estimator import Status
 from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities
 
 ROBOTS = 5

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from swarm_loc_estimator.core.identification.picture import Picture, TrackPoint
+from swarm_loc_estimator.identification.picture import Picture, TrackPoint
 
 if TYPE_CHECKING:
-    from swarm_loc_estimator.core.identification.own_motion import ComplexArray
-    from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+    from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+    from swarm_loc_estimator.identification.own_motion import ComplexArray
 
 PERIOD_S = 10.0
 PERIOD_NS = 10_000_000_000

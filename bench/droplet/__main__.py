@@ -23,16 +23,16 @@ from numpy.typing import NDArray
 
 from bench.droplet import swarm as droplet_swarm
 from bench.shared.common import Cell, new_plot, save_plot, table, write_figures
-from swarm_loc_estimator.core.infrared.board import IrPlatform, PairGains
-from swarm_loc_estimator.core.infrared.brightness import expected
-from swarm_loc_estimator.core.infrared.cramer_rao import information
-from swarm_loc_estimator.core.infrared.solution import IrEstimator, IrSolutions, Outcome
-from swarm_loc_estimator.core.infrared.solvers.closed_form import ClosedForm
-from swarm_loc_estimator.core.infrared.solvers.gains import Exchanges, estimate_gains
-from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.se2 import wrap_angle
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.cramer_rao import information
+from swarm_loc_estimator.infrared.solution import IrEstimator, IrSolutions, Outcome
+from swarm_loc_estimator.infrared.solvers.closed_form import ClosedForm
+from swarm_loc_estimator.infrared.solvers.gains import Exchanges, estimate_gains
+from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
 
 CENTIMETRES = (6, 8, 10, 12, 13, 14, 15, 16, 18, 20, 24, 28)
 POSES, LIVE, REPLAYS = 12000, 2, 6

@@ -36,20 +36,20 @@ from swarm_loc_drivers.sim.scenarios.droplet_run import (
     simulate_droplets,
 )
 from swarm_loc_drivers.sim.scenarios.droplet_table import DropletSwarmSettings, describe_droplets, starts
-from swarm_loc_estimator.calibration.infrared.gains import calibrate_infrared
-from swarm_loc_estimator.calibration.recording import read_recording
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.evaluation.metrics import pool, summarise
-from swarm_loc_estimator.evaluation.replay import replay
-from swarm_loc_estimator.evaluation.result import ReplayResult
-from swarm_loc_estimator.evaluation.truth import read_truth
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.launching.graph import NodeSpec, ParameterValue
-from swarm_loc_estimator.live.graph import START_PATIENCE_S, LiveGraph
-from swarm_loc_estimator.live.recorder import read_history, read_poses
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.launching.graph import NodeSpec, ParameterValue
+from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_infrared
+from swarm_loc_estimator.offline.calibration.recording import read_recording
+from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveGraph
+from swarm_loc_estimator.offline.live.recorder import read_history, read_poses
+from swarm_loc_estimator.offline.metrics import pool, summarise
+from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.offline.truth import read_truth
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 ROBOTS = 20
 DURATION_S, SETTLED_S = 90.0, 45.0

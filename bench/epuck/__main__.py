@@ -35,9 +35,9 @@ from bench.vision import report as vision_report
 from swarm_loc_drivers.sim.common.error_model import W0, W2, W2_FAST, ErrorModel
 from swarm_loc_drivers.sim.scenarios.dense import DenseSettings, blind_robots, simulate_dense
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import Robot, Swarm
-from swarm_loc_estimator.live.graph import LiveError
+from swarm_loc_estimator.offline.live.graph import LiveError
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 if TYPE_CHECKING:
     from swarm_loc_drivers.sim.common.record import SimulatedRun

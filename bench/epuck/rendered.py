@@ -18,15 +18,15 @@ from bench.graph.listener import TYPE_OF, Listener, Say
 from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
 from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
-from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.evaluation.result import ReplayResult
-from swarm_loc_estimator.io.bags.writer import BagWriter
-from swarm_loc_estimator.io.messages.cdr import DetectionArrayMessage, decode_detections
-from swarm_loc_estimator.io.messages.encoders import UNKNOWN_COVARIANCE, encode_detections
-from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.live.graph import LiveGraph, cpu_seconds
-from swarm_loc_estimator.live.recorder import read_history
+from swarm_loc_drivers.sim.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.messages.cdr import DetectionArrayMessage, decode_detections
+from swarm_loc_estimator.common.messages.encoders import UNKNOWN_COVARIANCE, encode_detections
+from swarm_loc_estimator.offline.live.graph import LiveGraph, cpu_seconds
+from swarm_loc_estimator.offline.live.recorder import read_history
+from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 ROBOTS = 5
 WORLD = "w2"

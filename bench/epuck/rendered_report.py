@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from bench.epuck.rendered import RenderedRun, run_rendered, starting_swarm
 from bench.epuck.seen import Seen, count_seen
 from bench.shared.common import OUT, Cell, ProgressLine, new_plot, save_plot, table
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.evaluation.metrics import ErrorSummary, pool, summarise
-from swarm_loc_estimator.evaluation.replay import replay
-from swarm_loc_estimator.evaluation.report.overview import plot_overview
-from swarm_loc_estimator.evaluation.report.style import INK, colour_of
-from swarm_loc_estimator.evaluation.result import ReplayResult
-from swarm_loc_vision.core.warm_up import warm_up
+from swarm_loc_estimator.offline.metrics import ErrorSummary, pool, summarise
+from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.offline.report.overview import plot_overview
+from swarm_loc_estimator.offline.report.style import INK, colour_of
+from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_vision.markers.precompile import warm_up
 
 OUTPUT_NS = 100_000_000
 """Of the poses, which come twice as often, those that the other rows of the benchmark have, too."""

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.epuck.rendered import WORLD, RenderedRun
-from swarm_loc_drivers.nodes.epuck.epuck_world_parameters import WorldParameters, make_world
+from swarm_loc_drivers.sim.epuck.epuck_world_parameters import WorldParameters, make_world
 from swarm_loc_drivers.sim.epuck.world import EpuckWorld
 from swarm_loc_drivers.sim.render.views import Views
-from swarm_loc_estimator.numerics.trajectory import DEFAULT_GAP_NS, interpolate
+from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 
 _PENDING_NS = 300_000_000
 """At the end of a run pictures so fresh may still be on their way; the world waits for older ones."""

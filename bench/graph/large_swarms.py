@@ -22,10 +22,10 @@ from swarm_loc_drivers.sim.common.record import SimulatedRun
 from swarm_loc_drivers.sim.recording.bag import write_bag
 from swarm_loc_drivers.sim.recording.shared_bag import write_shared_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
-from swarm_loc_estimator.evaluation.metrics import pool, summarise
-from swarm_loc_estimator.io.inputs.thinning import SHED_REASONS
-from swarm_loc_estimator.launching.graph import GraphOptions
-from swarm_loc_estimator.live.run import play_live
+from swarm_loc_estimator.common.launching.graph import GraphOptions
+from swarm_loc_estimator.offline.live.run import play_live
+from swarm_loc_estimator.offline.metrics import pool, summarise
+from swarm_loc_estimator.sensors.thinning import SHED_REASONS
 
 SIZES = (100, 300, 1000)
 DURATION_S = 30.0

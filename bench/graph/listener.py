@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from rclpy.time import Time
 from sensor_msgs.msg import Image
 
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.evaluation.truth import read_truth
-from swarm_loc_estimator.io.messages.cdr import decode_pose_stamped
-from swarm_loc_estimator.io.messages.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED
-from swarm_loc_estimator.live.graph import START_PATIENCE_S, LiveError, LiveGraph
-from swarm_loc_estimator.numerics.trajectory import Trajectory
+from swarm_loc_estimator.common.messages.cdr import decode_pose_stamped
+from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED
+from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveError, LiveGraph
+from swarm_loc_estimator.offline.truth import read_truth
+from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
 TYPE_OF = {"odom": ODOMETRY, "detections": DETECTIONS, "ground_truth": POSE_STAMPED}

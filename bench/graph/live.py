@@ -18,14 +18,14 @@ from pathlib import Path
 import numpy as np
 
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
-from swarm_loc_estimator.evaluation.metrics import pool, summarise
-from swarm_loc_estimator.evaluation.result import ReplayResult
-from swarm_loc_estimator.io.bags.cut import copy_beginning
-from swarm_loc_estimator.io.mrclam.bag import Delay, convert
-from swarm_loc_estimator.io.mrclam.dataset import read_dataset
-from swarm_loc_estimator.launching.graph import GraphOptions
-from swarm_loc_estimator.live.agreement import Agreement, compare_with_replay
-from swarm_loc_estimator.live.run import LiveRun, play_live
+from swarm_loc_estimator.common.bags.cut import copy_beginning
+from swarm_loc_estimator.common.launching.graph import GraphOptions
+from swarm_loc_estimator.offline.datasets.mrclam.bag import Delay, convert
+from swarm_loc_estimator.offline.datasets.mrclam.dataset import read_dataset
+from swarm_loc_estimator.offline.live.agreement import Agreement, compare_with_replay
+from swarm_loc_estimator.offline.live.run import LiveRun, play_live
+from swarm_loc_estimator.offline.metrics import pool, summarise
+from swarm_loc_estimator.offline.result import ReplayResult
 
 ROOT = OUT.parent
 DEMO_BAG = ROOT / "bags" / "eight_five_robots"

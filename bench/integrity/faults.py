@@ -18,9 +18,9 @@ from swarm_loc_drivers.sim.common.record import (
 )
 from swarm_loc_drivers.sim.common.trajectories import Trajectories
 from swarm_loc_drivers.sim.scenarios.eight import VIEW, EightSettings, camera_exposures, drive_eight
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.swarm.swarm import Swarm
 
 SwarmChange = Callable[[Swarm], Swarm]
 TruthChange = Callable[[Trajectories], Trajectories]

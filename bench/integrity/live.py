@@ -16,17 +16,17 @@ from bench.integrity.scoring import Estimated, Score, scored
 from swarm_loc_drivers.sim.common.error_model import W0
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
 from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
-from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.core.estimation.estimator import Status
-from swarm_loc_estimator.io.messages.cdr import decode_detections, decode_odometry
-from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.live.graph import LiveGraph
-from swarm_loc_estimator.live.recorder import read_history, read_poses
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.trajectory import DEFAULT_GAP_NS, interpolate
-from swarm_loc_vision.core.warm_up import warm_up
+from swarm_loc_drivers.sim.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.cdr import decode_detections, decode_odometry
+from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
+from swarm_loc_estimator.offline.live.graph import LiveGraph
+from swarm_loc_estimator.offline.live.recorder import read_history, read_poses
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.timeline.estimator import Status
+from swarm_loc_vision.markers.precompile import warm_up
 
 _ROBOTS = 5
 _BEFORE_S, _AFTER_S = 8.0, 10.0

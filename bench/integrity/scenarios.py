@@ -13,9 +13,9 @@ from swarm_loc_drivers.sim.common.error_model import W0, W2, ErrorModel
 from swarm_loc_drivers.sim.common.record import SimulatedRun
 from swarm_loc_drivers.sim.common.trajectories import Trajectories
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings
-from swarm_loc_estimator.core.description.swarm import SensorModel
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.swarm.swarm import SensorModel
 
 DURATION_S = 60.0
 FAULT_S = (15.0, 45.0)

@@ -10,10 +10,10 @@ import numpy as np
 from bench.integrity.faults import seconds
 from bench.integrity.scenarios import Fault
 from bench.shared.simulated_run import errors_of, inputs_between
-from swarm_loc_estimator.core.estimation.contradictions import Kind
-from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimator
-from swarm_loc_estimator.evaluation.metrics import nees
-from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.offline.metrics import nees
+from swarm_loc_estimator.timeline.contradictions import Kind
+from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimator
 
 TICK_NS = 100_000_000
 _MISLEADING_SIGMAS = 5.0

@@ -37,8 +37,8 @@ from bench.mrclam.jobs import (
 from bench.mrclam.report import report
 from bench.mrclam.sets import NoSetsError, find_sets
 from bench.shared.common import OUT
-from swarm_loc_estimator.cli.errors import exit_with_message
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 DEFAULT_FOLDER = OUT.parent.parent / "shared" / "data" / "mrclam"
 _PROCESSES = 2

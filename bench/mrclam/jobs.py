@@ -20,14 +20,14 @@ from bench.mrclam.sets import (
     without_sightings,
 )
 from bench.shared.common import OUT
-from swarm_loc_estimator.calibration.motion_and_camera.fit import Options, calibrate
-from swarm_loc_estimator.calibration.recording import Recording
-from swarm_loc_estimator.calibration.rerun import rerun
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.evaluation.metrics import Errors, pool
-from swarm_loc_estimator.evaluation.replay import replay
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.offline.calibration.motion_and_camera.fit import Options, calibrate
+from swarm_loc_estimator.offline.calibration.recording import Recording
+from swarm_loc_estimator.offline.calibration.rerun import rerun
+from swarm_loc_estimator.offline.metrics import Errors, pool
+from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 MODELS = ("plain", "calibrated")
 ONLINE = "landmarks_robots"

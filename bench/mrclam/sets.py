@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.calibration.recording import Recording, read_recording
-from swarm_loc_estimator.core.description.swarm import CameraMount, OdometryModel, Robot, SensorModel, Swarm
-from swarm_loc_estimator.io.mrclam.bag import Delay, convert
-from swarm_loc_estimator.io.mrclam.dataset import read_dataset
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.parameters.errors import UserError
+from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
+from swarm_loc_estimator.offline.datasets.mrclam.bag import Delay, convert
+from swarm_loc_estimator.offline.datasets.mrclam.dataset import read_dataset
+from swarm_loc_estimator.swarm.swarm import CameraMount, OdometryModel, Robot, SensorModel, Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 
 class NoSetsError(UserError):

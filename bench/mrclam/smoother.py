@@ -14,23 +14,23 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.calibration.recording import Recording
-from swarm_loc_estimator.core.description.estimated_parameters import TURN_BIAS
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot, Swarm
-from swarm_loc_estimator.core.filter.measurement_model import (
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.filter.calibration_states import TURN_BIAS
+from swarm_loc_estimator.filter.measurement_model import (
     MeasurementArray,
     MeasurementColumns,
     innovation,
     predict_one,
 )
-from swarm_loc_estimator.core.inputs.validation import InputValidator
-from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.evaluation.metrics import Errors, compare
-from swarm_loc_estimator.evaluation.result import ReplayResult
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
-from swarm_loc_estimator.numerics.trajectory import Trajectory
+from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.offline.calibration.recording import Recording
+from swarm_loc_estimator.offline.metrics import Errors, compare
+from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.sensors.validation import InputValidator
+from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 _FLOOR = np.diag([1e-10, 1e-10, 1e-10])
 """A robot that stands gathers no noise; a factor needs some."""

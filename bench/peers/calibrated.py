@@ -17,15 +17,15 @@ from bench.peers.shapes import scored
 from bench.shared.common import new_plot, save_plot, table, write_figures
 from bench.shared.simulated_run import errors_of, run_core, ticks
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import Robot, Swarm
-from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from swarm_loc_drivers.sim.common.record import Records, SimulatedRun
-    from swarm_loc_estimator.numerics.arrays import FloatArray
+    from swarm_loc_estimator.common.arrays import FloatArray
 
 SIZES = (100, 300, 1000)
 ROBOT_SECONDS = 12_000.0

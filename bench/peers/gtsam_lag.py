@@ -22,8 +22,8 @@ from bench.peers.problem import (
     sightings_of,
     starts_of,
 )
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

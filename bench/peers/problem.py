@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from swarm_loc_drivers.sim.common.record import Records, SimulatedRun

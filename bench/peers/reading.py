@@ -21,17 +21,17 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from bench.mrclam.sets import import_set
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
-from swarm_loc_estimator.io.bags.cut import copy_beginning
-from swarm_loc_estimator.io.bags.reader import BagReader
-from swarm_loc_estimator.io.messages.cdr import decode_odometry
-from swarm_loc_estimator.io.messages.planar import yaw_of
-from swarm_loc_estimator.io.messages.streams import DetectionReader, PoseReader
-from swarm_loc_estimator.io.messages.typestore import DETECTIONS, ODOMETRY, typestore
+from swarm_loc_estimator.common.bags.cut import copy_beginning
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.messages.cdr import decode_odometry
+from swarm_loc_estimator.common.messages.planar import yaw_of
+from swarm_loc_estimator.common.messages.streams import DetectionReader, PoseReader
+from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY, typestore
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from swarm_loc_estimator.numerics.arrays import FloatArray
+    from swarm_loc_estimator.common.arrays import FloatArray
 
 DEMO = Path(__file__).resolve().parents[2] / "bags" / "eight_five_robots"
 MRCLAM_S = 300.0

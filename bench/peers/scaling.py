@@ -24,7 +24,7 @@ from bench.shared.common import new_plot, save_plot, table, write_figures
 from bench.shared.simulated_run import errors_of, position_rmse, run_core, ticks, without_delay
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.scenarios.grid_shapes import Shape
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

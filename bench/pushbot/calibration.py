@@ -9,9 +9,9 @@ import numpy as np
 from bench.shared.common import Cell, new_plot, save_plot, table
 from swarm_loc_drivers.sim.pushbot import optics
 from swarm_loc_drivers.sim.pushbot.wall_drive import WallDriveSettings, drive_at_wall
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.laser.calibration import LaserCalibration
-from swarm_loc_vision.core.laser.fit import Drive, fit_hyperbola, fit_logarithm, logarithm_depth
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.laser.calibration import LaserCalibration
+from swarm_loc_vision.laser.fit import Drive, fit_hyperbola, fit_logarithm, logarithm_depth
 
 DEPTHS_M = np.linspace(0.1, 2.5, 241)
 _MAX_ROW = 125.0

@@ -10,13 +10,13 @@ import numpy as np
 from bench.pushbot.event_feed import StandingBody
 from bench.pushbot.event_flow import RATE, EventFlow, Measured
 from bench.shared.common import Cell, new_plot, save_plot, table
-from swarm_loc_drivers.core.pushbot.session import PushbotSession
-from swarm_loc_drivers.core.pushbot.settings import PushbotSettings, WheelGeometry
-from swarm_loc_drivers.protocols.pushbot.commands import Lights
-from swarm_loc_drivers.protocols.pushbot.hardware import SECOND_FIRMWARE, TIMESTAMPS
+from swarm_loc_drivers.common.link import Address
+from swarm_loc_drivers.pushbot.commands import Lights
+from swarm_loc_drivers.pushbot.hardware import SECOND_FIRMWARE, TIMESTAMPS
+from swarm_loc_drivers.pushbot.session import PushbotSession
+from swarm_loc_drivers.pushbot.settings import PushbotSettings, WheelGeometry
 from swarm_loc_drivers.sim.pushbot.firmware.event_stream import EventRing
 from swarm_loc_drivers.sim.pushbot.firmware.pushbot_firmware import PushbotFirmware
-from swarm_loc_drivers.transports.link import Address
 
 ROBOTS = (1, 2, 10)
 _CORES = 2

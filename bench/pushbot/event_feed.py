@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from swarm_loc_drivers.protocols.pushbot.hardware import SECOND_FIRMWARE
+from swarm_loc_drivers.pushbot.hardware import SECOND_FIRMWARE
 from swarm_loc_drivers.sim.common.body import Blinking
 from swarm_loc_drivers.sim.common.link_host import FirmwareHost
 from swarm_loc_drivers.sim.pushbot.firmware.pushbot_firmware import PushbotFirmware

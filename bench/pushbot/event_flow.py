@@ -18,9 +18,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.qos import QoSProfile
 
-from swarm_loc_estimator.launching.processes import executable_path
-from swarm_loc_estimator.live.graph import cpu_seconds
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.launching.processes import executable_path
+from swarm_loc_estimator.offline.live.graph import cpu_seconds
 
 RATE = 300_000
 """Events of each robot [1/s]."""

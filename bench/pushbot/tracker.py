@@ -12,11 +12,11 @@ from bench.shared.common import Cell, new_plot, save_plot, table
 from swarm_loc_drivers.sim.common.body import Blinking
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraEvents, CameraNoise, EventCamera, Spot
 from swarm_loc_drivers.sim.pushbot.optics import spot_brightness
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.events.centroid_tracker import CentroidTracker
-from swarm_loc_vision.core.events.paper_tracker import PaperSettings, PaperTracker
-from swarm_loc_vision.core.events.settings import LightSource, TrackerSettings
-from swarm_loc_vision.core.events.windows import WindowedTracker
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.events.centroid_tracker import CentroidTracker
+from swarm_loc_vision.events.paper_tracker import PaperSettings, PaperTracker
+from swarm_loc_vision.events.settings import LightSource, TrackerSettings
+from swarm_loc_vision.events.windows import WindowedTracker
 
 NOISES = (0.0, 1.0, 5.0, 15.0, 30.0)
 """Noise events of a pixel [1/s]; the bar is at 15."""

@@ -10,18 +10,18 @@ import numpy as np
 
 from swarm_loc_drivers.sim.common.record import in_order_of_arrival
 from swarm_loc_drivers.sim.recording.detections import as_detections
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
-from swarm_loc_estimator.core.inputs.messages import DetectionRows, OdometryRows, RawInputs, chosen
-from swarm_loc_estimator.evaluation.metrics import nees
-from swarm_loc_estimator.evaluation.runner import ListedSchedule, Runner
-from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.offline.metrics import nees
+from swarm_loc_estimator.offline.runner import ListedSchedule, Runner
+from swarm_loc_estimator.sensors.messages import DetectionRows, OdometryRows, RawInputs, chosen
+from swarm_loc_estimator.timeline.estimator import SwarmEstimator
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from swarm_loc_drivers.sim.common.record import SimulatedRun
-    from swarm_loc_estimator.core.description.settings import EstimatorSettings
-    from swarm_loc_estimator.numerics.arrays import FloatArray
+    from swarm_loc_estimator.common.arrays import FloatArray
+    from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 
 _TICK_NS = 100_000_000

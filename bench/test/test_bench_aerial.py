@@ -8,10 +8,10 @@ import pytest
 from bench.aerial import calibration, driving, printed, straight, turning
 from bench.aerial.rates import Rate, Results
 from bench.aerial.worlds import Conditions, simulate
-from swarm_loc_estimator.core.identification.angular_variation import identify_by_turns
-from swarm_loc_estimator.core.identification.chain import ChainModel
-from swarm_loc_estimator.core.identification.own_motion import ComplexArray
-from swarm_loc_estimator.core.identification.random_motion import identify_by_way
+from swarm_loc_estimator.identification.angular_variation import identify_by_turns
+from swarm_loc_estimator.identification.chain import ChainModel
+from swarm_loc_estimator.identification.own_motion import ComplexArray
+from swarm_loc_estimator.identification.random_motion import identify_by_way
 
 SEED = 77
 

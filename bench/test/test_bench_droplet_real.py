@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from bench.droplet.real.graph import outcome_of, standing
-from swarm_loc_estimator.core.description.swarm import Robot, Swarm
-from swarm_loc_estimator.core.estimation.estimator import Status
-from swarm_loc_estimator.evaluation.result import ReplayResult
-from swarm_loc_estimator.numerics.trajectory import Trajectory
+from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.timeline.estimator import Status
 
 SECOND = 10**9
 TRUTH = Trajectory(

@@ -6,7 +6,7 @@ import pytest
 
 from bench.integrity.scenarios import SCENARIOS
 from bench.integrity.scoring import score
-from swarm_loc_estimator.core.estimation.contradictions import Kind
+from swarm_loc_estimator.timeline.contradictions import Kind
 
 SEED = 23
 

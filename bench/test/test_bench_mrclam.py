@@ -22,9 +22,9 @@ from bench.mrclam.sets import (
     without_sightings,
 )
 from bench.shared.common import save_plot, write_figures
-from swarm_loc_estimator.calibration.recording import Recording, Rows
-from swarm_loc_estimator.core.description.swarm import Face, Landmark, Robot, SensorModel, Swarm
-from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.offline.calibration.recording import Recording, Rows
+from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, SensorModel, Swarm
 
 SWARM = Swarm(
     tuple(Robot(f"robot{k}", "create", faces=(Face("body", k),), start=(0.0, 0.0, 0.0)) for k in (1, 2, 3)),

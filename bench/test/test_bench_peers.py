@@ -11,8 +11,8 @@ from swarm_loc_drivers.sim.common.error_model import W0
 from swarm_loc_drivers.sim.common.record import SimulatedRun
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
 
 SHARP = replace(W0, heading_sigma=0.05, described=replace(W0.described, heading_sigma=0.05))
 """A world whose headings are good enough for linear error propagation, unlike the paper's 29 degrees."""

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from bench.peers import reading
-from swarm_loc_estimator.io.bags.cut import copy_beginning
-from swarm_loc_estimator.io.messages.typestore import DETECTIONS, ODOMETRY
+from swarm_loc_estimator.common.bags.cut import copy_beginning
+from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY
 
 
 @pytest.fixture

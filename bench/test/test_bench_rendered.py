@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.sim.epuck.world import Exposure
 from swarm_loc_drivers.sim.render.views import Views
-from swarm_loc_estimator.core.description.swarm import Robot, Swarm
-from swarm_loc_estimator.evaluation.result import ReplayResult
-from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE, DetectionArrayMessage, decode_detections
-from swarm_loc_estimator.io.messages.encoders import encode_detections
-from swarm_loc_estimator.numerics.trajectory import Trajectory
+from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE, DetectionArrayMessage, decode_detections
+from swarm_loc_estimator.common.messages.encoders import encode_detections
+from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 seen = pytest.importorskip("bench.epuck.seen", exc_type=ImportError)
 rendered = pytest.importorskip("bench.epuck.rendered", exc_type=ImportError)

@@ -10,12 +10,12 @@ import pytest
 from calibration_world import World, record, robot
 
 from bench.mrclam.jobs import Job, smoothed
-from swarm_loc_estimator.calibration.motion_and_camera.noise import with_noise
-from swarm_loc_estimator.calibration.recording import started_at_truth
-from swarm_loc_estimator.calibration.rerun import rerun
-from swarm_loc_estimator.core.description.swarm import Robot
-from swarm_loc_estimator.core.filter.measurement_model import MEASUREMENT_DTYPE, Kind, MeasurementColumns
-from swarm_loc_estimator.evaluation.metrics import pool, summarise
+from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, Kind, MeasurementColumns
+from swarm_loc_estimator.offline.calibration.motion_and_camera.noise import with_noise
+from swarm_loc_estimator.offline.calibration.recording import started_at_truth
+from swarm_loc_estimator.offline.calibration.rerun import rerun
+from swarm_loc_estimator.offline.metrics import pool, summarise
+from swarm_loc_estimator.swarm.swarm import Robot
 
 gtsam = pytest.importorskip("gtsam", exc_type=ImportError)
 smoother = pytest.importorskip("bench.mrclam.smoother", exc_type=ImportError)

@@ -15,10 +15,10 @@ from playwright.sync_api import Browser
 
 from bench.watch.browser import WatchedPage
 from bench.watch.watched_swarm import PLACES, SWARM, WatchedSwarm
-from swarm_loc_estimator.evaluation.report.recording import recorded
-from swarm_loc_estimator.evaluation.result import ReplayResult
-from swarm_loc_estimator.io.watch.page import page as page_of
-from swarm_loc_estimator.numerics.trajectory import Trajectory
+from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.offline.report.recording import recorded
+from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.watch.page import page as page_of
 
 PATIENCE_S = 15.0
 BLUE = (0x00, 0x72, 0xB2)

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_vision.core.decoding.decoder import Dictionary
-from swarm_loc_vision.core.decoding.draw import draw_marker
-from swarm_loc_vision.core.decoding.families import Family, family_named
-from swarm_loc_vision.core.detection.detector import MarkerDetector
-from swarm_loc_vision.core.detection.settings import DetectorSettings
-from swarm_loc_vision.core.imaging.sampling import GRID
+from swarm_loc_vision.common.sampling import GRID
+from swarm_loc_vision.markers.decoder import Dictionary
+from swarm_loc_vision.markers.detector import MarkerDetector
+from swarm_loc_vision.markers.detector_settings import DetectorSettings
+from swarm_loc_vision.markers.draw import draw_marker
+from swarm_loc_vision.markers.families import Family, family_named
 
 Gray = NDArray[np.uint8]
 

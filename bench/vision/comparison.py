@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from bench.vision.peers import FAMILY, Found, Peer, all_peers
 from bench.vision.scenes import CAMERA, Look, Truth, random_scene
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.decoding.families import family_named
-from swarm_loc_vision.core.pose.pose import square
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.markers.families import family_named
+from swarm_loc_vision.markers.pose import square
 
 LOOKS = {
     "still": Look(),

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from bench.vision.peers import FAMILY, own_detector
 from bench.vision.scenes import Look, random_scene
-from swarm_loc_vision.core.decoding.families import Family, families, family_named
-from swarm_loc_vision.core.detection.detector import MarkerDetector
-from swarm_loc_vision.core.detection.settings import DetectorSettings
+from swarm_loc_vision.markers.detector import MarkerDetector
+from swarm_loc_vision.markers.detector_settings import DetectorSettings
+from swarm_loc_vision.markers.families import Family, families, family_named
 
 Gray = NDArray[np.uint8]
 

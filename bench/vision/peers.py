@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.decoding.families import Family, family_named
-from swarm_loc_vision.core.detection.detector import Detections, MarkerDetector
-from swarm_loc_vision.core.detection.settings import DetectorSettings
-from swarm_loc_vision.core.imaging.camera import Camera
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.common.camera import Camera
+from swarm_loc_vision.markers.detector import Detections, MarkerDetector
+from swarm_loc_vision.markers.detector_settings import DetectorSettings
+from swarm_loc_vision.markers.families import Family, family_named
 
 Gray = NDArray[np.uint8]
 

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.jit import compiled
-from swarm_loc_vision.core.decoding.families import Family
-from swarm_loc_vision.core.imaging.homographies import homographies
-from swarm_loc_vision.core.pose.pose import square
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_vision.common.homographies import homographies
+from swarm_loc_vision.markers.families import Family
+from swarm_loc_vision.markers.pose import square
 
 Gray = NDArray[np.uint8]
 

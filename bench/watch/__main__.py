@@ -31,13 +31,13 @@ from bench.watch.browser import WatchedPage, chromium, running_browser
 from bench.watch.publisher import homes
 from swarm_loc_drivers.sim.recording.bag import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
-from swarm_loc_estimator.core.description.swarm import Landmark, Robot, Swarm
-from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.io.watch.access import free_port
-from swarm_loc_estimator.launching.graph import GraphOptions, NodeSpec, ParameterValue, graph_nodes
-from swarm_loc_estimator.launching.processes import Child, node_command, start, stop
-from swarm_loc_estimator.live.graph import START_PATIENCE_S, LiveGraph, cpu_seconds
-from swarm_loc_estimator.live.run import ESTIMATOR, PLAYER
+from swarm_loc_estimator.common.launching.graph import GraphOptions, NodeSpec, ParameterValue, graph_nodes
+from swarm_loc_estimator.common.launching.processes import Child, node_command, start, stop
+from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveGraph, cpu_seconds
+from swarm_loc_estimator.offline.live.run import ESTIMATOR, PLAYER
+from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.watch.access import free_port
 
 SIZES = (5, 300, 1000)
 BARS_MS = {5: 100.0, 300: 150.0, 1000: 250.0}

@@ -8,14 +8,14 @@ from bench.pushbot.runs import RunSettings
 from swarm_loc_drivers.sim.pushbot.exploration import Arrival, Exploration
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_drivers.sim.pushbot.kinematics import PushBotNoise
-from swarm_loc_estimator.core.description.swarm import Robot, Swarm
-from swarm_loc_estimator.core.estimation.estimate import Status
-from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.io.maps.grid_messages import GridMessage
-from swarm_loc_estimator.io.messages.estimates import EstimateMessage
-from swarm_loc_estimator.io.watch.about import about
-from swarm_loc_estimator.io.watch.frames import Frame, map_frame, places_frame, poses_frame
-from swarm_loc_estimator.io.watch.recording import recording
+from swarm_loc_estimator.common.messages.estimates import EstimateMessage
+from swarm_loc_estimator.mapping.grid_messages import GridMessage
+from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.timeline.estimate import Status
+from swarm_loc_estimator.watch.about import about
+from swarm_loc_estimator.watch.frames import Frame, map_frame, places_frame, poses_frame
+from swarm_loc_estimator.watch.recording import recording
 
 _MAP_EVERY_S = 20.0
 

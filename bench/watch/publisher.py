@@ -17,11 +17,11 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 
-from swarm_loc_estimator.core.estimation.sightings import Sightings
-from swarm_loc_estimator.io.messages.estimates import encode_sightings
-from swarm_loc_estimator.io.messages.outputs import SwarmPosesEncoder
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.estimates import encode_sightings
+from swarm_loc_estimator.common.messages.outputs import SwarmPosesEncoder
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.timeline.sightings import Sightings
 from swarm_loc_msgs.msg import SwarmPoses, SwarmSightings
 
 PERIOD_S = 0.05

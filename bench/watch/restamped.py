@@ -15,10 +15,10 @@ import rclpy
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
 
-from swarm_loc_estimator.io.bags.reader import BagReader
-from swarm_loc_estimator.io.messages.cdr import ENCAPSULATION
-from swarm_loc_estimator.io.messages.cdr_writer import STAMP_SIZE, stamp_bytes
-from swarm_loc_estimator.io.messages.typestore import DETECTIONS, ODOMETRY
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.messages.cdr import ENCAPSULATION
+from swarm_loc_estimator.common.messages.cdr_writer import STAMP_SIZE, stamp_bytes
+from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
 _CLASSES = {ODOMETRY: Odometry, DETECTIONS: MarkerDetectionArray}

@@ -21,11 +21,11 @@ from bench.watch.browser import WatchedPage, chromium, running_browser
 from bench.watch.mapping_run import mapping_run
 from swarm_loc_drivers.sim.recording.bag import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
-from swarm_loc_estimator.cli.arguments import swarm_beside
-from swarm_loc_estimator.evaluation.replay import replay
-from swarm_loc_estimator.evaluation.report.recording import recorded
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.io.watch.page import page
+from swarm_loc_estimator.common.arguments import swarm_beside
+from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.offline.report.recording import recorded
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.watch.page import page
 
 ROOT = OUT.parent
 FOLDER = ROOT / "swarm_loc_estimator" / "doc" / "watch"

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from swarm_loc_estimator.core.description.swarm import Landmark, Robot, Swarm
-from swarm_loc_estimator.core.estimation.sightings import Sightings
-from swarm_loc_estimator.io.maps.grid_messages import GridMessage
-from swarm_loc_estimator.io.messages.estimates import EstimateMessage
-from swarm_loc_estimator.io.watch.about import about
-from swarm_loc_estimator.io.watch.access import Access
-from swarm_loc_estimator.io.watch.frames import (
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.estimates import EstimateMessage
+from swarm_loc_estimator.mapping.grid_messages import GridMessage
+from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
+from swarm_loc_estimator.timeline.sightings import Sightings
+from swarm_loc_estimator.watch.about import about
+from swarm_loc_estimator.watch.access import Access
+from swarm_loc_estimator.watch.frames import (
     Frame,
     aerial_frame,
     map_frame,
@@ -23,8 +24,7 @@ from swarm_loc_estimator.io.watch.frames import (
     poses_frame,
     sightings_frame,
 )
-from swarm_loc_estimator.io.watch.server import Answer, Command, WatchServer
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.watch.server import Answer, Command, WatchServer
 
 SWARM = Swarm(
     robots=(Robot("alpha"), Robot("beta"), Robot("gamma")),

@@ -4,9 +4,9 @@ from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
-from swarm_loc_estimator.launching.graph import GraphOptions, graph_nodes
-from swarm_loc_estimator.launching.options import check_graph, options_from
-from swarm_loc_estimator.launching.ros_launch import argument_texts, node_action
+from swarm_loc_estimator.common.launching.graph import GraphOptions, graph_nodes
+from swarm_loc_estimator.common.launching.options import check_graph, options_from
+from swarm_loc_estimator.common.launching.ros_launch import argument_texts, node_action
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -76,7 +76,7 @@ def compile_estimator() -> None:
     if stamp.read() == inputs:
         return
     say("  compiling the estimator, about three minutes")
-    program, env = "from swarm_loc_estimator.nodes.warm_up import warm_up; warm_up()", environment()
+    program, env = "from swarm_loc_estimator.precompile import warm_up; warm_up()", environment()
     with _compiling_beside(env):
         status, output = run_logged([VENV_PYTHON, "-c", program], "compile.log", lambda _: None, env)
         if status:
@@ -93,8 +93,8 @@ def _compiling_beside(env: Mapping[str, str]) -> Iterator[None]:
 
     Should it fail, they are compiled when they are first needed.
     """
-    program = "from swarm_loc_estimator.nodes.warm_up import warm_up_infrared; warm_up_infrared()\n"
-    program += "from swarm_loc_vision.core.warm_up import warm_up; warm_up()"
+    program = "from swarm_loc_estimator.precompile import warm_up_infrared; warm_up_infrared()\n"
+    program += "from swarm_loc_vision.markers.precompile import warm_up; warm_up()"
     silent = subprocess.DEVNULL
     beside = subprocess.Popen([VENV_PYTHON, "-c", program], env=env, stdout=silent, stderr=silent)
     with beside:

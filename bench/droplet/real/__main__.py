@@ -24,22 +24,22 @@ import numpy as np
 from bench.droplet.real import firmware, graph
 from bench.droplet.real.recordings import Recorded, read_folder
 from bench.shared.common import OUT, Cell, ProgressLine, table, write_figures
-from swarm_loc_estimator.calibration.infrared.board import (
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.infrared.solution import IrEstimator
+from swarm_loc_estimator.infrared.solvers.closed_form import ClosedForm
+from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.offline.calibration.infrared.board import (
     BoardCalibration,
     calibrate_board,
     pair_gains,
     without_dead,
 )
-from swarm_loc_estimator.calibration.infrared.board_fit import BoardReadings, turned
-from swarm_loc_estimator.calibration.infrared.board_recording import MAX_RANGE
-from swarm_loc_estimator.cli.errors import exit_with_message
-from swarm_loc_estimator.core.infrared.board import IrPlatform
-from swarm_loc_estimator.core.infrared.solution import IrEstimator
-from swarm_loc_estimator.core.infrared.solvers.closed_form import ClosedForm
-from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.se2 import wrap_angle
+from swarm_loc_estimator.offline.calibration.infrared.board_fit import BoardReadings, turned
+from swarm_loc_estimator.offline.calibration.infrared.board_recording import MAX_RANGE
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
 DEFAULT_FOLDER = OUT.parent.parent / "shared" / "data" / "droplet_2016"
 METHODS = ("firmware", "closed_form", "stock", "board")

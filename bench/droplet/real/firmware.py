@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.se2 import wrap_angle
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.se2 import wrap_angle
 
 _RADIUS_MM = 22.0
 _NEAREST_MM = 46.0

@@ -17,22 +17,22 @@ import numpy as np
 from bench.droplet.real.recordings import Recorded
 from bench.integrity.scoring import Estimated, Score, scored
 from bench.shared.common import OUT, Cell, ProgressLine, new_plot, save_plot, table
-from swarm_loc_estimator.calibration.infrared.board import GAIN_SIGMA, BoardCalibration, without_dead
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.core.estimation.estimator import Status
-from swarm_loc_estimator.core.infrared.board import IrGains
-from swarm_loc_estimator.evaluation.replay import replay
-from swarm_loc_estimator.evaluation.result import ReplayResult
-from swarm_loc_estimator.io.swarm.board_writer import save_ir_platform
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.launching.graph import GraphOptions
-from swarm_loc_estimator.live.agreement import compare_with_replay
-from swarm_loc_estimator.live.run import play_live
-from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.numerics.se2 import wrap_angle
-from swarm_loc_estimator.numerics.trajectory import Trajectory, interpolate
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.launching.graph import GraphOptions
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
+from swarm_loc_estimator.offline.calibration.infrared.board import GAIN_SIGMA, BoardCalibration, without_dead
+from swarm_loc_estimator.offline.live.agreement import compare_with_replay
+from swarm_loc_estimator.offline.live.run import play_live
+from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.swarm.board_writer import save_ir_platform
+from swarm_loc_estimator.swarm.ir_board import IrGains
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.timeline.estimator import Status
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 SETTINGS = EstimatorSettings(lost_heading_sigma=1.5, fix_window_s=60.0)
 """Headings of robots that turn by themselves are seldom surer than the default; it is 7 to 20 s from one

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from bench.shared.common import ProgressLine
-from swarm_loc_estimator.calibration.infrared.board_fit import BoardReadings
-from swarm_loc_estimator.calibration.infrared.board_recording import BoardRecording, read_board
-from swarm_loc_estimator.calibration.recording import read_recording
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.io.droplets.bag import ImportSettings, import_recording
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.parameters.errors import UserError
+from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.offline.calibration.infrared.board_fit import BoardReadings
+from swarm_loc_estimator.offline.calibration.infrared.board_recording import BoardRecording, read_board
+from swarm_loc_estimator.offline.calibration.recording import read_recording
+from swarm_loc_estimator.offline.datasets.droplets.bag import ImportSettings, import_recording
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,8 @@ from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_drivers.sim.scenarios.eight_images import simulate_eight_images
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.scenarios.wandering import WanderingSettings, simulate_wandering
-from swarm_loc_estimator.cli.arguments import number_in
-from swarm_loc_estimator.cli.errors import exit_with_message
+from swarm_loc_estimator.common.arguments import number_in
+from swarm_loc_estimator.common.command_errors import exit_with_message
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

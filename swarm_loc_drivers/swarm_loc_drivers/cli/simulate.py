@@ -16,17 +16,17 @@ import sys
 from collections.abc import Sequence
 
 from swarm_loc_drivers.link_folder import link_folder
-from swarm_loc_drivers.pushbot_simulation import has_pushbots
 from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
-from swarm_loc_drivers.simulation import SimulationOptions, graph_of, simulated_swarm
-from swarm_loc_estimator.cli.arguments import number_in
-from swarm_loc_estimator.cli.errors import exit_with_message
+from swarm_loc_drivers.sim.pushbot_simulation import has_pushbots
+from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
 from swarm_loc_estimator.cli.graph import say
-from swarm_loc_estimator.launching.processes import run_graph
-from swarm_loc_estimator.numerics.jit import is_warm
-from swarm_loc_estimator.parameters.number_spec import number_specs
-from swarm_loc_vision.core.warm_up import WARM_UP, warm_up
+from swarm_loc_estimator.common.arguments import number_in
+from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.common.jit import is_warm
+from swarm_loc_estimator.common.launching.processes import run_graph
+from swarm_loc_estimator.common.number_spec import number_specs
+from swarm_loc_vision.markers.precompile import WARM_UP, warm_up
 
 
 def parse(arguments: Sequence[str] | None) -> SimulationOptions:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from epuck_body import DrivenBody
 
-from swarm_loc_drivers.protocols.epuck.hardware import EPUCK_MODELS
+from swarm_loc_drivers.epuck.hardware import EPUCK_MODELS
 from swarm_loc_drivers.sim.common.link_host import FirmwareHost
 from swarm_loc_drivers.sim.epuck.firmware.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.firmware.wifi_firmware import WifiFirmware

@@ -21,11 +21,11 @@ from node_world import Program, Ros, overrides, stamp_ns, values_of
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_drivers.nodes.droplet.droplet_driver_node import DropletDriverNode
-from swarm_loc_estimator.core.infrared.brightness import expected
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_drivers.droplet.droplet_driver_node import DropletDriverNode
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_msgs.msg import BrightnessMatrix
 
 UNIT = Path(__file__).parents[1] / "unit"

@@ -22,10 +22,10 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 
-from swarm_loc_drivers.core import robot_driver, velocity_command
-from swarm_loc_drivers.core.epuck import wifi_session
-from swarm_loc_drivers.nodes.epuck.epuck_driver_node import EpuckDriverNode
-from swarm_loc_drivers.protocols.epuck.hardware import EPUCK2
+from swarm_loc_drivers.common import robot_driver, velocity_command
+from swarm_loc_drivers.epuck import wifi_session
+from swarm_loc_drivers.epuck.epuck_driver_node import EpuckDriverNode
+from swarm_loc_drivers.epuck.hardware import EPUCK2
 
 STEP_NS = SECOND // 50
 CALIBRATION = """

@@ -27,9 +27,9 @@ from sensor_msgs.msg import Range
 from tcp_link import TcpLink
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_drivers.protocols.epuck.hardware import PROXIMITY_BEARINGS
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_drivers.epuck.hardware import PROXIMITY_BEARINGS
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
 
 UNIT = Path(__file__).parents[1] / "unit"
 

@@ -18,16 +18,16 @@ from node_world import Program, Ros, stamp_ns
 from rclpy.qos import qos_profile_sensor_data
 from test_world_node import free_ports
 
-from swarm_loc_drivers.core.pushbot.settings import WheelGeometry
+from swarm_loc_drivers.pushbot.settings import WheelGeometry
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import FOCAL_PX
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldSettings
-from swarm_loc_drivers.simulation import SimulationOptions, graph_of, simulated_swarm
-from swarm_loc_estimator.parameters.table import markdown_table
+from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
+from swarm_loc_estimator.common.parameters import markdown_table
 from swarm_loc_msgs.msg import EventPacket, LaserDistance, LightBearingArray, SwarmPose, SwarmPoses
-from swarm_loc_vision.core.laser.calibration import LaserCalibration
-from swarm_loc_vision.io.laser_file import load_laser, save_laser
-from swarm_loc_vision.nodes.calibrate_laser_node import CalibrateLaserParameters
+from swarm_loc_vision.laser.calibrate_laser_node import CalibrateLaserParameters
+from swarm_loc_vision.laser.calibration import LaserCalibration
+from swarm_loc_vision.laser.laser_file import load_laser, save_laser
 
 SEED = 3
 STARTS = {"pushbot1": (2.6, 1.5, math.pi), "pushbot2": (1.6, 1.2, 0.3)}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_drivers.sim.simulation import SimulationOptions, simulation_nodes
 
 pytest.importorskip("launch_ros.actions")
 from launch_world import end_of, nodes_of

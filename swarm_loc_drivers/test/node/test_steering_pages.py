@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_drivers.nodes.droplet.droplet_steering_node import DropletSteeringParameters
-from swarm_loc_drivers.nodes.epuck.eight_steering_node import SteeringParameters
-from swarm_loc_estimator.parameters.table import markdown_table
+from swarm_loc_drivers.droplet.droplet_steering_node import DropletSteeringParameters
+from swarm_loc_drivers.sim.scenarios.eight_steering_node import SteeringParameters
+from swarm_loc_estimator.common.parameters import markdown_table
 
 DOC = Path(__file__).parents[2] / "doc"
 

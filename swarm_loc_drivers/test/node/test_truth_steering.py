@@ -8,9 +8,9 @@ from node_world import Ros
 from rclpy.node import Node
 from rclpy.time import Time
 
-from swarm_loc_drivers.core.velocity_command import Velocity
-from swarm_loc_drivers.nodes.truth_steering import TruthSteering
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_drivers.common.velocity_command import Velocity
+from swarm_loc_drivers.sim.common.truth_steering import TruthSteering
+from swarm_loc_estimator.common.arrays import FloatArray
 
 NAMES = ("epuck1", "epuck2")
 

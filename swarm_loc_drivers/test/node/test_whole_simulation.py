@@ -10,11 +10,11 @@ from geometry_msgs.msg import PoseStamped
 
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
 from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
-from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
-from swarm_loc_estimator.core.estimation.estimator import Status
-from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.live.graph import LiveGraph
-from swarm_loc_estimator.live.recorder import Poses
+from swarm_loc_drivers.sim.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_estimator.offline.live.graph import LiveGraph
+from swarm_loc_estimator.offline.live.recorder import Poses
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.timeline.estimator import Status
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
 PATIENCE_S = 100.0

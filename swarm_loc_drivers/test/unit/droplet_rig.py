@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from swarm_loc_drivers.core.droplet.commanded_motion import MotionNoise
-from swarm_loc_drivers.core.droplet.exchange import Brightness, PollingSettings
-from swarm_loc_drivers.core.droplet.session import SessionSettings
-from swarm_loc_drivers.core.droplet.tdma import TdmaSettings
-from swarm_loc_drivers.protocols.droplet.hardware import DROPLET, ELEMENTS, FULL_POWER
+from swarm_loc_drivers.droplet.commanded_motion import MotionNoise
+from swarm_loc_drivers.droplet.exchange import Brightness, PollingSettings
+from swarm_loc_drivers.droplet.hardware import DROPLET, ELEMENTS, FULL_POWER
+from swarm_loc_drivers.droplet.session import SessionSettings
+from swarm_loc_drivers.droplet.tdma import TdmaSettings
 from swarm_loc_drivers.sim.droplet.infrared import InfraredSettings
 from swarm_loc_drivers.sim.droplet.lockstep import Cable, Loose, run
 from swarm_loc_drivers.sim.droplet.world import (
@@ -21,8 +21,8 @@ from swarm_loc_drivers.sim.droplet.world import (
     DropletWorld,
     DropletWorldSettings,
 )
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
 
 SECOND = 1_000_000_000
 START_NS = 1_000 * SECOND

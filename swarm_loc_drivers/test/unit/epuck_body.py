@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.core.epuck.wheels import WheelGeometry
+from swarm_loc_drivers.epuck.wheels import WheelGeometry
 
 GEOMETRY = WheelGeometry(wheel_diameter=0.041, wheel_separation=0.053)
 _CAMERA_PERIOD_NS = 66_000_000

@@ -14,15 +14,15 @@ import numpy as np
 from epuck_body import GEOMETRY, DrivenBody
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.core.epuck.driver import EpuckDriver, Listeners
-from swarm_loc_drivers.core.epuck.session import CameraImage, CameraSettings, EpuckSettings
-from swarm_loc_drivers.core.odometry_state import OdometryState
-from swarm_loc_drivers.protocols.epuck.hardware import EPUCK2, EpuckModel
+from swarm_loc_drivers.common.link import Address
+from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.epuck.driver import EpuckDriver, Listeners
+from swarm_loc_drivers.epuck.hardware import EPUCK2, EpuckModel
+from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, EpuckSettings
 from swarm_loc_drivers.sim.common.link_host import FirmwareHost
 from swarm_loc_drivers.sim.epuck.firmware.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.firmware.wifi_firmware import WifiFirmware
-from swarm_loc_drivers.transports.link import Address
-from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.common import se2
 
 PATIENCE_S = 60.0
 TICK_S = 0.02

@@ -11,16 +11,16 @@ import numpy as np
 from epuck_body import GEOMETRY, DrivenBody
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.core.epuck.serial_session import SerialSession
-from swarm_loc_drivers.core.epuck.session import CameraImage, EpuckSession, EpuckSettings, Reading
-from swarm_loc_drivers.core.epuck.wheel_odometry import WheelOdometry
-from swarm_loc_drivers.core.epuck.wifi_session import WifiSession
-from swarm_loc_drivers.core.odometry_state import OdometryState
-from swarm_loc_drivers.core.robot_driver import SessionError
-from swarm_loc_drivers.protocols.epuck.hardware import EpuckModel
+from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.epuck.hardware import EpuckModel
+from swarm_loc_drivers.epuck.serial_session import SerialSession
+from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession, EpuckSettings, Reading
+from swarm_loc_drivers.epuck.wheel_odometry import WheelOdometry
+from swarm_loc_drivers.epuck.wifi_session import WifiSession
 from swarm_loc_drivers.sim.epuck.firmware.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.firmware.wifi_firmware import WifiFirmware
-from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.common import se2
 
 MS = 1_000_000
 SECOND = 1000 * MS

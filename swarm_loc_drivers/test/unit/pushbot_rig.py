@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from swarm_loc_drivers.core.odometry_state import OdometryState
-from swarm_loc_drivers.core.pushbot.event_packets import EventPacket
-from swarm_loc_drivers.core.pushbot.session import PushbotSession
-from swarm_loc_drivers.core.pushbot.settings import PushbotSettings, WheelGeometry, WheelTicks
-from swarm_loc_drivers.core.pushbot.wheel_odometry import PushbotOdometry
-from swarm_loc_drivers.core.robot_driver import SessionError
-from swarm_loc_drivers.protocols.pushbot.commands import Lights
-from swarm_loc_drivers.protocols.pushbot.hardware import SECOND_FIRMWARE, FirmwareGeneration
+from swarm_loc_drivers.common.link import Address
+from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.pushbot.commands import Lights
+from swarm_loc_drivers.pushbot.event_packets import EventPacket
+from swarm_loc_drivers.pushbot.hardware import SECOND_FIRMWARE, FirmwareGeneration
+from swarm_loc_drivers.pushbot.session import PushbotSession
+from swarm_loc_drivers.pushbot.settings import PushbotSettings, WheelGeometry, WheelTicks
+from swarm_loc_drivers.pushbot.wheel_odometry import PushbotOdometry
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
 from swarm_loc_drivers.sim.pushbot.firmware.pushbot_firmware import PushbotFirmware
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, outline
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldSettings, SimulatedPushbot
-from swarm_loc_drivers.transports.link import Address
-from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.common import se2
 
 GEOMETRY = WheelGeometry(metres_per_tick=1e-4, wheel_separation=0.085)
 HALL = FloorPlan("hall", outline([(-2.0, -2.0, 3.0, 2.0)], []), np.zeros((1, 2)))

@@ -14,7 +14,7 @@ from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.raster import Patches
 from swarm_loc_drivers.sim.render.renderer import RobotCamera, Scene
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, faces, wall_markers
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
 
 LANDMARK_SIZE = wall_markers()[0].size
 

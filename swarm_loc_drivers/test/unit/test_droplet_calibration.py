@@ -11,10 +11,10 @@ import pytest
 from swarm_loc_drivers.sim.recording.droplet_bag import write_droplet_bag
 from swarm_loc_drivers.sim.scenarios.droplet_run import DropletRunSettings, simulate_droplets
 from swarm_loc_estimator.cli import calibrate_ir
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.evaluation.metrics import pool, summarise
-from swarm_loc_estimator.evaluation.replay import replay
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.offline.metrics import pool, summarise
+from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 SETTINGS = DropletRunSettings(seed=1, duration_s=40.0, robots=8, start_known=True, boards=1)
 

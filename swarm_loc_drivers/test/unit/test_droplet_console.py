@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_drivers.protocols.droplet import console
-from swarm_loc_drivers.protocols.droplet.console import (
+from swarm_loc_drivers.droplet import console
+from swarm_loc_drivers.droplet.console import (
     Broken,
     Complaint,
     ConsoleParser,
@@ -33,7 +33,7 @@ from swarm_loc_drivers.protocols.droplet.console import (
     Title,
     Unknown,
 )
-from swarm_loc_drivers.protocols.droplet.hardware import (
+from swarm_loc_drivers.droplet.hardware import (
     DIRECTIONS,
     ELEMENTS,
     TURN_CLOCKWISE,

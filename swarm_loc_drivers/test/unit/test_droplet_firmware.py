@@ -8,8 +8,8 @@ from droplet_rig import IDS, TRIANGLE, world_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_drivers.protocols.droplet.console import ConsoleParser, Matrix
-from swarm_loc_drivers.protocols.droplet.infrared_timing import (
+from swarm_loc_drivers.droplet.console import ConsoleParser, Matrix
+from swarm_loc_drivers.droplet.infrared_timing import (
     EMITTED_AFTER_NS,
     EXCHANGE_NS,
     HANDLING_NS,

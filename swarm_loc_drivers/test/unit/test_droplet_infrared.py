@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from droplet_rig import IDEAL, LINK, QUIET, SECOND, TRIANGLE, world_of
 
-from swarm_loc_drivers.protocols.droplet.hardware import FULL_POWER
-from swarm_loc_drivers.protocols.droplet.infrared_timing import EXCHANGE_NS, message_ns
+from swarm_loc_drivers.droplet.hardware import FULL_POWER
+from swarm_loc_drivers.droplet.infrared_timing import EXCHANGE_NS, message_ns
 from swarm_loc_drivers.sim.common.body import Command, Measured
 from swarm_loc_drivers.sim.droplet.infrared import InfraredSettings
 from swarm_loc_drivers.sim.droplet.world import NEAR_POWER, STEP_NS, DropletErrors, DropletWorld
-from swarm_loc_estimator.core.infrared.brightness import expected
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.infrared.brightness import expected
 
 
 def with_link(**changes: float) -> DropletErrors:

@@ -12,14 +12,14 @@ from droplet_rig import IDEAL, IDS, NOISE, SECOND, START_NS, TRIANGLE, Lab, aski
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_drivers.core.droplet.commanded_motion import CommandedMotion, MotionNoise
-from swarm_loc_drivers.core.droplet.console import ConsoleTalk, Talk
-from swarm_loc_drivers.core.droplet.mover import DropletMover, nearest_motion
-from swarm_loc_drivers.core.velocity_command import VelocityCommand
-from swarm_loc_drivers.protocols.droplet.hardware import AUDIO_DROPLET, DIRECTIONS, ELEMENTS, Gait
+from swarm_loc_drivers.common.velocity_command import VelocityCommand
+from swarm_loc_drivers.droplet.commanded_motion import CommandedMotion, MotionNoise
+from swarm_loc_drivers.droplet.console_session import ConsoleTalk, Talk
+from swarm_loc_drivers.droplet.hardware import AUDIO_DROPLET, DIRECTIONS, ELEMENTS, Gait
+from swarm_loc_drivers.droplet.mover import DropletMover, nearest_motion
 from swarm_loc_drivers.sim.droplet.world import STEP_NS, nominal_gait
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
 
 GAITS = {direction: nominal_gait(direction) for direction in DIRECTIONS}
 AHEAD, TURN = GAITS[0], GAITS[7]

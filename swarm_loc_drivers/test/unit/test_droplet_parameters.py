@@ -8,16 +8,16 @@ from typing import Any
 
 import pytest
 
-from swarm_loc_drivers.core.droplet.exchange import PollingSettings
-from swarm_loc_drivers.core.droplet.tdma import TdmaSettings
-from swarm_loc_drivers.nodes.droplet.droplet_parameters import (
+from swarm_loc_drivers.droplet.droplet_parameters import (
     DropletFleetParameters,
     DropletParameters,
     droplet_settings,
 )
-from swarm_loc_drivers.nodes.droplet.droplet_world_parameters import DropletWorldParameters
-from swarm_loc_drivers.protocols.droplet.hardware import AUDIO_DROPLET
-from swarm_loc_estimator.parameters.table import ParameterError, markdown_table
+from swarm_loc_drivers.droplet.exchange import PollingSettings
+from swarm_loc_drivers.droplet.hardware import AUDIO_DROPLET
+from swarm_loc_drivers.droplet.tdma import TdmaSettings
+from swarm_loc_drivers.sim.droplet.droplet_world_parameters import DropletWorldParameters
+from swarm_loc_estimator.common.parameters import ParameterError, markdown_table
 
 DOC = Path(__file__).parents[2] / "doc"
 PLAIN = DropletParameters(address="/dev/ttyUSB0")

@@ -10,12 +10,12 @@ import pytest
 from swarm_loc_drivers.cli.generate_bag import main
 from swarm_loc_drivers.sim.scenarios.droplet_run import DropletRun, DropletRunSettings, simulate_droplets
 from swarm_loc_drivers.sim.scenarios.droplet_table import PITCH, DropletSwarmSettings, starts
-from swarm_loc_estimator.core.infrared.board import PairGains
-from swarm_loc_estimator.core.infrared.brightness import expected
-from swarm_loc_estimator.io.bags.reader import BagReader
-from swarm_loc_estimator.io.messages.cdr import decode_brightness, decode_fix
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.messages.cdr import decode_brightness, decode_fix
+from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.swarm.ir_board import PairGains
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 SETTINGS = DropletRunSettings(seed=2, duration_s=20.0, robots=6, calibrated=True)
 

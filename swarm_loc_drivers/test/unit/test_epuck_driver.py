@@ -13,8 +13,8 @@ import pytest
 from epuck_body import GEOMETRY
 from epuck_rig import PATIENCE_S, SQUARE, Robots, settings
 
-from swarm_loc_drivers.protocols.epuck.hardware import EPUCK1, EPUCK2
-from swarm_loc_estimator.numerics import se2
+from swarm_loc_drivers.epuck.hardware import EPUCK1, EPUCK2
+from swarm_loc_estimator.common import se2
 
 
 @pytest.fixture

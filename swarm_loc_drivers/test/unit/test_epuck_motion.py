@@ -12,13 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.core.epuck.wheel_odometry import WheelOdometry
-from swarm_loc_drivers.core.odometry_state import OdometryState
-from swarm_loc_drivers.core.velocity_command import STANDING_CLOCK_S, STILL, Velocity, VelocityCommand
-from swarm_loc_drivers.protocols.epuck.hardware import EPUCK1, EPUCK2, as_counter
-from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot
-from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.numerics import se2
+from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.velocity_command import STANDING_CLOCK_S, STILL, Velocity, VelocityCommand
+from swarm_loc_drivers.epuck.hardware import EPUCK1, EPUCK2, as_counter
+from swarm_loc_drivers.epuck.wheel_odometry import WheelOdometry
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot
 
 SECOND = 1_000_000_000
 NOISE = 2e-4

@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.protocols.epuck import serial as epuck_serial
-from swarm_loc_drivers.protocols.epuck import wifi as epuck_wifi
-from swarm_loc_drivers.protocols.epuck.hardware import (
+from swarm_loc_drivers.epuck import serial_protocol as epuck_serial
+from swarm_loc_drivers.epuck import wifi_protocol as epuck_wifi
+from swarm_loc_drivers.epuck.hardware import (
     EPUCK1,
     EPUCK2,
     PROXIMITY_BEARINGS,
@@ -24,9 +24,9 @@ from swarm_loc_drivers.protocols.epuck.hardware import (
     as_counter,
     unwrapped_difference,
 )
-from swarm_loc_drivers.protocols.epuck.proximity import MAX_RANGE_M, range_of_raw, raw_of_distance
-from swarm_loc_drivers.protocols.epuck.rgb565 import decode_rgb565, encode_rgb565
-from swarm_loc_drivers.protocols.epuck.wifi import SENSORS_DTYPE, Command, StreamParser, plausible
+from swarm_loc_drivers.epuck.proximity import MAX_RANGE_M, range_of_raw, raw_of_distance
+from swarm_loc_drivers.epuck.rgb565 import decode_rgb565, encode_rgb565
+from swarm_loc_drivers.epuck.wifi_protocol import SENSORS_DTYPE, Command, StreamParser, plausible
 
 MODELS = pytest.mark.parametrize("model", [EPUCK1, EPUCK2], ids=lambda model: model.name)
 SPEED = st.integers(-1100, 1100)

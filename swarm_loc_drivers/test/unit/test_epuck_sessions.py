@@ -13,13 +13,13 @@ from epuck_rig import SQUARE, settings
 from epuck_wire import MS, SECOND, Wire
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.core.epuck.session import CameraImage, CameraSettings, EpuckSettings, Reading
-from swarm_loc_drivers.core.robot_driver import SessionError
-from swarm_loc_drivers.protocols.epuck import serial as protocol
-from swarm_loc_drivers.protocols.epuck.hardware import EPUCK1, EPUCK2
+from swarm_loc_drivers.common.link import Address
+from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.epuck import serial_protocol as protocol
+from swarm_loc_drivers.epuck.hardware import EPUCK1, EPUCK2
+from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, EpuckSettings, Reading
 from swarm_loc_drivers.sim.epuck.firmware.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.firmware.wifi_firmware import DELAY_NS, WifiFirmware
-from swarm_loc_drivers.transports.link import Address
 
 CYCLE_NS = 2 * DELAY_NS
 EXPOSURE_PERIOD_NS = 66 * MS

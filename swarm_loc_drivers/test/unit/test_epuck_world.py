@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.core.epuck.wheels import WheelGeometry
-from swarm_loc_drivers.protocols.epuck.proximity import raw_of_distance
+from swarm_loc_drivers.epuck.proximity import raw_of_distance
+from swarm_loc_drivers.epuck.wheels import WheelGeometry
 from swarm_loc_drivers.sim.common.error_model import W0, W2, ErrorModel
 from swarm_loc_drivers.sim.common.world_error import WorldError
 from swarm_loc_drivers.sim.epuck.world import (
@@ -20,9 +20,9 @@ from swarm_loc_drivers.sim.epuck.world import (
 from swarm_loc_drivers.sim.render.camera_rig import Arena
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, EightSettings, describe
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.decoding.families import family_named
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_vision.markers.families import family_named
 
 WHEELS = WheelGeometry(wheel_diameter=0.041, wheel_separation=0.053)
 IDEAL = replace(W0, wheel_noise=0.0)

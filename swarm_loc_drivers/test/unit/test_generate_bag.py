@@ -7,9 +7,9 @@ import pytest
 
 from swarm_loc_drivers.cli.generate_bag import main
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
-from swarm_loc_estimator.io.bags.reader import BagReader
-from swarm_loc_estimator.io.messages.cdr import decode_detections, decode_odometry, decode_pose_stamped
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.messages.cdr import decode_detections, decode_odometry, decode_pose_stamped
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 
 @pytest.fixture(scope="module")

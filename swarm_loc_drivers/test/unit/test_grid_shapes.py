@@ -8,7 +8,7 @@ import pytest
 from swarm_loc_drivers.sim.common.record import SimulatedRun
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.scenarios.grid_shapes import Shape
-from swarm_loc_estimator.numerics.arrays import IntArray
+from swarm_loc_estimator.common.arrays import IntArray
 
 ROBOTS = 9
 

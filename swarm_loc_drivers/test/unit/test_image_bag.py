@@ -15,13 +15,13 @@ from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.renderer import RobotCamera
 from swarm_loc_drivers.sim.scenarios.eight import CAMERA, EightSettings
 from swarm_loc_drivers.sim.scenarios.eight_images import FAMILY, simulate_eight_images
-from swarm_loc_estimator.core.description.swarm import Landmark
-from swarm_loc_estimator.io.bags.reader import BagReader
-from swarm_loc_estimator.io.messages.typestore import typestore
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.decoding.families import family_named
-from swarm_loc_vision.core.detection.detector import MarkerDetector
-from swarm_loc_vision.core.detection.settings import DetectorSettings
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.messages.typestore import typestore
+from swarm_loc_estimator.swarm.swarm import Landmark
+from swarm_loc_vision.markers.detector import MarkerDetector
+from swarm_loc_vision.markers.detector_settings import DetectorSettings
+from swarm_loc_vision.markers.families import family_named
 
 ARGUMENTS = ["--seed", "2", "--duration", "2.5", "--robots", "2", "--world", "w2"]
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.core.epuck.wheels import WheelGeometry
+from swarm_loc_drivers.epuck.wheels import WheelGeometry
 from swarm_loc_drivers.sim.common.error_model import W0
 from swarm_loc_drivers.sim.epuck.world import OVERHEAD, EpuckWorld, EpuckWorldSettings, Exposure
 from swarm_loc_drivers.sim.render.camera_rig import Arena
@@ -17,12 +17,12 @@ from swarm_loc_drivers.sim.render.overhead import OverheadSettings, overhead_mod
 from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, START_NS, EightSettings, describe
 from swarm_loc_drivers.sim.scenarios.eight_floor import eight_floor
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.aerial.detector import AerialDetector
-from swarm_loc_vision.core.aerial.ground.control_points import Noise
-from swarm_loc_vision.core.aerial.ground.ground_control import GroundControl
-from swarm_loc_vision.core.aerial.settings import AerialSettings
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.aerial.detector import AerialDetector
+from swarm_loc_vision.aerial.ground.control_points import Noise
+from swarm_loc_vision.aerial.ground.ground_control import GroundControl
+from swarm_loc_vision.aerial.settings import AerialSettings
 
 START = np.array([[0.1, 0.2, 0.3], [0.5, -0.2, 1.9], [-0.4, -0.3, -2.0]])
 RATE_HZ = 5.0

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_drivers.core.pushbot.event_clock import EventClock
-from swarm_loc_drivers.core.pushbot.event_packets import MAX_EVENTS, EventPackets
-from swarm_loc_drivers.core.pushbot.settings import WheelGeometry, WheelTicks
-from swarm_loc_drivers.core.pushbot.tick_clock import TickClock
-from swarm_loc_drivers.core.pushbot.wheel_odometry import PushbotOdometry
-from swarm_loc_drivers.protocols.pushbot.hardware import tick_difference
-from swarm_loc_estimator.io.messages.event_encoding import ENCODING, decode_events
-from swarm_loc_estimator.numerics.arrays import IntArray
+from swarm_loc_drivers.pushbot.event_clock import EventClock
+from swarm_loc_drivers.pushbot.event_packets import MAX_EVENTS, EventPackets
+from swarm_loc_drivers.pushbot.hardware import tick_difference
+from swarm_loc_drivers.pushbot.settings import WheelGeometry, WheelTicks
+from swarm_loc_drivers.pushbot.tick_clock import TickClock
+from swarm_loc_drivers.pushbot.wheel_odometry import PushbotOdometry
+from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.common.messages.event_encoding import ENCODING, decode_events
 
 MS = 1_000_000
 GEOMETRY = WheelGeometry(metres_per_tick=1e-4, wheel_separation=0.085)

@@ -23,15 +23,15 @@ from swarm_loc_drivers.sim.pushbot.optics import laser_hz
 from swarm_loc_drivers.sim.pushbot.ray_casting import clearance, is_visible, ray_distance
 from swarm_loc_drivers.sim.recording.pushbot_bag import PushbotBagSettings, write_pushbot_bag
 from swarm_loc_estimator.cli.replay_map import main as replay_map
-from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.io.bags.reader import BagReader
-from swarm_loc_estimator.io.messages.event_encoding import decode_events
-from swarm_loc_estimator.io.messages.typestore import typestore
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.se2 import wrap_angle
-from swarm_loc_vision.core.events.centroid_tracker import CentroidTracker
-from swarm_loc_vision.core.events.settings import LightSource, TrackerSettings
-from swarm_loc_vision.io.laser_file import load_laser
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.messages.event_encoding import decode_events
+from swarm_loc_estimator.common.messages.typestore import typestore
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_vision.events.centroid_tracker import CentroidTracker
+from swarm_loc_vision.events.settings import LightSource, TrackerSettings
+from swarm_loc_vision.laser.laser_file import load_laser
 
 ROOM = FloorPlan("room", outline([(0, 0, 4, 3)], [(2, 1, 2.5, 2)]), np.array([[1.0, 1.5], [3.5, 1.5]]))
 EXACT = PushBotNoise(turn=0.0, distance=0.0, heading=0.0, pixel=1e-9, dropout=0.0, outlier=0.0, bearing=1e-9)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from pushbot_rig import PushbotWire, pushbot_settings
 
-from swarm_loc_drivers.protocols.pushbot import commands
-from swarm_loc_drivers.protocols.pushbot.hardware import FIRST_FIRMWARE, SECOND_FIRMWARE, FirmwareGeneration
-from swarm_loc_estimator.io.messages.event_encoding import ENCODING, decode_events
+from swarm_loc_drivers.pushbot import commands
+from swarm_loc_drivers.pushbot.hardware import FIRST_FIRMWARE, SECOND_FIRMWARE, FirmwareGeneration
+from swarm_loc_estimator.common.messages.event_encoding import ENCODING, decode_events
 
 FORMATS = [(one, name) for one in (FIRST_FIRMWARE, SECOND_FIRMWARE) for name in ("", *one.formats)]
 

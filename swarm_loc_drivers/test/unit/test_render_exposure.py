@@ -15,8 +15,8 @@ from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.raster import project
 from swarm_loc_drivers.sim.render.renderer import MAX_INSTANTS, Renderer, RobotCamera
 from swarm_loc_drivers.sim.scenarios.eight import CAMERA
-from swarm_loc_estimator.core.description.swarm import CameraMount
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.swarm import CameraMount
 
 SHARP = CameraModel(width=640, height=480, focus_sigma_px=0.0)
 IN_FRONT_OF_107 = np.array([0.9, -0.2, 0.0])  # the marker stands at (1.2, -0.2)

@@ -15,8 +15,8 @@ from swarm_loc_drivers.sim.render.coverage import Image
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.renderer import Renderer, RobotCamera, Scene
 from swarm_loc_drivers.sim.scenarios.eight import CAMERA
-from swarm_loc_estimator.core.description.swarm import CameraMount
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.swarm import CameraMount
 
 SHARP = CameraModel(width=640, height=480, focus_sigma_px=0.0)
 FISHY = CameraModel(width=640, height=480, focus_sigma_px=0.0, k1=-0.25, k2=0.06, p1=1e-3, p2=-5e-4)

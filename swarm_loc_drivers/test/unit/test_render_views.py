@@ -6,16 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.core.epuck.wheels import WheelGeometry
+from swarm_loc_drivers.epuck.wheels import WheelGeometry
 from swarm_loc_drivers.sim.common.error_model import W2
 from swarm_loc_drivers.sim.epuck.world import EpuckWorld, EpuckWorldSettings
 from swarm_loc_drivers.sim.render.camera_rig import Arena
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, FACE_DISTANCE, EightSettings, describe
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.decoding.families import family_named
-from swarm_loc_vision.core.detection.detector import MarkerDetector
-from swarm_loc_vision.core.detection.settings import DetectorSettings
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.markers.detector import MarkerDetector
+from swarm_loc_vision.markers.detector_settings import DetectorSettings
+from swarm_loc_vision.markers.families import family_named
 
 FAMILY = family_named("artoolkit_bch_thin")
 CAMERA = CameraModel(k1=-0.2, k2=0.05)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from swarm_loc_drivers.cli.generate_bag import main
-from swarm_loc_estimator.io.bags.reader import BagReader
-from swarm_loc_estimator.io.messages.typestore import typestore
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.messages.typestore import typestore
 
 BAGS = Path(__file__).parents[3] / "bags"
 SIMULATED = [

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from swarm_loc_drivers.core.robot_driver import RobotDriver
-from swarm_loc_drivers.transports.link import LinkError
-from swarm_loc_drivers.transports.serial_link import SerialLink
+from swarm_loc_drivers.common.link import LinkError
+from swarm_loc_drivers.common.robot_driver import RobotDriver
+from swarm_loc_drivers.common.serial_link import SerialLink
 
 
 @pytest.mark.parametrize("call", ["tcsetattr", "tcflush"])

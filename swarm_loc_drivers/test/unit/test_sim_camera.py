@@ -13,8 +13,8 @@ from swarm_loc_drivers.sim.common.record import SIGHTING_DTYPE, SimulatedRun
 from swarm_loc_drivers.sim.scenarios.eight import VIEW, EightSettings, describe, simulate_eight, wall_markers
 from swarm_loc_drivers.sim.scenarios.grid import SENSOR, GridSettings, simulate_grid
 from swarm_loc_drivers.sim.scenarios.grid_shapes import Shape, cells
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
 
 IntArray = NDArray[np.integer]
 

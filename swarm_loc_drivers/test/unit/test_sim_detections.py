@@ -4,8 +4,8 @@ import numpy as np
 
 from swarm_loc_drivers.sim.recording.detections import as_detections
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
-from swarm_loc_estimator.core.inputs.camera import SightingConverter
-from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.sensors.camera import SightingConverter
 
 
 def test_the_estimator_reads_what_was_simulated() -> None:

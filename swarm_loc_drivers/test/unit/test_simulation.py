@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from swarm_loc_drivers.cli import simulate
-from swarm_loc_drivers.nodes.epuck.pending_images import Unanswered
-from swarm_loc_drivers.simulation import SimulationOptions, simulation_nodes
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.parameters.table import parameter_specs
-from swarm_loc_vision.nodes.aerial_parameters import AerialParameters
+from swarm_loc_drivers.epuck.pending_images import Unanswered
+from swarm_loc_drivers.sim.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_estimator.common.parameters import parameter_specs
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_vision.aerial.aerial_parameters import AerialParameters
 
 BAGS = Path(__file__).parents[3] / "bags"
 SECOND = 1_000_000_000

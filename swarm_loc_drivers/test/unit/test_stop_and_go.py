@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.core.pushbot.stop_and_go import MapGoal, StopAndGo, StopAndGoSettings
-from swarm_loc_drivers.core.velocity_command import STILL
-from swarm_loc_estimator.core.mapping.mapper import SCAN_TURN, START_TURN
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.se2 import wrap_angle
+from swarm_loc_drivers.common.velocity_command import STILL
+from swarm_loc_drivers.pushbot.stop_and_go import MapGoal, StopAndGo, StopAndGoSettings
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.mapping.mapper import SCAN_TURN, START_TURN
 
 PERIOD_S = 0.02
 SETTINGS = StopAndGoSettings()

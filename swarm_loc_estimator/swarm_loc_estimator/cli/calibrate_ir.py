@@ -16,18 +16,18 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from swarm_loc_estimator.calibration.infrared.board_plots import board_text, draw_board
-from swarm_loc_estimator.calibration.infrared.board_recording import calibrate_from, with_board
-from swarm_loc_estimator.calibration.infrared.gains import calibrate_infrared
-from swarm_loc_estimator.calibration.infrared.plots import draw, text_of
-from swarm_loc_estimator.calibration.recording import read_recording
-from swarm_loc_estimator.cli.arguments import add_bag, swarm_beside, yaml_to_write
-from swarm_loc_estimator.cli.errors import exit_with_message
-from swarm_loc_estimator.cli.progress import ProgressLine
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.io.swarm.board_writer import save_ir_platform
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.common.arguments import add_bag, swarm_beside, yaml_to_write
+from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.common.progress import ProgressLine
+from swarm_loc_estimator.offline.calibration.infrared.board_plots import board_text, draw_board
+from swarm_loc_estimator.offline.calibration.infrared.board_recording import calibrate_from, with_board
+from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_infrared
+from swarm_loc_estimator.offline.calibration.infrared.plots import draw, text_of
+from swarm_loc_estimator.offline.calibration.recording import read_recording
+from swarm_loc_estimator.swarm.board_writer import save_ir_platform
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 
 @exit_with_message

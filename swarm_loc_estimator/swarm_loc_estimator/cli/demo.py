@@ -19,21 +19,21 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.cli.arguments import folder_to_write, number_in, swarm_beside
-from swarm_loc_estimator.cli.errors import exit_with_message
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.core.estimation.estimator import Status
-from swarm_loc_estimator.evaluation.metrics import pool, summarise
-from swarm_loc_estimator.evaluation.report.report import write_report
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.io.watch.access import free_port
-from swarm_loc_estimator.launching.graph import GraphOptions
-from swarm_loc_estimator.live.agreement import Agreement, compare_with_replay
-from swarm_loc_estimator.live.recorder import Recorder, read_poses
-from swarm_loc_estimator.live.run import BagContent, LiveRun, play_live
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arguments import folder_to_write, number_in, swarm_beside
+from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.common.launching.graph import GraphOptions
+from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.nodes.player.playback import clock_step_ns
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.trajectory import interpolate
+from swarm_loc_estimator.offline.live.agreement import Agreement, compare_with_replay
+from swarm_loc_estimator.offline.live.recorder import Recorder, read_poses
+from swarm_loc_estimator.offline.live.run import BagContent, LiveRun, play_live
+from swarm_loc_estimator.offline.metrics import pool, summarise
+from swarm_loc_estimator.offline.report.report import write_report
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.timeline.estimator import Status
+from swarm_loc_estimator.watch.access import free_port
 
 BAG = Path("bags/eight_five_robots")
 RATE = 3.0

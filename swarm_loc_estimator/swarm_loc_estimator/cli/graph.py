@@ -6,11 +6,11 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from swarm_loc_estimator.cli.arguments import number_in
-from swarm_loc_estimator.cli.errors import exit_with_message
-from swarm_loc_estimator.launching.graph import GraphOptions, graph_nodes
-from swarm_loc_estimator.launching.options import check_graph
-from swarm_loc_estimator.launching.processes import run_graph
+from swarm_loc_estimator.common.arguments import number_in
+from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.common.launching.graph import GraphOptions, graph_nodes
+from swarm_loc_estimator.common.launching.options import check_graph
+from swarm_loc_estimator.common.launching.processes import run_graph
 
 
 def parse(arguments: Sequence[str]) -> GraphOptions:

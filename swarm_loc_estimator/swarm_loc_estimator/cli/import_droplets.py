@@ -15,10 +15,15 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from swarm_loc_estimator.cli.arguments import number_in
-from swarm_loc_estimator.cli.errors import exit_with_message
-from swarm_loc_estimator.cli.progress import ProgressLine
-from swarm_loc_estimator.io.droplets.bag import METRES_PER_PIXEL, ImportSettings, import_recording, name_of
+from swarm_loc_estimator.common.arguments import number_in
+from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.common.progress import ProgressLine
+from swarm_loc_estimator.offline.datasets.droplets.bag import (
+    METRES_PER_PIXEL,
+    ImportSettings,
+    import_recording,
+    name_of,
+)
 
 
 @exit_with_message

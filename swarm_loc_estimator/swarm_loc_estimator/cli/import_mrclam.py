@@ -14,10 +14,10 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from swarm_loc_estimator.cli.errors import exit_with_message
-from swarm_loc_estimator.cli.progress import ProgressLine
-from swarm_loc_estimator.io.mrclam.bag import Delay, convert
-from swarm_loc_estimator.io.mrclam.dataset import read_dataset
+from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.common.progress import ProgressLine
+from swarm_loc_estimator.offline.datasets.mrclam.bag import Delay, convert
+from swarm_loc_estimator.offline.datasets.mrclam.dataset import read_dataset
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

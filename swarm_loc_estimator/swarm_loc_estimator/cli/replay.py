@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.cli.arguments import (
+from swarm_loc_estimator.common.arguments import (
     add_bag,
     add_set,
     folder_to_write,
@@ -31,15 +31,15 @@ from swarm_loc_estimator.cli.arguments import (
     swarm_beside,
     yaml_to_write,
 )
-from swarm_loc_estimator.cli.errors import exit_with_message
-from swarm_loc_estimator.cli.progress import ProgressLine
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.evaluation.export import write_mcap
-from swarm_loc_estimator.evaluation.replay import TICK_S, replay
-from swarm_loc_estimator.evaluation.report.report import write_report
-from swarm_loc_estimator.evaluation.result import ReplayResult
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.common.progress import ProgressLine
+from swarm_loc_estimator.offline.export import write_mcap
+from swarm_loc_estimator.offline.replay import TICK_S, replay
+from swarm_loc_estimator.offline.report.report import write_report
+from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 _NOTHING_TO_LEARN = (
     "--learned: the swarm description has no sigma of a camera, of odometry or of a landmark, and nothing"

@@ -19,19 +19,25 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.cli.arguments import add_bag, add_set, folder_to_write, parameters_of, swarm_beside
-from swarm_loc_estimator.cli.errors import exit_with_message
-from swarm_loc_estimator.cli.progress import ProgressLine
-from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.core.mapping.settings import MapperSettings
-from swarm_loc_estimator.evaluation.map_figures import map_figures
-from swarm_loc_estimator.evaluation.map_replay import replay_map, truth_of
-from swarm_loc_estimator.evaluation.report.map_picture import draw_map
-from swarm_loc_estimator.io.maps.led_frequencies import led_frequencies
-from swarm_loc_estimator.io.maps.map_file import save_map
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.parameters.errors import UserError
+from swarm_loc_estimator.common.arguments import (
+    add_bag,
+    add_set,
+    folder_to_write,
+    parameters_of,
+    swarm_beside,
+)
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.progress import ProgressLine
+from swarm_loc_estimator.mapping.led_frequencies import led_frequencies
+from swarm_loc_estimator.mapping.map_file import save_map
+from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.mapping.settings import MapperSettings
+from swarm_loc_estimator.offline.map_figures import map_figures
+from swarm_loc_estimator.offline.map_replay import replay_map, truth_of
+from swarm_loc_estimator.offline.report.map_picture import draw_map
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 
 class WallsError(UserError):

@@ -13,14 +13,14 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from swarm_loc_estimator.cli.arguments import number_in, swarm_beside
-from swarm_loc_estimator.cli.errors import exit_with_message
 from swarm_loc_estimator.cli.graph import say
-from swarm_loc_estimator.io.watch.access import Access
-from swarm_loc_estimator.launching.graph import GraphOptions, NodeSpec, ParameterValue, graph_nodes
-from swarm_loc_estimator.launching.options import check_graph
-from swarm_loc_estimator.launching.processes import run_graph
-from swarm_loc_estimator.nodes.watch.watch_parameters import WatchParameters
+from swarm_loc_estimator.common.arguments import number_in, swarm_beside
+from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.common.launching.graph import GraphOptions, NodeSpec, ParameterValue, graph_nodes
+from swarm_loc_estimator.common.launching.options import check_graph
+from swarm_loc_estimator.common.launching.processes import run_graph
+from swarm_loc_estimator.watch.access import Access
+from swarm_loc_estimator.watch.watch_parameters import WatchParameters
 
 _DEFAULT = WatchParameters()
 _DESCRIPTIONS = (".yaml", ".yml")

@@ -10,16 +10,16 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.description.swarm import Robot, Swarm
-from swarm_loc_estimator.core.estimation.contradictions import Contradiction
-from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate
-from swarm_loc_estimator.core.estimation.fusion import Verdict
-from swarm_loc_estimator.core.filter.measurement_model import MeasurementArray
-from swarm_loc_estimator.core.identification.memory import Identities
-from swarm_loc_estimator.io.inputs.ingest import Ingest, InputStatistics
-from swarm_loc_estimator.io.inputs.topics import InputKind, InputTopic
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.filter.measurement_model import MeasurementArray
+from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.wording import listed
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
+from swarm_loc_estimator.sensors.topics import InputKind, InputTopic
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.timeline.contradictions import Contradiction
+from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate
+from swarm_loc_estimator.timeline.fusion import Verdict
 
 _FULL_LOAD = 0.95
 _IN_MAP = frozenset({InputKind.FIXES, InputKind.AERIAL, InputKind.SWARM_FIXES})
@@ -97,7 +97,7 @@ def add_identities(reports: Sequence[Report], identities: Identities | None) -> 
 
 
 class Graph(Protocol):
-    """What the ROS graph knows of publishers, see `ros/topic_graph.py`."""
+    """What the ROS graph knows of publishers, see `common/ros/topic_graph.py`."""
 
     def rivals(self, topic: str) -> list[str]:
         """The nodes that publish a topic, if there is more than one."""

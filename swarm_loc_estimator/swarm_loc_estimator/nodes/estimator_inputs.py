@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from swarm_loc_estimator.io.inputs.topics import InputKind, InputTopic
+from swarm_loc_estimator.sensors.topics import InputKind, InputTopic
 from swarm_loc_msgs.msg import (
     AnonymousDetectionArray,
     BrightnessMatrix,

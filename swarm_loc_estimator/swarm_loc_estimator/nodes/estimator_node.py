@@ -28,15 +28,13 @@ from rclpy.subscription import Subscription
 from rclpy.time import Time
 from std_srvs.srv import Trigger
 
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.core.estimation.contradictions import Contradiction, Kind
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.io.inputs.ingest import Ingest
-from swarm_loc_estimator.io.inputs.thinning import SHED_REASONS, Thinning
-from swarm_loc_estimator.io.inputs.topics import live_topics
-from swarm_loc_estimator.io.messages.message_batch import MessageBatch
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.common.jit import is_warm
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.ros.newest_time import newest_time_ns
+from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node
+from swarm_loc_estimator.common.ros.static_transforms import StaticTransforms
+from swarm_loc_estimator.common.ros.ticks import Ticks
+from swarm_loc_estimator.common.ros.topic_graph import TopicGraph
 from swarm_loc_estimator.nodes.estimator_diagnostics import (
     Diagnostics,
     Report,
@@ -54,13 +52,15 @@ from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
 from swarm_loc_estimator.nodes.load.fusion_pace import FusionPace
 from swarm_loc_estimator.nodes.load.shedding import Shedding
 from swarm_loc_estimator.nodes.set_pose import NO_CLOCK, PoseCommands
-from swarm_loc_estimator.nodes.warm_up import WARM_UP, warm_up
-from swarm_loc_estimator.numerics.jit import is_warm
-from swarm_loc_estimator.ros.newest_time import newest_time_ns
-from swarm_loc_estimator.ros.running import ConfiguredNode, run_node
-from swarm_loc_estimator.ros.static_transforms import StaticTransforms
-from swarm_loc_estimator.ros.ticks import Ticks
-from swarm_loc_estimator.ros.topic_graph import TopicGraph
+from swarm_loc_estimator.precompile import WARM_UP, warm_up
+from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.thinning import SHED_REASONS, Thinning
+from swarm_loc_estimator.sensors.topics import live_topics
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.timeline.contradictions import Contradiction, Kind
+from swarm_loc_estimator.timeline.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 _BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
 _DIAGNOSTICS_PERIOD_S = 1.0

@@ -8,14 +8,14 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.core.estimation.sightings import newest_sightings
-from swarm_loc_estimator.core.identification.memory import Identities
-from swarm_loc_estimator.io.messages.encoders import encode_identities, encode_poses
-from swarm_loc_estimator.io.messages.estimates import encode_sightings
-from swarm_loc_estimator.io.messages.outputs import SwarmPosesEncoder, TransformsEncoder
+from swarm_loc_estimator.common.messages.encoders import encode_identities, encode_poses
+from swarm_loc_estimator.common.messages.estimates import encode_sightings
+from swarm_loc_estimator.common.messages.outputs import SwarmPosesEncoder, TransformsEncoder
+from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline.sightings import newest_sightings
 from swarm_loc_msgs.msg import RobotIdentities, SwarmPoses, SwarmSightings
 
 _RELIABLE = QoSProfile(depth=10)

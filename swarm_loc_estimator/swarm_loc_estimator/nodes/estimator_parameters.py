@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.parameters.number_spec import number
-from swarm_loc_estimator.parameters.table import flag, text
+from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_estimator.common.parameters import flag, text
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 
 @dataclass(frozen=True)

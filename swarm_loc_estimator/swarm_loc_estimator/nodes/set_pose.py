@@ -9,10 +9,10 @@ from geometry_msgs.msg import PoseWithCovariance, PoseWithCovarianceStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from swarm_loc_estimator.core.description.swarm import StartSigma, Swarm
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
-from swarm_loc_estimator.io.messages.planar import PLANE, yaw_of
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.planar import PLANE, yaw_of
+from swarm_loc_estimator.swarm.swarm import StartSigma, Swarm
+from swarm_loc_estimator.timeline.estimator import SwarmEstimator
 from swarm_loc_msgs.srv import SetRobotPose
 
 NO_CLOCK = "use_sim_time is true but no /clock has come"

@@ -29,12 +29,12 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from typing_extensions import Self
 
-from swarm_loc_estimator.core.inputs.camera import CONTENT_POSE
-from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
-from swarm_loc_estimator.io.messages.encoders import encode_detections, encode_odometry
-from swarm_loc_estimator.launching.processes import executable_path
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.ros.task_errors import end_at_task_errors
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.launching.processes import executable_path
+from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.common.messages.encoders import encode_detections, encode_odometry
+from swarm_loc_estimator.common.ros.task_errors import end_at_task_errors
+from swarm_loc_estimator.sensors.camera import CONTENT_POSE
 from swarm_loc_msgs.msg import MarkerDetectionArray, SwarmPose, SwarmPoses
 
 SECOND = 1_000_000_000

@@ -16,10 +16,10 @@ from rclpy.publisher import Publisher
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
-from swarm_loc_estimator.core.infrared.brightness import expected
-from swarm_loc_estimator.io.messages.encoders import encode_brightness, encode_fix
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.common.messages.encoders import encode_brightness, encode_fix
+from swarm_loc_estimator.infrared.brightness import expected
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_msgs.msg import BrightnessMatrix, SwarmPose, SwarmPoses
 
 SWARM_YAML = """

@@ -29,13 +29,13 @@ from rcl_interfaces.msg import Log
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.estimation.contradictions import Contradiction, Kind
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate
-from swarm_loc_estimator.core.estimation.timeline import GoOn
-from swarm_loc_estimator.core.inputs.messages import RawInputs
+from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
-from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.sensors.messages import RawInputs
+from swarm_loc_estimator.timeline.contradictions import Contradiction, Kind
+from swarm_loc_estimator.timeline.estimator import SwarmEstimate
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.timeline import GoOn
 from swarm_loc_msgs.msg import SwarmPose
 from swarm_loc_msgs.srv import SetRobotPose
 

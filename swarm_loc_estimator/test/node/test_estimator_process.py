@@ -10,8 +10,8 @@ import pytest
 from node_world import SETTINGS, STEP_NS, T0_NS, TRUE_POSES, Poses, Program, Robots, Ros, overrides
 from rclpy.parameter import Parameter
 
+from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
-from swarm_loc_estimator.parameters.table import ParameterError
 
 LONG_ROBOT = """  robot{}:
     odometry: {{wheel_separation: 0.053, wheel_noise: 0.00002}}

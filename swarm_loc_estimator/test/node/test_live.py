@@ -13,16 +13,16 @@ from node_world import T0_NS, Ros
 from rclpy.time import Time
 
 from swarm_loc_estimator.cli.demo import main
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.estimation.estimator import Status
-from swarm_loc_estimator.io.bags.cut import copy_beginning
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.launching.graph import GraphOptions, graph_nodes
-from swarm_loc_estimator.live.agreement import _settled, compare_with_replay
-from swarm_loc_estimator.live.graph import LiveError, LiveGraph
-from swarm_loc_estimator.live.recorder import Recorder
-from swarm_loc_estimator.live.run import ESTIMATOR, play_live, read_bag
-from swarm_loc_estimator.numerics.trajectory import interpolate
+from swarm_loc_estimator.common.bags.cut import copy_beginning
+from swarm_loc_estimator.common.launching.graph import GraphOptions, graph_nodes
+from swarm_loc_estimator.common.trajectory import interpolate
+from swarm_loc_estimator.offline.live.agreement import _settled, compare_with_replay
+from swarm_loc_estimator.offline.live.graph import LiveError, LiveGraph
+from swarm_loc_estimator.offline.live.recorder import Recorder
+from swarm_loc_estimator.offline.live.run import ESTIMATOR, play_live, read_bag
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.timeline.estimator import Status
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 DEMO = Path(__file__).parents[3] / "bags" / "eight_five_robots"
 SWARM_FILE = DEMO / "swarm.yaml"

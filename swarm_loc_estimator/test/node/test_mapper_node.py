@@ -18,11 +18,11 @@ from rclpy.serialization import serialize_message
 from rclpy.time import Time
 from std_srvs.srv import Trigger
 
-from swarm_loc_estimator.core.mapping.grid.occupancy import CELL
-from swarm_loc_estimator.core.mapping.readings import Readings
-from swarm_loc_estimator.io.maps.map_file import load_map
+from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.mapping.grid.occupancy import CELL
+from swarm_loc_estimator.mapping.map_file import load_map
+from swarm_loc_estimator.mapping.readings import Readings
 from swarm_loc_estimator.nodes.mapper.mapper_node import MapperNode
-from swarm_loc_estimator.parameters.errors import UserError
 from swarm_loc_msgs.msg import LaserDistance
 
 START = (1.0, 1.0, 0.3)

@@ -14,10 +14,10 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry
 from node_world import TRUE_POSES, Ros, detection_bytes, odometry_bytes, overrides, sight
 
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.core.estimation.timeline import GoOn
-from swarm_loc_estimator.core.inputs.messages import RawInputs
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
+from swarm_loc_estimator.sensors.messages import RawInputs
+from swarm_loc_estimator.timeline.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline.timeline import GoOn
 from swarm_loc_msgs.msg import MarkerDetectionArray, SwarmPose, SwarmPoses
 
 PERIOD_S = 0.05

@@ -17,9 +17,9 @@ from pathlib import Path
 import pytest
 from machines import PORT, Machines, Radio
 
-from swarm_loc_estimator.io.bags.cut import copy_beginning
-from swarm_loc_estimator.launching.graph import NodeSpec, ParameterValue
-from swarm_loc_estimator.launching.processes import node_command
+from swarm_loc_estimator.common.bags.cut import copy_beginning
+from swarm_loc_estimator.common.launching.graph import NodeSpec, ParameterValue
+from swarm_loc_estimator.common.launching.processes import node_command
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_five_robots"
 INPUTS = 10

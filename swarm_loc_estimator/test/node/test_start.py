@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.launching.processes import executable_path
+from swarm_loc_estimator.common.launching.processes import executable_path
 from workspace.layout import PACKAGES, ROOT
 
 HELD = """

@@ -7,8 +7,8 @@ from node_world import SECOND, STEP_NS, T0_NS, TRUE_POSES, Robots, Ros, odometry
 from rclpy.duration import Duration
 from rosgraph_msgs.msg import Clock
 
+from swarm_loc_estimator.common.ros.ticks import _EACH_CHANGE
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
-from swarm_loc_estimator.ros.ticks import _EACH_CHANGE
 
 BACKLOG = 20
 PATIENCE = Duration(seconds=60)

@@ -22,9 +22,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
 from visualization_msgs.msg import MarkerArray
 
-from swarm_loc_estimator.io.watch.frames import unpack
-from swarm_loc_estimator.nodes.watch.markers_node import MarkersNode
-from swarm_loc_estimator.nodes.watch.watch_node import WatchNode
+from swarm_loc_estimator.watch.frames import unpack
+from swarm_loc_estimator.watch.markers_node import MarkersNode
+from swarm_loc_estimator.watch.watch_node import WatchNode
 from swarm_loc_msgs.msg import SwarmPose, SwarmPoses
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

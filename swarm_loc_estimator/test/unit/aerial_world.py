@@ -9,8 +9,8 @@ from core_messages import SECOND, T0, Event
 from core_world import Plan, World, simulate
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.io.messages.cdr import ANONYMOUS_DTYPE
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DTYPE
 
 SIGMA, HEADING_SIGMA = 0.01, 0.1
 _STEP_NS = 50_000_000

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from swarm_loc_estimator.calibration.recording import Recording, Rows
-from swarm_loc_estimator.core.description.swarm import CameraMount, Face, Landmark, Robot, Swarm
-from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
-from swarm_loc_estimator.numerics.trajectory import Trajectory
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.offline.calibration.recording import Recording, Rows
+from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, Swarm
 
 SECOND = 1_000_000_000
 _MARGIN_S = 2.0

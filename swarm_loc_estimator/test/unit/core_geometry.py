@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from swarm_loc_estimator.core.description.swarm import CameraMount
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.swarm import CameraMount
 
 
 def homogeneous(

@@ -9,16 +9,16 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
-from swarm_loc_estimator.core.inputs.messages import (
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DTYPE, DETECTION_DTYPE
+from swarm_loc_estimator.sensors.messages import (
     AerialRows,
     DetectionRows,
     FixRows,
     OdometryRows,
     RawInputs,
 )
-from swarm_loc_estimator.io.messages.cdr import ANONYMOUS_DTYPE, DETECTION_DTYPE
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.timeline.estimator import SwarmEstimator
 
 SECOND = 10**9
 T0 = 1_000 * SECOND

@@ -7,9 +7,9 @@ from collections.abc import Container, Iterable
 from core_messages import SECOND, Event, give
 from core_world import World
 
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.core.estimation.fusion import Verdict
-from swarm_loc_estimator.core.estimation.timeline import GoOn
+from swarm_loc_estimator.timeline.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline.fusion import Verdict
+from swarm_loc_estimator.timeline.timeline import GoOn
 
 
 def play(

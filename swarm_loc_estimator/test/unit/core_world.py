@@ -11,7 +11,8 @@ from core_geometry import homogeneous, marker_frame, seen
 from core_messages import POSE, POSITION, SECOND, T0, Event, detection, joined, quaternion
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.description.swarm import (
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
     Landmark,
@@ -21,7 +22,6 @@ from swarm_loc_estimator.core.description.swarm import (
     StartSigma,
     Swarm,
 )
-from swarm_loc_estimator.numerics.arrays import FloatArray
 
 
 @dataclass(frozen=True)

@@ -9,20 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.core.description.robot_ir import RobotIr
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot, StartSigma, Swarm
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.core.infrared.board import IrGains, IrPlatform, PairGains
-from swarm_loc_estimator.core.infrared.brightness import expected
-from swarm_loc_estimator.core.inputs.messages import BrightnessRows, FixRows, OdometryRows, RawInputs
-from swarm_loc_estimator.io.bags.writer import BagWriter
-from swarm_loc_estimator.io.inputs.topics import InputKind
-from swarm_loc_estimator.io.messages.encoders import encode_brightness, encode_fix, encode_odometry
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.messages.encoders import encode_brightness, encode_fix, encode_odometry
+from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.sensors.messages import BrightnessRows, FixRows, OdometryRows, RawInputs
+from swarm_loc_estimator.sensors.topics import InputKind
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains
+from swarm_loc_estimator.swarm.robot_ir import RobotIr
+from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, StartSigma, Swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.timeline.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 SECOND = 10**9
 T0 = 1_000 * SECOND

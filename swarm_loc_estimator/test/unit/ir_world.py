@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from swarm_loc_estimator.core.infrared.board import IrModel, IrPlatform, PairGains
-from swarm_loc_estimator.core.infrared.brightness import expected
-from swarm_loc_estimator.core.infrared.solvers.cost import Pair, new_costs, write_costs
-from swarm_loc_estimator.core.infrared.solvers.readings import classify
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.solvers.cost import Pair, new_costs, write_costs
+from swarm_loc_estimator.infrared.solvers.readings import classify
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 
 RHO = 0.022
 ANGLES = np.radians([-30.0, -90.0, -150.0, 150.0, 90.0, 30.0])

@@ -15,9 +15,9 @@ from core_world import Plan, World
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 UNKNOWN = Plan(4, 15.0, 0.15, start_known=(False,))
 Arrival = tuple[int, Event]

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.description.swarm import Robot, Swarm
-from swarm_loc_estimator.core.inputs.messages import RawInputs
-from swarm_loc_estimator.io.inputs.channels import MAX_ANONYMOUS
-from swarm_loc_estimator.io.inputs.ingest import Ingest
-from swarm_loc_estimator.io.messages.cdr import ANONYMOUS_DTYPE, CdrError, decode_anonymous
-from swarm_loc_estimator.io.messages.encoders import encode_anonymous, encode_identities
-from swarm_loc_estimator.io.messages.message_batch import MessageBatch
-from swarm_loc_estimator.io.messages.typestore import ANONYMOUS_DETECTIONS, ROBOT_IDENTITIES, typestore
+from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DTYPE, CdrError, decode_anonymous
+from swarm_loc_estimator.common.messages.encoders import encode_anonymous, encode_identities
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.typestore import ANONYMOUS_DETECTIONS, ROBOT_IDENTITIES, typestore
+from swarm_loc_estimator.sensors.channels import MAX_ANONYMOUS
+from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.messages import RawInputs
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 NAMES = st.sampled_from(["", "a", "map", "ab/base_link", "r\u00f6"])
 

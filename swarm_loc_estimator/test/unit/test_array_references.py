@@ -11,11 +11,11 @@ from ir_world import droplet, random_poses, readings_of
 from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]
 from numba.core.runtime.nrt import rtsys
 
-from swarm_loc_estimator.core.estimation import fusion
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
-from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.jit import borrowing, inlined
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import borrowing, inlined
+from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.timeline import fusion
+from swarm_loc_estimator.timeline.estimator import SwarmEstimator
 
 
 @pytest.fixture

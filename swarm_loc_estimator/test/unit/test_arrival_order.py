@@ -14,9 +14,9 @@ from core_world import MOUNT, ODOMETRY, Plan, World, simulate
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.estimation import fusion, timeline
-from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline import fusion, timeline
+from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 Arrival = tuple[int, Event]
 EXACT = EstimatorSettings(fusion_period_s=0.0)

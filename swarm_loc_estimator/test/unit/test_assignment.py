@@ -8,10 +8,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core.identification.assignment import AMBIGUOUS, UNSEEN, assign, log_ratios
-from swarm_loc_estimator.core.identification.memory import IdentityMemory, convex_hull
-from swarm_loc_estimator.core.identification.picture import Picture
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.identification.assignment import AMBIGUOUS, UNSEEN, assign, log_ratios
+from swarm_loc_estimator.identification.memory import IdentityMemory, convex_hull
+from swarm_loc_estimator.identification.picture import Picture
 
 SIGMA, GATE = 0.02, 18.4
 

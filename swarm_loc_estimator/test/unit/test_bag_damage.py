@@ -15,8 +15,8 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType
 from test_bags import START, expected, read, record_of, some_messages, write_bag, write_mcap, write_sqlite
 
-from swarm_loc_estimator.io.bags.bag_file import MAX_LOG_NS
-from swarm_loc_estimator.io.bags.reader import BagError, BagReader
+from swarm_loc_estimator.common.bags.bag_file import MAX_LOG_NS
+from swarm_loc_estimator.common.bags.reader import BagError, BagReader
 
 CHUNK_HEAD = 9 + 8 + 8 + 8 + 4 + 4 + 8
 """Bytes of a chunk's record before its messages, without compression."""

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.evaluation.metrics import pool, summarise
-from swarm_loc_estimator.evaluation.replay import replay
-from swarm_loc_estimator.evaluation.result import ReplayResult
-from swarm_loc_estimator.io.bags.cut import copy_beginning
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.common.bags.cut import copy_beginning
+from swarm_loc_estimator.offline.metrics import pool, summarise
+from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 BAGS = Path(__file__).parents[3] / "bags"
 BEGINNING_S = 30.0

@@ -8,13 +8,18 @@ import numpy as np
 import pytest
 from ir_world import random_poses
 
-from swarm_loc_estimator.calibration.infrared.board import errors_of, without_dead
-from swarm_loc_estimator.calibration.infrared.board_fit import BoardReadings, _Problem, fit_board, turned
-from swarm_loc_estimator.core.infrared.board import PairGains
-from swarm_loc_estimator.core.infrared.brightness import expected
-from swarm_loc_estimator.core.infrared.curves import curve_at
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.curves import curve_at
+from swarm_loc_estimator.offline.calibration.infrared.board import errors_of, without_dead
+from swarm_loc_estimator.offline.calibration.infrared.board_fit import (
+    BoardReadings,
+    _Problem,
+    fit_board,
+    turned,
+)
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import PairGains
 
 PLATFORM = load_ir_platform("droplet_2016")
 ROBOTS = 4

@@ -12,19 +12,19 @@ import pytest
 from ir_world import droplet, random_poses, readings_of
 from scipy.stats import chi2
 
-from swarm_loc_estimator.calibration.infrared.gains import MIN_EXCHANGES
 from swarm_loc_estimator.cli import calibrate_ir
-from swarm_loc_estimator.core.description.robot_ir import RobotIr
-from swarm_loc_estimator.core.description.swarm import Robot, Swarm
-from swarm_loc_estimator.core.infrared.board import IrGains, IrPlatform, PairGains
-from swarm_loc_estimator.io.bags.writer import BagWriter
-from swarm_loc_estimator.io.messages.encoders import encode_brightness, encode_pose_stamped
-from swarm_loc_estimator.io.messages.typestore import BRIGHTNESS, POSE_STAMPED
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.messages.encoders import encode_brightness, encode_pose_stamped
+from swarm_loc_estimator.common.messages.typestore import BRIGHTNESS, POSE_STAMPED
+from swarm_loc_estimator.offline.calibration.infrared.gains import MIN_EXCHANGES
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains
+from swarm_loc_estimator.swarm.robot_ir import RobotIr
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 BEGIN_NS, STEP_NS = 1_700_000_000_000_000_000, 1_000_000_000
 SPREAD = 0.1

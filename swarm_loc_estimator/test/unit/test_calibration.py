@@ -11,23 +11,38 @@ import numpy as np
 import pytest
 from calibration_world import World, record, robot
 
-from swarm_loc_estimator.calibration.motion_and_camera.fit import Options, calibrate, fit_models
-from swarm_loc_estimator.calibration.motion_and_camera.noise import TICK_S, Score, score, thinned, with_noise
-from swarm_loc_estimator.calibration.motion_and_camera.response import Drive, Lateness, fit_response, nodes_of
-from swarm_loc_estimator.calibration.motion_and_camera.robust import population, ridge, softened
-from swarm_loc_estimator.calibration.motion_and_camera.windows import steps_of, true_motion
-from swarm_loc_estimator.calibration.recording import CalibrationError, read_recording, started_at_truth
-from swarm_loc_estimator.calibration.rerun import rerun
 from swarm_loc_estimator.cli.calibrate import main
-from swarm_loc_estimator.core.description.motion_response import MotionResponse
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import CameraMount, OdometryModel, Robot, SensorModel
-from swarm_loc_estimator.core.inputs.camera import CONTENT_POSE
-from swarm_loc_estimator.io.bags.reader import BagReader
-from swarm_loc_estimator.io.bags.writer import BagWriter
-from swarm_loc_estimator.io.messages.typestore import typestore
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.numerics.trajectory import Trajectory
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.messages.typestore import typestore
+from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.offline.calibration.motion_and_camera.fit import Options, calibrate, fit_models
+from swarm_loc_estimator.offline.calibration.motion_and_camera.noise import (
+    TICK_S,
+    Score,
+    score,
+    thinned,
+    with_noise,
+)
+from swarm_loc_estimator.offline.calibration.motion_and_camera.response import (
+    Drive,
+    Lateness,
+    fit_response,
+    nodes_of,
+)
+from swarm_loc_estimator.offline.calibration.motion_and_camera.robust import population, ridge, softened
+from swarm_loc_estimator.offline.calibration.motion_and_camera.windows import steps_of, true_motion
+from swarm_loc_estimator.offline.calibration.recording import (
+    CalibrationError,
+    read_recording,
+    started_at_truth,
+)
+from swarm_loc_estimator.offline.calibration.rerun import rerun
+from swarm_loc_estimator.sensors.camera import CONTENT_POSE
+from swarm_loc_estimator.swarm.motion_response import MotionResponse
+from swarm_loc_estimator.swarm.swarm import CameraMount, OdometryModel, Robot, SensorModel
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 BAGS = Path(__file__).parents[3] / "bags"
 DROPLETS, FAST = BAGS / "droplets_twenty", BAGS / "eight_one_robot_fast"

@@ -10,11 +10,11 @@ from core_messages import POSE_TWO, POSITION, T0, detection, joined
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from swarm_loc_estimator.core.description.swarm import CameraMount, Face, Landmark, Robot, SensorModel, Swarm
-from swarm_loc_estimator.core.filter.measurement_model import NOBODY, Kind, MeasurementArray
-from swarm_loc_estimator.core.inputs.camera import SightingConverter
-from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.filter.measurement_model import NOBODY, Kind, MeasurementArray
+from swarm_loc_estimator.sensors.camera import SightingConverter
+from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, SensorModel, Swarm
 
 LEVEL = CameraMount(x=0.04, z=0.05)
 MOUNTS = [

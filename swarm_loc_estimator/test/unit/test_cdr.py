@@ -12,9 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.io.messages import cdr
-from swarm_loc_estimator.io.messages.encoders import encode_detections, encode_odometry, encode_pose_stamped
-from swarm_loc_estimator.io.messages.typestore import (
+from swarm_loc_estimator.common.messages import cdr
+from swarm_loc_estimator.common.messages.encoders import (
+    encode_detections,
+    encode_odometry,
+    encode_pose_stamped,
+)
+from swarm_loc_estimator.common.messages.typestore import (
     DETECTION,
     DETECTIONS,
     ODOMETRY,

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot, Swarm
-from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimator
-from swarm_loc_estimator.core.inputs.messages import RawInputs
-from swarm_loc_estimator.io.inputs.ingest import Ingest
-from swarm_loc_estimator.io.messages.cdr import CdrError, decode_brightness, decode_fix
-from swarm_loc_estimator.io.messages.encoders import encode_brightness, encode_fix, encode_odometry
-from swarm_loc_estimator.io.messages.message_batch import MessageBatch
-from swarm_loc_estimator.io.messages.typestore import BRIGHTNESS, POSE_WITH_COVARIANCE, typestore
+from swarm_loc_estimator.common.messages.cdr import CdrError, decode_brightness, decode_fix
+from swarm_loc_estimator.common.messages.encoders import encode_brightness, encode_fix, encode_odometry
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.typestore import BRIGHTNESS, POSE_WITH_COVARIANCE, typestore
+from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.messages import RawInputs
+from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimator
 
 SECOND = 1_000_000_000
 T0 = 1_000 * SECOND

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from swarm_loc_estimator.cli import calibrate, calibrate_ir, replay
-from swarm_loc_estimator.cli.arguments import folder_to_write
-from swarm_loc_estimator.cli.errors import exit_with_message
-from swarm_loc_estimator.parameters.errors import UserError
+from swarm_loc_estimator.common.arguments import folder_to_write
+from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.common.errors import UserError
 
 
 @pytest.mark.parametrize(

@@ -12,11 +12,11 @@ from core_run import on_time, play, ticks
 from core_world import MOUNT, ODOMETRY, Plan, World, simulate
 from scipy.stats import chi2
 
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.core.estimation import fusion
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline import fusion
+from swarm_loc_estimator.timeline.estimator import SwarmEstimator
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 SEEDS = range(6)
 

@@ -10,28 +10,28 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
-from swarm_loc_estimator.core.description.robot_ir import RobotIr
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import Robot, StartSigma, Swarm
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.core.filter.correlated_noise import (
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.filter.calibration_states import ParameterTable
+from swarm_loc_estimator.filter.correlated_noise import (
     PAIR_ROWS,
     record_constraint,
     record_pair,
     use_mean,
 )
-from swarm_loc_estimator.core.filter.measurement_model import (
+from swarm_loc_estimator.filter.measurement_model import (
     MEASUREMENT_DTYPE,
     Kind,
     MeasurementArray,
     MeasurementColumns,
 )
-from swarm_loc_estimator.core.filter.state import SwarmState
-from swarm_loc_estimator.core.odometry.look_up import new_sample
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.odometry.look_up import new_sample
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.robot_ir import RobotIr
+from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
+from swarm_loc_estimator.timeline.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 VARIANCES = np.array([1e-4, 2e-3, 5e-3])
 VALUE = (0.15, 0.4, -2.0)

@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ir_world import random_poses
 
-from swarm_loc_estimator.calibration.infrared.dead_elements import find_dead_elements
-from swarm_loc_estimator.core.infrared.board import PairGains
-from swarm_loc_estimator.core.infrared.brightness import expected
-from swarm_loc_estimator.core.infrared.solvers.gains import Exchanges
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.solvers.gains import Exchanges
+from swarm_loc_estimator.offline.calibration.infrared.dead_elements import find_dead_elements
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import PairGains
 
 PLATFORM = load_ir_platform("droplet_2016")
 ROBOTS, N = 3, 6

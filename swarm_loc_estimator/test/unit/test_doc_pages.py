@@ -9,15 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.cli import (
-    calibrate,
-    calibrate_ir,
-    import_mrclam,
-    replay,
-    replay_map,
-    watch,
-)
-from swarm_loc_estimator.core.description.swarm import (
+from swarm_loc_estimator.cli import calibrate, calibrate_ir, import_mrclam, replay, replay_map, watch
+from swarm_loc_estimator.common.number_spec import number_specs
+from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
     Landmark,
@@ -26,7 +20,6 @@ from swarm_loc_estimator.core.description.swarm import (
     SensorModel,
     StartSigma,
 )
-from swarm_loc_estimator.parameters.number_spec import number_specs
 
 DOC = Path(__file__).parents[2] / "doc"
 SWARM_DESCRIPTION = (DOC / "swarm_description.md").read_text(encoding="utf-8")

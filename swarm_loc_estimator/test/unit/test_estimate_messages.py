@@ -12,23 +12,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
-from swarm_loc_estimator.core.description.swarm import Landmark, Robot, Swarm
-from swarm_loc_estimator.core.estimation.fusion import Verdict
-from swarm_loc_estimator.core.estimation.sightings import Sightings, newest_sightings
-from swarm_loc_estimator.core.filter.measurement_model import MEASUREMENT_DTYPE, Kind
-from swarm_loc_estimator.evaluation.export import write_mcap
-from swarm_loc_estimator.evaluation.result import ReplayResult
-from swarm_loc_estimator.io.bags.reader import BagReader
-from swarm_loc_estimator.io.messages.cdr import CdrError
-from swarm_loc_estimator.io.messages.estimates import (
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.messages.cdr import CdrError
+from swarm_loc_estimator.common.messages.estimates import (
     EstimateMessage,
     SwarmPosesReader,
     decode_sightings,
     encode_sightings,
 )
-from swarm_loc_estimator.io.messages.markers import MarkersEncoder, ellipses
-from swarm_loc_estimator.io.messages.outputs import SwarmPosesEncoder
-from swarm_loc_estimator.io.messages.typestore import MARKERS, MESSAGE_PACKAGE, typestore
+from swarm_loc_estimator.common.messages.markers import MarkersEncoder, ellipses
+from swarm_loc_estimator.common.messages.outputs import SwarmPosesEncoder
+from swarm_loc_estimator.common.messages.typestore import MARKERS, MESSAGE_PACKAGE, typestore
+from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, Kind
+from swarm_loc_estimator.offline.export import write_mcap
+from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
+from swarm_loc_estimator.timeline.fusion import Verdict
+from swarm_loc_estimator.timeline.sightings import Sightings, newest_sightings
 
 SECOND = 1_000_000_000
 VIEWERS = Path(__file__).parents[2] / "viewers"

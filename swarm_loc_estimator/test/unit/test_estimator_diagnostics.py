@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot, Swarm
-from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate
-from swarm_loc_estimator.core.estimation.fusion import Verdict
-from swarm_loc_estimator.core.filter.measurement_model import MEASUREMENT_DTYPE
-from swarm_loc_estimator.io.inputs.ingest import Ingest
-from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
-from swarm_loc_estimator.io.messages.encoders import encode_detections, encode_odometry
-from swarm_loc_estimator.io.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.common.messages.encoders import encode_detections, encode_odometry
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE
 from swarm_loc_estimator.nodes.estimator_diagnostics import Diagnostics, Recent, TickCost, load_report
+from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate
+from swarm_loc_estimator.timeline.fusion import Verdict
 
 SECOND = 1_000_000_000
 SWARM = Swarm((Robot("a", odometry=OdometryModel(timeout_s=1.0)), Robot("b", camera=None)))

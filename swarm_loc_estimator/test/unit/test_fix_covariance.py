@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from swarm_loc_estimator.core.description.swarm import OdometryModel
-from swarm_loc_estimator.core.mapping.exploration.goal import Goal
-from swarm_loc_estimator.io.maps.fix_covariance import FixCovariances, pose_covariance
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.mapping.exploration.goal import Goal
+from swarm_loc_estimator.mapping.fix_covariance import FixCovariances, pose_covariance
+from swarm_loc_estimator.swarm.swarm import OdometryModel
 
 ELEMENTS = st.floats(-0.3, 0.3)
 STOP = np.diag([0.01, 0.02, 0.01]) ** 2

@@ -8,14 +8,14 @@ from core_messages import SECOND, T0
 from core_run import play, ticks
 from core_world import Plan, simulate
 
-from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import Robot
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.core.estimation.timeline import Timeline
-from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray
-from swarm_loc_estimator.core.filter.state import SwarmState
-from swarm_loc_estimator.core.inputs.validation import about_robots
+from swarm_loc_estimator.filter.calibration_states import ParameterTable
+from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
+from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.sensors.validation import about_robots
+from swarm_loc_estimator.swarm.swarm import Robot
+from swarm_loc_estimator.timeline.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.timeline import Timeline
 
 PERIOD_NS = SECOND // 5
 

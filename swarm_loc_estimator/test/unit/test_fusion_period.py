@@ -12,17 +12,17 @@ from core_world import Plan, simulate
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot, Swarm
-from swarm_loc_estimator.core.estimation import timeline
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
-from swarm_loc_estimator.core.estimation.fusion_period import end_of_period, middle_of_period
-from swarm_loc_estimator.core.estimation.timeline import Timeline
-from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray
-from swarm_loc_estimator.core.filter.state import SwarmState
-from swarm_loc_estimator.core.inputs.validation import about_robots
-from swarm_loc_estimator.numerics.arrays import IntArray
+from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.filter.calibration_states import ParameterTable
+from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
+from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.sensors.validation import about_robots
+from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.timeline import timeline
+from swarm_loc_estimator.timeline.estimator import SwarmEstimator
+from swarm_loc_estimator.timeline.fusion_period import end_of_period, middle_of_period
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.timeline import Timeline
 
 PERIOD_NS = SECOND // 5
 SMALLEST_LARGE = timeline._LARGE

@@ -8,13 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ir_world import droplet, random_poses
 
-from swarm_loc_estimator.calibration.infrared.gain_validation import helpful_gains
-from swarm_loc_estimator.calibration.infrared.held_out import ALIKE, GAINS, UNKNOWN, held_out_likelihoods
-from swarm_loc_estimator.core.infrared.board import IrGains, IrPlatform, PairGains
-from swarm_loc_estimator.core.infrared.brightness import expected
-from swarm_loc_estimator.core.infrared.solvers.gains import Exchanges
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.solvers.gains import Exchanges
+from swarm_loc_estimator.offline.calibration.infrared.gain_validation import helpful_gains
+from swarm_loc_estimator.offline.calibration.infrared.held_out import (
+    ALIKE,
+    GAINS,
+    UNKNOWN,
+    held_out_likelihoods,
+)
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains
 
 PAPER, REAL = droplet(0.1), load_ir_platform("droplet_2016")
 ROBOTS, N = 3, 6

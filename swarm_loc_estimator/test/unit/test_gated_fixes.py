@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 from core_messages import SECOND, T0, give_fix
 
-from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import RandomWalk, Robot, Swarm
-from swarm_loc_estimator.core.estimation.contradictions import Kind as Contradicted
-from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimator
-from swarm_loc_estimator.core.filter.integrity.divergence import LossLimits, count_gated
-from swarm_loc_estimator.core.filter.integrity.surprises import is_contradicted
-from swarm_loc_estimator.core.filter.measurement_model import MEASUREMENT_DTYPE, NOBODY, MeasurementColumns
-from swarm_loc_estimator.core.filter.state import SwarmState
+from swarm_loc_estimator.filter.calibration_states import ParameterTable
+from swarm_loc_estimator.filter.integrity.divergence import LossLimits, count_gated
+from swarm_loc_estimator.filter.integrity.fault_detection import is_contradicted
+from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, NOBODY, MeasurementColumns
+from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.swarm.swarm import RandomWalk, Robot, Swarm
+from swarm_loc_estimator.timeline.contradictions import Kind as Contradicted
+from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimator
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 ROOT, NEIGHBOUR = 0, 1
 LIMITS = LossLimits(1.0, 0.3, 12, 10.0)

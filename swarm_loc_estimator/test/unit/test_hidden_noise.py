@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
-from swarm_loc_estimator.core.description.swarm import CameraMount, Robot, SensorModel
-from swarm_loc_estimator.core.filter.integrity.hidden_noise import (
+from swarm_loc_estimator.filter.calibration_states import ParameterTable
+from swarm_loc_estimator.filter.integrity.noise_inflation import (
     MAX_UNITS,
     add_hidden_noise,
     doubt_noise,
@@ -15,13 +14,14 @@ from swarm_loc_estimator.core.filter.integrity.hidden_noise import (
     stamp_variance,
     with_hidden_noise,
 )
-from swarm_loc_estimator.core.filter.measurement_model import (
+from swarm_loc_estimator.filter.measurement_model import (
     MEASUREMENT_DTYPE,
     NOBODY,
     Kind,
     MeasurementColumns,
 )
-from swarm_loc_estimator.core.filter.state import SwarmState
+from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, SensorModel
 
 ROBOTS = (Robot("one", camera=CameraMount()), Robot("two", camera=CameraMount()))
 

@@ -11,15 +11,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
-from swarm_loc_estimator.core.identification.anchors import Scale
-from swarm_loc_estimator.core.identification.angular_variation import identify_by_turns
-from swarm_loc_estimator.core.identification.chain import ChainModel, Chains
-from swarm_loc_estimator.core.identification.linear_variation import identify_by_speeds
-from swarm_loc_estimator.core.identification.own_motion import fit_chains, own_displacement, relation
-from swarm_loc_estimator.core.identification.picture import Picture, TrackPoint, gathered_between
-from swarm_loc_estimator.core.identification.random_motion import identify_by_way
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.identification.anchors import Scale
+from swarm_loc_estimator.identification.angular_variation import identify_by_turns
+from swarm_loc_estimator.identification.chain import ChainModel, Chains
+from swarm_loc_estimator.identification.linear_variation import identify_by_speeds
+from swarm_loc_estimator.identification.own_motion import fit_chains, own_displacement, relation
+from swarm_loc_estimator.identification.picture import Picture, TrackPoint, gathered_between
+from swarm_loc_estimator.identification.random_motion import identify_by_way
 
 SECOND = 10**9
 SIGMA = 0.01

@@ -9,15 +9,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.calibration.infrared.board_recording import read_board
-from swarm_loc_estimator.calibration.recording import read_recording
-from swarm_loc_estimator.core.infrared.brightness import expected
-from swarm_loc_estimator.io.droplets.bag import METRES_PER_PIXEL, ImportSettings, import_recording
-from swarm_loc_estimator.io.droplets.places import clean
-from swarm_loc_estimator.io.droplets.text import DropletRecordingError, Exchange, Sighting, parse_line
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.offline.calibration.infrared.board_recording import read_board
+from swarm_loc_estimator.offline.calibration.recording import read_recording
+from swarm_loc_estimator.offline.datasets.droplets.bag import (
+    METRES_PER_PIXEL,
+    ImportSettings,
+    import_recording,
+)
+from swarm_loc_estimator.offline.datasets.droplets.places import clean
+from swarm_loc_estimator.offline.datasets.droplets.text import (
+    DropletRecordingError,
+    Exchange,
+    Sighting,
+    parse_line,
+)
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 QUARTER = 0.5 * math.pi
 PLACES = {

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from ir_swarm import DROPLET, T0, Light, brightness_rows, calibrated, exchange
 
-from swarm_loc_estimator.core.description.robot_ir import IrMethod, RobotIr
-from swarm_loc_estimator.core.description.swarm import Robot, Swarm
-from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementArray
-from swarm_loc_estimator.core.infrared.board import IrPlatform, PairGains
-from swarm_loc_estimator.core.infrared.solution import IrSolutions, Outcome
-from swarm_loc_estimator.core.inputs import infrared as brightness_sightings
-from swarm_loc_estimator.core.inputs.infrared import BrightnessConverter
-from swarm_loc_estimator.core.inputs.messages import BrightnessRows, chosen
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
+from swarm_loc_estimator.infrared.solution import IrSolutions, Outcome
+from swarm_loc_estimator.sensors import infrared as brightness_sightings
+from swarm_loc_estimator.sensors.infrared import BrightnessConverter
+from swarm_loc_estimator.sensors.messages import BrightnessRows, chosen
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
+from swarm_loc_estimator.swarm.robot_ir import IrMethod, RobotIr
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 POSES = np.array([[0.0, 0.0, 0.3], [0.14, 0.08, -1.2], [-0.05, 0.1, 2.0]])
 CLOSE = POSES * [0.55, 0.55, 1.0]

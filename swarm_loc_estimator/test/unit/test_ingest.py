@@ -9,19 +9,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core.description.swarm import Robot, Swarm
-from swarm_loc_estimator.io.inputs.ingest import Ingest
-from swarm_loc_estimator.io.inputs.topics import InputKind
-from swarm_loc_estimator.io.messages.cdr import (
+from swarm_loc_estimator.common.messages.cdr import (
     DETECTION_DTYPE,
     decode_detections,
     decode_odometry,
     decode_pose_stamped,
 )
-from swarm_loc_estimator.io.messages.encoders import encode_detections, encode_odometry, encode_pose_stamped
-from swarm_loc_estimator.io.messages.message_batch import MessageBatch
-from swarm_loc_estimator.io.messages.streams import DetectionReader, PoseReader
-from swarm_loc_estimator.io.messages.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED, typestore
+from swarm_loc_estimator.common.messages.encoders import (
+    encode_detections,
+    encode_odometry,
+    encode_pose_stamped,
+)
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.streams import DetectionReader, PoseReader
+from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED, typestore
+from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.topics import InputKind
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 Pose = tuple[float, float, float]
 FRAMES = st.sampled_from(["", "a", "ab/odom", "robot17/odom", "r\u00f6/camera"])

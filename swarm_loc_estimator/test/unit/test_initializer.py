@@ -10,18 +10,19 @@ from core_messages import SECOND, T0
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
-from swarm_loc_estimator.core.description.swarm import Landmark, Robot
-from swarm_loc_estimator.core.filter.belief import BeliefArrays
-from swarm_loc_estimator.core.filter.measurement_model import (
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.filter.belief import BeliefArrays
+from swarm_loc_estimator.filter.calibration_states import ParameterTable
+from swarm_loc_estimator.filter.measurement_model import (
     MEASUREMENT_DTYPE,
     NOBODY,
     Kind,
     MeasurementArray,
 )
-from swarm_loc_estimator.core.filter.state import InitialPose, SwarmState
-from swarm_loc_estimator.core.initialization import alignment, initializer
-from swarm_loc_estimator.core.initialization.constraints import (
+from swarm_loc_estimator.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.initialization import alignment, initializer
+from swarm_loc_estimator.initialization.constraints import (
     CONSTRAINT_DTYPE,
     NO_CONSTRAINTS,
     THE_MAP,
@@ -31,10 +32,9 @@ from swarm_loc_estimator.core.initialization.constraints import (
     refreshed,
     with_constraint,
 )
-from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
-from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.swarm.swarm import Landmark, Robot
 
 SEEDS = st.integers(0, 10**6)
 SIGMA, TURN_SIGMA = 0.01, 0.05

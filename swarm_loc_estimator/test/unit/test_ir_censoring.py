@@ -13,16 +13,16 @@ from ir_world import droplet, nees, pair_of, pose_errors, random_poses, readings
 from scipy.integrate import quad
 from scipy.optimize import minimize
 
-from swarm_loc_estimator.core.infrared.board import PairGains
-from swarm_loc_estimator.core.infrared.brightness import expected
-from swarm_loc_estimator.core.infrared.cramer_rao import information
-from swarm_loc_estimator.core.infrared.solution import IrEstimator, Outcome, ReadingsError
-from swarm_loc_estimator.core.infrared.solvers.closed_form import ClosedForm
-from swarm_loc_estimator.core.infrared.solvers.cost import cost_of, new_scratch
-from swarm_loc_estimator.core.infrared.solvers.gains import Exchanges, estimate_gains
-from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
-from swarm_loc_estimator.core.infrared.solvers.reading_cost import SATURATED
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.cramer_rao import information
+from swarm_loc_estimator.infrared.solution import IrEstimator, Outcome, ReadingsError
+from swarm_loc_estimator.infrared.solvers.closed_form import ClosedForm
+from swarm_loc_estimator.infrared.solvers.cost import cost_of, new_scratch
+from swarm_loc_estimator.infrared.solvers.gains import Exchanges, estimate_gains
+from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.infrared.solvers.reading_cost import SATURATED
+from swarm_loc_estimator.swarm.ir_board import PairGains
 
 LIMIT = 240.0
 ALIKE = MaximumLikelihood(droplet())

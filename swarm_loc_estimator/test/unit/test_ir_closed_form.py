@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from ir_world import ANGLES, RHO, droplet, emitter_20, random_poses, readings_of, sensor_19, units, wrapped
 
-from swarm_loc_estimator.core.infrared.board import IrGains, PairGains
-from swarm_loc_estimator.core.infrared.solution import IrEstimator, Outcome
-from swarm_loc_estimator.core.infrared.solvers.closed_form import ClosedForm
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.infrared.solution import IrEstimator, Outcome
+from swarm_loc_estimator.infrared.solvers.closed_form import ClosedForm
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import IrGains, PairGains
 
 PRINTED = ("(1)", "(10)", "(11)", "(12)", "(18)", "wrap")
 

@@ -23,15 +23,15 @@ from ir_world import (
     wrapped,
 )
 
-from swarm_loc_estimator.core.infrared.board import IrGains, IrPlatform, PairGains
-from swarm_loc_estimator.core.infrared.brightness import expected
-from swarm_loc_estimator.core.infrared.cramer_rao import information
-from swarm_loc_estimator.core.infrared.curves import TabulatedCurve
-from swarm_loc_estimator.core.infrared.solution import IrEstimator, Outcome, ReadingsError
-from swarm_loc_estimator.core.infrared.solvers.cost import Pair, cost_of, new_scratch
-from swarm_loc_estimator.core.infrared.solvers.likelihood import MaximumLikelihood
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.cramer_rao import information
+from swarm_loc_estimator.infrared.curves import TabulatedCurve
+from swarm_loc_estimator.infrared.solution import IrEstimator, Outcome, ReadingsError
+from swarm_loc_estimator.infrared.solvers.cost import Pair, cost_of, new_scratch
+from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains
 
 ALIKE = MaximumLikelihood(droplet())
 DIFFERING = MaximumLikelihood(droplet(0.1))

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from ir_world import ANGLES, droplet, emitter_20, far_21, sensor_19
 
-from swarm_loc_estimator.core.infrared.board import IrGains, PairGains
-from swarm_loc_estimator.core.infrared.curves import (
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.infrared.curves import (
     Amplitude,
     IrPlatformError,
     PowerCurve,
@@ -23,12 +23,12 @@ from swarm_loc_estimator.core.infrared.curves import (
     curves_at,
     distance_at,
 )
-from swarm_loc_estimator.io.swarm.board_file import (
+from swarm_loc_estimator.swarm.board_file import (
     IrPlatformFileError,
     load_ir_platform,
     packaged_platforms,
 )
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.swarm.ir_board import IrGains, PairGains
 
 DROPLET_FILE = Path(__file__).parents[2] / "swarm_loc_estimator" / "config" / "ir" / "droplet.yaml"
 

@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ir_swarm import SECOND, Event, Light, Plan, Run, play, simulate, write_bag
 
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate
-from swarm_loc_estimator.evaluation.replay import replay
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 SLOW = EstimatorSettings(horizon_s=4.0, fix_window_s=60.0)
 

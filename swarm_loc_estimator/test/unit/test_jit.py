@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 USED = """
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.common.jit import compiled
 
 @compiled
 def factor() -> float:
@@ -16,7 +16,7 @@ def factor() -> float:
 """
 USING = """
 from pathlib import Path
-from swarm_loc_estimator.numerics.jit import compiled, is_warm, note_warm
+from swarm_loc_estimator.common.jit import compiled, is_warm, note_warm
 from used import factor
 
 @compiled
@@ -64,7 +64,7 @@ def test_caches_of_sources_long_gone_are_deleted(tmp_path: Path) -> None:
 
 SAVING = """
 from pathlib import Path
-from swarm_loc_estimator.numerics.jit import _cache_folder, compiled
+from swarm_loc_estimator.common.jit import _cache_folder, compiled
 
 @compiled
 def one() -> float:

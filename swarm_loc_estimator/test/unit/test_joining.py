@@ -11,16 +11,16 @@ from core_messages import POSE, POSE_TWO, POSITION, SECOND, T0, Event, detection
 from core_run import on_time, play, settled, ticks
 from core_world import MOUNT, Plan, World, simulate
 
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import Robot, Swarm
-from swarm_loc_estimator.core.estimation import fusion
-from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.core.filter.measurement_model import Kind, MeasurementColumns
-from swarm_loc_estimator.core.filter.state import InitialPose
-from swarm_loc_estimator.core.inputs.validation import about_robots
-from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
-from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementColumns
+from swarm_loc_estimator.filter.state import InitialPose
+from swarm_loc_estimator.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.sensors.validation import about_robots
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.timeline import fusion
+from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 
 def errors(world: World, estimates: list[SwarmEstimate]) -> FloatArray:

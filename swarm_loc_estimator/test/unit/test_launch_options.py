@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.launching.graph import GraphOptions
-from swarm_loc_estimator.launching.options import check_graph, options_from
-from swarm_loc_estimator.parameters.errors import UserError
-from swarm_loc_estimator.parameters.table import ParameterError
+from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.launching.graph import GraphOptions
+from swarm_loc_estimator.common.launching.options import check_graph, options_from
+from swarm_loc_estimator.common.parameters import ParameterError
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_one_robot_slow"
 SWARM_FILE = str(BAG / "swarm.yaml")

@@ -11,15 +11,15 @@ from core_run import on_time, play, ticks
 from core_world import MOUNT, SENSOR, Plan, World, lasting_errors, simulate
 
 from swarm_loc_estimator.cli.replay import main
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import Landmark, Robot, Swarm
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
-from swarm_loc_estimator.core.estimation.self_calibration import learns
-from swarm_loc_estimator.core.inputs.camera import SightingConverter
-from swarm_loc_estimator.evaluation.report.table import SELF_CALIBRATED
-from swarm_loc_estimator.io.bags.cut import copy_beginning
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.bags.cut import copy_beginning
+from swarm_loc_estimator.offline.report.table import SELF_CALIBRATED
+from swarm_loc_estimator.sensors.camera import SightingConverter
+from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.timeline.estimator import SwarmEstimator
+from swarm_loc_estimator.timeline.self_calibration import learns
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_five_robots_w2"
 PLAN = Plan(2, 40.0, speed=0.15, lasting=1.0, survey=1.0)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from swarm_loc_estimator.cli.replay_map import main, read_walls
-from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.core.mapping.settings import MapperSettings
-from swarm_loc_estimator.evaluation.map_figures import MapFigures, map_figures
-from swarm_loc_estimator.evaluation.map_replay import replay_map, truth_of
-from swarm_loc_estimator.evaluation.metrics import pool, summarise
-from swarm_loc_estimator.evaluation.replay import replay
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.mapping.settings import MapperSettings
+from swarm_loc_estimator.offline.map_figures import MapFigures, map_figures
+from swarm_loc_estimator.offline.map_replay import replay_map, truth_of
+from swarm_loc_estimator.offline.metrics import pool, summarise
+from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 BAGS = Path(__file__).parents[3] / "bags"
 LEDS = {"pushbot1": 1000.0, "pushbot2": 1111.111}

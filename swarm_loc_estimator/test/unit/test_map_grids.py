@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core.mapping.exploration.explorer import next_stop
-from swarm_loc_estimator.core.mapping.exploration.goal import goal_by_odometry
-from swarm_loc_estimator.core.mapping.exploration.planning_grid import paths_from
-from swarm_loc_estimator.core.mapping.grid.occupancy import CELL, OccupancyMap, grid_around
-from swarm_loc_estimator.core.mapping.grid.visitation import VisitationMap
-from swarm_loc_estimator.core.mapping.settings import MapperSettings
-from swarm_loc_estimator.io.maps.map_file import load_map, save_map
-from swarm_loc_estimator.parameters.errors import UserError
+from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.mapping.exploration.explorer import next_stop
+from swarm_loc_estimator.mapping.exploration.goal import goal_by_odometry
+from swarm_loc_estimator.mapping.exploration.planning_grid import paths_from
+from swarm_loc_estimator.mapping.grid.occupancy import CELL, OccupancyMap, grid_around
+from swarm_loc_estimator.mapping.grid.visitation import VisitationMap
+from swarm_loc_estimator.mapping.map_file import load_map, save_map
+from swarm_loc_estimator.mapping.settings import MapperSettings
 
 SETTINGS = MapperSettings()
 NOBODY = np.zeros((0, 2))

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from mapping_world import ROOM, RoomRobot, distance_in_room
 
-from swarm_loc_estimator.core.mapping.mapper import SCAN_TURN, CooperativeMapper
-from swarm_loc_estimator.core.mapping.printed.particle_mapper import ParticleMapper
-from swarm_loc_estimator.core.mapping.readings import LightSightings, Readings
-from swarm_loc_estimator.core.mapping.settings import MapperSettings
-from swarm_loc_estimator.core.mapping.stops import MotionTracker, Stop
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.se2 import wrap_angle
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.mapping.mapper import SCAN_TURN, CooperativeMapper
+from swarm_loc_estimator.mapping.printed.particle_mapper import ParticleMapper
+from swarm_loc_estimator.mapping.readings import LightSightings, Readings
+from swarm_loc_estimator.mapping.settings import MapperSettings
+from swarm_loc_estimator.mapping.stops import MotionTracker, Stop
 
 START = (1.0, 1.0, 0.3)
 KNOWN = np.full(3, 1e-3)

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.core.description.swarm import Robot
-from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.io.maps.laser_messages import LASER
-from swarm_loc_estimator.io.maps.mapper_feed import MapperFeed, MapperInput
-from swarm_loc_estimator.io.messages.encoders import UNKNOWN_COVARIANCE, encode_odometry
-from swarm_loc_estimator.io.messages.typestore import encode, typestore
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.encoders import UNKNOWN_COVARIANCE, encode_odometry
+from swarm_loc_estimator.common.messages.typestore import encode, typestore
+from swarm_loc_estimator.mapping.laser_messages import LASER
+from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
+from swarm_loc_estimator.swarm.swarm import Robot
 
 STEP_NS = 20_000_000
 DISTANCE, SIGMA = 2.0, 0.05

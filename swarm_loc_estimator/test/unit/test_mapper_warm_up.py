@@ -8,11 +8,11 @@ from pathlib import Path
 
 from compiled_code import compiled_since, signatures, told_by_process
 
-from swarm_loc_estimator.core.mapping.settings import MapperSettings
-from swarm_loc_estimator.evaluation.map_replay import replay_map
-from swarm_loc_estimator.io.maps.fix_covariance import FixCovariances
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.mapping.fix_covariance import FixCovariances
+from swarm_loc_estimator.mapping.settings import MapperSettings
 from swarm_loc_estimator.nodes.mapper.warm_up import warm_up
+from swarm_loc_estimator.offline.map_replay import replay_map
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 BAG = Path(__file__).parents[3] / "bags" / "pushbots_two"
 FREQUENCIES = {"pushbot1": 1000.0, "pushbot2": 1050.0}

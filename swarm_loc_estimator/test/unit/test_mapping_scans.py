@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping_world import MAX_RANGE, SIGMA, inverse_distances
 
-from swarm_loc_estimator.core.mapping.matching.beam_matching import (
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.mapping.matching.beam_matching import (
     CAUCHY,
     FIT,
     Scans,
@@ -18,11 +19,10 @@ from swarm_loc_estimator.core.mapping.matching.beam_matching import (
     agreement,
     beam_residual,
 )
-from swarm_loc_estimator.core.mapping.matching.correlative_search import Lattice, search_offsets
-from swarm_loc_estimator.core.mapping.scans.beams import MAX_BEAMS, Beams, no_beams, set_beams
-from swarm_loc_estimator.core.mapping.scans.lines import BINS, FREE, LINE, fit_lines, no_lines
-from swarm_loc_estimator.core.mapping.scans.turn_ratio import turn_ratio
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.mapping.matching.correlative_search import Lattice, search_offsets
+from swarm_loc_estimator.mapping.scans.beams import MAX_BEAMS, Beams, no_beams, set_beams
+from swarm_loc_estimator.mapping.scans.lines import BINS, FREE, LINE, fit_lines, no_lines
+from swarm_loc_estimator.mapping.scans.turn_ratio import turn_ratio
 
 TURN = np.linspace(0.0, 2.1 * math.pi, 400)
 POSES = np.array([[1.5, 1.2, 0.4], [1.9, 1.4, -2.0]])

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.estimation.measurement_buffer import MeasurementBuffer
-from swarm_loc_estimator.core.filter.measurement_model import MEASUREMENT_DTYPE
+from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE
+from swarm_loc_estimator.timeline.buffer import MeasurementBuffer
 
 Row = tuple[int, int, int, float]
 ROW = st.tuples(

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from core_geometry import planar, pose_of
 
-from swarm_loc_estimator.core.filter.measurement_model import (
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.filter.measurement_model import (
     MEASUREMENT_DTYPE,
     NOBODY,
     Kind,
@@ -16,8 +18,6 @@ from swarm_loc_estimator.core.filter.measurement_model import (
     innovation,
     predict,
 )
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
 
 WHO = {"landmark": (0, NOBODY), "surveyed": (0, NOBODY), "robot": (0, 1), "fix": (NOBODY, 1)}
 """Observer and target; the place of the landmark "surveyed" is estimated."""

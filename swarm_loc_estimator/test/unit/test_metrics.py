@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.evaluation import metrics
-from swarm_loc_estimator.evaluation.metrics import MetricsError
-from swarm_loc_estimator.numerics.trajectory import Trajectory, TrajectoryError, interpolate
+from swarm_loc_estimator.common.trajectory import Trajectory, TrajectoryError, interpolate
+from swarm_loc_estimator.offline import metrics
+from swarm_loc_estimator.offline.metrics import MetricsError
 
 SECOND = 1_000_000_000
 

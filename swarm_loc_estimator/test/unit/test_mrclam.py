@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from swarm_loc_estimator.cli.import_mrclam import main
-from swarm_loc_estimator.core.description.swarm import Face
-from swarm_loc_estimator.io.bags.reader import BagReader
-from swarm_loc_estimator.io.messages.cdr import decode_detections, decode_odometry, decode_pose_stamped
-from swarm_loc_estimator.io.mrclam.dataset import MrclamError, integrate, read_dataset
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.messages.cdr import decode_detections, decode_odometry, decode_pose_stamped
+from swarm_loc_estimator.offline.datasets.mrclam.dataset import MrclamError, integrate, read_dataset
+from swarm_loc_estimator.swarm.swarm import Face
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -10,12 +10,12 @@ from core_geometry import wrapped
 from core_messages import SECOND, T0
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.description.estimated_parameters import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
-from swarm_loc_estimator.core.description.swarm import OdometryModel, RandomWalk, Robot
-from swarm_loc_estimator.core.odometry.look_up import OdometrySample, look_up_pose
-from swarm_loc_estimator.core.odometry.tracks import OdometryTracks, TrackChange
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.filter.calibration_states import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
+from swarm_loc_estimator.odometry.look_up import OdometrySample, look_up_pose
+from swarm_loc_estimator.odometry.tracks import OdometryTracks, TrackChange
+from swarm_loc_estimator.swarm.swarm import OdometryModel, RandomWalk, Robot
 
 PLAIN = OdometryModel(wheel_separation=0.1, wheel_noise=1e-4)
 WALK = RandomWalk(position=2e-4, heading=0.05)

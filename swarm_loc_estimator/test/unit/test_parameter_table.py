@@ -7,14 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.cli.arguments import parameters_of
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
-from swarm_loc_estimator.nodes.mapper.mapper_parameters import MapperParameters
-from swarm_loc_estimator.nodes.player.player_parameters import PlayerParameters
-from swarm_loc_estimator.nodes.watch.markers_parameters import MarkersParameters
-from swarm_loc_estimator.nodes.watch.watch_parameters import WatchParameters
-from swarm_loc_estimator.parameters.table import (
+from swarm_loc_estimator.common.arguments import parameters_of
+from swarm_loc_estimator.common.parameters import (
     ParameterError,
     ParameterSpec,
     choice,
@@ -22,6 +16,12 @@ from swarm_loc_estimator.parameters.table import (
     markdown_table,
     parameter_specs,
 )
+from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
+from swarm_loc_estimator.nodes.mapper.mapper_parameters import MapperParameters
+from swarm_loc_estimator.nodes.player.player_parameters import PlayerParameters
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.watch.markers_parameters import MarkersParameters
+from swarm_loc_estimator.watch.watch_parameters import WatchParameters
 
 DOC = Path(__file__).parents[2] / "doc"
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from swarm_loc_estimator.io.bags.bag_file import RawMessage
+from swarm_loc_estimator.common.bags.bag_file import RawMessage
 from swarm_loc_estimator.nodes.player.playback import LONGEST_STEP_NS, STEP_S, PlayedSoFar, play
 
 SECOND = 1_000_000_000

@@ -8,11 +8,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.core.mapping.pose_graph import constraints as model
-from swarm_loc_estimator.core.mapping.pose_graph.graph import PoseGraph
-from swarm_loc_estimator.core.mapping.pose_graph.normal_equations import NormalEquations
-from swarm_loc_estimator.core.mapping.settings import MapperSettings
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.mapping.pose_graph import constraints as model
+from swarm_loc_estimator.mapping.pose_graph.graph import PoseGraph
+from swarm_loc_estimator.mapping.pose_graph.normal_equations import NormalEquations
+from swarm_loc_estimator.mapping.settings import MapperSettings
 
 SEEDS = range(5)
 STOPS = 4

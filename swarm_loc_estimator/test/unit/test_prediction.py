@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 from core_messages import SECOND, T0
 
-from swarm_loc_estimator.core.description.estimated_parameters import (
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.filter.calibration_states import (
     DISTANCE_SCALE,
     TURN_BIAS,
     TURN_SCALE,
     ParameterTable,
 )
-from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot
-from swarm_loc_estimator.core.filter.prediction import new_scratch, predict, write_predicted
-from swarm_loc_estimator.core.filter.state import InitialPose, SwarmState
-from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
-from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.filter.prediction import new_scratch, predict, write_predicted
+from swarm_loc_estimator.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot
 
 BIAS_SIGMA, DISTANCE_SIGMA, TURN_SIGMA, BIAS_TIME_S = 0.005, 0.01, 0.005, 20.0
 STEP_NS = SECOND // 20

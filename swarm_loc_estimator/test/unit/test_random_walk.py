@@ -7,10 +7,10 @@ import pytest
 from core_geometry import wrapped
 from core_messages import SECOND, T0, give_fix
 
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import RandomWalk, Robot, StartSigma, Swarm, SwarmError
-from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.swarm import RandomWalk, Robot, StartSigma, Swarm, SwarmError
+from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 WALK = RandomWalk(1e-4, 4e-3)
 SWARM = Swarm((Robot("walker", camera=None, stands=True, random_walk=WALK),))

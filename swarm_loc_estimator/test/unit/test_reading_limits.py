@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from ir_world import random_poses
 
-from swarm_loc_estimator.calibration.infrared.reading_limits import (
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.solvers.gains import Exchanges
+from swarm_loc_estimator.offline.calibration.infrared.reading_limits import (
     ReadingLimits,
     contradictions,
     find_reading_limits,
 )
-from swarm_loc_estimator.core.infrared.board import IrPlatform, PairGains
-from swarm_loc_estimator.core.infrared.brightness import expected
-from swarm_loc_estimator.core.infrared.solvers.gains import Exchanges
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
 
 ROBOTS, N = 3, 6
 NEVER = 1e8

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.evaluation.metrics import pool, summarise
-from swarm_loc_estimator.evaluation.replay import replay
-from swarm_loc_estimator.io.bags.cut import copy_beginning
-from swarm_loc_estimator.io.bags.reader import BagReader
-from swarm_loc_estimator.io.bags.writer import BagWriter
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.common.bags.cut import copy_beginning
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.offline.metrics import pool, summarise
+from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 DEMO = Path(__file__).parents[3] / "bags" / "eight_five_robots"
 

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.core.description.swarm import Landmark, Robot, Swarm
-from swarm_loc_estimator.evaluation.report.overview import plot_overview
-from swarm_loc_estimator.evaluation.report.report import write_report
-from swarm_loc_estimator.evaluation.report.table import text_report
-from swarm_loc_estimator.evaluation.result import ReplayResult
-from swarm_loc_estimator.numerics.trajectory import Trajectory
+from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.offline.report.overview import plot_overview
+from swarm_loc_estimator.offline.report.report import write_report
+from swarm_loc_estimator.offline.report.table import text_report
+from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from swarm_loc_estimator.core.description.swarm import Robot, Swarm
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
-from swarm_loc_estimator.core.inputs.messages import OdometryRows, RawInputs
-from swarm_loc_estimator.evaluation.runner import ListedSchedule, PeriodicSchedule, Runner
+from swarm_loc_estimator.offline.runner import ListedSchedule, PeriodicSchedule, Runner
+from swarm_loc_estimator.sensors.messages import OdometryRows, RawInputs
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.timeline.estimator import SwarmEstimator
 
 SECOND = 1_000_000_000
 HOUR = 3600 * SECOND

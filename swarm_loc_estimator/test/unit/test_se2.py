@@ -5,9 +5,9 @@ import pytest
 from core_geometry import planar, wrapped
 from scipy.linalg import expm
 
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.se2_scalar import direction_of
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.se2_scalar import direction_of
 
 
 def poses(seed: int, *shape: int) -> FloatArray:

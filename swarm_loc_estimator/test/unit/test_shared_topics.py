@@ -10,14 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core.description.swarm import Robot, Swarm
-from swarm_loc_estimator.core.inputs.messages import RawInputs
-from swarm_loc_estimator.io.inputs.ingest import Ingest
-from swarm_loc_estimator.io.inputs.topics import InputKind, live_topics
-from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE, CdrError
-from swarm_loc_estimator.io.messages.encoders import encode_detections, encode_fix, encode_odometry
-from swarm_loc_estimator.io.messages.message_batch import MessageBatch
-from swarm_loc_estimator.io.messages.shared import (
+from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE, CdrError
+from swarm_loc_estimator.common.messages.encoders import encode_detections, encode_fix, encode_odometry
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.shared import (
     SharedHead,
     decode_shared_detections,
     decode_shared_numbers,
@@ -25,8 +22,16 @@ from swarm_loc_estimator.io.messages.shared import (
     encode_shared_numbers,
     swarm_key,
 )
-from swarm_loc_estimator.io.messages.typestore import SWARM_DETECTIONS, SWARM_FIXES, SWARM_ODOMETRY, typestore
-from swarm_loc_estimator.numerics.arrays import IntArray
+from swarm_loc_estimator.common.messages.typestore import (
+    SWARM_DETECTIONS,
+    SWARM_FIXES,
+    SWARM_ODOMETRY,
+    typestore,
+)
+from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.messages import RawInputs
+from swarm_loc_estimator.sensors.topics import InputKind, live_topics
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 SWARM = Swarm(tuple(Robot(name) for name in "abc"))
 KEY = swarm_key("abc")

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.core.description.estimated_parameters import CAMERA_YAW, ParameterTable
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import CameraMount, Landmark, Robot, Swarm
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
-from swarm_loc_estimator.core.filter.dense.covariance import DenseFilter
-from swarm_loc_estimator.core.filter.joint_filter import Robots
-from swarm_loc_estimator.core.filter.sparse.sparse_filter import SparseFilter
-from swarm_loc_estimator.core.filter.state import InitialPose, SwarmState
-from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
-from swarm_loc_estimator.numerics.se2 import error_covariance
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.se2 import error_covariance
+from swarm_loc_estimator.filter.calibration_states import CAMERA_YAW, ParameterTable
+from swarm_loc_estimator.filter.dense_filter import DenseFilter
+from swarm_loc_estimator.filter.joint_filter import Robots
+from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
+from swarm_loc_estimator.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.swarm.swarm import CameraMount, Landmark, Robot, Swarm
+from swarm_loc_estimator.timeline.estimator import SwarmEstimator
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 SIGMA = np.array([0.02, 0.02, 0.035])
 START = np.diag([1e-4, 1e-4, 4e-4])

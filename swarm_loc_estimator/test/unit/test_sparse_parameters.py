@@ -8,28 +8,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.core.description.estimated_parameters import (
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.filter.batch_update import related_columns
+from swarm_loc_estimator.filter.calibration_states import (
     CAMERA_SCALE,
     CAMERA_YAW,
     DRIVES,
     ParameterTable,
 )
-from swarm_loc_estimator.core.description.swarm import (
+from swarm_loc_estimator.filter.joint_filter import Robots
+from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns
+from swarm_loc_estimator.filter.prediction import new_scratch, predict
+from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
+from swarm_loc_estimator.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Landmark,
     OdometryModel,
     Robot,
     SensorModel,
 )
-from swarm_loc_estimator.core.filter.batch_update import related_columns
-from swarm_loc_estimator.core.filter.joint_filter import Robots
-from swarm_loc_estimator.core.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns
-from swarm_loc_estimator.core.filter.prediction import new_scratch, predict
-from swarm_loc_estimator.core.filter.sparse.sparse_filter import SparseFilter
-from swarm_loc_estimator.core.filter.state import InitialPose, SwarmState
-from swarm_loc_estimator.core.odometry.preintegration import Preintegrated
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
 
 START = np.diag([1e-4, 1e-4, 4e-4])
 NOISE = np.diag([4e-4, 4e-4, 1e-3])

@@ -13,11 +13,11 @@ from core_run import on_time, play, settled, ticks
 from core_world import Plan, World, simulate
 from scipy.stats import chi2
 
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.estimation import fusion
-from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.core.filter.sparse.sparse_filter import SparseFilter
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
+from swarm_loc_estimator.timeline import fusion
+from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 SPARSE = EstimatorSettings(sparse_from=2, fusion_period_s=0.2)
 DENSE = replace(SPARSE, sparse_from=1000)

@@ -12,8 +12,14 @@ from core_run import on_time, play, ticks
 from core_world import Plan, World, simulate
 from scipy.stats import chi2
 
-from swarm_loc_estimator.core.description.estimated_parameters import ParameterTable
-from swarm_loc_estimator.core.description.swarm import (
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.filter.calibration_states import ParameterTable
+from swarm_loc_estimator.filter.innovation import relative_motion
+from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns, predict
+from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.sensors.camera import SightingConverter
+from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
     Landmark,
@@ -21,14 +27,8 @@ from swarm_loc_estimator.core.description.swarm import (
     Robot,
     Swarm,
 )
-from swarm_loc_estimator.core.estimation import fusion
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
-from swarm_loc_estimator.core.filter.innovation import relative_motion
-from swarm_loc_estimator.core.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns, predict
-from swarm_loc_estimator.core.filter.state import SwarmState
-from swarm_loc_estimator.core.inputs.camera import SightingConverter
-from swarm_loc_estimator.core.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.timeline import fusion
+from swarm_loc_estimator.timeline.estimator import SwarmEstimator
 
 TIME_SIGMA_S = 0.04
 SEER = Robot("seer", camera=CameraMount(x=0.04))

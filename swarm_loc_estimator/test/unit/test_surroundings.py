@@ -14,21 +14,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core.description.swarm import Robot, Swarm
-from swarm_loc_estimator.core.identification.memory import Identities
-from swarm_loc_estimator.core.inputs.messages import AerialRows
-from swarm_loc_estimator.evaluation.export import write_mcap
-from swarm_loc_estimator.evaluation.replay import replay
-from swarm_loc_estimator.evaluation.report.recording import recorded
-from swarm_loc_estimator.evaluation.surroundings import AerialImages, MapReader
-from swarm_loc_estimator.io.bags.reader import BagReader
-from swarm_loc_estimator.io.bags.writer import BagWriter
-from swarm_loc_estimator.io.maps.grid_messages import MAX_CELLS, OCCUPANCY_GRID, decode_occupancy_grid
-from swarm_loc_estimator.io.messages.cdr import CdrError
-from swarm_loc_estimator.io.messages.encoders import UNKNOWN_COVARIANCE, encode_odometry, encode_pose_stamped
-from swarm_loc_estimator.io.messages.message_batch import MessageBatch
-from swarm_loc_estimator.io.messages.typestore import ODOMETRY, POSE_STAMPED, encode, typestore
-from swarm_loc_estimator.io.watch.frames import unpack
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.messages.cdr import CdrError
+from swarm_loc_estimator.common.messages.encoders import (
+    UNKNOWN_COVARIANCE,
+    encode_odometry,
+    encode_pose_stamped,
+)
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.typestore import ODOMETRY, POSE_STAMPED, encode, typestore
+from swarm_loc_estimator.identification.memory import Identities
+from swarm_loc_estimator.mapping.grid_messages import MAX_CELLS, OCCUPANCY_GRID, decode_occupancy_grid
+from swarm_loc_estimator.offline.export import write_mcap
+from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.offline.report.recording import recorded
+from swarm_loc_estimator.offline.surroundings import AerialImages, MapReader
+from swarm_loc_estimator.sensors.messages import AerialRows
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.watch.frames import unpack
 
 SECOND = 1_000_000_000
 SWARM = Swarm(robots=(Robot("a", start=(0.0, 0.0, 0.0)), Robot("b", start=(1.0, 0.0, 0.0))))

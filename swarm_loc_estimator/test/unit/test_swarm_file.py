@@ -9,8 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core.description.motion_response import MotionResponse
-from swarm_loc_estimator.core.description.swarm import (
+from swarm_loc_estimator.swarm.motion_response import MotionResponse
+from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
     Landmark,
@@ -20,7 +20,7 @@ from swarm_loc_estimator.core.description.swarm import (
     Swarm,
     SwarmError,
 )
-from swarm_loc_estimator.io.swarm.swarm_file import SwarmFileError, load_swarm
+from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm
 
 EXAMPLE = """\
 fileversion: 1

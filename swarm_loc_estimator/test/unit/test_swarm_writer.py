@@ -9,9 +9,12 @@ from typing import Any
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core.description.motion_response import MotionResponse
-from swarm_loc_estimator.core.description.robot_ir import IrMethod, RobotIr
-from swarm_loc_estimator.core.description.swarm import (
+from swarm_loc_estimator.common.number_spec import number_specs
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import IrGains
+from swarm_loc_estimator.swarm.motion_response import MotionResponse
+from swarm_loc_estimator.swarm.robot_ir import IrMethod, RobotIr
+from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
     Landmark,
@@ -22,11 +25,8 @@ from swarm_loc_estimator.core.description.swarm import (
     StartSigma,
     Swarm,
 )
-from swarm_loc_estimator.core.infrared.board import IrGains
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.parameters.number_spec import number_specs
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 RESPONSE = MotionResponse(
     (0.0, 0.1), (0.0, 0.5, 1.0), ((1.0, 0.9, 0.9), (1.0, 0.8, 0.7)), ((1.0, 0.9, 0.8),) * 2

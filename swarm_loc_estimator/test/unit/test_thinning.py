@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.core.estimation.fusion_period import end_of_period
-from swarm_loc_estimator.core.inputs.messages import (
+from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.sensors.messages import (
     AerialRows,
     BrightnessRows,
     DetectionRows,
@@ -19,8 +19,8 @@ from swarm_loc_estimator.core.inputs.messages import (
     RawInputs,
     joined,
 )
-from swarm_loc_estimator.io.inputs.thinning import Thinning, water_level
-from swarm_loc_estimator.numerics.arrays import IntArray
+from swarm_loc_estimator.sensors.thinning import Thinning, water_level
+from swarm_loc_estimator.timeline.fusion_period import end_of_period
 
 ROBOTS = 20
 SEEN = 4

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.core.description.swarm import Robot, Swarm
-from swarm_loc_estimator.evaluation.truth import read_truth
-from swarm_loc_estimator.io.messages.encoders import encode_pose_stamped
+from swarm_loc_estimator.common.messages.encoders import encode_pose_stamped
+from swarm_loc_estimator.offline.truth import read_truth
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 SWARM = Swarm((Robot("a"), Robot("b"), Robot("silent")))
 

@@ -11,9 +11,9 @@ from core_run import on_time, play, settled, ticks
 from core_world import MOUNT, Plan, World, simulate
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.estimation.estimator import Status, SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 END = T0 + 4 * SECOND
 

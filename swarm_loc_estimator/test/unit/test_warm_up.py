@@ -11,23 +11,23 @@ from pathlib import Path
 import numpy as np
 from compiled_code import compiled_since, signatures, told_by_process
 
-from swarm_loc_estimator.core.description.settings import EstimatorSettings
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.core.estimation.estimator import SwarmEstimator
-from swarm_loc_estimator.core.inputs.messages import RawInputs
-from swarm_loc_estimator.evaluation.recorded_bag import read_bag, unwatched
-from swarm_loc_estimator.io.inputs.ingest import Ingest
-from swarm_loc_estimator.io.inputs.thinning import Thinning
-from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
-from swarm_loc_estimator.io.messages.message_batch import MessageBatch
-from swarm_loc_estimator.io.messages.shared import (
+from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.shared import (
     SharedHead,
     encode_shared_detections,
     encode_shared_numbers,
     swarm_key,
 )
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.nodes.warm_up import warm_up
+from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
+from swarm_loc_estimator.precompile import warm_up
+from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.messages import RawInputs
+from swarm_loc_estimator.sensors.thinning import Thinning
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.timeline.estimator import SwarmEstimator
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
 BAGS = Path(__file__).parents[3] / "bags"
 SECOND = 1_000_000_000

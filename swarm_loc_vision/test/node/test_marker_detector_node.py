@@ -15,11 +15,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profi
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
-from swarm_loc_estimator.parameters.table import ParameterError
+from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_msgs.msg import MarkerDetection, MarkerDetectionArray
-from swarm_loc_vision.core.decoding.families import family_named
-from swarm_loc_vision.nodes import camera_node
-from swarm_loc_vision.nodes.marker_detector_node import MarkerDetectorNode
+from swarm_loc_vision.common import camera_node
+from swarm_loc_vision.markers.families import family_named
+from swarm_loc_vision.markers.marker_detector_node import MarkerDetectorNode
 
 FAMILY = "aruco_mip_36h12"
 IMAGE, TRUTHS = random_scene(np.random.default_rng(4), family_named(FAMILY), 8, Look())

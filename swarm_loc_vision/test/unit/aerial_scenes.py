@@ -7,10 +7,10 @@ import math
 import cv2
 import numpy as np
 
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.aerial.ground.control_points import ControlPoints
-from swarm_loc_vision.core.aerial.ground.ground_camera import GroundCamera
-from swarm_loc_vision.core.imaging.camera import Camera
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.aerial.ground.control_points import ControlPoints
+from swarm_loc_vision.aerial.ground.ground_camera import GroundCamera
+from swarm_loc_vision.common.camera import Camera
 
 LENSES = {
     "straight": Camera(640, 480, 500.0, 500.0, 319.5, 239.5),

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 
 SIZE = (128, 128)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swarm_loc_vision.core.imaging.camera import Camera, CameraError
+from swarm_loc_vision.common.camera import Camera, CameraError
 
 PLUMB_BOB = (-0.28, 0.09, 1e-3, -5e-4, -0.01)
 RATIONAL = (0.3, -0.1, 1e-3, 5e-4, 0.02, 0.6, -0.05, 0.01)

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from aerial_scenes import LENSES, floor_points, over_floor, spread
 
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.aerial.ground.control_points import (
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.aerial.ground.control_points import (
     ControlPointError,
     ControlPoints,
     Noise,
     misfit,
     solve_pose,
 )
-from swarm_loc_vision.core.aerial.ground.floor_markers import FloorMarker
-from swarm_loc_vision.core.aerial.ground.ground_control import Ground
-from swarm_loc_vision.core.decoding.families import family_named
-from swarm_loc_vision.io.ground_file import GroundFileError, load_ground, save_ground
+from swarm_loc_vision.aerial.ground.floor_markers import FloorMarker
+from swarm_loc_vision.aerial.ground.ground_control import Ground
+from swarm_loc_vision.aerial.ground_file import GroundFileError, load_ground, save_ground
+from swarm_loc_vision.markers.families import family_named
 
 NOISE = Noise(pixel=0.5, place=0.0)
 

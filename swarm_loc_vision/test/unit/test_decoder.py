@@ -10,15 +10,15 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from swarm_loc_vision.core.decoding.decoder import (
+from swarm_loc_vision.common.sampling import GRID
+from swarm_loc_vision.markers.decoder import (
     FALSE_READINGS,
     Dictionary,
     _clear_cells,
     _flatten,
     correctable_bits,
 )
-from swarm_loc_vision.core.decoding.families import BITS, Family, family_named, rotated, unpacked
-from swarm_loc_vision.core.imaging.sampling import GRID
+from swarm_loc_vision.markers.families import BITS, Family, family_named, rotated, unpacked
 
 INK, PAPER = 40.0, 200.0
 BCH = family_named("artoolkit_bch_thin")

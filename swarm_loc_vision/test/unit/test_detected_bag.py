@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.evaluation.metrics import pool, summarise
-from swarm_loc_estimator.evaluation.replay import replay
-from swarm_loc_estimator.evaluation.result import ReplayResult
-from swarm_loc_estimator.io.bags.cut import copy_beginning
-from swarm_loc_estimator.io.bags.reader import BagReader
-from swarm_loc_estimator.io.bags.writer import BagWriter
-from swarm_loc_estimator.io.messages.cdr import decode_detections
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.trajectory import interpolate
-from swarm_loc_vision.cli.detect import main
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.bags.cut import copy_beginning
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.messages.cdr import decode_detections
+from swarm_loc_estimator.common.trajectory import interpolate
+from swarm_loc_estimator.offline.metrics import pool, summarise
+from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_vision.markers.detect import main
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_pictures"
 DESCRIPTION = BAG / "self_calibrating.yaml"

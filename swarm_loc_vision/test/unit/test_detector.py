@@ -18,13 +18,13 @@ from scipy.spatial.transform import Rotation
 from bench.vision.negatives import black_squares
 from bench.vision.peers import own_detector
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, random_scene
-from swarm_loc_estimator.core.inputs.camera import CONTENT_POSE, CONTENT_POSE_TWO
-from swarm_loc_vision.core.decoding.draw import draw_marker
-from swarm_loc_vision.core.decoding.families import Family, family_named, packed
-from swarm_loc_vision.core.detection.detector import Detections, MarkerDetector
-from swarm_loc_vision.core.detection.rows import detection_rows
-from swarm_loc_vision.core.detection.settings import DetectorSettings
-from swarm_loc_vision.core.imaging.camera import Camera
+from swarm_loc_estimator.sensors.camera import CONTENT_POSE, CONTENT_POSE_TWO
+from swarm_loc_vision.common.camera import Camera
+from swarm_loc_vision.markers.detector import Detections, MarkerDetector
+from swarm_loc_vision.markers.detector_settings import DetectorSettings
+from swarm_loc_vision.markers.draw import draw_marker
+from swarm_loc_vision.markers.families import Family, family_named, packed
+from swarm_loc_vision.markers.rows import detection_rows
 
 PHOTOS = Path(__file__).resolve().parents[4] / "shared" / "data" / "photos"
 Gray = NDArray[np.uint8]

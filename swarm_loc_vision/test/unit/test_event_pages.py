@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.parameters.table import ParameterError, markdown_table
-from swarm_loc_vision.core.events.paper_tracker import PaperTracker
-from swarm_loc_vision.core.laser.calibration import LaserCalibration
-from swarm_loc_vision.io.laser_file import save_laser
-from swarm_loc_vision.nodes.event_tracker_parameters import (
+from swarm_loc_estimator.common.parameters import ParameterError, markdown_table
+from swarm_loc_vision.events.event_tracker_parameters import (
     EventTrackerParameters,
     laser_calibration,
     light_sources,
     make_tracker,
 )
+from swarm_loc_vision.events.paper_tracker import PaperTracker
+from swarm_loc_vision.laser.calibration import LaserCalibration
+from swarm_loc_vision.laser.laser_file import save_laser
 
 DOC = Path(__file__).parents[2] / "doc"
 

@@ -8,11 +8,11 @@ from blinking_lights import SIZE, light, noise, together
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swarm_loc_vision.core.events.bearing import direction, direction_jacobian
-from swarm_loc_vision.core.events.bursts import BurstMatcher
-from swarm_loc_vision.core.events.centroid_tracker import CentroidTracker
-from swarm_loc_vision.core.events.paper_tracker import PaperSettings, PaperTracker
-from swarm_loc_vision.core.events.settings import MAX_SOURCES, LightSource, TrackerSettings, WindowReport
+from swarm_loc_vision.events.bearing import direction, direction_jacobian
+from swarm_loc_vision.events.bursts import BurstMatcher
+from swarm_loc_vision.events.centroid_tracker import CentroidTracker
+from swarm_loc_vision.events.paper_tracker import PaperSettings, PaperTracker
+from swarm_loc_vision.events.settings import MAX_SOURCES, LightSource, TrackerSettings, WindowReport
 
 LASER, LED = LightSource(450.0, is_above=False), LightSource(1000.0, is_above=True)
 SETTINGS = TrackerSettings()

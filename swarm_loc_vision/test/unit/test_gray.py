@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swarm_loc_vision.core.imaging.gray import ImageError, Pixels, decoded_image, gray_image
+from swarm_loc_vision.common.gray import ImageError, Pixels, decoded_image, gray_image
 
 WIDTH, HEIGHT = 14, 10
 SHADES = np.linspace(10, 240, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH).astype(np.uint8)

@@ -12,22 +12,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.io.bags.writer import BagWriter
-from swarm_loc_estimator.io.maps.laser_messages import LASER
-from swarm_loc_estimator.io.messages.encoders import UNKNOWN_COVARIANCE, encode_odometry
-from swarm_loc_estimator.io.messages.typestore import ODOMETRY, encode, typestore
-from swarm_loc_vision.core.laser.calibration import LaserCalibration
-from swarm_loc_vision.core.laser.fit import (
+from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.messages.encoders import UNKNOWN_COVARIANCE, encode_odometry
+from swarm_loc_estimator.common.messages.typestore import ODOMETRY, encode, typestore
+from swarm_loc_estimator.mapping.laser_messages import LASER
+from swarm_loc_vision.laser.calibration import LaserCalibration
+from swarm_loc_vision.laser.fit import (
     CalibrationError,
     Drive,
     fit_hyperbola,
     fit_logarithm,
     logarithm_depth,
 )
-from swarm_loc_vision.core.laser.row_bias import RowBias, fit_row_bias
-from swarm_loc_vision.core.laser.wall_drive import WallDrive
-from swarm_loc_vision.io.laser_file import LaserFileError, load_laser, save_laser
-from swarm_loc_vision.io.recorded_drive import recorded_drive
+from swarm_loc_vision.laser.laser_file import LaserFileError, load_laser, save_laser
+from swarm_loc_vision.laser.recorded_drive import recorded_drive
+from swarm_loc_vision.laser.row_bias import RowBias, fit_row_bias
+from swarm_loc_vision.laser.wall_drive import WallDrive
 
 DEPTHS = np.linspace(0.1, 2.5, 200)
 

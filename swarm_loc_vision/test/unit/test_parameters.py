@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
-from swarm_loc_estimator.core.description.swarm import Face, Landmark, Robot, Swarm
-from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.parameters.table import markdown_table
-from swarm_loc_vision.core.decoding.families import family_named
-from swarm_loc_vision.core.imaging.camera import Camera
-from swarm_loc_vision.nodes.detector_parameters import DetectorParameters, detector_maker
+from swarm_loc_estimator.common.parameters import markdown_table
+from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_vision.common.camera import Camera
+from swarm_loc_vision.markers.detector_parameters import DetectorParameters, detector_maker
+from swarm_loc_vision.markers.families import family_named
 
 PAGE = Path(__file__).parents[2] / "doc" / "marker_detector_node.md"
 FAMILY = "aruco_mip_36h12"

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bench.vision.scenes import facing, project
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.pose.pose import Poses, Upright, _equations, _Sight, marker_poses, square
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.markers.pose import Poses, Upright, _equations, _Sight, marker_poses, square
 
 INTRINSICS = np.array([1000.0, 1000.0, 639.5, 479.5])
 LENGTH, SIGMA_PX = 0.05, 0.05

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from swarm_loc_vision.core.detection.selection import SelectionError, parse_ids, parse_lengths
+from swarm_loc_vision.markers.selection import SelectionError, parse_ids, parse_lengths
 
 
 def test_ids() -> None:

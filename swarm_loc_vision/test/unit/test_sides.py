@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.decoding.decoder import Dictionary
-from swarm_loc_vision.core.decoding.families import family_named
-from swarm_loc_vision.core.detection.edges import Corners, refine, refine_read
-from swarm_loc_vision.core.detection.side_pixels import INNER, side_pixels
-from swarm_loc_vision.core.imaging.camera import Camera
-from swarm_loc_vision.core.imaging.lens import LENS_SIZE
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.common.camera import Camera
+from swarm_loc_vision.common.lens import LENS_SIZE
+from swarm_loc_vision.markers.decoder import Dictionary
+from swarm_loc_vision.markers.edges import Corners, refine, refine_read
+from swarm_loc_vision.markers.families import family_named
+from swarm_loc_vision.markers.side_pixels import INNER, side_pixels
 
 FAMILY = family_named("artoolkit_bch_thin")
 INK, PAPER = 30.0, 200.0

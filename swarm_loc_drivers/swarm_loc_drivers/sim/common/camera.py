@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.sim.common.record import FRAME_DTYPE, Records, in_order_of_arrival
 from swarm_loc_drivers.sim.common.transport import CAMERA_LATENESS, arrival_ns, survivors
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
 
 Exposures = tuple[NDArray[np.int64], NDArray[np.int64]]
 """Robot (F,) and stamp (F,) [ns] of images, sorted by stamp."""

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.sim.common.record import ODOMETRY_DTYPE, Records, in_order_of_arrival
 from swarm_loc_drivers.sim.common.transport import Lateness, arrival_ns
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
 
 Controller = Callable[[int, FloatArray], tuple[FloatArray, FloatArray]]
 """(step index, true poses (N, 3)) -> commanded speed (N,) [m/s] and turn rate (N,) [rad/s]."""

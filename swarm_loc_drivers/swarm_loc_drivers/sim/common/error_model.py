@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from swarm_loc_estimator.core.description.swarm import SensorModel
+from swarm_loc_estimator.swarm.swarm import SensorModel
 
 
 @dataclass(frozen=True)

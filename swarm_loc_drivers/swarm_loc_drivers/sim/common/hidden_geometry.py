@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
 
 if TYPE_CHECKING:
     from swarm_loc_drivers.sim.common.error_model import ErrorModel
-    from swarm_loc_estimator.core.description.swarm import Swarm
+    from swarm_loc_estimator.swarm.swarm import Swarm
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from swarm_loc_drivers.sim.common.camera import Exposures, View, deliver, hidden
 from swarm_loc_drivers.sim.common.hidden_geometry import HiddenGeometry, hidden_geometry
 from swarm_loc_drivers.sim.common.record import SIGHTING_DTYPE, Records
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
 
 if TYPE_CHECKING:
     from swarm_loc_drivers.sim.common.error_model import ErrorModel
     from swarm_loc_drivers.sim.common.trajectories import Trajectories
-    from swarm_loc_estimator.core.description.swarm import Swarm
+    from swarm_loc_estimator.swarm.swarm import Swarm
 
 
 ROBOT_RADIUS = 0.036

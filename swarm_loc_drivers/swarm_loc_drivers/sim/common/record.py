@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from swarm_loc_drivers.sim.common.trajectories import Trajectories
-    from swarm_loc_estimator.core.description.swarm import Swarm
+    from swarm_loc_estimator.swarm.swarm import Swarm
 
 ODOMETRY_DTYPE = np.dtype(
     [("robot", "<i4"), ("stamp_ns", "<i8"), ("arrival_ns", "<i8"), ("pose", "<f8", (3,))]

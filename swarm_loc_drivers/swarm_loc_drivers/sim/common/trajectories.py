@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.common import se2
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

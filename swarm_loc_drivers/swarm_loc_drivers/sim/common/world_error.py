@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from swarm_loc_estimator.core.description.swarm import Pose2, Robot
-from swarm_loc_estimator.parameters.errors import UserError
+from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.swarm.swarm import Pose2, Robot
 
 
 class WorldError(UserError):

@@ -11,8 +11,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.protocols.droplet.hardware import DIRECTIONS, FULL_POWER, gait
-from swarm_loc_drivers.protocols.droplet.infrared_timing import (
+from swarm_loc_drivers.droplet.hardware import DIRECTIONS, FULL_POWER, gait
+from swarm_loc_drivers.droplet.infrared_timing import (
     EMIT_DELAY_NS,
     HANDLING_NS,
     MAX_MESSAGE,

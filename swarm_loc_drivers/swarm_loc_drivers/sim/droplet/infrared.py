@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.protocols.droplet import infrared_timing as timing
+from swarm_loc_drivers.droplet import infrared_timing as timing
 from swarm_loc_drivers.sim.common.body import Command, Measured
 from swarm_loc_drivers.sim.droplet.light import DropletLight, distance_to_segments
 from swarm_loc_drivers.sim.droplet.transmissions import Exchange, Message, overlap
-from swarm_loc_estimator.core.infrared.board import IrPlatform
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
 _REMEMBERED_NS = 1_000_000_000
 """So long messages and exchanges that are over are kept: longer than any message takes."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.protocols.droplet.hardware import FULL_POWER
-from swarm_loc_estimator.core.infrared.board import IrPlatform, PairGains
-from swarm_loc_estimator.core.infrared.brightness import expected
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray
+from swarm_loc_drivers.droplet.hardware import FULL_POWER
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
 
 
 class DropletLight:

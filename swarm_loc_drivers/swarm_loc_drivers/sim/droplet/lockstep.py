@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from swarm_loc_drivers.core.droplet.commanded_motion import CommandedMotion, MotionNoise
-from swarm_loc_drivers.core.droplet.exchange import Brightness
-from swarm_loc_drivers.core.droplet.mover import DropletMover
-from swarm_loc_drivers.core.droplet.session import DropletSession, SessionSettings
-from swarm_loc_drivers.core.odometry_state import OdometryState
-from swarm_loc_drivers.core.velocity_command import Velocity, VelocityCommand
-from swarm_loc_drivers.protocols.droplet.console import TERMINATOR
+from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.velocity_command import Velocity, VelocityCommand
+from swarm_loc_drivers.droplet.commanded_motion import CommandedMotion, MotionNoise
+from swarm_loc_drivers.droplet.console import TERMINATOR
+from swarm_loc_drivers.droplet.exchange import Brightness
+from swarm_loc_drivers.droplet.mover import DropletMover
+from swarm_loc_drivers.droplet.session import DropletSession, SessionSettings
 from swarm_loc_drivers.sim.common.link_host import ConsoleFirmware
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, Print
 from swarm_loc_drivers.sim.droplet.world import DropletWorld, SimulatedDroplet

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.protocols.droplet import infrared_timing as timing
-from swarm_loc_drivers.protocols.droplet.hardware import ELEMENTS
+from swarm_loc_drivers.droplet import infrared_timing as timing
+from swarm_loc_drivers.droplet.hardware import ELEMENTS
 
 
 def overlap(one: Message | Exchange, other: Message | Exchange) -> bool:

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swarm_loc_drivers.protocols.droplet.hardware import DIRECTIONS, ELEMENTS, WALKS, Gait, gait
+from swarm_loc_drivers.droplet.hardware import DIRECTIONS, ELEMENTS, WALKS, Gait, gait
 from swarm_loc_drivers.sim.common.body import Command, Measured
 from swarm_loc_drivers.sim.common.world_error import WorldError
 from swarm_loc_drivers.sim.droplet.infrared import DropletInfrared, InfraredSettings
 from swarm_loc_drivers.sim.droplet.light import DropletLight
-from swarm_loc_estimator.core.infrared.board import IrPlatform
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
 STEP_NS = 5_000_000
 NEAR_POWER = 40

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.protocols.epuck.hardware import PROXIMITY_BEARINGS, PROXIMITY_RADIUS_M
-from swarm_loc_drivers.protocols.epuck.proximity import FIELD_OF_VIEW, raw_of_distance
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_drivers.epuck.hardware import PROXIMITY_BEARINGS, PROXIMITY_RADIUS_M
+from swarm_loc_drivers.epuck.proximity import FIELD_OF_VIEW, raw_of_distance
+from swarm_loc_estimator.common.arrays import FloatArray
 
 _LARGEST = 4095
 _NOISE = 6.0

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.core.epuck.wheels import WheelGeometry
+from swarm_loc_drivers.epuck.wheels import WheelGeometry
 from swarm_loc_drivers.sim.common.differential_drive import Drive, LastingNoise, roll
 from swarm_loc_drivers.sim.common.error_model import ErrorModel
 from swarm_loc_drivers.sim.common.hidden_geometry import hidden_geometry
@@ -23,9 +23,9 @@ from swarm_loc_drivers.sim.render.camera_rig import Arena, CameraRig
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.overhead import OverheadRig, OverheadSettings
 from swarm_loc_drivers.sim.render.views import Views
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.aerial.ground.floor_markers import FloorMarker
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_vision.aerial.ground.floor_markers import FloorMarker
 
 GrayImage = NDArray[np.uint8]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
 
 _FREE_RATE = 6000.0
 """A wheel at full voltage [ticks/s]; the firmware's fastest velocity needs four fifths of it."""

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.protocols.pushbot.hardware import SENSOR_PX
+from swarm_loc_drivers.pushbot.hardware import SENSOR_PX
 from swarm_loc_drivers.sim.common.body import Blinking
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
-from swarm_loc_estimator.parameters.number_spec import number
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.number_spec import number
 
 _REACH_PX = 4
 """Half the width of the part of the image that a spot is computed in."""

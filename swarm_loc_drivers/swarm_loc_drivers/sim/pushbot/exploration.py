@@ -12,11 +12,11 @@ import numpy as np
 
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan
 from swarm_loc_drivers.sim.pushbot.kinematics import KinematicPushBot, PushBotNoise
-from swarm_loc_estimator.core.mapping.exploration.goal import Goal
-from swarm_loc_estimator.core.mapping.mapper import SCAN_TURN
-from swarm_loc_estimator.core.mapping.readings import LightSightings, Readings
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.se2 import wrap_angle
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.mapping.exploration.goal import Goal
+from swarm_loc_estimator.mapping.mapper import SCAN_TURN
+from swarm_loc_estimator.mapping.readings import LightSightings, Readings
 
 START_SIGMA = np.array([0.10, 0.10, math.radians(5.0)])
 """How well the starts of all robots but the first are known; that one's is the origin of the map."""

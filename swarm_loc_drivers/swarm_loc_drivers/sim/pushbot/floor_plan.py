@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.parameters.errors import UserError
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.errors import UserError
 
 Rectangle = tuple[float, float, float, float]
 """Left, lower, right and upper edge [m]."""

@@ -13,10 +13,10 @@ import numpy as np
 
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan
 from swarm_loc_drivers.sim.pushbot.ray_casting import clearance, is_visible, ray_distance
-from swarm_loc_estimator.core.mapping.readings import UNSEEN, LightSightings, Readings
-from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.numerics.jit import compiled
-from swarm_loc_estimator.numerics.se2 import wrap_angle
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.mapping.readings import UNSEEN, LightSightings, Readings
 
 PERIOD_S = 0.02
 """Between two reports of the event tracker."""

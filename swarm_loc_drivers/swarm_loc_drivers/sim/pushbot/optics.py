@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from swarm_loc_drivers.sim.common.body import Blinking
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
 
 FOCAL_PX = 90.0
 """3.6 mm over pixels of 40 um: 70.8 degrees."""

@@ -10,8 +10,8 @@ from swarm_loc_drivers.sim.common.body import Blinking
 from swarm_loc_drivers.sim.pushbot import optics
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraEvents, CameraNoise, EventCamera, Spot
 from swarm_loc_drivers.sim.pushbot.ray_casting import is_visible, ray_distance
-from swarm_loc_estimator.numerics.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.jit import compiled
 
 BODY_RADIUS_M = 0.07
 _MAX_SPOT_M = 5.0

@@ -16,11 +16,11 @@ from swarm_loc_drivers.sim.pushbot.optics import (
     assembled_robots,
     spot_brightness,
 )
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.events.centroid_tracker import CentroidTracker
-from swarm_loc_vision.core.events.settings import LightSource, TrackerSettings
-from swarm_loc_vision.core.laser.fit import Drive, fit_hyperbola
-from swarm_loc_vision.io.laser_file import save_laser
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.events.centroid_tracker import CentroidTracker
+from swarm_loc_vision.events.settings import LightSource, TrackerSettings
+from swarm_loc_vision.laser.fit import Drive, fit_hyperbola
+from swarm_loc_vision.laser.laser_file import save_laser
 
 _STEP_US = 5_000
 _BLINKING, _LASER = Blinking(2222, 1111), LightSource(450.0, is_above=False)

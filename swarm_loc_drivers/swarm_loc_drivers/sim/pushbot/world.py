@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.core.pushbot.settings import WheelGeometry
+from swarm_loc_drivers.pushbot.settings import WheelGeometry
 from swarm_loc_drivers.sim.common.body import Blinking
 from swarm_loc_drivers.sim.common.differential_drive import Drive, LastingNoise, roll
 from swarm_loc_drivers.sim.common.world_error import WorldError
@@ -22,8 +22,8 @@ from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan
 from swarm_loc_drivers.sim.pushbot.ray_casting import clearance
 from swarm_loc_drivers.sim.pushbot.sight import BODY_RADIUS_M, HallSight, Lights
-from swarm_loc_estimator.core.description.swarm import Pose2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.swarm import Pose2
 
 STEP_NS = 5_000_000
 _MS_PER_STEP = 5

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from swarm_loc_drivers.sim.recording.bag import Stream, odometry_stream, truth_stream, write_streams
-from swarm_loc_estimator.io.messages.encoders import encode_anonymous
-from swarm_loc_estimator.io.messages.typestore import ANONYMOUS_DETECTIONS
+from swarm_loc_estimator.common.messages.encoders import encode_anonymous
+from swarm_loc_estimator.common.messages.typestore import ANONYMOUS_DETECTIONS
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,23 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.sim.recording.detections import as_detections
-from swarm_loc_estimator.io.bags.writer import BagWriter
-from swarm_loc_estimator.io.messages.encoders import (
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.messages.encoders import (
     UNKNOWN_COVARIANCE,
     encode_detections,
     encode_odometry,
     encode_pose_stamped,
 )
-from swarm_loc_estimator.io.messages.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED
-from swarm_loc_estimator.io.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.numerics import se2
+from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
     from swarm_loc_drivers.sim.common.record import LivedRun, Records, SimulatedRun
-    from swarm_loc_estimator.core.description.swarm import Swarm
+    from swarm_loc_estimator.swarm.swarm import Swarm
 
 TRUTH_PERIOD_NS = 100_000_000
 

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from swarm_loc_drivers.sim.common.record import Records, SimulatedRun
-from swarm_loc_estimator.core.inputs.camera import CONTENT_POSE
-from swarm_loc_estimator.io.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.sensors.camera import CONTENT_POSE
 
 FAMILY = 0
 """MarkerDetection.FAMILY_ARTOOLKIT_BCH."""

@@ -9,8 +9,8 @@ import numpy as np
 from swarm_loc_drivers.sim.common.transport import CAMERA_LATENESS, arrival_ns, survivors
 from swarm_loc_drivers.sim.recording.bag import Stream, odometry_stream, truth_stream, write_streams
 from swarm_loc_drivers.sim.scenarios.droplet_run import FIX_SIGMAS, DropletRun
-from swarm_loc_estimator.io.messages.encoders import encode_brightness, encode_fix
-from swarm_loc_estimator.io.messages.typestore import BRIGHTNESS, POSE_WITH_COVARIANCE
+from swarm_loc_estimator.common.messages.encoders import encode_brightness, encode_fix
+from swarm_loc_estimator.common.messages.typestore import BRIGHTNESS, POSE_WITH_COVARIANCE
 
 SATURATION = 240
 """As the drivers say it: full scale less the largest ambient light [count]."""

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.io.calibration_file import CameraCalibration
+from swarm_loc_drivers.common.calibration_file import CameraCalibration
 from swarm_loc_drivers.sim.recording.bag import Stream, odometry_stream, truth_stream, write_streams
 from swarm_loc_drivers.sim.scenarios.eight_images import ImageRun
-from swarm_loc_estimator.io.messages.typestore import encode, typestore
+from swarm_loc_estimator.common.messages.typestore import encode, typestore
 
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"

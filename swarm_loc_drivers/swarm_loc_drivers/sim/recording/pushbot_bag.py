@@ -17,19 +17,15 @@ from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.recording.bag import Stream, write_streams
 from swarm_loc_drivers.sim.recording.pushbot_events import event_streams, header_at, poses_between, sight_of
 from swarm_loc_drivers.sim.recording.pushbot_maps import MapNotes, goal_stream
-from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot, StartSigma, Swarm
-from swarm_loc_estimator.core.mapping.exploration.goal import Goal
-from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.core.mapping.readings import LightSightings, Readings
-from swarm_loc_estimator.io.maps.fix_covariance import FixCovariances
-from swarm_loc_estimator.io.maps.laser_messages import LASER, LIGHTS
-from swarm_loc_estimator.io.messages.encoders import (
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.encoders import (
     UNKNOWN_COVARIANCE,
     encode_fix,
     encode_odometry,
     encode_pose_stamped,
 )
-from swarm_loc_estimator.io.messages.typestore import (
+from swarm_loc_estimator.common.messages.typestore import (
     MESSAGE_PACKAGE,
     ODOMETRY,
     POSE_STAMPED,
@@ -37,8 +33,12 @@ from swarm_loc_estimator.io.messages.typestore import (
     encode,
     typestore,
 )
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.mapping.exploration.goal import Goal
+from swarm_loc_estimator.mapping.fix_covariance import FixCovariances
+from swarm_loc_estimator.mapping.laser_messages import LASER, LIGHTS
+from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.mapping.readings import LightSightings, Readings
+from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, StartSigma, Swarm
 
 BEGIN_NS = 1_700_000_000_000_000_000
 _TRUTH_EVERY = 5

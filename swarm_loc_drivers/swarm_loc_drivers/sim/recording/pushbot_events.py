@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from swarm_loc_drivers.protocols.pushbot.hardware import SENSOR_PX
+from swarm_loc_drivers.pushbot.hardware import SENSOR_PX
 from swarm_loc_drivers.sim.pushbot import optics
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
 from swarm_loc_drivers.sim.pushbot.sight import HallSight
 from swarm_loc_drivers.sim.recording.bag import Stream
-from swarm_loc_estimator.io.messages.event_encoding import ENCODING, Events, encode_events
-from swarm_loc_estimator.io.messages.typestore import MESSAGE_PACKAGE, encode, typestore
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.messages.event_encoding import ENCODING, Events, encode_events
+from swarm_loc_estimator.common.messages.typestore import MESSAGE_PACKAGE, encode, typestore
 
 EVENTS = f"{MESSAGE_PACKAGE}/msg/EventPacket"
 STEP_US = 5_000

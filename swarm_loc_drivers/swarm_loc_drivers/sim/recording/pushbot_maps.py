@@ -9,11 +9,11 @@ import numpy as np
 
 from swarm_loc_drivers.sim.recording.bag import Stream
 from swarm_loc_drivers.sim.recording.pushbot_events import header_at
-from swarm_loc_estimator.core.mapping.exploration.goal import Goal
-from swarm_loc_estimator.core.mapping.grid.occupancy import OccupancyMap
-from swarm_loc_estimator.io.maps.grid_messages import OCCUPANCY_GRID
-from swarm_loc_estimator.io.messages.encoders import encode_pose_stamped
-from swarm_loc_estimator.io.messages.typestore import POSE_STAMPED, encode, typestore
+from swarm_loc_estimator.common.messages.encoders import encode_pose_stamped
+from swarm_loc_estimator.common.messages.typestore import POSE_STAMPED, encode, typestore
+from swarm_loc_estimator.mapping.exploration.goal import Goal
+from swarm_loc_estimator.mapping.grid.occupancy import OccupancyMap
+from swarm_loc_estimator.mapping.grid_messages import OCCUPANCY_GRID
 
 _PERIOD_NS = 30_000_000_000
 """Of maps: often enough to see them grow."""

@@ -9,14 +9,14 @@ import numpy as np
 
 from swarm_loc_drivers.sim.recording.bag import Stream, truth_stream, write_streams
 from swarm_loc_drivers.sim.recording.detections import as_detections
-from swarm_loc_estimator.io.messages.shared import (
+from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.common.messages.shared import (
     SharedHead,
     encode_shared_detections,
     encode_shared_numbers,
     swarm_key,
 )
-from swarm_loc_estimator.io.messages.typestore import SWARM_DETECTIONS, SWARM_ODOMETRY
-from swarm_loc_estimator.numerics.arrays import IntArray
+from swarm_loc_estimator.common.messages.typestore import SWARM_DETECTIONS, SWARM_ODOMETRY
 
 if TYPE_CHECKING:
     from pathlib import Path

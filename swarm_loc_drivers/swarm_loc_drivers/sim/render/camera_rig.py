@@ -14,9 +14,9 @@ from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.raster import Patches
 from swarm_loc_drivers.sim.render.renderer import Renderer, RobotCamera, Scene
 from swarm_loc_drivers.sim.render.views import Views, views_of
-from swarm_loc_estimator.core.description.swarm import CameraMount, Face, Landmark, Swarm
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.decoding.families import Family
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Swarm
+from swarm_loc_vision.markers.families import Family
 
 
 @dataclass(frozen=True)

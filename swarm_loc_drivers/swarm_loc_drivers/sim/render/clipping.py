@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import compiled
 
 _NEAR = 0.004  # [m] in front of the camera; what is nearer is cut off
 CORNERS = 12  # a quadrangle cut by five planes has at most nine

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.io.calibration_file import CameraCalibration
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.parameters.number_spec import number
-from swarm_loc_vision.core.imaging.camera import Camera
+from swarm_loc_drivers.common.calibration_file import CameraCalibration
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_vision.common.camera import Camera
 
 _REACH_MARGIN = 1.1
 

@@ -14,11 +14,11 @@ from swarm_loc_drivers.sim.render import scene as scenery
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.raster import Patches
 from swarm_loc_drivers.sim.render.renderer import Renderer, RobotCamera, Scene
-from swarm_loc_estimator.core.description.swarm import CameraMount
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.parameters.number_spec import number
-from swarm_loc_vision.core.aerial.ground.floor_markers import FloorMarker
-from swarm_loc_vision.core.decoding.families import Family
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_estimator.swarm.swarm import CameraMount
+from swarm_loc_vision.aerial.ground.floor_markers import FloorMarker
+from swarm_loc_vision.markers.families import Family
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ import numpy as np
 
 from swarm_loc_drivers.sim.render.clipping import CORNERS, ball_in_view, cut, move
 from swarm_loc_drivers.sim.render.coverage import Changes, Layer, add_straight
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
-from swarm_loc_estimator.numerics.jit import compiled
-from swarm_loc_vision.core.imaging.lens import CX, CY, FX, FY, LENS_KIND, LENS_SIZE, STRAIGHT, distorted
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_vision.common.lens import CX, CY, FX, FY, LENS_KIND, LENS_SIZE, STRAIGHT, distorted
 
 REACH = LENS_SIZE
 """Behind the constants of a lens, the radius at distance 1 up to which they hold."""

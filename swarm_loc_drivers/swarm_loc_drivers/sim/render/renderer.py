@@ -16,10 +16,10 @@ from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.raster import REACH, Motion, Patches, draw, project
 from swarm_loc_drivers.sim.render.scene import ROOM
 from swarm_loc_drivers.sim.render.sensor import expose
-from swarm_loc_estimator.core.description.swarm import CameraMount
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.imaging.lens import CX, CY, FX
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.swarm import CameraMount
+from swarm_loc_vision.common.lens import CX, CY, FX
 
 STEP_PX = 1.0
 """An image is drawn at as many instants of its exposure as keep the motion between them below this."""

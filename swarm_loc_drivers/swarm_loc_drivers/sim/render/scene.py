@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.sim.render.raster import Patches
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_vision.core.aerial.pattern import MARK_RADIUS
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.aerial.pattern import MARK_RADIUS
 
 BLACK, WHITE = 0.05, 0.85
 ROOM = 0.30

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.sim.render.coverage import Image
-from swarm_loc_estimator.numerics.arrays import IntArray
-from swarm_loc_estimator.numerics.jit import compiled
+from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.common.jit import compiled
 
 
 @compiled

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.sim.render.raster import Motion, Patches, project
 from swarm_loc_drivers.sim.render.renderer import RobotCamera, Scene
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
 
 _CLOSEST = 0.01
 """What is nearer to the camera's plane is not projected [m]."""

@@ -23,7 +23,7 @@ from swarm_loc_drivers.sim.scenarios.eight import (
     follow,
 )
 from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
 
 PITCH = 0.13
 COLUMNS, ROWS = 5, 4

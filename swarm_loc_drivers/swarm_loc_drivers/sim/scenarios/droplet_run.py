@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from swarm_loc_drivers.core.droplet.commanded_motion import MotionNoise
-from swarm_loc_drivers.core.droplet.exchange import Brightness
-from swarm_loc_drivers.core.droplet.session import SessionSettings
-from swarm_loc_drivers.core.droplet.tdma import TdmaSettings
-from swarm_loc_drivers.protocols.droplet.hardware import DROPLET, ELEMENTS, FULL_POWER
+from swarm_loc_drivers.droplet.commanded_motion import MotionNoise
+from swarm_loc_drivers.droplet.exchange import Brightness
+from swarm_loc_drivers.droplet.hardware import DROPLET, ELEMENTS, FULL_POWER
+from swarm_loc_drivers.droplet.session import SessionSettings
+from swarm_loc_drivers.droplet.tdma import TdmaSettings
 from swarm_loc_drivers.sim.common.record import ODOMETRY_DTYPE, LivedRun, in_order_of_arrival
 from swarm_loc_drivers.sim.common.trajectories import Trajectories
 from swarm_loc_drivers.sim.common.transport import ODOMETRY_LATENESS, arrival_ns
@@ -35,9 +35,9 @@ from swarm_loc_drivers.sim.scenarios.droplet_table import (
     starts,
 )
 from swarm_loc_drivers.sim.scenarios.eight import START_NS
-from swarm_loc_estimator.core.infrared.board import IrGains
-from swarm_loc_estimator.io.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import IrGains
 
 TURN_S = 0.9
 FIXED = (0, -1)

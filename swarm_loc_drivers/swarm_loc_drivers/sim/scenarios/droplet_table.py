@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from swarm_loc_drivers.sim.scenarios.eight import rounded
-from swarm_loc_estimator.core.description.robot_ir import RobotIr
-from swarm_loc_estimator.core.description.swarm import OdometryModel, Robot, Swarm
-from swarm_loc_estimator.core.infrared.board import IrGains, IrPlatform
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform
+from swarm_loc_estimator.swarm.robot_ir import RobotIr
+from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
 
 PITCH = 0.13
 _JITTER = 0.02

@@ -21,7 +21,9 @@ from swarm_loc_drivers.sim.common.record import Records, SimulatedRun
 from swarm_loc_drivers.sim.common.trajectories import Trajectories
 from swarm_loc_drivers.sim.common.transport import ODOMETRY_LATENESS
 from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
-from swarm_loc_estimator.core.description.swarm import (
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
     Landmark,
@@ -30,8 +32,6 @@ from swarm_loc_estimator.core.description.swarm import (
     StartSigma,
     Swarm,
 )
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
 
 HALF_WIDTH = 0.60
 ARENA = (2.4, 1.6)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from swarm_loc_drivers.sim.scenarios.eight import ARENA
 from swarm_loc_drivers.sim.scenarios.eight_images import FAMILY
-from swarm_loc_vision.core.aerial.ground.floor_markers import FloorMarker
-from swarm_loc_vision.core.aerial.ground.ground_control import Ground
-from swarm_loc_vision.core.decoding.families import family_named
+from swarm_loc_vision.aerial.ground.floor_markers import FloorMarker
+from swarm_loc_vision.aerial.ground.ground_control import Ground
+from swarm_loc_vision.markers.families import family_named
 
 _SIZE, _FROM_WALL = 0.12, 0.15
 

@@ -14,7 +14,7 @@ from swarm_loc_drivers.sim.common.record import SIGHTING_DTYPE, SimulatedRun
 from swarm_loc_drivers.sim.render.camera_rig import Arena, CameraRig
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, EightSettings, camera_exposures, drive_eight
-from swarm_loc_vision.core.decoding.families import family_named
+from swarm_loc_vision.markers.families import family_named
 
 FAMILY = "artoolkit_bch_thin"
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from swarm_loc_drivers.core.velocity_command import Velocity
+from swarm_loc_drivers.common.velocity_command import Velocity
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, follow
 from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
 
 
 class EightSteering:

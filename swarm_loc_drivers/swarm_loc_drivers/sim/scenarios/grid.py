@@ -20,7 +20,9 @@ from swarm_loc_drivers.sim.common.record import SIGHTING_DTYPE, Records, Simulat
 from swarm_loc_drivers.sim.common.trajectories import Trajectories
 from swarm_loc_drivers.sim.common.transport import ODOMETRY_LATENESS
 from swarm_loc_drivers.sim.scenarios.grid_shapes import HOME_RADIUS, ROAMING_SPEED, Shape, roam, stay
-from swarm_loc_estimator.core.description.swarm import (
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
     Landmark,
@@ -30,8 +32,6 @@ from swarm_loc_estimator.core.description.swarm import (
     StartSigma,
     Swarm,
 )
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
 
 VIEW = View(field_of_view=math.radians(160.0), nearest=0.05, farthest=0.8, incidence=math.pi)
 SENSOR = SensorModel(forward_sigma=0.020, left_sigma=0.020, heading_sigma=0.035)

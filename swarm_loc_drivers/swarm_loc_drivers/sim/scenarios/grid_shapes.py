@@ -8,8 +8,8 @@ from enum import Enum
 import numpy as np
 
 from swarm_loc_drivers.sim.common.differential_drive import Controller
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
 
 PITCH = 0.5
 HOME_RADIUS = 0.08

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ellipk, ellipkinc
 
-from swarm_loc_estimator.numerics.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray
 
 _TABLE_SIZE = 20001
 

@@ -22,10 +22,10 @@ from swarm_loc_drivers.sim.scenarios.eight import (
     EightSettings,
     drive_robots,
 )
-from swarm_loc_estimator.core.description.swarm import Swarm
-from swarm_loc_estimator.io.messages.cdr import ANONYMOUS_DTYPE
-from swarm_loc_estimator.numerics import se2
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DTYPE
+from swarm_loc_estimator.swarm.swarm import Swarm
 
 PERIOD_NS = 500_000_000
 _SIGMA = 0.008

@@ -10,10 +10,10 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.time import Time
 from std_msgs.msg import Header
 
-from swarm_loc_estimator.core.mapping.exploration.goal import Goal
-from swarm_loc_estimator.core.mapping.grid.occupancy import OccupancyMap
-from swarm_loc_estimator.io.messages.planar import PLANE, planar_covariance
-from swarm_loc_estimator.numerics.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.messages.planar import PLANE, planar_covariance
+from swarm_loc_estimator.mapping.exploration.goal import Goal
+from swarm_loc_estimator.mapping.grid.occupancy import OccupancyMap
 
 
 def occupancy_message(occupancy: OccupancyMap, header: Header) -> OccupancyGrid:

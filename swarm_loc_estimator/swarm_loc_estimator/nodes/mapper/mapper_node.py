@@ -24,13 +24,15 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from swarm_loc_estimator.core.mapping.grid.occupancy import CELL, OccupancyMap
-from swarm_loc_estimator.core.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.io.maps.fix_covariance import FixCovariances
-from swarm_loc_estimator.io.maps.led_frequencies import led_frequencies
-from swarm_loc_estimator.io.maps.map_file import MapFileError, load_map, save_map
-from swarm_loc_estimator.io.maps.mapper_feed import MapperFeed, MapperInput
-from swarm_loc_estimator.io.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.common.jit import is_warm
+from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node
+from swarm_loc_estimator.common.ros.topic_graph import TopicGraph
+from swarm_loc_estimator.mapping.fix_covariance import FixCovariances
+from swarm_loc_estimator.mapping.grid.occupancy import CELL, OccupancyMap
+from swarm_loc_estimator.mapping.led_frequencies import led_frequencies
+from swarm_loc_estimator.mapping.map_file import MapFileError, load_map, save_map
+from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
 from swarm_loc_estimator.nodes.mapper.map_messages import (
     fix_message,
     goal_message,
@@ -42,9 +44,7 @@ from swarm_loc_estimator.nodes.mapper.mapper_parameters import (
     chosen_robots,
 )
 from swarm_loc_estimator.nodes.mapper.warm_up import WARM_UP, warm_up
-from swarm_loc_estimator.numerics.jit import is_warm
-from swarm_loc_estimator.ros.running import ConfiguredNode, run_node
-from swarm_loc_estimator.ros.topic_graph import TopicGraph
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_msgs.msg import LaserDistance, LightBearingArray
 
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass, field
 
-from swarm_loc_estimator.core.mapping.settings import MapperSettings
-from swarm_loc_estimator.parameters.number_spec import number
-from swarm_loc_estimator.parameters.table import ParameterError, text, texts
+from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_estimator.common.parameters import ParameterError, text, texts
+from swarm_loc_estimator.mapping.settings import MapperSettings
 
 
 @dataclass(frozen=True)

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.core.mapping.mapper import SCAN_TURN, START_TURN, CooperativeMapper
-from swarm_loc_estimator.core.mapping.matching.correlative_search import Lattice, search_offsets
-from swarm_loc_estimator.core.mapping.readings import Readings
-from swarm_loc_estimator.core.mapping.settings import MapperSettings
-from swarm_loc_estimator.io.messages.planar import yaw_of
-from swarm_loc_estimator.numerics.arrays import FloatArray
-from swarm_loc_estimator.numerics.jit import note_warm
-from swarm_loc_estimator.numerics.se2 import wrap_angle
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import note_warm
+from swarm_loc_estimator.common.messages.planar import yaw_of
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.mapping.mapper import SCAN_TURN, START_TURN, CooperativeMapper
+from swarm_loc_estimator.mapping.matching.correlative_search import Lattice, search_offsets
+from swarm_loc_estimator.mapping.readings import Readings
+from swarm_loc_estimator.mapping.settings import MapperSettings
 
 WARM_UP = Path(__file__)
 """What all compiled code that this module imports is remembered by, see `is_warm`."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import chain, dropwhile, islice
 from typing import Protocol
 
-from swarm_loc_estimator.io.bags.bag_file import RawMessage
+from swarm_loc_estimator.common.bags.bag_file import RawMessage
 
 _SECOND = 1_000_000_000
 STEP_S = 0.005

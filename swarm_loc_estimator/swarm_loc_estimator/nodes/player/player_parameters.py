@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from swarm_loc_estimator.parameters.number_spec import number
-from swarm_loc_estimator.parameters.table import flag, text, texts
+from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_estimator.common.parameters import flag, text, texts
 
 
 @dataclass(frozen=True)

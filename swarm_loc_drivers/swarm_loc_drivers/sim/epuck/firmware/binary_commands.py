@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarm_loc_drivers.protocols.epuck.serial import code
+from swarm_loc_drivers.epuck.serial_protocol import code
 from swarm_loc_drivers.sim.epuck.firmware.serial_robot import SerialRobot
 
 _SPEEDS = struct.Struct("<2h")

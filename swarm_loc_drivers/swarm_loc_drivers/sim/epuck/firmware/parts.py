@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.protocols.epuck.hardware import EpuckModel, as_counter
-from swarm_loc_drivers.protocols.epuck.rgb565 import Image
-from swarm_loc_drivers.protocols.epuck.wifi import SENSORS_DTYPE
+from swarm_loc_drivers.epuck.hardware import EpuckModel, as_counter
+from swarm_loc_drivers.epuck.rgb565 import Image
+from swarm_loc_drivers.epuck.wifi_protocol import SENSORS_DTYPE
 from swarm_loc_drivers.sim.common.body import EpuckBody
 
 CAMERA_WIDTH, CAMERA_HEIGHT = 640, 480

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 
-from swarm_loc_drivers.protocols.epuck.hardware import EpuckModel
+from swarm_loc_drivers.epuck.hardware import EpuckModel
 from swarm_loc_drivers.sim.common.body import EpuckBody
 from swarm_loc_drivers.sim.epuck.firmware.ascii_commands import AsciiCommands
 from swarm_loc_drivers.sim.epuck.firmware.binary_commands import BinaryCommands

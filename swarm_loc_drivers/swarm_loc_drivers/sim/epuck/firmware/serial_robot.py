@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.protocols.epuck.hardware import EPUCK1, EpuckModel
-from swarm_loc_drivers.protocols.epuck.rgb565 import encode_rgb565
-from swarm_loc_drivers.protocols.epuck.serial import RGB565_MODE
+from swarm_loc_drivers.epuck.hardware import EPUCK1, EpuckModel
+from swarm_loc_drivers.epuck.rgb565 import encode_rgb565
+from swarm_loc_drivers.epuck.serial_protocol import RGB565_MODE
 from swarm_loc_drivers.sim.common.body import EpuckBody
 from swarm_loc_drivers.sim.epuck.firmware.parts import GRAVITY_EPUCK2, Motors, camera_image, sensor_values
 

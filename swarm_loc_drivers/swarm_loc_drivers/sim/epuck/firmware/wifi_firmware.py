@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Generator
 
-from swarm_loc_drivers.protocols.epuck import wifi
-from swarm_loc_drivers.protocols.epuck.hardware import EPUCK2, as_counter
-from swarm_loc_drivers.protocols.epuck.rgb565 import encode_rgb565
+from swarm_loc_drivers.epuck import wifi_protocol as wifi
+from swarm_loc_drivers.epuck.hardware import EPUCK2, as_counter
+from swarm_loc_drivers.epuck.rgb565 import encode_rgb565
 from swarm_loc_drivers.sim.common.body import EpuckBody
 from swarm_loc_drivers.sim.epuck.firmware.parts import Motors, camera_image, sensor_values
 

@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.protocols.pushbot.hardware import TIMESTAMPS, FirmwareGeneration
+from swarm_loc_drivers.pushbot.hardware import TIMESTAMPS, FirmwareGeneration
 from swarm_loc_drivers.sim.common.body import Blinking, PushbotBody
 from swarm_loc_drivers.sim.pushbot.firmware.event_stream import EventRing
 from swarm_loc_drivers.sim.pushbot.firmware.motors import Motor

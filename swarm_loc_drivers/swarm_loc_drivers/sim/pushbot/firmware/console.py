@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from swarm_loc_drivers.protocols.pushbot.hardware import FirmwareGeneration
+from swarm_loc_drivers.pushbot.hardware import FirmwareGeneration
 from swarm_loc_drivers.sim.pushbot.firmware.board import Board
 
 _MAX_LINE = 128

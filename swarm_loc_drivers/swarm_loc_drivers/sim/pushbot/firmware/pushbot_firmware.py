@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.protocols.pushbot.hardware import BAUD_RATE, FirmwareGeneration
+from swarm_loc_drivers.pushbot.hardware import BAUD_RATE, FirmwareGeneration
 from swarm_loc_drivers.sim.common.body import PushbotBody
 from swarm_loc_drivers.sim.pushbot.firmware.board import TX_BUFFER, Board
 from swarm_loc_drivers.sim.pushbot.firmware.console import Console

@@ -1,0 +1,1 @@
+"""What all drivers share: links, odometry, diagnostics, nodes."""

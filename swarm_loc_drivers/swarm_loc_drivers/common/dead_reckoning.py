@@ -1,0 +1,70 @@
+"""Dead reckoning of a differential drive: paths of two wheels add up to a pose with its covariance."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from swarm_loc_drivers.common.odometry_state import OdometryState, carried_on
+from swarm_loc_estimator.common.arrays import FloatArray
+
+_STEP_VARIANCE = 1.0 / 12.0
+"""Of a counter that has cut off the fraction of a step."""
+_FORWARD_TURN = np.ix_((0, 2), (0, 2))
+
+
+class DeadReckoning:
+    """Adds up the paths of the wheels, from zero.
+
+    Args:
+        wheel_separation: [m].
+        wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
+        metres_per_step: Resolution of the wheels' counters [m].
+    """
+
+    def __init__(self, wheel_separation: float, wheel_noise: float, metres_per_step: float) -> None:
+        self._separation = wheel_separation
+        self._wheel_noise = wheel_noise
+        self._step = metres_per_step
+        self._pose = (0.0, 0.0, 0.0)
+        self._covariance = np.zeros((3, 3))
+
+    def advance(self, left: float, right: float) -> None:
+        """Move by the wheels' paths [m], an arc, and add its noise about its middle."""
+        x, y, theta = self._pose
+        turn = (right - left) / self._separation
+        half = 0.5 * turn
+        chord = 0.5 * (left + right) * (math.sin(half) / half if half else 1.0)
+        forward = np.array([math.cos(theta + half), math.sin(theta + half)])
+        dx, dy = (chord * forward).tolist()
+        self._pose = (x + dx, y + dy, (theta + turn + math.pi) % (2.0 * math.pi) - math.pi)
+        self._covariance = carried_on(self._covariance, dx, dy)
+        effect = np.array([[forward[0], -0.5 * dy], [forward[1], 0.5 * dx], [0.0, 1.0]])
+        self._covariance += effect @ self._twist_noise(abs(left), abs(right), self._wheel_noise) @ effect.T
+
+    def forget_motion(self, reach: float) -> None:
+        """The robot went nobody knows where, its wheels at most so far [m]."""
+        turned = min(2.0 * reach / self._separation, math.pi)
+        self._covariance += np.diag([reach**2, reach**2, turned**2]) / 3.0
+
+    def state(self, stamp_ns: int, left: float, right: float, elapsed_s: float) -> OdometryState:
+        """What is published; `left` and `right` are the wheels' last paths [m], made in `elapsed_s`."""
+        cut_off = _STEP_VARIANCE * self._step**2
+        (along, _), (_, turned) = self._twist_noise(1.0, 1.0, cut_off).tolist()
+        covariance = self._covariance + np.diag([along, along, turned])
+        twist, twist_noise = np.zeros(3), np.zeros((3, 3))
+        if elapsed_s > 0.0:
+            turned_rad = (right - left) / self._separation
+            twist = np.array([0.5 * (left + right), 0.0, turned_rad]) / elapsed_s
+            noise = self._twist_noise(abs(left), abs(right), self._wheel_noise)
+            twist_noise[_FORWARD_TURN] = (noise + self._twist_noise(2.0, 2.0, cut_off)) / elapsed_s**2
+        return OdometryState(stamp_ns, np.array(self._pose), covariance, twist, twist_noise)
+
+    def _twist_noise(self, left: float, right: float, scale: float) -> FloatArray:
+        """Covariance (2, 2) of path and turn when the wheels' paths have the variances scale * left, right.
+
+        covar(ds_r, ds_l) = diag(k |ds_r|, k |ds_l|) of Siegwart and Nourbakhsh, as the estimator has it.
+        """
+        both = 0.5 * (right - left) / self._separation
+        return scale * np.array([[0.25 * (left + right), both], [both, (left + right) / self._separation**2]])

@@ -1,0 +1,100 @@
+"""A robot's odometry as ROS messages: `odom` and the transform from odom to base_link."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from builtin_interfaces.msg import Time as TimeMessage
+from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.time import Time
+from std_msgs.msg import Header
+from tf2_msgs.msg import TFMessage
+
+from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_estimator.common.messages.planar import PLANE
+
+ODOMETRY_QOS = QoSProfile(depth=10)
+_TF_QOS = QoSProfile(depth=100)
+
+_FIXED_VARIANCE = 1e-9
+"""Of what the plane fixes: z, roll, pitch; and the least of what a robot does not do."""
+
+
+def stamp_message(stamp_ns: int) -> TimeMessage:
+    """A time [ns] as a message."""
+    return Time(nanoseconds=stamp_ns).to_msg()
+
+
+def nanoseconds(stamp: TimeMessage) -> int:
+    """A message's time [ns]; also one before zero, which `rclpy.time.Time` cannot be."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def yaw_quaternion(yaw: float) -> Quaternion:
+    """A rotation about z [rad]."""
+    return Quaternion(z=math.sin(0.5 * yaw), w=math.cos(0.5 * yaw))
+
+
+def odometry_message(state: OdometryState, odom_frame: str, base_frame: str) -> Odometry:
+    """The state as nav_msgs/Odometry, its covariances over x, y, z, and rotation about X, Y, Z."""
+    message = Odometry(
+        header=Header(stamp=stamp_message(state.stamp_ns), frame_id=odom_frame), child_frame_id=base_frame
+    )
+    position, twist = message.pose.pose.position, message.twist.twist
+    position.x, position.y, yaw = (float(value) for value in state.pose)
+    message.pose.pose.orientation = yaw_quaternion(yaw)
+    twist.linear.x, twist.linear.y, twist.angular.z = (float(value) for value in state.twist)
+    covariance, twist_covariance = np.eye(6) * _FIXED_VARIANCE, np.eye(6) * _FIXED_VARIANCE
+    covariance[PLANE] += state.covariance
+    twist_covariance[PLANE] += state.twist_covariance
+    message.pose.covariance = covariance.ravel()
+    message.twist.covariance = twist_covariance.ravel()
+    return message
+
+
+def odometry_transform(odometry: Odometry) -> TransformStamped:
+    """The transform that the odometry is."""
+    pose = odometry.pose.pose
+    return TransformStamped(
+        header=odometry.header,
+        child_frame_id=odometry.child_frame_id,
+        transform=Transform(
+            translation=Vector3(x=pose.position.x, y=pose.position.y), rotation=pose.orientation
+        ),
+    )
+
+
+class OdometryOutput:
+    """Publishes the odometry of one robot.
+
+    Args:
+        node: Whose publishers.
+        topic: Of the odometry.
+        odom_frame: The pose is in it.
+        base_frame: The pose is that of it.
+        transforms: Publisher of /tf, None for none.
+    """
+
+    def __init__(
+        self, node: Node, topic: str, odom_frame: str, base_frame: str, transforms: Publisher | None
+    ) -> None:
+        self._odometry = node.create_publisher(Odometry, topic, ODOMETRY_QOS)
+        self._frames = odom_frame, base_frame
+        self._transforms = transforms
+
+    def publish(self, state: OdometryState) -> None:
+        """Publish a state."""
+        message = odometry_message(state, *self._frames)
+        self._odometry.publish(message)
+        if self._transforms is not None:
+            self._transforms.publish(TFMessage(transforms=[odometry_transform(message)]))
+
+
+def transform_publisher(node: Node) -> Publisher:
+    """The publisher of /tf; tf2's listeners know this absolute name, whatever the namespace."""
+    return node.create_publisher(TFMessage, "/tf", _TF_QOS)

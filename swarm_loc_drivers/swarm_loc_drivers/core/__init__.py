@@ -1,1 +1,0 @@
-"""What a driver does between bytes and messages, without ROS."""

@@ -1,0 +1,1 @@
+"""The Droplet: bytes, sessions, driver and nodes."""

@@ -1,0 +1,170 @@
+"""Dead reckoning of a Droplet by its commands alone, with the covariance of its gait.
+
+A Droplet walks by vibrating; what a step does varies from robot to robot and from floor to floor. So the
+uncertainty is a share of the way, and what was perhaps heard, perhaps not, is uncertain as a whole.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from swarm_loc_drivers.common.odometry_state import OdometryState, carried_on
+from swarm_loc_drivers.droplet.hardware import Gait
+from swarm_loc_estimator.common.arrays import FloatArray
+
+_NS = 1e9
+_ALL_OR_NONE = 1.0 / 3.0
+"""Variance in units of the way where the truth is anything from none of it to all, and all is believed."""
+
+
+@dataclass(frozen=True)
+class MotionNoise:
+    """How far a robot strays from what it is told.
+
+    Attributes:
+        walk_noise: Variance along and across of a walk per metre [m^2/m].
+        veer_noise: Variance of the heading per metre walked [rad^2/m].
+        turn_noise: Variance of a turn per radian [rad^2/rad].
+    """
+
+    walk_noise: float
+    veer_noise: float
+    turn_noise: float
+
+
+@dataclass(frozen=True)
+class _Move:
+    """A command that the robot obeys."""
+
+    gait: Gait
+    steps: float
+    begin_ns: int
+
+    @property
+    def end_ns(self) -> int:
+        return self.begin_ns + round(self.steps * self.gait.step_s * _NS)
+
+    def steps_left(self, stamp_ns: int) -> float:
+        """How many steps are still to be done."""
+        return min(max(0.0, (self.end_ns - stamp_ns) / (_NS * self.gait.step_s)), self.steps)
+
+
+class CommandedMotion:
+    """Adds up commands.
+
+    Args:
+        noise: How the robot errs.
+    """
+
+    def __init__(self, noise: MotionNoise) -> None:
+        self._noise = noise
+        self._pose = np.zeros(3)
+        self._covariance = np.zeros((3, 3))
+        self._now_ns: int | None = None
+        self._move: _Move | None = None
+        self._doubted: tuple[FloatArray, float] | None = None  # all motion since a pose, and its variance
+
+    def moving(self, stamp_ns: int) -> bool:
+        """Whether the robot is believed to move at an instant [ns]."""
+        return self._move is not None and stamp_ns < self._move.end_ns
+
+    def begin(self, stamp_ns: int, gait: Gait, steps: int, doubt: float = 0.0) -> None:
+        """The robot begins to move; unless it stands, it goes on with what it does.
+
+        Args:
+            stamp_ns: When [ns].
+            gait: What a step does.
+            steps: How many.
+            doubt: Variance of the way in units of the way: how likely the command was not heard.
+        """
+        self._advance(stamp_ns)
+        if not self.moving(stamp_ns):
+            self._settle()
+            self._move = _Move(gait, steps, stamp_ns)
+            self._doubted = (self._pose, doubt)
+
+    def stop(self, stamp_ns: int, doubt: float = 0.0) -> None:
+        """The robot stands.
+
+        Args:
+            stamp_ns: When [ns].
+            doubt: How likely the command was not heard, and the robot does all that it was told before.
+        """
+        move = self._move
+        self._advance(stamp_ns)
+        self._settle()
+        if move is not None:
+            rest = self._way(move.gait, move.steps_left(stamp_ns))
+            self._covariance = self._covariance + doubt * np.outer(rest, rest)
+        self._move = None
+
+    def lose(self, stamp_ns: int) -> None:
+        """From now on nobody knows whether the robot goes on with what it does."""
+        self._advance(stamp_ns)
+        self._settle()
+        self._doubted = (self._pose, _ALL_OR_NONE)
+
+    def state(self, stamp_ns: int) -> OdometryState:
+        """What is believed at an instant [ns]."""
+        self._advance(stamp_ns)
+        twist, noise = np.zeros(3), np.zeros((3, 3))
+        if self._move is not None:
+            gait = self._move.gait
+            twist = np.array(gait.velocity)
+            noise = np.diag(self._body_noise(gait, 1.0)) / gait.step_s**2
+        return OdometryState(stamp_ns, self._pose, self._whole_covariance(), twist, noise)
+
+    def _settle(self) -> None:
+        """What was in doubt stays so uncertain."""
+        self._covariance = self._whole_covariance()
+        self._doubted = None
+
+    def _whole_covariance(self) -> FloatArray:
+        """With what is in doubt."""
+        if self._doubted is None:
+            return self._covariance
+        since, share = self._doubted
+        way = self._pose - since
+        way[2] = (way[2] + math.pi) % (2.0 * math.pi) - math.pi
+        return self._covariance + share * np.outer(way, way)
+
+    def _advance(self, stamp_ns: int) -> None:
+        """Go on to an instant; where time has jumped back the robot stands, and it goes on from there."""
+        before_ns, self._now_ns = self._now_ns, stamp_ns
+        if before_ns is None or stamp_ns < before_ns:
+            self._move = None
+        if self._move is None or before_ns is None:
+            return
+        begin_ns, end_ns = max(before_ns, self._move.begin_ns), min(stamp_ns, self._move.end_ns)
+        if end_ns > begin_ns:
+            self._step(self._move.gait, (end_ns - begin_ns) / (_NS * self._move.gait.step_s))
+        if stamp_ns >= self._move.end_ns:
+            self._move = None
+
+    def _step(self, gait: Gait, steps: float) -> None:
+        """Do some steps."""
+        way = self._way(gait, steps)
+        dx, dy, _ = way
+        self._covariance = carried_on(self._covariance, dx, dy)
+        walk, _, heading = self._body_noise(gait, steps)
+        # an error of the heading that grows on the way leads aside by half of it, give or take
+        effect, spread = np.array([-0.5 * dy, 0.5 * dx, 1.0]), np.array([-dy, dx, 0.0])
+        self._covariance += np.diag([walk, walk, 0.0])
+        self._covariance += heading * (np.outer(effect, effect) + np.outer(spread, spread) / 12.0)
+        self._pose = self._pose + way
+        self._pose[2] = (self._pose[2] + math.pi) % (2.0 * math.pi) - math.pi
+
+    def _body_noise(self, gait: Gait, steps: float) -> FloatArray:
+        """Variances (3,) of some steps: along, across, heading."""
+        path, turn = steps * math.hypot(gait.forward, gait.left), steps * abs(gait.turn)
+        walk = self._noise.walk_noise * path
+        return np.array([walk, walk, self._noise.veer_noise * path + self._noise.turn_noise * turn])
+
+    def _way(self, gait: Gait, steps: float) -> FloatArray:
+        """Where some steps lead (3,) from here, in the odometry's frame; the turn is not wrapped."""
+        cos, sin = math.cos(self._pose[2]), math.sin(self._pose[2])
+        step = [cos * gait.forward - sin * gait.left, sin * gait.forward + cos * gait.left, gait.turn]
+        return steps * np.array(step)

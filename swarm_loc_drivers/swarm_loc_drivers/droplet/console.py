@@ -1,0 +1,343 @@
+"""The Droplet's serial console: lines to type, and what the lines that it prints say. No I/O.
+
+The console echoes every character and answers the end of a line with CR LF. CR and LF each end a line, so
+exactly one of them may be sent. Everything else is print-outs for people, in the midst of which echoes may
+fall. All matrices have one row per emitter and one column per sensor. Formats are those of the firmware of
+2014, 2016 and 2018 (correlllab/cu-droplet).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import NamedTuple
+
+from swarm_loc_drivers.droplet.hardware import ELEMENTS, FULL_POWER
+
+TERMINATOR = b"\r"
+ERASE = b"\b"
+"""Takes back the last character of the line; the console answers `\\b \\b` even where there is none."""
+BACKSPACES_PER_ERASE = 2
+
+MAX_LINE = 63
+"""The line buffer has 64 characters, and one of them ends the text."""
+MAX_TARGETED_LINE = 31
+"""A command for a certain other robot is copied into 32 characters without looking."""
+MAX_STEPS = 0xFFFF
+
+GET_ID = "get_id"
+STOP = "stop_walk"
+EMIT = "rnb_b"
+MOTOR_SETTINGS = "print_motor_settings"
+
+_MAX_PRINTED_LINE = 512
+_MAX_DIGITS = 5
+_BACKSPACE = 8
+
+
+class CommandError(ValueError):
+    """A line that the console cannot take; the message is one sentence."""
+
+
+def move_steps(direction: int, steps: int) -> str:
+    """Move; ignored, though acknowledged, while the robot is moving."""
+    return f"move_steps {direction} {steps}"
+
+
+def set_power(power: int) -> str:
+    """Set how bright the emitters shine, 0 to 256."""
+    if not 0 <= power <= FULL_POWER:
+        raise CommandError(f"power {power} must lie in [0, {FULL_POWER}].")
+    return f"set_ir {power}"
+
+
+def for_robot(robot: int, line: str) -> str:
+    """Send a line to another robot by infrared, which executes it as if it had been typed there.
+
+    Raises:
+        CommandError: It is too long for that.
+    """
+    if len(line) > MAX_TARGETED_LINE:
+        raise CommandError(f"'{line}' is too long: another robot takes {MAX_TARGETED_LINE} characters.")
+    return f"tgt_cmd {robot:04X} {line}"
+
+
+def typed(line: str) -> bytes:
+    """The characters of a line, without its end.
+
+    Raises:
+        CommandError: It is empty, too long, or holds what is no printable character.
+    """
+    if not 0 < len(line) <= MAX_LINE or not line.isascii() or not line.isprintable():
+        raise CommandError(f"{line!r} must be 1 to {MAX_LINE} printable ASCII characters.")
+    return line.encode()
+
+
+class Echo(NamedTuple):
+    """A command that was typed."""
+
+    line: str
+
+
+class Identity(NamedTuple):
+    """The robot's own id."""
+
+    robot: int
+
+
+class MoveStarted(NamedTuple):
+    """A command to move was understood; whether it moves depends on whether it was moving."""
+
+    direction: int
+    steps: int
+
+
+class Relayed(NamedTuple):
+    """A line is being sent to another robot; None: to all."""
+
+    target: int | None
+    line: str
+
+
+class SendAborted(NamedTuple):
+    """A message was not sent: infrared is busy."""
+
+    status: int
+
+
+class EmissionFailed(NamedTuple):
+    """The robot should have emitted for others, and was busy."""
+
+    status: int
+
+
+class RangeBearing(NamedTuple):
+    """What the robot makes of a matrix: range [m], bearing [rad] and heading [rad] of another one."""
+
+    robot: int
+    range_m: float
+    bearing: float
+    heading: float
+
+
+class Matrix(NamedTuple):
+    """A brightness matrix.
+
+    Attributes:
+        emitter: Id of the robot that lit its emitters; None where the format does not tell.
+        receiver: Id of the robot that measured; likewise.
+        brightness: One row per emitter of one count per sensor.
+    """
+
+    emitter: int | None
+    receiver: int | None
+    brightness: tuple[tuple[int, ...], ...]
+
+
+class SilentSensor(NamedTuple):
+    """A sensor has read nothing again and again."""
+
+    sensor: int
+
+
+class MotorTrims(NamedTuple):
+    """Of the three motors when moving in a direction."""
+
+    direction: int
+    trims: tuple[int, int, int]
+
+
+class StepLength(NamedTuple):
+    """Calibrated path [mm] or turn [deg] per 1000 steps of a direction."""
+
+    direction: int
+    per_kilostep: int
+
+
+class Title(NamedTuple):
+    """What stands above a table."""
+
+    text: str
+
+
+class NotRecognised(NamedTuple):
+    """A command that the firmware does not know."""
+
+    word: str
+
+
+class Overflow(NamedTuple):
+    """A line had more characters than the buffer; it was forgotten."""
+
+
+class Complaint(NamedTuple):
+    """Another error of the firmware."""
+
+    text: str
+
+
+class Broken(NamedTuple):
+    """What must have been a matrix, and is not whole."""
+
+    text: str
+
+
+class Unknown(NamedTuple):
+    """Another line, or a longer one than the console prints."""
+
+    text: str
+
+
+Event = (
+    Echo | Identity | MoveStarted | Relayed | SendAborted | EmissionFailed | RangeBearing | Matrix
+    | SilentSensor | MotorTrims | StepLength | Title | NotRecognised | Overflow | Complaint | Broken | Unknown
+)  # fmt: skip
+
+
+class Said(NamedTuple):
+    """A line of the console.
+
+    Attributes:
+        stamp_ns: When its first character came.
+        event: What it says.
+    """
+
+    stamp_ns: int
+    event: Event
+
+
+_COMMANDS = (
+    "adj_motors|broadcast_id|cmd|coll|get_id|get_rgb|move_steps|msg|msg_tst|print_motor_settings|reset|rnb_b|"
+    "set_dist_per_step|set_ir|set_led|set_motors|stop_walk|tasks|tgt|tgt_cmd|walk|write_motor_settings"
+)
+_HEX = "([0-9A-F]{4})"
+_NUMBER = rf" *(-?\d{{1,{_MAX_DIGITS}}})"
+
+
+def _integers(match: re.Match[str]) -> tuple[int, ...]:
+    return tuple(int(group) for group in match.groups())
+
+
+def _relayed(match: re.Match[str]) -> Event:
+    target, line, length = match.groups()
+    return (
+        Relayed(int(target, 16) if target else None, line) if len(line) == int(length) else Unknown(match[0])
+    )
+
+
+def _range_bearing(match: re.Match[str]) -> RangeBearing:
+    robot, range_mm, bearing_deg, heading_deg = match.groups()
+    angles = math.radians(int(bearing_deg)), math.radians(int(heading_deg))
+    return RangeBearing(int(robot, 16), 1e-3 * int(range_mm), *angles)
+
+
+def _move_started(match: re.Match[str]) -> MoveStarted:
+    return MoveStarted(*_integers(match))
+
+
+def _motor_trims(match: re.Match[str]) -> MotorTrims:
+    direction, *trims = _integers(match)
+    return MotorTrims(direction, (trims[0], trims[1], trims[2]))
+
+
+_LINES: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Event]], ...] = tuple(
+    (re.compile(pattern), make)
+    for pattern, make in (
+        (r"My ID is: ([0-9A-F]{1,4})", lambda m: Identity(int(m[1], 16))),
+        (r"walk direction (\d), num_steps (\d{1,5})", _move_started),
+        (rf'Broadcasting command to {_HEX}: "(.*)", of length (\d{{1,2}})\.', _relayed),
+        (r'Broadcasting command()?: "(.*)", of length (\d{1,2})\.', _relayed),
+        (r"Aborting IR send \[([0-9A-Fa-f]{2})\] while trying: .*", lambda m: SendAborted(int(m[1], 16))),
+        (r"RNB Broadcast failed \[ ([0-9A-F]{2}) \]", lambda m: EmissionFailed(int(m[1], 16))),
+        (rf"\t\(RNB\) ID: {_HEX} \| R:{_NUMBER} B:{_NUMBER} H:{_NUMBER}", _range_bearing),
+        (r"!!!\tGot \d+ consecutive nothings from sensor (\d)\.\t!!!", lambda m: SilentSensor(int(m[1]))),
+        (rf"\tdir: ([0-7])\t{_NUMBER}\t{_NUMBER}\t{_NUMBER}\t", _motor_trims),
+        (r"\t([0-7])\t(\d{1,5})", lambda m: StepLength(*_integers(m))),
+        (r"Motor Values|Dist \(mm\) per kilostep", lambda m: Title(m[0])),
+        (r"\tCommand \( (.*) \) not recognized\.", lambda m: NotRecognised(m[1])),
+        (r"ERROR: Serial input buffer capacity of \d+ characters exceeded\.", lambda _: Overflow()),
+        (r"(?:!!!|error|ERROR|Error).*", lambda m: Complaint(m[0])),
+        (rf"(?:{_COMMANDS})(?: .*)?", lambda m: Echo(m[0])),
+    )
+)
+
+
+class ConsoleParser:
+    """Reads what the console prints, in pieces of any size and after any garbage.
+
+    Args:
+        elements: Emitters, and sensors, of the robots; other matrices are broken.
+
+    Attributes:
+        partial: The line that has not ended yet, as a terminal would show it.
+        backspaces: How many have come.
+    """
+
+    def __init__(self, elements: int = ELEMENTS) -> None:
+        self.partial = ""
+        self.backspaces = 0
+        self._stamp_ns = 0
+        row = r"\{" + ",".join([_NUMBER] * elements) + r"\}"
+        rows = r"\{" + ",".join([row] * elements) + r"\}"
+        self._elements = elements
+        self._named = re.compile(rf'\{{"{_HEX}", "{_HEX}", {rows}\}},')
+        self._nameless = re.compile(rf"{rows};")
+        self._row = re.compile(rf"\t{row}(,?)")
+        self._last = re.compile(rf"\}};(?: sum={_NUMBER})?")
+        self._rows: list[tuple[int, ...]] | None = None
+        self._rows_stamp_ns = 0
+
+    def feed(self, data: bytes, stamp_ns: int) -> list[Said]:
+        """Take bytes that came at `stamp_ns`; what the lines that are complete with them say."""
+        said: list[Said] = []
+        for code in data:
+            if code in TERMINATOR + b"\n":
+                said += self._line(self.partial) if self.partial else []
+                self.partial = ""
+            elif code == _BACKSPACE:
+                self.partial = self.partial[:-1]
+                self.backspaces += 1
+            elif len(self.partial) < _MAX_PRINTED_LINE:
+                self._stamp_ns = self._stamp_ns if self.partial else stamp_ns
+                self.partial += chr(code)
+        return said
+
+    def _line(self, line: str) -> list[Said]:
+        """What a line says; nothing while it is part of a matrix."""
+        if self._rows is not None:
+            return self._line_of_matrix(line, self._rows)
+        if line == "{":
+            self._rows, self._rows_stamp_ns = [], self._stamp_ns
+            return []
+        return [Said(self._stamp_ns, self._event(line))]
+
+    def _line_of_matrix(self, line: str, rows: list[tuple[int, ...]]) -> list[Said]:
+        """Take a line behind an opening brace."""
+        missing = self._elements - len(rows)
+        if missing and (row := self._row.fullmatch(line)):
+            *cells, comma = row.groups()
+            if bool(comma) == (missing > 1):
+                rows.append(tuple(int(cell) for cell in cells))
+                return []
+        self._rows = None
+        if not missing and self._last.fullmatch(line):
+            return [Said(self._rows_stamp_ns, Matrix(None, None, tuple(rows)))]
+        return [Said(self._rows_stamp_ns, Broken("{")), *self._line(line)]
+
+    def _event(self, line: str) -> Event:
+        """What a line by itself says."""
+        if match := self._named.fullmatch(line):
+            emitter, receiver, *cells = match.groups()
+            return Matrix(int(emitter, 16), int(receiver, 16), self._square(cells))
+        if match := self._nameless.fullmatch(line):
+            return Matrix(None, None, self._square(match.groups()))
+        for pattern, make in _LINES:
+            if match := pattern.fullmatch(line):
+                return make(match)
+        return Broken(line) if "{" in line or "}" in line else Unknown(line)
+
+    def _square(self, cells: tuple[str, ...] | list[str]) -> tuple[tuple[int, ...], ...]:
+        """Cells row by row."""
+        numbers = [int(cell) for cell in cells]
+        return tuple(tuple(numbers[k : k + self._elements]) for k in range(0, len(numbers), self._elements))

@@ -1,0 +1,112 @@
+"""The driver of a Droplet at a cable as a ROS 2 node; one per cable, in the robot's namespace.
+
+    ./run swarm_loc_drivers droplet_driver_node --ros-args -r __ns:=/droplet1 -p address:=/dev/ttyUSB0 \
+        -p partners:='["6B6F", "DF64"]'
+
+It follows `cmd_vel` and publishes `odom`, `brightness`, `/tf` and `/diagnostics`; for Droplets without cable
+it follows and publishes `cmd_vel`, `odom` and `/tf` besides. Service: `~/measure`. Parameters: see
+`droplet_parameters.py` and `doc/droplet_driver_node.md`.
+"""
+
+from __future__ import annotations
+
+from array import array
+from functools import partial
+from typing import Any
+
+from geometry_msgs.msg import Twist
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from swarm_loc_drivers.common.driver_diagnostics import DriverDiagnostics
+from swarm_loc_drivers.common.odometry_output import OdometryOutput, stamp_message, transform_publisher
+from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
+from swarm_loc_drivers.droplet.driver import OWN, DropletDriver, DropletListeners
+from swarm_loc_drivers.droplet.droplet_parameters import DropletParameters, droplet_settings
+from swarm_loc_drivers.droplet.exchange import Brightness
+from swarm_loc_estimator.common.ros.running import run_node
+from swarm_loc_msgs.msg import BrightnessMatrix
+
+_COMMAND_QOS = QoSProfile(depth=1)
+_BRIGHTNESS_QOS = QoSProfile(depth=50)
+_RATES = ("exchanges", "lines")
+_WRONG = {
+    "bad_cmd_vel": "velocities that were not finite, or absurd",
+    "broken_matrices": "print-outs that were no whole matrix of numbers",
+    "equal_powers": "exchanges as bright at near as at far power; does the firmware obey set_ir?",
+    "firmware_errors": "lines in which the firmware complains",
+    "foreign_receiver": "matrices that another robot must have measured",
+    "self_heard": "matrices of a robot that heard itself",
+    "silent_sensors": "reports of a sensor that reads nothing",
+    "unknown_commands": "commands that the firmware does not know",
+    "unknown_ids": "matrices of robots that are not among the partners",
+}
+
+
+class DropletDriverNode(RobotDriverNode[DropletParameters]):
+    """Hands velocities to the driver and publishes what it reports."""
+
+    _driver: DropletDriver
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("droplet_driver", DropletParameters, **node_arguments)
+        settings = droplet_settings(self.chosen)
+        robot = self.get_namespace().strip("/")
+        self._base_frame = f"{self._prefix}{self.chosen.base_frame}"
+        self._transforms = transform_publisher(self) if self.chosen.publish_tf else None
+        self._brightness = self.create_publisher(BrightnessMatrix, "brightness", _BRIGHTNESS_QOS)
+        self._odometry = {OWN: self._odometry_output("odom", self._prefix)}
+        for name in settings.relayed:
+            path = _relayed_path(robot, name)
+            self._odometry[name] = self._odometry_output(f"/{path}/odom", f"{path}/")
+        listeners = DropletListeners(self._publish_odometry, self._publish_brightness)
+        self._driver = DropletDriver(settings, listeners, self._now_ns)
+        for name in self._odometry:
+            topic = f"/{_relayed_path(robot, name)}/cmd_vel" if name else "cmd_vel"
+            self.create_subscription(Twist, topic, partial(self._on_cmd_vel, name), _COMMAND_QOS)
+        self.create_service(Trigger, "~/measure", self._on_measure)
+        name, address = f"{self._prefix}{self.get_name()}", settings.device
+        self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
+
+    def _odometry_output(self, topic: str, prefix: str) -> OdometryOutput:
+        odom_frame, base_frame = f"{prefix}{self.chosen.odom_frame}", f"{prefix}{self.chosen.base_frame}"
+        return OdometryOutput(self, topic, odom_frame, base_frame, self._transforms)
+
+    def _on_cmd_vel(self, name: str, message: Twist) -> None:
+        self._driver.set_velocity(name, (message.linear.x, message.linear.y, message.angular.z))
+
+    def _on_measure(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self.chosen.turns or not self.chosen.partners:
+            response.message = "Nobody is asked: there are no partners, or Droplets take turns."
+        elif self._driver.trouble:
+            response.message = f"Nobody is asked: {self._driver.trouble}"
+        else:
+            self._driver.request_exchanges()
+            response.success = True
+            response.message = f"{len(self.chosen.partners)} partners are asked to emit."
+        return response
+
+    def _publish_odometry(self, name: str, state: OdometryState) -> None:
+        self._odometry[name].publish(state)
+
+    def _publish_brightness(self, receiver: int, one: Brightness) -> None:
+        message = BrightnessMatrix(
+            header=Header(stamp=stamp_message(one.stamp_ns), frame_id=self._base_frame),
+            receiver=receiver,
+            transmitter=one.transmitter,
+            n=len(one.readings),
+            power=int(one.power),
+            saturation=self.chosen.saturation,
+        )
+        message.readings = array("i", one.readings.ravel().tolist())
+        self._brightness.publish(message)
+
+
+def _relayed_path(robot: str, name: str) -> str:
+    """Where the topics of a robot without a cable are: beside those of the robot at the cable."""
+    return "/".join([*robot.split("/")[:-1], name])
+
+
+main = partial(run_node, "droplet_driver_node", DropletDriverNode)

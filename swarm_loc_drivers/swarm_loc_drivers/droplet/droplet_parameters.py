@@ -1,0 +1,162 @@
+"""Parameters of the Droplets' driver nodes, and the drivers' settings that follow from them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, fields
+
+from swarm_loc_drivers.droplet.commanded_motion import MotionNoise
+from swarm_loc_drivers.droplet.driver import DropletSettings
+from swarm_loc_drivers.droplet.exchange import PollingSettings
+from swarm_loc_drivers.droplet.hardware import DROPLET_MODELS, ELEMENTS, FULL_POWER
+from swarm_loc_drivers.droplet.session import SessionSettings
+from swarm_loc_drivers.droplet.tdma import MIN_TURN_S, TdmaSettings
+from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_estimator.common.parameters import ParameterError, Value, choice, flag, text, texts
+
+_ID = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})")
+_RELAYED = re.compile(r"([A-Za-z]\w*)=(.*)")
+
+
+@dataclass(frozen=True)
+class DropletTraits:
+    """Parameters that all Droplets of a table share."""
+
+    model: str = choice(
+        "droplet", tuple(DROPLET_MODELS), "an audio_droplet moves only ahead, back and in turns"
+    )
+    reply_timeout_s: float = number(0.3, "s", 0.01, 10.0, "how long an echo or an answer may take")
+    cmd_vel_timeout_s: float = number(0.5, "s", 0.02, 10.0, "without cmd_vel for so long the robot stops")
+    stride_s: float = number(
+        2.0, "s", 0.2, 60.0, "how far ahead a motion is commanded; so long it goes on if the driver dies"
+    )
+    odom_rate: float = number(5.0, "1/s", 0.1, 20.0, "published odometry")
+    walk_noise: float = number(
+        5e-4, "m", 0.0, 1.0, "variance along and across of a walk per metre [m^2/m], of what is believed"
+    )
+    veer_noise: float = number(0.05, "rad^2/m", 0.0, 100.0, "likewise of the heading per metre walked")
+    turn_noise: float = number(0.01, "rad", 0.0, 10.0, "likewise of the heading per radian turned")
+    far_power: int = number(FULL_POWER, "1", 1, FULL_POWER, "of the emitters in far exchanges")
+    near_power: int = number(40, "1", 0, FULL_POWER - 1, "likewise in near ones; 0: only far ones")
+    saturation: int = number(
+        240, "count", 1, 4095, "a reading tells no more from here on: full scale less ambient light"
+    )
+    turn_s: float = number(1.0, "s", MIN_TURN_S, 60.0, "how long a turn to emit lasts")
+    odom_frame: str = text("odom", "the pose is in <robot>/odom_frame", required=True)
+    base_frame: str = text("base_link", "the pose is that of <robot>/base_frame", required=True)
+    publish_tf: bool = flag(True, "publish the transform from odom to base_link")
+
+
+@dataclass(frozen=True)
+class DropletParameters(DropletTraits):
+    """Parameters of `droplet_driver_node`."""
+
+    address: str = text("", "the serial port of the Droplet at the cable", required=True)
+    partners: tuple[str, ...] = texts("ids of the Droplets to measure, in hexadecimal as they print them")
+    exchange_rate: float = number(
+        0.5, "1/s", 0.0, 2.0, "exchanges in which a partner is asked to emit; 0: only on request"
+    )
+    retries: int = number(5, "1", 0, 100, "how often a partner is asked anew when no matrix comes")
+    least_brightness: int = number(
+        5, "count", 0, 4095, "a far matrix of no brighter reading shows nobody and is asked for anew"
+    )
+    turns: int = number(
+        0,
+        "1",
+        0,
+        10_000,
+        "with a cable at every Droplet: how many take turns to emit; 0: partners are asked",
+    )
+    turn: int = number(0, "1", 0, 9_999, "which turn is this one's, counted from 0")
+    relayed: tuple[str, ...] = texts(
+        "NAME=ID of Droplets without a cable, which are driven by infrared through this one"
+    )
+    relay_loss: float = number(0.1, "1", 0.0, 1.0, "share of the commands by infrared that are not heard")
+
+
+@dataclass(frozen=True)
+class DropletFleetParameters(DropletTraits):
+    """Parameters of `droplet_fleet_node`."""
+
+    swarm_file: str = text("", "path of the swarm description: which robots there are", required=True)
+    link_folder: str = text("", "where each robot's serial port lies under its name", required=True)
+    part: int = number(0, "1", 0, 999, "of the table's parts, each in a process of its own, this one")
+    parts: int = number(1, "1", 1, 1000, "how many parts there are")
+
+    @property
+    def traits(self) -> dict[str, Value]:
+        """The parameters of every robot's driver that stand here."""
+        return {one.name: getattr(self, one.name) for one in fields(DropletTraits)}
+
+
+def droplet_settings(parameters: DropletParameters) -> DropletSettings:
+    """What the parameters mean together.
+
+    Raises:
+        ParameterError: One cannot be used, or does not go with another.
+    """
+    if not parameters.address.startswith("/"):
+        raise ParameterError(
+            f"parameter address = '{parameters.address}' must be the path of a serial port,"
+            " such as /dev/ttyUSB0."
+        )
+    return DropletSettings(
+        device=parameters.address,
+        session=SessionSettings(
+            DROPLET_MODELS[parameters.model], ELEMENTS, parameters.reply_timeout_s, _exchanges(parameters)
+        ),
+        noise=MotionNoise(parameters.walk_noise, parameters.veer_noise, parameters.turn_noise),
+        stride_s=parameters.stride_s,
+        relayed=_relayed(parameters),
+        relay_loss=parameters.relay_loss,
+        command_timeout_s=parameters.cmd_vel_timeout_s,
+        odometry_period_s=1.0 / parameters.odom_rate,
+    )
+
+
+def _exchanges(parameters: DropletParameters) -> PollingSettings | TdmaSettings:
+    """How brightness is measured."""
+    partners = _partners(parameters)
+    far, near = parameters.far_power, parameters.near_power
+    if near >= far:
+        raise ParameterError(f"parameter near_power = {near} must be below far_power = {far}.")
+    powers = (far, near) if near else (far,)
+    if not parameters.turns:
+        period_s = 1.0 / parameters.exchange_rate if parameters.exchange_rate else 0.0
+        return PollingSettings(partners, period_s, parameters.retries, powers, parameters.least_brightness)
+    if parameters.turn >= parameters.turns:
+        raise ParameterError(f"parameter turn = {parameters.turn} must be below turns = {parameters.turns}.")
+    return TdmaSettings(parameters.turn, parameters.turns, parameters.turn_s, powers, partners)
+
+
+def _partners(parameters: DropletParameters) -> tuple[int, ...]:
+    """Ids of whom to ask."""
+    found: list[int] = []
+    for one in parameters.partners:
+        robot = _id("partners", one)
+        if robot in found:
+            raise ParameterError(f"parameter partners has '{one}', but each id may stand once.")
+        found.append(robot)
+    return tuple(found)
+
+
+def _relayed(parameters: DropletParameters) -> dict[str, int]:
+    """Names and ids of the robots without a cable."""
+    found: dict[str, int] = {}
+    for one in parameters.relayed:
+        match = _RELAYED.fullmatch(one)
+        if match is None:
+            raise ParameterError(f"parameter relayed has '{one}' but must have entries as droplet2=6B6F.")
+        name, robot = match[1], _id("relayed", match[2])
+        if name in found or robot in found.values():
+            raise ParameterError(f"parameter relayed has '{one}', but each name and each id may stand once.")
+        found[name] = robot
+    return found
+
+
+def _id(parameter: str, value: str) -> int:
+    """A Droplet's id."""
+    match = _ID.fullmatch(value)
+    if match is None or not int(match[1], 16):
+        raise ParameterError(f"parameter {parameter} has the id '{value}' but ids lie in [1, FFFF].")
+    return int(match[1], 16)

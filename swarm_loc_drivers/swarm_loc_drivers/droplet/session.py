@@ -1,0 +1,180 @@
+"""A conversation with the Droplet at the cable: who it is, how it walks, what it and others see. No I/O."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.droplet import console as protocol
+from swarm_loc_drivers.droplet.console import Identity, MotorTrims, MoveStarted, Said, StepLength
+from swarm_loc_drivers.droplet.console_session import ConsoleTalk, Talk
+from swarm_loc_drivers.droplet.exchange import PollingExchange, PollingSettings, Publish
+from swarm_loc_drivers.droplet.hardware import DIRECTIONS, DropletModel, Gait, gait
+from swarm_loc_drivers.droplet.mover import DropletMover
+from swarm_loc_drivers.droplet.tdma import TdmaExchange, TdmaSettings
+
+_TRIES = 3
+_IDLE_NS = 20_000_000
+"""While nothing is said, look so often what is to be done."""
+
+
+@dataclass(frozen=True)
+class SessionSettings:
+    """What the conversation is about.
+
+    Attributes:
+        model: The robot's kind.
+        elements: Emitters, and sensors, of all robots.
+        reply_timeout_s: How long an echo or an answer may take [s].
+        exchanges: How brightness is measured.
+    """
+
+    model: DropletModel
+    elements: int
+    reply_timeout_s: float
+    exchanges: PollingSettings | TdmaSettings
+
+
+class DropletSession:
+    """Talks to one Droplet, from its begin to its end, which may be asked for.
+
+    Args:
+        settings: What about.
+        mover: Of the robot itself.
+        relayed: Movers of robots without a cable.
+        publish: Gets the matrices of exchanges.
+        counts: Gets what happens how often.
+
+    Attributes:
+        ending: Set it to have all robots stand and the conversation end.
+        connected: Whether the robot has said who it is and how it walks.
+        ended: Whether the conversation has ended.
+    """
+
+    def __init__(
+        self,
+        settings: SessionSettings,
+        mover: DropletMover,
+        relayed: Sequence[DropletMover],
+        publish: Publish,
+        counts: Counter[str],
+    ) -> None:
+        self.ending = self.connected = self.ended = False
+        self._settings = settings
+        self._mover = mover
+        self._movers = (mover, *relayed)
+        self._counts = counts
+        self._console = ConsoleTalk(
+            settings.elements, round(settings.reply_timeout_s * 1e9), self._on_said, counts
+        )
+        self._exchanging = self._exchanges(settings.exchanges, publish)
+        self._trims: dict[int, tuple[int, int, int]] = {}
+        self._lengths: dict[int, int] = {}
+        self._gaits: dict[int, Gait] = {}
+        self._talk = self._run()
+        self._due_ns = 0
+
+    def _exchanges(
+        self, settings: PollingSettings | TdmaSettings, publish: Publish
+    ) -> PollingExchange | TdmaExchange:
+        if isinstance(settings, TdmaSettings):
+            return TdmaExchange(self._console, settings, self._interlude, publish, self._counts)
+        return PollingExchange(self._console, settings, self._interlude, publish, self._counts)
+
+    @property
+    def robot(self) -> int:
+        """Its id; 0, which no robot has, until it is known."""
+        return self._exchanging.validator.robot or 0
+
+    def request_exchanges(self) -> None:
+        """Have one exchange with every partner soon."""
+        self._exchanging.request()
+
+    def step(self, data: bytes, now_ns: int) -> bytes:
+        """Go on; what to send.
+
+        Args:
+            data: What the console has printed since the last step.
+            now_ns: The time, which may be simulated, stand still or jump back; 0 is none.
+
+        Raises:
+            SessionError: The robot does not answer, or not as it must.
+        """
+        jumped_back = now_ns < self._console.now_ns
+        self._console.hear(data, now_ns)
+        if data or jumped_back or now_ns >= self._due_ns:
+            try:
+                self._due_ns = next(self._talk)
+            except StopIteration:
+                self.ended = True
+        return self._console.take_output()
+
+    def abandon(self, now_ns: int) -> None:
+        """The link is broken: nobody knows what the robots do."""
+        if not self.ended:
+            for mover in self._movers:
+                mover.motion.lose(now_ns)
+
+    def _run(self) -> Talk[None]:
+        yield from self._get_acquainted()
+        self.connected = True
+        while (yield from self._interlude()):
+            if self._exchanging.is_due(self._console.now_ns):
+                yield from self._exchanging.talk()
+            else:
+                yield self._console.now_ns + _IDLE_NS
+        for mover in self._movers:
+            yield from mover.stop(self._console)
+
+    def _get_acquainted(self) -> Talk[None]:
+        """Have it stand, and learn who it is and what its steps do."""
+        yield from self._console.forget_line()
+        yield from self._mover.stop(self._console)
+        yield from self._answered(protocol.GET_ID, lambda: self.robot != 0)
+        yield from self._answered(
+            protocol.MOTOR_SETTINGS, lambda: len(self._trims) == len(self._lengths) == len(DIRECTIONS)
+        )
+        gaits = {
+            direction: gait(direction, self._trims[direction], self._lengths[direction])
+            for direction in self._settings.model.directions
+        }
+        self._gaits = {direction: one for direction, one in gaits.items() if one is not None}
+
+    def _answered(self, line: str, condition: Callable[[], bool]) -> Talk[None]:
+        """Ask for something that the robot must be able to say."""
+        for _ in range(_TRIES):
+            yield from self._console.enter(line)
+            if (yield from self._console.until(condition)):
+                return
+        raise SessionError(f"the robot does not answer '{line}'")
+
+    def _interlude(self) -> Talk[bool]:
+        """Do what cannot wait: tell the robots how to move; whether to go on."""
+        for mover in self._movers:
+            now_ns = self._console.now_ns
+            waits = self.ending or not self._exchanging.is_quiet(now_ns)
+            if not waits and mover.is_due(now_ns, self._gaits):
+                yield from mover.tell(self._console, self._gaits)
+        return not self.ending
+
+    def _on_said(self, said: Said) -> None:
+        """The console has printed a line."""
+        event = said.event
+        if isinstance(event, Identity):
+            self._exchanging.validator.robot = event.robot
+        elif isinstance(event, MotorTrims):
+            self._trims[event.direction] = event.trims
+        elif isinstance(event, StepLength):
+            self._lengths[event.direction] = event.per_kilostep
+        elif isinstance(event, MoveStarted):
+            self._note_move(event)
+        else:
+            self._exchanging.note(said)
+
+    def _note_move(self, started: MoveStarted) -> None:
+        """The robot was told to move: here, or by infrared."""
+        if started != self._mover.asked and started.direction in self._gaits:
+            self._counts["foreign_moves"] += 1
+            self._mover.motion.begin(self._console.now_ns, self._gaits[started.direction], started.steps)

@@ -1,0 +1,1 @@
+"""The e-puck: bytes, sessions, odometry, driver and node."""

@@ -1,0 +1,120 @@
+"""The driver of one e-puck: keeps the link up, the wheels obedient and the odometry added up. No ROS here."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_drivers.common.link import Link
+from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.robot_driver import RobotDriver
+from swarm_loc_drivers.common.serial_link import SerialLink
+from swarm_loc_drivers.common.tcp_link import TcpLink
+from swarm_loc_drivers.common.velocity_command import VelocityCommand
+from swarm_loc_drivers.epuck.serial_session import SerialSession
+from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession, EpuckSettings
+from swarm_loc_drivers.epuck.wheel_odometry import WheelOdometry
+from swarm_loc_drivers.epuck.wifi_session import WifiSession
+
+_MAX_IDLE_S = 0.5
+"""Without a tick for so long, as when simulated time stands still, the robot is asked all the same."""
+_READ_S = 0.02
+
+
+@dataclass(frozen=True)
+class Listeners:
+    """Who gets what the robot measures; called in the driver's thread.
+
+    Attributes:
+        odometry: Gets every new state.
+        proximity: Gets stamps [ns] and raw values (8,).
+        image: Gets images.
+    """
+
+    odometry: Callable[[OdometryState], None]
+    proximity: Callable[[int, NDArray[np.int64]], None]
+    image: Callable[[CameraImage], None]
+
+
+class EpuckDriver(RobotDriver[EpuckSession]):
+    """Drives one robot in a thread of its own.
+
+    Args:
+        settings: The robot.
+        listeners: Who gets its data.
+        clock: Tells the time [ns]; may be simulated, and 0 is none.
+    """
+
+    def __init__(self, settings: EpuckSettings, listeners: Listeners, clock: Callable[[], int]) -> None:
+        super().__init__(str(settings.address))
+        self._settings = settings
+        self._listeners = listeners
+        self._clock = clock
+        self._command = VelocityCommand(settings.command_timeout_s, clock, self.counts)
+        self._odometry = WheelOdometry(settings.geometry, settings.wheel_noise, self.counts)
+        self._tick = threading.Event()
+
+    def tick(self) -> None:
+        """It is time to ask the robot, where it has to be asked."""
+        self._tick.set()
+
+    def set_velocity(self, speed: float, turn_rate: float) -> None:
+        """Drive forward [m/s] and turn to the left [rad/s] from now on."""
+        self._command.set((speed, 0.0, turn_rate))
+        self._tick.set()
+
+    def begin_to_stop(self) -> None:
+        """See `RobotDriver.begin_to_stop`."""
+        super().begin_to_stop()
+        self._tick.set()
+
+    def _open(self) -> Link:
+        settings = self._settings
+        if settings.address.device:
+            return SerialLink(settings.address.device, settings.baud_rate, settings.reply_timeout_s)
+        return TcpLink(settings.address.host, settings.address.port, 2.0 * settings.reply_timeout_s)
+
+    def _begin(self) -> EpuckSession:
+        if self._settings.address.device:
+            return SerialSession(self._settings, self._speeds, self._doubt, self.counts)
+        return WifiSession(self._settings, self._speeds, self.counts)
+
+    def _step(self, session: EpuckSession, link: Link) -> bytes:
+        if session.is_idle:
+            self._tick.wait(_MAX_IDLE_S)
+            self._tick.clear()
+        data = link.read(0.0 if session.is_idle else _READ_S)
+        return session.step(data, self._clock(), time.monotonic())
+
+    def _serve(self, session: EpuckSession) -> None:
+        found, session.found = session.found, []
+        for one in found:
+            if not one.stamp_ns:
+                self.counts["no_clock"] += 1
+            elif isinstance(one, CameraImage):
+                self.counts["images"] += 1
+                self._listeners.image(one)
+            else:
+                self.counts["readings"] += 1
+                self._listeners.proximity(one.stamp_ns, one.proximity)
+                counters = one.left_counter, one.right_counter
+                state = self._odometry.update(one.stamp_ns, *counters, doubt_ns=one.doubt_ns)
+                if state is not None:
+                    self._listeners.odometry(state)
+
+    def _speeds(self) -> tuple[int, int]:
+        """What the wheels are told now."""
+        speed, _, turn_rate = self._command.velocity()
+        left, right = self._settings.geometry.commands_for(speed, turn_rate, self._settings.model)
+        rate = self._settings.model.rate
+        self._odometry.note_rates(self._clock(), rate(left), rate(right))
+        return left, right
+
+    def _doubt(self) -> None:
+        """Nobody knows what the wheels do."""
+        self._odometry.doubt_rates(self._clock(), self._settings.model.max_rate)

@@ -1,0 +1,99 @@
+"""The driver of one e-puck or e-puck2 as a ROS 2 node, in the robot's namespace.
+
+    ./run swarm_loc_drivers epuck_driver_node --ros-args -r __ns:=/epuck1 -p address:=/dev/rfcomm0
+
+It takes `cmd_vel` and publishes `odom`, `proximity/ps0` to `ps7`, `image_raw`, `camera_info`, `/tf`,
+`/tf_static` and `/diagnostics`. Parameters: see `doc/epuck_driver_node.md`.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import Twist
+from numpy.typing import NDArray
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo, Image, Range
+from tf2_msgs.msg import TFMessage
+
+from swarm_loc_drivers.common.camera_messages import camera_info_message, image_message
+from swarm_loc_drivers.common.driver_diagnostics import DriverDiagnostics
+from swarm_loc_drivers.common.odometry_output import OdometryOutput, transform_publisher
+from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
+from swarm_loc_drivers.epuck import epuck_messages
+from swarm_loc_drivers.epuck.driver import EpuckDriver, Listeners
+from swarm_loc_drivers.epuck.epuck_parameters import EpuckParameters, camera_calibration, epuck_settings
+from swarm_loc_drivers.epuck.session import CameraImage
+from swarm_loc_estimator.common.ros.running import run_node
+
+_COMMAND_QOS = QoSProfile(depth=1)
+_TF_STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_RATES = ("readings", "images")
+_WRONG = {
+    "bad_cmd_vel": "velocities that were not finite, or absurd",
+    "bad_images": "images of another size or kind than asked for",
+    "counter_restarts": "counters that did not go on, as after a reset",
+    "implausible_counters": "readings that no command could have led to",
+    "missed_replies": "questions that were not answered in time or not whole",
+    "reversed_counters": "right wheels counted backwards, as by firmware before December 2018; corrected",
+    "time_jumps": "stamps that stepped back",
+}
+
+
+class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
+    """Hands velocities to the driver and publishes what it reports."""
+
+    _driver: EpuckDriver
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("epuck_driver", EpuckParameters, **node_arguments)
+        parameters = self.chosen
+        settings = epuck_settings(parameters)
+        self._base_frame = f"{self._prefix}{parameters.base_frame}"
+        self._camera_frame = f"{self._prefix}camera_optical_frame"
+        self._calibration = camera_calibration(parameters, settings.camera) if settings.camera else None
+        transforms = transform_publisher(self) if parameters.publish_tf else None
+        odom_frame = f"{self._prefix}{parameters.odom_frame}"
+        odometry = OdometryOutput(self, "odom", odom_frame, self._base_frame, transforms)
+        listeners = Listeners(odometry.publish, self._publish_proximity, self._publish_image)
+        self._driver = EpuckDriver(settings, listeners, self._now_ns)
+        self._advertise()
+        name, address = f"{self._prefix}{self.get_name()}", str(settings.address)
+        self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
+        self.create_subscription(Twist, "cmd_vel", self._on_cmd_vel, _COMMAND_QOS)
+        self.create_timer(1.0 / parameters.reading_rate, self._driver.tick)
+
+    def _advertise(self) -> None:
+        # one topic each: eight at once on one would overrun the few places of a sensor-data queue
+        self._proximity = [
+            self.create_publisher(Range, f"proximity/{name}", qos_profile_sensor_data)
+            for name in epuck_messages.PROXIMITY_NAMES
+        ]
+        if self._calibration is not None:
+            self._image = self.create_publisher(Image, "image_raw", qos_profile_sensor_data)
+            self._camera_info = self.create_publisher(CameraInfo, "camera_info", qos_profile_sensor_data)
+        # tf2's listeners know this absolute name, whatever the namespace
+        self._tf_static = self.create_publisher(TFMessage, "/tf_static", _TF_STATIC_QOS)
+        sensors = epuck_messages.proximity_transforms(self._now_ns(), self._base_frame, self._prefix)
+        self._tf_static.publish(TFMessage(transforms=sensors))
+
+    def _on_cmd_vel(self, message: Twist) -> None:
+        self._driver.set_velocity(message.linear.x, message.angular.z)
+
+    def _publish_proximity(self, stamp_ns: int, raw: NDArray[np.int64]) -> None:
+        if any(publisher.get_subscription_count() for publisher in self._proximity):
+            messages = epuck_messages.range_messages(stamp_ns, raw, self._prefix)
+            for publisher, message in zip(self._proximity, messages, strict=True):
+                publisher.publish(message)
+
+    def _publish_image(self, taken: CameraImage) -> None:
+        if self._calibration is None:
+            return
+        image = image_message(taken.pixels, taken.stamp_ns, self._camera_frame)
+        self._image.publish(image)
+        self._camera_info.publish(camera_info_message(self._calibration, image.header))
+
+
+main = partial(run_node, "epuck_driver_node", EpuckDriverNode)

@@ -1,0 +1,190 @@
+"""A conversation with an e-puck by the serial command set: question and answer. No I/O."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Generator
+from typing import TypeVar
+
+import numpy as np
+
+from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.epuck import serial_protocol as protocol
+from swarm_loc_drivers.epuck.rgb565 import decode_rgb565
+from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, EpuckSettings, Reading, Speeds
+
+_MAX_MISSED = 5
+"""So many exchanges in a row without an answer, and the link is opened anew."""
+_NS = 1_000_000_000
+
+Result = TypeVar("Result")
+Talk = Generator[None, None, Result]
+"""Goes on at every step."""
+
+
+class SerialSession:
+    """Asks for readings at every step that finds it idle, and for images in between; see `EpuckSession`.
+
+    Args:
+        settings: Of the robot.
+        speeds: Tells what the wheels are to do.
+        doubt: Called when it is not known what the robot has understood.
+        counts: Gets `exchanges`, `missed_replies`, `stray_bytes`, `resyncs`, `bad_images`.
+    """
+
+    def __init__(
+        self, settings: EpuckSettings, speeds: Speeds, doubt: Callable[[], None], counts: Counter[str]
+    ) -> None:
+        self.ending = self.connected = self.ended = self.is_idle = False
+        self.found: list[Reading | CameraImage] = []
+        self._settings = settings
+        self._wanted_speeds = speeds
+        self._doubt = doubt
+        self._counts = counts
+        self._received = self._output = b""
+        self._now_ns, self._steady_s = 0, 0.0
+        self._told = (0, 0)
+        self._missed = 0
+        self._image_due_ns = 0
+        self._way_ns = 0
+        self._talk = self._run()
+
+    def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
+        """See `EpuckSession.step`."""
+        self._received += data
+        self._now_ns, self._steady_s = now_ns, steady_s
+        try:
+            next(self._talk)
+        except StopIteration:
+            self.ended = True
+        output, self._output = self._output, b""
+        return output
+
+    def _run(self) -> Talk[None]:
+        yield from self._resync()
+        camera = self._settings.camera
+        if camera is not None:
+            yield from self._set_camera(camera)
+        self.connected = True
+        while True:
+            self.is_idle = True
+            yield
+            self.is_idle = False
+            if self.ending:
+                break
+            yield from self._exchange(camera)
+        yield from self._resync()
+
+    def _speeds(self) -> tuple[int, int]:
+        """What the wheels are to do now; they stand at the begin and at the end."""
+        return self._wanted_speeds() if self.connected and not self.ending else (0, 0)
+
+    def _exchange(self, camera: CameraSettings | None) -> Talk[None]:
+        """Tell the wheels what to do, and take what the robot has measured."""
+        speeds = self._speeds()
+        is_answered = yield from self._read(speeds)
+        if is_answered and camera is not None and self._image_is_due(camera):
+            is_answered = yield from self._take_image(speeds, camera)
+        if is_answered:
+            self._missed = 0
+            return
+        self._doubt()
+        self._counts["missed_replies"] += 1
+        self._missed += 1
+        if self._missed >= _MAX_MISSED:
+            raise SessionError(f"the robot missed {self._missed} requests in a row")
+        yield from self._resync()
+
+    def _read(self, speeds: tuple[int, int]) -> Talk[bool]:
+        """Counters and proximity; taken in the middle between question and answer."""
+        asked_ns = self._now_ns
+        body = yield from self._ask(protocol.readings_request(*speeds, is_new=speeds != self._told))
+        if body is None:
+            return False
+        self._told = speeds
+        self._way_ns = max(0, self._now_ns - asked_ns) // 2
+        left, right, proximity = protocol.decode_readings(body)
+        stamp_ns, sensors = asked_ns + self._way_ns, np.array(proximity, dtype=np.int64)
+        self.found.append(Reading(stamp_ns, self._way_ns, left, right, sensors))
+        return True
+
+    def _image_is_due(self, camera: CameraSettings) -> bool:
+        period_ns = round(camera.period_s * _NS)
+        if self._image_due_ns - period_ns <= self._now_ns < self._image_due_ns:
+            return False
+        self._image_due_ns = self._now_ns + period_ns
+        return True
+
+    def _take_image(self, speeds: tuple[int, int], camera: CameraSettings) -> Talk[bool]:
+        """An image; the robot takes it when the question arrives."""
+        asked_ns = self._now_ns
+        body = yield from self._ask(protocol.image_request(*speeds, camera.width, camera.height))
+        if body is None:
+            return False
+        pixels = protocol.decode_image(body, camera.width, camera.height)
+        if pixels is None:
+            self._counts["bad_images"] += 1
+        else:
+            image = decode_rgb565(pixels, camera.width, camera.height)
+            self.found.append(CameraImage(asked_ns + self._way_ns, image))
+        return True
+
+    def _ask(self, request: protocol.Request) -> Talk[bytes | None]:
+        """The body of the reply; None when it does not come in time, or not whole."""
+        self._counts["stray_bytes"] += len(self._received)
+        self._received = b""
+        self._output += request.data
+        parser = protocol.ReplyParser(request)
+        deadline_s = self._deadline_s(len(request.data) + request.size + 2 * len(request.mark))
+        while self._steady_s < deadline_s:
+            yield
+            received, self._received = self._received, b""
+            body = parser.feed(received)
+            if body is not None:
+                self._counts["exchanges"] += 1
+                self._counts["stray_bytes"] += parser.skipped
+                return body
+        return None
+
+    def _deadline_s(self, bytes_in_all: int) -> float:
+        """Until when an answer must have come, if so many bytes are under way."""
+        settings = self._settings
+        return self._steady_s + settings.reply_timeout_s + 20.0 * bytes_in_all / settings.baud_rate
+
+    def _set_camera(self, camera: CameraSettings) -> Talk[None]:
+        """Choose the size of images, and check that the robot has really taken it."""
+        setting = protocol.camera_setting(camera.width, camera.height, camera.zoom)
+        yield from self._line(lambda: (setting, protocol.ASCII_CAMERA_SET))
+        answer = yield from self._line(lambda: (protocol.ASCII_CAMERA_QUERY, protocol.ASCII_CAMERA_REPLY))
+        wanted = (protocol.RGB565_MODE, camera.width, camera.height, camera.zoom)
+        taken = tuple(int(number) for number in answer.groups()[:4])
+        if taken != wanted:
+            raise SessionError(f"the robot's camera is set to {taken} though {wanted} was asked for")
+
+    def _resync(self) -> Talk[None]:
+        """Bring the robot back to idle, whatever bytes were lost, and tell it the speeds of the moment.
+
+        It may hear and not be heard; so each attempt says what the wheels are to do when it is made.
+        """
+
+        def attempt() -> tuple[bytes, re.Pattern[bytes]]:
+            self._counts["resyncs"] += 1
+            self._told = self._speeds()
+            return protocol.resync(*self._told), protocol.speed_reply(*self._told)
+
+        yield from self._line(attempt)
+
+    def _line(self, attempt: Callable[[], tuple[bytes, re.Pattern[bytes]]]) -> Talk[re.Match[bytes]]:
+        """The answer to an ASCII line, behind whatever was still under way; both as each attempt has them."""
+        for _ in range(_MAX_MISSED):
+            line, answer = attempt()
+            self._received = b""
+            self._output += line
+            deadline_s = self._deadline_s(len(line))
+            while self._steady_s < deadline_s:
+                yield
+                if match := answer.search(self._received):
+                    self._received = b""
+                    return match
+        raise SessionError("the robot does not answer")

@@ -1,0 +1,119 @@
+"""What the two ways of talking to an e-puck have in common: settings, and what the robot measures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_drivers.common.link import Address
+from swarm_loc_drivers.common.robot_driver import Session
+from swarm_loc_drivers.epuck.hardware import EpuckModel
+from swarm_loc_drivers.epuck.rgb565 import Image
+from swarm_loc_drivers.epuck.wheels import WheelGeometry
+
+Speeds = Callable[[], tuple[int, int]]
+"""Tells what the wheels are to do, left and right [steps/s]; called when it is about to be sent."""
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """The images to ask for.
+
+    Attributes:
+        width: [px].
+        height: [px].
+        zoom: Camera pixels per pixel.
+        period_s: Between two images over a serial port [s].
+    """
+
+    width: int
+    height: int
+    zoom: int
+    period_s: float
+
+
+@dataclass(frozen=True)
+class EpuckSettings:
+    """How to reach a robot and what it is.
+
+    Attributes:
+        address: Where it answers; over TCP it is an e-puck2 with the WiFi firmware.
+        model: Its generation.
+        geometry: Its wheels.
+        wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
+        command_timeout_s: How long a velocity counts [s].
+        baud_rate: Of a serial port [bit/s].
+        reading_period_s: Between two readings over TCP that are used [s]; over serial the ticks decide.
+        reply_timeout_s: How long an answer may take [s].
+        camera: Which images to ask for, None for none; over TCP they have one size only.
+    """
+
+    address: Address
+    model: EpuckModel
+    geometry: WheelGeometry
+    wheel_noise: float
+    command_timeout_s: float
+    baud_rate: int
+    reading_period_s: float
+    reply_timeout_s: float
+    camera: CameraSettings | None
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Sensor values.
+
+    Attributes:
+        stamp_ns: Acquisition [ns].
+        doubt_ns: It may have been so much earlier or later [ns].
+        left_counter: Steps of the left wheel, 16 bits, wrapping.
+        right_counter: Likewise of the right wheel.
+        proximity: (8,) raw values of ps0..ps7.
+    """
+
+    stamp_ns: int
+    doubt_ns: int
+    left_counter: int
+    right_counter: int
+    proximity: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class CameraImage:
+    """An image of the robot's camera.
+
+    Attributes:
+        stamp_ns: Exposure, as well as it can be known [ns].
+        pixels: (height, width, 3) RGB.
+    """
+
+    stamp_ns: int
+    pixels: Image
+
+
+class EpuckSession(Session, Protocol):
+    """A conversation with one e-puck.
+
+    Attributes:
+        found: What the robot has measured; whoever takes it empties the list.
+        is_idle: Whether nothing is expected of the robot: the next step asks it.
+    """
+
+    found: list[Reading | CameraImage]
+    is_idle: bool
+
+    def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
+        """Go on; what to send.
+
+        Args:
+            data: What has come since the last step.
+            now_ns: The time, which may be simulated, stand still or jump back; 0 is none.
+            steady_s: Real time.
+
+        Raises:
+            SessionError: The robot does not answer, or not as it must.
+        """

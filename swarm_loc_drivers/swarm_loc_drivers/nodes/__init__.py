@@ -1,1 +1,0 @@
-"""The drivers as ROS 2 nodes."""

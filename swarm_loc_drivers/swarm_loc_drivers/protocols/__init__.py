@@ -1,1 +1,0 @@
-"""The bytes of the robots: encoding and decoding, no I/O."""

@@ -1,0 +1,1 @@
+"""The PushBot: bytes, session, odometry, driver and nodes."""

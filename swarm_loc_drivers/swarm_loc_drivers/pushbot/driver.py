@@ -1,0 +1,92 @@
+"""The driver of one PushBot: keeps the link up, the wheels obedient, the odometry added up. No ROS here."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from swarm_loc_drivers.common.link import Link
+from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.robot_driver import RobotDriver
+from swarm_loc_drivers.common.serial_link import SerialLink
+from swarm_loc_drivers.common.tcp_link import TcpLink
+from swarm_loc_drivers.common.velocity_command import VelocityCommand
+from swarm_loc_drivers.pushbot.event_packets import EventPacket
+from swarm_loc_drivers.pushbot.session import PushbotSession
+from swarm_loc_drivers.pushbot.settings import PushbotSettings
+from swarm_loc_drivers.pushbot.wheel_odometry import PushbotOdometry
+
+_READ_S = 0.02
+_BATCH_S = 0.002
+"""Bytes are taken no more often than so: each time has its price, however few there are."""
+
+
+@dataclass(frozen=True)
+class Listeners:
+    """Who gets what the robot measures; called in the driver's thread.
+
+    Attributes:
+        odometry: Gets every new state.
+        events: Gets packets of events.
+    """
+
+    odometry: Callable[[OdometryState], None]
+    events: Callable[[EventPacket], None]
+
+
+class PushbotDriver(RobotDriver[PushbotSession]):
+    """Drives one robot in a thread of its own.
+
+    Args:
+        settings: The robot.
+        listeners: Who gets its data.
+        clock: Tells the time [ns]; may be simulated, and 0 is none.
+    """
+
+    def __init__(self, settings: PushbotSettings, listeners: Listeners, clock: Callable[[], int]) -> None:
+        super().__init__(str(settings.address))
+        self._settings = settings
+        self._listeners = listeners
+        self._clock = clock
+        self._command = VelocityCommand(settings.command_timeout_s, clock, self.counts)
+        self._odometry = PushbotOdometry(settings.geometry, settings.wheel_noise, self.counts)
+        self._read_s = 0.0
+
+    def set_velocity(self, speed: float, turn_rate: float) -> None:
+        """Drive forward [m/s] and turn to the left [rad/s] from now on."""
+        self._command.set((speed, 0.0, turn_rate))
+
+    def _open(self) -> Link:
+        settings = self._settings
+        if settings.address.device:
+            return SerialLink(settings.address.device, settings.baud_rate, settings.reply_timeout_s)
+        return TcpLink(settings.address.host, settings.address.port, 2.0 * settings.reply_timeout_s)
+
+    def _begin(self) -> PushbotSession:
+        self._odometry.restart()
+        return PushbotSession(self._settings, self._velocities, self.counts)
+
+    def _step(self, session: PushbotSession, link: Link) -> bytes:
+        early_s = self._read_s + _BATCH_S - time.monotonic()
+        if early_s > 0.0:
+            time.sleep(early_s)
+        data = link.read(_READ_S)
+        self._read_s = time.monotonic()
+        return session.step(data, self._clock(), self._read_s)
+
+    def _serve(self, session: PushbotSession) -> None:
+        found, session.found = session.found, []
+        for one in found:
+            if one.stamp_ns <= 0:  # before the clock has come, or began
+                self.counts["no_clock"] += 1
+            elif isinstance(one, EventPacket):
+                self.counts["packets"] += 1
+                self._listeners.events(one)
+            elif (state := self._odometry.update(one)) is not None:
+                self._listeners.odometry(state)
+
+    def _velocities(self) -> tuple[int, int]:
+        """What the wheels are told now."""
+        speed, _, turn_rate = self._command.velocity()
+        return self._settings.geometry.velocities(speed, turn_rate)

@@ -1,0 +1,210 @@
+"""Parser of a PushBot's bytes: events with their timestamps, and lines of text between them.
+
+An event is `1yyyyyyy pxxxxxxx` and its timestamp, most significant byte first. Text never lies within an
+event: at a boundary a byte below 0x80 begins a line, any other one an event. After lost bytes this rule finds
+a boundary again soon, and until then the timestamps give the wrong events away: events whose time jumps are
+kept only if those that follow confirm them, without rubbish in between.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_drivers.pushbot.hardware import TIMESTAMPS
+from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.common.jit import compiled
+
+CONFIRMATIONS = 8
+"""So many events in a row must agree with a jump of time."""
+MAX_LINE = 256
+"""Longer lines are dropped."""
+_MAX_HELD = 1024
+"""Bytes of a jump that wait for confirmation; then it is believed."""
+_MAX_GAP_US = 250_000
+_MAX_SHORT_GAP_US = 16_384
+"""A longer silence of the camera is a jump of time; the second one holds for timestamps of 16 bits."""
+_HIGH, _NEWLINE, _SPACE, _DELETE = 0x80, 0x0A, 0x20, 0x7F
+_COUNTS = ("corrupt_events", "time_jumps", "skipped_bytes", "long_lines")
+_CORRUPT, _JUMPS, _SKIPPED, _LONG = range(4)
+_TIME, _RAW, _STARTED = range(3)
+
+
+class Parsed(NamedTuple):
+    """What a stretch of bytes holds.
+
+    Attributes:
+        x: (N,) columns of events [px].
+        y: (N,) rows of events [px].
+        polarity: (N,) the polarity bit as sent, 0 or 1.
+        time_us: (N,) the board's clock, unwrapped, from an arbitrary instant on [us]; zeros without one.
+        lines: Lines without their end, each with the number of events before it.
+    """
+
+    x: NDArray[np.uint8]
+    y: NDArray[np.uint8]
+    polarity: NDArray[np.uint8]
+    time_us: IntArray
+    lines: list[tuple[int, bytes]]
+
+
+class EventParser:
+    """Takes bytes in pieces of any size; how they are cut does not change what comes out.
+
+    Args:
+        timestamps: A key of `TIMESTAMPS`.
+        counts: Gets `corrupt_events` (dropped), `time_jumps` (believed), `skipped_bytes` and `long_lines`.
+    """
+
+    def __init__(self, timestamps: str, counts: Counter[str]) -> None:
+        self._stamp_bytes = TIMESTAMPS[timestamps]
+        self._counts = counts
+        self._rest = b""
+        self._state = np.zeros(3, np.int64)
+
+    @property
+    def span_us(self) -> int:
+        """After so long the timestamps begin anew [us]; 0: they do not, or there are none."""
+        return 1 << (8 * self._stamp_bytes) if self._stamp_bytes > 0 else 0
+
+    def feed(self, data: bytes) -> Parsed:
+        """Take bytes; the events and lines that are complete and sure."""
+        buffer = np.frombuffer(self._rest + data, np.uint8)
+        room = len(buffer) // 2 + 1
+        columns = np.empty((3, room), np.uint8)
+        times = np.empty(room, np.int64)
+        spans = np.empty((len(buffer) + 1, 3), np.int64)
+        tally = np.zeros(len(_COUNTS), np.int64)
+        used, events, lines = _parse(buffer, self._stamp_bytes, self._state, columns, times, spans, tally)
+        self._counts.update({name: int(count) for name, count in zip(_COUNTS, tally, strict=True) if count})
+        content = buffer.tobytes()
+        self._rest = content[used:]
+        texts = [(int(before), content[begin:end]) for begin, end, before in spans[:lines]]
+        x, y, polarity = columns[:, :events]
+        return Parsed(x, y, polarity, times[:events], texts)
+
+
+@compiled
+def _parse(
+    data: NDArray[np.uint8],
+    stamp_bytes: int,
+    state: IntArray,
+    columns: NDArray[np.uint8],
+    times: IntArray,
+    spans: IntArray,
+    tally: IntArray,
+) -> tuple[int, int, int]:  # fmt: skip
+    """Fill columns, times and spans of lines; the bytes used, the numbers of events and of lines."""
+    at, events, lines = 0, 0, 0
+    run_at, run_events, run_lines = -1, 0, 0  # where a jump of time began that is not confirmed yet
+    before, tally_before = state.copy(), tally.copy()
+    while at < len(data):
+        if data[at] < _HIGH:
+            end, verdict = _line_end(data, at)
+            if verdict == 0:
+                break
+            if verdict == 1:
+                if end > at:
+                    spans[lines, 0], spans[lines, 1], spans[lines, 2] = at, end, events
+                    lines += 1
+                at = end + 1
+                continue
+            if run_at >= 0:  # rubbish: there was no boundary where the events of the run began
+                tally[_CORRUPT] += events - run_events
+                events, run_at = run_events, -1
+                state[:] = before
+            tally[_LONG if verdict == 3 else _SKIPPED] += 1 if verdict == 3 else end - at
+            at = end
+            continue
+        size, stamp = _stamp(data, at, stamp_bytes)
+        if size == 0:
+            break
+        if size < 0:  # a difference without an end
+            tally[_SKIPPED] += 2
+            at += 2
+            continue
+        if stamp_bytes:
+            elapsed = _elapsed(stamp, state, stamp_bytes)
+            if run_at >= 0 and not _is_plausible(elapsed, stamp_bytes):
+                tally[_CORRUPT] += events - run_events
+                events, state[:] = run_events, before
+                elapsed = _elapsed(stamp, state, stamp_bytes)
+                if state[_STARTED] == 0 or not _is_plausible(elapsed, stamp_bytes):
+                    at, lines, run_at = run_at + 1, run_lines, -1  # there was no boundary: look behind it
+                    tally[_SKIPPED] += 1
+                    continue
+                run_at = -1
+            if run_at < 0 and (state[_STARTED] == 0 or not _is_plausible(elapsed, stamp_bytes)):
+                run_at, run_events, run_lines = at, events, lines
+                before[:] = state
+                tally_before[:] = tally
+            state[_TIME] += elapsed
+            state[_RAW], state[_STARTED] = stamp, 1
+        columns[0, events], columns[1, events] = data[at + 1] & 0x7F, data[at] & 0x7F
+        columns[2, events] = data[at + 1] >> 7
+        times[events] = state[_TIME]
+        events += 1
+        at += size
+        if run_at >= 0 and events - run_events >= CONFIRMATIONS:
+            tally[_JUMPS] += before[_STARTED]
+            run_at = -1
+    if run_at >= 0 and len(data) - run_at < _MAX_HELD:  # parse it again when there is more
+        state[:] = before
+        tally[:] = tally_before
+        return run_at, run_events, run_lines
+    return at, events, lines
+
+
+@compiled
+def _line_end(data: NDArray[np.uint8], at: int) -> tuple[int, int]:
+    """Where a line ends, and 0: not yet, 1: by a newline, 2: by a byte that is no text, 3: it is too long."""
+    for end in range(at, min(len(data), at + MAX_LINE)):
+        byte = data[end]
+        if byte == _NEWLINE:
+            return end, 1
+        if byte >= _HIGH:
+            return end, 2
+        if byte >= _DELETE or (byte < _SPACE and not 8 <= byte <= 13):
+            return end + 1, 2
+    return (at + MAX_LINE, 3) if len(data) >= at + MAX_LINE else (len(data), 0)
+
+
+@compiled
+def _stamp(data: NDArray[np.uint8], at: int, stamp_bytes: int) -> tuple[int, int]:
+    """Bytes of the event at `at` and its timestamp as sent; 0: it is not complete, -1: it has no end."""
+    left = len(data) - at - 2
+    stamp = 0
+    if stamp_bytes >= 0:
+        if left < stamp_bytes:
+            return 0, 0
+        for k in range(stamp_bytes):
+            stamp = (stamp << 8) | data[at + 2 + k]
+        return 2 + stamp_bytes, stamp
+    for k in range(min(left, 4)):
+        byte = data[at + 2 + k]
+        stamp = (stamp << 7) | (byte & 0x7F)
+        if byte >= _HIGH:
+            return 3 + k, stamp
+    return (-1, 0) if left >= 4 else (0, 0)
+
+
+@compiled
+def _elapsed(stamp: int, state: IntArray, stamp_bytes: int) -> int:
+    """Time since the last event [us]; long timestamps may step back."""
+    if stamp_bytes < 0:
+        return stamp
+    if state[_STARTED] == 0:
+        return 0
+    span = 1 << (8 * stamp_bytes)
+    forward = (stamp - int(state[_RAW])) % span
+    return forward - span if stamp_bytes > 2 and 2 * forward > span else forward
+
+
+@compiled
+def _is_plausible(elapsed: int, stamp_bytes: int) -> bool:
+    """Whether events can be so far apart [us]."""
+    longest = _MAX_SHORT_GAP_US if stamp_bytes == 2 else _MAX_GAP_US
+    return 0 <= elapsed <= longest

@@ -1,0 +1,149 @@
+"""Drives robots to a mapper's goals and lets them look around there, as a ROS 2 node.
+
+    ./run swarm_loc_drivers exploration_node --ros-args -p swarm_file:=swarm.yaml
+
+It takes `<robot>/goal` and `<robot>/fix` of `mapper_node`, `<robot>/odom` of the robots' drivers and
+`<robot>/laser` of their event trackers, and publishes `<robot>/cmd_vel` and `/diagnostics`. Parameters: see
+`doc/exploration_node.md`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Pose, PoseStamped, PoseWithCovarianceStamped, Twist, Vector3
+from nav_msgs.msg import Odometry
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from swarm_loc_drivers.common.odometry_output import nanoseconds
+from swarm_loc_drivers.common.velocity_command import Velocity
+from swarm_loc_drivers.pushbot.exploration_parameters import ExplorationParameters, driven_robots
+from swarm_loc_drivers.pushbot.stop_and_go import MapGoal, StopAndGo, StopAndGoSettings
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.planar import yaw_of
+from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_msgs.msg import LaserDistance
+
+_LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_QOS = QoSProfile(depth=10)
+_PERIOD_S = 1.0
+_THROTTLE_S = 10.0
+
+
+class _Robot:
+    """One robot and what came of it last."""
+
+    def __init__(self, settings: StopAndGoSettings) -> None:
+        self.motion = StopAndGo(settings)
+        self.drives = False
+        self.fix: tuple[int, FloatArray] | None = None
+        self.goal: tuple[int, FloatArray] | None = None
+
+
+class ExplorationNode(ConfiguredNode[ExplorationParameters]):
+    """Turns goals and odometry into velocities."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("exploration", ExplorationParameters, **node_arguments)
+        chosen = self.chosen
+        self._names = driven_robots(chosen, load_swarm(Path(chosen.swarm_file)))
+        self._robots = [_Robot(chosen.settings) for _ in self._names]
+        self._drops: Counter[str] = Counter()
+        self._commands = [self.create_publisher(Twist, f"{name}/cmd_vel", 1) for name in self._names]
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", _QOS)
+        for index, name in enumerate(self._names):
+            self.create_subscription(Odometry, f"{name}/odom", partial(self._on_odometry, index), _QOS)
+            self.create_subscription(LaserDistance, f"{name}/laser", partial(self._on_laser, index), _QOS)
+            self.create_subscription(
+                PoseWithCovarianceStamped, f"{name}/fix", partial(self._on_fix, index), _QOS
+            )
+            self.create_subscription(PoseStamped, f"{name}/goal", partial(self._on_goal, index), _LATCHED)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_PERIOD_S, self._on_diagnostics, clock=steady)
+        self.get_logger().info(f"ready: {len(self._names)} robots of '{chosen.swarm_file}'")
+
+    def destroy_node(self) -> None:
+        """Let the robots stand first."""
+        for command in self._commands:
+            command.publish(Twist())
+        super().destroy_node()
+
+    def _on_odometry(self, index: int, message: Odometry) -> None:
+        robot = self._robots[index]
+        robot.drives = robot.drives or self._can_begin(self._names[index])
+        stamp_ns, pose = nanoseconds(message.header.stamp), _planar(message.pose.pose)
+        if not robot.drives:
+            return
+        if stamp_ns < 0 or not np.isfinite(pose).all():
+            self._drops["bad_odometry"] += 1
+            return
+        self._command(index, robot.motion.command(stamp_ns, pose))
+
+    def _can_begin(self, name: str) -> bool:
+        """Whether all that make and use a robot's distances are there: nothing it sees is to get lost."""
+        awaited = [f"{name}/laser", f"{name}/goal", f"{name}/fix"]
+        awaited += ["swarm/poses"] if self.chosen.wait_for_poses else []
+        heard = self.count_subscribers(f"{name}/laser") > 1 and self.count_subscribers(f"{name}/odom") > 1
+        return heard and all(self.count_publishers(topic) for topic in awaited)
+
+    def _on_laser(self, index: int, message: LaserDistance) -> None:
+        self._robots[index].motion.take_distance(message.distance)
+
+    def _on_fix(self, index: int, message: PoseWithCovarianceStamped) -> None:
+        self._robots[index].fix = (nanoseconds(message.header.stamp), _planar(message.pose.pose))
+        self._go(self._robots[index])
+
+    def _on_goal(self, index: int, message: PoseStamped) -> None:
+        self._robots[index].goal = (nanoseconds(message.header.stamp), _planar(message.pose)[:2])
+        self._go(self._robots[index])
+
+    def _go(self, robot: _Robot) -> None:
+        """Send a robot to its goal, once the fix that belongs to it is here, too."""
+        if robot.goal is None or robot.fix is None or robot.goal[0] != robot.fix[0]:
+            return
+        stamp_ns, position = robot.goal
+        pose, robot.goal = robot.fix[1], None
+        if not (np.isfinite(pose).all() and np.isfinite(position).all()):
+            self._drops["bad_goal"] += 1
+        elif not robot.motion.take_goal(MapGoal(stamp_ns, pose, position)):
+            self._drops["goal_of_another_time"] += 1
+
+    def _command(self, index: int, velocity: Velocity) -> None:
+        forward, _, rate = velocity
+        self._commands[index].publish(Twist(linear=Vector3(x=forward), angular=Vector3(z=rate)))
+
+    def _on_diagnostics(self) -> None:
+        waiting = [name for name, robot in zip(self._names, self._robots, strict=True) if not robot.drives]
+        motions = [robot.motion for robot in self._robots]
+        values = {
+            "goals": sum(one.goals for one in motions),
+            "halts": sum(one.halts for one in motions),
+            "odometry_restarts": sum(one.restarts for one in motions),
+            **{f"dropped: {reason}": count for reason, count in sorted(self._drops.items())},
+        }
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.OK,
+            name=self.get_name(),
+            message=f"waiting for all that map with {', '.join(waiting)}" if waiting else "driving",
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+
+def _planar(pose: Pose) -> FloatArray:
+    """x, y and yaw (3,) of a pose."""
+    turned = pose.orientation
+    return np.array([pose.position.x, pose.position.y, yaw_of(turned.x, turned.y, turned.z, turned.w)])
+
+
+main = partial(run_node, "exploration_node", ExplorationNode)

@@ -1,0 +1,71 @@
+"""The driver of one PushBot as a ROS 2 node, in the robot's namespace.
+
+    ./run swarm_loc_drivers pushbot_driver_node --ros-args -r __ns:=/pushbot1 -p address:=tcp://192.168.1.11
+
+It takes `cmd_vel` and publishes `odom`, `events`, `/tf` and `/diagnostics`. Parameters: see
+`doc/pushbot_driver_node.md`.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+from geometry_msgs.msg import Twist
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from swarm_loc_drivers.common.driver_diagnostics import DriverDiagnostics
+from swarm_loc_drivers.common.odometry_output import OdometryOutput, transform_publisher
+from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
+from swarm_loc_drivers.pushbot.driver import Listeners, PushbotDriver
+from swarm_loc_drivers.pushbot.event_output import event_message
+from swarm_loc_drivers.pushbot.event_packets import EventPacket
+from swarm_loc_drivers.pushbot.pushbot_parameters import PushbotParameters, pushbot_settings
+from swarm_loc_drivers.pushbot.warm_up import warm_up
+from swarm_loc_estimator.common.ros.running import run_node
+from swarm_loc_msgs.msg import EventPacket as EventPacketMessage
+
+EVENT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Half a second of packets."""
+_COMMAND_QOS = QoSProfile(depth=1)
+_RATES = ("events", "packets", "readings")
+_WRONG = {
+    "bad_cmd_vel": "velocities that were not finite, or absurd",
+    "corrupt_events": "events that were put together wrongly, as after lost bytes",
+    "counter_restarts": "wheel ticks that did not go on",
+    "implausible_counters": "wheel ticks that no motor could have made",
+    "long_lines": "lines of text without an end",
+    "refused_commands": "commands that the robot did not understand",
+    "skipped_bytes": "bytes that belonged to nothing",
+    "time_jumps": "times that stepped back or far ahead",
+}
+
+
+class PushbotDriverNode(RobotDriverNode[PushbotParameters]):
+    """Hands velocities to the driver and publishes what it reports."""
+
+    _driver: PushbotDriver
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("pushbot_driver", PushbotParameters, **node_arguments)
+        parameters = self.chosen
+        settings = pushbot_settings(parameters)
+        warm_up()
+        transforms = transform_publisher(self) if parameters.publish_tf else None
+        frames = f"{self._prefix}{parameters.odom_frame}", f"{self._prefix}{parameters.base_frame}"
+        odometry = OdometryOutput(self, "odom", *frames, transforms)
+        self._camera_frame = f"{self._prefix}event_camera_optical_frame"
+        self._events = self.create_publisher(EventPacketMessage, "events", EVENT_QOS)
+        self._driver = PushbotDriver(settings, Listeners(odometry.publish, self._publish), self._now_ns)
+        name, address = f"{self._prefix}{self.get_name()}", str(settings.address)
+        self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
+        self.create_subscription(Twist, "cmd_vel", self._on_cmd_vel, _COMMAND_QOS)
+
+    def _on_cmd_vel(self, message: Twist) -> None:
+        self._driver.set_velocity(message.linear.x, message.angular.z)
+
+    def _publish(self, packet: EventPacket) -> None:
+        self._events.publish(event_message(packet, self._camera_frame))
+
+
+main = partial(run_node, "pushbot_driver_node", PushbotDriverNode)

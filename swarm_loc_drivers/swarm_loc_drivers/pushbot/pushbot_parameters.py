@@ -1,0 +1,82 @@
+"""Parameters of `pushbot_driver_node`, and the driver's settings that follow from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from swarm_loc_drivers.common.link import Address, AddressError, parse_address
+from swarm_loc_drivers.pushbot.commands import Lights
+from swarm_loc_drivers.pushbot.hardware import BAUD_RATE, TIMESTAMPS
+from swarm_loc_drivers.pushbot.settings import PushbotSettings, WheelGeometry
+from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, text
+
+TCP_PORT = 56000
+"""Of the radio's transparent link."""
+_MIN_FREQUENCY = 10.0
+"""A light that blinks more slowly is not what a tracker looks for; 0 is off."""
+
+
+@dataclass(frozen=True)
+class PushbotParameters:
+    """Parameters of `pushbot_driver_node`."""
+
+    address: str = text("", "a serial port such as /dev/ttyUSB0, or tcp://HOST[:56000]", required=True)
+    baud_rate: int = number(BAUD_RATE, "bit/s", 9600, 12_000_000, "of a serial port")
+    timestamps: str = choice("24bit", tuple(TIMESTAMPS), "timestamps of events: their bits, or differences")
+    events: bool = flag(True, "publish what the event camera sees")
+    on_bit: int = number(0, "1", 0, 1, "polarity bit of pixels that became brighter")
+    packet_period: float = number(0.005, "s", 0.001, 0.1, "of packets of events")
+    laser_frequency: float = number(450.0, "Hz", 0.0, 5000.0, "at which the laser pointer blinks; 0: off")
+    led_frequency: float = number(1000.0, "Hz", 0.0, 5000.0, "at which both LEDs blink; 0: off")
+    tick_rate: float = number(50.0, "1/s", 1.0, 200.0, "readings of the wheel ticks")
+    reply_timeout_s: float = number(
+        0.5, "s", 0.05, 10.0, "how long an answer, or the next wheel ticks, may take"
+    )
+    cmd_vel_timeout_s: float = number(0.5, "s", 0.02, 10.0, "without cmd_vel for so long the robot stops")
+    metres_per_tick: float = number(1e-4, "m", 1e-6, 1e-2, "path of a wheel per tick")
+    wheel_separation: float = number(0.085, "m", 0.01, 1.0, "distance between the two wheels")
+    wheel_noise: float = number(
+        2e-4, "m", 0.0, 1.0, "variance of each wheel's path per metre it rolls [m^2/m]"
+    )
+    odom_frame: str = text("odom", "the pose is in <robot>/odom_frame", required=True)
+    base_frame: str = text("base_link", "the pose is that of <robot>/base_frame", required=True)
+    publish_tf: bool = flag(True, "publish the transform from odom to base_link")
+
+
+def pushbot_settings(parameters: PushbotParameters) -> PushbotSettings:
+    """What the parameters mean together.
+
+    Raises:
+        ParameterError: One cannot be used.
+    """
+    lights = Lights(
+        _frequency("laser_frequency", parameters.laser_frequency),
+        _frequency("led_frequency", parameters.led_frequency),
+    )
+    return PushbotSettings(
+        address=_address(parameters),
+        baud_rate=parameters.baud_rate,
+        geometry=WheelGeometry(parameters.metres_per_tick, parameters.wheel_separation),
+        wheel_noise=parameters.wheel_noise,
+        command_timeout_s=parameters.cmd_vel_timeout_s,
+        reply_timeout_s=parameters.reply_timeout_s,
+        tick_period_s=1.0 / parameters.tick_rate,
+        timestamps=parameters.timestamps if parameters.events else "",
+        on_bit=parameters.on_bit,
+        packet_period_s=parameters.packet_period,
+        lights=lights,
+    )
+
+
+def _frequency(name: str, value: float) -> float:
+    if 0.0 < value < _MIN_FREQUENCY:
+        raise ParameterError(f"parameter {name} = {value} must be 0, or at least {_MIN_FREQUENCY:g} Hz.")
+    return value
+
+
+def _address(parameters: PushbotParameters) -> Address:
+    try:
+        return parse_address(parameters.address, TCP_PORT)
+    except AddressError as error:
+        raise ParameterError(f"parameter address = {error}") from error

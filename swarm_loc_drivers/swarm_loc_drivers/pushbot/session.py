@@ -1,0 +1,207 @@
+"""A conversation with a PushBot: handshake, then a stream of events and wheel ticks. No I/O.
+
+The board is reset first. So its motors stand whatever was before, its clock and its ticks begin at zero, and
+what it says at its start tells that it is one. While it streams it gets a velocity whenever that changes, and
+otherwise so often that a firmware that can stops by itself soon after it hears nothing.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Generator
+from typing import TypeVar
+
+from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.pushbot import commands, lines
+from swarm_loc_drivers.pushbot.event_bytes import EventParser, Parsed
+from swarm_loc_drivers.pushbot.event_clock import EventClock
+from swarm_loc_drivers.pushbot.event_packets import EventPacket, EventPackets
+from swarm_loc_drivers.pushbot.hardware import FirmwareGeneration
+from swarm_loc_drivers.pushbot.settings import PushbotSettings, WheelTicks
+from swarm_loc_drivers.pushbot.tick_clock import TickClock
+
+Velocities = Callable[[], tuple[int, int]]
+"""Tells what the wheels are to do, left and right [ticks per 21 ms]; called when it is about to be sent."""
+
+_BOOT_S = 2.0
+"""So long a board may take to start, besides the time of an answer."""
+_ATTEMPTS = 3
+_REPEAT_S = 0.4
+"""A velocity that does not change is told again after so long; a decaying one holds for a second."""
+_MAX_RECEIVED = 1 << 16
+"""Bytes kept while an answer is awaited: a camera may still be streaming."""
+
+Result = TypeVar("Result")
+Talk = Generator[None, None, Result]
+"""Goes on at every step."""
+
+
+class PushbotSession:
+    """Goes on whenever there are bytes, or time has passed.
+
+    Args:
+        settings: Of the robot.
+        velocities: Tells what the wheels are to do.
+        counts: Gets `events`, `readings`, `refused_commands`, `other_lines`, and those of `EventParser`.
+
+    Attributes:
+        ending: Set it to have the robot stand and the conversation end.
+        connected: Whether the robot has answered and told its wheel ticks.
+        ended: Whether the conversation has ended; the robot stands.
+        found: What the robot has measured; whoever takes it empties the list.
+        generation: Its firmware, once that is known.
+    """
+
+    def __init__(self, settings: PushbotSettings, velocities: Velocities, counts: Counter[str]) -> None:
+        self.ending = self.connected = self.ended = False
+        self.found: list[WheelTicks | EventPacket] = []
+        self.generation: FirmwareGeneration | None = None
+        self._settings = settings
+        self._velocities = velocities
+        self._counts = counts
+        self._received = self._output = b""
+        self._now_ns, self._steady_s = 0, 0.0
+        self._told, self._told_s = (0, 0), 0.0
+        self._talk = self._run()
+
+    def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
+        """Go on; what to send.
+
+        Args:
+            data: What has come since the last step.
+            now_ns: The time, which may be simulated, stand still or jump back; 0 is none.
+            steady_s: Real time.
+
+        Raises:
+            SessionError: The robot does not answer, or not as it must.
+        """
+        self._received += data
+        self._now_ns, self._steady_s = now_ns, steady_s
+        try:
+            next(self._talk)
+        except StopIteration:
+            self.ended = True
+        output, self._output = self._output, b""
+        return output
+
+    def _run(self) -> Talk[None]:
+        yield from self._answer(commands.RESET, lines.BANNER, _BOOT_S)
+        if not self.ending:
+            generation = yield from self._set_up()
+            yield from self._stream(generation)
+        yield from self._answer(self._farewell(), lines.FORMAT, 0.0)
+
+    def _set_up(self) -> Talk[FirmwareGeneration]:
+        """Find out what firmware it is, and have it do what is wanted; it streams at the end."""
+        settings = self._settings
+        self._output += commands.NO_ECHO
+        listing = yield from self._answer(commands.LIST_SENSORS, lines.LAST_SENSORS, 0.0)
+        generation = self.generation = lines.generation_of(listing)
+        if generation is None:
+            raise SessionError("the board's firmware has no wheels: it is not one built for PushBots")
+        if settings.timestamps:
+            yield from self._choose_format(generation, settings.timestamps)
+        self._output += commands.lights(settings.lights) + commands.BRAKE + commands.MOTORS_ON
+        self._output += commands.stream_ticks(generation, _tick_period_ms(settings))
+        if settings.timestamps:
+            self._output += commands.EVENTS_ON
+        return generation
+
+    def _choose_format(self, generation: FirmwareGeneration, timestamps: str) -> Talk[None]:
+        if timestamps not in generation.formats:
+            raise SessionError(
+                f"the firmware, of the {generation.name} generation, has no timestamps '{timestamps}', only"
+                f" {', '.join(generation.formats)}"
+            )
+        wanted = commands.event_format(generation, timestamps) + commands.QUERY_FORMAT
+        answer = yield from self._answer(wanted, lines.FORMAT, 0.0)
+        if int(answer.strip()[-1:]) != generation.formats[timestamps]:
+            raise SessionError(f"the robot answers {answer!r} to the choice of timestamps '{timestamps}'")
+
+    def _answer(self, request: bytes, pattern: re.Pattern[bytes], extra_s: float) -> Talk[bytes]:
+        """What came up to the end of an answer, which is taken; the question is asked up to three times."""
+        for _ in range(_ATTEMPTS):
+            self._received = b""
+            self._output += request
+            deadline_s = self._steady_s + self._settings.reply_timeout_s + extra_s
+            while self._steady_s < deadline_s:
+                yield
+                if match := pattern.search(self._received):
+                    answer, self._received = self._received[: match.end()], self._received[match.end() :]
+                    return answer if pattern is lines.LAST_SENSORS else match[0]
+                self._received = self._received[-_MAX_RECEIVED:]
+        raise SessionError(f"the robot does not answer {request.split()[0].decode()}")
+
+    def _stream(self, generation: FirmwareGeneration) -> Talk[None]:
+        """Take what it measures, and tell the wheels what to do, until it is to end."""
+        settings = self._settings
+        parser = EventParser(settings.timestamps or "none", self._counts)
+        clock = EventClock(parser.span_us) if settings.timestamps not in ("", "none") else None
+        packets = EventPackets(settings.packet_period_s, settings.on_bit)
+        readings = TickClock(_tick_period_ms(settings))
+        ticks_s = self._steady_s
+        while not self.ending:
+            yield
+            received, self._received = self._received, b""
+            parsed = parser.feed(received)
+            stamps_ns = self._take_events(parsed, clock, packets)
+            for before, line in parsed.lines:
+                if before and clock is not None:
+                    readings.pass_event(int(parsed.time_us[before - 1]), stamps_ns[before - 1])
+                if self._take_line(line, readings, generation):
+                    ticks_s, self.connected = self._steady_s, True
+            if self._steady_s > ticks_s + settings.reply_timeout_s + settings.tick_period_s:
+                raise SessionError("the robot tells no wheel ticks any more")
+            self._tell_velocity(generation)
+
+    def _take_events(self, parsed: Parsed, clock: EventClock | None, packets: EventPackets) -> list[int]:
+        """Stamp and pack events; their stamps [ns], which lines among them get, too."""
+        count = len(parsed.x)
+        stamps: list[int] = []
+        if count:
+            stamps_ns = parsed.time_us * 0 + self._now_ns
+            if clock is not None:
+                stamps_ns = clock.stamps(parsed.time_us, self._now_ns)
+            self._counts["events"] += count
+            packets.add(parsed.x, parsed.y, parsed.polarity, stamps_ns, parsed.time_us)
+            stamps = stamps_ns.tolist() if parsed.lines else []
+        packets.flush_late(self._now_ns)
+        self.found += packets.ready
+        packets.ready.clear()
+        return stamps
+
+    def _take_line(self, line: bytes, readings: TickClock, generation: FirmwareGeneration) -> bool:
+        """Take a line; whether it was wheel ticks.
+
+        Raises:
+            SessionError: The board has begun anew.
+        """
+        ticks = lines.wheel_ticks(line, generation)
+        if ticks is not None:
+            self._counts["readings"] += 1
+            self.found.append(WheelTicks(readings.stamp_ns(self._now_ns), *ticks))
+            return True
+        if lines.BANNER.search(line + b"\n"):
+            raise SessionError("the robot has been reset")
+        self._counts["refused_commands" if lines.is_refusal(line) else "other_lines"] += 1
+        return False
+
+    def _tell_velocity(self, generation: FirmwareGeneration) -> None:
+        """Say a velocity that is new, and one that is not before it decays; wheels stand until it answers."""
+        wanted = self._velocities() if self.connected else (0, 0)
+        if wanted == self._told and (wanted == (0, 0) or self._steady_s < self._told_s + _REPEAT_S):
+            return
+        self._output += commands.velocity(generation, *wanted) if any(wanted) else commands.BRAKE
+        self._told, self._told_s = wanted, self._steady_s
+
+    def _farewell(self) -> bytes:
+        """Everything off; the answer to the question behind it says that all of it was heard."""
+        dark = commands.lights(commands.Lights(0.0, 0.0))
+        off = commands.EVENTS_OFF + commands.STOP_SENSORS + commands.MOTORS_OFF
+        return b"\n" + commands.BRAKE + off + dark + commands.QUERY_FORMAT
+
+
+def _tick_period_ms(settings: PushbotSettings) -> int:
+    """Between two readings of the wheel ticks [ms]."""
+    return max(1, round(1e3 * settings.tick_period_s))

@@ -1,0 +1,74 @@
+"""Dead reckoning by the wheel ticks of a PushBot."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from swarm_loc_drivers.common.dead_reckoning import DeadReckoning
+from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.pushbot.hardware import MAX_TICK_RATE, tick_difference
+from swarm_loc_drivers.pushbot.settings import WheelGeometry, WheelTicks
+
+_MAX_RATE = 2.0 * MAX_TICK_RATE
+"""No wheel is faster, not even when its controller catches up [ticks/s]."""
+_SLACK_S = 0.15
+"""Stamps may be wrong by so much."""
+_MAX_CORRECTION_S = 0.5
+"""So far back stamps step when a shorter way of the bytes is found, or events come behind ticks."""
+
+
+class PushbotOdometry:
+    """Adds up ticks.
+
+    The wheels may also be turned by hand, so only what no motor can do is refused.
+
+    Args:
+        geometry: The wheels.
+        wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
+        counts: Gets `implausible_counters`, `counter_restarts`, `time_jumps` and `corrected_times`.
+    """
+
+    def __init__(self, geometry: WheelGeometry, wheel_noise: float, counts: Counter[str]) -> None:
+        self._metres_per_tick = geometry.metres_per_tick
+        self._reckoning = DeadReckoning(geometry.wheel_separation, wheel_noise, geometry.metres_per_tick)
+        self._counts = counts
+        self._last: WheelTicks | None = None
+        self._doubtful = False
+
+    def restart(self) -> None:
+        """The board begins anew, its ticks at zero; the robot has stood meanwhile."""
+        self._last = None
+
+    def update(self, ticks: WheelTicks) -> OdometryState | None:
+        """Take a reading; the state, or None when it tells nothing new or cannot be true."""
+        last = self._last
+        if last is None:
+            self._last = ticks
+            return self._reckoning.state(ticks.stamp_ns, 0.0, 0.0, 0.0)
+        if ticks.stamp_ns == last.stamp_ns:
+            return None
+        elapsed_s = (ticks.stamp_ns - last.stamp_ns) * 1e-9
+        if -_MAX_CORRECTION_S < elapsed_s < 0.0:
+            self._counts["corrected_times"] += 1  # its way is told with the next reading
+            return None
+        if elapsed_s < 0.0:
+            self._counts["time_jumps"] += 1
+            elapsed_s = 0.0
+        done = tick_difference(last.left, ticks.left), tick_difference(last.right, ticks.right)
+        if max(map(abs, done)) > _MAX_RATE * (elapsed_s + _SLACK_S):
+            return self._distrust(ticks, elapsed_s)
+        self._last, self._doubtful = ticks, False
+        left, right = (self._metres_per_tick * one for one in done)
+        self._reckoning.advance(left, right)
+        return self._reckoning.state(ticks.stamp_ns, left, right, elapsed_s)
+
+    def _distrust(self, ticks: WheelTicks, elapsed_s: float) -> OdometryState | None:
+        """A single reading may have lost bytes; a second one says that the counters have changed."""
+        if not self._doubtful:
+            self._counts["implausible_counters"] += 1
+            self._doubtful = True
+            return None
+        self._counts["counter_restarts"] += 1
+        self._reckoning.forget_motion(_MAX_RATE * self._metres_per_tick * elapsed_s)
+        self._last, self._doubtful = ticks, False
+        return self._reckoning.state(ticks.stamp_ns, 0.0, 0.0, 0.0)

@@ -1,0 +1,80 @@
+"""One simulated world of Droplets as a ROS 2 node: robots that answer at their consoles, and /clock.
+
+    ./run swarm_loc_drivers droplet_world_node --ros-args -p swarm_file:=swarm.yaml -p link_folder:=/tmp/links
+
+Drivers connect to serial ports named like the robots in `link_folder`. The node publishes `/clock`, per robot
+`ground_truth` (for evaluation and steering) and, in the place of a tracker above the table, `fix` of some.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.qos import QoSProfile
+
+from swarm_loc_drivers.common.odometry_output import stamp_message, yaw_quaternion
+from swarm_loc_drivers.sim.common.world_node import Pace, WorldNode
+from swarm_loc_drivers.sim.droplet.droplet_world_parameters import (
+    DropletWorldParameters,
+    make_droplet_world,
+)
+from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
+from swarm_loc_drivers.sim.droplet.fixes import Fix, Tracker
+from swarm_loc_drivers.sim.droplet.world import STEP_NS, SimulatedDroplet
+from swarm_loc_estimator.common.messages.planar import planar_covariance
+from swarm_loc_estimator.common.ros.running import run_node
+
+_FIX_QOS = QoSProfile(depth=10)
+_CLOCK_STEPS = 2
+"""Droplets are slow; many drivers hear the clock."""
+
+
+class DropletWorldNode(WorldNode[DropletWorldParameters]):
+    """Steps the world, serves its robots' consoles, publishes what is to be seen of it."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("droplet_world", DropletWorldParameters, **node_arguments)
+        chosen = self.chosen
+        swarm, self._world = make_droplet_world(chosen)
+        names = [robot.name for robot in swarm.robots]
+        folder = chosen.link_folder
+
+        def serve(robot: int) -> str:
+            firmware = DropletFirmware(SimulatedDroplet(self._world, robot))
+            return str(self.host.serve_pty(firmware, Path(folder) / names[robot]))
+
+        pace = Pace(STEP_NS, chosen.rate, chosen.truth_rate, _CLOCK_STEPS)
+        self.begin(names, pace, serve, f"link_folder = {folder}")
+        fixed = tuple(swarm.index_of[name] for name in chosen.fixed)
+        self._tracker = Tracker(
+            fixed, chosen.fix_rate, (chosen.fix_sigma, chosen.fix_heading_sigma), chosen.seed
+        )
+        self._fixes = {
+            robot: self.create_publisher(PoseWithCovarianceStamped, f"{names[robot]}/fix", _FIX_QOS)
+            for robot in fixed
+        }
+
+    def step(self) -> None:
+        """Let the world do a step; tell the time, and then what a tracker has seen."""
+        self._world.step()
+        self.tell(self._world.now_ns, self._world.poses)
+        for fix in self._tracker.look(self._world.now_ns, self._world.poses):
+            self._fixes[fix.robot].publish(self._fix_message(fix))
+
+    def _fix_message(self, fix: Fix) -> PoseWithCovarianceStamped:
+        message = PoseWithCovarianceStamped()
+        message.header.stamp = stamp_message(fix.stamp_ns)
+        message.header.frame_id = "map"
+        pose, (sigma, heading_sigma) = message.pose.pose, self._tracker.sigmas
+        pose.position.x, pose.position.y = float(fix.pose[0]), float(fix.pose[1])
+        pose.orientation = yaw_quaternion(float(fix.pose[2]))
+        covariance = planar_covariance(sigma**2, sigma**2, heading_sigma**2)
+        message.pose.covariance = np.ravel(covariance)
+        return message
+
+
+main = partial(run_node, "droplet_world_node", DropletWorldNode)

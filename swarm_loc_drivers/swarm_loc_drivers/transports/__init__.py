@@ -1,1 +1,0 @@
-"""Ways that bytes take: serial ports and TCP, with deadlines."""

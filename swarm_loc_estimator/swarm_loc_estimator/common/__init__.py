@@ -1,0 +1,1 @@
+"""What all packages share: geometry, compilation, parameters, messages, bags and nodes."""

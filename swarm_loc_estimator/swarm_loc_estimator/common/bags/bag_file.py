@@ -1,0 +1,73 @@
+"""The interface of the readers of one bag file, whatever its storage."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+from swarm_loc_estimator.common.errors import UserError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+
+RawMessage = tuple[str, str, int, bytes]
+"""Topic, type, log time [ns], serialized message."""
+
+MAX_LOG_NS = 2**62
+"""Log times lie between 0 and here [ns], in the year 2116, so that the difference of any two is a number."""
+
+
+class BagError(UserError):
+    """A bag of which nothing can be read; the message is one sentence."""
+
+
+class BagTopic(NamedTuple):
+    """A topic of a bag: its name, such as robot1/odom, and its type, such as nav_msgs/msg/Odometry."""
+
+    name: str
+    type: str
+
+
+class Losses(list[str]):
+    """What could not be read of a file, one sentence each, said once however often the file is read."""
+
+    def __init__(self, file: str) -> None:
+        super().__init__()
+        self._file = file
+
+    def say(self, sentence: str) -> None:
+        """Add a sentence about the file."""
+        sentence = f"{self._file}: {sentence}"
+        if sentence not in self:
+            self.append(sentence)
+
+
+class BagFile(Protocol):
+    """One open file."""
+
+    @property
+    def topics(self) -> list[BagTopic]:
+        """The topics."""
+
+    @property
+    def message_count(self) -> int:
+        """Number of messages, as far as they can be counted before reading."""
+
+    @property
+    def time_range_ns(self) -> tuple[int, int]:
+        """First and last log time; (0, 0) without messages."""
+
+    @property
+    def losses(self) -> Losses:
+        """What could not be read; more may come while reading."""
+
+    @property
+    def progress(self) -> float:
+        """Share of the file that was read, 0 to 1."""
+
+    def batches(self, number_of: Mapping[BagTopic, int]) -> Iterator[MessageBatch]:
+        """The messages of some topics in order of log time, numbered as told."""
+
+    def close(self) -> None:
+        """Close the file."""

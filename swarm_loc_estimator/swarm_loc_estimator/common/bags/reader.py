@@ -1,0 +1,187 @@
+"""Reading bags: rosbag2 folders and bare files, MCAP and sqlite3, whole or cut off by a crash."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING
+
+from typing_extensions import Self
+
+from swarm_loc_estimator.common.bags.bag_file import BagError, BagFile, BagTopic, RawMessage
+from swarm_loc_estimator.common.bags.mcap_file import McapFile
+from swarm_loc_estimator.common.bags.qos import offered_qos
+from swarm_loc_estimator.common.bags.sqlite_file import SqliteFile
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, merge_streams
+from swarm_loc_estimator.common.yaml_tree import YamlTreeError, read_tree
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from pathlib import Path
+    from types import TracebackType
+
+    from rosbags.interfaces import Qos
+
+__all__ = ["BagError", "BagReader", "BagTopic", "RawMessage"]
+
+_STORAGES: dict[str, type[McapFile | SqliteFile]] = {".mcap": McapFile, ".db3": SqliteFile}
+_METADATA_BYTES = 20_000_000
+"""Larger metadata are not read; the three thousand topics of a thousand robots take a tenth of it."""
+
+
+class BagReader:
+    """An open bag; use it as a context manager.
+
+    Topic names come without the leading slash, as `robot1/odom`.
+
+    Args:
+        path: A rosbag2 folder, or an .mcap or .db3 file.
+
+    Attributes:
+        offered_qos: Topic -> what its publishers offered, as far as a folder's metadata know it.
+
+    Raises:
+        BagError: There is nothing to read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.offered_qos: dict[str, list[Qos]] = {}
+        self._files: list[BagFile] = []
+        self._own_losses: list[str] = []
+        paths = self._find()
+        try:
+            self._open(paths)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def topics(self) -> list[BagTopic]:
+        """The topics of all files."""
+        return list(dict.fromkeys(topic for file in self._files for topic in file.topics))
+
+    @property
+    def message_count(self) -> int:
+        """Number of messages, as far as they can be counted before reading."""
+        return sum(file.message_count for file in self._files)
+
+    @property
+    def time_range_ns(self) -> tuple[int, int]:
+        """First and last log time; (0, 0) without messages."""
+        ranges = [file.time_range_ns for file in self._files if file.message_count]
+        return (min(first for first, _ in ranges), max(last for _, last in ranges)) if ranges else (0, 0)
+
+    @property
+    def losses(self) -> list[str]:
+        """One sentence for each thing that could not be read; more may come while reading."""
+        return self._own_losses + [loss for file in self._files for loss in file.losses]
+
+    @property
+    def progress(self) -> float:
+        """Share of the bag that was read, 0 to 1."""
+        return sum(file.progress for file in self._files) / len(self._files)
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """All messages in order of log time.
+
+        Args:
+            topics: Names of the topics to read; all when left out.
+
+        Yields:
+            (topic, type, log time [ns], serialized message).
+        """
+        wanted = None if topics is None else {name.lstrip("/") for name in topics}
+        chosen = [topic for topic in self.topics if wanted is None or topic.name in wanted]
+        for batch in self._batches({topic: number for number, topic in enumerate(chosen)}):
+            for number, log_ns, data in batch.messages():
+                yield *chosen[number], log_ns, data
+
+    def batches(self, topics: Sequence[str]) -> Iterator[MessageBatch]:
+        """All messages of some topics in order of log time, many at once.
+
+        Args:
+            topics: Names; their place here is the topic's number in the batches.
+        """
+        number_of = {name.lstrip("/"): number for number, name in enumerate(topics)}
+        return self._batches({t: number_of[t.name] for t in self.topics if t.name in number_of})
+
+    def _batches(self, number_of: Mapping[BagTopic, int]) -> Iterator[MessageBatch]:
+        ends = [file.time_range_ns for file in self._files]
+        streams = [file.batches(number_of) for file in self._files]
+        if all(before[1] < after[0] for before, after in itertools.pairwise(ends)):
+            return itertools.chain.from_iterable(streams)
+        return merge_streams(streams)
+
+    def close(self) -> None:
+        """Close all files; may be called twice."""
+        for file in self._files:
+            file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _open(self, paths: list[Path]) -> None:
+        """Open every file; one that is unreadable beside readable ones is a loss."""
+        errors: list[BagError] = []
+        for path in paths:
+            try:
+                self._files.append(_STORAGES[path.suffix](path))
+            except BagError as error:  # each file may fail on its own
+                errors.append(error)
+        if not self._files:
+            raise errors[0]
+        self._own_losses += [str(error) for error in errors]
+
+    def _find(self) -> list[Path]:
+        """The storage files."""
+        if not self._path.exists():
+            raise BagError(f"There is no bag '{self._path}'.")
+        if not self._path.is_dir():
+            if self._path.is_file() and self._path.suffix in _STORAGES:
+                return [self._path]
+            raise BagError(f"'{self._path}' is no bag: expected a rosbag2 folder, an .mcap or a .db3 file.")
+        listed = self._listed()
+        paths = sorted((path for path in self._path.iterdir() if path.suffix in _STORAGES), key=_part_number)
+        self._own_losses += [
+            f"{name}: the file is missing, its messages are lost."
+            for name in listed
+            if not (self._path / name).exists()
+        ]
+        if not paths:
+            packed = [
+                path.name for path in self._path.iterdir() if path.name.endswith((".mcap.zstd", ".db3.zstd"))
+            ]
+            hint = f"; unpack it first: zstd -d {packed[0]}" if packed else ""
+            raise BagError(f"'{self._path}' holds no .mcap or .db3 file{hint}.")
+        return paths
+
+    def _listed(self) -> list[str]:
+        """File names in the folder's metadata; none when a crash left it without."""
+        path = self._path / "metadata.yaml"
+        try:
+            tree = read_tree(path, _METADATA_BYTES) if path.exists() else None
+        except YamlTreeError as error:
+            self._own_losses.append(str(error))
+            return []
+        info = tree.get("rosbag2_bagfile_information") if isinstance(tree, dict) else None
+        if not isinstance(info, dict):
+            self._own_losses.append(f"'{self._path}' has no metadata: its recording was not finished.")
+            return []
+        if str(info.get("compression_mode") or "").lower() == "message":
+            raise BagError(
+                f"'{self._path}' is compressed message by message; convert it first: ros2 bag convert."
+            )
+        self.offered_qos = offered_qos(info)
+        files = info.get("relative_file_paths")
+        return [str(name) for name in files] if isinstance(files, list) else []
+
+
+def _part_number(path: Path) -> tuple[int, str]:
+    """Parts are numbered without leading zeros: bag_10 comes behind bag_9."""
+    number = path.stem.rpartition("_")[2]
+    return (int(number) if number.isdecimal() else 0, path.name)

@@ -1,0 +1,234 @@
+"""sqlite3 bag files, whole or damaged, in order of log time.
+
+What can still be read of a damaged file is copied to a temporary one first, so that there is one way of
+reading and memory does not grow with the bag.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import quote
+
+from swarm_loc_estimator.common.bags.bag_file import MAX_LOG_NS, BagError, BagTopic, Losses
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+_BATCH = 500
+_UNWANTED = -1
+_MAX_ID = 2**63 - 1
+_TIMED = f"WHERE typeof(timestamp) = 'integer' AND timestamp BETWEEN 0 AND {MAX_LOG_NS}"
+_MESSAGES = f"SELECT topic_id, timestamp, data FROM messages {_TIMED} ORDER BY timestamp, id"  # noqa: S608
+_VIEWS = """SELECT name FROM sqlite_master
+WHERE type = 'view' AND lower(name) IN ('topics', 'messages')"""  # they may take for ever
+_TABLES = """
+CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT);
+CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);
+"""
+
+
+class SqliteFile:
+    """One open sqlite3 bag file; see `BagFile`."""
+
+    def __init__(self, path: Path) -> None:
+        """Open it.
+
+        Raises:
+            BagError: It is no bag, or nothing of it can be read.
+        """
+        self._path = path
+        self._rescue: tempfile.TemporaryDirectory[str] | None = None
+        self._done = 0
+        self.losses = Losses(path.name)
+        self.message_count = 0
+        self.time_range_ns = (0, 0)
+        self._topics: dict[int, BagTopic] = {}
+        if not path.is_file() or path.stat().st_size == 0:
+            raise BagError(
+                f"{path} is empty." if path.is_file() else f"{path} cannot be opened: no such file."
+            )
+        self._connection = _connect(path)
+        try:
+            self._open()
+        except sqlite3.Error as error:
+            self._open_rescued(error)
+
+    @property
+    def topics(self) -> list[BagTopic]:
+        """The topics, in the order of their ids."""
+        return list(dict.fromkeys(self._topics.values()))
+
+    @property
+    def progress(self) -> float:
+        """Share of the messages that were read."""
+        return min(self._done / self.message_count, 1.0) if self.message_count else 1.0
+
+    def close(self) -> None:
+        """Close the file and forget what was rescued of it; may be called twice."""
+        self._connection.close()
+        if self._rescue:
+            self._rescue.cleanup()
+
+    def batches(self, number_of: Mapping[BagTopic, int]) -> Iterator[MessageBatch]:
+        """The messages of some topics in order of log time, equal ones in order of recording."""
+        self._done = skipped = 0
+        numbers = {topic_id: number_of.get(topic, _UNWANTED) for topic_id, topic in self._topics.items()}
+        cursor = self._connection.execute(_MESSAGES)
+        while rows := cursor.fetchmany(_BATCH):
+            self._done += len(rows)
+            valid = [
+                (numbers[topic_id], data, log_ns)
+                for topic_id, log_ns, data in rows
+                if topic_id in numbers and type(data) is bytes
+            ]
+            skipped += len(rows) - len(valid)
+            yield MessageBatch.of([row for row in valid if row[0] != _UNWANTED])
+        if skipped:
+            self.losses.say(f"{skipped} messages without a known topic or data were skipped.")
+
+    def _open(self) -> None:
+        """Read topics, count and times; raises when a page is damaged, or a column's name."""
+        rows = self._connection.execute("SELECT id, name, type FROM topics ORDER BY id").fetchall()
+        if self._connection.execute("PRAGMA integrity_check(1)").fetchone() != ("ok",):
+            raise sqlite3.DatabaseError("database disk image is malformed")
+        self._topics = {number: BagTopic(str(name).lstrip("/"), str(kind)) for number, name, kind in rows}
+        self._connection.execute(f"EXPLAIN {_MESSAGES}")
+        (stored,) = self._connection.execute("SELECT count(*) FROM messages").fetchone()
+        query = f"SELECT count(*), min(timestamp), max(timestamp) FROM messages {_TIMED}"  # noqa: S608
+        self.message_count, first, last = self._connection.execute(query).fetchone()
+        if stored > self.message_count:
+            self.losses.say(f"{stored - self.message_count} messages whose log time cannot be were skipped.")
+        self.time_range_ns = (first or 0, last or 0)
+
+    def _leave_half_page(self, folder: Path) -> None:
+        """Read whole pages only: sqlite would silently fill the last one of a cut off file with zeros."""
+        with self._path.open("rb") as source:
+            page = int.from_bytes(source.read(18)[16:], "big")
+        size = self._path.stat().st_size
+        if page < 512 or size % page == 0:
+            return
+        whole = folder / "whole_pages.db3"
+        with self._path.open("rb") as source, whole.open("wb") as target:
+            shutil.copyfileobj(source, target)
+            target.truncate(size - size % page)
+        self._connection.close()
+        self._connection = _connect(whole)
+
+    def _open_rescued(self, error: sqlite3.Error) -> None:
+        """Copy what can be read to a new file and open that."""
+        self._rescue = tempfile.TemporaryDirectory(prefix="rescued_bag_")
+        folder = Path(self._rescue.name)
+        self._leave_half_page(folder)
+        rescued = sqlite3.connect(folder / "rescued.db3", isolation_level=None)
+        try:
+            rescued.executescript("PRAGMA journal_mode=OFF; PRAGMA synchronous=OFF;" + _TABLES)
+            _copy_readable(self._connection, rescued)
+            rescued.execute("CREATE INDEX by_time ON messages(timestamp)")
+        except sqlite3.Error:
+            rescued.close()
+            self.close()
+            raise BagError(f"{self._path} is no readable sqlite3 bag: {error}.") from error
+        self._connection.close()
+        self._connection = rescued
+        self._open()
+        self.losses.say(
+            f"the database is damaged ({error}): {self.message_count} messages were kept, the rest is lost."
+        )
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    """Open without ever writing; a database whose journal cannot be shared is read as it lies there."""
+    name = f"file:{quote(str(path.resolve()))}"
+    for mode in ("?mode=ro", "?immutable=1"):
+        connection = sqlite3.connect(name + mode, uri=True, isolation_level=None)
+        try:
+            # a file shorter than its head says would otherwise be refused as a whole
+            connection.execute("PRAGMA writable_schema=ON")
+            views = connection.execute(_VIEWS).fetchone()
+        except sqlite3.Error:
+            if mode == "?immutable=1":
+                break
+            connection.close()
+        else:
+            connection.text_factory = lambda data: data.decode(errors="replace")
+            if not views:
+                return connection
+            connection.close()
+            raise BagError(f"{path} is no sqlite3 bag: its {views[0]} are computed, not stored.")
+    connection.close()
+    raise BagError(f"{path} is no sqlite3 bag.")
+
+
+def _copy_readable(source: sqlite3.Connection, target: sqlite3.Connection) -> None:
+    """Copy topics and all messages that can be read."""
+    target.execute("BEGIN")
+    topics = source.execute("SELECT id, name, type FROM topics").fetchall()
+    target.executemany("INSERT INTO topics VALUES (?, ?, ?)", topics)
+    last = _last_id(source)
+    next_id: int | None = 0
+    while next_id is not None:
+        behind, finished = _copy_stretch(source, target, next_id, last)
+        next_id = None if finished else _next_readable(source, behind, last)
+    target.execute("COMMIT")
+
+
+def _last_id(source: sqlite3.Connection) -> int:
+    """The last message's id; what a damaged page claims to be beyond it is no message."""
+    try:
+        (last,) = source.execute("SELECT max(id) FROM messages").fetchone()
+    except sqlite3.Error:
+        return _MAX_ID
+    return int(last) if isinstance(last, int) else 0
+
+
+def _copy_stretch(
+    source: sqlite3.Connection, target: sqlite3.Connection, first: int, last: int
+) -> tuple[int, bool]:
+    """Copy messages from an id on up to the end or a damaged page.
+
+    Returns:
+        The next id, and whether the end was reached.
+    """
+    next_id = first
+    query = "SELECT id, topic_id, timestamp, data FROM messages WHERE id >= ? ORDER BY id"
+    try:
+        for row in source.execute(query, (first,)):
+            if not next_id <= row[0] <= last:
+                return next_id, False
+            next_id = row[0] + 1
+            if isinstance(row[2], int) and isinstance(row[3], bytes):
+                target.execute("INSERT INTO messages VALUES (?, ?, ?, ?)", row)
+    except sqlite3.Error:
+        return next_id, False
+    return next_id, True
+
+
+def _next_readable(source: sqlite3.Connection, behind: int, last: int) -> int | None:
+    """The first readable id behind a damaged page: seen from ever further away, then narrowed down."""
+    bad, good = 0, 1
+    while not _readable(source, behind + good, last):
+        bad, good = good, 2 * good
+        if behind + good > last:
+            return None
+    while good - bad > 1:
+        middle = (bad + good) // 2
+        if _readable(source, behind + middle, last):
+            good = middle
+        else:
+            bad = middle
+    return behind + good
+
+
+def _readable(source: sqlite3.Connection, message_id: int, last: int) -> bool:
+    """Whether the next message from an id on can be read."""
+    query = "SELECT id, data FROM messages WHERE id >= ? ORDER BY id LIMIT 1"
+    try:
+        row = source.execute(query, (message_id,)).fetchone()
+    except sqlite3.Error:
+        return False
+    return row is not None and message_id <= row[0] <= last

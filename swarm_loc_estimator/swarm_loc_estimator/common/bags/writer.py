@@ -1,0 +1,157 @@
+"""Writing bags: rosbag2 folders with MCAP inside, as `ros2 bag record` leaves them.
+
+Equal input gives equal bytes, so that a bag can be compared and kept in version control. The library
+`rosbags` writes the folder, `mcap` the file inside: chunks with checksums, channels with their types' hashes.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
+from typing_extensions import Self
+
+from swarm_loc_estimator.common.bags.bag_file import BagError
+from swarm_loc_estimator.common.messages.typestore import typestore
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from types import TracebackType
+
+    from rosbags.interfaces import Connection
+    from rosbags.rosbag2.writer import StorageWriter
+
+_FOREVER = QosTime(sec=9223372036, nsec=854775807)
+RELIABLE = Qos(
+    history=QosHistory.KEEP_LAST,
+    depth=10,
+    reliability=QosReliability.RELIABLE,
+    durability=QosDurability.VOLATILE,
+    deadline=_FOREVER,
+    lifespan=_FOREVER,
+    liveliness=QosLiveliness.AUTOMATIC,
+    liveliness_lease_duration=_FOREVER,
+    avoid_ros_namespace_conventions=False,
+)
+"""Odometry, detections and estimates: reliable, small depth."""
+LATCHED = RELIABLE._replace(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
+"""A map: who subscribes later gets the newest."""
+
+
+class _McapStorage:
+    """The file inside the folder: a storage plug-in of rosbags."""
+
+    def __init__(self, folder: Path, compression: CompressionMode) -> None:
+        self.path = folder / f"{folder.name}.mcap"
+        self._file = self.path.open("xb")
+        packed = compression == CompressionMode.STORAGE
+        self._writer = McapWriter(
+            self._file, compression=CompressionType.ZSTD if packed else CompressionType.NONE
+        )
+        self._writer.start("ros2", "swarm_loc_estimator")
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[int, int] = {}
+
+    def add_msgtype(self, connection: Connection) -> None:
+        """Add the type of a topic."""
+        definition = connection.msgdef.data.encode()
+        schema = self._writer.register_schema(connection.msgtype, "ros2msg", definition)
+        self._schemas[connection.msgtype] = schema
+
+    def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
+        """Add a topic."""
+        metadata = {"offered_qos_profiles": offered_qos_profiles, "topic_type_hash": connection.digest}
+        self._channels[connection.id] = self._writer.register_channel(
+            connection.topic, "cdr", self._schemas[connection.msgtype], metadata
+        )
+
+    def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
+        """Add a message."""
+        self._writer.add_message(self._channels[connection.id], timestamp, bytes(data), timestamp)
+
+    def close(self, version: int, metadata: str) -> None:
+        """End the file."""
+        del version
+        self._writer.add_metadata("rosbag2", {"serialized_metadata": metadata})
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._file.close()
+
+    def abort(self) -> None:
+        """Close the file as it is."""
+        self._file.close()
+
+
+class _Rosbag2Writer(Writer):
+    """A writer of folders with such a file."""
+
+    STORAGE_PLUGINS: Mapping[StoragePlugin, type[StorageWriter]] = {StoragePlugin.MCAP: _McapStorage}
+
+
+class BagWriter:
+    """A new bag; use it as a context manager, an error inside leaves no bag behind.
+
+    Args:
+        path: Folder to create; must not exist.
+        compress: Whether chunks are compressed with zstd.
+
+    Raises:
+        BagError: The folder is there already, or cannot be created.
+    """
+
+    def __init__(self, path: Path, *, compress: bool = False) -> None:
+        self._path = path
+        self._connections: dict[str, Connection] = {}
+        try:
+            self._writer = _Rosbag2Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+            if compress:
+                self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+            self._writer.open()
+        except (WriterError, OSError) as error:
+            raise BagError(f"The bag '{path}' cannot be created: {error}") from error
+
+    def add_topic(self, name: str, message_type: str, *, is_latched: bool = False) -> None:
+        """Announce a topic, such as robot1/odom of nav_msgs/msg/Odometry.
+
+        Names are written fully qualified, as a recorder writes them.
+
+        Args:
+            name: Of the topic.
+            message_type: Of its messages.
+            is_latched: Whether its publisher is said to have kept the newest for late subscribers.
+        """
+        topic = "/" + name.lstrip("/")
+        self._connections[name] = self._writer.add_connection(
+            topic,
+            message_type,
+            typestore=typestore(),
+            offered_qos_profiles=[LATCHED if is_latched else RELIABLE],
+        )
+
+    def write(self, topic: str, log_ns: int, data: bytes) -> None:
+        """Add a serialized message of an announced topic."""
+        self._writer.write(self._connections[topic], log_ns, data)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self._writer.close()
+        else:
+            self._writer.abort()
+            shutil.rmtree(self._path, ignore_errors=True)

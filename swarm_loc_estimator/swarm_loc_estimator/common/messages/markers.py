@@ -1,0 +1,199 @@
+"""Serialize visualization_msgs/MarkerArray of a swarm: a handful of markers, however many robots.
+
+Robots are points of one list in the colours of their status, headings, 95 % ellipses and sightings are lines.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.messages.cdr_writer import CdrWriter, stamp_bytes
+from swarm_loc_estimator.common.messages.estimates import EstimateMessage
+from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
+from swarm_loc_estimator.timeline.sightings import Sightings
+
+LINE_LIST, CUBE_LIST, SPHERE_LIST, TEXT = 5, 6, 7, 9
+_DELETE_ALL = 3
+_COLOURS = np.array(
+    [
+        [0.48, 0.53, 0.56, 1.0],  # waiting
+        [0.00, 0.45, 0.70, 1.0],  # tracked
+        [0.48, 0.53, 0.56, 1.0],  # stale
+        [0.90, 0.62, 0.00, 1.0],  # unconfirmed
+        [0.84, 0.37, 0.00, 1.0],  # contradicted
+    ]
+)
+_USED, _GATED, _KEPT = [0.0, 0.62, 0.45, 0.7], [0.84, 0.37, 0.0, 0.9], [0.9, 0.62, 0.0, 0.9]
+_VERDICT_COLOURS = np.array([_KEPT, _USED, _GATED, _KEPT, _KEPT])
+_INK = (0.2, 0.25, 0.3, 1.0)
+_CHI2_95 = 5.991
+"""Of two degrees of freedom."""
+_CORNERS = 24
+_MAX_LABELS = 100
+_HEIGHT = 0.01
+_BODY_PER_WHEELS = 1.32
+"""Diameter of a body by the distance of its wheels, as of an e-puck."""
+
+
+class _Marker(NamedTuple):
+    """What the markers differ in."""
+
+    name: str
+    kind: int
+    scale: tuple[float, float, float]
+    points: FloatArray
+    colours: FloatArray
+    text: str = ""
+    number: int = 0
+
+
+class MarkersEncoder:
+    """Serializes the markers of a swarm.
+
+    Args:
+        swarm: Its description.
+        frame_id: Frame of the poses.
+    """
+
+    def __init__(self, swarm: Swarm, frame_id: str) -> None:
+        self._frame_id = frame_id
+        self._names = [robot.name for robot in swarm.robots]
+        widths = [robot.odometry.wheel_separation for robot in swarm.robots]
+        self._size = _BODY_PER_WHEELS * float(np.median(widths)) if widths else 0.07
+        self._landmarks = np.array([[one.x, one.y, one.z] for one in swarm.landmarks]).reshape(-1, 3)
+        self._faces = _faces(swarm.landmarks, self._size)
+
+    def encode(self, estimate: EstimateMessage, sightings: Sightings | None = None) -> bytes:
+        """The message for poses and what was seen; what it does not hold any more is deleted."""
+        located: BoolArray = ~np.isnan(estimate.pose[:, 0])
+        pose, size = estimate.pose[located], self._size
+        colours = _COLOURS[np.minimum(estimate.status[located], len(_COLOURS) - 1)]
+        line = (0.15 * size, 0.0, 0.0)
+        markers = [
+            _Marker("landmarks", CUBE_LIST, (0.4 * size,) * 3, self._landmarks, _inked(self._landmarks)),
+            _Marker("landmarks_facing", LINE_LIST, line, self._faces, _inked(self._faces)),
+            _Marker("robots", SPHERE_LIST, (size, size, 0.5 * size), _lifted(pose), colours),
+            _lines("headings", line, _headings(pose, size)),
+            _lines("ellipses_95", (0.06 * size, 0.0, 0.0), ellipses(pose, estimate.covariance[located])),
+        ]
+        if sightings is not None:
+            markers.append(self._sightings(estimate, sightings))
+        if len(self._names) <= _MAX_LABELS:
+            names = [name for name, there in zip(self._names, located.tolist(), strict=True) if there]
+            markers += self._labels(names, pose)
+        return self._message(estimate.stamp_ns, [one for one in markers if one.text or len(one.points)])
+
+    def _sightings(self, estimate: EstimateMessage, seen: Sightings) -> _Marker:
+        places = np.concatenate([estimate.pose[:, :2], self._landmarks[:, :2]])
+        target = np.where(seen.target < 0, len(estimate.pose) - 1 - seen.target, seen.target)
+        ends = np.stack([places[seen.observer], places[target]], axis=1)
+        shown = np.isfinite(ends).all(axis=(1, 2)) & (seen.observer >= 0)
+        colours = _VERDICT_COLOURS[np.minimum(seen.verdict[shown], len(_VERDICT_COLOURS) - 1)]
+        scale = (0.05 * self._size, 0.0, 0.0)
+        points = _lifted(ends[shown].reshape(-1, 2))
+        return _Marker("sightings", LINE_LIST, scale, points, np.repeat(colours, 2, axis=0))
+
+    def _labels(self, names: list[str], pose: FloatArray) -> list[_Marker]:
+        above = _lifted(pose) + np.array([0.0, 0.0, self._size])
+        size = (0.0, 0.0, 0.6 * self._size)
+        pairs = enumerate(zip(names, above, strict=True))
+        return [_Marker("names", TEXT, size, at[None], _inked(at[None]), name, k) for k, (name, at) in pairs]
+
+    def _message(self, stamp_ns: int, markers: list[_Marker]) -> bytes:
+        writer = CdrWriter()
+        writer.count(1 + len(markers))
+        self._add(writer, stamp_ns, _Marker("", CUBE_LIST, (0.0,) * 3, _NONE, _NONE), _DELETE_ALL)
+        for marker in markers:
+            self._add(writer, stamp_ns, marker, 0)
+        return writer.message()
+
+    def _add(self, writer: CdrWriter, stamp_ns: int, marker: _Marker, action: int) -> None:
+        """One visualization_msgs/Marker, field by field."""
+        is_text = marker.kind == TEXT
+        at = marker.points[0] if is_text else np.zeros(3)
+        points, colours = (_NONE, _NONE) if is_text else (marker.points, marker.colours)
+        writer.raw(4, stamp_bytes(np.array([stamp_ns])).tobytes())
+        writer.text(self._frame_id)
+        writer.text(marker.name)
+        writer.raw(4, struct.pack("<iii", marker.number, marker.kind, action))
+        writer.raw(8, struct.pack("<7d", *at, 0.0, 0.0, 0.0, 1.0))
+        writer.raw(8, struct.pack("<3d", *marker.scale))
+        writer.raw(4, struct.pack("<4f", *_INK))
+        writer.raw(4, bytes(8))  # lifetime: until the next
+        writer.raw(1, bytes(1))
+        _add_rows(writer, points, "<f8")
+        _add_rows(writer, colours, "<f4")
+        writer.text("")  # no texture
+        writer.raw(4, bytes(8))
+        writer.text("")
+        writer.text("")
+        writer.count(0)
+        writer.count(0)
+        writer.text(marker.text)
+        writer.text("")  # no mesh
+        writer.text("")
+        writer.count(0)
+        writer.raw(1, bytes(1))
+
+
+_NONE = np.zeros((0, 3))
+
+
+def _add_rows(writer: CdrWriter, rows: FloatArray, kind: str) -> None:
+    """A sequence of points or colours."""
+    writer.count(len(rows))
+    if len(rows):
+        data = np.ascontiguousarray(rows, dtype=kind)
+        writer.raw(data.itemsize, data.tobytes())
+
+
+def _lines(name: str, scale: tuple[float, float, float], points: FloatArray) -> _Marker:
+    return _Marker(name, LINE_LIST, scale, points, _inked(points))
+
+
+def _inked(points: FloatArray) -> FloatArray:
+    """The colour of lines for each point."""
+    return np.tile(_INK, (len(points), 1))
+
+
+def _lifted(points: FloatArray) -> FloatArray:
+    """Points (n, 3) a little above the ground at x, y of rows (n, 2 or more)."""
+    return np.column_stack([points[:, :2], np.full(len(points), _HEIGHT)])
+
+
+def _headings(pose: FloatArray, size: float) -> FloatArray:
+    """Lines (2 n, 3) from the middle of each robot ahead."""
+    ahead = pose[:, :2] + size * np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
+    points = np.stack([pose[:, :2], ahead], axis=1).reshape(-1, 2)
+    return np.column_stack([points, np.full(len(points), size)])
+
+
+def ellipses(pose: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Lines (n * 2 * corners, 3) around the 95 % ellipses of positions.
+
+    Args:
+        pose: (n, 3) in map.
+        covariance: (n, 3, 3), of which x and y count.
+    """
+    turn = 2.0 * np.pi * np.arange(_CORNERS + 1) / _CORNERS
+    circle = np.stack([np.cos(turn), np.sin(turn)])
+    values, vectors = np.linalg.eigh(covariance[:, :2, :2])
+    axes = vectors * np.sqrt(_CHI2_95 * np.maximum(values, 0.0))[:, None, :]
+    around: NDArray[np.float64] = pose[:, :2, None] + axes @ circle
+    lines = np.stack([around[..., :-1], around[..., 1:]], axis=-1)  # (n, 2, corners, 2 ends)
+    return _lifted(np.moveaxis(lines, 1, -1).reshape(-1, 2))
+
+
+def _faces(landmarks: tuple[Landmark, ...], size: float) -> FloatArray:
+    """Lines (2 n, 3) from landmarks to where they face."""
+    ends = [
+        [[one.x, one.y, one.z], [one.x + size * np.cos(one.yaw), one.y + size * np.sin(one.yaw), one.z]]
+        for one in landmarks
+        if one.yaw is not None
+    ]
+    return np.array(ends).reshape(-1, 3)

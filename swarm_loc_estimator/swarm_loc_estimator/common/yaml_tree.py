@@ -1,0 +1,163 @@
+"""YAML 1.2 files as trees: decimal numbers, every key once, one sentence for each error."""
+
+from __future__ import annotations
+
+import re
+import reprlib
+import warnings
+from io import StringIO
+from typing import TYPE_CHECKING, Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.constructor import ConstructorError, SafeConstructor
+from ruamel.yaml.error import YAMLError
+from ruamel.yaml.nodes import Node, ScalarNode
+from ruamel.yaml.representer import SafeRepresenter
+from ruamel.yaml.resolver import VersionedResolver
+
+from swarm_loc_estimator.common.errors import UserError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+Tree = Any
+"""dict, list, str, int, float, bool or None."""
+
+MAX_BYTES = 2_000_000
+"""Larger files are refused [byte]; a thousand robots take a fourth of it."""
+
+_TAG = "tag:yaml.org,2002:"
+_FLOAT = r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"
+_SCALARS = [
+    (_TAG + kind, re.compile(f"^({pattern})$"))
+    for kind, pattern in (
+        ("null", r"~|null|Null|NULL|"),
+        ("bool", r"true|True|TRUE|false|False|FALSE"),
+        ("int", r"[-+]?[0-9]+"),
+        ("float", _FLOAT),
+    )
+]
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 100
+
+
+class YamlTreeError(UserError):
+    """A file that is not such YAML; the message is one sentence."""
+
+
+class _Resolver(VersionedResolver):
+    """Numbers are decimal; what else YAML allows, such as 0x10 and 1_000, is text."""
+
+    @property
+    def versioned_resolver(self) -> dict[None, list[tuple[str, re.Pattern[str]]]]:
+        return {None: _SCALARS}
+
+    @property
+    def processing_version(self) -> tuple[int, int]:
+        return 1, 2  # whatever a %YAML directive says
+
+
+class _Constructor(SafeConstructor):
+    """Values of the kinds above alone; no merge keys, whose expansion has no bound."""
+
+    yaml_constructors = {  # noqa: RUF012  # the library's own attribute
+        tag: SafeConstructor.yaml_constructors[tag]
+        for tag in (*(_TAG + kind for kind in ("null", "bool", "int", "float", "str", "seq", "map")), None)
+    }
+
+    def construct_object(self, node: Node, deep: bool = False) -> Tree:  # noqa: ARG002
+        if node in self.recursive_objects:
+            raise ConstructorError(problem="a value contains itself", problem_mark=node.start_mark)
+        return super().construct_object(node, deep=True)
+
+    def flatten_mapping(self, node: Node) -> None:
+        pass
+
+    def check_mapping_key(self, node: Node, key_node: Node, mapping: Tree, key: Tree, value: Tree) -> bool:
+        del node, value
+        problem = None
+        if isinstance(key, tuple):
+            problem = "a mapping has a key that is no word or number,"
+        elif isinstance(key, bool) or not isinstance(key, str | int):
+            problem = f"{shown(key)} is a key that is neither a name nor a whole number,"
+        elif key in mapping:
+            problem = f"{shown(str(key))} is given twice, again"
+        if problem:
+            raise ConstructorError(problem=problem, problem_mark=key_node.start_mark)
+        return True
+
+
+class _Representer(SafeRepresenter):
+    """Numbers with a point: without it, readers of YAML 1.1 take 2e-05 for text."""
+
+    def represent_float(self, data: float) -> ScalarNode:
+        node: ScalarNode = super().represent_float(data)
+        if "." not in node.value:
+            node.value = node.value.replace("e", ".0e")
+        return node
+
+
+_Representer.add_representer(float, _Representer.represent_float)
+
+
+def shown(value: object) -> str:
+    """A value for an error message: short, on one line."""
+    return _SHORT.repr(value).replace("\n", " ")
+
+
+def read_tree(path: Path, most_bytes: int = MAX_BYTES) -> Tree:
+    """Read a YAML file.
+
+    Args:
+        path: The file.
+        most_bytes: Larger files are refused [byte].
+
+    Returns:
+        Nested dicts, lists and scalars.
+
+    Raises:
+        YamlTreeError: It cannot be read, is too large, is not YAML, or has a key twice.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(most_bytes + 1)
+    except OSError as error:
+        raise YamlTreeError(f"{path} cannot be read: {error.strerror or error}.") from error
+    if len(data) > most_bytes:
+        raise YamlTreeError(f"{path} has more than the {most_bytes} bytes that are sensible.")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of anchors that are used twice
+            return _yaml().load(data)
+    except ConstructorError as error:
+        raise YamlTreeError(f"{path}: {_one_line(error)}.") from error
+    except RecursionError:
+        raise YamlTreeError(f"{path} is nested too deeply.") from None
+    except (YAMLError, ValueError, LookupError, TypeError) as error:
+        raise YamlTreeError(f"{path} is not YAML: {_one_line(error)}.") from error
+
+
+def tree_text(tree: Tree) -> str:
+    """A tree as YAML, its innermost mappings and lists on one line each."""
+    yaml, stream = _yaml(), StringIO()
+    yaml.default_flow_style = None
+    yaml.dump(tree, stream)
+    return stream.getvalue()
+
+
+def _yaml() -> YAML:
+    """The library, in Python alone: in its parser in C, deeply nested brackets crash the process."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]  # the library's is too narrow
+    yaml.width = 1000
+    yaml.Resolver, yaml.Constructor, yaml.Representer = _Resolver, _Constructor, _Representer
+    return yaml
+
+
+def _one_line(error: Exception) -> str:
+    """The library's several lines in one, with the place."""
+    problem = getattr(error, "problem", None) or str(error)
+    mark = getattr(error, "problem_mark", None)
+    place = f" in line {mark.line + 1}" if mark is not None else ""
+    return " ".join(f"{problem}{place}".split())

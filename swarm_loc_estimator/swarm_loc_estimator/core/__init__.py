@@ -1,1 +1,0 @@
-"""The estimator itself: no ROS, no files, no clock."""

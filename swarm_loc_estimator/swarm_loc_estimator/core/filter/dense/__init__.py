@@ -1,1 +1,0 @@
-"""The dense filter: one full covariance matrix."""

@@ -1,1 +1,0 @@
-"""From messages to measurements: validation, cameras, infrared."""

@@ -1,1 +1,0 @@
-"""Replay of bags, errors against ground truth, reports."""

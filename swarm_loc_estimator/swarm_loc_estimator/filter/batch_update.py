@@ -1,0 +1,166 @@
+"""Batch update: many measurements of one period held against one belief, and used together."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.small_matrix import assign
+from swarm_loc_estimator.filter import prediction
+from swarm_loc_estimator.filter.belief import BeliefArrays, to_map
+from swarm_loc_estimator.filter.calibration_states import CAMERA_SCALE, CAMERA_YAW
+from swarm_loc_estimator.filter.innovation import (
+    InnovationBatch,
+    body_columns,
+    evaluate,
+    new_scratch,
+    relative_motion,
+)
+from swarm_loc_estimator.filter.integrity.divergence import (
+    LossLimits,
+    confirm,
+    count_gated,
+    is_uncertain,
+)
+from swarm_loc_estimator.filter.integrity.fault_detection import assess, is_set_aside
+from swarm_loc_estimator.filter.measurement_model import MeasurementColumns
+from swarm_loc_estimator.odometry.look_up import look_up, look_up_pose, new_sample
+from swarm_loc_estimator.odometry.preintegration import Preintegrated, TrackArrays
+
+
+@compiled
+def predict_all(
+    measurements: MeasurementColumns,
+    stamp_ns: int,
+    tracks: TrackArrays,
+    belief: BeliefArrays,
+    limits: LossLimits,
+    batch: InnovationBatch,
+    uncertain: BoolArray,
+) -> None:
+    """Predict every robot involved to one instant, and find where all were at their measurements' stamps.
+
+    Args:
+        measurements: (m,) between robots that are located.
+        stamp_ns: The instant.
+        tracks: Odometry.
+        belief: Changed in place.
+        limits: Beyond which a robot is given up.
+        batch: (m,) its `pose` and `motion` are written; nobody's pose is not.
+        uncertain: (N,) written: robots involved that no longer know where they are.
+    """
+    involved, sample = np.zeros(belief.tracked.size, dtype=np.bool_), new_sample(1)
+    scratch = prediction.new_scratch()
+    for k in range(measurements.stamp_ns.size):
+        for robot in (measurements.observer[k], measurements.target[k]):
+            if robot >= 0 and not involved[robot]:
+                involved[robot] = True
+                look_up(tracks, robot, stamp_ns, sample, 0)
+                to = Preintegrated(stamp_ns, sample.covariance[0], sample.jacobian[0])
+                prediction.predict(belief, robot, to, scratch)
+    for k in range(measurements.stamp_ns.size):
+        _write_poses(measurements, k, tracks, belief, limits, batch, uncertain)
+
+
+@inlined
+def _write_poses(
+    measurements: MeasurementColumns,
+    k: int,
+    tracks: TrackArrays,
+    belief: BeliefArrays,
+    limits: LossLimits,
+    batch: InnovationBatch,
+    uncertain: BoolArray,
+) -> None:
+    """Write what `predict_all` does of measurement k, by the belief predicted."""
+    sides = (measurements.observer[k], measurements.target[k])
+    for i in range(2):
+        if sides[i] >= 0:
+            pose = batch.pose[k, i]
+            if _is_of_same_image(measurements, k, i):
+                assign(pose, batch.pose[k - 1, i])
+                continue
+            look_up_pose(tracks, sides[i], measurements.stamp_ns[k], pose)
+            to_map(belief, sides[i], pose)
+            uncertain[sides[i]] |= is_uncertain(belief, sides[i], pose, limits)
+    if measurements.landmark[k] > 0:
+        assign(batch.pose[k, 1], belief.landmark[measurements.landmark[k] - 1])
+    relative_motion(measurements, k, tracks, belief, batch.pose[k], batch.motion[k])
+
+
+@inlined
+def _is_of_same_image(measurements: MeasurementColumns, k: int, side: int) -> bool:
+    """Whether the observer of measurement k was looked up at the same instant for the one before it."""
+    if side != 0 or k == 0 or measurements.observer[k] != measurements.observer[k - 1]:
+        return False
+    same: bool = measurements.stamp_ns[k] == measurements.stamp_ns[k - 1]
+    return same
+
+
+@compiled
+def related_columns(measurements: MeasurementColumns, belief: BeliefArrays) -> IntArray:
+    """The first columns (m, 3) of observers, targets and observers' cameras; -1: there is none."""
+    columns = np.empty((measurements.stamp_ns.size, 3), dtype=np.int64)
+    for k in range(columns.shape[0]):
+        columns[k, 0], columns[k, 1] = body_columns(measurements, k, belief)
+        columns[k, 2] = -1
+        for m in (CAMERA_YAW, CAMERA_SCALE):
+            column = belief.table.column[max(measurements.observer[k], 0), m]
+            if measurements.observer[k] >= 0 and column >= 0:
+                columns[k, 2] = column - (m - CAMERA_YAW)
+    return columns
+
+
+@compiled
+def evaluate_all(measurements: MeasurementColumns, belief: BeliefArrays, batch: InnovationBatch) -> None:
+    """Evaluate the innovations of all measurements (m,) against one belief, see `evaluate`."""
+    scratch = new_scratch()
+    for k in range(measurements.stamp_ns.size):
+        evaluate(measurements, k, belief, batch, k, scratch)
+
+
+@compiled
+def assess_all(
+    measurements: MeasurementColumns,
+    belief: BeliefArrays,
+    limits: LossLimits,
+    looks: tuple[FloatArray, FloatArray, IntArray],
+    passed: BoolArray,
+) -> BoolArray:
+    """Assess all measurements (m,); return which robots and landmarks (N + L,) are contradicted.
+
+    Those of pairs set aside do not pass.
+    """
+    contradicted = np.zeros(belief.integrity.doubt.size, dtype=np.bool_)
+    for k in range(passed.size):
+        look = (looks[0][k], (looks[1][k, 0], looks[1][k, 1]), looks[2][k])
+        source = assess(measurements, k, belief, limits.max_doubt, look)
+        if source >= 0:
+            contradicted[source] = True
+        passed[k] &= not is_set_aside(measurements, k, belief)
+    return contradicted
+
+
+@compiled
+def confirm_all(measurements: MeasurementColumns, belief: BeliefArrays, passed: BoolArray) -> BoolArray:
+    """Hold all measurements (m,) against poses that were assumed; return which robots (N,) are elsewhere."""
+    lost = np.zeros(belief.tracked.size, dtype=np.bool_)
+    for k in range(passed.size):
+        robot = confirm(measurements, k, belief, passed[k])
+        if robot >= 0:
+            lost[robot] = True
+    return lost
+
+
+@compiled
+def count_all_gated(
+    measurements: MeasurementColumns, belief: BeliefArrays, passed: BoolArray, limits: LossLimits
+) -> BoolArray:
+    """Count the gated of all measurements (m,); return whether each robot (N,) has had too many in a row."""
+    lost = np.zeros(belief.tracked.size, dtype=np.bool_)
+    for k in range(passed.size):
+        robot = count_gated(measurements, k, belief, passed[k], limits)
+        if robot >= 0:
+            lost[robot] = True
+    return lost

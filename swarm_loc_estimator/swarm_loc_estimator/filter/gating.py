@@ -1,0 +1,69 @@
+"""Gating: the Mahalanobis distance of an innovation, and a heading that is robust to flips."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import gammaincinv
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import inlined
+from swarm_loc_estimator.common.small_matrix import factor_numbers
+
+_STUDENT_DOF = 4.0
+
+
+def gate_threshold(probability: ArrayLike) -> FloatArray:
+    """The squared distance of two components that good measurements exceed with 1 - probability."""
+    threshold: FloatArray = 2.0 * gammaincinv(1.0, np.asarray(probability, dtype=float))
+    return threshold
+
+
+@inlined
+def squared_distance(innovation: FloatArray, covariance: FloatArray) -> float:
+    """Normalised innovation squared of an innovation (3,) under its covariance (3, 3)."""
+    aa, ba, bb, ca, cb, cc = factor_numbers(covariance)
+    a = innovation[0] / aa
+    b = (innovation[1] - ba * a) / bb
+    c = (innovation[2] - ca * a - cb * b) / cc
+    c = c / cc
+    b = (b - cb * c) / bb
+    a = (a - ba * b - ca * c) / aa
+    distance: float = innovation[0] * a + innovation[1] * b + innovation[2] * c
+    return distance
+
+
+@inlined
+def position_distance(
+    innovation: FloatArray, covariance: FloatArray, more: tuple[float, float] = (0.0, 0.0)
+) -> float:
+    """Normalised square of the first two components, on which alone the gate decides.
+
+    The heading has no vote: the planar ambiguity of a square marker flips it in otherwise good sightings.
+
+    Args:
+        innovation: (3,).
+        covariance: (3, 3) of it.
+        more: Variances added to those of both components.
+    """
+    a, b, d = covariance[0, 0] + more[0], covariance[0, 1], covariance[1, 1] + more[1]
+    x, y = innovation[0], innovation[1]
+    distance: float = (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
+    return distance
+
+
+@inlined
+def soften_heading(innovation: FloatArray, covariance: FloatArray, noise: FloatArray) -> None:
+    """Enlarge the heading's part of `noise` (3, 3) where its innovation is unlikely: flips count little.
+
+    Student's t with 4 degrees of freedom instead of a normal; `covariance` (3, 3) is the innovation's.
+    """
+    normalised = innovation[2] * innovation[2] / covariance[2, 2]
+    factor = (_STUDENT_DOF + normalised) / (_STUDENT_DOF + 1.0)
+    if factor > 1.0:
+        scale = np.sqrt(factor)
+        noise[0, 2] *= scale
+        noise[1, 2] *= scale
+        noise[2, 0] *= scale
+        noise[2, 1] *= scale
+        noise[2, 2] *= factor

@@ -1,0 +1,344 @@
+"""Innovations: measurements linearised about the belief and gated."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
+from swarm_loc_estimator.filter.belief import BeliefArrays, covariance_within, own_within
+from swarm_loc_estimator.filter.calibration_states import CAMERA_SCALE, CAMERA_YAW
+from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS, use_mean
+from swarm_loc_estimator.filter.gating import position_distance, soften_heading, squared_distance
+from swarm_loc_estimator.filter.integrity.fault_detection import (
+    cause_of,
+    noise_of_frequent_looks,
+    small_variances,
+)
+from swarm_loc_estimator.filter.integrity.noise_inflation import add_hidden_noise, stamp_variance
+from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, innovation, predict_one
+from swarm_loc_estimator.odometry.look_up import rate_at
+from swarm_loc_estimator.odometry.preintegration import TrackArrays
+
+DEPENDS_ON = 8
+"""Filter columns that a measurement depends on: both bodies, observer first, yaw and scale of the camera."""
+
+
+class Scratch(NamedTuple):
+    """Where one evaluation after the other is worked out: memory of its own for each would cost more.
+
+    Attributes:
+        predicted: (3,) value.
+        other: (3,) innovation of the alternative.
+        chain: (3, 5) Jacobian of the value, see `measurement_model.predict`.
+        difference: (3, 3) covariance of xi_target - xi_observer.
+        expected: (3, 3) covariance of the innovation.
+        variances: (3,) of the predicted value.
+    """
+
+    predicted: FloatArray
+    other: FloatArray
+    chain: FloatArray
+    difference: FloatArray
+    expected: FloatArray
+    variances: FloatArray
+
+
+class InnovationBatch(NamedTuple):
+    """Measurements (m,) held against one belief.
+
+    Attributes:
+        pose: (m, 2, 3) observers and targets in `map` at the stamps, or by what a landmark is moved.
+        motion: (m, 3) how fast xi_target - xi_observer changes by driving [1/s], see `relative_motion`.
+        across: (m, 3, 5) covariance of the observer's error with the target's, and of the target's with those
+            of yaw and scale of the observer's camera.
+        columns: (m, DEPENDS_ON) what each depends on.
+        jacobian: (m, 3, DEPENDS_ON) of the innovation.
+        innovation: (m, 3) measured minus predicted.
+        noise: (m, 3, 3) covariances of the measurements, as they are used.
+        pair: (m, PAIR_ROWS, 3) what to remember of its pair when it is used, see `correlated_noise`.
+        distance: (m,) squared Mahalanobis distance of the position, small errors left out.
+        whitened: (m, 2) position innovation over its standard deviation, likewise.
+        cause: (m,) what may explain the innovation, see `integrity.cause_of`.
+        passed: (m,) whether the gate lets it through.
+        nis: (m,) normalised innovation squared.
+    """
+
+    pose: FloatArray
+    motion: FloatArray
+    across: FloatArray
+    columns: IntArray
+    jacobian: FloatArray
+    innovation: FloatArray
+    noise: FloatArray
+    pair: FloatArray
+    distance: FloatArray
+    whitened: FloatArray
+    cause: IntArray
+    passed: BoolArray
+    nis: FloatArray
+
+
+@compiled
+def new_batch(count: int) -> InnovationBatch:
+    """Room for `count` measurements."""
+    return InnovationBatch(
+        np.zeros((count, 2, 3)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3, 5)),
+        np.zeros((count, DEPENDS_ON), dtype=np.int64),
+        np.zeros((count, 3, DEPENDS_ON)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3, 3)),
+        np.zeros((count, PAIR_ROWS, 3)),
+        np.zeros(count),
+        np.zeros((count, 2)),
+        np.zeros(count, dtype=np.int64),
+        np.zeros(count, dtype=np.bool_),
+        np.zeros(count),
+    )
+
+
+@compiled
+def new_scratch() -> Scratch:
+    """Room to evaluate measurements in."""
+    return Scratch(
+        np.zeros(3), np.zeros(3), np.zeros((3, 5)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
+    )
+
+
+@inlined
+def evaluate(
+    measurements: MeasurementColumns,
+    k: int,
+    belief: BeliefArrays,
+    batch: InnovationBatch,
+    row: int,
+    scratch: Scratch,
+) -> None:
+    """Linearise measurement k about the belief and gate it; of two planar solutions the likelier counts.
+
+    Args:
+        measurements: (m,).
+        k: Which one.
+        belief: Not changed.
+        batch: Its `pose` and `motion` are read, all others written; `across` is read, too, unless the whole
+            covariance is at hand.
+        row: Where in the batch.
+        scratch: Written.
+    """
+    columns, jacobian, difference = batch.columns[row], batch.jacobian[row], batch.innovation[row]
+    pose, motion, noise = batch.pose[row], batch.motion[row], batch.noise[row]
+    bodies = body_columns(measurements, k, belief)
+    camera, camera_columns = _camera(belief, measurements.observer[k])
+    predicted, chain, s, variances = scratch.predicted, scratch.chain, scratch.expected, scratch.variances
+    predict_one(measurements, k, pose[0], pose[1], camera, predicted, chain)
+    _write_jacobian(chain, bodies, camera_columns, columns, jacobian)
+    assign_matrix(noise, measurements.covariance[k])
+    add_hidden_noise(measurements, k, belief, noise)
+    of_stamp = stamp_variance(measurements, k, belief)
+    if of_stamp > 0.0:
+        _add_stamp_noise(chain, motion, of_stamp, noise)
+    assign_matrix(s, noise)
+    if belief.covariance.shape[0] > 0:
+        _read_across(belief.covariance, bodies, camera_columns, batch.across[row])
+    _add_uncertainty(belief, (bodies, camera_columns), chain, batch.across[row], scratch.difference, s)
+    for i in range(3):
+        variances[i] = s[i, i] - noise[i, i]
+    innovation(measurements, k, measurements.value[k], predicted, difference)
+    if measurements.has_alternative[k]:
+        other = scratch.other
+        innovation(measurements, k, measurements.alternative[k], predicted, other)
+        if squared_distance(other, s) < squared_distance(difference, s):
+            assign(difference, other)
+    batch.passed[row] = position_distance(difference, s) <= measurements.gate[k]
+    small = small_variances(measurements.kind[k], predicted)
+    batch.distance[row] = position_distance(difference, s, small)
+    for i in range(2):
+        batch.whitened[row, i] = difference[i] / math.sqrt(s[i, i] + small[i])
+    batch.cause[row] = cause_of(measurements.kind[k], difference, predicted)
+    if measurements.has_heading[k]:
+        before = (noise[0, 2], noise[1, 2], noise[2, 2])
+        soften_heading(difference, s, noise)
+        for i in range(3):
+            s[i, 2] += noise[i, 2] - before[i]
+            if i < 2:
+                s[2, i] = s[i, 2]
+    batch.nis[row] = squared_distance(difference, s)
+    scale = noise_of_frequent_looks(measurements, k, belief)
+    for i in range(3):
+        for j in range(3):
+            noise[i, j] *= scale
+    use_mean(measurements, k, belief, (pose, predicted, variances), difference, noise, batch.pair[row])
+
+
+@inlined
+def relative_motion(
+    measurements: MeasurementColumns,
+    k: int,
+    tracks: TrackArrays,
+    belief: BeliefArrays,
+    pose: FloatArray,
+    motion: FloatArray,
+) -> None:
+    """Write how fast xi_target - xi_observer (3,) of measurement k changes by both robots' driving [1/s].
+
+    Zero where the stamp is exact, and it does not matter.
+
+    Args:
+        measurements: (m,).
+        k: Which one.
+        tracks: Odometry.
+        belief: Not changed.
+        pose: (2, 3) of observer and target in `map`.
+        motion: Written.
+    """
+    motion.fill(0.0)
+    if stamp_variance(measurements, k, belief) == 0.0:
+        return
+    sides = (measurements.observer[k], measurements.target[k])
+    for i in range(2):
+        if sides[i] >= 0:
+            rate = rate_at(tracks, sides[i], measurements.stamp_ns[k])
+            cos, sin, sign = np.cos(pose[i, 2]), np.sin(pose[i, 2]), 2.0 * i - 1.0
+            # the body's own velocity, seen from the origin of map
+            motion[0] += sign * (cos * rate[0] - sin * rate[1] + rate[2] * pose[i, 1])
+            motion[1] += sign * (sin * rate[0] + cos * rate[1] - rate[2] * pose[i, 0])
+            motion[2] += sign * rate[2]
+
+
+@inlined
+def _camera(belief: BeliefArrays, observer: int) -> tuple[tuple[float, float], tuple[int, int]]:
+    """Yaw and scale of an observer's camera, and their columns; -1: has none."""
+    if observer < 0:
+        return (0.0, 0.0), (-1, -1)
+    parameter, column = belief.parameter, belief.table.column
+    return (
+        (parameter[observer, CAMERA_YAW], parameter[observer, CAMERA_SCALE]),
+        (column[observer, CAMERA_YAW], column[observer, CAMERA_SCALE]),
+    )
+
+
+@inlined
+def _write_jacobian(
+    chain: FloatArray,
+    bodies: tuple[int, int],
+    camera_columns: tuple[int, int],
+    columns: IntArray,
+    jacobian: FloatArray,
+) -> None:
+    """Write the Jacobian of an innovation (3, DEPENDS_ON) by the state's columns (DEPENDS_ON,).
+
+    Columns of nobody do not matter: their Jacobian is zero.
+    """
+    for j in range(3):
+        columns[j], columns[3 + j] = max(bodies[0], 0) + j, max(bodies[1], 0) + j
+        for i in range(3):
+            jacobian[i, j] = -chain[i, j] if bodies[0] >= 0 else 0.0
+            jacobian[i, 3 + j] = chain[i, j] if bodies[1] >= 0 else 0.0
+    for j in range(2):
+        columns[6 + j] = max(camera_columns[j], 0)
+        for i in range(3):
+            jacobian[i, 6 + j] = chain[i, 3 + j] if camera_columns[j] >= 0 else 0.0
+
+
+@inlined
+def _add_stamp_noise(chain: FloatArray, motion: FloatArray, variance: float, noise: FloatArray) -> None:
+    """Add to `noise` (3, 3) what a stamp of such variance does to a value that changes by `motion` (3,)."""
+    change = (_along(chain, 0, motion), _along(chain, 1, motion), _along(chain, 2, motion))
+    for i in range(3):
+        for j in range(3):
+            noise[i, j] += variance * change[i] * change[j]
+
+
+@inlined
+def _along(chain: FloatArray, row: int, motion: FloatArray) -> float:
+    """How fast a component of the value changes."""
+    speed: float = chain[row, 0] * motion[0] + chain[row, 1] * motion[1] + chain[row, 2] * motion[2]
+    return speed
+
+
+@inlined
+def body_columns(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> tuple[int, int]:
+    """The first of the three columns of the observer and of the target of measurement k; -1: has none."""
+    observer, target = measurements.observer[k], measurements.target[k]
+    first = 3 * target if target >= 0 else -1
+    if measurements.landmark[k] > 0:
+        first = belief.table.survey_column[measurements.landmark[k] - 1]
+    return (3 * observer if observer >= 0 else -1), first
+
+
+@inlined
+def _read_across(p: FloatArray, bodies: tuple[int, int], camera: tuple[int, int], out: FloatArray) -> None:
+    """Write the covariances `across` (3, 5) of one measurement; those of nobody do not matter."""
+    o, t = max(bodies[0], 0), max(bodies[1], 0)
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = p[o + i, t + j]
+        for k in range(2):
+            out[i, 3 + k] = p[t + i, max(camera[k], 0)]
+
+
+@inlined
+def _add_uncertainty(
+    belief: BeliefArrays,
+    columns: tuple[tuple[int, int], tuple[int, int]],
+    chain: FloatArray,
+    across: FloatArray,
+    difference: FloatArray,
+    s: FloatArray,
+) -> None:
+    """Add H P H^T (3, 3), eq. (13) of the e-puck paper, where H is `chain` (3, 5) by xi_target - xi_observer.
+
+    The difference is taken first: a third of the work.
+
+    Args:
+        belief: Not changed.
+        columns: First of the observer and of the target, and those of the camera's parameters; -1: none.
+        chain: (3, 5).
+        across: (3, 5) covariances of the observer, the target and the camera, see `InnovationBatch`.
+        difference: (3, 3) written: scratch.
+        s: (3, 3) added to.
+    """
+    bodies, camera = columns
+    o, t = max(bodies[0], 0), max(bodies[1], 0)
+    of_observer, of_target = 1.0 if bodies[0] >= 0 else 0.0, 1.0 if bodies[1] >= 0 else 0.0
+    for i in range(3):
+        for j in range(3):
+            both = of_target * of_observer * (across[j, i] + across[i, j])
+            of_t, of_o = covariance_within(belief, t, i, j), covariance_within(belief, o, i, j)
+            difference[i, j] = of_target * of_t + of_observer * of_o - both
+    for i in range(3):
+        x, y, z = _turned(chain, i, difference)
+        for j in range(3):
+            s[i, j] = s[i, j] + x * chain[j, 0] + y * chain[j, 1] + z * chain[j, 2]
+    for k in range(2):
+        if camera[k] >= 0:
+            for a in range(3):
+                own = own_within(belief, o // 3, a, 3 + CAMERA_YAW + k)
+                difference[a, 0] = of_target * across[a, 3 + k] - of_observer * own
+            for i in range(3):
+                beside = chain[i, 0] * difference[0, 0] + chain[i, 1] * difference[1, 0]
+                beside += chain[i, 2] * difference[2, 0]
+                for other in range(2):  # its own variance, and its covariance with the other parameter
+                    if camera[other] >= 0:
+                        both = own_within(belief, o // 3, 3 + CAMERA_YAW + other, 3 + CAMERA_YAW + k)
+                        beside += 0.5 * chain[i, 3 + other] * both
+                for j in range(3):
+                    s[i, j] += beside * chain[j, 3 + k]
+                    s[j, i] += beside * chain[j, 3 + k]
+
+
+@inlined
+def _turned(chain: FloatArray, row: int, matrix: FloatArray) -> tuple[float, float, float]:
+    """The product of the first three columns of a row of `chain` and a matrix (3, 3)."""
+    a, b, c = chain[row, 0], chain[row, 1], chain[row, 2]
+    return (
+        a * matrix[0, 0] + b * matrix[1, 0] + c * matrix[2, 0],
+        a * matrix[0, 1] + b * matrix[1, 1] + c * matrix[2, 1],
+        a * matrix[0, 2] + b * matrix[1, 2] + c * matrix[2, 2],
+    )

@@ -1,0 +1,1 @@
+"""Integrity: fault detection, noise inflation and loss of track."""

@@ -1,0 +1,142 @@
+"""Divergence: whether a pose has been confirmed, how sure it is told to be, and when a robot is given up."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.filter.belief import BeliefArrays, IntegrityArrays, covariance_within
+from swarm_loc_estimator.filter.integrity.fault_detection import source_of
+from swarm_loc_estimator.filter.measurement_model import MeasurementColumns
+
+CONFIRMED = 2
+"""So many sightings that agree make a pose that was assumed one that is known."""
+WELL_CONFIRMED = 12
+_DOUBTFUL = 2.0
+_HIDDEN_SIGMA = (0.03, 0.03, 0.06)
+"""What sensors may hide while a pose is doubtful, or few sightings have confirmed it [m], [m], [rad]."""
+_SEEN_RELIEF = 1.0
+"""A look from above rests on nothing else that is believed."""
+_GATED_AGAIN_NS = 250_000_000
+_MAX_GATED_FIXES = 3
+"""A robot is where fixes put it, not where other robots that hang on it say: so many send it there."""
+_CONFIRMED_AGAIN_NS = 150_000_000
+"""Sightings that follow each other faster confirm a pose once: they have much of their errors in common."""
+
+
+class LossLimits(NamedTuple):
+    """Beyond which a robot is given up.
+
+    Attributes:
+        position_sigma: Standard deviation of its position [m].
+        heading_sigma: Of its heading [rad].
+        gated_in_a_row: Gated measurements since the last accepted one.
+        max_doubt: How much may speak against a robot or landmark before it is contradicted.
+    """
+
+    position_sigma: float
+    heading_sigma: float
+    gated_in_a_row: int
+    max_doubt: float
+
+
+@inlined
+def confirm(measurements: MeasurementColumns, k: int, belief: BeliefArrays, passed: bool) -> int:
+    """Hold measurement k against poses that were assumed; return a robot that is elsewhere, or -1."""
+    observer, target = measurements.observer[k], measurements.target[k]
+    known = belief.integrity.confirmations
+    knows_observer = observer < 0 or known[observer] >= CONFIRMED
+    knows_target = target < 0 or known[target] >= CONFIRMED
+    if passed:
+        if knows_observer and target >= 0:
+            _count_confirmation(belief.integrity, target, measurements.stamp_ns[k])
+        if knows_target and observer >= 0:
+            _count_confirmation(belief.integrity, observer, measurements.stamp_ns[k])
+        return -1
+    if knows_observer and knows_target:
+        return -1
+    elsewhere: int = target if knows_observer else observer
+    return elsewhere
+
+
+@inlined
+def _count_confirmation(state: IntegrityArrays, robot: int, stamp_ns: int) -> None:
+    if stamp_ns - state.confirmed_ns[robot] >= _CONFIRMED_AGAIN_NS:
+        state.confirmations[robot] += 1
+        state.confirmed_ns[robot] = stamp_ns
+
+
+@inlined
+def is_uncertain(belief: BeliefArrays, robot: int, pose: FloatArray, limits: LossLimits) -> bool:
+    """Whether the standard deviation of the robot's position or heading at `pose` (3,) exceeds its limit."""
+    first = 3 * robot
+    xx, yy = covariance_within(belief, first, 0, 0), covariance_within(belief, first, 1, 1)
+    xt, yt = covariance_within(belief, first, 0, 2), covariance_within(belief, first, 1, 2)
+    tt = covariance_within(belief, first, 2, 2)
+    x = xx - 2.0 * pose[1] * xt + pose[1] * pose[1] * tt
+    y = yy + 2.0 * pose[0] * yt + pose[0] * pose[0] * tt
+    uncertain: bool = max(x, y) > limits.position_sigma**2 or tt > limits.heading_sigma**2
+    return uncertain
+
+
+@inlined
+def add_hidden_errors(state: IntegrityArrays, robot: int, covariance: FloatArray) -> None:
+    """Add to a pose's covariance (3, 3) what its sensors may hide."""
+    if state.doubt[robot] > _DOUBTFUL or state.confirmations[robot] < WELL_CONFIRMED:
+        for i in range(3):
+            covariance[i, i] += _HIDDEN_SIGMA[i] ** 2
+
+
+def note_missed(state: IntegrityArrays, robot: int, weight: float) -> float:
+    """Count that a robot was not seen where it should be; return how much speaks against it now."""
+    state.doubt[robot] += weight
+    return float(state.doubt[robot])
+
+
+def note_seen(state: IntegrityArrays, robot: int) -> None:
+    """Count that a robot was seen from above where it is believed to be."""
+    state.doubt[robot] = max(0.0, state.doubt[robot] - _SEEN_RELIEF)
+
+
+@inlined
+def count_gated(
+    measurements: MeasurementColumns, k: int, belief: BeliefArrays, passed: bool, limits: LossLimits
+) -> int:
+    """Count fixes and gated measurements; return a robot that has had too many gated in a row, or -1.
+
+    One source alone counts four times a second at most.
+    """
+    observer, target = measurements.observer[k], measurements.target[k]
+    lost, state = -1, belief.integrity
+    for side in (observer, target):
+        if side >= 0:
+            source = source_of(measurements, k, belief) if side == observer else observer
+            now_ns = measurements.stamp_ns[k]
+            if passed:
+                state.gated_in_a_row[side] = 0
+            elif state.gated_source[side] != source or now_ns - state.gated_ns[side] > _GATED_AGAIN_NS:
+                state.gated_in_a_row[side] += 1
+                state.gated_source[side], state.gated_ns[side] = source, now_ns
+            if state.gated_in_a_row[side] >= limits.gated_in_a_row:
+                lost = side
+    if observer < 0 and not passed and _is_off_its_fixes(state, target, measurements.stamp_ns[k]):
+        lost = target
+    if passed and (observer < 0 or target < 0):
+        fixed = max(observer, target)
+        state.gated_fixes[fixed] = 0
+        belief.last_fix_ns[fixed] = max(belief.last_fix_ns[fixed], measurements.stamp_ns[k])
+    return lost
+
+
+@compiled
+def _is_off_its_fixes(state: IntegrityArrays, robot: int, stamp_ns: int) -> bool:
+    """Count a gated fix of a robot; whether there are too many since the last accepted sight of the map.
+
+    Robots that were located by way of this one agree with it wherever it is, so what they say does not count.
+    """
+    if stamp_ns - state.gated_fix_ns[robot] > _GATED_AGAIN_NS:
+        state.gated_fixes[robot] += 1
+        state.gated_fix_ns[robot] = stamp_ns
+    off: bool = state.gated_fixes[robot] >= _MAX_GATED_FIXES
+    return off

@@ -1,0 +1,336 @@
+"""Integrity: what the newest measurements say of the belief, whom they contradict, and when a robot is lost.
+
+A measurement is a surprise when the squared Mahalanobis distance of its position exceeds a threshold that one
+good measurement in twenty does, or when the whitened innovations of its last few have a trend. Every surprise
+counts against its pair of observer and source. It counts against one of the two, too, where the other one is
+in agreement: for each, the share of its pairs that are surprises, as observer and as source, is compared. A
+robot whose camera was turned disagrees with all that it sees, a landmark that was moved with all that see it;
+they are contradicted once enough speaks against them. A false sighting disagrees with nobody but itself: the
+pair is set aside. Every measurement that is no surprise counts for those whom it is about.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
+from swarm_loc_estimator.filter.calibration_states import CAMERA_YAW
+from swarm_loc_estimator.filter.integrity.noise_inflation import raise_hidden_noise
+from swarm_loc_estimator.filter.measurement_model import POLAR, MeasurementColumns
+
+_ASIDE, _MAX_EVIDENCE = 10.0, 15.0
+"""Evidence from which on a pair is set aside, and the most that is counted."""
+_DENIED = 7.5
+"""From here on a robot is not told as tracked."""
+
+_SOURCES = 16
+_SURPRISE = 6.0
+_MAX_WEIGHT = 3.0
+_UNEXPLAINED_WEIGHT = 2.0
+NOISE, DESCRIPTION, ELSEWHERE = 0, 1, 2
+"""What may explain an innovation: noise, a wrong description, or that a robot is somewhere else."""
+_NOISE_M = 0.05
+_EXPLAINED_M, _EXPLAINED_SHARE = 0.1, 0.35
+"""A wrong description explains errors of so much, and of that share of the distance."""
+_SMALL_M, _SMALL_SHARE = 0.003, 0.005
+"""Errors of so much, and of that share of the distance, are no surprise whatever the noise is."""
+_SINGLE_WEIGHT = 0.3
+"""A surprise of an observer with no other one."""
+_MAX_SINGLE_DOUBT = 5.0
+"""One source alone makes an observer doubtful, but does not contradict it."""
+_SHARED_WEIGHT = 0.2
+"""The source's part where it cannot be told who is wrong."""
+_RELIEF = 0.25
+RECENT_NS = 400_000_000
+_ONE_IMAGE_NS = 20_000_000
+_TOLD_NS = 3_000_000_000
+_AGAIN_NS = 90_000_000
+"""What comes sooner after the last look of a pair is no new evidence."""
+_INDEPENDENT_NS = 100_000_000
+"""The errors of looks that follow each other faster are the same."""
+_TREND_LOOKS = 8
+_TREND = 3.0
+"""Squared sum of so many whitened innovations over the sum of their squares; 1 on average without a trend."""
+_MIN_TREND = 0.6
+"""A mean of whitened innovations that matters: calibrated sensors have trends that their noise covers."""
+_TREND_WEIGHT = 4.0
+
+
+def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
+    """Nothing is held against anybody."""
+    return IntegrityArrays(
+        source=np.full((robots, _SOURCES), -1),
+        source_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
+        counted_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
+        surprised=np.zeros((robots, _SOURCES), dtype=bool),
+        unexplained=np.zeros((robots, _SOURCES), dtype=bool),
+        trending=np.zeros((robots, _SOURCES), dtype=bool),
+        evidence=np.zeros((robots, _SOURCES)),
+        whitened=np.zeros((robots, _SOURCES, 2)),
+        squares=np.zeros((robots, _SOURCES)),
+        looks=np.zeros((robots, _SOURCES), dtype=np.int64),
+        doubt=np.zeros(robots + landmarks),
+        confirmations=np.zeros(robots, dtype=np.int64),
+        confirmed_ns=np.full(robots, NEVER_NS // 2),
+        gated_in_a_row=np.zeros(robots, dtype=np.int64),
+        gated_source=np.full(robots, -1),
+        gated_ns=np.full(robots, NEVER_NS // 2),
+        gated_fixes=np.zeros(robots, dtype=np.int64),
+        gated_fix_ns=np.full(robots, NEVER_NS // 2),
+        hidden_noise=np.zeros(robots),
+    )
+
+
+@inlined
+def assess(
+    measurements: MeasurementColumns,
+    k: int,
+    belief: BeliefArrays,
+    max_doubt: float,
+    look: tuple[float, tuple[float, float], int],
+) -> int:
+    """Hold measurement k against what its observer and its source have shown lately.
+
+    Args:
+        measurements: (m,).
+        k: Which one.
+        belief: Its integrity is changed.
+        max_doubt: How much may speak against a robot or landmark before it is contradicted.
+        look: Squared Mahalanobis distance of the position, the innovation over its standard deviation (2,),
+            and what may explain it, see `cause_of`.
+
+    Returns:
+        The robot or landmark (as N + l) that is contradicted; -1: nobody.
+    """
+    observer, source = measurements.observer[k], source_of(measurements, k, belief)
+    if observer < 0 or source < 0:
+        return -1
+    state, now_ns = belief.integrity, measurements.stamp_ns[k]
+    distance, whitened, cause = look
+    place = _find(measurements, k, belief)
+    if place < 0:
+        place = _new_place(state, observer, source)
+    state.source_ns[observer, place] = max(now_ns, state.source_ns[observer, place])
+    state.surprised[observer, place] = distance > _SURPRISE
+    state.unexplained[observer, place] = cause == ELSEWHERE
+    if now_ns - state.counted_ns[observer, place] < _AGAIN_NS:
+        return -1
+    state.counted_ns[observer, place] = now_ns
+    weight = min(distance / _SURPRISE, _MAX_WEIGHT) if distance > _SURPRISE else 0.0
+    if weight == 0.0:
+        weight = _weight_of_trend(state, observer, place, whitened)
+    if weight == 0.0:
+        if not state.trending[observer, place]:
+            _relieve(state, observer, source, place)
+        return -1
+    if not _blame(state, (observer, source), weight, cause == ELSEWHERE, now_ns):
+        state.evidence[observer, place] = min(state.evidence[observer, place] + weight, _MAX_EVIDENCE)
+    for node in (observer, source):
+        if state.doubt[node] >= max_doubt:
+            if cause != NOISE or not _is_estimated(belief, node) or not raise_hidden_noise(belief, observer):
+                return node
+            _forgive(state, node)
+    return -1
+
+
+@compiled
+def _is_estimated(belief: BeliefArrays, node: int) -> bool:
+    """Whether what describes a robot or landmark is estimated already."""
+    robots, table = belief.tracked.size, belief.table
+    column = table.column[node, CAMERA_YAW] if node < robots else table.survey_column[node - robots]
+    estimated: bool = column >= 0
+    return estimated
+
+
+@compiled
+def _forgive(state: IntegrityArrays, node: int) -> None:
+    """Hold nothing against a robot or landmark any more, nor against its pairs."""
+    state.doubt[node] = 0.0
+    robots, places = state.source.shape
+    for robot in range(robots):
+        for place in range(places):
+            if node in (robot, state.source[robot, place]):
+                state.evidence[robot, place] = 0.0
+
+
+def pairs_set_aside(state: IntegrityArrays, now_ns: int) -> list[tuple[int, int]]:
+    """The pairs of observer and source that do not count, of those measured of late."""
+    aside = (state.evidence >= _ASIDE) & (now_ns - state.source_ns < _TOLD_NS)
+    return [(int(observer), int(state.source[observer, place])) for observer, place in np.argwhere(aside)]
+
+
+@inlined
+def is_set_aside(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> bool:
+    """Whether the pair of measurement k has disagreed so often that it does not count."""
+    observer, place = measurements.observer[k], _find(measurements, k, belief)
+    aside: bool = place >= 0 and belief.integrity.evidence[observer, place] >= _ASIDE
+    return aside
+
+
+@inlined
+def cause_of(kind: int, innovation: FloatArray, predicted: FloatArray) -> int:
+    """What may explain an innovation (3,) of a prediction (3,): NOISE, DESCRIPTION or ELSEWHERE."""
+    if kind == POLAR:
+        distance, along, across = predicted[0], abs(innovation[0]), abs(innovation[1]) * predicted[0]
+    else:
+        distance = math.hypot(predicted[0], predicted[1])
+        along, across = abs(innovation[0]), abs(innovation[1])
+    error = math.hypot(along, across)
+    if error > _EXPLAINED_M + _EXPLAINED_SHARE * distance:
+        return ELSEWHERE
+    return DESCRIPTION if error > _NOISE_M else NOISE
+
+
+@inlined
+def small_variances(kind: int, predicted: FloatArray) -> tuple[float, float]:
+    """Variances of errors of a position, forward or range and left or bearing, too small to matter."""
+    distance = predicted[0] if kind == POLAR else math.hypot(predicted[0], predicted[1])
+    small = (_SMALL_M + _SMALL_SHARE * abs(distance)) ** 2
+    return small, (small / max(distance * distance, 1e-6) if kind == POLAR else small)
+
+
+@inlined
+def is_elsewhere(state: IntegrityArrays, robot: int, within_ns: int = RECENT_NS) -> bool:
+    """Whether most of what a robot has measured last can only mean that it is somewhere else."""
+    newest_ns, elsewhere, count = state.source_ns[robot, 0], 0, 0
+    for place in range(state.source.shape[1]):
+        newest_ns = max(newest_ns, state.source_ns[robot, place])
+    for place in range(state.source.shape[1]):
+        recent = newest_ns - state.source_ns[robot, place] < within_ns
+        if recent and state.source[robot, place] >= 0 and state.evidence[robot, place] < _ASIDE:
+            count += 1
+            elsewhere += 1 if state.unexplained[robot, place] else 0
+    return 2 * elsewhere > count
+
+
+@inlined
+def is_contradicted(state: IntegrityArrays, robot: int) -> bool:
+    """Whether the newest measurements speak against a robot's pose: it is not told as tracked."""
+    contradicted: bool = (
+        state.doubt[robot] >= _DENIED
+        or state.gated_fixes[robot] > 0
+        or is_elsewhere(state, robot, _ONE_IMAGE_NS)
+    )
+    return contradicted
+
+
+@inlined
+def _relieve(state: IntegrityArrays, observer: int, source: int, place: int) -> None:
+    """Count a look that is no surprise for those whom it is about."""
+    state.evidence[observer, place] = max(0.0, state.evidence[observer, place] - _RELIEF)
+    for node in (observer, source):
+        state.doubt[node] = max(0.0, state.doubt[node] - _RELIEF)
+
+
+@compiled
+def _blame(
+    state: IntegrityArrays, pair: tuple[int, int], weight: float, unexplained: bool, now_ns: int
+) -> bool:
+    """Add a surprise to the doubt of whoever has more of them among its pairs; False: of neither."""
+    observer, source = pair
+    bad_observer, share_observer = _surprises(state, observer, now_ns)
+    _, share_source = _surprises(state, source, now_ns)
+    if share_observer > 0.5 and share_observer >= share_source:
+        if bad_observer >= 2:
+            state.doubt[observer] += weight * (_UNEXPLAINED_WEIGHT if unexplained else 1.0)
+        elif state.doubt[observer] < _MAX_SINGLE_DOUBT:
+            state.doubt[observer] += _SINGLE_WEIGHT * weight
+        if share_observer == share_source and state.doubt[source] < _MAX_SINGLE_DOUBT:
+            state.doubt[source] += _SHARED_WEIGHT * weight
+        return True
+    if share_source > 0.5:
+        state.doubt[source] += weight
+        return True
+    return False
+
+
+@compiled
+def _surprises(state: IntegrityArrays, node: int, now_ns: int) -> tuple[int, float]:
+    """How many pairs of a robot or landmark are surprises, as observer and as source, and what share."""
+    robots, places = state.source.shape
+    bad, count = 0, 0
+    for robot in range(robots):
+        named = 0
+        for place in range(places):  # most robots have not looked at it, which is soon found out like this
+            named += state.source[robot, place] == node
+        for place in range(places if named or robot == node else 0):
+            source = state.source[robot, place]
+            about = source >= 0 and node in (robot, source)
+            if about and now_ns - state.source_ns[robot, place] < RECENT_NS:
+                count += 1
+                bad += 1 if state.surprised[robot, place] or state.trending[robot, place] else 0
+    return bad, bad / max(1, count)
+
+
+@inlined
+def _weight_of_trend(
+    state: IntegrityArrays, observer: int, place: int, whitened: tuple[float, float]
+) -> float:
+    """Take a whitened innovation (2,) into the pair's sum; what speaks against it when there are enough."""
+    total = state.whitened[observer, place]
+    for i in range(2):
+        total[i] += whitened[i]
+        state.squares[observer, place] += whitened[i] * whitened[i]
+    state.looks[observer, place] += 1
+    if state.looks[observer, place] < _TREND_LOOKS:
+        return 0.0
+    squared = total[0] * total[0] + total[1] * total[1]
+    trending = squared > max(_TREND * state.squares[observer, place], (_MIN_TREND * _TREND_LOOKS) ** 2)
+    _forget_trend(state, observer, place)
+    state.trending[observer, place] = trending
+    return _TREND_WEIGHT if trending else 0.0
+
+
+@inlined
+def _forget_trend(state: IntegrityArrays, observer: int, place: int) -> None:
+    state.whitened[observer, place, 0] = state.whitened[observer, place, 1] = 0.0
+    state.squares[observer, place], state.looks[observer, place] = 0.0, 0
+
+
+@inlined
+def _find(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int:
+    """Where the pair of measurement k is remembered; -1: nowhere, or it is no pair."""
+    observer, source = measurements.observer[k], source_of(measurements, k, belief)
+    if observer >= 0 and source >= 0:
+        sources = belief.integrity.source[observer]
+        for place in range(sources.size):
+            if sources[place] == source:
+                return place
+    return -1
+
+
+@inlined
+def _new_place(state: IntegrityArrays, observer: int, source: int) -> int:
+    """Remember a new pair in place of the one seen longest ago."""
+    oldest = 0
+    for place in range(state.source.shape[1]):
+        if state.source_ns[observer, place] < state.source_ns[observer, oldest]:
+            oldest = place
+    state.source[observer, oldest], state.source_ns[observer, oldest] = source, NEVER_NS // 2
+    state.counted_ns[observer, oldest] = NEVER_NS // 2
+    state.evidence[observer, oldest] = 0.0
+    state.surprised[observer, oldest] = state.trending[observer, oldest] = False
+    _forget_trend(state, observer, oldest)
+    return oldest
+
+
+@inlined
+def source_of(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int:
+    """What measurement k is of: a robot, N + l for a landmark, or -1."""
+    landmark: int = measurements.landmark[k] - 1
+    target: int = measurements.target[k]
+    return belief.tracked.size + landmark if landmark >= 0 else target
+
+
+@inlined
+def noise_of_frequent_looks(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> float:
+    """By what factor the noise of measurement k counts more, so soon after another one of its pair."""
+    observer, place = measurements.observer[k], _find(measurements, k, belief)
+    if place < 0:
+        return 1.0
+    since_ns = measurements.stamp_ns[k] - belief.integrity.source_ns[observer, place]
+    return _INDEPENDENT_NS / since_ns if 0 < since_ns < _INDEPENDENT_NS else 1.0

@@ -1,0 +1,77 @@
+"""Hidden noise: what measurements scatter beyond their description, found when they contradict the belief.
+
+A robot whose measurements go on to contradict what is believed although all that describes it is estimated
+has more noise than described: its markers sit a little off, its images are stamped a little wrong. Its
+measurements then count with one unit of noise more, each time.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.filter.belief import BeliefArrays, IntegrityArrays
+from swarm_loc_estimator.filter.measurement_model import POLAR, MeasurementColumns
+from swarm_loc_estimator.swarm.swarm import SensorModel
+
+_POSITION_SIGMA, _BEARING_SIGMA, _HEADING_SIGMA, _STAMP_SIGMA = 0.004, 0.01, 0.03, 0.03
+"""One unit of it [m], [rad], [rad], [s]."""
+_DOUBTED_UNITS, MAX_UNITS = 2.0, 5.0
+
+
+@inlined
+def stamp_variance(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> float:
+    """How unsure the stamp of measurement k is, as described and as found out [s^2]."""
+    variance: float = measurements.stamp_variance[k]
+    observer = measurements.observer[k]
+    if observer >= 0:
+        variance += (belief.integrity.hidden_noise[observer] * _STAMP_SIGMA) ** 2
+    return variance
+
+
+@inlined
+def add_hidden_noise(
+    measurements: MeasurementColumns, k: int, belief: BeliefArrays, noise: FloatArray
+) -> None:
+    """Add to the noise (3, 3) of measurement k what its observer's measurements scatter beyond it."""
+    observer = measurements.observer[k]
+    units = belief.integrity.hidden_noise[observer] if observer >= 0 else 0.0
+    if units > 0.0:
+        noise[0, 0] += (units * _POSITION_SIGMA) ** 2
+        noise[1, 1] += (units * (_BEARING_SIGMA if measurements.kind[k] == POLAR else _POSITION_SIGMA)) ** 2
+        noise[2, 2] += (units * _HEADING_SIGMA) ** 2
+
+
+@compiled
+def raise_hidden_noise(belief: BeliefArrays, observer: int) -> bool:
+    """Count one more unit of an observer's noise; False: it cannot be noise any more."""
+    units = belief.integrity.hidden_noise[observer]
+    belief.integrity.hidden_noise[observer] = min(units + 1.0, MAX_UNITS)
+    raised: bool = units < MAX_UNITS
+    return raised
+
+
+def doubt_noise(state: IntegrityArrays) -> None:
+    """Take no robot's noise for as small as described, where the description has proved wrong."""
+    np.maximum(state.hidden_noise, _DOUBTED_UNITS, out=state.hidden_noise)
+
+
+def with_hidden_noise(sensor: SensorModel, units: float) -> SensorModel:
+    """A sensor whose noise is described as it was found to be."""
+    unit_of = {
+        "forward_sigma": _POSITION_SIGMA,
+        "left_sigma": _POSITION_SIGMA,
+        "heading_sigma": _HEADING_SIGMA,
+        "range_sigma": _POSITION_SIGMA,
+        "bearing_sigma": _BEARING_SIGMA,
+        "residual_position_sigma": _POSITION_SIGMA,
+        "residual_heading_sigma": _HEADING_SIGMA,
+        "time_sigma_s": _STAMP_SIGMA,
+    }
+    return replace(
+        sensor, **{name: math.hypot(getattr(sensor, name), units * unit) for name, unit in unit_of.items()}
+    )

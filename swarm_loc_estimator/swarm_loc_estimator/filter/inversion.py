@@ -1,0 +1,35 @@
+"""Inverses of covariance and information matrices."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.lapack import invert_positive
+
+
+def inverse(matrix: FloatArray) -> FloatArray:
+    """The inverse (n, n) of a symmetric positive definite matrix, symmetric to the last bit.
+
+    Raises:
+        LinAlgError: The matrix is not positive definite.
+    """
+    inverted: FloatArray = matrix.copy()
+    invert(inverted)
+    return inverted
+
+
+def invert(matrix: FloatArray) -> None:
+    """Invert a matrix (n, n) where it stands; see `inverse`."""
+    if not invert_positive(matrix.reshape(-1), matrix.shape[0]):
+        raise np.linalg.LinAlgError("the covariance is not positive definite")
+    _mirror(matrix)
+
+
+@compiled
+def _mirror(matrix: FloatArray) -> None:
+    """Copy the upper triangle, which is the lower one in Fortran's order, to the other one."""
+    for i in range(matrix.shape[0]):
+        for j in range(i):
+            matrix[i, j] = matrix[j, i]

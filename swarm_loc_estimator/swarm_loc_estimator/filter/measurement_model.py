@@ -1,0 +1,194 @@
+"""The measurement model: relative and absolute poses, predicted values and Jacobians.
+
+Every measurement observes the pose of a marker in a sensor's frame,
+
+    rel = (X_observer S)^-1 (X_target M),
+
+the transform chains (3) and (5) of the e-puck paper in the plane (whose printed eq. (6) has three wrong
+signs: the chain is used, not the print). S is the sensor on the observer, M the marker on the target. A
+landmark has no target robot (M is its pose in `map`, moved by X_target when its place is estimated), an
+absolute fix has no observer (S is the identity).
+
+With right-invariant errors X = exp(xi) X_hat the chain depends on xi_target - xi_observer only, so one
+Jacobian (3 x 3) serves both robots, with opposite signs. Two more columns are for the sensor's own yaw and
+scale, see CAMERA_YAW and CAMERA_SCALE of filter/calibration_states.py.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import inlined
+from swarm_loc_estimator.common.se2_scalar import composed, wrap
+
+NOBODY = -1
+"""Index in place of a robot: the observer of an absolute fix, the target of a landmark sighting."""
+
+
+class Kind(IntEnum):
+    """What a value is: its first two components, or an order about the target robot."""
+
+    CARTESIAN = 0  # forward [m], left [m]
+    POLAR = 1  # range [m], bearing [rad], positive to the left
+    SET_POSE = 2  # the target is at `value` in map with `covariance`, whatever was believed
+    FORGET = 3  # the target is not where it was believed to be
+    ANONYMOUS = 4  # some robot, seen from above, was at `value` in map; marker_id: its number in the image
+
+
+POLAR, SET_POSE = int(Kind.POLAR), int(Kind.SET_POSE)
+"""Kinds as plain numbers, for compiled code."""
+
+MEASUREMENT_DTYPE = np.dtype(
+    [
+        ("stamp_ns", np.int64),  # when it was true
+        ("received_from", np.int64),  # robot whose message it came in; -1 for a message about the whole swarm
+        ("observer", np.int64),  # robot index or NOBODY
+        ("target", np.int64),  # robot index or NOBODY
+        ("landmark", np.int64),  # 1 + index of the landmark; 0: none
+        ("marker_id", np.int64),
+        ("kind", np.int64),  # Kind
+        ("has_heading", np.int64),  # 1 when value[2] was measured, else 0
+        ("has_alternative", np.int64),  # 1 when `alternative` is a second, mirrored solution, else 0
+        ("stamp_variance", np.float64),  # of stamp_ns [s^2], times how many measurements share this error
+        ("gate", np.float64),  # largest squared distance of its first two components that is believed
+        ("sensor", np.float64, (3,)),  # S: x [m], y [m], yaw [rad] in the observer's base_link
+        ("marker", np.float64, (3,)),  # M: in the target's base_link, or in map
+        ("value", np.float64, (3,)),  # two by kind, then the heading [rad] of the marker's face
+        ("alternative", np.float64, (3,)),
+        (
+            "covariance",
+            np.float64,
+            (3, 3),
+        ),  # of value; a heading not measured has no covariance and variance 1
+        (
+            "systematic_share",
+            np.float64,
+            (3,),
+        ),  # share of each variance that comes again, see filter/correlated_noise.py
+    ]
+)
+
+MeasurementArray = NDArray[np.void]
+
+
+class MeasurementColumns(NamedTuple):
+    """The fields of measurements (m,) as compiled code takes them."""
+
+    stamp_ns: NDArray[np.int64]
+    observer: NDArray[np.int64]
+    target: NDArray[np.int64]
+    landmark: NDArray[np.int64]
+    kind: NDArray[np.int64]
+    has_heading: NDArray[np.int64]
+    has_alternative: NDArray[np.int64]
+    stamp_variance: FloatArray
+    gate: FloatArray
+    sensor: FloatArray
+    marker: FloatArray
+    value: FloatArray
+    alternative: FloatArray
+    covariance: FloatArray
+    systematic_share: FloatArray
+
+    @classmethod
+    def of(cls, measurements: MeasurementArray) -> MeasurementColumns:
+        """The columns of an array of MEASUREMENT_DTYPE, to be read.
+
+        Each is contiguous. As views they would be so only of a single measurement, for which everything
+        that takes them would be compiled a second time, perhaps while robots wait.
+        """
+        return cls(*(np.ascontiguousarray(measurements[name]) for name in cls._fields))
+
+    @classmethod
+    def views(cls, measurements: MeasurementArray) -> MeasurementColumns:
+        """Likewise, to be written."""
+        return cls(*(measurements[name] for name in cls._fields))
+
+
+def predict(
+    measurements: MeasurementArray,
+    observer_pose: FloatArray,
+    target_pose: FloatArray,
+    camera: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Predicted values (m, 3) and their Jacobians (m, 3, 5) by xi_target - xi_observer, camera yaw and scale.
+
+    A heading that was not measured has a zero row.
+
+    Args:
+        measurements: (m,) of MEASUREMENT_DTYPE.
+        observer_pose: (m, 3) in `map`; rows without an observer are ignored.
+        target_pose: (m, 3), or what moves a landmark from its surveyed place; rows with neither are ignored.
+        camera: (m, 2) by how much the sensor is turned to the left besides [rad], and stretches distances;
+            zero if not given.
+    """
+    value, jacobian = np.zeros((measurements.size, 3)), np.zeros((measurements.size, 3, 5))
+    errors = np.zeros((measurements.size, 2)) if camera is None else camera
+    columns = MeasurementColumns.of(measurements)
+    for k in range(measurements.size):
+        predict_one(
+            columns, k, observer_pose[k], target_pose[k], (errors[k, 0], errors[k, 1]), value[k], jacobian[k]
+        )
+    return value, jacobian
+
+
+@inlined
+def predict_one(
+    measurements: MeasurementColumns,
+    k: int,
+    observer_pose: FloatArray,
+    target_pose: FloatArray,
+    camera: tuple[float, float],
+    value: FloatArray,
+    jacobian: FloatArray,
+) -> None:
+    """Write the predicted value (3,) of measurement k and its Jacobian (3, 5), see `predict`."""
+    sensor, marker = measurements.sensor[k], measurements.marker[k]
+    sx, sy, stheta = sensor[0], sensor[1], sensor[2] + camera[0]
+    if measurements.observer[k] >= 0:
+        sx, sy, stheta = composed(observer_pose[0], observer_pose[1], observer_pose[2], sx, sy, stheta)
+    mx, my, mtheta = marker[0], marker[1], marker[2]
+    if measurements.target[k] >= 0 or measurements.landmark[k] > 0:
+        mx, my, mtheta = composed(target_pose[0], target_pose[1], target_pose[2], mx, my, mtheta)
+    cos, sin = math.cos(stheta), math.sin(stheta)
+    stretch = 1.0 + camera[1]
+    x, y = cos * (mx - sx) + sin * (my - sy), -sin * (mx - sx) + cos * (my - sy)
+    value[0], value[1], value[2] = stretch * x, stretch * y, wrap(mtheta - stheta)
+    # moving the target by xi moves its marker by rho + phi * (-my, mx)
+    jacobian[0, 0], jacobian[0, 1], jacobian[0, 2] = cos, sin, -cos * my + sin * mx
+    jacobian[1, 0], jacobian[1, 1], jacobian[1, 2] = -sin, cos, sin * my + cos * mx
+    jacobian[2, 0], jacobian[2, 1], jacobian[2, 2] = 0.0, 0.0, float(measurements.has_heading[k])
+    jacobian[0, 3], jacobian[1, 3], jacobian[2, 3] = y, -x, -jacobian[2, 2]
+    for j in range(4):
+        jacobian[0, j] *= stretch
+        jacobian[1, j] *= stretch
+    jacobian[0, 4], jacobian[1, 4], jacobian[2, 4] = x, y, 0.0
+    if measurements.kind[k] == POLAR:
+        distance = max(math.hypot(x, y), 1e-6)
+        ux, uy = x / distance, y / distance
+        value[0], value[1] = stretch * distance, math.atan2(y, x)
+        for j in range(5):
+            forward, left = jacobian[0, j], jacobian[1, j]
+            jacobian[0, j] = ux * forward + uy * left
+            jacobian[1, j] = (ux * left - uy * forward) / (stretch * distance)
+
+
+@inlined
+def innovation(
+    measurements: MeasurementColumns, k: int, measured: FloatArray, predicted: FloatArray, out: FloatArray
+) -> None:
+    """Write measured minus predicted (3,), angles wrapped, zero for a heading that was not measured.
+
+    Eq. (11) of the e-puck paper subtracts without wrapping, which is wrong across +-pi.
+    """
+    out[0] = measured[0] - predicted[0]
+    out[1] = measured[1] - predicted[1]
+    out[2] = wrap(measured[2] - predicted[2]) if measurements.has_heading[k] else 0.0
+    if measurements.kind[k] == POLAR:
+        out[1] = wrap(out[1])

@@ -1,0 +1,258 @@
+"""Prediction of one robot along its odometry track.
+
+A robot's pose is X = T O with the track O. Between two instants T gathers noise, and drifts with the
+parameters z of the robot's motion (`filter/calibration_states.py`):
+
+    T <- T exp((D2 - D1) z) = exp(A z) T,    P <- F P F^T + Ad(T) (G2 - G1) Ad(T)^T,    A = Ad(T) (D2 - D1).
+
+The right-invariant error does not change by the move itself, whatever z is, but by the error of z:
+xi <- xi + Ad(exp(A z / 2)) A dz, which is F. So what moves all robots and landmarks alike is never taken for
+observed. The turn rate's bias is a first-order Gauss-Markov process: it decays, and between the instants it
+was what it was on average.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.se2_scalar import adjoint_of, carry, moved_by_twist
+from swarm_loc_estimator.common.small_matrix import assign, assign_matrix, factor_numbers
+from swarm_loc_estimator.filter.belief import (
+    BeliefArrays,
+    covariance_within,
+    own_column,
+    own_covariance,
+)
+from swarm_loc_estimator.filter.calibration_states import DRIVES, TURN_BIAS
+from swarm_loc_estimator.odometry.preintegration import Preintegrated
+
+
+class _Drift(NamedTuple):
+    """How a robot's parameters move its pose from where its belief stands to another instant.
+
+    Attributes:
+        twist: (3,) T is moved by exp(twist).
+        drive: (3, DRIVES) the error of the pose there per error of each parameter before.
+        left: Share of the turn bias that is left.
+        gained: Variance that its mean over the time gained, in units of its column of `drive`, squared.
+        shared: Covariance that the mean gained with the bias there, in those units.
+    """
+
+    twist: FloatArray
+    drive: FloatArray
+    left: float
+    gained: float
+    shared: float
+
+
+@compiled
+def new_scratch() -> FloatArray:
+    """Room (3, 3, 3) to predict in: memory of its own for each robot would cost more."""
+    return np.empty((3, 3, 3))
+
+
+@inlined
+def predict(belief: BeliefArrays, robot: int, to: Preintegrated, scratch: FloatArray) -> None:
+    """Predict a robot, in place, to an instant; `scratch` is from `new_scratch`."""
+    if not _new_noise(belief, robot, to.covariance, scratch):
+        return
+    if _has_drives(belief, robot):
+        _drive(belief, robot, to)
+    whole, own, first = belief.covariance, belief.marginal, 3 * robot
+    for i in range(3):
+        for j in range(3):
+            if whole.shape[0] > 0:
+                whole[first + i, first + j] += scratch[0, i, j]
+            else:
+                own[robot, i, j] += scratch[0, i, j]
+    assign_matrix(belief.preintegrated_covariance[robot], to.covariance)
+    assign_matrix(belief.preintegrated_jacobian[robot], to.jacobian)
+    belief.predicted_to_ns[robot] = max(to.stamp_ns, belief.predicted_to_ns[robot])
+
+
+@inlined
+def write_predicted(
+    belief: BeliefArrays,
+    robot: int,
+    to: Preintegrated,
+    scratch: FloatArray,
+    transform: FloatArray,
+    covariance: FloatArray,
+) -> None:
+    """Write T (3,) and the covariance (3, 3) of its error where `predict` would take them; change nothing.
+
+    Args:
+        belief: Where all are.
+        robot: Whose T it is.
+        to: The instant.
+        scratch: From `new_scratch`.
+        transform: (3,) written.
+        covariance: (3, 3) written.
+    """
+    assign(transform, belief.transform[robot])
+    for i in range(3):
+        for j in range(3):
+            covariance[i, j] = covariance_within(belief, 3 * robot, i, j)
+    if not _new_noise(belief, robot, to.covariance, scratch):
+        return
+    if _has_drives(belief, robot):
+        _write_drifted(belief, robot, to, transform, covariance)
+    for i in range(3):
+        for j in range(3):
+            covariance[i, j] += scratch[0, i, j]
+
+
+@compiled
+def _write_drifted(
+    belief: BeliefArrays, robot: int, to: Preintegrated, transform: FloatArray, covariance: FloatArray
+) -> None:
+    """Move T (3,) as the parameters of its motion do, and write the covariance (3, 3) of its error there."""
+    drift = _new_drift(belief, robot, to)
+    _move(drift.twist, transform)
+    columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))
+    count = _own(belief, robot, drift, columns, weight)
+    _block(own_covariance(belief, robot), columns, weight, count, drift, covariance)
+
+
+@inlined
+def _new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, scratch: FloatArray) -> bool:
+    """Write Ad(T) (G2 - G1) Ad(T)^T to `scratch[0]`, and return whether it is a covariance.
+
+    It is none only when odometry comes so late that more was assumed of a silence beyond the horizon.
+    """
+    before, difference, work = belief.preintegrated_covariance[robot], scratch[1], scratch[2]
+    rounding = 1e-12
+    for i in range(3):
+        rounding += 1e-9 * abs(noise[i, i] - before[i, i])
+    for i in range(3):
+        for j in range(3):
+            difference[i, j] = noise[i, j] - before[i, j]
+            work[i, j] = difference[i, j] + (rounding if i == j else 0.0)
+    first, _, second, _, _, third = factor_numbers(work)
+    if not math.isfinite(first + second + third):
+        return False
+    carry(belief.transform[robot], difference, scratch[0])
+    return True
+
+
+@inlined
+def _has_drives(belief: BeliefArrays, robot: int) -> bool:
+    """Whether any parameter of the robot's motion is estimated."""
+    estimated = False
+    for m in range(DRIVES):
+        estimated = estimated or belief.table.column[robot, m] >= 0
+    return estimated
+
+
+@compiled
+def _new_drift(belief: BeliefArrays, robot: int, to: Preintegrated) -> _Drift:
+    """How the pose moves until an instant."""
+    x = max(0, to.stamp_ns - belief.predicted_to_ns[robot]) * 1e-9 / belief.table.turn_bias_time_s[robot]
+    left, variance = math.exp(-x), belief.table.sigma[robot, TURN_BIAS] ** 2
+    reach = -math.expm1(-x)  # of the bias now, over the time, in units of its time constant
+    # of what arises meanwhile; a series where the closed form would be rounding
+    spread = 2.0 * x - 3.0 + 4.0 * left - left * left if x > 1e-2 else x**3 * (2.0 / 3.0 - 0.5 * x)
+    gained, shared = spread / max(reach, 1e-12) ** 2, (1.0 - left) ** 2 / max(reach, 1e-12)
+    out = _Drift(np.zeros(3), np.zeros((3, DRIVES)), left, variance * gained, variance * shared)
+    adjoint, before = adjoint_of(belief.transform[robot]), belief.preintegrated_jacobian[robot]
+    for m in range(DRIVES):
+        mean = reach / x if m == TURN_BIAS and x > 1e-9 else 1.0
+        for i in range(3):
+            for a in range(3):
+                out.drive[i, m] += adjoint[i][a] * (to.jacobian[a, m] - before[a, m]) * mean
+            out.twist[i] += out.drive[i, m] * belief.parameter[robot, m]
+    pose, column = np.zeros(3), np.empty(3)
+    _move(0.5 * out.twist, pose)
+    half = adjoint_of(pose)
+    for m in range(DRIVES):
+        for i in range(3):
+            column[i] = out.drive[i, m]
+        for i in range(3):
+            out.drive[i, m] = half[i][0] * column[0] + half[i][1] * column[1] + half[i][2] * column[2]
+    return out
+
+
+@compiled
+def _own(belief: BeliefArrays, robot: int, drift: _Drift, columns: IntArray, weight: FloatArray) -> int:
+    """Write which columns (3 + DRIVES,) the pose's error comes from, with what weight; return how many."""
+    count = 0
+    for m in range(3 + DRIVES):
+        column = own_column(belief, robot, m)
+        if column >= 0:
+            columns[count] = column
+            for i in range(3):
+                weight[i, count] = drift.drive[i, m - 3] if m >= 3 else (1.0 if i == m else 0.0)
+            count += 1
+    return count
+
+
+@compiled
+def _block(
+    p: FloatArray, columns: IntArray, weight: FloatArray, count: int, drift: _Drift, out: FloatArray
+) -> None:
+    """Write the covariance (3, 3) of the pose's error after the drift."""
+    for i in range(3):
+        for j in range(i + 1):
+            total = drift.gained * drift.drive[i, TURN_BIAS] * drift.drive[j, TURN_BIAS]
+            for a in range(count):
+                for b in range(count):
+                    total += weight[i, a] * p[columns[a], columns[b]] * weight[j, b]
+            out[i, j] = out[j, i] = total
+
+
+@compiled
+def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
+    """Apply the drift to T and to the covariance of its error with everything, and let the bias decay."""
+    drift = _new_drift(belief, robot, to)
+    _move(drift.twist, belief.transform[robot])
+    first, p = own_column(belief, robot, 0), own_covariance(belief, robot)
+    size = p.shape[0]
+    columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))
+    rows, block = np.zeros((3, size)), np.empty((3, 3))
+    count = _own(belief, robot, drift, columns, weight)
+    _block(p, columns, weight, count, drift, block)
+    for i in range(3):
+        for a in range(count):
+            for j in range(size):
+                rows[i, j] += weight[i, a] * p[columns[a], j]
+    if belief.covariance.shape[0] == 0:
+        _note_driven(belief, robot, drift)
+    bias = own_column(belief, robot, 3 + TURN_BIAS)
+    if bias >= 0:
+        belief.parameter[robot, TURN_BIAS] *= drift.left
+        for j in range(size):
+            p[bias, j] *= drift.left
+            p[j, bias] *= drift.left
+        p[bias, bias] += belief.table.sigma[robot, TURN_BIAS] ** 2 * (1.0 - drift.left**2)
+        for i in range(3):
+            rows[i, bias] = drift.left * rows[i, bias] + drift.shared * drift.drive[i, TURN_BIAS]
+    for i in range(3):
+        for j in range(size):
+            p[first + i, j] = p[j, first + i] = rows[i, j]
+    for i in range(3):
+        for j in range(3):
+            p[first + i, first + j] = block[i, j]
+
+
+@compiled
+def _note_driven(belief: BeliefArrays, robot: int, drift: _Drift) -> None:
+    """Note how the drift changes the covariance of the pose's error with those of others."""
+    driven = belief.driven[robot]
+    for m in range(DRIVES):
+        if belief.table.column[robot, m] >= 0:
+            for i in range(3):
+                driven[i, m] += drift.drive[i, m] * driven[3, m]
+    if belief.table.column[robot, TURN_BIAS] >= 0:
+        driven[3, TURN_BIAS] *= drift.left
+
+
+@compiled
+def _move(twist: FloatArray, transform: FloatArray) -> None:
+    """Move a transform (3,), in place, by exp(twist)."""
+    x, y, theta = moved_by_twist(twist[0], twist[1], twist[2], transform[0], transform[1], transform[2])
+    transform[0], transform[1], transform[2] = x, y, theta

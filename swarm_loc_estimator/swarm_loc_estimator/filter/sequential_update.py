@@ -1,0 +1,97 @@
+"""Sequential update: predict two robots, evaluate one innovation, correct all, measurement by measurement."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.small_matrix import assign
+from swarm_loc_estimator.filter import prediction
+from swarm_loc_estimator.filter.belief import BeliefArrays, correct, to_map
+from swarm_loc_estimator.filter.correlated_noise import record_pair
+from swarm_loc_estimator.filter.dense_filter import update_one
+from swarm_loc_estimator.filter.innovation import evaluate, new_batch, new_scratch, relative_motion
+from swarm_loc_estimator.filter.integrity.divergence import (
+    LossLimits,
+    confirm,
+    count_gated,
+    is_uncertain,
+)
+from swarm_loc_estimator.filter.integrity.fault_detection import assess, is_set_aside
+from swarm_loc_estimator.filter.measurement_model import SET_POSE, MeasurementColumns
+from swarm_loc_estimator.odometry.look_up import look_up, new_sample
+from swarm_loc_estimator.odometry.preintegration import Preintegrated, TrackArrays
+
+OPEN, USED, GATED = 0, 1, 2
+"""Verdicts, see `fusion.Verdict`."""
+
+FINISHED, NOT_LOCALIZED, LOST, CONTRADICTED = 0, 1, 2, 3
+"""Why `update_in_order` came back: all done, a measurement not between robots located, a robot given up, a
+robot or landmark contradicted."""
+
+
+@compiled
+def update_in_order(
+    measurements: MeasurementColumns,
+    begin: int,
+    tracks: TrackArrays,
+    belief: BeliefArrays,
+    limits: LossLimits,
+    verdicts: NDArray[np.uint8],
+    nis: FloatArray,
+) -> tuple[int, int, int]:
+    """Fuse measurements one after the other, each at its exact stamp, linearised at the newest belief.
+
+    Args:
+        measurements: (m,) in order of their stamps.
+        begin: The first one to fuse.
+        tracks: Odometry.
+        belief: Changed in place.
+        limits: Beyond which a robot is given up.
+        verdicts: (m,) written.
+        nis: (m,) normalised innovations squared, written.
+
+    Returns:
+        The first measurement not dealt with, why, and the robot or landmark that it is about.
+    """
+    batch, sample, scratch, room = new_batch(1), new_sample(2), new_scratch(), prediction.new_scratch()
+    pose = batch.pose[0]
+    for k in range(begin, measurements.stamp_ns.size):
+        sides = (measurements.observer[k], measurements.target[k])
+        for side in sides:
+            if measurements.kind[k] >= SET_POSE or (side >= 0 and not belief.tracked[side]):
+                return k, NOT_LOCALIZED, -1
+        for i in range(2):
+            if sides[i] >= 0:
+                look_up(tracks, sides[i], measurements.stamp_ns[k], sample, i)
+                to = Preintegrated(measurements.stamp_ns[k], sample.covariance[i], sample.jacobian[i])
+                prediction.predict(belief, sides[i], to, room)
+                assign(pose[i], sample.pose[i])
+                to_map(belief, sides[i], pose[i])
+                if is_uncertain(belief, sides[i], pose[i], limits):
+                    return k, LOST, sides[i]
+        if measurements.landmark[k] > 0:
+            assign(pose[1], belief.landmark[measurements.landmark[k] - 1])
+        relative_motion(measurements, k, tracks, belief, pose, batch.motion[0])
+        evaluate(measurements, k, belief, batch, 0, scratch)
+        look = (batch.distance[0], (batch.whitened[0, 0], batch.whitened[0, 1]), batch.cause[0])
+        contradicted = assess(measurements, k, belief, limits.max_doubt, look)
+        if contradicted >= 0:
+            return k, CONTRADICTED, contradicted
+        passed, nis[k] = batch.passed[0] and not is_set_aside(measurements, k, belief), batch.nis[0]
+        verdicts[k] = USED if passed else GATED
+        contradicted = confirm(measurements, k, belief, passed)
+        if contradicted >= 0:
+            return k + 1, LOST, contradicted
+        if passed:
+            noise, jacobian = batch.noise[0], batch.jacobian[0]
+            record_pair(measurements, k, belief, batch.pair[0])
+            correct(
+                belief, update_one(belief.covariance, batch.columns[0], jacobian, batch.innovation[0], noise)
+            )
+        lost = count_gated(measurements, k, belief, passed, limits)
+        if lost >= 0:
+            return k + 1, LOST, lost
+    return measurements.stamp_ns.size, FINISHED, -1

@@ -1,0 +1,265 @@
+"""The factor: how each front's pivots depend on its border, and the covariances that follow from it.
+
+    x_J = A^T x_B + e,    cov e = D,
+
+for every front, in which all that is known of the bodies is said. A factor is never written to: what is
+derived from it, or comes after it, is another one.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.filter.sparse.symbolic import Pattern
+
+_FEW = 2
+"""Products of so few pivots with many columns take less time as loops than as calls of BLAS."""
+
+
+class Derived(NamedTuple):
+    """A body that has come since, whose error follows from those of others.
+
+    Attributes:
+        others: (s,) bodies of the factor, or derived before; none: it is independent.
+        gain: (3 s, 3) A.
+        spread: (3, 3) D.
+    """
+
+    others: IntArray
+    gain: FloatArray
+    spread: FloatArray
+
+
+class Factor(NamedTuple):
+    """A Gaussian over bodies.
+
+    Attributes:
+        pattern: Its fronts.
+        gain: Of each front A (3 b, 3 j), one behind the other.
+        gain_begin: (F + 1,) where that of each front begins.
+        spread: Likewise of each front D (3 j, 3 j).
+        spread_begin: (F + 1,)
+    """
+
+    pattern: Pattern
+    gain: FloatArray
+    gain_begin: IntArray
+    spread: FloatArray
+    spread_begin: IntArray
+
+
+_NONE: IntArray = np.zeros(0, dtype=np.int64)
+_FIRST: IntArray = np.zeros(1, dtype=np.int64)
+EMPTY = Factor(Pattern(_NONE, _FIRST, _NONE, _FIRST, _NONE), np.zeros(0), _FIRST, np.zeros(0), _FIRST)
+"""Of no bodies."""
+
+
+def new_factor(pattern: Pattern) -> Factor:
+    """A factor to be written."""
+    pivots, border = 3 * np.diff(pattern.pivot_begin), 3 * np.diff(pattern.border_begin)
+    gain_begin, spread_begin = _begins(border * pivots), _begins(pivots * pivots)
+    return Factor(pattern, np.empty(gain_begin[-1]), gain_begin, np.empty(spread_begin[-1]), spread_begin)
+
+
+def with_derived(factor: Factor, derived: tuple[Derived, ...]) -> Factor:
+    """The factor with more bodies, numbered behind those it has; each is eliminated before all others."""
+    if not derived:
+        return factor
+    old, count = factor.pattern, len(derived)
+    newest = derived[::-1]
+    bodies = old.front.size + np.arange(count)
+    borders = _begins(np.array([one.others.size for one in newest]))
+    pattern = Pattern(
+        np.concatenate([bodies[::-1], old.pivot]),
+        np.concatenate([np.arange(count), count + old.pivot_begin]),
+        np.concatenate([*(one.others for one in newest), old.border]),
+        np.concatenate([borders[:-1], borders[-1] + old.border_begin]),
+        np.concatenate([np.where(old.front >= 0, old.front + count, -1), np.arange(count)[::-1]]),
+    )
+    return Factor(
+        pattern,
+        np.concatenate([*(one.gain.reshape(-1) for one in newest), factor.gain]),
+        np.concatenate([9 * borders[:-1], 9 * borders[-1] + factor.gain_begin]),
+        np.concatenate([*(one.spread.reshape(-1) for one in newest), factor.spread]),
+        np.concatenate([9 * np.arange(count), 9 * count + factor.spread_begin]),
+    )
+
+
+def _begins(sizes: IntArray) -> IntArray:
+    """Where each of some (k,) begins, and the last one ends (k + 1,)."""
+    return np.concatenate([[0], np.cumsum(sizes)])
+
+
+@compiled
+def write_fronts(factor: Factor, covariance: FloatArray) -> None:
+    """Write the covariances within all fronts, from the last front to the first.
+
+    Takahashi et al., "Formation of a sparse bus impedance matrix and its application to short circuit study"
+    (1973), for fronts.
+
+    Args:
+        factor: Of n bodies, none of them derived.
+        covariance: (n, n, 3, 3) written; what is in no front stays as it is.
+    """
+    for f in range(factor.pattern.pivot_begin.size - 2, -1, -1):
+        _write_front(factor, f, covariance)
+
+
+@compiled
+def _write_front(factor: Factor, f: int, covariance: FloatArray) -> None:
+    """Write the covariances of the pivots of front f with it, where those of its border stand."""
+    pattern = factor.pattern
+    pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
+    border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+    width, size = 3 * border.size, 3 * pivots.size
+    own = factor.spread[factor.spread_begin[f] : factor.spread_begin[f + 1]].reshape(size, size)
+    if width:
+        gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]].reshape(width, size)
+        across = np.dot(gathered(covariance, border, border), gain)
+        own = own + np.dot(gain.T, across)
+        _scatter(covariance, border, pivots, across)
+    _scatter_own(covariance, pivots, own)
+
+
+@compiled
+def write_rows(factor: Factor, derived: int, rows: tuple[IntArray, IntArray], covariance: FloatArray) -> None:
+    """Write the covariances of wanted rows, and of bodies derived, where those within other fronts stand.
+
+    Args:
+        factor: Of n bodies.
+        derived: So many of the first fronts are of bodies derived: pairs of their borders may be in no front.
+        rows: As `symbolic.wanted_rows` gives them.
+        covariance: (n, n, 3, 3) written; what is not wanted stays as it is.
+    """
+    pattern = factor.pattern
+    for f in range(pattern.pivot_begin.size - 2, -1, -1):
+        if f < derived:
+            _write_front(factor, f, covariance)
+        wanted = rows[0][rows[1][f] : rows[1][f + 1]]
+        if not wanted.size:
+            continue
+        pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
+        border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+        across = np.zeros((3 * wanted.size, 3 * pivots.size))
+        if border.size:
+            gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]]
+            gain_of = gain.reshape(3 * border.size, 3 * pivots.size)
+            np.dot(gathered(covariance, wanted, border), gain_of, across)
+        _scatter(covariance, wanted, pivots, across)
+
+
+@compiled
+def solve(factor: Factor, right: FloatArray) -> None:
+    """Multiply the factor's covariance by columns (3 n, c), in place."""
+    fronts = factor.pattern.pivot_begin.size - 1
+    for f in range(fronts):
+        _substitute(factor, f, right)
+    for f in range(fronts - 1, -1, -1):
+        _substitute_back(factor, f, right)
+
+
+@compiled
+def _substitute(factor: Factor, f: int, right: FloatArray) -> None:
+    """Add to the border of front f what its pivots' columns say of it."""
+    pattern, columns = factor.pattern, right.shape[1]
+    pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
+    border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+    rows, size = 3 * border.size, 3 * pivots.size
+    gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]].reshape(rows, size)
+    if pivots.size <= _FEW:
+        for r in range(rows):
+            out = right[3 * border[r // 3] + r % 3]
+            for p in range(0, size, 3):
+                of_pivot = right[3 * pivots[p // 3] : 3 * pivots[p // 3] + 3]
+                add_rows(of_pivot, gain[r, p], gain[r, p + 1], gain[r, p + 2], out)
+    elif border.size:
+        added = np.dot(gain, _rows_of(right, pivots))
+        for r in range(rows):
+            row = 3 * border[r // 3] + r % 3
+            for c in range(columns):
+                right[row, c] += added[r, c]
+
+
+@compiled
+def _substitute_back(factor: Factor, f: int, right: FloatArray) -> None:
+    """Make the columns of the pivots of front f the solution, where those of its border are."""
+    pattern = factor.pattern
+    pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
+    border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
+    rows, size = 3 * border.size, 3 * pivots.size
+    gain = factor.gain[factor.gain_begin[f] : factor.gain_begin[f + 1]].reshape(rows, size)
+    spread = factor.spread[factor.spread_begin[f] : factor.spread_begin[f + 1]].reshape(size, size)
+    own = _rows_of(right, pivots)
+    if pivots.size <= _FEW:
+        for p in range(size):
+            out = right[3 * pivots[p // 3] + p % 3]
+            out[:] = 0.0
+            for q in range(0, size, 3):
+                add_rows(own[q : q + 3], spread[p, q], spread[p, q + 1], spread[p, q + 2], out)
+            for r in range(0, rows, 3):
+                of_border = right[3 * border[r // 3] : 3 * border[r // 3] + 3]
+                add_rows(of_border, gain[r, p], gain[r + 1, p], gain[r + 2, p], out)
+        return
+    solved = np.dot(spread, own)
+    if border.size:
+        solved += np.dot(gain.T, _rows_of(right, border))
+    for r in range(pivots.size):
+        right[3 * pivots[r] : 3 * pivots[r] + 3] = solved[3 * r : 3 * r + 3]
+
+
+@inlined
+def add_rows(rows: FloatArray, first: float, second: float, third: float, out: FloatArray) -> None:
+    """Add three rows (3, k), each times a factor, to one (k,)."""
+    for c in range(out.size):
+        out[c] += first * rows[0, c] + second * rows[1, c] + third * rows[2, c]
+
+
+@compiled
+def _rows_of(matrix: FloatArray, bodies: IntArray) -> FloatArray:
+    """The rows (3 k, c) of bodies (k,)."""
+    out = np.empty((3 * bodies.size, matrix.shape[1]))
+    for r in range(bodies.size):
+        out[3 * r : 3 * r + 3] = matrix[3 * bodies[r] : 3 * bodies[r] + 3]
+    return out
+
+
+@compiled
+def gathered(covariance: FloatArray, rows: IntArray, columns: IntArray) -> FloatArray:
+    """Covariances (3 r, 3 c) of bodies (r,) with bodies (c,), which stand there either way."""
+    out = np.empty((3 * rows.size, 3 * columns.size))
+    for c in range(columns.size):  # rows are many: those of one column stand together
+        for r in range(rows.size):
+            for i in range(3):
+                for j in range(3):
+                    out[3 * r + i, 3 * c + j] = covariance[columns[c], rows[r], j, i]
+    return out
+
+
+@compiled
+def _scatter(covariance: FloatArray, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
+    """Write covariances (3 r, 3 c) of bodies (r,) with bodies (c,), either way."""
+    for c in range(columns.size):
+        for r in range(rows.size):
+            for i in range(3):
+                for j in range(3):
+                    covariance[columns[c], rows[r], j, i] = values[3 * r + i, 3 * c + j]
+    for r in range(rows.size):
+        for c in range(columns.size):
+            for i in range(3):
+                for j in range(3):
+                    covariance[rows[r], columns[c], i, j] = values[3 * r + i, 3 * c + j]
+
+
+@compiled
+def _scatter_own(covariance: FloatArray, bodies: IntArray, values: FloatArray) -> None:
+    """Write covariances (3 k, 3 k) among bodies (k,), symmetric to the last bit."""
+    for r in range(bodies.size):
+        for c in range(bodies.size):
+            for i in range(3):
+                for j in range(3):
+                    a, b = 3 * r + i, 3 * c + j
+                    covariance[bodies[r], bodies[c], i, j] = 0.5 * (values[a, b] + values[b, a])

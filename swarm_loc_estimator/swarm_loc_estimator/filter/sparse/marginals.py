@@ -1,0 +1,158 @@
+"""Covariances of each body with its own parameters, and what has become of them since the newest factor."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.filter.calibration_states import BLOCKS, DRIVES
+from swarm_loc_estimator.filter.sparse.factor import Derived
+from swarm_loc_estimator.filter.sparse.parameters import Groups, Moves
+from swarm_loc_estimator.filter.sparse.translation_adjoint import levers
+
+_DRIVEN = slice(3, 3 + DRIVES)
+
+
+class Marginals:
+    """Each body's own covariance, as predictions change it.
+
+    Args:
+        groups: Which bodies have blocks of parameters.
+
+    Attributes:
+        groups: Likewise.
+        current: (n, w, w) see `JointFilter.marginal`.
+        driven: (robots, 4, DRIVES) see `JointFilter.driven`.
+    """
+
+    def __init__(self, groups: Groups) -> None:
+        self.groups = groups
+        count, width = groups.owner.size, _width(groups)
+        self.current: FloatArray = np.zeros((count, width, width))
+        self.current[:, :3, :3] = np.eye(3)
+        self._settled = self.current.copy()
+        self.driven = _undriven(groups)
+
+    def copy(self) -> Marginals:
+        """An independent copy."""
+        other = Marginals.__new__(Marginals)
+        arrays = {name: array.copy() for name, array in vars(self).items() if name != "groups"}
+        vars(other).update(arrays | {"groups": self.groups})
+        return other
+
+    def grow(self, groups: Groups) -> None:
+        """Have more bodies or blocks, without error."""
+        self.groups, driven = groups, _undriven(groups)
+        driven[: len(self.driven)] = self.driven
+        self.current, self._settled, self.driven = (
+            _enlarged(self.current, groups),
+            _enlarged(self._settled, groups),
+            driven,
+        )
+
+    def place(self, bodies: IntArray, own: IntArray, covariances: FloatArray) -> None:
+        """Give columns (c,) of bodies (k,) covariances (k, c, c), independent of what else is theirs."""
+        for known in (self.current, self._settled):
+            known[bodies[:, None], own], known[bodies[:, None], :, own] = 0.0, 0.0
+            known[bodies[:, None, None], own[:, None], own] = covariances
+        if own[0] < 3:
+            self.driven[bodies[bodies < len(self.driven)], :3] = 0.0
+
+    def settle(self, bodies: IntArray) -> None:
+        """Take them for bodies (k,) as those of the newest factor."""
+        self._settled[bodies] = self.current[bodies]
+        robots = bodies[bodies < len(self.driven)]
+        self.driven[robots, :3], self.driven[robots, 3] = 0.0, 1.0
+
+    def within(self, bodies: IntArray) -> Iterator[tuple[tuple[slice, slice], IntArray, IntArray, IntArray]]:
+        """Pairs of a body's parts, itself or its blocks, for bodies (k,).
+
+        Yields:
+            Rows and columns of both parts, whose of the bodies they are (m,), and the parts (m,) themselves.
+        """
+        parts = range(self.current.shape[1] // 3)
+        first = np.arange(bodies.size)
+        yield (slice(3), slice(3)), first, bodies, bodies
+        robots = np.flatnonzero(bodies < len(self.driven))
+        member = self.groups.member[bodies[robots]]
+        for row, column in itertools.product(parts, parts):
+            there = (member[:, row] >= 0) & (member[:, column] >= 0)
+            if row + column and there.any():
+                where = slice(3 * row, 3 * row + 3), slice(3 * column, 3 * column + 3)
+                yield where, robots[there], member[there, row], member[there, column]
+
+    def since(self, bodies: IntArray, places: FloatArray) -> tuple[FloatArray, Moves]:
+        """What has become of the errors of bodies (k,) since the newest factor, about places (n, 2).
+
+        Returns:
+            The noise (k, w, w) in them and their parameters, and how else these have moved.
+        """
+        count, before, lever = self.groups.owner.size, self._settled[bodies], levers(places[bodies])
+        moves = Moves(np.full(count, -1), np.zeros((count, 3, 3)), np.ones((count, 3)))
+        if len(self.driven):
+            of_robots = np.flatnonzero(bodies < len(self.driven))
+            robots, own = bodies[of_robots], np.arange(3, 3 + DRIVES)
+            driven, blocks = self.driven[robots], self.groups.member[robots, 1]
+            follow = np.tile(np.eye(before.shape[1]), (bodies.size, 1, 1))
+            follow[of_robots, :3, _DRIVEN] = driven[:, :3]
+            follow[of_robots[:, None], own, own] = driven[:, 3]
+            before = follow @ before @ follow.transpose(0, 2, 1)
+            moved = driven[:, :3].any(axis=(1, 2))
+            moves.beside[robots[moved]] = blocks[moved]
+            moves.gain[robots] = lever[of_robots] @ driven[:, :3]
+            moves.left[blocks[blocks >= 0]] = driven[blocks >= 0, 3]
+        noise = self.current[bodies] - before
+        noise[:, :3] = lever @ noise[:, :3]
+        noise[:, :, :3] = noise[:, :, :3] @ lever.transpose(0, 2, 1)
+        return noise, moves
+
+
+def _width(groups: Groups) -> int:
+    """Columns of a body with its parameters: where there are none, those of the body."""
+    return 3 * (1 + BLOCKS) if (groups.member[:, 1:] >= 0).any() else 3
+
+
+def _enlarged(known: FloatArray, groups: Groups) -> FloatArray:
+    """The same (n, w, w) for more bodies and blocks, without error."""
+    out = np.zeros((groups.owner.size, _width(groups), _width(groups)))
+    out[: len(known), : known.shape[1], : known.shape[1]] = known
+    return out
+
+
+def _undriven(groups: Groups) -> FloatArray:
+    """No move; where there are no parameters, of no robot."""
+    robots = len(groups.member) if _width(groups) > 3 else 0
+    return np.tile(np.vstack([np.zeros((3, DRIVES)), np.ones(DRIVES)]), (robots, 1, 1))
+
+
+def derived_by(moves: Moves, group: tuple[int, int], noise: FloatArray, numbers: IntArray) -> list[Derived]:
+    """The blocks and the pose of one robot after moves, each to be appended behind those before.
+
+    Args:
+        moves: What becomes of them.
+        group: The robot and the block that moves it; -1: none.
+        noise: (w, w) covariance of what the pose and the blocks have gained; of the block that moves the
+            pose each column has noise of its own.
+        numbers: (2 + BLOCKS,) of the pose and the blocks before, and of the next body to come; -1: none.
+
+    Returns:
+        The new blocks in their order, then the pose.
+    """
+    out, (robot, block) = [], group
+    gain, left = moves.gain[robot], moves.left[block]
+    for k in range(1, 1 + BLOCKS):
+        if numbers[k] >= 0:
+            own = noise[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+            out.append(Derived(numbers[k : k + 1], np.diag(left) if k == 1 else np.eye(3), own))
+    if numbers[0] < 0:
+        return out
+    if numbers[1] < 0:
+        return [*out, Derived(numbers[:1], np.eye(3), noise[:3, :3])]
+    variance = np.maximum(np.diag(noise)[3:6], 0.0)
+    share = np.divide(noise[:3, 3:6], variance, out=np.zeros((3, 3)), where=variance > 0.0)
+    weights = np.hstack([np.eye(3), gain - share * left, share])
+    rest = noise[:3, :3] - (share * variance) @ share.T
+    return [*out, Derived(numbers[[0, 1, -1]], weights.T.copy(), rest)]

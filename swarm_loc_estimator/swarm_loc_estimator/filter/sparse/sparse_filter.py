@@ -1,0 +1,378 @@
+"""The sparse filter: errors of bodies and of parameters on a chordal pattern, which follows who sees whom."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.filter.calibration_states import BLOCKS, ParameterTable
+from swarm_loc_estimator.filter.joint_filter import Robots
+from swarm_loc_estimator.filter.sparse import low_rank_correction as copies
+from swarm_loc_estimator.filter.sparse.elimination import Prior, eliminate
+from swarm_loc_estimator.filter.sparse.factor import (
+    EMPTY,
+    Derived,
+    Factor,
+    with_derived,
+    write_fronts,
+    write_rows,
+)
+from swarm_loc_estimator.filter.sparse.marginals import Marginals, derived_by
+from swarm_loc_estimator.filter.sparse.neighbours import spread
+from swarm_loc_estimator.filter.sparse.ordering import Ordering, Situation, ordered
+from swarm_loc_estimator.filter.sparse.parameters import (
+    Groups,
+    active_blocks,
+    block_pairs,
+    move,
+    moved_shares,
+)
+from swarm_loc_estimator.filter.sparse.symbolic import Pattern, wanted_rows
+from swarm_loc_estimator.filter.sparse.translation_adjoint import (
+    carried,
+    carried_pairs,
+    centres,
+    information_of,
+    levers,
+    summed,
+)
+
+_COPIES = 64
+_COPIED_SHARE = 4
+"""One of so many bodies is copied, at most."""
+_COPIED_AGAIN = 100
+"""Updates after which other bodies are copied: copies grow old, but each new choice forgets something."""
+_PAIRS_KEPT, _PAIRS_KEPT_WITH_BLOCKS = 3, 2
+"""Pairs of so many updates count as neighbours; with blocks all that a robot has measured are neighbours."""
+_FAR_M = 20.0
+"""A body so far from where its error is held about is held about another place."""
+_NOBODY: IntArray = np.zeros(0, dtype=np.int64)
+
+
+class _Prepared(NamedTuple):
+    """What an update needs: the pattern, covariances and shares of copies before it, who is active."""
+
+    pattern: Pattern
+    prior: Prior
+    shares: FloatArray
+    active: IntArray
+
+    def covariance_of(self, first: IntArray, second: IntArray) -> FloatArray:
+        """Covariances (k, 3, 3) of pairs of the pattern."""
+        places, covariance = self.prior.place, self.prior.covariance
+        return covariance[places[first], places[second]] + copies.shared(self.shares, first, second)
+
+
+class SparseFilter:
+    """Errors of bodies, of which those of bodies that are not neighbours are known through others.
+
+    Three columns each are those of a body, or of a block of a robot's parameters.
+
+    Args:
+        table: Which columns there are, in blocks; each starts with unit variance, independent.
+    """
+
+    sequential = False
+
+    def __init__(self, table: ParameterTable) -> None:
+        count = table.filter_size // 3
+        self.covariance: FloatArray = np.zeros((0, 0))
+        self._marginals = Marginals(Groups.of(table))
+        self._place: FloatArray = np.zeros((count, 2))
+        self._number: IntArray = np.full(count, -1)
+        self._factor = EMPTY
+        self._shares: FloatArray = np.zeros((0, 3, 0))
+        self._new: tuple[Derived, ...] = ()
+        self._pairs: tuple[IntArray, ...] = ()
+        self._ordering: Ordering | None = None
+        self._updates = 0
+        self._prepared: _Prepared | None = None
+        self._room = _Room(count)
+
+    def copy(self) -> SparseFilter:
+        """An independent copy; factors are shared, since they are never written to."""
+        other = SparseFilter.__new__(SparseFilter)
+        copied = {name: vars(self)[name].copy() for name in ("_marginals", "_place", "_number")}
+        vars(other).update(vars(self) | copied | {"_prepared": None})
+        return other
+
+    @property
+    def marginal(self) -> FloatArray:
+        """See `JointFilter`."""
+        return self._marginals.current
+
+    @property
+    def driven(self) -> FloatArray:
+        """See `JointFilter`."""
+        return self._marginals.driven
+
+    @property
+    def _groups(self) -> Groups:
+        """Which bodies have blocks."""
+        return self._marginals.groups
+
+    def place(self, columns: IntArray, covariance: FloatArray) -> None:
+        """Give columns (k,) this covariance (k, k), independent of the rest, whatever was known."""
+        if columns.size and self._groups.part[columns[0] // 3]:
+            blocks, variances = columns // 3, np.diag(covariance)
+            for block in np.unique(blocks).tolist():
+                here = blocks == block
+                self._place_parameters(columns[here], variances[here])
+        elif columns.size:
+            self.place_bodies(columns[:1] // 3, covariance[None])
+
+    def _place_parameters(self, columns: IntArray, variances: FloatArray) -> None:
+        """Likewise parameters (k,) of one block; what else stands there stays as it is."""
+        (robot, own), block = self._groups.columns(columns), columns[:1] // 3
+        spread, kept = np.ones(3), np.ones(3)
+        kept[columns % 3] = 0.0
+        if self._number[block[0]] < 0:
+            others, gain = _NOBODY, np.zeros((0, 3))
+        else:
+            self._take_in(robot)
+            others, gain, spread = self._number[block], np.diag(kept), np.zeros(3)
+        spread[columns % 3] = variances
+        self._append(block, [Derived(others, gain, np.diag(spread))])
+        self._marginals.place(np.array([robot]), own, np.diag(variances)[None])
+
+    def place_bodies(self, bodies: IntArray, covariances: FloatArray) -> None:
+        """Likewise the columns of bodies (k,), each with a covariance (k, 3, 3) of its own."""
+        self._place[bodies] = centres(covariances)
+        own = carried(self._place[bodies], covariances)
+        self._append(bodies, [Derived(_NOBODY, np.zeros((0, 3)), one) for one in own])
+        self._marginals.place(bodies, np.arange(3), covariances)
+
+    def _append(self, bodies: IntArray, derived: Sequence[Derived]) -> None:
+        """Let bodies (k,) be new ones."""
+        self._number[bodies] = self._next_number + np.arange(len(derived))
+        self._new += tuple(derived)
+
+    @property
+    def _next_number(self) -> int:
+        """That of the next body to come."""
+        return self._factor.pattern.front.size + len(self._new)
+
+    def add(self, columns: IntArray, covariance: FloatArray) -> None:
+        """Add a covariance (k, k) to that of columns (k,): their errors are larger than was known."""
+        if columns.size:
+            body, own = self._groups.columns(columns)
+            self.marginal[body, own[:, None], own] += covariance
+
+    def grow(self, table: ParameterTable) -> None:
+        """Append the columns that a table has more, without error as yet: they are placed next."""
+        more = table.filter_size // 3 - self._number.size
+        self._marginals.grow(Groups.of(table))
+        self._place = np.concatenate([self._place, np.zeros((more, 2))])
+        self._number = np.concatenate([self._number, np.full(more, -1)])
+        self._ordering = None
+
+    def relate(self, columns: IntArray, others: IntArray, mapping: FloatArray) -> None:
+        """Add the errors of other bodies' columns (m,), mapped by (3, m), to those of a body just placed.
+
+        Until the next update its marginal is that of others which err alike.
+        """
+        if others.size == 0:
+            return
+        body, bodies = int(columns[0]) // 3, others[::3] // 3
+        placed, self._new = self._new[-1], self._new[:-1]
+        for other in np.unique(bodies).tolist():
+            self._take_in(other)
+        lever, back = levers(self._place[[body]])[0], levers(-self._place[bodies])
+        shares = lever @ mapping.reshape(3, -1, 3).transpose(1, 0, 2) @ back
+        alike = np.linalg.cholesky(carried(self._place[bodies], self.marginal[bodies, :3, :3]))
+        common = np.sum(shares @ alike, axis=0)
+        gain = shares.transpose(0, 2, 1).reshape(-1, 3)
+        self._append(columns[:1] // 3, [Derived(self._number[bodies], gain, placed.spread)])
+        more = carried(-self._place[[body]], (common @ common.T)[None])
+        own = self.marginal[[body], :3, :3] + more
+        self._marginals.place(np.array([body]), np.arange(3), own)
+
+    def _take_in(self, body: int) -> None:
+        """Take what a body's errors have become since the newest factor into them, so others share it."""
+        noise, moves = self._marginals.since(np.array([body]), self._place)
+        if not noise.any() and moves.beside[body] < 0:
+            return
+        is_robot = body < len(self.driven)
+        blocks = self._groups.member[body] if is_robot else np.array([body] + BLOCKS * [-1])
+        numbers = np.where(blocks >= 0, self._number[blocks], -1)
+        derived = derived_by(
+            moves, (int(body), int(blocks[1])), noise[0], np.append(numbers, self._next_number)
+        )
+        present = blocks[[*range(1, 1 + BLOCKS), 0]]
+        self._append(present[(present >= 0) & (self._number[present] >= 0)], derived)
+        self._marginals.settle(np.array([body]))
+
+    def block(self, columns: IntArray) -> FloatArray:
+        """Covariance (k, k) of columns (k,) of a body or of one robot's parameters; (0, 0) of none."""
+        if columns.size == 0:
+            return np.zeros((0, 0))
+        body, own = self._groups.columns(columns)
+        covariance: FloatArray = self.marginal[body][np.ix_(own, own)]
+        return covariance
+
+    def relate_pairs(self, columns: IntArray, robots: Robots, across: FloatArray) -> None:
+        """Write covariances of what measurements (m,) depend on, before an update with them.
+
+        Args:
+            columns: (m, 3) the first columns of observers, targets and observers' cameras; -1: there is none.
+            robots: Where all are.
+            across: (m, 3, 5) written: of the observers' errors with the targets', and of these with those of
+                the cameras; those that there are none of do not matter.
+        """
+        tied = (columns[:, :2] >= 0).all(axis=1)
+        bodies = columns // 3
+        prepared = self._prepare(bodies[tied, :2], robots)
+        across[tied, :, :3] = self._about_map(prepared.covariance_of, *bodies[tied, :2].T)
+        seen = (columns[:, 1:] >= 0).all(axis=1)
+        across[seen, :, 3:] = self._about_map(prepared.covariance_of, *bodies[seen, 1:].T)[:, :, :2]
+
+    def _prepare(self, pairs: IntArray, robots: Robots) -> _Prepared:
+        """Have the covariances of all pairs of a pattern that pairs (k, 2) fit into."""
+        count = robots.active.size
+        # landmarks stand where they were placed
+        places = np.concatenate([robots.places, self._place[count:]])
+        active = np.flatnonzero(np.concatenate([robots.active, self._number[count:] >= 0]))
+        bodies = active[self._groups.part[active] == 0]
+        self._move_far(bodies, places)
+        factor, shares = with_derived(self._factor, self._new), copies.with_derived(self._shares, self._new)
+        pattern = self._pattern(pairs, active, places)
+        noise, moves = self._marginals.since(bodies, self._place)
+        rows = wanted_rows(factor.pattern, pattern, self._number, len(self._new), moves.beside)
+        covariance = self._room.with_fronts(self._factor, len(self._new))
+        write_rows(factor, len(self._new), rows, covariance)
+        self._room.holds = None  # since noise is added to it
+        others = None
+        if self._updates % _COPIED_AGAIN == 0:
+            copied = bodies[spread(places[bodies], min(_COPIES, bodies.size // _COPIED_SHARE))]
+            others = copies.renewed(factor, shares, self._number[copied])
+        if moves.any():
+            move(covariance, pattern, self._number, moves)
+            shares = moved_shares(shares, self._number, moves)
+            others = None if others is None else moved_shares(others, self._number, moves)
+        if others is not None:
+            copies.change_shared(covariance, pattern, self._number, (shares, others))
+            shares = others
+        self._updates += 1
+        self._add_noise(covariance, bodies, noise)
+        prior = Prior(covariance, self._number)
+        self._prepared = _Prepared(pattern, prior, self._by_body(shares, active), active)
+        return self._prepared
+
+    def _add_noise(self, covariance: FloatArray, bodies: IntArray, noise: FloatArray) -> None:
+        """Add what bodies (k,) have gained, with their blocks, to covariances by number."""
+        for (row, column), of, first, second in self._marginals.within(bodies):
+            covariance[self._number[first], self._number[second]] += noise[of, row, column]
+
+    def _by_body(self, shares: FloatArray, active: IntArray) -> FloatArray:
+        """Shares of copies (n, 3, r) of all bodies, from those by number."""
+        numbers = self._number[active]
+        if np.array_equal(numbers, np.arange(self._number.size)):
+            return shares  # all are there, as they were before
+        by_body = np.zeros((self._number.size, 3, shares.shape[2]))
+        by_body[active] = shares[numbers]
+        return by_body
+
+    def _move_far(self, active: IntArray, places: FloatArray) -> None:
+        """Hold the errors of bodies that have gone far about where they are now."""
+        moved = places[active] - self._place[active]
+        far = active[np.hypot(moved[:, 0], moved[:, 1]) > _FAR_M]
+        turns = levers(places[far] - self._place[far])
+        for body, turn in zip(far[:, None], turns, strict=True):
+            self._append(body, [Derived(self._number[body], turn.T.copy(), np.zeros((3, 3)))])
+        self._place[far] = places[far]
+
+    def _pattern(self, pairs: IntArray, active: IntArray, places: FloatArray) -> Pattern:
+        """A pattern in which all these pairs (k, 2) lie, in the order in use or a new one."""
+        here = np.zeros(self._number.size, dtype=bool)
+        here[active] = True
+        kept = _PAIRS_KEPT_WITH_BLOCKS if self._groups.part.any() else _PAIRS_KEPT
+        self._pairs = (*self._pairs[1 - kept :], pairs)
+        recent = np.concatenate(self._pairs)
+        recent = recent[here[recent].all(axis=1)]
+        pairs = np.concatenate([recent, block_pairs(self._groups, here, recent)])
+        bodies = active[self._groups.part[active] == 0]
+        situation = Situation(bodies, active_blocks(self._groups, here), places, pairs)
+        self._ordering = ordered(situation, self._ordering)
+        return self._ordering.pattern
+
+    def _about_map(
+        self, covariance_of: Callable[[IntArray, IntArray], FloatArray], first: IntArray, second: IntArray
+    ) -> FloatArray:
+        """Covariances (k, 3, 3) of pairs, of errors as the filter's columns are."""
+        return carried_pairs(-self._place[first], covariance_of(first, second), -self._place[second])
+
+    def update(
+        self, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
+    ) -> FloatArray:
+        """Use many measurements with independent errors at once; return the correction (n,) of all columns.
+
+        Their pairs must have been among those of `relate_pairs`, which comes before each update.
+
+        Args:
+            columns: (m, c) what each depends on, the two bodies' first.
+            jacobian: (m, 3, c) its Jacobian; a zero row is a component that was not measured.
+            innovation: (m, 3) measured minus predicted.
+            noise: (m, 3, 3) covariance of the measurement.
+        """
+        if self._prepared is None:
+            raise RuntimeError("the pairs of an update are related first")
+        (pattern, prior, shares, active), self._prepared = self._prepared, None
+        measured = summed(information_of(columns, jacobian, innovation, noise, self._place))
+        self._factor = eliminate(pattern, prior, measured)
+        self._shares, correction = copies.updated(self._factor, shares, measured)
+        count = self._number.size
+        self._number = np.full(count, -1)
+        self._number[active] = active
+        self._new = ()
+        self._settle(active)
+        moved = np.einsum("nij,nj->ni", levers(-self._place[active]), correction[active])
+        out = np.zeros((count, 3))
+        out[active] = moved
+        return out.reshape(-1)
+
+    def _settle(self, active: IntArray) -> None:
+        """Have the marginals of the newest factor and copies."""
+        covariance = self._room.with_fronts(self._factor)
+        bodies = active[self._groups.part[active] == 0]
+        for (row, column), of, first, second in self._marginals.within(bodies):
+            own = covariance[first, second] + copies.shared(self._shares, first, second)
+            own = carried_pairs(-self._place[first], own, -self._place[second])
+            self.marginal[bodies[of], row, column] = own
+        self._marginals.settle(bodies)
+
+
+class _Room:
+    """Where covariances are written between two factors, for a filter and all its copies.
+
+    Args:
+        bodies: How many there are at first.
+
+    Attributes:
+        holds: The factor of whose fronts all covariances stand there.
+    """
+
+    def __init__(self, bodies: int) -> None:
+        self._blocks: FloatArray = np.zeros((0, 0, 3, 3))
+        self.holds: Factor | None = None
+        self._make(bodies)
+
+    def with_fronts(self, factor: Factor, more: int = 0) -> FloatArray:
+        """Room (n, n, 3, 3) with the covariances within all fronts of a factor; others do not matter.
+
+        There is room for `more` bodies than the factor has.
+        """
+        bodies = factor.pattern.front.size + more
+        if len(self._blocks) < bodies:
+            self._make(bodies)
+        if factor is not self.holds:
+            write_fronts(factor, self._blocks)
+            self.holds = factor
+        return self._blocks
+
+    def _make(self, bodies: int) -> None:
+        size = bodies + bodies // 8
+        self._blocks, self.holds = np.zeros((size, size, 3, 3)), None
+        self._blocks.fill(0.0)  # so that the system finds the memory now, and not when data are there

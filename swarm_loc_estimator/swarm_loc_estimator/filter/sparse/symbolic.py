@@ -1,0 +1,195 @@
+"""Symbolic elimination: which bodies each front holds, and what of the factor before it has to be known.
+
+A front eliminates its pivots J, given its border B: all bodies eliminated later that are paired with one of
+them, or with what was eliminated before and led to them. The pairs within all J and B are the pattern.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import BoolArray, IntArray
+from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.filter.sparse.dissection import Order
+from swarm_loc_estimator.filter.sparse.neighbours import Adjacency
+
+
+class Pattern(NamedTuple):
+    """Fronts in the order of their elimination.
+
+    Attributes:
+        pivot: Bodies, front by front.
+        pivot_begin: (F + 1,) where those of each front begin.
+        border: Likewise the bodies of the borders.
+        border_begin: (F + 1,)
+        front: (n,) in which front each body is a pivot; -1: in none.
+    """
+
+    pivot: IntArray
+    pivot_begin: IntArray
+    border: IntArray
+    border_begin: IntArray
+    front: IntArray
+
+    @property
+    def fronts(self) -> int:
+        """How many there are."""
+        return self.pivot_begin.size - 1
+
+    @property
+    def width(self) -> int:
+        """Bodies in the largest front."""
+        return int((np.diff(self.pivot_begin) + np.diff(self.border_begin)).max(initial=0))
+
+
+def pattern_of(order: Order, adjacency: Adjacency) -> Pattern:
+    """The fronts of an order of n bodies."""
+    front = np.full(adjacency.begin.size - 1, -1, dtype=np.int64)
+    front[order.body] = np.repeat(np.arange(order.begin.size - 1), np.diff(order.begin))
+    border, border_begin = _borders(order, front, adjacency)
+    return Pattern(order.body, order.begin, border, border_begin, front)
+
+
+@compiled
+def _borders(order: Order, front: IntArray, adjacency: Adjacency) -> tuple[IntArray, IntArray]:
+    """The bodies of all borders, front by front, and where each begins (F + 1,)."""
+    pivot, begin = order.body, order.begin
+    fronts, seen = begin.size - 1, np.full(front.size, -1, dtype=np.int64)
+    borders, border_begin = np.empty(64 * front.size, dtype=np.int64), np.zeros(fronts + 1, dtype=np.int64)
+    child, sibling = np.full(fronts, -1, dtype=np.int64), np.full(fronts, -1, dtype=np.int64)
+    end = 0
+    for f in range(fronts):
+        if end + front.size > borders.size:
+            borders = np.concatenate((borders, np.empty_like(borders)))
+        first = end
+        for body in pivot[begin[f] : begin[f + 1]]:
+            neighbours = adjacency.neighbour[adjacency.begin[body] : adjacency.begin[body + 1]]
+            end = _take(neighbours, f, front, seen, borders, end)
+        below = child[f]
+        while below >= 0:
+            end = _take(borders[border_begin[below] : border_begin[below + 1]], f, front, seen, borders, end)
+            below = sibling[below]
+        border_begin[f + 1] = end
+        if end > first:
+            parent = front[borders[first:end]].min()
+            sibling[f], child[parent] = child[parent], f
+    return borders[:end].copy(), border_begin
+
+
+@compiled
+def _take(bodies: IntArray, f: int, front: IntArray, seen: IntArray, borders: IntArray, end: int) -> int:
+    """Write those bodies behind the borders that are pivots later than front f; return the new end."""
+    for body in bodies:
+        if front[body] > f and seen[body] != f:
+            seen[body] = f
+            borders[end] = body
+            end += 1
+    return end
+
+
+def wanted_rows(
+    old: Pattern, new: Pattern, place: IntArray, derived: int, beside: IntArray
+) -> tuple[IntArray, IntArray]:
+    """What has to be known of an old factor besides its own pattern, for a new pattern to be.
+
+    Args:
+        old: Its bodies have numbers of their own.
+        new: Whose pairs are wanted.
+        place: (n,) the numbers of the new pattern's bodies in the old one.
+        derived: So many of the first fronts have borders whose pairs may be in no front.
+        beside: (n,) a body that is wanted wherever another one is; -1: none.
+
+    Returns:
+        Bodies, front by front of the old pattern, whose covariances with its pivots are wanted, and where
+        those of each front begin (F + 1,).
+    """
+    position = np.empty_like(old.front)
+    position[old.pivot] = np.arange(old.pivot.size)
+    wanted = np.zeros((old.fronts, old.pivot.size), dtype=np.bool_)
+    _want_pairs(_Sequence(old.front, position), new, place, beside, wanted)
+    return _close(old, position, wanted, derived)
+
+
+class _Sequence(NamedTuple):
+    """When each body is eliminated: in which front, and as which one."""
+
+    front: IntArray
+    position: IntArray
+
+
+@compiled
+def _want_pairs(old: _Sequence, new: Pattern, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
+    """Note all pairs of the new pattern, and of those beside, at the earlier one's front."""
+    for f in range(new.pivot_begin.size - 1):
+        for k in range(new.pivot_begin[f], new.pivot_begin[f + 1]):
+            a = new.pivot[k]
+            if beside[a] >= 0:
+                _want(old, place[a], place[beside[a]], wanted)
+            for q in range(k + 1, new.pivot_begin[f + 1]):
+                _want_with(old, a, new.pivot[q], place, beside, wanted)
+            for q in range(new.border_begin[f], new.border_begin[f + 1]):
+                _want_with(old, a, new.border[q], place, beside, wanted)
+
+
+@compiled
+def _want_with(old: _Sequence, a: int, b: int, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
+    """Note a pair of bodies, with those beside them."""
+    _want(old, place[a], place[b], wanted)
+    if beside[a] >= 0:
+        _want(old, place[beside[a]], place[b], wanted)
+        if beside[b] >= 0:
+            _want(old, place[beside[a]], place[beside[b]], wanted)
+    if beside[b] >= 0:
+        _want(old, place[a], place[beside[b]], wanted)
+
+
+@compiled
+def _want(old: _Sequence, a: int, b: int, wanted: BoolArray) -> None:
+    """Note a pair of bodies; those of one front are known."""
+    if old.front[a] < old.front[b]:
+        wanted[old.front[a], old.position[b]] = True
+    elif old.front[b] < old.front[a]:
+        wanted[old.front[b], old.position[a]] = True
+
+
+@compiled
+def _close(old: Pattern, position: IntArray, wanted: BoolArray, derived: int) -> tuple[IntArray, IntArray]:
+    """Add what the wanted ones follow from: a pair of a pivot follows from those of its border."""
+    sequence, fronts = _Sequence(old.front, position), old.pivot_begin.size - 1
+    begin, end = np.zeros(fronts + 1, dtype=np.int64), 0
+    for f in range(fronts):
+        border = old.border[old.border_begin[f] : old.border_begin[f + 1]]
+        for body in border:
+            wanted[f, position[body]] = False
+            for other in border if f < derived else border[:0]:
+                _want(sequence, body, other, wanted)
+        end += _follow(old, position, wanted, f)
+        begin[f + 1] = end
+    rows, end = np.empty(end, dtype=np.int64), 0
+    for f in range(fronts):
+        for k in range(old.pivot_begin[f + 1], old.pivot.size):
+            if wanted[f, k]:
+                rows[end] = old.pivot[k]
+                end += 1
+    return rows, begin
+
+
+@compiled
+def _follow(old: Pattern, position: IntArray, wanted: BoolArray, f: int) -> int:
+    """Want the pairs of the border of front f with all that are wanted there; return how many these are."""
+    border = old.border[old.border_begin[f] : old.border_begin[f + 1]]
+    for body in border:  # those that are eliminated after it
+        front = old.front[body]
+        for k in range(old.pivot_begin[front + 1], old.pivot.size):
+            wanted[front, k] |= wanted[f, k]
+    count, newest = 0, -1
+    for k in range(old.pivot_begin[f + 1], old.pivot.size):
+        if wanted[f, k]:
+            count, front = count + 1, old.front[old.pivot[k]]
+            for body in border if front != newest else border[:0]:
+                if old.front[body] > front:
+                    wanted[front, position[body]] = True
+            newest = front
+    return count

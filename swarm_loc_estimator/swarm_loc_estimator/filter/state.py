@@ -1,0 +1,304 @@
+"""The filter's state at one instant: enough to go on from there, so a copy is a checkpoint."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.se2 import error_covariance
+from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
+from swarm_loc_estimator.filter.calibration_states import PARAMETERS, ParameterTable
+from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS
+from swarm_loc_estimator.filter.dense_filter import DenseFilter
+from swarm_loc_estimator.filter.integrity.fault_detection import new_integrity
+from swarm_loc_estimator.filter.integrity.noise_inflation import doubt_noise
+from swarm_loc_estimator.filter.joint_filter import JointFilter
+from swarm_loc_estimator.filter.measurement_model import NOBODY
+from swarm_loc_estimator.identification.memory import IdentityMemory
+from swarm_loc_estimator.odometry.preintegration import Preintegrated
+
+_DOUBTED_POSE_SIGMA = (0.02, 0.02, 0.03)
+"""By how much less certain the pose of a contradicted robot becomes [m], [m], [rad]."""
+_REOPENED_POSE_SIGMA = (0.06, 0.06, 0.12)
+"""How certain poses are that rest on a description that is not so."""
+_ALONE: IntArray = np.zeros(0, dtype=np.int64)
+_NO_SHARES: FloatArray = np.zeros((0, 3, 3))
+
+
+class InitialPose(NamedTuple):
+    """Where the track of a robot lies that is to be initialized.
+
+    Its error is one of its own, and a share of those of what it was located by.
+
+    Attributes:
+        transform: (3,) T, from `map` to the track's frame.
+        covariance: (3, 3) of the part of its right-invariant error that is its own.
+        columns: (s,) first filter columns of the others' errors.
+        shares: (s, 3, 3) how they enter its own.
+    """
+
+    transform: FloatArray
+    covariance: FloatArray
+    columns: IntArray = _ALONE
+    shares: FloatArray = _NO_SHARES
+
+
+class Starts(NamedTuple):
+    """Where and when the tracks of robots (k,) begin to count, whose errors are their own.
+
+    Attributes:
+        transform: (k, 3) T, from `map` to the tracks' frames.
+        covariance: (k, 3, 3) of their right-invariant errors.
+        stamp_ns: (k,) the instants.
+        preintegrated_covariance: (k, 3, 3) of the tracks by then.
+        preintegrated_jacobian: (k, 3, 3) likewise.
+    """
+
+    transform: FloatArray
+    covariance: FloatArray
+    stamp_ns: IntArray
+    preintegrated_covariance: FloatArray
+    preintegrated_jacobian: FloatArray
+
+
+class SwarmState:
+    """Joint belief over all robots.
+
+    Args:
+        table: Which parameters are estimated besides the poses.
+        pairs: Of how many others each robot remembers what it has measured.
+        joint: A filter of the table's size in which nothing is known; a dense one if not given.
+
+    Attributes:
+        transform: (N, 3) T, from `map` to the frame of the robot's odometry track.
+        parameter: (N, PARAMETERS) see `filter/calibration_states.py`.
+        landmark: (L, 3) by what each landmark is moved from its surveyed place, in `map`.
+        filter: Covariance of the errors: robot i has columns 3i..3i+2 for its pose, right-invariant, and
+            those of the table for its parameters; landmarks have those of the table.
+        predicted_to_ns: (N,) the instant to which the robot is predicted.
+        preintegrated_covariance: (N, 3, 3) of its track at that instant; likewise preintegrated_jacobian.
+        tracked: (N,) whether the robot is part of the estimate.
+        start_pending: (N,) whether the robot may still be initialized at its configured start.
+        last_fix_ns: (N,) newest accepted measurement tied to a landmark or an absolute fix.
+        integrity: What the newest measurements say of all this.
+        contradicted_ns: (N + L,) when each robot and landmark was contradicted last; NEVER_NS: never.
+        all_opened: Whether everything was, at once.
+        pair_robot: (N, pairs) whom each has measured; -1: nobody.
+        pair_stamp_ns: (N, pairs) when last.
+        pair_history: (N, pairs, PAIR_ROWS, 3) what was measured, see `correlated_noise.py`.
+        constraints: Per robot that is not tracked, sightings which may locate it (see `initializer.py`).
+        next_attempt_ns: (N,) before this instant nothing more is made of its constraints.
+        images: What is remembered of aerial images.
+    """
+
+    def __init__(self, table: ParameterTable, pairs: int = 0, joint: JointFilter | None = None) -> None:
+        robots = table.column.shape[0]
+        self._table = table
+        self.transform: FloatArray = np.zeros((robots, 3))
+        self.parameter: FloatArray = np.zeros((robots, PARAMETERS))
+        landmarks = table.survey_column.size
+        self.landmark: FloatArray = np.zeros((landmarks, 3))
+        self.filter: JointFilter = DenseFilter(table.filter_size) if joint is None else joint
+        self._place_described()
+        self.predicted_to_ns: NDArray[np.int64] = np.zeros(robots, dtype=np.int64)
+        self.preintegrated_covariance: FloatArray = np.zeros((robots, 3, 3))
+        self.preintegrated_jacobian: FloatArray = np.zeros((robots, 3, 3))
+        self.tracked: NDArray[np.bool_] = np.zeros(robots, dtype=bool)
+        self.start_pending: NDArray[np.bool_] = np.ones(robots, dtype=bool)
+        self.last_fix_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
+        self.integrity = new_integrity(robots, landmarks)
+        self.contradicted_ns: IntArray = np.full(robots + landmarks, NEVER_NS)
+        self.all_opened = False
+        self.pair_robot: NDArray[np.int64] = np.full((robots, pairs), -1)
+        self.pair_stamp_ns: NDArray[np.int64] = np.full((robots, pairs), NEVER_NS)
+        self.pair_history: FloatArray = np.zeros((robots, pairs, PAIR_ROWS, 3))
+        self.constraints: dict[int, NDArray[np.void]] = {}
+        self.next_attempt_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
+        self.images = IdentityMemory()
+
+    def copy(self) -> SwarmState:
+        """An independent copy."""
+        other = SwarmState.__new__(SwarmState)
+        for name, value in vars(self).items():
+            # a table never changes; the arrays inside `constraints` are replaced, never written to
+            setattr(other, name, value if name in {"_table", "integrity", "all_opened"} else value.copy())
+        other.integrity = IntegrityArrays(*(column.copy() for column in self.integrity))
+        return other
+
+    def arrays(self) -> BeliefArrays:
+        """Views for compiled code."""
+        return BeliefArrays(
+            self.transform,
+            self.filter.covariance,
+            self.filter.marginal,
+            self.filter.driven,
+            self.parameter,
+            self.landmark,
+            self._table,
+            self.predicted_to_ns,
+            self.preintegrated_covariance,
+            self.preintegrated_jacobian,
+            self.tracked,
+            self.last_fix_ns,
+            self.integrity,
+            self.pair_robot,
+            self.pair_stamp_ns,
+            self.pair_history,
+        )
+
+    def is_known(self, side: int) -> bool:
+        """Whether a side of a measurement is located: a robot, or NOBODY in place of what is in `map`."""
+        return side == NOBODY or bool(self.tracked[side])
+
+    def initialize(self, robot: int, initial: InitialPose, at: Preintegrated, confirmations: int = 0) -> None:
+        """Take the robot into the estimate.
+
+        Args:
+            robot: Its index.
+            initial: Where its track lies.
+            at: The instant, and what its track has preintegrated by then.
+            confirmations: How many sightings agree with that.
+        """
+        alone = (initial.transform, initial.covariance, at.stamp_ns, at.covariance, at.jacobian)
+        self.start(np.array([robot]), Starts(*(np.array([one]) for one in alone)), confirmations)
+        others = (initial.columns[:, None] + np.arange(3)).reshape(-1)
+        mapping = initial.shares.transpose(1, 0, 2).reshape(3, -1)
+        self.filter.relate(robot_columns(np.array([robot]))[0], others, mapping)
+
+    def start(self, robots: IntArray, starts: Starts, confirmations: int = 0) -> None:
+        """Take robots (k,) into the estimate whose errors are their own, see `initialize`."""
+        for robot in robots[self.tracked[robots]].tolist():
+            self._forget_pairs(robot)
+        self.transform[robots] = starts.transform
+        self._isolate(robots, starts.covariance)
+        self.predicted_to_ns[robots] = starts.stamp_ns
+        self.preintegrated_covariance[robots] = starts.preintegrated_covariance
+        self.preintegrated_jacobian[robots] = starts.preintegrated_jacobian
+        self.tracked[robots] = True
+        self.start_pending[robots] = False
+        self._trust(robots, confirmations)
+        for robot in robots.tolist():
+            self.constraints.pop(robot, None)
+
+    def lose(self, robot: int) -> None:
+        """Take the robot out of the estimate; it waits for a fix."""
+        self._isolate(np.array([robot]), np.eye(3)[None])
+        self._forget_pairs(robot)
+        self.tracked[robot] = False
+        self.start_pending[robot] = False
+        self._trust(np.array([robot]), 0)
+
+    def open(self, source: int, pose: FloatArray) -> None:
+        """Estimate what a contradicted robot or landmark was described by, or estimate it anew.
+
+        Args:
+            source: The robot, or N plus the landmark.
+            pose: (3,) of the robot in `map`, which becomes less certain, too.
+        """
+        robots = self.tracked.size
+        self.integrity.doubt[source] = 0.0
+        self.integrity.evidence[self.integrity.source == source] = 0.0
+        if source < robots:
+            self.integrity.evidence[source] = 0.0
+        if source >= robots:
+            self._open_landmark(source - robots)
+            return
+        before = self._table.column[source]
+        self._use_table(self._table.with_robot(source))
+        columns, variances = self._table.column[source], self._table.sigma[source] ** 2
+        again, new = before >= 0, (before < 0) & (columns >= 0)
+        self.filter.add(columns[again], np.diag(variances[again]))
+        self.filter.place(columns[new], np.diag(variances[new]))
+        doubt = error_covariance(pose, np.diag(np.square(_DOUBTED_POSE_SIGMA)))
+        self.filter.add(robot_columns(np.array([source]))[0], doubt)
+
+    def open_all(self, poses: FloatArray) -> None:
+        """Estimate everything that may be estimated anew, since what is believed rests on what is not so.
+
+        Args:
+            poses: (N, 3) of the robots in `map`, which stay where they are believed to be.
+        """
+        robots, landmarks = self.tracked.size, self.landmark.shape[0]
+        self.all_opened = True
+        table = self._table
+        for robot in range(robots):
+            table = table.with_robot(robot)
+        for landmark in range(landmarks):
+            table = table.with_landmark(landmark)
+        self._use_table(table)
+        self.parameter[:], self.landmark[:] = 0.0, 0.0
+        sigma = np.diag(np.square(_REOPENED_POSE_SIGMA))
+        covariances = np.where(self.tracked[:, None, None], error_covariance(poses, sigma), np.eye(3))
+        self.filter.place_bodies(np.arange(robots), covariances)
+        self._place_described()
+        self.integrity.doubt[:], self.integrity.evidence[:] = 0.0, 0.0
+        doubt_noise(self.integrity)
+
+    def _use_table(self, table: ParameterTable) -> None:
+        """Go on with more columns."""
+        self.filter.grow(table)
+        self._table = table
+
+    def _open_landmark(self, landmark: int) -> None:
+        """Estimate a landmark, or estimate it anew."""
+        is_new = self.landmark_column(landmark) < 0
+        self._use_table(self._table.with_landmark(landmark))
+        columns = self.landmark_column(landmark) + np.arange(3)
+        if is_new:
+            self.filter.place(columns, self._table.survey[landmark])
+        else:
+            self.filter.add(columns, self._table.survey[landmark])
+
+    def _place_described(self) -> None:
+        """Let all that is estimated besides poses be as certain as it is described."""
+        estimated = self._table.column >= 0
+        self.filter.place(self._table.column[estimated], np.diag(self._table.sigma[estimated] ** 2))
+        for first, survey in zip(self._table.survey_column, self._table.survey, strict=True):
+            if first >= 0:
+                self.filter.place(first + np.arange(3), survey)
+
+    def _trust(self, robots: IntArray, confirmations: int) -> None:
+        """Forget what was held against robots (k,) that begin anew."""
+        self.integrity.gated_in_a_row[robots] = 0
+        self.integrity.gated_fixes[robots] = 0
+        self.integrity.doubt[robots] = 0.0
+        self.integrity.confirmations[robots] = confirmations
+        self.integrity.source[robots] = -1
+        self.integrity.evidence[np.isin(self.integrity.source, robots)] = 0.0
+
+    def _forget_pairs(self, robot: int) -> None:
+        """Forget what the robot has measured, and others of it: its errors now are others."""
+        for gone in (self.pair_robot == robot, np.s_[robot]):
+            self.pair_robot[gone], self.pair_stamp_ns[gone] = -1, NEVER_NS
+
+    def _isolate(self, robots: IntArray, covariances: FloatArray) -> None:
+        """Give poses (k,) covariances (k, 3, 3); what was learned of the robots' sensors stays."""
+        known = robots[self.tracked[robots]]  # what is estimated of others has nothing to do with anything
+        for robot in known[(self._table.column[known] >= 0).any(axis=1)].tolist():
+            columns = self._table.column[robot, self._table.column[robot] >= 0]
+            self.filter.place(columns, np.diag(np.diag(self.filter.block(columns))))
+        self.filter.place_bodies(robots, covariances)
+
+    def parameter_sigma(self, robot: int) -> FloatArray:
+        """Standard deviations (PARAMETERS,) of a robot's parameters; zero of those not estimated."""
+        column = self._table.column[robot]
+        sigma, estimated = np.zeros(column.size), column >= 0
+        sigma[estimated] = np.sqrt(np.diag(self.filter.block(column[estimated])))
+        return sigma
+
+    def landmark_covariance(self, landmark: int) -> FloatArray:
+        """Covariance (3, 3) of the right-invariant error of a landmark that is estimated."""
+        return self.filter.block(self.landmark_column(landmark) + np.arange(3))
+
+    def landmark_column(self, landmark: int) -> int:
+        """First filter column of the error of a landmark that is estimated."""
+        return int(self._table.survey_column[landmark])
+
+
+def robot_columns(robots: NDArray[np.int64]) -> IntArray:
+    """Filter columns (k, 3) of robots (k,)."""
+    columns: IntArray = 3 * robots[:, None] + np.arange(3)
+    return columns

@@ -1,0 +1,328 @@
+"""Which detection is me: the posterior over chains of anonymous detections, image after image.
+
+A robot is in the picture or not; in it, it is detected with a probability, or missed; each other detection
+is another robot or a false one. So the likelihood of a chain is a product over images of P_D N(z; expected)
+/ beta for the detection that it has, and of 1 - P_D where it has none (the likelihood of one target in
+clutter). The density beta is that of others, anywhere, and of one that was where the chain was before and
+moves alike: robots of one kind do, so that a detection about as far away as the own way is long tells
+little. Robots that enter begin a chain later.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import logsumexp
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.identification.anchors import (
+    Anchors,
+    Scale,
+    circles,
+    is_concentrated,
+    merged,
+    shown_by_heading,
+    tracks_of,
+)
+from swarm_loc_estimator.identification.picture import Picture, TrackPoint, gathered_between
+from swarm_loc_estimator.identification.tracks import (
+    MISSED,
+    NO_TRACKS,
+    Tracks,
+    joined,
+    log_likelihoods,
+    predicted,
+    updated,
+)
+
+_NEGLIGIBLE = 12.0
+"""By so much in its logarithm a chain's weight may lie below the largest one's."""
+_MAX_TRACKS = 3000
+_MAX_ANCHORED_IMAGES = 6
+"""A chain whose last detection lies further back ends unless its heading is known."""
+_LIKENESS = 0.5
+"""By what share of its own way, and turn, a robot expects that of another one to differ from it."""
+_LEAST_TURN_SPREAD = 0.1
+_OUTSIDE = 0.5
+"""Share of the detection probability for robots that are outside of all that was seen."""
+
+
+METRIC = Scale(1.0, 0.02)
+"""Of a calibrated camera: detections are in metres, and 2 % off at most about."""
+
+
+@dataclass(frozen=True)
+class ChainModel:
+    """What is assumed of images and robots.
+
+    Attributes:
+        detection_probability: Of a robot in the picture.
+        absent: Probability that a robot is not in the first image.
+        entering: Probability that a robot not in the picture is in the next one.
+        false_detections: How many detections of an image are no robots, on average.
+        scale: The image's units per metre, and how unsure that is.
+        scale_drift: By what share it drifts, the standard deviation after a second [1/s^0.5].
+    """
+
+    detection_probability: float = 0.95
+    absent: float = 0.05
+    entering: float = 0.05
+    false_detections: float = 0.2
+    scale: Scale = METRIC
+    scale_drift: float = 0.0
+
+
+class Identity(NamedTuple):
+    """An answer.
+
+    Attributes:
+        place: Which detection of the newest image the robot is.
+        probability: That this is right.
+        pose: (3,) x [m], y [m], heading [rad] there.
+        covariance: (3, 3) of it.
+        scale: Of the image.
+    """
+
+    place: int
+    probability: float
+    pose: FloatArray
+    covariance: FloatArray
+    scale: float
+
+
+@dataclass(frozen=True)
+class Chains:
+    """All chains that may be one robot, after some images.
+
+    Attributes:
+        model: What is assumed.
+        point: The robot's own track at the newest image; None before the first.
+        stamp_ns: Of that image.
+        images: How many there were.
+        detections: How many the newest one has.
+        tracks: Chains with a heading.
+        anchors: Chains without, newest image last.
+        log_absent: Log probability that the robot is not in the picture.
+        low: Least x and y of all detections so far [m]; likewise high, the greatest.
+        reach: The longest of the robot's own ways between images [m].
+    """
+
+    model: ChainModel = ChainModel()
+    point: TrackPoint | None = None
+    stamp_ns: int = 0
+    images: int = 0
+    detections: int = 0
+    tracks: Tracks = NO_TRACKS
+    anchors: tuple[Anchors, ...] = ()
+    log_absent: float = 0.0
+    low: tuple[float, float] = (math.inf, math.inf)
+    high: tuple[float, float] = (-math.inf, -math.inf)
+    reach: float = 0.0
+
+    def advanced(self, picture: Picture, point: TrackPoint, stamp_ns: int) -> Chains:
+        """The chains after one more image, later than all before.
+
+        Args:
+            picture: Its detections (n,).
+            point: The robot's own track there.
+            stamp_ns: When it was taken.
+        """
+        reach, low, high = self.reach, self.low, self.high
+        if self.point is not None:
+            reach = max(reach, math.hypot(*(point.pose[:2] - self.point.pose[:2])))
+        if len(picture.pose):
+            x, y = picture.pose[:, 0], picture.pose[:, 1]
+            low = min(low[0], float(x.min())), min(low[1], float(y.min()))
+            high = max(high[0], float(x.max())), max(high[1], float(y.max()))
+        bounded = replace(self, low=low, high=high, reach=reach)
+        return bounded._with(picture, point, stamp_ns)  # noqa: SLF001 # of its own class
+
+    def _with(self, picture: Picture, point: TrackPoint, stamp_ns: int) -> Chains:
+        """The chains, whose bounds hold for the image already, after it."""
+        log_density = self._log_density(picture)
+        tracks, anchors = self._continued(picture, point, stamp_ns, log_density)
+        return self._normalised(picture, point, stamp_ns, tracks, anchors)
+
+    @property
+    def probabilities(self) -> FloatArray:
+        """(n,) that each detection of the newest image is the robot; the rest is that none is."""
+        out = np.zeros(self.detections)
+        parts = [(self.tracks.place, self.tracks.log_weight)]
+        parts += [(one.place, one.log_weight) for one in self.anchors]
+        for place, log_weight in parts:
+            here = place >= 0
+            np.add.at(out, place[here], np.exp(log_weight[here]))
+        return out
+
+    def answer(self) -> Identity | None:
+        """The detection that is the robot most probably, where chains with a heading end in one."""
+        here = np.flatnonzero(self.tracks.place >= 0)
+        if not here.size:
+            return None
+        place = int(np.argmax(self.probabilities))
+        rows = here[self.tracks.place[here] == place]
+        if not rows.size:
+            return None
+        weight = np.exp(self.tracks.log_weight[rows])
+        pose, covariance, scale = self._mixed(self.tracks.chosen(rows), weight / weight.sum())
+        return Identity(place, float(weight.sum()), pose, covariance, scale)
+
+    def _log_density(self, picture: Picture) -> float:
+        """Of detections that are other robots or false [1/m^2].
+
+        The area is that of all that was seen so far, and of what the robot may have come from.
+        """
+        others = max(len(picture.pose) - 1, 0) + self.model.false_detections
+        extent = np.maximum(np.subtract(self.high, self.low), 0.0) + self.reach
+        sigma = math.sqrt(float(picture.variance.max(initial=1e-12)))
+        return math.log(others / float(np.prod(np.maximum(extent, 10.0 * sigma))))
+
+    def _log_other_share(self, picture: Picture) -> float:
+        """How likely any detection is another robot or false, before all else."""
+        others = max(len(picture.pose) - 1, 0) + self.model.false_detections
+        return math.log(others / max(others, len(picture.pose)))
+
+    def _continued(
+        self, picture: Picture, point: TrackPoint, stamp_ns: int, log_density: float
+    ) -> tuple[list[Tracks], list[Anchors]]:
+        """All chains with and without a detection in the newest image."""
+        probability = self.model.detection_probability
+        log_hit = math.log(probability)
+        tracks: list[Tracks] = [NO_TRACKS]
+        if self.tracks.place.size and self.point is not None:
+            tracks += self._tracks_continued(picture, point, stamp_ns, log_density)
+        standing = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
+        anchors: list[Anchors] = []
+        for old in self.anchors:
+            pairs = circles(old, picture, point, self._scale_since(old.stamp_ns, stamp_ns), _LIKENESS)
+            alike = pairs.log_alike + self._log_other_share(picture)
+            log_ratio = pairs.log_density - np.logaddexp(log_density, alike)
+            weight = old.log_weight[:, None] + log_ratio + log_hit
+            likely = weight > self._threshold()
+            rows, places = np.nonzero(likely & is_concentrated(pairs.concentration))
+            scale = self._scale_since(old.stamp_ns, stamp_ns)
+            some = old._replace(log_weight=np.zeros_like(old.log_weight))
+            begun = tracks_of(some, rows, picture, places, point, scale)
+            tracks.append(begun._replace(log_weight=begun.log_weight + weight[rows, places]))
+            rows, places = np.nonzero(likely & ~is_concentrated(pairs.concentration))
+            standing[0].append(places)
+            standing[1].append(weight[rows, places])
+            missed = np.full(old.place.size, MISSED)
+            anchors.append(old._replace(log_weight=old.log_weight + math.log1p(-probability), place=missed))
+        self._begin(picture, point, tracks, standing)
+        if sum(map(len, standing[0])):
+            anchors.append(
+                merged(np.concatenate(standing[0]), np.concatenate(standing[1]), picture, point, stamp_ns)
+            )
+        return tracks, anchors[-_MAX_ANCHORED_IMAGES:]
+
+    def _tracks_continued(
+        self, picture: Picture, point: TrackPoint, stamp_ns: int, log_density: float
+    ) -> list[Tracks]:
+        """The tracks with a detection of the newest image each, and without."""
+        before = self.point or point
+        x, y = point.pose[:2] - before.pose[:2]
+        drift = self.model.scale_drift**2 * (stamp_ns - self.stamp_ns) * 1e-9
+        moved = predicted(self.tracks, complex(x, y), gathered_between(before, point), drift)
+        spread = _LIKENESS * self.model.scale.mean * math.hypot(x, y)
+        alike = log_likelihoods(moved, picture, spread) + self._log_other_share(picture)
+        log_ratio = log_likelihoods(moved, picture) - np.logaddexp(log_density, alike)
+        weight = moved.log_weight[:, None] + log_ratio + math.log(self.model.detection_probability)
+        rows, places = np.nonzero(weight > self._threshold())
+        chosen = moved.chosen(rows)
+        chosen = chosen._replace(log_weight=weight[rows, places])
+        turn_spread = max(_LIKENESS * abs(point.pose[2] - before.pose[2]), _LEAST_TURN_SPREAD)
+        found = updated(chosen, picture, places, point.pose[2], turn_spread)
+        inside = np.all((moved.mean[:, :2] >= self.low) & (moved.mean[:, :2] <= self.high), axis=1)
+        probability = self.model.detection_probability * np.where(inside, 1.0, _OUTSIDE)
+        missed = moved._replace(
+            log_weight=moved.log_weight + np.log1p(-probability), place=np.full(len(inside), MISSED)
+        )
+        return [found, missed]
+
+    def _begin(
+        self,
+        picture: Picture,
+        point: TrackPoint,
+        tracks: list[Tracks],
+        standing: tuple[list[IntArray], list[FloatArray]],
+    ) -> None:
+        """Add chains that begin in the newest image: anywhere, as likely as the others' density there."""
+        count = len(picture.pose)
+        if not count:
+            return
+        entering = self.model.entering if self.images else 1.0 - self.model.absent
+        others = max(count - 1, 0) + self.model.false_detections
+        weight = self.log_absent + math.log(entering * self.model.detection_probability / others)
+        shown = np.flatnonzero(picture.has_heading)
+        if shown.size:
+            begun = shown_by_heading(picture, shown, point, self.model.scale)
+            tracks.append(begun._replace(log_weight=np.full(shown.size, weight)))
+        hidden = np.flatnonzero(~picture.has_heading)
+        standing[0].append(hidden)
+        standing[1].append(np.full(hidden.size, weight))
+
+    def _scale_since(self, begin_ns: int, end_ns: int) -> Scale:
+        """What is known of the scale, and of by how much it has drifted since an image."""
+        mean, sigma = self.model.scale
+        drift = self.model.scale_drift * mean * math.sqrt(max(0, end_ns - begin_ns) * 1e-9)
+        return Scale(mean, math.hypot(sigma, drift))
+
+    def _threshold(self) -> float:
+        """Weights below this are negligible beside that of a chain that goes on without a detection."""
+        return math.log1p(-self.model.detection_probability) - _NEGLIGIBLE
+
+    def _normalised(
+        self,
+        picture: Picture,
+        point: TrackPoint,
+        stamp_ns: int,
+        tracks: list[Tracks],
+        anchors: list[Anchors],
+    ) -> Chains:
+        """The chains that are left, their probabilities summing up to one."""
+        entering = self.model.entering if self.images else 1.0 - self.model.absent
+        log_absent = self.log_absent + math.log1p(-entering * self.model.detection_probability)
+        whole = joined(tracks)
+        weights = np.concatenate([whole.log_weight, *(one.log_weight for one in anchors), [log_absent]])
+        total, least = float(logsumexp(weights)), float(weights.max()) - _NEGLIGIBLE
+        kept = np.flatnonzero(whole.log_weight > least)
+        if kept.size > _MAX_TRACKS:
+            order = np.argsort(whole.log_weight[kept], kind="stable")[-_MAX_TRACKS:]
+            kept = kept[np.sort(order)]
+        tracks_kept = whole.chosen(kept)
+        some = [one.chosen(np.flatnonzero(one.log_weight > least)) for one in anchors]
+        return replace(
+            self,
+            point=point,
+            stamp_ns=stamp_ns,
+            images=self.images + 1,
+            detections=len(picture.pose),
+            tracks=tracks_kept._replace(log_weight=tracks_kept.log_weight - total),
+            anchors=tuple(one._replace(log_weight=one.log_weight - total) for one in some if one.place.size),
+            log_absent=log_absent - total,
+        )
+
+    def _mixed(self, tracks: Tracks, weight: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Pose (3,), its covariance (3, 3) and the scale, of tracks (k,) together by weight."""
+        real, imag = tracks.mean[:, 2], tracks.mean[:, 3]
+        squared = real**2 + imag**2
+        jacobian = np.zeros((weight.size, 3, 4))
+        jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
+        jacobian[:, 2, 2], jacobian[:, 2, 3] = -imag / squared, real / squared
+        covariance = jacobian @ tracks.covariance @ jacobian.transpose(0, 2, 1)
+        heading = np.arctan2(imag, real)
+        poses = np.column_stack([tracks.mean[:, :2], heading])
+        mean = weight @ poses
+        mean[2] = np.angle(weight @ np.exp(1j * heading))
+        away = poses - mean
+        away[:, 2] = wrap_angle(away[:, 2])
+        spread = np.einsum("k,kij->ij", weight, covariance + away[:, :, None] * away[:, None, :])
+        if self.point is not None:
+            mean[2] += self.point.pose[2]
+        mean[2] = wrap_angle(mean[2])
+        return mean, spread, float(weight @ np.sqrt(squared))

@@ -1,0 +1,93 @@
+"""A robot's own motion, and how it relates to what an aerial image shows of it; all in complex numbers.
+
+The robot moves by W in the frame in which its heading was zero; the image shows that it moved by D. Then D
+= c W with c = lambda exp(i theta), lambda the scale of the image and theta the heading (aerial
+self-localization paper, eqs. (12)-(14); its eqs. (15)-(23) are the two real parts of this one equation,
+solved with arctan, arccos and arcsin, which lose the quadrant and one of two roots each).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+
+ComplexArray = NDArray[np.complex128]
+
+
+def own_displacement(speeds: ArrayLike, turn_rates: ArrayLike, step_s: float) -> ComplexArray:
+    """The motion W (..., 1) [m] by constant commands of a step each: sum of v_j exp(i dt sum_k<=j r_k) dt.
+
+    A backward difference as eqs. (10) and (13) of the paper: a step goes along the heading at its end.
+
+    Args:
+        speeds: (..., m) [m/s].
+        turn_rates: (..., m) [rad/s].
+        step_s: Duration of a step [s].
+    """
+    heading = step_s * np.cumsum(np.asarray(turn_rates, dtype=float), axis=-1)
+    moved: ComplexArray = step_s * np.sum(np.asarray(speeds, dtype=float) * np.exp(1j * heading), axis=-1)
+    return moved
+
+
+class Relation(NamedTuple):
+    """How displacements in an image relate to a robot's own.
+
+    Attributes:
+        heading: (...) theta [rad].
+        scale: (...) lambda, in units of the image per metre.
+    """
+
+    heading: FloatArray
+    scale: FloatArray
+
+
+def relation(displacement: ArrayLike, own: ArrayLike) -> Relation:
+    """The relation from one displacement each: theta = arg D - arg W, lambda = |D| / |W|.
+
+    Args:
+        displacement: (...) D, complex.
+        own: (...) W, complex and not zero.
+    """
+    ratio = np.asarray(displacement) / np.asarray(own)
+    return Relation(np.angle(ratio), np.abs(ratio))
+
+
+class Fit(NamedTuple):
+    """Chains of positions fitted by a robot's own motion.
+
+    Attributes:
+        coefficient: (...) c.
+        cost: (...) sum of squared residuals over the positions' variance, and the scale's misfit.
+    """
+
+    coefficient: ComplexArray
+    cost: FloatArray
+
+
+def fit_chains(
+    positions: ComplexArray, own: ComplexArray, sigma: float, scale: float = 1.0, scale_sigma: float = np.inf
+) -> Fit:
+    """Fit z_k = p + c W_k to chains by complex least squares, with or without a known scale.
+
+    Args:
+        positions: (..., k) positions of a chain in k images.
+        own: (k,) where the robot was by its own motion.
+        sigma: Standard deviation of each coordinate of a position.
+        scale: |c| as far as it is known.
+        scale_sigma: How unsure that is, in the same unit; infinite: unknown.
+    """
+    z, w = positions - positions.mean(axis=-1, keepdims=True), own - own.mean()
+    power = float(np.sum(np.abs(w) ** 2))
+    correlation: ComplexArray = z @ w.conj()
+    weight = (
+        sigma / scale_sigma
+    ) ** 2  # the information on |c| of the prior, that of the positions is `power`
+    length = (np.abs(correlation) + weight * scale) / max(power + weight, np.finfo(float).tiny)
+    coefficient = length * np.exp(1j * np.angle(correlation))
+    residual = z - coefficient[..., None] * w
+    cost = np.sum(np.abs(residual) ** 2, axis=-1) / sigma**2
+    return Fit(coefficient, cost + ((length - scale) / scale_sigma) ** 2)

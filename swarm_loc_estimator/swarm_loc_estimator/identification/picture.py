@@ -1,0 +1,51 @@
+"""What an aerial image shows, and what a robot knows of its own way to there."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+
+
+class Picture(NamedTuple):
+    """Anonymous detections (n,) of one aerial image, in `map`.
+
+    Attributes:
+        pose: (n, 3) x [m], y [m], heading [rad], which is zero where it was not measured.
+        covariance: (n, 3, 3) of it.
+        has_heading: (n,) whether the heading was measured.
+    """
+
+    pose: FloatArray
+    covariance: FloatArray
+    has_heading: BoolArray
+
+    @property
+    def variance(self) -> FloatArray:
+        """(n,) of a position along any direction, the mean of x and y [m^2]."""
+        return np.asarray(0.5 * (self.covariance[:, 0, 0] + self.covariance[:, 1, 1]))
+
+
+class TrackPoint(NamedTuple):
+    """A robot's own track at the instant of an image.
+
+    Attributes:
+        pose: (3,) on the track, in the track's frame; the heading is not wrapped.
+        covariance: (3, 3) of the right-invariant error that the track has gathered since its beginning.
+    """
+
+    pose: FloatArray
+    covariance: FloatArray
+
+
+def gathered_between(before: TrackPoint, after: TrackPoint) -> FloatArray:
+    """Covariance (3, 3) that a track has gathered between two points, at the later one.
+
+    Of x, y (along the axes of the track's frame) and heading there.
+    """
+    x, y = after.pose[0], after.pose[1]
+    shear = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+    gathered: FloatArray = shear @ (after.covariance - before.covariance) @ shear.T
+    return gathered

@@ -1,0 +1,225 @@
+"""The forward model: brightness that each sensor reads of each emitter, eqs (1)-(4) of the Droplet paper.
+
+The paper's vectors live in two frames. Here all are in RX's: an emitter's direction is turned by the
+heading phi before it enters (1), r = R - rho i + rho Rot(phi) j, which is not said there. Angles are signed
+and wrapped.
+
+A relative pose is range [m] from centre to centre, bearing [rad] of the transmitter in the receiver's
+base_link, and heading [rad] of the transmitter's base_link relative to the receiver's.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import borrowing, compiled
+from swarm_loc_estimator.common.se2_scalar import direction_of
+from swarm_loc_estimator.infrared.curves import amplitudes_at, curves_at
+from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
+
+
+def expected(platform: IrPlatform, poses: ArrayLike, gains: PairGains | None = None) -> FloatArray:
+    """Readings (k, modes, n, n) [count] without noise, not cut at saturation; [mode, sensor, emitter].
+
+    Args:
+        platform: The board of both robots.
+        poses: (k, 3) range [m], bearing [rad], heading [rad].
+        gains: Of the k pairs; None: all ones.
+    """
+    return _at(platform, poses, gains)[0]
+
+
+def expected_with_slopes(
+    platform: IrPlatform, poses: ArrayLike, gains: PairGains | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Besides, their derivatives (k, modes, n, n, 3) by range [count/m], bearing and heading [count/rad]."""
+    readings, slopes = _at(platform, poses, gains)
+    return readings, np.moveaxis(slopes, 1, -1)
+
+
+def _at(platform: IrPlatform, poses: ArrayLike, gains: PairGains | None) -> tuple[FloatArray, FloatArray]:
+    """Readings (k, modes, n, n) and slopes (k, 3, modes, n, n)."""
+    at = np.atleast_2d(np.asarray(poses, dtype=float))
+    modes, n = len(platform.amplitudes), platform.n
+    readings = np.empty((len(at), modes, n, n))
+    slopes = np.empty((len(at), 3, modes, n, n))
+    _predict_all(platform.model, at, readings.reshape(len(at), -1), slopes.reshape(len(at), 3, -1))
+    if gains is None:
+        return readings, slopes
+    factor = (gains.sensor[:, :, None] * gains.emitter[:, None, :])[:, None]
+    return readings * factor, slopes * factor[:, None]
+
+
+WAY_ROWS = 22
+"""How many numbers a way has while brightness is predicted."""
+
+
+class _Ways(NamedTuple):
+    """What the ways from every sensor to every emitter have, one behind the other, sensor by sensor.
+
+    Every step of a prediction is a loop over all W of them, without a branch, which is vectorized.
+
+    Attributes:
+        x, y: (W,) from sensor to emitter in the receiver's frame [m].
+        length, direction: (W,) likewise [m], [rad].
+        emitter_x, emitter_y: (W,) the emitter's direction in the receiver's frame.
+        at_sensor, at_emitter: (W,) the angles of incidence, and to the emitter's axis [rad].
+        piece: (W,) of the curves.
+        seen, seen_slope, lit, lit_slope: (W,) the curves S and E.
+        share: (W,) their product.
+        bright, bright_slope: (W,) the amplitude of one power.
+        by_length, by_turn: (3, W) what a change of the pose does by the way's length, and by all angles: what
+            the amplitude's slope, and the amplitude, is multiplied by.
+    """
+
+    x: FloatArray
+    y: FloatArray
+    length: FloatArray
+    direction: FloatArray
+    emitter_x: FloatArray
+    emitter_y: FloatArray
+    at_sensor: FloatArray
+    at_emitter: FloatArray
+    piece: FloatArray
+    seen: FloatArray
+    seen_slope: FloatArray
+    lit: FloatArray
+    lit_slope: FloatArray
+    share: FloatArray
+    bright: FloatArray
+    bright_slope: FloatArray
+    by_length: FloatArray
+    by_turn: FloatArray
+
+
+@compiled
+def _predict_all(model: IrModel, poses: FloatArray, readings: FloatArray, slopes: FloatArray) -> None:
+    """All poses."""
+    room = np.empty((WAY_ROWS, model.angles.size**2))
+    for k in range(poses.shape[0]):
+        predict_brightness(model, poses[k, 0], poses[k, 1], poses[k, 2], room, readings[k], slopes[k])
+
+
+@borrowing
+def predict_brightness(
+    model: IrModel,
+    distance: float,
+    bearing: float,
+    heading: float,
+    room: FloatArray,
+    readings: FloatArray,
+    slopes: FloatArray,
+) -> None:
+    """Write readings (modes * n * n,) and their slopes (3, modes * n * n) of one pose.
+
+    The room to work in is (WAY_ROWS, n * n).
+    """
+    r = room
+    ways = _Ways(
+        r[0],
+        r[1],
+        r[2],
+        r[3],
+        r[4],
+        r[5],
+        r[6],
+        r[7],
+        r[8],
+        r[9],
+        r[10],
+        r[11],
+        r[12],
+        r[13],
+        r[14],
+        r[15],
+        r[16:19],
+        r[19:22],
+    )
+    _lay(model, distance, bearing, heading, ways)
+    _measure(ways.x, ways.y, ways.length, ways.direction)
+    _write_angles(model.angles, heading, ways)
+    curves_at(model.sensor, ways.at_sensor, ways.piece, ways.seen, ways.seen_slope)
+    curves_at(model.emitter, ways.at_emitter, ways.piece, ways.lit, ways.lit_slope)
+    _write_changes(model.radius, distance, bearing, ways)
+    count = ways.share.size
+    for m in range(model.amplitudes.shape[0]):
+        begin, end = m * count, (m + 1) * count
+        amplitudes_at(model.amplitudes[m], ways.length, ways.bright, ways.bright_slope)
+        _multiply(ways.share, ways.bright, readings[begin:end])
+        for p in range(3):
+            by_length, by_turn, slope = ways.by_length[p], ways.by_turn[p], slopes[p, begin:end]
+            _combine(by_length, ways.bright_slope, by_turn, ways.bright, slope)
+
+
+@borrowing
+def _lay(model: IrModel, distance: float, bearing: float, heading: float, ways: _Ways) -> None:
+    """Write where emitters are, and the ways to them."""
+    n, units, rho = model.angles.size, model.units, model.radius
+    cos, sin = math.cos(heading), math.sin(heading)
+    x, y = distance * math.cos(bearing), distance * math.sin(bearing)
+    for j in range(n):
+        emitter_x = cos * units[j, 0] - sin * units[j, 1]
+        emitter_y = sin * units[j, 0] + cos * units[j, 1]
+        for i in range(n):
+            ways.emitter_x[i * n + j], ways.emitter_y[i * n + j] = emitter_x, emitter_y
+            ways.x[i * n + j] = x + rho * (emitter_x - units[i, 0])
+            ways.y[i * n + j] = y + rho * (emitter_y - units[i, 1])
+
+
+@compiled
+def _measure(x: FloatArray, y: FloatArray, length: FloatArray, direction: FloatArray) -> None:
+    """Write lengths, none of them zero, and directions [rad] of vectors."""
+    for k in range(x.size):
+        length[k] = math.sqrt(max(x[k] * x[k] + y[k] * y[k], 1e-12))
+        direction[k] = direction_of(y[k], x[k])
+
+
+@borrowing
+def _write_angles(angles: FloatArray, heading: float, ways: _Ways) -> None:
+    """Write at which angles sensors and emitters of these directions [rad] have the ways."""
+    n = angles.size
+    for i in range(n):
+        for j in range(n):
+            direction = ways.direction[i * n + j]
+            ways.at_sensor[i * n + j] = direction - angles[i]
+            ways.at_emitter[i * n + j] = direction + math.pi - angles[j] - heading
+
+
+@borrowing
+def _write_changes(rho: float, distance: float, bearing: float, ways: _Ways) -> None:
+    """Write what a change of the pose does."""
+    ux, uy = math.cos(bearing), math.sin(bearing)
+    by_length, by_turn = ways.by_length, ways.by_turn
+    for w in range(ways.share.size):
+        jx, jy = ways.emitter_x[w], ways.emitter_y[w]
+        per_r = 1.0 / ways.length[w]
+        vx, vy = ways.x[w] * per_r, ways.y[w] * per_r
+        seen, lit = ways.seen[w], ways.lit[w]
+        share, of_emitter = seen * lit, seen * ways.lit_slope[w]
+        turned = (ways.seen_slope[w] * lit + of_emitter) * per_r  # by the direction
+        # how far the emitter moves along the way and across it
+        forward, aside = vx * ux + vy * uy, vx * uy - vy * ux
+        ways.share[w] = share
+        by_length[0, w], by_turn[0, w] = share * forward, turned * aside
+        by_length[1, w], by_turn[1, w] = -share * distance * aside, turned * distance * forward
+        forward, aside = vx * jx + vy * jy, vx * jy - vy * jx
+        by_length[2, w], by_turn[2, w] = -share * rho * aside, turned * rho * forward - of_emitter
+
+
+@compiled
+def _multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    """Write a b."""
+    for w in range(out.size):
+        out[w] = a[w] * b[w]
+
+
+@compiled
+def _combine(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, out: FloatArray) -> None:
+    """Write a b + c d."""
+    for w in range(out.size):
+        out[w] = a[w] * b[w] + c[w] * d[w]

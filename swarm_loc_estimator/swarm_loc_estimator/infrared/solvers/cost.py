@@ -1,0 +1,362 @@
+"""The negative log likelihood of readings, with gradient and Hessian by pose and gains.
+
+What is sought is the pose and, where elements differ by an unknown amount, every sensor's and emitter's
+log-gain, which has a prior. Most readings just have the square of their distance from expectation, in sigmas:
+these are taken in loops that are vectorized. The others are taken one by one, by `reading_cost`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import borrowing, compiled, compiled_sums
+from swarm_loc_estimator.infrared.brightness import WAY_ROWS, predict_brightness
+from swarm_loc_estimator.infrared.solvers.reading_cost import (
+    BELIEVED,
+    DARK,
+    MEASURED,
+    MISSING,
+    reading_cost,
+    spread,
+)
+from swarm_loc_estimator.swarm.ir_board import IrModel, ReadingErrors
+
+_MOST = math.sqrt(2.0 * BELIEVED)
+
+
+class Costs(NamedTuple):
+    """Which of F readings cost what, for a model.
+
+    Attributes:
+        per_sigma: (F,) one over the noise of readings whose distance from expectation is squared, else 0.
+        most: (F,) from so many sigmas on, by which expectation is brighter, a reading is taken for blocked.
+        others: (F,) which readings are, or may be, taken otherwise.
+        counts: (2,) how many there are of both.
+    """
+
+    per_sigma: FloatArray
+    most: FloatArray
+    others: NDArray[np.int64]
+    counts: NDArray[np.int64]
+
+
+@compiled
+def new_costs(readings: int) -> Costs:
+    """Room for so many readings."""
+    return Costs(np.empty(readings), np.empty(readings), np.empty(readings, np.int64), np.empty(2, np.int64))
+
+
+class Pair(NamedTuple):
+    """The readings of one pair of robots; F is modes * n * n, by mode, sensor, emitter.
+
+    Attributes:
+        readings: (F,) [count].
+        cut: (F,) likewise, cut at saturation; 0 where MISSING.
+        stable: (F,) these by `stabilized` [sigma].
+        kinds: (F,) MISSING, MEASURED or SATURATED.
+        costs: What they cost.
+        sensor: (n,) gains of the receiver's sensors.
+        emitter: (n,) gains of the transmitter's emitters.
+        prior: (2, 2) of sensors and emitters: what weighs every log-gain's square, and the share of their
+            common part that this weight leaves free; weights of zero: gains are exact.
+        nearest: The least range to seek [m].
+        farthest: The largest.
+    """
+
+    readings: FloatArray
+    cut: FloatArray
+    stable: FloatArray
+    kinds: NDArray[np.int8]
+    costs: Costs
+    sensor: FloatArray
+    emitter: FloatArray
+    prior: FloatArray
+    nearest: float
+    farthest: float
+
+
+class Scratch(NamedTuple):
+    """Room to work in; P unknowns are the log-gains of n sensors and n emitters, if sought, and the pose.
+
+    The pose comes last, so that the last rows of the Hessian's factor are those of the pose alone.
+
+    Attributes:
+        ways: (WAY_ROWS, n * n) to predict brightness.
+        expected: (F,) without gains.
+        slopes: (3, F) likewise.
+        pulls: (F,) what slopes are multiplied by for the gradient.
+        weights: (F,) what products of slopes are multiplied by for the Hessian.
+        at: (P,) the best so far.
+        trial: (P,).
+        factors: (F,) products of a sensor's and an emitter's gain.
+        gradients: (2, P) of the cost at the best so far, or at the trial.
+        hessians: (2, P, P) likewise, by Gauss-Newton; lower triangles.
+        factor: (P, P) lower triangle.
+        step: (P,).
+        tally: (3,) squares of what is left of priors and of the readings that are no outliers, the degrees of
+            freedom of these, and squares of what is left of all.
+        lasting: (3, 3) the part of the information on the pose by whose noise it errs the same every time.
+        of_gains: (3,) the part of the pose's variances that is the unknown gains'.
+        root: (3, 3) inverse of the pose's part of the factor, lower triangle.
+        first_root: (3, 3) likewise at a minimum.
+    """
+
+    ways: FloatArray
+    expected: FloatArray
+    slopes: FloatArray
+    pulls: FloatArray
+    weights: FloatArray
+    at: FloatArray
+    trial: FloatArray
+    factors: FloatArray
+    gradients: FloatArray
+    hessians: FloatArray
+    factor: FloatArray
+    step: FloatArray
+    tally: FloatArray
+    lasting: FloatArray
+    of_gains: FloatArray
+    root: FloatArray
+    first_root: FloatArray
+
+
+@compiled
+def new_scratch(modes: int, n: int, gains: bool) -> Scratch:
+    """Room for a platform, with or without gains to seek."""
+    size, readings = 3 + 2 * n if gains else 3, modes * n * n
+    return Scratch(
+        np.empty((WAY_ROWS, n * n)),
+        np.empty(readings),
+        np.empty((3, readings)),
+        np.empty(readings),
+        np.empty(readings),
+        np.zeros(size),
+        np.zeros(size),
+        np.empty(readings),
+        np.empty((2, size)),
+        np.empty((2, size, size)),
+        np.empty((size, size)),
+        np.empty(size),
+        np.empty(3),
+        np.zeros((3, 3)),
+        np.zeros(3),
+        np.zeros((3, 3)),
+        np.zeros((3, 3)),
+    )
+
+
+@compiled
+def with_stray_light(model: IrModel, readings: FloatArray) -> IrModel:
+    """The platform with the noise that an exchange has whose readings (F,) are so bright."""
+    brightest, e = 0.0, model.errors
+    for reading in readings:
+        if math.isfinite(reading):
+            brightest = max(brightest, reading)
+    noise = math.hypot(e.noise, model.stray * min(brightest, model.saturation))
+    return IrModel(
+        model.radius,
+        model.angles,
+        model.units,
+        model.sensor,
+        model.emitter,
+        model.amplitudes,
+        model.saturation,
+        noise,
+        ReadingErrors(noise, e.relative, e.lasting, e.blocked, e.bright),
+        model.stray,
+        model.scale,
+    )
+
+
+@borrowing
+def write_costs(errors: ReadingErrors, pair: Pair) -> None:
+    """Write `Pair.costs` for readings that err like this."""
+    costs, squared, others = pair.costs, 0, 0
+    one_by_one = errors.bright < math.inf or errors.lasting > 0.0
+    for f in range(pair.kinds.size):
+        costs.per_sigma[f], costs.most[f] = 0.0, math.inf
+        if pair.kinds[f] == MISSING:
+            continue
+        alone = one_by_one or pair.kinds[f] != MEASURED
+        if not alone:
+            costs.per_sigma[f] = 1.0 / spread(errors, pair.cut[f])
+            squared += 1
+            if pair.cut[f] < DARK * errors.noise and errors.blocked < math.inf:
+                costs.most[f] = _MOST
+        if alone or costs.most[f] < math.inf:
+            costs.others[others] = f
+            others += 1
+    costs.counts[0], costs.counts[1] = squared, others
+
+
+@borrowing
+def cost_of(
+    model: IrModel, pair: Pair, at: FloatArray, room: Scratch, gradient: FloatArray, hessian: FloatArray
+) -> float:
+    """The cost at some place; writes its gradient and Hessian there."""
+    size, sought = at.size, at.size > 3
+    predict_brightness(model, at[size - 3], at[size - 2], at[size - 1], room.ways, room.expected, room.slopes)
+    _write_factors(pair, at, room.factors)
+    for p in range(size):
+        gradient[p] = 0.0
+        for q in range(p + 1):
+            hessian[p, q] = 0.0
+    of_prior = _add_prior(pair, at, gradient, hessian) if sought else 0.0
+    cost, costs = of_prior, pair.costs
+    cost += _squares(
+        room.expected, room.factors, pair.cut, costs.per_sigma, costs.most, room.pulls, room.weights
+    )
+    room.tally[0], room.tally[1], room.tally[2] = 2.0 * cost, costs.counts[0] - 3.0, 2.0 * (cost - of_prior)
+    cost += _add_others(model.errors, pair, room)
+    _add_by_pose(room.pulls, room.weights, room.slopes[0], room.slopes[1], room.slopes[2], gradient, hessian)
+    if sought:
+        _add_by_gains(pair.sensor.size, room, gradient, hessian)
+    return cost
+
+
+@borrowing
+def _write_factors(pair: Pair, at: FloatArray, factors: FloatArray) -> None:
+    """Write the products of gains, with log-gains where they are sought; 0 for dead elements."""
+    n, sought = pair.sensor.size, at.size > 3
+    for i in range(n):
+        sensor = pair.sensor[i] * (math.exp(at[i]) if sought else 1.0)
+        for j in range(n):
+            factor = sensor * pair.emitter[j]
+            factors[i * n + j] = 0.0 if math.isnan(factor) else factor
+    for j in range(n if sought else 0):
+        gain = math.exp(at[n + j])
+        for i in range(n):
+            factors[i * n + j] *= gain
+    for f in range(n * n, factors.size):  # all powers alike
+        factors[f] = factors[f - n * n]
+
+
+@compiled_sums
+def _squares(
+    expected: FloatArray,
+    factors: FloatArray,
+    cut: FloatArray,
+    per_sigma: FloatArray,
+    most: FloatArray,
+    pulls: FloatArray,
+    weights: FloatArray,
+) -> float:
+    """The cost of readings by their distance from expectation; writes its derivatives."""
+    cost = 0.0
+    for w in range(expected.size):
+        slope = factors[w] * per_sigma[w]
+        more = min(slope * expected[w] - per_sigma[w] * cut[w], most[w])
+        cost += 0.5 * more * more
+        pulls[w] = slope * more
+        weights[w] = slope * slope
+    return cost
+
+
+@borrowing
+def _add_others(errors: ReadingErrors, pair: Pair, room: Scratch) -> float:
+    """What other readings cost besides what they were taken for; corrects the derivatives and the tally."""
+    total, tally, costs = 0.0, room.tally, pair.costs
+    for p in range(3):
+        for q in range(3):
+            room.lasting[p, q] = 0.0
+    for k in range(costs.counts[1]):
+        f = costs.others[k]
+        factor, kind = room.factors[f], pair.kinds[f]
+        expected = factor * room.expected[f]
+        taken = min(costs.per_sigma[f] * (expected - pair.cut[f]), costs.most[f])
+        if costs.per_sigma[f] > 0.0:  # dark, and may be blocked where it is expected to be brighter
+            if taken < 0.0:
+                continue
+            tally[0], tally[1] = tally[0] - taken * taken, tally[1] - 1.0
+            if taken < costs.most[f]:
+                continue
+        cost, pull, weight, sure, lasting, square = reading_cost(
+            errors, kind, pair.cut[f], pair.stable[f], expected
+        )
+        total += cost - 0.5 * taken * taken
+        tally[2] += square - taken * taken
+        if sure:
+            tally[0], tally[1] = tally[0] + 2.0 * cost, tally[1] + (1.0 if kind == MEASURED else 0.0)
+        room.pulls[f], room.weights[f] = factor * pull, factor * factor * weight
+        if lasting > 0.0:
+            _add_lasting(lasting * room.weights[f], room.slopes[:, f], room.lasting)
+    return total
+
+
+@compiled_sums
+def _add_by_pose(
+    pulls: FloatArray,
+    weights: FloatArray,
+    by_r: FloatArray,
+    by_b: FloatArray,
+    by_h: FloatArray,
+    gradient: FloatArray,
+    hessian: FloatArray,
+) -> None:
+    """Write the derivatives by the pose, of slopes by range, bearing and heading (F,)."""
+    r, b, h = 0.0, 0.0, 0.0
+    rr, br, bb, hr, hb, hh = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for f in range(pulls.size):
+        r, b, h = r + pulls[f] * by_r[f], b + pulls[f] * by_b[f], h + pulls[f] * by_h[f]
+        of_r, of_b, of_h = weights[f] * by_r[f], weights[f] * by_b[f], weights[f] * by_h[f]
+        rr, br, hr = rr + of_r * by_r[f], br + of_r * by_b[f], hr + of_r * by_h[f]
+        bb, hb, hh = bb + of_b * by_b[f], hb + of_b * by_h[f], hh + of_h * by_h[f]
+    x = gradient.size - 3
+    gradient[x], gradient[x + 1], gradient[x + 2] = r, b, h
+    hessian[x, x], hessian[x + 1, x], hessian[x + 1, x + 1] = rr, br, bb
+    hessian[x + 2, x], hessian[x + 2, x + 1], hessian[x + 2, x + 2] = hr, hb, hh
+
+
+@borrowing
+def _add_by_gains(n: int, room: Scratch, gradient: FloatArray, hessian: FloatArray) -> None:
+    """Add the derivatives by log-gains; by its sensor's and its emitter's a reading has the same slope."""
+    expected, pulls, slopes, x = room.expected, room.pulls, room.slopes, gradient.size - 3
+    for w in range(n * n):
+        i, j = w // n, n + w % n
+        pull, both, by_r, by_b, by_h = 0.0, 0.0, 0.0, 0.0, 0.0
+        for f in range(w, expected.size, n * n):
+            weight = room.weights[f] * expected[f]
+            pull += pulls[f] * expected[f]
+            both += weight * expected[f]
+            by_r += weight * slopes[0, f]
+            by_b += weight * slopes[1, f]
+            by_h += weight * slopes[2, f]
+        hessian[j, i] += both
+        for p in (i, j):
+            gradient[p] += pull
+            hessian[p, p] += both
+            hessian[x, p] += by_r
+            hessian[x + 1, p] += by_b
+            hessian[x + 2, p] += by_h
+
+
+@borrowing
+def _add_prior(pair: Pair, at: FloatArray, gradient: FloatArray, hessian: FloatArray) -> float:
+    """Add the priors of log-gains: independent errors, and one common to all of a side."""
+    n, cost = pair.sensor.size, 0.0
+    for side in range(2):
+        weight, common = pair.prior[side, 0], pair.prior[side, 1]
+        first, total = side * n, 0.0
+        for p in range(first, first + n):
+            total += at[p]
+        for p in range(first, first + n):
+            pull = weight * (at[p] - common * total)
+            cost += 0.5 * pull * at[p]
+            gradient[p] += pull
+            hessian[p, p] += weight * (1.0 - common)
+            for q in range(first, p):
+                hessian[p, q] -= weight * common
+    return cost
+
+
+@borrowing
+def _add_lasting(weight: float, slopes: FloatArray, lasting: FloatArray) -> None:
+    """Add a reading whose noise has a part that is the same every time."""
+    for p in range(3):
+        for q in range(3):
+            lasting[p, q] += weight * slopes[p] * slopes[q]

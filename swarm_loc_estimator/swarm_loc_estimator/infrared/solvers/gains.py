@@ -1,0 +1,382 @@
+"""Calibration of the gains of sensors and emitters from brightness matrices.
+
+All gains and the relative pose of every exchange are sought together by Gauss-Newton, each pose eliminated
+from its own readings, and so is the ambient light that a sensor did not subtract. Without known poses, what
+all gains of a robot have in common is told from range only by near robots, whose pattern depends on it; far
+ones with brighter elements just seem nearer. The result says how unsure it is. Known poses determine it, but
+for a factor between sensors and emitters, which cancels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.infrared.brightness import expected_with_slopes
+from swarm_loc_estimator.infrared.solution import DARKEST, Outcome
+from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.swarm.ir_board import GAIN_RANGE, IrGains, IrPlatform, PairGains
+
+Progress = Callable[[str], None]
+
+_ROUNDS = 8
+_STILL = 1e-3
+"""Rounds end when no log-gain moves by more."""
+POSE_SIGMA = (0.0005, 0.005, 0.005)
+"""How well known poses are known: range [m], bearing, heading [rad]."""
+_BACKGROUND = 0.5
+"""How much of the ambient light a sensor may read besides, one standard deviation [sigma of a reading]."""
+_SEARCH_SIGMA = 0.02
+"""How unsure gains are taken to be while poses are searched with them."""
+_MAX_ODDS = 0.05
+_MAX_MISFIT = 3.0
+"""Exchanges whose second-best pose is likelier, or that fit worse, are left out; where most fit worse though
+gains are free, the curves are wrong."""
+_CLEAR_OF_SATURATION = 3.0
+"""Readings expected nearer to saturation than this are left out [sigma]."""
+_WORST = 5.0
+"""Exchanges whose residuals' mean square is above the median by more than this factor are left out."""
+_LONGEST_STEP = 0.3
+_MIN_SIGMA = 0.003
+"""Gains are never called surer than this."""
+
+
+class Exchanges(NamedTuple):
+    """What robots read of each other.
+
+    Attributes:
+        receiver: (k,) index of the robot that measured.
+        transmitter: (k,) index of the robot that lit its emitters.
+        readings: (k, modes, n, n) [count], [mode, sensor, emitter], NaN where not measured.
+        saturation: (k, modes) from where on readings tell no more [count].
+        poses: (k, 3) of the transmitter seen from the receiver, range [m], bearing, heading [rad]; NaN where
+            not known.
+    """
+
+    receiver: NDArray[np.int64]
+    transmitter: NDArray[np.int64]
+    readings: FloatArray
+    saturation: FloatArray
+    poses: FloatArray
+
+    def chosen(self, rows: NDArray[np.bool_]) -> Exchanges:
+        """Those that are marked (k,)."""
+        return Exchanges(
+            self.receiver[rows],
+            self.transmitter[rows],
+            self.readings[rows],
+            self.saturation[rows],
+            self.poses[rows],
+        )
+
+
+@dataclass(frozen=True)
+class GainsFit:
+    """Gains of all robots, and how well they explain what was read.
+
+    Attributes:
+        gains: One per robot; as if never calibrated where its exchanges contradict each other by so much that
+            they would be less sure than that.
+        used: (k,) which exchanges were used.
+        before: (k, modes, n, n) residuals with all gains 1, in sigmas; NaN where a reading was not used.
+        after: Likewise with the gains.
+    """
+
+    gains: tuple[IrGains, ...]
+    used: NDArray[np.bool_]
+    before: FloatArray
+    after: FloatArray
+
+
+class GainsError(ValueError):
+    """Exchanges that tell nothing of gains; the message is one sentence."""
+
+
+def estimate_gains(
+    platform: IrPlatform, robots: int, exchanges: Exchanges, progress: Progress = lambda _: None
+) -> GainsFit:
+    """Estimate the gains of all robots.
+
+    Args:
+        platform: Of all robots; its `element_sigma` is by how much elements may differ.
+        robots: How many there are.
+        exchanges: What they read.
+        progress: Called with a word on what is being done.
+
+    Raises:
+        GainsError: Elements cannot differ, the platform's curves do not hold, or no exchange can be used.
+    """
+    if platform.element_sigma == 0.0:
+        raise GainsError("element_sigma of the platform is 0, so that all gains are 1.")
+    estimator = MaximumLikelihood(platform)
+    logs = np.zeros((2, robots, platform.n))
+    unknown = _pairs(exchanges, logs, platform.element_sigma)
+    _check_curves(estimator, exchanges, unknown)
+    poses, used = _poses(estimator, exchanges, unknown)
+    before = _residuals(platform, exchanges, logs, poses, used)
+    for number in range(_ROUNDS):
+        progress(f"gains, round {number + 1}")
+        logs, covariances, moved = _improved(platform, exchanges, logs, poses, used)
+        poses, used = _poses(estimator, exchanges, _pairs(exchanges, logs, _SEARCH_SIGMA))
+        used = _without_worst(_residuals(platform, exchanges, logs, poses, used), used)
+        if moved < _STILL:
+            break
+    after = _residuals(platform, exchanges, logs, poses, used)
+    return GainsFit(_as_gains(platform, exchanges, logs, covariances, used), used, before, after)
+
+
+def _pairs(exchanges: Exchanges, logs: FloatArray, sigma: float) -> PairGains:
+    """The gains of every exchange's pair, from log-gains (2, robots, n) of sensors and emitters."""
+    factors = np.exp(logs)
+    sigmas = np.tile([sigma, 0.0, sigma, 0.0], (len(exchanges.receiver), 1))
+    return PairGains(factors[0, exchanges.receiver], factors[1, exchanges.transmitter], sigmas)
+
+
+def _check_curves(estimator: MaximumLikelihood, exchanges: Exchanges, unknown: PairGains) -> None:
+    """Refuse to blame elements where most exchanges fit no pose whatsoever, however elements differ.
+
+    Raises:
+        GainsError: So it is.
+    """
+    misfits = estimator.solve(exchanges.readings, unknown, exchanges.saturation).misfits
+    found = misfits[np.isfinite(misfits)]
+    if found.size and np.median(found) > _MAX_MISFIT:
+        raise GainsError(
+            f"its curves do not hold, for readings are off by {np.sqrt(np.median(found)):.1f} sigma whatever"
+            " poses and gains are taken; find the board itself first, with `calibrate_ir --board`."
+        )
+
+
+def _poses(
+    estimator: MaximumLikelihood, exchanges: Exchanges, pairs: PairGains
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """The pose (k, 3) of every exchange, and which of them can be relied on.
+
+    Readings have a say even where the pose is known: robots may have moved while they exchanged.
+
+    Raises:
+        GainsError: None of them.
+    """
+    solutions = estimator.solve(exchanges.readings, pairs, exchanges.saturation)
+    known = _known(exchanges)
+    sure = (solutions.odds < _MAX_ODDS) & (solutions.misfits < _MAX_MISFIT)
+    found = solutions.outcomes == Outcome.FOUND
+    used = np.asarray(found & (known | sure))
+    if not used.any():
+        raise GainsError(f"None of {len(used)} exchanges determines a pose.")
+    poses, both = np.where(known[:, None], exchanges.poses, solutions.poses), found & known
+    prior = np.diag(np.square(POSE_SIGMA))
+    share = prior @ np.linalg.inv(prior + solutions.covariances[both])
+    poses[both] += np.einsum("kab,kb->ka", share, _apart(solutions.poses[both], poses[both]))
+    return poses, used
+
+
+def _apart(poses: FloatArray, others: FloatArray) -> FloatArray:
+    """Poses (k, 3) less others, angles wrapped."""
+    apart = poses - others
+    apart[:, 1:] = wrap_angle(apart[:, 1:])
+    return apart
+
+
+def _known(exchanges: Exchanges) -> NDArray[np.bool_]:
+    """(k,) whether the pose is known."""
+    known: NDArray[np.bool_] = np.isfinite(exchanges.poses[:, 0])
+    return known
+
+
+def _residuals(
+    platform: IrPlatform,
+    exchanges: Exchanges,
+    logs: FloatArray,
+    poses: FloatArray,
+    used: NDArray[np.bool_],
+) -> FloatArray:
+    """(k, modes, n, n) what readings differ from expectation by [sigma]; NaN where not used."""
+    linear = _linearized(platform, exchanges, logs, poses, used)
+    residuals = np.full(exchanges.readings.shape, np.nan)
+    residuals[used] = np.where(linear.weight > 0.0, linear.residual * np.sqrt(linear.weight), np.nan)
+    return residuals
+
+
+def _without_worst(residuals: FloatArray, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which exchanges are used of those that were: not the few that fit far worse than most."""
+    kept: NDArray[np.bool_] = used.copy()
+    squares = np.nanmean(residuals[used] ** 2, axis=(1, 2, 3))
+    kept[used] = squares <= _WORST * max(float(np.median(squares)), 1.0)
+    return kept
+
+
+class _Linear(NamedTuple):
+    """Readings about expectation, for the u exchanges used.
+
+    Attributes:
+        weight: (u, modes, n, n) one over the variance, 0 where there is no reading to use.
+        residual: (u, modes, n, n) reading less expectation.
+        expected: (u, modes, n, n), which is the slope by a log-gain.
+        slopes: (u, modes, n, n, 3) by the pose.
+    """
+
+    weight: FloatArray
+    residual: FloatArray
+    expected: FloatArray
+    slopes: FloatArray
+
+
+def _linearized(
+    platform: IrPlatform,
+    exchanges: Exchanges,
+    logs: FloatArray,
+    poses: FloatArray,
+    used: NDArray[np.bool_],
+) -> _Linear:
+    """The readings of the exchanges used."""
+    pairs = PairGains(*(values[used] for values in _pairs(exchanges, logs, 0.0)))
+    expected, slopes = expected_with_slopes(platform, poses[used], pairs)
+    readings, limit = exchanges.readings[used], exchanges.saturation[used][..., None, None]
+    with np.errstate(invalid="ignore"):
+        spread = np.hypot(platform.noise, platform.relative * readings)
+        clear = expected < limit - _CLEAR_OF_SATURATION * platform.noise
+        light = (readings > DARKEST * platform.noise) & (readings < limit)
+    usable = np.isfinite(readings) & clear & light
+    weight = np.where(usable, 1.0 / np.where(usable, spread, 1.0) ** 2, 0.0)
+    return _Linear(weight, np.where(usable, readings - expected, 0.0), expected, slopes)
+
+
+def _improved(
+    platform: IrPlatform,
+    exchanges: Exchanges,
+    logs: FloatArray,
+    poses: FloatArray,
+    used: NDArray[np.bool_],
+) -> tuple[FloatArray, FloatArray, float]:
+    """One step of Gauss-Newton: log-gains, two covariances (2, P, P), and the largest change.
+
+    The first is that of the noise. The second, White's sandwich, is wider where exchanges pull apart more
+    than noise explains, as those of robots do that move meanwhile.
+    """
+    linear = _linearized(platform, exchanges, logs, poses, used)
+    to_known = _apart(exchanges.poses[used], poses[used])
+    information, pull = _without_pose(linear, to_known, _BACKGROUND * platform.noise)
+    _, robots, n = logs.shape
+    own = np.arange(n)
+    sensors = exchanges.receiver[used, None] * n + own
+    emitters = robots * n + exchanges.transmitter[used, None] * n + own
+    place = np.concatenate([sensors, emitters], axis=1)
+    prior = 1.0 / platform.element_sigma**2
+    matrix, vector = prior * np.eye(logs.size), -prior * logs.ravel()
+    scatter, block = matrix.copy(), (place[:, :, None], place[:, None, :])
+    np.add.at(matrix, block, information)
+    np.add.at(scatter, block, pull[:, :, None] * pull[:, None, :])
+    np.add.at(vector, place, pull)
+    covariance = np.asarray(np.linalg.inv(matrix))
+    step = np.clip(covariance @ vector, -_LONGEST_STEP, _LONGEST_STEP)
+    both = np.stack([covariance, covariance @ scatter @ covariance])
+    return logs + step.reshape(logs.shape), both, float(np.abs(step).max())
+
+
+def _without_pose(linear: _Linear, to_known: FloatArray, background: float) -> tuple[FloatArray, FloatArray]:
+    """The information (u, 2n, 2n) on log-gains of each exchange's sensors and emitters, and its pull (u, 2n).
+
+    The pose is eliminated, with what is known of it, and so is the background of each sensor.
+
+    Args:
+        linear: The readings.
+        to_known: (u, 3) from the poses to those that are known; NaN where none is.
+        background: Standard deviation of each sensor's [count].
+    """
+    weight, expected, slopes = linear.weight, linear.expected, linear.slopes
+    bright = weight * expected
+    square, mixed = bright * expected, bright[..., None] * slopes
+    count, _, n, _ = weight.shape
+    gains = np.zeros((count, 2 * n, 2 * n))
+    both, own = square.sum(axis=1), np.arange(n)
+    gains[:, own, own], gains[:, n + own, n + own] = both.sum(axis=2), both.sum(axis=1)
+    gains[:, :n, n:], gains[:, n:, :n] = both, np.swapaxes(both, 1, 2)
+    to_pose = np.concatenate([mixed.sum(axis=(1, 3)), mixed.sum(axis=(1, 2))], axis=1)
+    pose = np.einsum("kmij,kmija,kmijb->kab", weight, slopes, slopes)
+    known = np.isfinite(to_known[:, 0])
+    pose[known] += np.diag(1.0 / np.square(POSE_SIGMA))
+    of_gains = bright * linear.residual
+    pull = np.concatenate([of_gains.sum(axis=(1, 3)), of_gains.sum(axis=(1, 2))], axis=1)
+    of_pose = np.einsum("kmij,kmija->ka", weight * linear.residual, slopes)
+    of_pose[known] += to_known[known] / np.square(POSE_SIGMA)
+    dark = _of_background(linear, background)
+    gains, to_pose = gains - dark[:, :-4, :-4], to_pose - dark[:, :-4, -4:-1]
+    pose, pull, of_pose = pose - dark[:, -4:-1, -4:-1], pull - dark[:, :-4, -1], of_pose - dark[:, -4:-1, -1]
+    back = np.linalg.solve(pose, np.swapaxes(to_pose, 1, 2))
+    return gains - to_pose @ back, pull - np.einsum("kap,ka->kp", back, of_pose)
+
+
+def _of_background(linear: _Linear, sigma: float) -> FloatArray:
+    """What not knowing the background of each sensor takes away from all products of weighted columns.
+
+    Returns:
+        (u, 2n + 4, 2n + 4) for sensors, emitters, pose and residual.
+    """
+    weight, own = linear.weight, np.arange(linear.weight.shape[2])
+    bright = (weight * linear.expected).sum(axis=1)
+    pose = np.einsum("kmij,kmija->kia", weight, linear.slopes)
+    residual = (weight * linear.residual).sum(axis=(1, 3))
+    columns = np.concatenate([np.zeros_like(bright), bright, pose, residual[..., None]], axis=2)
+    columns[:, own, own] = bright.sum(axis=2)
+    columns /= np.sqrt(1.0 / sigma**2 + weight.sum(axis=(1, 3)))[..., None]
+    return np.asarray(np.swapaxes(columns, 1, 2) @ columns)
+
+
+def _as_gains(
+    platform: IrPlatform,
+    exchanges: Exchanges,
+    logs: FloatArray,
+    covariances: FloatArray,
+    used: NDArray[np.bool_],
+) -> tuple[IrGains, ...]:
+    """Gains with how unsure they are, by the covariance (2, P, P) that is wider; see `GainsFit`."""
+    unseen = platform.element_sigma**2 / platform.n
+    sigmas = [_sigmas(exchanges, covariance, logs.shape, unseen, used) for covariance in covariances]
+    own, shared = np.max(sigmas, axis=0)
+    factors = np.clip(np.exp(logs), *GAIN_RANGE)
+    return tuple(
+        IrGains(
+            tuple(factors[0, k].tolist()),
+            tuple(factors[1, k].tolist()),
+            max(float(own[k]), _MIN_SIGMA),
+            float(shared[k]),
+        )
+        if max(own[k], shared[k]) < platform.element_sigma
+        else IrGains.unknown(platform)
+        for k in range(logs.shape[1])
+    )
+
+
+def _sigmas(
+    exchanges: Exchanges,
+    covariance: FloatArray,
+    shape: tuple[int, ...],
+    unseen: float,
+    used: NDArray[np.bool_],
+) -> FloatArray:
+    """How unsure each robot's gains are (2, robots): each by itself, and all of a robot together.
+
+    The latter is what a receiver's sensors and a transmitter's emitters have in common, halved between them:
+    sensors that read more and emitters that shine less by the same factor are no different.
+    """
+    _, robots, n = shape
+    blocks = covariance.reshape(2 * robots, n, 2 * robots, n)
+    means = blocks.mean(axis=(1, 3))
+    own = np.array([np.trace(blocks[k, :, k]) / n - means[k, k] for k in range(2 * robots)])
+    common: list[list[float]] = [[] for _ in range(2 * robots)]
+    pairs = np.unique(
+        np.stack([exchanges.receiver[used], robots + exchanges.transmitter[used]], axis=1), axis=0
+    )
+    for sensors, emitters in pairs.tolist():
+        both = means[sensors, sensors] + means[emitters, emitters] + 2.0 * means[sensors, emitters]
+        common[sensors].append(0.5 * float(both))
+        common[emitters].append(0.5 * float(both))
+    shared = np.array([np.mean(values) if values else unseen for values in common])
+    return np.sqrt([np.mean(v.reshape(2, robots), axis=0) for v in (own, shared)])

@@ -1,0 +1,351 @@
+"""Maximum likelihood estimate of the relative pose of two robots, from all readings of all powers.
+
+The search of `search` starts at the poses of `start_table`, so that no wrong minimum is found. The inverse
+information is the covariance, grown where readings fit worse than the platform's noise allows. Elements'
+unknown gains are sought along, so that the covariance contains them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import borrowing, compiled
+from swarm_loc_estimator.common.se2_scalar import wrap
+from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
+from swarm_loc_estimator.infrared.solution import IrSolutions, Outcome, checked, no_solutions
+from swarm_loc_estimator.infrared.solvers.coarse_posterior import add_spread
+from swarm_loc_estimator.infrared.solvers.cost import Pair, with_stray_light, write_costs
+from swarm_loc_estimator.infrared.solvers.reading_cost import DARK, MEASURED
+from swarm_loc_estimator.infrared.solvers.readings import classify, compress_readings
+from swarm_loc_estimator.infrared.solvers.search import pose_covariance, search
+from swarm_loc_estimator.infrared.solvers.start_table import (
+    StartTable,
+    blurred,
+    compress,
+    find_starts,
+    start_table,
+)
+from swarm_loc_estimator.infrared.solvers.workspace import TABLE_STARTS, Room, new_room
+from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
+
+_WORSE = 2.0
+"""A start that fits worse than the best one by more than this factor is not tried."""
+_LOOSE, _STILL = 0.1, 1e-4
+"""A step that promises to lower the cost by less ends a search, of the soft and of the exact model."""
+_SAME = 0.02
+"""Two minima whose costs differ by less are one."""
+_SUSPICIOUS = 1.3
+"""A misfit that is seldom so large by chance."""
+_FEWEST = 9
+_FAINTEST = 6.0
+"""Readings must be brighter than noise by so many sigmas of the sum of their squares."""
+_FAINTEST_OF_OUTLIERS = 3.0
+"""Likewise where the probability of all poses is known besides; noise alone then gives none."""
+_EXPLAINED = 0.5
+"""The share of what is read, in squares, that a pose must explain."""
+_EXPLAINED_OF_OUTLIERS = 0.2
+"""Likewise where readings may be blocked or too bright."""
+_WIDEST = 1.0
+"""A bearing or heading less sure than this, by the best minimum alone, is open [rad]."""
+_WIDEST_OF_ALL = 0.9
+"""Likewise by the probability of all poses."""
+_APART = 0.1
+"""Two minima farther apart than this, in bearing, heading [rad] or relative in range, are two poses."""
+_AROUND = [(b, h) for b in (-0.2, 0.0, 0.2) for h in (-0.2, 0.0, 0.2) if b or h]
+_ASIDE = np.array([(0.0, 0.1, 0.3), (0.0, -0.1, -0.3), *((0.0, b, h) for b, h in _AROUND)])
+"""Where to look besides: two from the best minimum, where the second-best often is, and others from the
+table's best start; range, bearing, heading [m, rad]."""
+_OF_SECOND = 2
+"""How many of these are of the second-best minimum."""
+_MIN_ODDS = 1e-4
+_WORTH_WEIGHING = 8.0
+"""Minima whose costs differ by more are not weighed by what is around them."""
+_NO_MINIMUM = np.full(4, math.inf)
+_EXACT = 1e-4
+"""The own sigma of gains of which only the common part is unsure."""
+_FOUND, _TOO_WEAK, _TOO_FEW, _UNDETERMINED, _MISFIT = (int(outcome) for outcome in Outcome)
+
+
+class MaximumLikelihood:
+    """Most likely poses for one platform.
+
+    Args:
+        platform: The board of both robots.
+    """
+
+    def __init__(self, platform: IrPlatform) -> None:
+        self._platform = platform
+        self._models = Models(platform.model, blurred(platform), start_table(platform))
+
+    def solve(
+        self, readings: ArrayLike, gains: PairGains | None = None, saturation: ArrayLike | None = None
+    ) -> IrSolutions:
+        """Relative poses of k pairs, see `solution.IrEstimator`."""
+        values, known, limits = checked(self._platform, readings, gains, saturation)
+        flat = values.reshape(len(values), math.prod(values.shape[1:]))
+        return _solve_all(self._models, flat, known, limits)
+
+
+class Models(NamedTuple):
+    """What is known of a platform.
+
+    Attributes:
+        exact: The platform.
+        blurred: Its soft version, whose minimum is near the right one.
+        table: What is read all around.
+    """
+
+    exact: IrModel
+    blurred: IrModel
+    table: StartTable
+
+
+@compiled
+def _solve_all(models: Models, readings: FloatArray, gains: PairGains, saturation: FloatArray) -> IrSolutions:
+    """All pairs, first those of known gains, then the others, each kind with room of its own."""
+    out = no_solutions(len(readings))
+    for known in (True, False):
+        some = [k for k in range(len(readings)) if known == (gains.sigma[k].max() == 0.0)]
+        if len(some) > 0:
+            room = new_room(models.table, saturation.shape[1], gains.sensor.shape[1], known)
+            for k in some:
+                _solve_at(models, readings, gains, saturation, room, out, k)
+    return out
+
+
+@compiled
+def _solve_at(
+    models: Models,
+    readings: FloatArray,
+    gains: PairGains,
+    saturation: FloatArray,
+    room: Room,
+    out: IrSolutions,
+    k: int,
+) -> None:
+    """One pair."""
+    pair = Pair(
+        readings[k],
+        room.cut,
+        room.stable,
+        room.kinds,
+        room.exact,
+        gains.sensor[k],
+        gains.emitter[k],
+        room.prior,
+        models.table.ranges[0],
+        2.0 * models.table.ranges[-1],
+    )
+    _write_prior(gains.sigma[k], pair.sensor.size, room.prior)
+    exact = with_stray_light(models.exact, pair.readings)
+    soft = with_stray_light(models.blurred, pair.readings)
+    out.outcomes[k] = _solve_one(Models(exact, soft, models.table), saturation[k], pair, room, out, k)
+
+
+@borrowing
+def _write_prior(sigma: FloatArray, n: int, prior: FloatArray) -> None:
+    """Write `Pair.prior` for the sigmas (4,) of `PairGains`."""
+    for side in range(2):
+        own, common = max(sigma[2 * side], _EXACT) ** 2, sigma[2 * side + 1] ** 2
+        prior[side, 0], prior[side, 1] = 1.0 / own, common / (own + n * common)
+
+
+@borrowing
+def _solve_one(
+    models: Models, saturation: FloatArray, pair: Pair, room: Room, out: IrSolutions, k: int
+) -> int:
+    """One pair; returns the outcome."""
+    measured, saturated, bright = classify(models.exact, saturation, pair)
+    if measured < _FEWEST:
+        return _UNDETERMINED if saturated > 0 else _TOO_FEW
+    two_sided = models.exact.errors.bright < math.inf
+    faintest = _FAINTEST_OF_OUTLIERS if two_sided else _FAINTEST
+    if bright < measured + faintest * math.sqrt(2.0 * measured):
+        return _TOO_WEAK
+    write_costs(models.exact.errors, pair)
+    _find_minima(models, pair, room, measured)
+    if two_sided:
+        _weigh_minima(models.exact, pair, room)
+    best, other = room.minima[0], room.minima[1]
+    covariance, odds = room.covariance, math.exp(best[3] - other[3])
+    determined = pose_covariance(models.exact, pair, room.best, room.full, covariance)
+    misfit = room.full.tally[0] / max(room.full.tally[1], 1.0)
+    if _unexplained(models.exact, pair, room, bright / (measured + saturated)):
+        return _MISFIT
+    if not determined:
+        return _UNDETERMINED
+    share = 0.0 if two_sided else odds / (1.0 + odds)
+    for p in range(3):
+        for q in range(3):
+            apart = _apart(best, other, p) * _apart(best, other, q) if share > 0.0 else 0.0
+            covariance[p, q] = models.exact.scale * max(misfit, 1.0) * covariance[p, q] + share * apart
+    if two_sided:
+        if add_spread(models.table, room.start, best, covariance) > _WIDEST_OF_ALL**2:
+            return _UNDETERMINED
+    elif max(covariance[1, 1], covariance[2, 2]) > models.exact.scale * _WIDEST * _WIDEST:
+        return _UNDETERMINED
+    out.misfits[k], out.odds[k] = misfit, odds
+    assign(out.systematic_share[k], room.full.of_gains)
+    assign_matrix(out.covariances[k], covariance)
+    for p in range(3):
+        out.poses[k, p] = best[p]
+        if odds > _MIN_ODDS:
+            out.alternatives[k, p] = other[p]
+    return _FOUND
+
+
+@borrowing
+def _weigh_minima(model: IrModel, pair: Pair, room: Room) -> None:
+    """Judge the two minima by the probability around them, not its density; writes the better one first.
+
+    A pose that takes most readings for outliers can fit the few others in a tiny region only.
+    """
+    best, other, at = room.minima[0], room.minima[1], room.full.at
+    if not other[3] - best[3] < _WORTH_WEIGHING or not pose_covariance(
+        model, pair, room.best, room.full, room.covariance
+    ):
+        return
+    best[3] -= _log_volume(room.covariance)
+    cost = search(model, pair, other, _STILL, room.full, _NO_MINIMUM)
+    found = room.found
+    assign(found, at)
+    if not pose_covariance(model, pair, found, room.full, room.covariance):
+        return
+    for p in range(3):
+        other[p] = wrap(found[at.size - 3 + p]) if p > 0 else found[at.size - 3]
+    other[3] = cost - _log_volume(room.covariance)
+    if other[3] < best[3]:
+        for p in range(4):
+            best[p], other[p] = other[p], best[p]
+        assign(room.best, found)
+
+
+@borrowing
+def _log_volume(covariance: FloatArray) -> float:
+    """Half the logarithm of the determinant of a covariance (3, 3)."""
+    c = covariance
+    size = c[0, 0] * (c[1, 1] * c[2, 2] - c[1, 2] * c[2, 1])
+    size -= c[0, 1] * (c[1, 0] * c[2, 2] - c[1, 2] * c[2, 0])
+    size += c[0, 2] * (c[1, 0] * c[2, 1] - c[1, 1] * c[2, 0])
+    return 0.5 * math.log(max(size, 1e-30))
+
+
+@borrowing
+def _unexplained(model: IrModel, pair: Pair, room: Room, bright: float) -> bool:
+    """Whether a pose leaves most of what was read, mean square `bright`, unexplained."""
+    tally = room.full.tally
+    if model.errors.bright == math.inf:
+        misfit = tally[0] / max(tally[1], 1.0)
+        return bool(misfit - 1.0 > (1.0 - _EXPLAINED) * max(bright - 1.0, 0.0))
+    total, count = 0.0, 0
+    for f in range(pair.kinds.size):
+        if pair.kinds[f] == MEASURED:
+            total += pair.stable[f] ** 2
+            count += 1
+    return bool(tally[2] - count > (1.0 - _EXPLAINED_OF_OUTLIERS) * max(total - count, 0.0))
+
+
+@borrowing
+def _apart(a: FloatArray, b: FloatArray, p: int) -> float:
+    """The difference of two poses in range, bearing or heading."""
+    return wrap(a[p] - b[p]) if p > 0 else a[p] - b[p]
+
+
+@borrowing
+def _find_minima(models: Models, pair: Pair, room: Room, measured: int) -> None:
+    """Search from all starts that are worth it; writes the best minimum of all and another one."""
+    room.minima[:, 3] = math.inf
+    reached = 0
+    for s in range(_list_starts(models, pair, room)):
+        reached = _search_from(models, pair, room, room.starts[s], reached)
+    first, start = room.first, room.starts[0]
+    assign(first, room.starts[1])
+    for aside in range(_ASIDE.shape[0]):
+        of_second = aside < _OF_SECOND
+        if _in_doubt(room, reached, measured) or (of_second and room.full.at.size > 3):  # gains are sought
+            origin = room.minima[0] if of_second else first
+            for p in range(3):
+                start[p] = origin[p] + _ASIDE[aside, p]
+            reached = _search_from(models, pair, room, start, reached)
+    if _in_doubt(room, reached, measured) and models.exact.errors.blocked < math.inf:
+        dark = compress(models.exact, DARK * models.exact.noise)
+        blocked = find_starts(models.table, room.pattern, room.present, dark, room.start, room.starts)
+        for s in range(min(blocked, TABLE_STARTS)):
+            reached = _search_from(models, pair, room, room.starts[s], reached)
+
+
+@borrowing
+def _in_doubt(room: Room, reached: int, measured: int) -> bool:
+    """Whether the best minimum may not be the best of all: reached but once, or it fits badly."""
+    return reached < 2 or 2.0 * room.minima[0, 3] > _SUSPICIOUS * (measured - 3)
+
+
+@borrowing
+def _search_from(models: Models, pair: Pair, room: Room, start: FloatArray, reached: int) -> int:
+    """Search from a start, keep where it ends; how often the best minimum was reached, before and now."""
+    at, best = room.full.at, room.minima[0, 3]
+    cost = search(models.exact, pair, start, _STILL, room.full, room.minima[0])
+    if _keep(room.minima, at[at.size - 3 :], cost):
+        assign(room.best, at)
+    if abs(cost - best) < _SAME:
+        return reached + 1
+    return 1 if cost < best else reached
+
+
+@borrowing
+def _list_starts(models: Models, pair: Pair, room: Room) -> int:
+    """Write poses to begin at; returns how many.
+
+    First where the soft model's search ends, then the best of the table, then others that fit there nearly as
+    well. More are in `_ASIDE`, and at last those for readings of which some are blocked.
+    """
+    compress_readings(models.exact, pair, room.pattern, room.present)
+    starts, found = room.starts, room.starts[1 : 1 + TABLE_STARTS]
+    outliers = math.inf if models.exact.errors.bright < math.inf else -math.inf
+    count = 1 + find_starts(models.table, room.pattern, room.present, outliers, room.start, found)
+    _search_blurred(models.blurred, pair, room, found[0])
+    while starts[count - 1, 3] > _WORSE * starts[1, 3]:
+        count -= 1
+    return count
+
+
+@borrowing
+def _search_blurred(model: IrModel, pair: Pair, room: Room, start: FloatArray) -> None:
+    """Write where the soft model's search ends as the first start."""
+    p = pair
+    soft = Pair(
+        p.readings,
+        p.cut,
+        p.stable,
+        p.kinds,
+        room.soft,
+        p.sensor,
+        p.emitter,
+        p.prior,
+        p.nearest,
+        p.farthest,
+    )
+    write_costs(model.errors, soft)
+    search(model, soft, start, _LOOSE, room.plain, room.minima[0])
+    for c in range(3):
+        room.starts[0, c] = room.plain.at[c]
+
+
+@borrowing
+def _keep(minima: FloatArray, pose: FloatArray, cost: float) -> bool:
+    """Sort a minimum into the best two that lie apart (2, 4); whether it is the best."""
+    best, other = minima[0], minima[1]
+    better = cost < best[3]
+    turned = max(abs(wrap(pose[1] - best[1])), abs(wrap(pose[2] - best[2])))
+    apart = max(turned, abs(pose[0] / best[0] - 1.0)) > _APART
+    if better and apart:
+        assign(other, best)
+    if better or (apart and cost < other[3]):
+        place = best if better else other
+        place[0], place[1], place[2], place[3] = pose[0], wrap(pose[1]), wrap(pose[2]), cost
+    return bool(better)

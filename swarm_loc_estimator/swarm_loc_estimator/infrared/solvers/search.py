@@ -1,0 +1,255 @@
+"""Damped Gauss-Newton search of the maximum likelihood from a start.
+
+At a kink of the curves the slope is one-sided, which the damping bears. The covariance looks beyond a kink
+that is near.
+"""
+
+from __future__ import annotations
+
+import math
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import borrowing
+from swarm_loc_estimator.common.se2_scalar import wrap
+from swarm_loc_estimator.common.small_matrix import assign_matrix
+from swarm_loc_estimator.infrared.solvers.cost import Pair, Scratch, cost_of
+from swarm_loc_estimator.swarm.ir_board import IrModel
+
+_ROUNDS = 40
+_FIRST_DAMPING = 1e-3
+_MAX_DAMPING = 1e8
+_LONGEST_TURN = 0.4
+"""Of one step [rad]."""
+_LONGEST_SHARE = 0.4
+"""Of one step in range, relative."""
+_BESIDE = 0.03
+"""A search that has come so near a known minimum [rad, relative in range], at its cost, would end there."""
+_AWAY = 2.5
+"""How far around a minimum its covariance looks [sigma]."""
+_CORNER = 3.0**-0.5
+_AROUND = (
+    (_CORNER, _CORNER, _CORNER),
+    (_CORNER, -_CORNER, -_CORNER),
+    (-_CORNER, _CORNER, -_CORNER),
+    (-_CORNER, -_CORNER, _CORNER),
+)
+"""Where to: the corners of a tetrahedron."""
+
+
+@borrowing
+def search(
+    model: IrModel, pair: Pair, start: FloatArray, still: float, room: Scratch, known: FloatArray
+) -> float:
+    """Go down from a start (range, bearing, heading, ...) to a minimum; returns its cost.
+
+    It ends when a step promises to lower the cost by less than `still`, or in the basin of a minimum that is
+    known (4,), range, bearing, heading, and the cost that is returned then; infinite: none is.
+
+    The cost is half the weighed sum of squares, of readings and priors, and minus the logarithms of the
+    probabilities of saturated readings. `room.at` has the minimum.
+    """
+    at, size, gradients, hessians = room.at, room.at.size, room.gradients, room.hessians
+    for p in range(size - 3):
+        at[p] = 0.0
+    for p in range(3):
+        at[size - 3 + p] = start[p]
+    best, damping, growth = 0, _FIRST_DAMPING, 2.0
+    cost = cost_of(model, pair, at, room, gradients[best], hessians[best])
+    for _ in range(_ROUNDS):
+        promise = _step(pair, room, gradients[best], hessians[best], damping)
+        if promise < still:
+            break
+        now = cost_of(model, pair, room.trial, room, gradients[1 - best], hessians[1 - best])
+        gain = (cost - now) / promise
+        if gain > 1e-3:
+            best, cost = 1 - best, now
+            for p in range(size):
+                at[p] = room.trial[p]
+            if known[3] < math.inf and now < known[3] + 1.0 and _beside(known, at):
+                return float(min(now, known[3]))
+            damping, growth = damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 2.0
+        else:
+            damping, growth = damping * growth, growth * 2.0
+            if damping > _MAX_DAMPING:
+                break
+    return cost
+
+
+@borrowing
+def _beside(known: FloatArray, at: FloatArray) -> bool:
+    """Whether a search has come to a known minimum."""
+    x = at.size - 3
+    turned = max(abs(wrap(at[x + 1] - known[1])), abs(wrap(at[x + 2] - known[2])))
+    return bool(max(turned, abs(at[x] / known[0] - 1.0)) < _BESIDE)
+
+
+@borrowing
+def _step(pair: Pair, room: Scratch, gradient: FloatArray, hessian: FloatArray, damping: float) -> float:
+    """Write the next trial; returns by how much the quadratic model lowers the cost there."""
+    step, size = room.step, room.step.size
+    distance = room.at[size - 3]
+    # where the range is at its limit and would go beyond, it stays
+    held = (distance <= pair.nearest and gradient[size - 3] > 0.0) or (
+        distance >= pair.farthest and gradient[size - 3] < 0.0
+    )
+    while not _factorize(hessian, damping, room.factor, held):
+        damping = max(10.0 * damping, _FIRST_DAMPING)
+        if damping > _MAX_DAMPING:
+            return 0.0
+    for p in range(size):
+        step[p] = -gradient[p]
+    if held:
+        step[size - 3] = 0.0
+    _solve(room.factor, step)
+    shorter = 1.0
+    for p in (size - 2, size - 1):
+        shorter = min(shorter, _LONGEST_TURN / max(abs(step[p]), 1e-12))
+    shorter = min(shorter, _LONGEST_SHARE * distance / max(abs(step[size - 3]), 1e-12))
+    slope, bend = 0.0, 0.0
+    for p in range(size):
+        step[p] *= shorter
+        slope += gradient[p] * step[p]
+        bend += 0.5 * hessian[p, p] * step[p] * step[p]
+        for q in range(p):
+            bend += hessian[p, q] * step[p] * step[q]
+        room.trial[p] = room.at[p] + step[p]
+    room.trial[size - 3] = min(max(room.trial[size - 3], pair.nearest), pair.farthest)
+    return -slope - bend
+
+
+@borrowing
+def _factorize(matrix: FloatArray, damping: float, factor: FloatArray, held: bool) -> bool:
+    """Cholesky of the lower triangle with its diagonal grown by a share; whether it is positive definite.
+
+    Args:
+        matrix: (P, P).
+        damping: The share.
+        factor: (P, P) written.
+        held: Leave the third last row and column out, which is the range.
+    """
+    size = matrix.shape[0]
+    for p in range(size):
+        for q in range(p + 1):
+            value = matrix[p, q] * (1.0 + damping if p == q else 1.0)
+            if held and size - 3 in (p, q):
+                value = 1.0 if p == q else 0.0
+            for k in range(q):
+                value -= factor[p, k] * factor[q, k]
+            if p == q:
+                if not value > 1e-12 * matrix[p, p]:
+                    return False
+                factor[p, p] = math.sqrt(value)
+            else:
+                factor[p, q] = value / factor[q, q]
+    return True
+
+
+@borrowing
+def _solve(factor: FloatArray, vector: FloatArray) -> None:
+    """Solve factor factor^T x = vector in place."""
+    size = vector.size
+    for p in range(size):
+        for k in range(p):
+            vector[p] -= factor[p, k] * vector[k]
+        vector[p] /= factor[p, p]
+    for p in range(size - 1, -1, -1):
+        for k in range(p + 1, size):
+            vector[p] -= factor[k, p] * vector[k]
+        vector[p] /= factor[p, p]
+
+
+@borrowing
+def pose_covariance(
+    model: IrModel, pair: Pair, at: FloatArray, room: Scratch, covariance: FloatArray
+) -> bool:
+    """Write the pose's covariance (3, 3) at a minimum (P,); whether the readings determine the pose.
+
+    It is the mean of the inverse information there and around: beyond a kink of the curves, readings may tell
+    much less of the pose. `room.tally` is that of the minimum, `room.of_gains` there the share of the
+    gains, and of other noise that is the same every time.
+    """
+    hessian = room.hessians[0]
+    cost_of(model, pair, at, room, room.gradients[0], hessian)
+    squares, freedom, all_squares = room.tally
+    if not _invert(hessian, room):
+        return False
+    _write_share_of_gains(pair, room)
+    _add_square(room.root, covariance, 1.0 / (1.0 + len(_AROUND)), 0.0)
+    root, x = room.first_root, at.size - 3
+    assign_matrix(root, room.root)
+    for direction in _AROUND:
+        for p in range(at.size):
+            room.trial[p] = at[p]
+        for p in range(3):
+            for q in range(p, 3):
+                room.trial[x + p] += _AWAY * root[q, p] * direction[q]
+        room.trial[x] = max(room.trial[x], pair.nearest)
+        cost_of(model, pair, room.trial, room, room.gradients[0], hessian)
+        if not _invert(hessian, room):
+            return False
+        _add_square(room.root, covariance, 1.0 / (1.0 + len(_AROUND)), 1.0)
+    room.tally[0], room.tally[1], room.tally[2] = squares, freedom, all_squares
+    return True
+
+
+@borrowing
+def _write_share_of_gains(pair: Pair, room: Scratch) -> None:
+    """Write which share of the pose's variances, by the factor, comes from errors of the gains.
+
+    With the inverse Hessian C and the prior weight W of the gains, the pose errs by -C_pose,gains W times
+    their errors.
+    """
+    x, n, row = room.at.size - 3, pair.sensor.size, room.step
+    for p in range(3):
+        room.of_gains[p] = 0.0
+        if x == 0:
+            room.of_gains[p] = _share_of_lasting(room, p)
+            continue
+        for q in range(row.size):
+            row[q] = 1.0 if q == x + p else 0.0
+        _solve(room.factor, row)
+        for side in range(2):
+            squares, total = 0.0, 0.0
+            for q in range(side * n, side * n + n):
+                squares += row[q] * row[q]
+                total += row[q]
+            part = pair.prior[side, 0] * (squares - pair.prior[side, 1] * total * total)
+            room.of_gains[p] += part / row[x + p]
+
+
+@borrowing
+def _share_of_lasting(room: Scratch, p: int) -> float:
+    """Which share of a pose's variance, by the factor, comes from noise that is the same every time."""
+    row, part = room.step, 0.0
+    for q in range(3):
+        row[q] = 1.0 if q == p else 0.0
+    _solve(room.factor, row)
+    for a in range(3):
+        for b in range(3):
+            part += row[a] * room.lasting[a, b] * row[b]
+    return float(part / row[p])
+
+
+@borrowing
+def _invert(information: FloatArray, room: Scratch) -> bool:
+    """Write the inverse of the pose's part of the information's factor; whether there is one."""
+    if not _factorize(information, 0.0, room.factor, False):
+        return False
+    factor, root, x = room.factor, room.root, information.shape[0] - 3
+    for p in range(3):
+        root[p, p] = 1.0 / factor[x + p, x + p]
+    root[1, 0] = -factor[x + 1, x] * root[0, 0] * root[1, 1]
+    root[2, 1] = -factor[x + 2, x + 1] * root[1, 1] * root[2, 2]
+    root[2, 0] = -(factor[x + 2, x] * root[0, 0] + factor[x + 2, x + 1] * root[1, 0]) * root[2, 2]
+    return True
+
+
+@borrowing
+def _add_square(root: FloatArray, matrix: FloatArray, weight: float, keep: float) -> None:
+    """Matrix becomes keep * matrix + weight * root^T root, all (3, 3)."""
+    for p in range(3):
+        for q in range(3):
+            value = 0.0
+            for k in range(max(p, q), 3):
+                value += root[k, p] * root[k, q]
+            matrix[p, q] = (keep * matrix[p, q] if keep else 0.0) + weight * value

@@ -1,0 +1,348 @@
+"""Alignment of a robot's track with the map: the transform on which most constraints agree, if it is unique.
+
+The parts are compiled, because every robot that waits tries again and again, and apart from one another:
+each would be compiled once more inside whatever calls it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.se2 import adjoint
+from swarm_loc_estimator.common.se2_scalar import carry, moved_by_twist, wrap
+from swarm_loc_estimator.common.small_matrix import assign, cholesky3, solve3
+from swarm_loc_estimator.filter.gating import gate_threshold
+from swarm_loc_estimator.filter.state import InitialPose
+from swarm_loc_estimator.initialization.constraints import Constraint, ConstraintArray, spread_at, turned
+
+MIN_CONSTRAINTS = 3
+_AGREE = float(gate_threshold(0.999))
+_AGREE_AT_FIRST = 2.0 * _AGREE  # a hypothesis has the errors of the constraint that it was made from
+_MIN_SHARE = 0.6  # of the constraints must agree with an alignment
+_RIVAL_SHARE = 0.8  # another transform with this share of the best one's support is a rival
+_MAX_RIVALS = 8
+_APART_M, _APART_RAD = 0.1, 0.1
+HEADING_SIGMA = 0.2
+_POSITION_SIGMA = 0.5
+_REFINEMENTS = 5
+_MARGIN = 1e-6  # so that what is its own is a covariance where next to nothing is
+_PRIOR = 1e-6  # so that what no constraint shows is unsure instead of singular
+
+
+def align(
+    constraints: ConstraintArray, track_noise: FloatArray, heading_sigma: float = HEADING_SIGMA
+) -> InitialPose | None:
+    """The transform that a robot's constraints (k,) agree on, or None while it is not unique and sure.
+
+    Args:
+        constraints: Of CONSTRAINT_DTYPE, refreshed.
+        track_noise: (3, 3) preintegrated covariance of the track by now.
+        heading_sigma: How sure the heading must be [rad].
+    """
+    if constraints.size < MIN_CONSTRAINTS:
+        return None
+    hypotheses = _hypotheses(constraints)
+    constraints = _drifted(constraints, track_noise)
+    agreeing, support = _vote(constraints, hypotheses)
+    enough = max(MIN_CONSTRAINTS, _MIN_SHARE * constraints.size)
+    best = int(np.argmax(support)) if support.size else -1
+    if best < 0 or agreeing[best] < enough:
+        return None
+    transform, covariance, weight = _refined(constraints, hypotheses[best])
+    if np.count_nonzero(weight) < enough:
+        return None
+    position, heading = _unsureness(constraints, track_noise, weight, transform, covariance)
+    if not (position < _POSITION_SIGMA and heading < heading_sigma):
+        return None
+    rivals = hypotheses[support >= _RIVAL_SHARE * support[best]]
+    limits = (_APART_M + 3.0 * position, _APART_RAD + 3.0 * heading)
+    if _is_ambiguous(constraints, transform, rivals, limits):
+        return None
+    return _parted(constraints, track_noise, weight, transform, covariance)
+
+
+def _is_ambiguous(
+    constraints: ConstraintArray, transform: FloatArray, rivals: FloatArray, limits: tuple[float, float]
+) -> bool:
+    """Whether a rival (of h, 3), refined, differs from a transform (3,) by more than the limits of `_apart`.
+
+    The one farthest from all that were looked at comes next: what lies near one of them leads to the same.
+    """
+    apart = _apart(constraints, transform, rivals, limits)
+    for _ in range(_MAX_RIVALS):
+        farthest = int(np.argmax(apart))
+        if apart[farthest] <= 1.0:
+            return False
+        refined, _, _ = _refined(constraints, rivals[farthest])
+        if _apart(constraints, transform, refined[None], limits)[0] > 1.0:
+            return True
+        apart = np.minimum(apart, _apart(constraints, rivals[farthest], rivals, limits))
+    return False
+
+
+@compiled
+def _apart(
+    constraints: ConstraintArray, one: FloatArray, others: FloatArray, limits: tuple[float, float]
+) -> FloatArray:
+    """How far (h,) others (h, 3) put the constraints' middle from where one transform (3,) does, or turn it.
+
+    In units of the limits [m, rad]; the greater of the two.
+    """
+    x, y = 0.0, 0.0
+    for k in range(constraints.size):
+        x += constraints[k].local_x / constraints.size
+        y += constraints[k].local_y / constraints.size
+    apart = np.empty(others.shape[0])
+    for h in range(apart.size):
+        cos, sin = math.cos(others[h, 2]) - math.cos(one[2]), math.sin(others[h, 2]) - math.sin(one[2])
+        dx, dy = others[h, 0] - one[0] + cos * x - sin * y, others[h, 1] - one[1] + sin * x + cos * y
+        turn = abs(wrap(others[h, 2] - one[2]))
+        apart[h] = max(math.hypot(dx, dy) / limits[0], turn / limits[1])
+    return apart
+
+
+def _refined(constraints: ConstraintArray, begin: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Transform (3,), covariance (3, 3) and weights (k,) by least squares, see `_refine`."""
+    transform, covariance, weight = np.empty(3), np.empty((3, 3)), np.empty(constraints.size)
+    _refine(constraints, begin, transform, covariance, weight)
+    return transform, covariance, weight
+
+
+@compiled
+def _hypotheses(constraints: ConstraintArray) -> FloatArray:
+    """Transforms (h, 3) from each heading shown and each pair of constraints far enough apart."""
+    count, h = constraints.size, 0
+    out = np.empty((2 * count + count * (count - 1) // 2, 3))
+    for k in range(count):
+        a = constraints[k]
+        for turn in (a.turn, a.other_turn):
+            if math.isfinite(turn):
+                h = _place(turn, a.local_x, a.local_y, a.map_x, a.map_y, out, h)
+    for i in range(count):
+        for k in range(i):
+            a, b = constraints[i], constraints[k]
+            lx, ly = a.local_x - b.local_x, a.local_y - b.local_y
+            mx, my = a.map_x - b.map_x, a.map_y - b.map_y
+            variance = a.local_xx + a.local_yy + a.map_xx + a.map_yy
+            sigma = math.sqrt(variance + b.local_xx + b.local_yy + b.map_xx + b.map_yy)
+            length = math.hypot(mx, my)
+            if length > 3.0 * sigma and abs(math.hypot(lx, ly) - length) < 4.0 * sigma:
+                turn = math.atan2(my, mx) - math.atan2(ly, lx)
+                lx, ly = b.local_x + 0.5 * lx, b.local_y + 0.5 * ly
+                mx, my = b.map_x + 0.5 * mx, b.map_y + 0.5 * my
+                h = _place(turn, lx, ly, mx, my, out, h)
+    return out[:h]
+
+
+@compiled
+def _place(turn: float, lx: float, ly: float, mx: float, my: float, out: FloatArray, h: int) -> int:
+    """Write the transform h with heading `turn` that brings a point of the track to its place on the map."""
+    cos, sin = math.cos(turn), math.sin(turn)
+    out[h, 0], out[h, 1], out[h, 2] = mx - cos * lx + sin * ly, my - sin * lx - cos * ly, wrap(turn)
+    return h + 1
+
+
+@compiled
+def _drifted(constraints: ConstraintArray, track_noise: FloatArray) -> ConstraintArray:
+    """The constraints (k,), their points on the track less sure by what it has drifted since."""
+    out, drift = np.empty_like(constraints), np.empty((3, 3))
+    for k in range(constraints.size):
+        out[k] = constraints[k]
+        constraint = out[k]
+        for i in range(3):
+            for j in range(3):
+                drift[i, j] = track_noise[i, j] - constraint.track_noise[i, j]
+        xx, xy, yy = spread_at(drift, constraint.local_x, constraint.local_y)
+        constraint.local_xx += xx
+        constraint.local_xy += xy
+        constraint.local_yy += yy
+    return out
+
+
+@compiled
+def _misses(
+    constraint: Constraint, x: float, y: float, cos: float, sin: float
+) -> tuple[float, float, float, float, float]:
+    """By what a transform misses a constraint's place on the map, x and y, with information xx, xy, yy."""
+    xx, xy, yy = turned(constraint.local_xx, constraint.local_xy, constraint.local_yy, cos, sin)
+    xx, xy, yy = xx + constraint.map_xx, xy + constraint.map_xy, yy + constraint.map_yy
+    scale = 1.0 / (xx * yy - xy * xy)
+    dx = constraint.map_x - x - cos * constraint.local_x + sin * constraint.local_y
+    dy = constraint.map_y - y - sin * constraint.local_x - cos * constraint.local_y
+    return dx, dy, scale * yy, -scale * xy, scale * xx
+
+
+@compiled
+def _turn_off(constraint: Constraint, heading: float) -> float:
+    """By what turn a heading differs from a constraint's, or from the mirrored one; NaN if by much."""
+    turn, other = wrap(constraint.turn - heading), wrap(constraint.other_turn - heading)
+    if abs(other) < abs(turn):  # NaN, which stands for none shown, is not less
+        turn = other
+    return turn if turn * turn < 9.0 * constraint.turn_variance else math.nan
+
+
+@compiled
+def _vote(
+    constraints: ConstraintArray, transforms: FloatArray
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """How many constraints agree with each transform (h, 3), and how many points and headings of theirs."""
+    count = transforms.shape[0]
+    agreeing, support = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
+    for h in range(count):
+        x, y, heading = transforms[h, 0], transforms[h, 1], transforms[h, 2]
+        cos, sin = math.cos(heading), math.sin(heading)
+        for k in range(constraints.size):
+            dx, dy, xx, xy, yy = _misses(constraints[k], x, y, cos, sin)
+            if xx * dx * dx + 2.0 * xy * dx * dy + yy * dy * dy <= _AGREE_AT_FIRST:
+                agreeing[h] += 1
+                support[h] += 1 if math.isnan(_turn_off(constraints[k], heading)) else 2
+    return agreeing, support
+
+
+@compiled
+def _refine(
+    constraints: ConstraintArray,
+    begin: FloatArray,
+    transform: FloatArray,
+    covariance: FloatArray,
+    weight: FloatArray,
+) -> None:
+    """Gauss-Newton on the points and headings that agree with a transform.
+
+    Args:
+        constraints: (k,).
+        begin: (3,) where to begin.
+        transform: (3,) written.
+        covariance: (3, 3) written, of its right-invariant error.
+        weight: (k,) written: how sure the points are, zero for those that do not agree.
+    """
+    information, factor = np.empty((3, 3)), np.empty((3, 3))
+    gradient, step = np.empty(3), np.empty(3)
+    assign(transform, begin)
+    squared, agreeing = 0.0, 0
+    for iteration in range(_REFINEMENTS):
+        x, y, heading = transform[0], transform[1], transform[2]
+        cos, sin = math.cos(heading), math.sin(heading)
+        squared, agreeing = 0.0, 0
+        for i in range(3):
+            gradient[i] = 0.0
+            for j in range(3):
+                information[i, j] = _PRIOR if i == j else 0.0
+        for k in range(constraints.size):
+            constraint = constraints[k]
+            dx, dy, xx, xy, yy = _misses(constraint, x, y, cos, sin)
+            distance = xx * dx * dx + 2.0 * xy * dx * dy + yy * dy * dy
+            agrees = distance <= (_AGREE if iteration else _AGREE_AT_FIRST)
+            weight[k] = xx + yy if agrees else 0.0
+            if not agrees:
+                continue
+            agreeing += 1
+            squared += distance
+            px, py = constraint.map_x - dx, constraint.map_y - dy  # where the transform puts the point
+            along, across = (1.0, 0.0, -py), (0.0, 1.0, px)
+            for i in range(3):
+                wx, wy = along[i] * xx + across[i] * xy, along[i] * xy + across[i] * yy
+                gradient[i] += wx * dx + wy * dy
+                for j in range(3):
+                    information[i, j] += wx * along[j] + wy * across[j]
+            turn = _turn_off(constraint, heading)
+            if math.isfinite(turn):
+                gradient[2] += turn / constraint.turn_variance
+                information[2, 2] += 1.0 / constraint.turn_variance
+        factor = cholesky3(information)
+        solve3(factor, gradient, step)
+        x, y, heading = moved_by_twist(step[0], step[1], step[2], x, y, heading)
+        transform[0], transform[1], transform[2] = x, y, heading
+    excess = max(1.0, squared / max(1, 2 * agreeing - 3))
+    for i in range(3):
+        for j in range(3):
+            gradient[j] = excess if i == j else 0.0
+        solve3(factor, gradient, covariance[i])
+
+
+def _parted(
+    constraints: ConstraintArray,
+    track_noise: FloatArray,
+    weight: FloatArray,
+    transform: FloatArray,
+    covariance: FloatArray,
+) -> InitialPose:
+    """Part the error of a transform (3,) into its own and that of all those it was located by.
+
+    An error of another side moves all that is tied to it, so it enters by the share of the information that
+    its constraints have. What else makes them unsure is their own, and averages out but for the drift of the
+    track since, which counts at its mean by weight (k,).
+    """
+    used = weight > 0.0
+    constraints, weight = constraints[used], weight[used]
+    cos, sin = math.cos(transform[2]), math.sin(transform[2])
+    turn = np.array([[cos, -sin], [sin, cos]])
+    local = _matrices(constraints, "local")
+    place = np.column_stack([constraints["local_x"], constraints["local_y"]]) @ turn.T + transform[:2]
+    tie, other_tie = _ties(place), _ties(np.column_stack([constraints["map_x"], constraints["map_y"]]))
+    tie[:, 2, 2] = [math.isfinite(_turn_off(constraint, transform[2])) for constraint in constraints]
+    noise, common = np.zeros((2, constraints.size, 3, 3))
+    noise[:, :2, :2] = turn @ local @ turn.T + _matrices(constraints, "map")
+    noise[:, 2, 2] = constraints["turn_variance"]
+    common[:, :2, :2] = (other_tie @ constraints["shared"] @ np.swapaxes(other_tie, 1, 2))[:, :2, :2]
+    common[:, 2, 2] = constraints["shared"][:, 2, 2]
+    weighted = np.linalg.solve(noise, tie)
+    information = np.swapaxes(tie, 1, 2) @ weighted
+    gain = np.linalg.inv(information.sum(axis=0) + _PRIOR * np.eye(3))
+    rest = (np.swapaxes(weighted, 1, 2) @ ((1.0 + _MARGIN) * noise - common) @ weighted).sum(axis=0)
+    drift = np.average(track_noise - constraints["track_noise"], axis=0, weights=weight)
+    own = covariance @ rest @ gain + adjoint(transform) @ drift @ adjoint(transform).T
+    columns = np.unique(constraints["column"][constraints["column"] >= 0])
+    shares = np.array([gain @ information[constraints["column"] == column].sum(axis=0) for column in columns])
+    return InitialPose(transform, 0.5 * (own + own.T), columns, shares.reshape(-1, 3, 3))
+
+
+def _ties(places: FloatArray) -> FloatArray:
+    """How right-invariant errors move points (k, 2), and turn what is there: (k, 3, 3)."""
+    ties = np.tile(np.eye(3), (len(places), 1, 1))
+    ties[:, 0, 2], ties[:, 1, 2] = -places[:, 1], places[:, 0]
+    return ties
+
+
+def _matrices(constraints: ConstraintArray, side: str) -> FloatArray:
+    """Covariances (k, 2, 2) of the points of a side."""
+    xx, xy, yy = (constraints[f"{side}_{name}"] for name in ("xx", "xy", "yy"))
+    return np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-1)
+
+
+@compiled
+def _unsureness(
+    constraints: ConstraintArray,
+    track_noise: FloatArray,
+    weight: FloatArray,
+    transform: FloatArray,
+    covariance: FloatArray,
+) -> tuple[float, float]:
+    """How unsure an alignment leaves the constraints' middle [m], the greater of x and y, and the heading.
+
+    What does not average out counts at its mean by weight (k,): the errors of the other sides, as if all
+    erred alike, and the drift of the track since.
+    """
+    x, y, total = 0.0, 0.0, 0.0
+    whole, drift, carried = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
+    for k in range(constraints.size):
+        x += constraints[k].map_x / constraints.size
+        y += constraints[k].map_y / constraints.size
+        total += weight[k]
+    for k in range(constraints.size):
+        share = weight[k] / total
+        for i in range(3):
+            for j in range(3):
+                whole[i, j] += share * constraints[k].shared[i, j]
+                drift[i, j] += share * (track_noise[i, j] - constraints[k].track_noise[i, j])
+    carry(transform, drift, carried)
+    for i in range(3):
+        for j in range(3):
+            whole[i, j] += covariance[i, j] + carried[i, j]
+    xx, _, yy = spread_at(whole, x, y)
+    return math.sqrt(max(xx, yy)), math.sqrt(whole[2, 2])

@@ -1,0 +1,101 @@
+"""Initialization of robots whose start is unknown: sightings tie their odometry tracks to the map.
+
+Each sighting between a waiting robot and something located says that one point of the robot's track (the
+place where it saw the marker, or its own marker) lies at one point of the map. Two such points give the
+transform in closed form (a rigid alignment); a sighting with heading gives it alone, with a mirrored
+solution it gives two. The transform on which most constraints agree is refined by least squares and accepted
+when it is sure, and when no other one explains the constraints about as well.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.filter.calibration_states import CAMERA_SCALE, CAMERA_YAW
+from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED
+from swarm_loc_estimator.filter.measurement_model import NOBODY, MeasurementArray
+from swarm_loc_estimator.filter.prediction import new_scratch, predict
+from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.initialization.alignment import HEADING_SIGMA, MIN_CONSTRAINTS, align
+from swarm_loc_estimator.initialization.constraints import (
+    NO_CONSTRAINTS,
+    THE_MAP,
+    OtherSide,
+    Waiting,
+    refreshed,
+    with_constraint,
+)
+from swarm_loc_estimator.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.odometry.tracks import OdometryTracks
+
+_INDEPENDENT_NS = 100_000_000
+"""Sightings of one marker that follow each other faster tell the same."""
+_LONGEST_PAUSE_NS = 300_000_000
+_PAUSE_SHARE = 8
+"""After a vain attempt the robot collects more constraints, for an eighth of the time that they span.
+
+Counted in stamps, so that attempts do not depend on the order of arrival.
+"""
+
+
+class Initializer:
+    """Collects constraints and initializes robots.
+
+    Args:
+        tracks: The robots' odometry.
+        window_s: Age up to which a constraint is used.
+        heading_sigma: How sure the heading of a robot must be that is initialized [rad].
+    """
+
+    def __init__(self, tracks: OdometryTracks, window_s: float, heading_sigma: float = HEADING_SIGMA) -> None:
+        self._heading_sigma = heading_sigma
+        self._tracks = tracks
+        self._window_ns = int(window_s * 1e9)
+
+    def note(self, state: SwarmState, one: MeasurementArray) -> bool:
+        """Keep a measurement (1,) that ties a waiting robot to something located; enough of them locate it.
+
+        Returns:
+            Whether the measurement does so.
+        """
+        observer, target, now_ns = int(one["observer"][0]), int(one["target"][0]), int(one["stamp_ns"][0])
+        knows_observer, knows_target = state.is_known(observer), state.is_known(target)
+        robot, other = (target, observer) if knows_observer else (observer, target)
+        if knows_observer == knows_target or not self._tracks.begun(robot, now_ns):
+            return False
+        old = state.constraints.get(robot, NO_CONSTRAINTS)
+        same = old[(old["marker_id"] == one["marker_id"][0]) & (old["other"] == other)]
+        if same.size and abs(now_ns - int(same["stamp_ns"][-1])) < _INDEPENDENT_NS:
+            return True
+        track = self._tracks.at(np.array([robot]), one["stamp_ns"])
+        at = Preintegrated(now_ns, track.covariance[0], track.jacobian[0])
+        camera = np.zeros(2) if observer == NOBODY else state.parameter[observer, [CAMERA_YAW, CAMERA_SCALE]]
+        waiting, seen = Waiting(robot, track.pose[0], at.covariance), self._located(state, other, one)
+        constraints = with_constraint(old, one, camera, waiting, seen, self._window_ns)
+        state.constraints[robot] = constraints
+        few = constraints.size < MIN_CONSTRAINTS or constraints["stamp_ns"][0] == now_ns
+        if few or now_ns < state.next_attempt_ns[robot]:
+            return True
+        initial = align(refreshed(constraints, state.arrays()), at.covariance, self._heading_sigma)
+        if initial is not None:
+            state.initialize(robot, initial, at, CONFIRMED)
+        else:
+            waited_ns = now_ns - int(constraints["stamp_ns"][0])
+            state.next_attempt_ns[robot] = now_ns + min(_LONGEST_PAUSE_NS, waited_ns // _PAUSE_SHARE)
+        return True
+
+    def _located(self, state: SwarmState, other: int, one: MeasurementArray) -> OtherSide:
+        """The side of a measurement (1,) that is located, brought up to its stamp."""
+        landmark = int(one["landmark"][0]) - 1
+        if landmark >= 0:
+            moved = state.landmark[landmark].copy()
+            return OtherSide(NOBODY, landmark, moved, moved, np.zeros((3, 3)))
+        if other == NOBODY:
+            return THE_MAP
+        sample = self._tracks.at(np.array([other]), one["stamp_ns"])
+        at = Preintegrated(int(one["stamp_ns"][0]), sample.covariance[0], sample.jacobian[0])
+        # so that how it erred until now is shared by all that are located by it
+        predict(state.arrays(), other, at, new_scratch())
+        transform = state.transform[other].copy()
+        return OtherSide(other, -1, se2.compose(transform, sample.pose[0]), transform, at.covariance)

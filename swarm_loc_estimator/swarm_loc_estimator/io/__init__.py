@@ -1,1 +1,0 @@
-"""Files and bytes: swarm descriptions, bags, messages, datasets."""

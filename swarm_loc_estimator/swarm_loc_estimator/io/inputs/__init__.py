@@ -1,1 +1,0 @@
-"""The topics of the estimator, and the way from raw messages to its columns."""

@@ -1,1 +1,0 @@
-"""Maps: their files, and the inputs that they are made of."""

@@ -1,1 +1,0 @@
-"""Swarm descriptions and infrared boards as YAML files."""

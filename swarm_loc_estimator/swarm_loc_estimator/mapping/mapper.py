@@ -1,0 +1,370 @@
+"""The cooperative mapper: readings of many robots in, their poses, one map and their next goals out.
+
+A robot stands, looks around by turning, and drives on. Each stop becomes a node of the pose graph; its beams
+are matched against those of other stops, of whichever robot. Robots join and leave at any time.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.se2 import between, compose, wrap_angle
+from swarm_loc_estimator.mapping.exploration.explorer import next_stop
+from swarm_loc_estimator.mapping.exploration.goal import Goal, goal_by_odometry
+from swarm_loc_estimator.mapping.grid.occupancy import OccupancyMap, draw_map
+from swarm_loc_estimator.mapping.grid.visitation import VisitationMap
+from swarm_loc_estimator.mapping.localization.alignment import align, align_all, align_start
+from swarm_loc_estimator.mapping.localization.lights import LightBook, Visit
+from swarm_loc_estimator.mapping.localization.loop_closure import close_loop
+from swarm_loc_estimator.mapping.pose_graph.graph import PoseGraph
+from swarm_loc_estimator.mapping.readings import LightSightings, Readings
+from swarm_loc_estimator.mapping.scans.turn_ratio import turn_ratio
+from swarm_loc_estimator.mapping.settings import MapperSettings
+from swarm_loc_estimator.mapping.stops import MIN_TURN, MotionTracker, Stop
+
+START_TURN = 4.5 * math.pi
+"""Turn by odometry of a whole first scan: a quarter, slowly, to hold the heading; then two turns [rad]."""
+SCAN_TURN = 2.14 * math.pi
+"""Turn by odometry at every later stop: a full turn also where wheels slip [rad]."""
+_START_PARTS = (0.25 * math.pi, *(0.5 * math.pi * k for k in range(1, 9)))
+"""Where a first scan is cut into parts, each a stop [rad]."""
+_TURN_TOLERANCE = 0.03
+_PART_SIGMA = np.array([0.002, 0.002, 0.002])
+_LEAST_SIGMA = 0.003
+_LOST_SIGMA, _CHECK_EVERY = 0.15, 4
+"""A robot that is less sure of its position [m] goes home: to an old stop nearby."""
+_RESTART_SIGMA = np.array([0.10, 0.10, math.radians(5.0)])
+_HOME_AGE, _HOME_RADIUS, _AT_HOME = 10, 4.0, 0.5
+
+
+@dataclass
+class _Track:
+    """What the mapper knows of one robot.
+
+    Attributes:
+        prior: (3,) pose at which it started.
+        prior_sigma: (3,) of it.
+        motion: Tells standing from driving.
+        stop: Where it stands.
+        node: Its newest stop in the graph.
+        is_known: Whether `stop` is in the graph, as `node`.
+        passes: Whether `node` is one too many: the next stop takes its place.
+        left: (3,) pose by odometry when it left `node`.
+        last: (3,) newest pose by odometry.
+        path: Driven since it left the node [m].
+        target: (2,) where it wants to be in the end [m].
+        goal: Its next stop.
+        home: (2,) where it goes to be sure of its position again [m].
+    """
+
+    prior: FloatArray
+    prior_sigma: FloatArray
+    motion: MotionTracker = field(default_factory=MotionTracker)
+    stop: Stop | None = None
+    node: int | None = None
+    is_known: bool = False
+    passes: bool = False
+    left: FloatArray = field(default_factory=lambda: np.zeros(3))
+    last: FloatArray | None = None
+    path: float = 0.0
+    target: FloatArray | None = None
+    goal: Goal | None = None
+    home: FloatArray | None = None
+
+
+class CooperativeMapper:
+    """Poses, map and goals of many robots.
+
+    Args:
+        settings: Noise and limits.
+
+    Attributes:
+        settings: Likewise.
+        graph: The stops.
+        visits: Where robots have been.
+        counters: How often what has happened.
+        background: A map from before, below what the stops draw.
+        begin_ns: Stop in the graph -> its first reading [ns].
+    """
+
+    def __init__(self, settings: MapperSettings | None = None) -> None:
+        self.settings = settings or MapperSettings()
+        self.graph = PoseGraph(self.settings)
+        self.visits = VisitationMap()
+        self.counters = {"scans": 0, "scans_refused": 0, "loops_closed": 0, "odometry_restarts": 0}
+        self._tracks: dict[int, _Track] = {}
+        self._lights = LightBook()
+        self.background: OccupancyMap | None = None
+        self.begin_ns: dict[int, int] = {}
+        self._map: OccupancyMap | None = None
+
+    def join(self, pose: FloatArray, sigma: FloatArray) -> int:
+        """Let a robot join at a pose (3,) in map that is known to sigmas (3,); its number."""
+        robot = self.graph.add_robot()
+        self._tracks[robot] = _Track(np.asarray(pose, dtype=float), np.asarray(sigma, dtype=float))
+        return robot
+
+    def leave(self, robot: int) -> None:
+        """Let a robot leave; what it saw stays."""
+        self._depart(robot, self._tracks[robot])
+        del self._tracks[robot]
+
+    def add_readings(self, robot: int, readings: Readings) -> None:
+        """Take readings (n,) of a robot, newer than all before."""
+        track = self._tracks[robot]
+        for run in track.motion.runs(readings):
+            if run.arrives or not run.stands:
+                self._depart(robot, track)
+            if run.jumps:
+                track = self._begin_anew(robot, track)
+            elif run.arrives:
+                self._drive(track, run.readings.odometry[:1])
+            if run.arrives:
+                track.stop, track.is_known = Stop(run.readings.odometry[0]), False
+            if run.stands and track.stop is not None:
+                track.stop.extend(run.readings)
+                track.last = run.readings.odometry[-1]
+                self._look(robot, track, track.stop)
+            else:
+                self._drive(track, run.readings.odometry)
+                self._lights.note_time(robot, int(run.readings.stamp_ns[-1]))
+
+    def _begin_anew(self, robot: int, track: _Track) -> _Track:
+        """Odometry has begun anew, as when a driver was restarted: the robot is about where it was last."""
+        self.counters["odometry_restarts"] += 1
+        pose = self.pose(robot)
+        fresh = _Track(track.prior, track.prior_sigma) if pose is None else _Track(pose, _RESTART_SIGMA)
+        fresh.motion = track.motion
+        self._tracks[robot] = fresh
+        return fresh
+
+    def add_lights(self, robot: int, sightings: LightSightings) -> None:
+        """Take sightings (m,) of other robots by one of them."""
+        self._lights.add(robot, sightings)
+
+    def pose(self, robot: int) -> FloatArray | None:
+        """The pose (3,) of a robot in map at its newest reading; None before its first scan."""
+        track = self._tracks[robot]
+        if track.node is None or track.last is None:
+            return None
+        if track.is_known and track.stop is not None:
+            x, y, theta, ratio = self.graph.states[track.node]
+            theta += ratio * (track.stop.turn[-1] - track.stop.begin_turn)
+            return np.array([x, y, wrap_angle(theta)])
+        return self._driven(track, track.last)
+
+    def covariance(self, robot: int) -> FloatArray:
+        """Covariance (3, 3) of the newest stop of a robot; NaN before its first scan."""
+        node = self._tracks[robot].node
+        return np.full((3, 3), np.nan) if node is None else self.graph.covariance(node)
+
+    def goal(self, robot: int) -> Goal | None:
+        """Where a robot should go now; None unless it stands and has looked around."""
+        track = self._tracks[robot]
+        return track.goal if track.is_known else None
+
+    def newest_stop(self, robot: int) -> int | None:
+        """Number of the newest stop of a robot in the graph."""
+        return self._tracks[robot].node
+
+    def turned(self, robot: int) -> float:
+        """Turn by odometry of a robot that stands, since its newest stop began [rad]."""
+        stop = self._tracks[robot].stop
+        return 0.0 if stop is None or not self._tracks[robot].is_known else stop.turn[-1] - stop.begin_turn
+
+    def occupancy(self) -> OccupancyMap:
+        """The map as the stops stand now."""
+        if self._map is None:
+            limit = self.settings.max_cells
+            self._map = draw_map(self.graph.scans, self.graph.count, limit, self.background)
+        return self._map
+
+    def finish(self) -> None:
+        """Solve everything anew with all beams."""
+        for track in self._tracks.values():
+            self._update_scan(track)
+        align_all(self.graph)
+        self._map = None
+
+    def _driven(self, track: _Track, odometry: FloatArray) -> FloatArray:
+        """Poses (..., 3) in map of poses (..., 3) by odometry on the way from the newest stop."""
+        left = self.graph.states[track.node, :3].copy()
+        left[2] = self.graph.heading_at_departure(track.node) if track.node is not None else 0.0
+        return compose(left, between(track.left, odometry))
+
+    def _drive(self, track: _Track, odometry: FloatArray) -> None:
+        """Note where a robot drove (n, 3)."""
+        if track.last is not None:
+            steps = np.diff(np.vstack([track.last, odometry])[:, :2], axis=0)
+            paths = np.concatenate([[track.path], np.hypot(steps[:, 0], steps[:, 1])])
+            track.path = float(np.cumsum(paths)[-1])  # the same whoever cuts the readings
+        track.last = odometry[-1]
+        if track.node is not None:
+            self.visits.add(self._driven(track, odometry)[:, :2])
+
+    def _look(self, robot: int, track: _Track, stop: Stop) -> None:
+        """Take a stop into the graph once the robot has looked around."""
+        around = min(2.02 * math.pi / (1.0 - self.graph.slip[robot]), SCAN_TURN - _TURN_TOLERANCE)
+        if not track.is_known:
+            count = stop.completed(START_TURN - _TURN_TOLERANCE if track.node is None else around)
+            if count:
+                self._enter(robot, track, stop, count)
+                self._choose_goal(robot, track, stop)
+        again = stop.split(around) if track.is_known else None
+        if again is not None:  # it could not leave, and turns once more: a stop of its own, and a new goal
+            self._depart(robot, track)
+            track.stop = again
+            self._look(robot, track, again)
+
+    def _depart(self, robot: int, track: _Track) -> None:
+        """A robot leaves where it stood."""
+        stop, track.stop = track.stop, None
+        if stop is None or not len(stop.turn):
+            return
+        if not track.is_known and stop.turned >= MIN_TURN:
+            track.stop = stop
+            self._enter(robot, track, stop, len(stop.turn))
+        if track.is_known:
+            track.stop = stop
+            self._update_scan(track)
+            self._note_visit(robot, track, stop)
+            # from where the node is: its first steps away already count
+            track.left = np.array([*stop.arrival[:2], stop.departure[2]])
+            self.visits.add(np.tile(self.graph.states[track.node, :2], (stop.total, 1)))
+            track.path = math.dist(stop.arrival[:2], stop.departure[:2])
+        track.stop, track.is_known = None, False
+
+    def _note_visit(self, robot: int, track: _Track, stop: Stop) -> None:
+        """Note where a robot stood until now, for lights that it saw and others saw of it."""
+        if track.node is not None:
+            begin_ns, end_ns = int(stop.stamp_ns[stop.begin]), int(stop.stamp_ns[-1])
+            self._lights.note_visit(robot, Visit(track.node, begin_ns, end_ns, stop, stop.begin_turn))
+            self._lights.note_time(robot, end_ns)
+            self._lights.settle(self.graph)
+
+    def _update_scan(self, track: _Track) -> None:
+        """Give the newest stop all readings made there."""
+        stop = track.stop
+        if stop is not None and track.is_known and track.node is not None:
+            turn = stop.turn[stop.begin :] - stop.begin_turn
+            self.graph.set_scan(track.node, turn, stop.inverse[stop.begin :])
+            self._map = None
+
+    def _enter(self, robot: int, track: _Track, stop: Stop, count: int) -> None:
+        """Make a node of the first readings of a stop, or several of a first scan, and align them."""
+        self.counters["scans"] += 1
+        self._map = None
+        track.is_known, stop.looked = True, count
+        if track.node is None:
+            self._enter_first(robot, track, stop, count)
+            return
+        motion = between(track.left, stop.arrival)
+        sigma = self._motion_sigma(track.path, abs(float(motion[2])))
+        pose = self._driven(track, stop.arrival)
+        if track.passes:
+            node = self._replace(track.node, pose, sigma, stop.sigma)
+        else:
+            begin, node = track.node, self.graph.add_stop(robot, pose, stop.sigma)
+            self.graph.constraints.add_departure(begin, node, self.graph.turned[begin], motion, sigma)
+        self.begin_ns[node] = int(stop.stamp_ns[0])
+        self.graph.set_scan(node, stop.turn[:count], stop.inverse[:count])
+        track.node, track.passes = node, self.graph.count > self.settings.max_stops
+        if not align(self.graph, node, track.path):
+            self.counters["scans_refused"] += 1
+        if close_loop(self.graph, node):
+            self.counters["loops_closed"] += 1
+
+    def _replace(self, node: int, pose: FloatArray, motion_sigma: FloatArray, sigma: float) -> int:
+        """Let the newest stop of a robot become its next one: the map is full, the robot goes on."""
+        known = np.sqrt(np.maximum(np.diag(self.graph.covariance(node)), 0.0))
+        self._lights.forget_node(node)
+        self.graph.reuse_stop(node, pose, sigma)
+        drive = np.array([*np.full(2, motion_sigma[:2].max()), motion_sigma[2]])
+        self.graph.constraints.add_prior(node, pose, np.hypot(known, drive))
+        return node
+
+    def _motion_sigma(self, path: float, turn: float) -> FloatArray:
+        """Standard deviations (3,) of a drive: along [m], across [m], heading [rad]."""
+        noise = self.settings
+        heading = noise.heading_noise
+        return np.array(
+            [
+                noise.distance_noise * path + _LEAST_SIGMA,
+                heading * path + _LEAST_SIGMA,
+                math.hypot(heading, noise.course_noise * math.sqrt(path)) + noise.slip_sigma * turn,
+            ]
+        )
+
+    def _enter_first(self, robot: int, track: _Track, stop: Stop, count: int) -> None:
+        """Make nodes of the parts of a first scan: what was seen first holds the heading at the start."""
+        turn, inverse = stop.turn[:count], stop.inverse[:count]
+        furthest = np.maximum.accumulate(np.abs(turn))
+        ratio = turn_ratio(turn, inverse, stop.sigma)
+        if not math.isnan(ratio):
+            self.graph.slip[robot] = 1.0 - ratio
+        cuts = np.searchsorted(furthest, np.array(_START_PARTS) + 1e-6)
+        bounds = sorted({0, *cuts[cuts < count].tolist(), count})
+        nodes: list[int] = []
+        pose = track.prior
+        for first, last in pairwise(bounds):
+            before = turn[first - 1] if first else 0.0
+            node = self.graph.add_stop(robot, pose, stop.sigma)
+            self.graph.set_scan(node, turn[first:last] - before, inverse[first:last])
+            if nodes:
+                turned = self.graph.turned[nodes[-1]]
+                self.graph.constraints.add_departure(nodes[-1], node, turned, np.zeros(3), _PART_SIGMA)
+            else:
+                self.graph.constraints.add_prior(node, track.prior, track.prior_sigma)
+            pose = np.array([pose[0], pose[1], self.graph.heading_at_departure(node)])
+            stop.begin = first
+            self.begin_ns[node] = int(stop.stamp_ns[first])
+            nodes.append(node)
+        track.node = nodes[-1]
+        self.graph.starts.update(nodes)
+        align_start(self.graph, nodes, track.prior_sigma)
+
+    def _choose_goal(self, robot: int, track: _Track, stop: Stop) -> None:
+        """Decide where a robot goes next."""
+        node = track.node
+        if node is None:
+            return
+        self._look_for_home(track, node)
+        x, y, theta, ratio = self.graph.states[node]
+        others = [other for key, other in self._tracks.items() if key != robot]
+        places = [self.pose(key) for key in self._tracks if key != robot]
+        hop, track.target = next_stop(
+            self.occupancy(),
+            np.array([x, y]),
+            self.graph.poses[:, :2],
+            np.array([place[:2] for place in places if place is not None]).reshape(-1, 2),
+            np.array([other.target for other in others if other.target is not None]).reshape(-1, 2),
+            self.settings,
+            track.home,
+        )
+        turned = float(stop.turn[stop.looked - 1])
+        pose = np.array([x, y, theta + ratio * (turned - stop.begin_turn)])
+        odometry = stop.arrival + np.array([0.0, 0.0, turned])
+        number = track.goal.number + 1 if track.goal else 1
+        there = goal_by_odometry(pose, odometry, hop, ratio)
+        track.goal = Goal(number, hop, there, int(stop.stamp_ns[stop.looked - 1]), pose)
+
+    def _look_for_home(self, track: _Track, node: int) -> None:
+        """Send a robot that has become unsure of its position to where it was sure."""
+        graph = self.graph
+        if track.home is not None and math.dist(track.home, graph.states[node, :2]) < _AT_HOME:
+            track.home = None
+        if graph.count <= _HOME_AGE or graph.count % _CHECK_EVERY:
+            return
+        variances = np.diag(graph.covariance(node))[:2]
+        if variances.max() <= _LOST_SIGMA**2:
+            return
+        away = graph.distances(node)
+        old = (away < _HOME_RADIUS) & (np.arange(graph.count) < node - _HOME_AGE)
+        if old.any():
+            cost = np.where(old, away + 0.02 * np.arange(graph.count), np.inf)
+            track.home = graph.states[int(np.argmin(cost)), :2].copy()

@@ -1,0 +1,180 @@
+"""Beams of one stop against lines of another: residuals in inverse distance, normal equations, agreement.
+
+The residual of a beam in direction u on a line with normal n at distance D from where the beam starts is
+z = y - (n.u)/D. Its Jacobian, and whether the beam is used at all, follow from the predicted value and not
+from the measured one: a cut on what was measured keeps those with errors of one sign and shrinks the map.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.mapping.scans.beams import Beams
+from swarm_loc_estimator.mapping.scans.lines import BINS, LINE, Lines
+
+CAUCHY = 6.0
+"""Square of the scale of the Cauchy loss, in variances."""
+MIN_MATCHED = 30
+"""A pair of stops with fewer matched beams tells nothing."""
+_MIN_INCIDENCE = 0.15
+_MIN_DISTANCE = 0.05
+_ROUGHNESS = 0.004
+"""How far walls are from straight [m]."""
+_GATE_VARIANCES = 16.0
+_RANGE_SIGMAS = 2.5
+
+OFF, UNUSABLE, FIT = 0, 1, 2
+"""A beam: not on the line that it should meet; cannot tell; on it."""
+
+
+class Scans(NamedTuple):
+    """All that matching needs to know of stops.
+
+    Attributes:
+        states: (k, 4) x [m], y [m], theta [rad] on arrival, true turn over turn by odometry.
+        beams: What was seen.
+        lines: What that tells.
+        max_range: Beyond this nothing comes back [m].
+    """
+
+    states: FloatArray
+    beams: Beams
+    lines: Lines
+    max_range: float
+
+
+@compiled
+def beam_residual(
+    scans: Scans, k: int, i: int, j: int, gate: float
+) -> tuple[int, float, float, float, float, float, float]:
+    """Compare beam i of stop k with the lines of stop j.
+
+    Args:
+        scans: All stops.
+        k: The stop with the beam.
+        i: Number of the beam.
+        j: The stop with the lines.
+        gate: Further than this and four sigmas off a line, a beam does not belong to it [m].
+
+    Returns:
+        Whether it fits, residual and its variance, predicted inverse distance over the line's distance, the
+        line's normal in map, and the bin of the line; all but the first are zero unless it fits.
+    """
+    states, lines = scans.states, scans.lines
+    measured = scans.beams.inverse[k, i]
+    angle = states[k, 2] + states[k, 3] * scans.beams.turn[k, i]
+    ux, uy = math.cos(angle), math.sin(angle)
+    dx, dy = states[k, 0] - states[j, 0], states[k, 1] - states[j, 1]
+    cos, sin = math.cos(states[j, 2]), math.sin(states[j, 2])
+    bearing = math.atan2(dy + uy / measured, dx + ux / measured) - states[j, 2]
+    m = math.floor(bearing * BINS / (2.0 * math.pi)) % BINS
+    if not lines.usable[j, m] or lines.kind[j, m] != LINE:
+        return OFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    a, b = lines.a[j, m], lines.b[j, m]
+    size = math.hypot(a, b)
+    nx, ny = (cos * a - sin * b) / size, (sin * a + cos * b) / size
+    distance = 1.0 / size - nx * dx - ny * dy
+    incidence = nx * ux + ny * uy
+    if distance < _MIN_DISTANCE or incidence < _MIN_INCIDENCE:
+        return OFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    predicted = incidence / distance
+    sigma = scans.beams.sigma[k]
+    if predicted < 1.0 / scans.max_range + _RANGE_SIGMAS * sigma:
+        return UNUSABLE, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    per_metre = predicted / distance
+    line_sigma = math.sqrt(lines.variance[j, m]) * lines.distance[j, m] / size  # of its distance [m]
+    variance = sigma**2 + (per_metre * line_sigma) ** 2 + (per_metre * _ROUGHNESS) ** 2
+    residual = measured - predicted
+    if residual * residual > _GATE_VARIANCES * variance + (gate * per_metre) ** 2:
+        return OFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    return FIT, residual, variance, per_metre, nx, ny, float(m)
+
+
+@compiled
+def agreement(scans: Scans, k: int, j: int, gate: float, stride: int) -> tuple[int, int, float]:
+    """How well beams of stop k, every `stride`-th, agree with lines of stop j: matched, tried, loss."""
+    matched, tried, loss = 0, 0, 0.0
+    for i in range(0, scans.beams.counts[k], stride):
+        if scans.beams.inverse[k, i] <= 0.0:
+            continue
+        fate, residual, variance, _, _, _, _ = beam_residual(scans, k, i, j, gate)
+        if fate != UNUSABLE:
+            tried += 1
+        if fate == FIT:
+            matched += 1
+            loss += math.log(1.0 + residual * residual / variance / CAUCHY)
+    return matched, tried, loss
+
+
+@compiled
+def accumulate(
+    scans: Scans, k: int, j: int, gate: float, stride: int, H: FloatArray, g: FloatArray
+) -> tuple[int, int]:
+    """Add the normal equations of a pair of stops to H (8, 8) and g (8,); matched and tried beams.
+
+    The unknowns are x, y, theta, ratio of stop k, then those of stop j; H dx = g is the Gauss-Newton step.
+    """
+    matched, tried = 0, 0
+    row = np.zeros(8)
+    for i in range(0, scans.beams.counts[k], stride):
+        if scans.beams.inverse[k, i] <= 0.0:
+            continue
+        fate, residual, variance, per_metre, nx, ny, m = beam_residual(scans, k, i, j, gate)
+        if fate != UNUSABLE:
+            tried += 1
+        if fate != FIT:
+            continue
+        matched += 1
+        distance = (scans.beams.inverse[k, i] - residual) / per_metre
+        _jacobian(scans, k, i, j, distance, nx, ny, row)
+        row[7] = row[6] * scans.lines.turn[j, int(m)]
+        weight = 1.0 / (variance * (1.0 + residual * residual / variance / CAUCHY))
+        for a in range(8):
+            g[a] += weight * row[a] * residual
+            for b in range(8):
+                H[a, b] += weight * row[a] * row[b]
+    return matched, tried
+
+
+@compiled
+def _jacobian(
+    scans: Scans, k: int, i: int, j: int, distance: float, nx: float, ny: float, row: FloatArray
+) -> None:
+    """Write the derivative (7,) of the inverse distance predicted on a line at a distance, with a normal."""
+    states, turn = scans.states, scans.beams.turn[k, i]
+    angle = states[k, 2] + states[k, 3] * turn
+    ux, uy = math.cos(angle), math.sin(angle)
+    dx, dy = states[k, 0] - states[j, 0], states[k, 1] - states[j, 1]
+    per_metre = (nx * ux + ny * uy) / (distance * distance)
+    row[0], row[1] = per_metre * nx, per_metre * ny
+    row[2] = (-nx * uy + ny * ux) / distance
+    row[3] = row[2] * turn
+    row[4], row[5] = -row[0], -row[1]
+    row[6] = (-ny * ux + nx * uy) / distance + per_metre * (-ny * dx + nx * dy)
+
+
+@compiled
+def match_pairs(
+    scans: Scans, pairs: IntArray, weights: FloatArray, gate: float, stride: int
+) -> tuple[FloatArray, FloatArray]:
+    """Weighted normal equations (p, 8, 8) and (p, 8) of pairs (p, 2) of stops: beams of one, lines of other.
+
+    Args:
+        scans: All stops.
+        pairs: (p, 2).
+        weights: (p,) of each pair: its beams share errors.
+        gate: See `beam_residual` [m].
+        stride: Every so many-th beam is used, and weighs as much more.
+    """
+    H, g = np.zeros((len(pairs), 8, 8)), np.zeros((len(pairs), 8))
+    for p in range(len(pairs)):
+        matched, _ = accumulate(scans, pairs[p, 0], pairs[p, 1], gate, stride, H[p], g[p])
+        scale = weights[p] * stride if matched * stride >= MIN_MATCHED else 0.0
+        H[p] *= scale
+        g[p] *= scale
+    return H, g

@@ -1,0 +1,240 @@
+"""The pose graph: stops of all robots, what ties them together, and where all of it puts them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.mapping.matching.beam_matching import Scans, agreement, match_pairs
+from swarm_loc_estimator.mapping.pose_graph import constraints as model
+from swarm_loc_estimator.mapping.pose_graph.constraint_lists import ConstraintLists
+from swarm_loc_estimator.mapping.pose_graph.constraints import STOP_UNKNOWNS
+from swarm_loc_estimator.mapping.pose_graph.normal_equations import Factor, NormalEquations
+from swarm_loc_estimator.mapping.scans.beams import Beams, no_beams, set_beams
+from swarm_loc_estimator.mapping.scans.lines import Lines, fit_lines, no_lines
+from swarm_loc_estimator.mapping.settings import MapperSettings
+
+_REFIT_RATIO = 0.0006
+"""Lines are fitted anew when the ratio of turns has changed by more."""
+_MIN_RATIO_SIGMA = 0.0013
+_MATCH_WEIGHT, _START_WEIGHT = 0.3, 1.5
+"""Of all matches of a stop together: beams of a pair share the errors of one scan."""
+_SMALL_STEP = (1e-3, 1e-3, 5e-4)
+MATCH_GATE = 0.03
+"""Beams further off a line do not belong to it, in the final solution [m]."""
+_OVERLAP_STRIDE = 6
+
+
+class PoseGraph:
+    """Stops with beams and lines, constraints, Gauss-Newton over all or some of them.
+
+    Args:
+        settings: Of the mapper.
+
+    Attributes:
+        settings: Likewise.
+        count: Number of stops.
+        states: (capacity, 4) x [m], y [m], theta on arrival [rad], true turn over turn by odometry.
+        robot: (capacity,) whose stop it is.
+        turned: (capacity,) turn by odometry at the stop until now [rad].
+        slip: (R,) share of turns that each robot's wheels slip.
+        constraints: All but the matches of beams.
+        targets: Stop -> those against whose lines its beams are matched.
+        starts: Stops of first scans.
+    """
+
+    def __init__(self, settings: MapperSettings) -> None:
+        self.settings = settings
+        self.count = 0
+        self.states = np.zeros((64, 4))
+        self.robot: IntArray = np.zeros(64, dtype=np.int64)
+        self.turned = np.zeros(64)
+        self.slip = np.zeros(0)
+        self.constraints = ConstraintLists()
+        self.targets: dict[int, list[int]] = {}
+        self.starts: set[int] = set()
+        self._turned_all = np.zeros(64)
+        self._fitted_ratio = np.ones(64)
+        self._beams, self._lines = no_beams(64), no_lines(64)
+        self._factor: Factor
+        self._factored = -1
+
+    @property
+    def scans(self) -> Scans:
+        """What matching needs."""
+        return Scans(self.states, self._beams, self._lines, self.settings.max_range)
+
+    @property
+    def poses(self) -> FloatArray:
+        """(count, 3) of all stops on arrival, in map."""
+        return self.states[: self.count, :3]
+
+    def add_robot(self) -> int:
+        """Let a robot join; its number."""
+        self.slip = np.append(self.slip, self.settings.usual_slip)
+        self._factored = -1
+        return len(self.slip) - 1
+
+    def add_stop(self, robot: int, pose: FloatArray, sigma: float) -> int:
+        """Add a stop at a pose (3,) whose inverse distances have this sigma [1/m]; its number."""
+        if self.count == len(self.states):
+            self._grow()
+        k = self.count
+        self.count += 1
+        self.states[k] = (*pose[:3], 1.0 - self.slip[robot])
+        self.robot[k] = robot
+        self._beams.sigma[k] = sigma
+        return k
+
+    def reuse_stop(self, stop: int, pose: FloatArray, sigma: float) -> None:
+        """Forget a stop, and let its number be that of a new one of the same robot; see `add_stop`."""
+        self.constraints.remove_stop(stop)
+        self.targets = {
+            one: [other for other in others if other != stop]
+            for one, others in self.targets.items()
+            if one != stop
+        }
+        self.starts.discard(stop)
+        self.states[stop] = (*pose[:3], 1.0 - self.slip[self.robot[stop]])
+        self._beams.sigma[stop] = sigma
+        self._factored = -1
+
+    def set_scan(self, stop: int, turn: FloatArray, inverse: FloatArray) -> None:
+        """Set the beams (n,) of a stop: turn by odometry since arrival [rad], inverse distances [1/m]."""
+        set_beams(self._beams, stop, turn, inverse)
+        self.turned[stop] = turn[-1]
+        self._turned_all[stop] = np.abs(turn).max()
+        self.fit(stop)
+
+    def heading_at_departure(self, stop: int) -> float:
+        """The heading after all turns at a stop [rad]."""
+        return float(self.states[stop, 2] + self.states[stop, 3] * self.turned[stop])
+
+    def fit(self, stop: int) -> None:
+        """Fit the lines of a stop with its present ratio of turns."""
+        ratio = self._fitted_ratio[stop] = self.states[stop, 3]
+        fit_lines(stop, ratio, self.settings.max_range, self._beams, self._lines)
+
+    def overlap(self, stop: int, other: int) -> float:
+        """Share of the beams of a stop that fit the lines of another."""
+        matched, tried, _ = agreement(self.scans, stop, other, 0.0, _OVERLAP_STRIDE)
+        return matched / max(1, tried)
+
+    def distances(self, stop: int) -> FloatArray:
+        """Distances (count,) of all stops from one [m]."""
+        off = self.states[: self.count, :2] - self.states[stop, :2]
+        distances: FloatArray = np.hypot(off[:, 0], off[:, 1])
+        return distances
+
+    def neighbours(self, stop: int, limit: int, least: float) -> list[int]:
+        """The nearest stops within sight of which the beams of a stop overlap the lines by a share."""
+        away = self.distances(stop)
+        found: list[int] = []
+        for other in np.argsort(away, kind="stable"):
+            if away[other] > 0.88 * self.settings.max_range or len(found) == limit:
+                break
+            if other != stop and self.overlap(stop, int(other)) > least:
+                found.append(int(other))
+        return found
+
+    def match_both_ways(self, stop: int, limit: int = 10) -> None:
+        """Let the targets of a stop be matched against it, too."""
+        for other in self.targets[stop]:
+            back = self.targets.setdefault(other, [])
+            if stop not in back and len(back) < limit:
+                back.append(stop)
+
+    def solve(
+        self, iterations: int, free: Iterable[int] | None = None, gate: float = MATCH_GATE, stride: int = 2
+    ) -> None:
+        """Gauss-Newton steps over all stops, or some; slips are free always.
+
+        Args:
+            iterations: Steps at most.
+            free: Stops that may move; None: all.
+            gate: See `beam_residual` [m].
+            stride: Of the beams every so many-th is used.
+        """
+        count = self.count
+        moves = np.ones(count, dtype=bool)
+        if free is not None:
+            moves[:] = False
+            moves[list(free)] = True
+        unknowns = np.concatenate([np.repeat(moves, STOP_UNKNOWNS), np.ones(len(self.slip), dtype=bool)])
+        for _ in range(iterations):
+            equations = NormalEquations(unknowns)
+            equations.add(self._linearised())
+            self._add_matches(equations, moves, gate, stride)
+            step, factor = equations.solve()
+            if free is None:
+                self._factor, self._factored = factor, count
+            if self._apply(step):
+                break
+        for stop in np.flatnonzero(moves):
+            if abs(self.states[stop, 3] - self._fitted_ratio[stop]) > _REFIT_RATIO:
+                self.fit(int(stop))
+
+    def covariance(self, stop: int) -> FloatArray:
+        """Covariance (3, 3) of the pose of a stop."""
+        return self._factor_of_all().covariance(STOP_UNKNOWNS * stop + np.arange(3))
+
+    def relative_sigma(self, stop: int, other: int) -> tuple[float, float]:
+        """How well the position [m] and heading [rad] of a stop relative to another are known."""
+        index = np.concatenate([STOP_UNKNOWNS * one + np.arange(3) for one in (stop, other)])
+        cov = self._factor_of_all().covariance(index, np.hstack([np.eye(3), -np.eye(3)]))
+        variances = np.maximum(np.diag(cov), 0.0)
+        return math.sqrt(max(variances[:2])), math.sqrt(variances[2])
+
+    def _factor_of_all(self) -> Factor:
+        if self._factored != self.count:
+            self.solve(1)
+        return self._factor
+
+    def _apply(self, step: FloatArray) -> bool:
+        """Change the estimate; whether hardly anything has moved."""
+        count = self.count
+        change = step[: STOP_UNKNOWNS * count].reshape(-1, STOP_UNKNOWNS)
+        self.states[:count] += change
+        self.slip = self.slip + step[STOP_UNKNOWNS * count :]
+        return bool((np.abs(change[:, :3]).max(axis=0, initial=0.0) < _SMALL_STEP).all())
+
+    def _linearised(self) -> list[model.Linearised]:
+        states, robot = self.states[: self.count], self.robot[: self.count]
+        turns = np.maximum(self._turned_all[: self.count], 1.0) / (2.0 * math.pi)
+        sigma = np.maximum(self.settings.turn_noise / np.sqrt(turns), _MIN_RATIO_SIGMA)
+        return [
+            *self.constraints.linearised(states),
+            model.ratios(states, self.slip, robot, sigma),
+            model.slips(self.count, self.slip, self.settings.usual_slip, self.settings.slip_sigma),
+        ]
+
+    def _add_matches(self, equations: NormalEquations, moves: BoolArray, gate: float, stride: int) -> None:
+        pairs, weights = [], []
+        for stop, targets in self.targets.items():
+            for other in targets:
+                if moves[stop] or moves[other]:
+                    start = stop in self.starts or other in self.starts
+                    pairs.append((stop, other))
+                    weights.append(min(1.0, (_START_WEIGHT if start else _MATCH_WEIGHT) / len(targets)))
+        if pairs:
+            index = np.array(pairs, dtype=np.int64)
+            squares, gradient = match_pairs(self.scans, index, np.array(weights), gate, stride)
+            unknowns = STOP_UNKNOWNS * index[:, :, None] + np.arange(STOP_UNKNOWNS)
+            equations.add_blocks(unknowns.reshape(-1, 8), squares, gradient)
+
+    def _grow(self) -> None:
+        """Double the room."""
+        self.states, self.robot = _doubled(self.states), _doubled(self.robot)
+        self.turned, self._turned_all = _doubled(self.turned), _doubled(self._turned_all)
+        self._fitted_ratio = _doubled(self._fitted_ratio)
+        self._beams = Beams(*(_doubled(one) for one in self._beams))
+        self._lines = Lines(*(_doubled(one) for one in self._lines))
+
+
+def _doubled(array: Any) -> Any:
+    """An array with as much room again behind."""
+    return np.concatenate([array, np.zeros_like(array)])

@@ -1,0 +1,1 @@
+"""What a robot saw from one place: its beams, and their lines."""

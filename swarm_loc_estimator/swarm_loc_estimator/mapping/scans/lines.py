@@ -1,0 +1,191 @@
+"""Lines that the beams of one stop tell: per degree, a wall as a linear function of cosine and sine.
+
+A wall at distance D with normal n is met by a beam of direction u at the inverse distance (n.u)/D, which is
+A cos(a) + B sin(a) with (A, B) = n/D: linear least squares with noise that is the same everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.mapping.scans.beams import Beams
+
+BINS = 360
+UNKNOWN, FREE, POINT, LINE = 0, 1, 2, 3
+"""What is known of a direction: nothing; nothing came back; something did; a line did."""
+
+_SEEN, _CC, _CS, _SS, _YC, _YS, _YY, _C, _S, _Y, _ALL = range(11)
+"""Sums over the beams of a direction; y is the inverse distance."""
+_WINDOWS = (40, 28, 20, 14, 9, 6)
+_MIN_BEAMS, _MIN_SEEN_SHARE = 5, 0.85
+_MAX_THIRD_SIGMAS = 2.2
+"""Where the middle of a third lies further off the line, there is a step in the wall."""
+_MIN_INCIDENCE = 0.15
+"""Least cosine between beam and normal."""
+_MAX_NORMAL_SIGMA = 0.08
+_RANGE_SIGMAS = 2.5
+
+
+class Lines(NamedTuple):
+    """Lines of stops (k,), per degree of direction from the heading at which the robot came.
+
+    Attributes:
+        kind: (k, BINS) `UNKNOWN`, `FREE`, `POINT` or `LINE`.
+        a: (k, BINS) normal over distance, along x [1/m].
+        b: (k, BINS) likewise along y [1/m].
+        distance: (k, BINS) along the direction [m].
+        variance: (k, BINS) of the line's inverse distance along the direction [1/m^2].
+        turn: (k, BINS) turn by odometry at which the robot looked there [rad].
+        usable: (k, BINS) whether the normal is known well enough to match other beams against.
+    """
+
+    kind: NDArray[np.int8]
+    a: FloatArray
+    b: FloatArray
+    distance: FloatArray
+    variance: FloatArray
+    turn: FloatArray
+    usable: NDArray[np.bool_]
+
+
+def no_lines(capacity: int) -> Lines:
+    """Room for the lines of so many stops."""
+    shape = (capacity, BINS)
+    a, b, distance, variance, turn = np.zeros((5, *shape))
+    return Lines(np.zeros(shape, dtype=np.int8), a, b, distance, variance, turn, np.zeros(shape, dtype=bool))
+
+
+@compiled
+def fit_lines(stop: int, ratio: float, max_range: float, beams: Beams, lines: Lines) -> None:
+    """Fit the lines of one stop.
+
+    Args:
+        stop: Its number.
+        ratio: True turn over turn by odometry.
+        max_range: Beyond this nothing comes back [m].
+        beams: Of all stops.
+        lines: Of all stops; those of this one are written.
+    """
+    sums, turns = _sums_per_bin(stop, ratio, beams)
+    total = np.zeros((3 * BINS + 1, 11))  # three times around: windows go across the seam
+    for m in range(3 * BINS):
+        total[m + 1] = total[m] + sums[m % BINS]
+    sigma = beams.sigma[stop]
+    least = 1.0 / max_range + _RANGE_SIGMAS * sigma
+    for m in range(BINS):
+        seen, looked = sums[m, _SEEN], sums[m, _ALL]
+        lines.turn[stop, m] = turns[m] / looked if looked > 0 else (m + 0.5) * 2.0 * math.pi / BINS / ratio
+        lines.usable[stop, m] = False
+        if _fit_bin(stop, m, total, sigma, least, lines):
+            continue
+        lines.kind[stop, m] = UNKNOWN
+        if _is_free(total, m):
+            lines.kind[stop, m] = FREE
+        elif seen > 0:
+            lines.kind[stop, m] = POINT
+            lines.distance[stop, m] = 1.0 / math.sqrt(sums[m, _YY] / seen)
+
+
+@compiled
+def _sums_per_bin(stop: int, ratio: float, beams: Beams) -> tuple[FloatArray, FloatArray]:
+    """Sums (BINS, 11), and sums of turns by odometry (BINS,)."""
+    sums, turns = np.zeros((BINS, 11)), np.zeros(BINS)
+    for i in range(beams.counts[stop]):
+        angle = ratio * beams.turn[stop, i]
+        m = math.floor(angle * BINS / (2.0 * math.pi)) % BINS
+        y = beams.inverse[stop, i]
+        sums[m, _ALL] += 1.0
+        turns[m] += beams.turn[stop, i]
+        if y > 0.0:
+            c, s = math.cos(angle), math.sin(angle)
+            row = sums[m]
+            row[_SEEN] += 1.0
+            row[_CC] += c * c
+            row[_CS] += c * s
+            row[_SS] += s * s
+            row[_YC] += y * c
+            row[_YS] += y * s
+            row[_YY] += y * y
+            row[_C] += c
+            row[_S] += s
+            row[_Y] += y
+    return sums, turns
+
+
+@compiled
+def _fit_bin(stop: int, m: int, total: FloatArray, sigma: float, least: float, lines: Lines) -> bool:
+    """Fit the longest window around a bin in which a line holds; whether there is one."""
+    here = BINS + m
+    if total[here + 3, _SEEN] - total[here - 2, _SEEN] == 0.0:
+        return False
+    angle = (m + 0.5) * 2.0 * math.pi / BINS
+    c, s = math.cos(angle), math.sin(angle)
+    for width in _WINDOWS:
+        best = math.inf
+        for position in range(3):
+            low = here - (width // 2 if position == 0 else (width - 2 if position == 1 else 1))
+            misfit, a, b, vaa, vab, vbb = _fit_window(total, low, low + width, sigma)
+            if misfit >= best:
+                continue
+            y, square = a * c + b * s, a * a + b * b
+            if y < least or y < _MIN_INCIDENCE * math.sqrt(square):
+                continue
+            best = misfit
+            lines.a[stop, m], lines.b[stop, m] = a, b
+            lines.distance[stop, m] = 1.0 / y
+            lines.variance[stop, m] = c * c * vaa + 2.0 * c * s * vab + s * s * vbb
+            normal_variance = (b * b * vaa - 2.0 * a * b * vab + a * a * vbb) / (square * square)
+            lines.usable[stop, m] = normal_variance < _MAX_NORMAL_SIGMA**2
+        if best < math.inf:
+            lines.kind[stop, m] = LINE
+            return True
+    return False
+
+
+@compiled
+def _fit_window(
+    total: FloatArray, low: int, high: int, sigma: float
+) -> tuple[float, float, float, float, float, float]:
+    """Misfit (infinite: no line), a, b, and their covariance aa, ab, bb."""
+    none = (math.inf, 0.0, 0.0, 0.0, 0.0, 0.0)
+    d = total[high] - total[low]
+    n = d[_SEEN]
+    if n < _MIN_BEAMS or n < _MIN_SEEN_SHARE * d[_ALL]:
+        return none
+    det = d[_CC] * d[_SS] - d[_CS] * d[_CS]
+    if det < 1e-9:
+        return none
+    a = (d[_SS] * d[_YC] - d[_CS] * d[_YS]) / det
+    b = (d[_CC] * d[_YS] - d[_CS] * d[_YC]) / det
+    misfit = (d[_YY] - a * d[_YC] - b * d[_YS]) / (sigma * sigma * max(1.0, n - 2.0))
+    if misfit >= 1.0 + 2.0 * math.sqrt(2.0 / n):
+        return none
+    width = high - low
+    for part in range(3):
+        first, last = low + part * width // 3, low + (part + 1) * width // 3
+        count = total[last, _SEEN] - total[first, _SEEN]
+        if count > 0.0:
+            off = total[last, _Y] - total[first, _Y]
+            off -= a * (total[last, _C] - total[first, _C]) + b * (total[last, _S] - total[first, _S])
+            if abs(off) > _MAX_THIRD_SIGMAS * sigma * math.sqrt(count):
+                return none
+    v = sigma * sigma / det
+    return misfit, a, b, v * d[_SS], -v * d[_CS], v * d[_CC]
+
+
+@compiled
+def _is_free(total: FloatArray, m: int) -> bool:
+    """Whether so few beams came back from around a bin that there is nothing within range."""
+    here = BINS + m
+    looked = total[here + 2, _ALL] - total[here - 1, _ALL]
+    seen = total[here + 2, _SEEN] - total[here - 1, _SEEN]
+    if looked == 0.0 or seen > 0.2 * looked:
+        return False
+    around = total[here + 3, _ALL] - total[here - 2, _ALL]
+    return bool(total[here + 3, _SEEN] - total[here - 2, _SEEN] <= 0.34 * around)

@@ -1,0 +1,188 @@
+"""From a stream of readings to stops: where a robot stands and looks around between two drives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.mapping.readings import Readings
+
+MIN_TURN = 0.5
+"""A robot that has not turned so much [rad] has not looked around: it drives on."""
+_STAND_SPEED = 0.02
+"""A robot that drives slower than this stands [m/s]."""
+_DEPARTED = 0.01
+"""A robot that is further than this from where it came has left [m]."""
+_MAX_READINGS = 4096
+"""Of more at one stop, every second one is left out."""
+_REST_NS, _REST_TURN = 1_000_000_000, 0.01
+"""A robot that turns less than this in such a time rests [rad]."""
+_DRIVES, _STANDS, _ARRIVES, _JUMPS = 0, 1, 2, 3
+_MAX_SPEED, _MAX_STEP, _MAX_RATE, _MAX_TURN = 3.0, 0.05, 20.0, 0.3
+"""Odometry that goes further than such a speed or rate allows has begun anew [m/s], [m], [rad/s], [rad]."""
+
+
+class Stop:
+    """Where a robot stands, or stood.
+
+    Args:
+        arrival: (3,) pose by odometry when it came.
+
+    Attributes:
+        arrival: Likewise.
+        departure: (3,) pose by odometry at the last reading.
+        stamp_ns: (n,) of its readings.
+        turn: (n,) turn by odometry since it came [rad].
+        inverse: (n,) inverse distances [1/m].
+        sigma: Of an inverse distance; of no meaning before something was seen [1/m].
+        begin: How many of the readings belong to nodes before the one that this stop is.
+        looked: How many there were when it became a node; 0: it is none.
+        total: How many there were in all.
+    """
+
+    def __init__(self, arrival: FloatArray) -> None:
+        self.arrival = self.departure = arrival
+        self.stamp_ns: IntArray = np.zeros(0, dtype=np.int64)
+        self.turn = np.zeros(0)
+        self.inverse = np.zeros(0)
+        self.sigma = 1.0
+        self.begin = self.looked = self.total = 0
+
+    def extend(self, readings: Readings) -> None:
+        """Add readings made here."""
+        headings = np.concatenate([self.departure[2:], readings.odometry[:, 2]])
+        turned = self.turn[-1:] if len(self.turn) else np.zeros(1)
+        steps = np.concatenate([turned, wrap_angle(np.diff(headings))])
+        self.turn = np.concatenate([self.turn, np.cumsum(steps)[1:]])  # the same whoever cuts the readings
+        self.stamp_ns = np.concatenate([self.stamp_ns, readings.stamp_ns])
+        self.inverse = np.concatenate([self.inverse, readings.inverse])
+        self.departure = readings.odometry[-1]
+        self.total += len(readings.stamp_ns)
+        if not math.isnan(readings.sigma):
+            self.sigma = readings.sigma
+        if len(self.turn) > _MAX_READINGS:
+            self.turn, self.stamp_ns, self.inverse = (
+                np.concatenate([one[:-1:2], one[-1:]]) for one in (self.turn, self.stamp_ns, self.inverse)
+            )
+            self.begin, self.looked = (self.begin + 1) // 2, (self.looked + 1) // 2
+
+    @property
+    def turned(self) -> float:
+        """The largest turn by odometry there was [rad]."""
+        return float(np.abs(self.turn).max(initial=0.0))
+
+    @property
+    def begin_turn(self) -> float:
+        """Turn by odometry at which its node begins [rad]."""
+        return float(self.turn[self.begin - 1]) if self.begin else 0.0
+
+    def split(self, around: float) -> Stop | None:
+        """Cut off what came since it became a node as another stop, if it turned by `around` [rad] then."""
+        if not self.looked or self.looked == len(self.turn):
+            return None
+        before = float(self.turn[self.looked - 1])
+        if np.abs(self.turn[self.looked :] - before).max() < around:
+            return None
+        heading = wrap_angle(self.arrival[2] + before)
+        other = Stop(np.array([*self.arrival[:2], heading]))
+        other.departure, other.sigma = self.departure, self.sigma
+        other.turn = self.turn[self.looked :] - before
+        other.stamp_ns, other.inverse = self.stamp_ns[self.looked :], self.inverse[self.looked :]
+        other.total = len(other.turn)
+        self.total -= other.total
+        self.turn, self.inverse = self.turn[: self.looked], self.inverse[: self.looked]
+        self.stamp_ns = self.stamp_ns[: self.looked]
+        self.departure = other.arrival
+        return other
+
+    def completed(self, full: float) -> int:
+        """After how many readings the robot had turned by `full` [rad], or looked and rested; 0: not yet."""
+        return _completed(self.stamp_ns, self.turn, full)
+
+    def turn_at(self, stamp_ns: int) -> float:
+        """Turn by odometry at an instant during the stop [rad]."""
+        since = (self.stamp_ns - self.stamp_ns[0]) * 1e-9
+        return float(np.interp((stamp_ns - self.stamp_ns[0]) * 1e-9, since, self.turn))
+
+
+class Run(NamedTuple):
+    """Readings that belong together.
+
+    Attributes:
+        stands: Whether the robot stands.
+        arrives: Whether it has just come.
+        jumps: Whether odometry has begun anew, by which nothing is known of the way here.
+        readings: These.
+    """
+
+    stands: bool
+    arrives: bool
+    jumps: bool
+    readings: Readings
+
+
+class MotionTracker:
+    """Tells standing from driving for one robot."""
+
+    def __init__(self) -> None:
+        self._state = np.full(6, np.nan)  # anchor x, y; before x, y; whether it stands; heading before
+        self._before_ns = 0
+
+    def runs(self, readings: Readings) -> Iterator[Run]:
+        """Cut readings (n,) where the robot comes or leaves."""
+        labels = _labels(readings.stamp_ns, readings.odometry, self._state, self._before_ns)
+        self._before_ns = int(readings.stamp_ns[-1])
+        changes = (labels[1:] >= _ARRIVES) | ((labels[1:] == _DRIVES) != (labels[:-1] == _DRIVES))
+        bounds = [0, *(np.flatnonzero(changes) + 1).tolist(), len(labels)]
+        for begin, end in pairwise(bounds):
+            part = slice(begin, end)
+            chosen = Readings(
+                readings.stamp_ns[part], readings.odometry[part], readings.inverse[part], readings.sigma
+            )
+            label = int(labels[begin])
+            yield Run(label != _DRIVES, label >= _ARRIVES, label == _JUMPS, chosen)
+
+
+@compiled
+def _labels(stamp_ns: IntArray, odometry: FloatArray, state: FloatArray, before_ns: int) -> IntArray:
+    """Whether a robot drives, stands or arrives at each reading, or jumps; the state goes on."""
+    labels = np.zeros(len(stamp_ns), dtype=np.int64)
+    for k in range(len(stamp_ns)):
+        x, y = odometry[k, 0], odometry[k, 1]
+        elapsed_s = (stamp_ns[k] - before_ns) * 1e-9
+        step = math.hypot(x - state[2], y - state[3])
+        turn = abs((odometry[k, 2] - state[5] + math.pi) % (2.0 * math.pi) - math.pi)
+        if step > _MAX_SPEED * elapsed_s + _MAX_STEP or turn > _MAX_RATE * elapsed_s + _MAX_TURN:
+            labels[k] = _JUMPS
+            state[0], state[1], state[4] = x, y, 1.0
+        elif state[4] == 1.0 and math.hypot(x - state[0], y - state[1]) <= _DEPARTED:
+            labels[k] = _STANDS
+        elif math.isnan(state[4]) or (state[4] == 0.0 and step < _STAND_SPEED * elapsed_s):
+            labels[k] = _ARRIVES
+            state[0], state[1], state[4] = x, y, 1.0
+        else:
+            labels[k] = _DRIVES
+            state[4] = 0.0
+        state[2], state[3], state[5] = x, y, odometry[k, 2]
+        before_ns = stamp_ns[k]
+    return labels
+
+
+@compiled
+def _completed(stamp_ns: IntArray, turn: FloatArray, full: float) -> int:
+    """See `Stop.completed`."""
+    furthest, rest_turn, rest_ns = 0.0, math.inf, 0
+    for k in range(len(turn)):
+        furthest = max(furthest, abs(turn[k]))
+        if abs(turn[k] - rest_turn) > _REST_TURN:
+            rest_turn, rest_ns = turn[k], stamp_ns[k]
+        if furthest >= full or (furthest >= MIN_TURN and stamp_ns[k] - rest_ns >= _REST_NS):
+            return k + 1
+    return 0

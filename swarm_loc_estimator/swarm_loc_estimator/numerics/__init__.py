@@ -1,1 +1,0 @@
-"""Planar geometry and small matrices, for arrays and inside compiled code."""

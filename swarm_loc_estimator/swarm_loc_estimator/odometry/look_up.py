@@ -1,0 +1,168 @@
+"""Where tracks are at any instant, between their rows and past the newest one."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
+from swarm_loc_estimator.filter.process_noise import add_silence
+from swarm_loc_estimator.odometry.preintegration import TrackArrays
+
+
+class OdometrySample(NamedTuple):
+    """Tracks looked up at some instants (m,).
+
+    Attributes:
+        pose: (m, 3) calibrated odometry pose O, heading not wrapped.
+        raw: (m, 3) the pose that the driver reported, interpolated likewise.
+        covariance: (m, 3, 3) preintegrated by then, see `Preintegrated`.
+        jacobian: (m, 3, 3) likewise.
+        silence_s: (m,) how long after the newest message of its robot the instant lies; 0 within the track.
+    """
+
+    pose: FloatArray
+    raw: FloatArray
+    covariance: FloatArray
+    jacobian: FloatArray
+    silence_s: FloatArray
+
+
+@compiled
+def new_sample(count: int) -> OdometrySample:
+    """Room for `count` look-ups."""
+    return OdometrySample(
+        np.zeros((count, 3)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3, 3)),
+        np.zeros((count, 3, 3)),
+        np.zeros(count),
+    )
+
+
+@inlined
+def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample, k: int) -> None:
+    """Write where the track of a robot is at an instant, in row k of a sample.
+
+    Within a step the motion is an arc of constant twist. Past the newest row the last twist goes on, less and
+    less sure; after `timeout_s` the motion since that row counts as unknown. Before the first row the robot
+    stands. One without odometry stands, or walks at random, in body directions about where it is.
+    """
+    count = tracks.filled[robot]
+    out.silence_s[k] = 0.0
+    if count == 0:
+        out.pose[k].fill(0.0)
+        out.raw[k].fill(0.0)
+        out.covariance[k].fill(0.0)
+        out.jacobian[k].fill(0.0)
+        out.silence_s[k] = 0.0 if tracks.stands[robot] else math.inf
+        for i in range(3):  # of a random walk only the differences between instants count
+            out.covariance[k, i, i] = tracks.walk[robot, i // 2] * (1e-9 * stamp_ns)
+        return
+    row, fraction = _find_step(tracks, robot, stamp_ns)
+    if fraction < 0.0:
+        assign(out.pose[k], tracks.pose[robot, row])
+        assign(out.raw[k], tracks.raw[robot, row])
+        assign_matrix(out.covariance[k], tracks.covariance[robot, row])
+        assign_matrix(out.jacobian[k], tracks.jacobian[robot, row])
+    else:
+        _along_step(tracks, robot, row, fraction, out, k)
+        if fraction < 1.0:
+            return
+        row += 1
+    model, pose, rate = tracks.model[robot], tracks.pose[robot, row], tracks.rate[robot, row]
+    silence_ns = max(0, stamp_ns - tracks.stamp_ns[robot, row])
+    unknown = silence_ns > model.timeout_s * 1e9
+    out.silence_s[k] = silence_s = silence_ns * 1e-9
+    add_silence(model, silence_s, unknown, pose, rate, out.covariance[k])
+
+
+@inlined
+def look_up_pose(tracks: TrackArrays, robot: int, stamp_ns: int, out: FloatArray) -> None:
+    """Write the pose (3,) that `look_up` finds, and nothing else."""
+    if tracks.filled[robot] == 0:
+        out.fill(0.0)
+        return
+    row, fraction = _find_step(tracks, robot, stamp_ns)
+    if fraction < 0.0:
+        assign(out, tracks.pose[robot, row])
+    else:
+        _interpolate(tracks.pose[robot, row], tracks.pose[robot, row + 1], fraction, out)
+
+
+@inlined
+def _find_step(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[int, float]:
+    """The row behind which an instant lies on a track that has some, and at what fraction of the step.
+
+    From 1 on the instant lies past the newest row; below 0: the robot stands at the row, as far as is known.
+    """
+    count = tracks.filled[robot]
+    stamps, timeout_ns = tracks.stamp_ns[robot, :count], tracks.model[robot].timeout_s * 1e9
+    row = max(0, np.searchsorted(stamps, stamp_ns, side="right") - 1)
+    if row + 1 < count and stamps[row + 1] - stamps[row] <= timeout_ns:
+        return row, max(0, stamp_ns - stamps[row]) / (stamps[row + 1] - stamps[row])
+    silence_ns = max(0, stamp_ns - stamps[row])
+    if row > 0 and silence_ns <= timeout_ns and stamps[row] - stamps[row - 1] <= timeout_ns:
+        return row - 1, 1.0 + silence_ns / (stamps[row] - stamps[row - 1])
+    return row, -1.0
+
+
+@inlined
+def rate_at(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[float, float, float]:
+    """The velocity forward and left [m/s] and the turn rate [rad/s] of base_link at an instant.
+
+    At a row it is that of the step to it, so what comes later does not change it. Up to the first row, and
+    where the motion is unknown, it is zero.
+    """
+    count = tracks.filled[robot]
+    stamps, timeout_ns = tracks.stamp_ns[robot, :count], tracks.model[robot].timeout_s * 1e9
+    row = min(np.searchsorted(stamps, stamp_ns), count - 1)
+    if row < 1:
+        return 0.0, 0.0, 0.0
+    if max(stamps[row], stamp_ns) - stamps[row - 1] > timeout_ns:
+        return 0.0, 0.0, 0.0
+    before, after = tracks.pose[robot, row - 1], tracks.pose[robot, row]
+    duration_s = (stamps[row] - stamps[row - 1]) * 1e-9
+    turn = after[2] - before[2]
+    cos, sin = math.cos(before[2] + 0.5 * turn), math.sin(before[2] + 0.5 * turn)
+    dx, dy = after[0] - before[0], after[1] - before[1]
+    return (cos * dx + sin * dy) / duration_s, (cos * dy - sin * dx) / duration_s, turn / duration_s
+
+
+@inlined
+def _along_step(
+    tracks: TrackArrays, robot: int, row: int, fraction: float, out: OdometrySample, k: int
+) -> None:
+    """Write what `look_up` does at a fraction of the step from a row to the next, or beyond it."""
+    _interpolate(tracks.pose[robot, row], tracks.pose[robot, row + 1], fraction, out.pose[k])
+    _interpolate(tracks.raw[robot, row], tracks.raw[robot, row + 1], fraction, out.raw[k])
+    for i in range(3):
+        for j in range(3):
+            for table, target in ((tracks.covariance, out.covariance), (tracks.jacobian, out.jacobian)):
+                before, after = table[robot, row, i, j], table[robot, row + 1, i, j]
+                target[k, i, j] = before + fraction * (after - before)
+
+
+@compiled
+def look_up_all(tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray) -> OdometrySample:
+    """Look up m robots at m instants; see `look_up`."""
+    out = new_sample(robots.size)
+    for k in range(robots.size):
+        look_up(tracks, robots[k], stamps_ns[k], out, k)
+    return out
+
+
+@inlined
+def _interpolate(start: FloatArray, end: FloatArray, fraction: float, out: FloatArray) -> None:
+    """The pose on the arc of constant twist from `start` to `end`; a `fraction` past 1 runs on."""
+    turn = end[2] - start[2]
+    back = -0.5 * (1.0 - fraction) * turn
+    cos, sin = math.cos(back), math.sin(back)
+    dx, dy = end[0] - start[0], end[1] - start[1]
+    out[0] = start[0] + fraction * (cos * dx - sin * dy)
+    out[1] = start[1] + fraction * (sin * dx + cos * dy)
+    out[2] = start[2] + fraction * turn

@@ -1,0 +1,235 @@
+"""Odometry of all robots as tracks: calibrated poses with preintegrated noise.
+
+A robot's pose is X(t) = T O(t): the track O, and the transform T from `map` to the track's frame, which
+is what the filter estimates. With right-invariant errors X = exp(xi) X_hat the prediction over any time
+then leaves T as it is and adds noise to the robot's own block only (F = I):
+
+    P += Ad(T) (G(t2) - G(t1)) Ad(T)^T,    G(t) = sum over steps of Ad(O_mid) Q Ad(O_mid)^T.
+
+So a prediction costs two look-ups however many odometry messages lie between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.odometry.look_up import OdometrySample, look_up_all
+from swarm_loc_estimator.odometry.preintegration import (
+    BEFORE_ALL_NS,
+    MODEL_DTYPE,
+    UNCHANGED_NS,
+    TrackArrays,
+    continue_tracks,
+    integrate,
+)
+from swarm_loc_estimator.swarm.motion_response import MotionResponse
+from swarm_loc_estimator.swarm.swarm import Robot
+
+_IDEAL = MotionResponse(speeds=(0.0,), turn_rates=(0.0,), speed_share=((1.0,),), turn_share=((1.0,),))
+_FIRST_CAPACITY = 256
+_TRIM_EVERY_NS = 1_000_000_000
+_JUMPING_NS = 3_000_000_000
+_ROWS = ("stamp_ns", "raw", "pose", "covariance", "jacobian", "rate", "known_ns", "jump_ns")
+
+
+@dataclass(frozen=True)
+class TrackChange:
+    """What `OdometryTracks.extend` did.
+
+    Attributes:
+        changed_from_ns: (N,) per robot the instant after which look-ups may now differ, or UNCHANGED_NS.
+        duplicates: Rows dropped because the robot has a row with that stamp.
+        too_old: Rows dropped because they are older than the oldest accepted.
+        jumps: New rows to which no robot can have driven; the step was replaced by unknown motion.
+    """
+
+    changed_from_ns: IntArray
+    duplicates: int
+    too_old: int
+    jumps: int
+
+
+class OdometryTracks:
+    """The recent odometry of all robots, in any order of arrival.
+
+    Args:
+        robots: Whose; of each its motion model and response are used.
+    """
+
+    def __init__(self, robots: Sequence[Robot]) -> None:
+        models = [robot.odometry for robot in robots]
+        self._robots = len(models)
+        self._response = _stacked([robot.response or _IDEAL for robot in robots])
+        names = MODEL_DTYPE.names or ()
+        self._model = np.array([tuple(getattr(m, name) for name in names) for m in models], dtype=MODEL_DTYPE)
+        self._stands = np.array([robot.stands for robot in robots], dtype=bool)
+        walks = [robot.random_walk for robot in robots]
+        self._walk = np.array([(walk.position, walk.heading) for walk in walks]).reshape(-1, 2)
+        self._delay_ns = np.array([round(m.delay_s * 1e9) for m in models], dtype=np.int64)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget every row."""
+        self._oldest_ns = BEFORE_ALL_NS
+        self._trimmed_ns = BEFORE_ALL_NS
+        self.arrays = self._allocated(_FIRST_CAPACITY)
+
+    @property
+    def reach_ns(self) -> int:
+        """How far before its stamp a row may change look-ups."""
+        timeout_ns = np.ceil(self._model["timeout_s"] * 1e9).astype(np.int64)
+        return int(np.max(timeout_ns - np.minimum(0, self._delay_ns), initial=0))
+
+    def begun(self, robots: IntArray | int, stamps_ns: IntArray | int) -> BoolArray:
+        """Whether the odometry of robots (k,) has begun by instants (k,); those without have always stood."""
+        arrays = self.arrays
+        begun = (arrays.filled[robots] > 0) & (arrays.begin_ns[robots] <= stamps_ns)
+        return np.asarray(begun | self._stands[robots])
+
+    def walks(self, robots: IntArray | int) -> BoolArray:
+        """Whether robots (k,) walk at random, without odometry."""
+        return np.asarray(self._walk[robots].any(axis=-1))
+
+    def contradict_themselves(self, now_ns: int) -> BoolArray:
+        """Whether the odometry of each robot (N,) has jumped again and again of late."""
+        arrays, robots = self.arrays, np.arange(self._robots)
+        before_last_ns = arrays.jump_ns[robots, np.maximum(arrays.filled - 1, 0), 1]
+        jumping: BoolArray = (arrays.filled > 0) & (now_ns - before_last_ns < _JUMPING_NS)
+        return jumping
+
+    def extend(self, robots: IntArray, stamps_ns: IntArray, raw: FloatArray) -> TrackChange:
+        """Add rows, whatever their order and age.
+
+        Args:
+            robots: (k,) robot index of each row.
+            stamps_ns: (k,) acquisition stamps.
+            raw: (k, 3) finite poses as the driver reports them, in its own odom frame.
+        """
+        changed_from = np.empty(self._robots, dtype=np.int64)
+        jumps = continue_tracks(self.arrays, self._oldest_ns, robots, stamps_ns, raw, changed_from)
+        if jumps >= 0:
+            return TrackChange(changed_from, 0, 0, jumps)
+        stamps = stamps_ns + self._delay_ns[robots]
+        young = stamps_ns >= self._oldest_ns
+        robots, stamps, raw, new = robots[young], stamps[young], raw[young], young[young]
+        robots, stamps, raw, changed_from = self._take_back_later_rows(robots, stamps, raw)
+        order = np.lexsort((wrap_angle(raw[:, 2]), raw[:, 1], raw[:, 0], stamps, robots))
+        new = (np.arange(robots.size) < new.size)[order]  # not those taken back
+        robots, stamps, raw = robots[order], stamps[order], raw[order]
+        while np.any(
+            self.arrays.filled + np.bincount(robots, minlength=self._robots) > self.arrays.stamp_ns.shape[1]
+        ):
+            self._grow()
+        duplicates, jumps = integrate(self.arrays, robots, stamps, raw, new)
+        return TrackChange(changed_from, duplicates, int((~young).sum()), jumps)
+
+    def at(self, robots: IntArray, stamps_ns: IntArray) -> OdometrySample:
+        """Look tracks up, see `look_up`.
+
+        Args:
+            robots: (m,) robot indices.
+            stamps_ns: (m,) instants.
+        """
+        return look_up_all(self.arrays, robots, stamps_ns)
+
+    def trim(self, oldest_ns: int, kept_ns: int) -> None:
+        """Refuse rows stamped before `oldest_ns`; let those go that no look-up from `kept_ns` on needs."""
+        self._oldest_ns = oldest_ns
+        if kept_ns < self._trimmed_ns + _TRIM_EVERY_NS:
+            return
+        self._trimmed_ns = kept_ns
+        capacity = self.arrays.stamp_ns.shape[1]
+        for robot in np.flatnonzero(self.arrays.filled > capacity // 2):
+            count = self.arrays.filled[robot]
+            first = int(np.searchsorted(self.arrays.stamp_ns[robot, :count], kept_ns, side="right")) - 2
+            if first > capacity // 4:
+                for rows in (getattr(self.arrays, name) for name in _ROWS):
+                    rows[robot, : count - first] = rows[robot, first:count].copy()
+                self.arrays.filled[robot] = count - first
+
+    def _allocated(self, capacity: int) -> TrackArrays:
+        shape = (self._robots, capacity)
+        arrays = TrackArrays(
+            filled=np.zeros(self._robots, dtype=np.int64),
+            stamp_ns=np.zeros(shape, dtype=np.int64),
+            raw=np.zeros((*shape, 3)),
+            pose=np.zeros((*shape, 3)),
+            covariance=np.zeros((*shape, 3, 3)),
+            jacobian=np.zeros((*shape, 3, 3)),
+            rate=np.zeros((*shape, 3)),
+            known_ns=np.zeros(shape, dtype=np.int64),
+            jump_ns=np.zeros((*shape, 2), dtype=np.int64),
+            delay_ns=self._delay_ns,
+            model=self._model,
+            response=self._response[0],
+            response_speed=self._response[1],
+            response_turn_rate=self._response[2],
+            begin_ns=np.zeros(self._robots, dtype=np.int64),
+            begin_pose=np.zeros((self._robots, 3)),
+            stands=self._stands,
+            walk=self._walk,
+        )
+        for name in _ROWS:  # so that the system finds the memory now, and not when data are there
+            getattr(arrays, name).fill(0)
+        return arrays
+
+    def _grow(self) -> None:
+        old = self.arrays
+        capacity = old.stamp_ns.shape[1]
+        rows = self._allocated(2 * capacity)
+        for name in _ROWS:
+            getattr(rows, name)[:, :capacity] = getattr(old, name)
+        self.arrays = old._replace(**{name: getattr(rows, name) for name in _ROWS})
+
+    def _take_back_later_rows(
+        self, robots: IntArray, stamps: IntArray, raw: FloatArray
+    ) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
+        """Merge the new rows with those of the tracks that come after them, which are then integrated anew.
+
+        Returns:
+            Robots, stamps, raw poses, and per robot the instant after which its track changes.
+        """
+        arrays = self.arrays
+        taken: list[tuple[IntArray, IntArray, FloatArray]] = [(robots, stamps, raw)]
+        newest = arrays.stamp_ns[robots, np.maximum(arrays.filled[robots] - 1, 0)]
+        late = (arrays.filled[robots] > 0) & (
+            stamps <= newest
+        )  # of two rows with one stamp the order decides
+        for robot in np.unique(robots[late]):
+            count = arrays.filled[robot]
+            first = int(
+                np.searchsorted(arrays.stamp_ns[robot, :count], stamps[late & (robots == robot)].min())
+            )
+            rows = slice(first, count)
+            taken.append(
+                (
+                    np.full(count - first, robot),
+                    arrays.stamp_ns[robot, rows].copy(),
+                    arrays.raw[robot, rows].copy(),
+                )
+            )
+            arrays.filled[robot] = first
+        changed_from = np.full(self._robots, UNCHANGED_NS)
+        last = np.maximum(arrays.filled[robots] - 1, 0)
+        changed_from[robots] = np.where(
+            arrays.filled[robots] > 0, arrays.stamp_ns[robots, last], BEFORE_ALL_NS
+        )
+        columns = [np.concatenate(parts) for parts in zip(*taken, strict=True)]
+        return columns[0], columns[1], columns[2], changed_from
+
+
+def _stacked(responses: Sequence[MotionResponse]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Shares (N, 2, V, W), speeds (N, V) and turn rates (N, W) of all robots, smaller grids filled up."""
+    v = max((len(r.speeds) for r in responses), default=1)
+    w = max((len(r.turn_rates) for r in responses), default=1)
+    shares = np.ones((len(responses), 2, v, w))
+    speeds, turn_rates = np.full((len(responses), v), np.inf), np.full((len(responses), w), np.inf)
+    for i, r in enumerate(responses):
+        speeds[i, : len(r.speeds)], turn_rates[i, : len(r.turn_rates)] = r.speeds, r.turn_rates
+        shares[i, :, : len(r.speeds), : len(r.turn_rates)] = r.speed_share, r.turn_share
+    return shares, speeds, turn_rates

@@ -1,0 +1,1 @@
+"""Replay of bags, errors against ground truth, reports, calibration and datasets."""

@@ -1,0 +1,339 @@
+"""Fit what an infrared board is, from exchanges of robots whose relative poses are known.
+
+Sought are the amplitude law, the symmetric curves of sensors and emitters as tables, and by how much the
+heading of each robot's ground truth is off. Readings are compared on the scale on which their noise is one,
+outliers count up to a limit, and second differences of the curves' logarithms are held small.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.infrared.curves import Amplitude, TabulatedCurve
+from swarm_loc_estimator.swarm.ir_board import IrPlatform
+
+_KNOTS = np.radians([0, 15, 30, 40, 50, 60, 70, 80, 90, 110, 135, 180])
+_TABLE = np.radians(np.arange(0, 181, 10))
+_FALLS_FROM = 5
+"""From this knot on curves fall."""
+_STEEPNESS, _BEND = 5.0, 0.8
+"""What weighs a rise where curves fall, and by how much logarithms bend from knot to knot."""
+_YAW_SIGMA = np.radians(4.0)
+_OFFSET, _OFFSET_SIGMA, _EXPONENT, _EXPONENT_SIGMA = 0.05, 0.05, 2.5, 1.0
+_PRIOR = 3.0
+_STEP = 1e-5
+_GAIN_SIGMA, _MIN_SPREAD = 0.25, 0.01
+_MIN_MEASURED = 100
+"""Sensors of robots that measured in fewer exchanges have no gains."""
+_LIMIT = 2.0
+"""Outliers count as residuals of so many sigmas do at most."""
+_DIM = 3.0
+"""Readings within so many sigmas of the median show the noise, for most elements do not face each other."""
+_LIT = 8.0
+"""Readings expected above so many sigmas show how far curves are off."""
+_OUTLIER = 3.0
+_MIN_SHARE, _MAX_SHARE = 0.02, 0.3
+_ROUNDS = 2
+_MAX_EVALUATIONS = 10
+_TO_SIGMA = 1.4826
+"""Median absolute deviation of a normal distribution to its standard deviation."""
+
+
+class BoardReadings(NamedTuple):
+    """Exchanges of robots with one kind of board at full power.
+
+    Attributes:
+        receiver: (k,) index of the robot that measured.
+        transmitter: (k,) index of the robot that lit its emitters.
+        readings: (k, n, n) [count], [sensor, emitter], NaN where not measured or dead.
+        poses: (k, 3) of the transmitter seen from the receiver, range [m], bearing, heading [rad].
+        stamp_ns: (k,).
+    """
+
+    receiver: NDArray[np.int64]
+    transmitter: NDArray[np.int64]
+    readings: FloatArray
+    poses: FloatArray
+    stamp_ns: NDArray[np.int64]
+
+    def chosen(self, rows: NDArray[np.bool_]) -> BoardReadings:
+        """Those that are marked (k,)."""
+        return BoardReadings(
+            self.receiver[rows],
+            self.transmitter[rows],
+            self.readings[rows],
+            self.poses[rows],
+            self.stamp_ns[rows],
+        )
+
+
+@dataclass(frozen=True)
+class BoardModel:
+    """A board as it was found.
+
+    Attributes:
+        platform: The board.
+        sensor_gains: (robots, n) factors of the receivers' sensors; ones where not sought.
+        gains_sought: (robots,) whether they were; what they differ by is the platform's `element_sigma`.
+        truth_yaw: (robots,) by how much each robot's heading is ahead of its ground truth's [rad].
+        scatter: (k, n, n) residuals of the readings it was fitted to [sigma].
+        angles: (2, k, n, n) at which sensors and emitters are met [rad].
+    """
+
+    platform: IrPlatform
+    sensor_gains: FloatArray
+    gains_sought: NDArray[np.bool_]
+    truth_yaw: FloatArray
+    scatter: FloatArray
+    angles: FloatArray
+
+
+def fit_board(start: IrPlatform, data: BoardReadings, robots: int, *, gains: bool = True) -> BoardModel:
+    """Fit a board, from the arrangement, saturation and noise of one that is roughly right.
+
+    Args:
+        start: Whose arrangement, saturation and, to begin with, noise count.
+        data: What was read; poses must be finite.
+        robots: How many there are.
+        gains: Whether sensors of robots that measured often may have gains.
+    """
+    noise = round(noise_floor(data), 2)
+    platform = replace(start, noise=noise, curve_sigma=0.3, relative_noise=0.0, element_sigma=0.0)
+    unknowns = _Problem(platform, data, robots, gains=gains).first_unknowns()
+    for _ in range(_ROUNDS):
+        problem = _Problem(platform, data, robots, gains=gains)
+        unknowns = least_squares(
+            problem.residuals, unknowns, problem.slopes, x_scale="jac", max_nfev=_MAX_EVALUATIONS
+        ).x
+        platform = _with_noise(problem.platform_of(unknowns), problem, unknowns)
+    scatter = problem.scatter(unknowns)
+    yaw = problem.parts(unknowns)[3]
+    logs, sought = problem.log_gains(unknowns), problem.gains_sought
+    if sought.any():
+        spread = float(np.sqrt(np.mean(logs[sought] ** 2)))
+        platform = replace(platform, element_sigma=round(min(max(spread, _MIN_SPREAD), 1.0), 3))
+    return BoardModel(platform, np.exp(logs), sought, yaw, scatter, problem.angles(yaw)[1])
+
+
+def turned(poses: FloatArray, receiver_yaw: FloatArray, transmitter_yaw: FloatArray) -> FloatArray:
+    """Relative poses (k, 3) of robots whose headings are ahead of their ground truth by (k,) [rad]."""
+    moved: FloatArray = poses.copy()
+    moved[:, 1] = wrap_angle(poses[:, 1] - receiver_yaw)
+    moved[:, 2] = wrap_angle(poses[:, 2] + transmitter_yaw - receiver_yaw)
+    return moved
+
+
+def noise_floor(data: BoardReadings) -> float:
+    """Robust standard deviation of readings where there is no light [count].
+
+    By the differences of one element's readings in successive exchanges of a receiver, in both of which it is
+    dark: so what an amplifier is off, and drifts by, is no noise.
+    """
+    middle = float(np.nanmedian(data.readings))
+    limit = _DIM * max(_TO_SIGMA * float(np.nanmedian(np.abs(data.readings - middle))), 0.5)
+    steps = []
+    for receiver in np.unique(data.receiver).tolist():
+        rows = np.flatnonzero(data.receiver == receiver)
+        own = data.readings[rows[np.argsort(data.stamp_ns[rows], kind="stable")]]
+        dark = np.abs(own - middle) < limit
+        steps.append(np.diff(own, axis=0)[dark[1:] & dark[:-1]])
+    found = np.concatenate(steps)
+    return float(max(_robust_sigma(found) / np.sqrt(2.0), 0.5)) if found.size else 0.5
+
+
+class _Problem:
+    """The least squares of one platform's noise."""
+
+    def __init__(self, platform: IrPlatform, data: BoardReadings, robots: int, *, gains: bool) -> None:
+        self._platform, self._data, self._robots = platform, data, robots
+        often = np.bincount(data.receiver, minlength=robots) >= _MIN_MEASURED
+        self._often = np.flatnonzero(often & gains)
+        self.gains_sought: NDArray[np.bool_] = often & gains
+        count = len(_KNOTS)
+        flat = ((1, np.zeros(count)), (1, np.zeros(count)))
+        self._spline = CubicSpline(_KNOTS, np.eye(count), bc_type=flat)
+        self._bend = np.diff(np.eye(count), 2, axis=0) / _BEND
+        self._known = np.isfinite(data.readings)
+        self._saturated = data.readings >= platform.saturation
+        self._read = self._stable(np.clip(np.nan_to_num(data.readings), None, platform.saturation))
+        self._units = np.stack([np.cos(platform.angles), np.sin(platform.angles)], axis=-1)
+
+    def first_unknowns(self) -> FloatArray:
+        """Curves of a cosine's kind, and the amplitude that brings most of the brightest readings out."""
+        data = self._data
+        shape = np.log(np.interp(_KNOTS[1:], np.radians([0, 40, 90, 180]), [1.0, 0.8, 0.05, 0.01]))
+        gap = data.poses[:, 0] - 2.0 * self._platform.radius + _OFFSET
+        brightest = np.maximum(np.nan_to_num(data.readings).max(axis=(1, 2)), 1.0)
+        scale = np.median(np.log(brightest) + _EXPONENT * np.log(np.maximum(gap, 1e-3)))
+        zeros = np.zeros(self._robots + self._often.size * self._platform.n)
+        return np.concatenate([[scale, _OFFSET, _EXPONENT], shape, shape, zeros])
+
+    def parts(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Law (log scale, offset, exponent), log curves of sensors and emitters at the knots, yaw."""
+        count = len(_KNOTS) - 1
+        law, sensor, emitter, rest = np.split(unknowns, [3, 3 + count, 3 + 2 * count])
+        return law, np.r_[0.0, sensor], np.r_[0.0, emitter], rest[: self._robots]
+
+    def log_gains(self, unknowns: FloatArray) -> FloatArray:
+        """(robots, n) of sensors."""
+        n = self._platform.n
+        logs = np.zeros((self._robots, n))
+        logs[self._often] = unknowns[unknowns.size - self._often.size * n :].reshape(-1, n)
+        return logs
+
+    def angles(self, yaw: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Distances (k, n, n) [m], and angles (2, k, n, n) at sensors and emitters [rad]."""
+        data = self._data
+        return self._angles(turned(data.poses, yaw[data.receiver], yaw[data.transmitter]))
+
+    def _angles(self, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Likewise of relative poses (k, 3)."""
+        rho, ahead = self._platform.radius, np.array(self._platform.angles)
+        distance, bearing, heading = poses.T
+        at = ahead + heading[:, None]
+        emitters = rho * np.stack([np.cos(at), np.sin(at)], axis=-1)
+        centre = distance[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
+        way = (centre[:, None] + emitters)[:, None] - rho * self._units[None, :, None]
+        along = np.arctan2(way[..., 1], way[..., 0])
+        sensor = np.abs(wrap_angle(along - ahead[None, :, None]))
+        emitter = np.abs(wrap_angle(along + np.pi - at[:, None]))
+        return np.hypot(way[..., 0], way[..., 1]), np.stack([sensor, emitter])
+
+    def expected(self, unknowns: FloatArray) -> FloatArray:
+        """Readings (k, n, n)."""
+        law, sensor, emitter, yaw = self.parts(unknowns)
+        distance, (alpha, beta) = self.angles(yaw)
+        logs = law[0] - law[2] * np.log(np.maximum(distance + law[1], 1e-3))
+        logs += self.log_gains(unknowns)[self._data.receiver, :, None]
+        readings: FloatArray = np.exp(logs + self._spline(alpha) @ sensor + self._spline(beta) @ emitter)
+        return readings
+
+    def scatter(self, unknowns: FloatArray) -> FloatArray:
+        """What readings are above expectation (k, n, n) [sigma]; NaN where there is none."""
+        more = self._read - self._stable(self.expected(unknowns))
+        more = np.where(self._saturated, np.maximum(more, 0.0), more)
+        return np.where(self._known, more, np.nan)
+
+    def residuals(self, unknowns: FloatArray) -> FloatArray:
+        """Of readings, each with a limit, and of what is held small."""
+        limited = _limited(np.nan_to_num(self.scatter(unknowns)))[0]
+        return np.concatenate([limited.ravel(), self._held(unknowns)])
+
+    def slopes(self, unknowns: FloatArray) -> FloatArray:
+        """Of the residuals by the unknowns."""
+        data, count, n = self._data, len(_KNOTS) - 1, self._platform.n
+        law, sensor, emitter, yaw = self.parts(unknowns)
+        distance, (alpha, beta) = self.angles(yaw)
+        bright = self.expected(unknowns)
+        scatter = self.scatter(unknowns)
+        by_log = -bright / np.hypot(self._platform.noise, self._platform.relative * bright)
+        by_log = np.nan_to_num(np.where(scatter == 0.0, 0.0, by_log) * _limited(np.nan_to_num(scatter))[1])
+        by_log[~self._known] = 0.0
+        away = np.maximum(distance + law[1], 1e-3)
+        columns = np.zeros((unknowns.size, *bright.shape))
+        columns[0], columns[1], columns[2] = by_log, -by_log * law[2] / away, -by_log * np.log(away)
+        columns[3 : 3 + count] = np.moveaxis(self._spline(alpha)[..., 1:], -1, 0) * by_log
+        columns[3 + count : 3 + 2 * count] = np.moveaxis(self._spline(beta)[..., 1:], -1, 0) * by_log
+        first = 3 + 2 * count
+        for side, robots in ((0, data.receiver), (1, data.transmitter)):
+            turn = np.zeros((2, len(robots)))
+            turn[side] = _STEP
+            distance_there, (alpha_there, beta_there) = self._angles(
+                turned(data.poses, yaw[data.receiver] + turn[0], yaw[data.transmitter] + turn[1])
+            )
+            change = -law[2] * np.log(np.maximum(distance_there + law[1], 1e-3) / away)
+            change += (self._spline(alpha_there) - self._spline(alpha)) @ sensor
+            change += (self._spline(beta_there) - self._spline(beta)) @ emitter
+            columns[first + robots, np.arange(len(robots))] += by_log * change / _STEP
+        for place, robot in enumerate(self._often.tolist()):
+            rows = np.flatnonzero(data.receiver == robot)
+            for i in range(n):
+                columns[first + self._robots + place * n + i, rows, i] = by_log[rows, i]
+        return np.concatenate([columns.reshape(unknowns.size, -1).T, self._held_slopes(unknowns)])
+
+    def _held_slopes(self, unknowns: FloatArray) -> FloatArray:
+        """Of what is held small; by differences, since it is cheap."""
+        here, slopes = self._held(unknowns), []
+        for k in range(unknowns.size):
+            ahead = unknowns.copy()
+            ahead[k] += _STEP
+            slopes.append((self._held(ahead) - here) / _STEP)
+        return np.stack(slopes, axis=1)
+
+    def _held(self, unknowns: FloatArray) -> FloatArray:
+        """What is held small."""
+        law, sensor, emitter, yaw = self.parts(unknowns)
+        held = [self._bend @ sensor, self._bend @ emitter, yaw / _YAW_SIGMA]
+        held += [
+            _STEEPNESS * np.maximum(np.diff(curve)[_FALLS_FROM - 1 :], 0.0) for curve in (sensor, emitter)
+        ]
+        held.append(self.log_gains(unknowns)[self._often].ravel() / _GAIN_SIGMA)
+        held.append((law[1:] - [_OFFSET, _EXPONENT]) / [_OFFSET_SIGMA, _EXPONENT_SIGMA])
+        return _PRIOR * np.concatenate(held)
+
+    def platform_of(self, unknowns: FloatArray) -> IrPlatform:
+        """The platform with law and curves."""
+        law, sensor, emitter, _ = self.parts(unknowns)
+        amplitude = Amplitude(float(np.exp(law[0])), float(law[1]), float(law[2]), nearest=_nearest(law[1]))
+        return replace(
+            self._platform,
+            sensor=self._curve(sensor),
+            emitter=self._curve(emitter),
+            amplitudes=(amplitude, *self._platform.amplitudes[1:]),
+        )
+
+    def _curve(self, logs: FloatArray) -> TabulatedCurve:
+        """A symmetric table that falls beyond its top."""
+        values = np.exp(self._spline(_TABLE) @ logs)
+        top = int(values.argmax())
+        values[top:] = np.minimum.accumulate(values[top:])
+        both = np.concatenate([values[:0:-1], values]).round(4)
+        angles = np.concatenate([-_TABLE[:0:-1], _TABLE]).round(5)
+        return TabulatedCurve(tuple(angles.tolist()), tuple(both.tolist()))
+
+    def _stable(self, values: FloatArray) -> FloatArray:
+        """Brightness on the scale on which noise is one."""
+        relative, noise = self._platform.relative, self._platform.noise
+        return np.asarray(np.arcsinh(relative * values / noise) / relative)
+
+
+def _limited(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Residuals whose size ends at a limit, and their slopes by the residuals."""
+    part = np.exp(-(values**2) / (2.0 * _LIMIT**2))
+    size = np.sqrt(2.0 * _LIMIT**2 * (1.0 - part))
+    slope = np.where(size > 1e-6, np.abs(values) * part / np.maximum(size, 1e-12), 1.0)
+    return np.sign(values) * size, slope
+
+
+def _nearest(offset: float) -> float:
+    """From where on a law with this offset is believed [m]."""
+    return 0.0 if offset > 0.0 else 0.005 - offset
+
+
+def _with_noise(platform: IrPlatform, problem: _Problem, unknowns: FloatArray) -> IrPlatform:
+    """The platform with the noise, and the shares of outliers, that its residuals show."""
+    expected, scatter = problem.expected(unknowns), problem.scatter(unknowns)
+    known = np.isfinite(scatter)
+    lit = known & (expected > _LIT * platform.noise) & (expected < platform.saturation)
+    relative = platform.relative * (_robust_sigma(scatter[lit]) if lit.any() else 1.0)
+    blocked = float(np.mean(scatter[lit] < -_OUTLIER)) if lit.any() else 0.0
+    bright = float(np.mean(scatter[known & ~lit] > _OUTLIER))
+    return replace(
+        platform,
+        curve_sigma=round(min(max(relative, 0.01), 1.0), 3),
+        blocked_share=round(min(max(blocked, _MIN_SHARE), _MAX_SHARE), 3),
+        bright_share=round(min(max(bright, _MIN_SHARE), _MAX_SHARE), 3),
+    )
+
+
+def _robust_sigma(values: FloatArray) -> float:
+    """Standard deviation about zero of the many, whatever the few are."""
+    return float(_TO_SIGMA * np.median(np.abs(values)))

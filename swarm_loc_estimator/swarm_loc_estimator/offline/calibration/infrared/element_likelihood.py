@@ -1,0 +1,226 @@
+"""Likelihood of exchanges by the share of its light that one element still gives, over all poses.
+
+Where two robots stood is not known, so the likelihood is marginalized over a grid of relative poses. Of each
+sensor of the receiver and each emitter of the transmitter it is told for a few shares of its light, all
+other elements being as the board has them. Readings are compared on the scale on which their noise is one;
+any may be blocked, or lit from elsewhere, as the board says.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.solution import DARKEST
+from swarm_loc_estimator.infrared.solvers.start_table import start_table
+from swarm_loc_estimator.swarm.ir_board import IrPlatform
+
+SHARES: FloatArray = np.array([0.0, 0.15, 0.35, 0.7, 1.0, 1.4])
+"""Of an element's light that are compared; the first is none of it."""
+WHOLE = 4
+"""Which of them is all of it."""
+_PER_ELEMENT, _MAX_DIRECTIONS = 4, 24
+"""Bearings, and headings, of the grid."""
+_SHOWN = 10.0
+"""Readings that show how much the grid errs are brighter [sigma]."""
+_NOISE_RATIO = 1.2
+"""Exchanges whose noise differs by less are compared with one table."""
+_NEGLIGIBLE = 8.0
+"""Poses whose log likelihoods are lower by this are left out."""
+BRIGHT_SPAN = 20.0
+"""Light from elsewhere is as likely at any brightness on a span of so many sigmas."""
+MIN_SHARE = 1e-3
+"""Of outliers, where a board is said to have fewer."""
+PEAK = 1.0 / math.sqrt(2.0 * math.pi)
+LOWEST = 1e-300
+_FAR_OFF = 8.0
+"""Readings off by more sigmas have no density to speak of."""
+
+Float32Array = NDArray[np.float32]
+
+
+class ElementLikelihoods(NamedTuple):
+    """What exchanges say of their elements.
+
+    Attributes:
+        log: (k, 2, n, S) log likelihood by the share, of `SHARES`, of the receiver's sensors and the
+            transmitter's emitters.
+        directions: (k, 2) bearing and heading [rad] of the likeliest pose.
+    """
+
+    log: FloatArray
+    directions: FloatArray
+
+
+def element_likelihoods(
+    platform: IrPlatform, readings: FloatArray, saturation: FloatArray
+) -> ElementLikelihoods:
+    """Log likelihoods of k exchanges by the share of light that each of their elements gives.
+
+    Args:
+        platform: The board of both robots.
+        readings: (k, n, n) [count] at full power, [sensor, emitter]; NaN where not measured or left out.
+        saturation: (k,) from where on they tell no more [count].
+    """
+    count, n = len(readings), platform.n
+    poses, light, log_prior = _grid(platform)
+    found = np.empty((count, 2, n, SHARES.size))
+    best = np.zeros(count, dtype=np.int64)
+    relative = math.sqrt(
+        platform.relative**2 + 2.0 * platform.element_sigma**2 + _grid_variance(platform, light)
+    )
+    bright = np.nan_to_num(readings, nan=0.0).max(axis=(1, 2))
+    noise = np.hypot(platform.noise, platform.stray_noise * np.minimum(bright, saturation))
+    level = np.rint(np.log(noise / platform.noise) / math.log(_NOISE_RATIO)).astype(np.int64)
+    blocked, stray = max(platform.blocked_share, MIN_SHARE), max(platform.bright_share, MIN_SHARE)
+    for one in np.unique(level).tolist():
+        rows = np.flatnonzero(level == one)
+        sigma = platform.noise * _NOISE_RATIO**one
+        table = np.stack([_stabilized(share * light, sigma, relative) for share in SHARES])
+        present = np.isfinite(readings[rows]) & (readings[rows] >= DARKEST * sigma)
+        limit = saturation[rows, None, None]
+        saturated = present & (readings[rows] >= limit)
+        stable = _stabilized(np.where(present, np.minimum(readings[rows], limit), 0.0), sigma, relative)
+        kinds = present.astype(np.int8) + saturated
+        dark = np.where(saturated, 0.0, blocked * PEAK * np.exp(-0.5 * np.square(stable, dtype=np.float64)))
+        outlier = dark + stray / BRIGHT_SPAN
+        part, places = np.empty((rows.size, 2, n, SHARES.size)), np.zeros(rows.size, dtype=np.int64)
+        _marginalize(table, log_prior, stable.astype(np.float64), kinds, outlier, part, places)
+        found[rows], best[rows] = part, places
+    return ElementLikelihoods(found, poses[best, 1:])
+
+
+def direction_step(platform: IrPlatform) -> float:
+    """Between neighbouring bearings, or headings, of the grid [rad]."""
+    return 2.0 * math.pi / min(_PER_ELEMENT * platform.n, _MAX_DIRECTIONS)
+
+
+def _grid(platform: IrPlatform) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Poses (g, 3), what is read there (g, n, n), and the log prior (g,): as likely all over the plane."""
+    full = replace(platform, amplitudes=platform.amplitudes[:1])
+    ranges = start_table(full).ranges
+    angles = np.arange(-math.pi, math.pi - 1e-9, direction_step(platform))
+    poses = np.stack(np.meshgrid(ranges, angles, angles, indexing="ij"), axis=-1).reshape(-1, 3)
+    return poses, expected(full, poses)[:, 0], 2.0 * np.log(poses[:, 0] / ranges[-1])
+
+
+def _grid_variance(platform: IrPlatform, light: FloatArray) -> float:
+    """Mean square by which readings differ, relative, from those of the nearest pose of the grid."""
+    n, size = platform.n, round(2.0 * math.pi / direction_step(platform))
+    logs = np.log(np.clip(light, platform.noise, platform.saturation)).reshape(-1, size, size, n * n)
+    shown = logs > math.log(_SHOWN * platform.noise)
+    total = 0.0
+    for axis in range(3):
+        steps = np.diff(logs, axis=axis)
+        one, other = (np.delete(shown, end, axis=axis) for end in (-1, 0))
+        total += float(np.mean(np.square(steps[one | other])))
+    return total / 12.0  # uniform within a step
+
+
+def _stabilized(values: FloatArray, noise: float, relative: float) -> Float32Array:
+    """On the scale on which noise, with what is relative to the reading, is one."""
+    stable: Float32Array = (np.arcsinh(relative / noise * values) / relative).astype(np.float32)
+    return stable
+
+
+@compiled
+def _marginalize(
+    table: Float32Array,
+    log_prior: FloatArray,
+    stable: FloatArray,
+    kinds: NDArray[np.int8],
+    outlier: FloatArray,
+    found: FloatArray,
+    best: NDArray[np.int64],
+) -> None:
+    """Write `found` (k, 2, n, S) and the likeliest pose of each exchange.
+
+    Args:
+        table: (S, g, n, n) expectations by share.
+        log_prior: (g,).
+        stable: (k, n, n) readings.
+        kinds: (k, n, n) 0 missing, 1 measured, 2 saturated.
+        outlier: (k, n, n) densities of readings that are blocked, or lit from elsewhere.
+        found: Written.
+        best: (k,) written.
+    """
+    shares, poses, n = table.shape[0], table.shape[1], stable.shape[1]
+    sides, logs, tops = np.empty((poses, 2, n)), np.empty(poses), np.empty((2, n))
+    dark, changed = np.empty((2, n)), np.empty((2, n, shares))
+    for k in range(stable.shape[0]):
+        _by_side(table[0, 0], stable[k], kinds[k], outlier[k], dark)
+        tops[:] = -math.inf
+        best[k] = 0
+        for g in range(poses):
+            logs[g] = log_prior[g] + _by_side(table[WHOLE, g], stable[k], kinds[k], outlier[k], sides[g])
+            if logs[g] > logs[best[k]]:
+                best[k] = g
+            for side in range(2):
+                for e in range(n):
+                    tops[side, e] = max(tops[side, e], logs[g] - sides[g, side, e] + dark[side, e])
+        found[k] = 0.0
+        base = logs[best[k]]
+        for g in range(poses):
+            if not _counts(logs[g], base, sides[g], dark, tops):
+                continue
+            for s in range(shares):
+                _by_side(table[s, g], stable[k], kinds[k], outlier[k], changed[:, :, s])
+            for side in range(2):
+                for e in range(n):
+                    for s in range(shares):
+                        log = logs[g] - sides[g, side, e] + changed[side, e, s]
+                        found[k, side, e, s] += math.exp(log - base)
+        for side in range(2):
+            for e in range(n):
+                for s in range(shares):
+                    found[k, side, e, s] = base + math.log(max(found[k, side, e, s], LOWEST))
+
+
+@compiled
+def _counts(log: float, base: float, sides: FloatArray, dark: FloatArray, tops: FloatArray) -> bool:
+    """Whether a pose is likely enough to count, with all elements whole or any one of them dark."""
+    if log > base - _NEGLIGIBLE:
+        return True
+    for side in range(2):
+        for e in range(sides.shape[1]):
+            if log - sides[side, e] + dark[side, e] > tops[side, e] - _NEGLIGIBLE:
+                return True
+    return False
+
+
+@compiled
+def _by_side(
+    light: Float32Array,
+    stable: FloatArray,
+    kinds: NDArray[np.int8],
+    outlier: FloatArray,
+    sides: FloatArray,
+) -> float:
+    """Write the log likelihood of each sensor's and each emitter's readings (2, n); returns that of all."""
+    n, total = stable.shape[0], 0.0
+    for e in range(n):
+        sides[1, e] = 1.0
+    for i in range(n):
+        row = 1.0
+        for j in range(n):
+            if kinds[i, j] == 0:
+                continue
+            off, density = stable[i, j] - light[i, j], outlier[i, j]
+            if kinds[i, j] == 2:
+                density += 0.5 * math.erfc(off / math.sqrt(2.0))
+            elif abs(off) < _FAR_OFF:
+                density += PEAK * math.exp(-0.5 * off * off)
+            row *= density
+            sides[1, j] *= density
+        sides[0, i] = math.log(max(row, LOWEST))
+        total += sides[0, i]
+    for e in range(n):
+        sides[1, e] = math.log(max(sides[1, e], LOWEST))
+    return total

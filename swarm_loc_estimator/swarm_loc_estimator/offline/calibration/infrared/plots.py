@@ -1,0 +1,180 @@
+"""Plots and table of an infrared calibration: residuals and gains."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.offline.calibration.infrared.dead_elements import ElementVerdicts
+from swarm_loc_estimator.offline.calibration.infrared.gains import BoardFit, InfraredCalibration, rms
+from swarm_loc_estimator.offline.report.style import INK, SOFT, TRUTH, colour_of, save, style
+
+_REACH = 6.0
+_BINS = 61
+_LEVELS = 12
+_MIN_IN_LEVEL = 30
+
+
+def text_of(done: InfraredCalibration) -> str:
+    """A table with one line per robot."""
+    head = f"{'':16}{'exchanges':>10}{'before':>9}{'after':>9}{'own':>9}{'common':>9}"
+    lines = [head, f"{'':16}{'used':>10}{'[sigma]':>9}{'[sigma]':>9}{'[%]':>9}{'[%]':>9}"]
+    for board in done.boards:
+        exchanges, used = board.group.exchanges, board.fit.used
+        for place, index in enumerate(board.group.robots):
+            count, before, after = board.of_robot(place)
+            gains = board.fit.gains[place]
+            lines.append(
+                f"{done.swarm.robots[index].name:16}{count:10}{before:9.2f}{after:9.2f}"
+                f"{100.0 * gains.sigma:9.2f}{100.0 * gains.common_sigma:9.2f}"
+            )
+        known = int(np.isfinite(exchanges.poses[used, 0]).sum())
+        before, after = rms(board.fit.before), rms(board.fit.after)
+        lines.append(
+            f"platform {board.group.source}: {int(used.sum())} of {used.size} exchanges used, {known} of them"
+            f" with ground truth; residuals {before:.2f} before, {after:.2f} after"
+        )
+        names = [done.swarm.robots[index].name for index in board.group.robots]
+        lines += dead_lines(board.elements, names) + _limits(board, names)
+    return "\n".join([*lines, *done.remarks])
+
+
+def dead_lines(elements: ElementVerdicts, names: list[str]) -> list[str]:
+    """A line per robot that has dead elements, and one for elements of which not enough was read."""
+    lines = []
+    for place, name in enumerate(names):
+        found = zip(("sensors", "emitters"), elements.numbers(place), strict=True)
+        said = [f"{what} {list(numbers)}" for what, numbers in found if numbers]
+        if said:
+            lines.append(f"{name}: dead or shaded, left out: {', '.join(said)}")
+    sensors, emitters = elements.undecided.sum(axis=(1, 2)).tolist()
+    if sensors or emitters:
+        count = elements.dead[0].size
+        lines.append(
+            f"not enough exchanges to say whether they are dead: {sensors} of {count} sensors,"
+            f" {emitters} of {count} emitters"
+        )
+    return lines
+
+
+def _limits(board: BoardFit, names: list[str]) -> list[str]:
+    """A line per robot with what exchanges tell of saturation and noise, and of how many sensors they do."""
+    limits, lines = board.limits, []
+    told = (
+        ("saturation [count]", limits.saturation + board.group.platform.dark_level, 0),
+        ("noise [count]", limits.noise, 2),
+        ("relative noise [%]", 100.0 * limits.relative_noise, 1),
+    )
+    for place, name in enumerate(names):
+        said = [
+            f"{what} {_told(values[place], digits)}"
+            for what, values, digits in told
+            if np.isfinite(values[place]).any()
+        ]
+        if said:
+            lines.append(f"{name}, by sensor: {', '.join(said)}")
+    saturated, noisy = (int(np.isfinite(part).sum()) for part in (limits.saturation, limits.noise))
+    lines.append(
+        f"exchanges tell where {saturated} of {limits.noise.size} sensors saturate, and the noise of {noisy}"
+    )
+    return lines
+
+
+def _told(values: FloatArray, digits: int) -> str:
+    """Numbers in brackets, a dash where there is none."""
+    return f"[{' '.join(f'{value:.{digits}f}' if np.isfinite(value) else '-' for value in values)}]"
+
+
+def draw(done: InfraredCalibration, path: Path) -> Path:
+    """Residuals before and after, all and by brightness, and all gains; one row per kind of board."""
+    figure = Figure(figsize=(12.0, 3.2 * len(done.boards)))
+    rows: list[Any] = list(figure.subplots(len(done.boards), 3, squeeze=False, width_ratios=(1.0, 1.0, 1.4)))
+    for axes, board in zip(rows, done.boards, strict=True):
+        _residuals(axes[0], board)
+        _by_brightness(axes[1], board)
+        _gains(axes[2], board, [done.swarm.robots[index].name for index in board.group.robots])
+    save(figure, path)
+    return path
+
+
+def _residuals(axis: Any, board: BoardFit) -> None:
+    """Histogram of all residuals."""
+    bins = np.linspace(-_REACH, _REACH, _BINS)
+    before, after = (
+        one[np.isfinite(one)].clip(-_REACH, _REACH) for one in (board.fit.before, board.fit.after)
+    )
+    style(axis)
+    axis.hist(before, bins, color=TRUTH, alpha=0.6, label="before")
+    axis.hist(after, bins, histtype="step", color=colour_of(0), linewidth=1.6, label="after")
+    axis.set_yticks([])
+    axis.spines["left"].set_visible(False)
+    axis.legend(frameon=False, fontsize=9)
+    _title(axis, f"{board.group.source}: residuals [sigma]")
+
+
+def _by_brightness(axis: Any, board: BoardFit) -> None:
+    """Their size by how bright it was: gains show where it is bright, blocked light where it is dim."""
+    readings = board.group.exchanges.readings
+    style(axis)
+    for label, residuals, colour in (
+        ("before", board.fit.before, TRUTH),
+        ("after", board.fit.after, colour_of(0)),
+    ):
+        levels, sizes = _sizes(readings, residuals)
+        axis.plot(levels, sizes, color=colour, marker=".", label=label)
+    platform, limits = board.group.platform, board.limits
+    noise, relative = limits.typical_noise
+    if np.isfinite(noise):
+        bright = np.array(levels)
+        repeated = np.hypot(noise, np.nan_to_num(relative) * bright)
+        repeated /= np.hypot(platform.noise, platform.relative * bright)
+        (line,) = axis.plot(bright, repeated, color=colour_of(2), linewidth=0.8)
+        axis.legend([line], ["noise where robots stand"], frameon=False, fontsize=9)
+    for ceiling in limits.saturation[np.isfinite(limits.saturation)].tolist():
+        axis.axvline(ceiling, color=SOFT, linewidth=0.3)
+    axis.axhline(1.0, color=SOFT, linewidth=0.8, linestyle="--")
+    axis.set_ylim(bottom=0.0)
+    axis.set_xlabel("reading [count]", color=SOFT, fontsize=9)
+    _title(axis, "rms residual by brightness [sigma]")
+
+
+def _sizes(readings: FloatArray, residuals: FloatArray) -> tuple[list[float], list[float]]:
+    """Middles of levels of brightness, and the rms of the residuals there."""
+    known = np.isfinite(residuals)
+    bright, error = readings[known], residuals[known]
+    edges = np.linspace(bright.min(initial=0.0), bright.max(initial=1.0), _LEVELS + 1)
+    level = np.digitize(bright, edges[1:-1])
+    full = [k for k in range(_LEVELS) if np.sum(level == k) >= _MIN_IN_LEVEL]
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    return [float(middles[k]) for k in full], [rms(error[level == k]) for k in full]
+
+
+def _gains(axis: Any, board: BoardFit, names: list[str]) -> None:
+    """The factors of each robot's elements, with what each is unsure by."""
+    style(axis)
+    for number, part in enumerate(("sensor", "emitter")):
+        factors = np.array([getattr(gains, part) for gains in board.fit.gains])
+        sigma = np.array([np.hypot(gains.sigma, gains.common_sigma) for gains in board.fit.gains])
+        places = np.arange(len(names))[:, None] + np.linspace(-0.15, 0.15, factors.shape[1])
+        axis.errorbar(
+            (places + (number - 0.5) * 0.36).ravel(),
+            factors.ravel(),
+            (np.ones_like(factors) * sigma[:, None] * factors).ravel(),
+            fmt=".",
+            markersize=3,
+            linewidth=0.7,
+            color=colour_of(number),
+            label=f"{part}s",
+        )
+    axis.axhline(1.0, color=SOFT, linewidth=0.8, linestyle="--")
+    axis.set_xticks(range(len(names)), names, rotation=90 if len(names) > 4 else 0)
+    axis.legend(frameon=False, fontsize=9, ncols=2)
+    _title(axis, "gains, one sigma")
+
+
+def _title(axis: Any, text: str) -> None:
+    axis.set_title(text, loc="left", fontsize=10, color=INK)

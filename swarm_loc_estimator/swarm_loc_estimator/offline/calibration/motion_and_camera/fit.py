@@ -1,0 +1,313 @@
+"""Calibrate a swarm from a recording with ground truth: cameras, motion, and the noise that remains.
+
+The noise is fitted to errors that the calibration has not seen: each half of the recording is run with what
+the other half gave. So the covariances admit that a calibration is never quite right elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.offline.calibration.motion_and_camera.camera import CameraFit, fit_cameras
+from swarm_loc_estimator.offline.calibration.motion_and_camera.noise import (
+    Fold,
+    Score,
+    fit_noise,
+    score,
+    with_noise,
+)
+from swarm_loc_estimator.offline.calibration.motion_and_camera.offsets import fit_offsets
+from swarm_loc_estimator.offline.calibration.motion_and_camera.response import (
+    WINDOW_S,
+    Drive,
+    Lateness,
+    explained,
+    fit_lateness,
+    fit_response,
+)
+from swarm_loc_estimator.offline.calibration.motion_and_camera.robust import spread
+from swarm_loc_estimator.offline.calibration.motion_and_camera.windows import steps_of, true_motion, windows
+from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording, started_at_truth
+from swarm_loc_estimator.offline.calibration.rerun import rerun
+from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
+from swarm_loc_estimator.sensors.ingest import MAX_PAUSE_NS
+from swarm_loc_estimator.swarm.motion_response import MotionResponse
+from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
+
+EVALUATIONS = 80
+"""How often the estimator runs over the recording to fit the noise."""
+
+_MIN_WINDOWS = 50
+_CORRELATION = 2.7
+"""White noise that stands for errors that last is about so much larger than the scatter; a beginning."""
+_TICK_S = 0.5
+_FLOORS = {"wheel_noise": 0.0, "distance_drift": 1e-5, "lateral_drift": 1e-6, "range_sigma": 1e-3}
+"""Not fitted: the fitted terms say the same, these keep the covariance of a crawling robot positive."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is fitted.
+
+    Attributes:
+        plain: Only noise, no calibration.
+        response: Whether a table of shares may be fitted, else one share of speed and one of turn rate.
+        evaluations: How often the estimator may run to fit the noise.
+    """
+
+    plain: bool = False
+    response: bool = True
+    evaluations: int = EVALUATIONS
+
+
+@dataclass(frozen=True)
+class DriveFit:
+    """What became of the motion of a type of robot.
+
+    Attributes:
+        members: Indices of its robots.
+        drives: Those with dense ground truth.
+        late: Delay and lag.
+        response: Shares; None when plain numbers were fitted.
+        before: (m, 2) errors of path [m] and turn [rad] of 5 s windows as reported.
+        after: (m, 2) calibrated.
+    """
+
+    members: tuple[int, ...]
+    drives: tuple[Drive, ...]
+    late: Lateness
+    response: MotionResponse | None
+    before: FloatArray
+    after: FloatArray
+
+
+@dataclass(frozen=True)
+class Models:
+    """Calibrated models, without noise.
+
+    Attributes:
+        swarm: Calibrated.
+        cameras: By type, what became of the cameras.
+        motion: By type, what became of the motion.
+        remarks: What could not be fitted, one sentence each.
+    """
+
+    swarm: Swarm
+    cameras: tuple[CameraFit, ...]
+    motion: tuple[DriveFit, ...]
+    remarks: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Everything that a calibration gives.
+
+    Attributes:
+        swarm: Calibrated; robots start where they started before.
+        models: How it came about.
+        noise: The fitted noise by name.
+        before: How the estimator did on the recording, started at the true poses.
+        after: How it does now.
+    """
+
+    swarm: Swarm
+    models: Models
+    noise: dict[str, float] = field(default_factory=dict)
+    before: Score | None = None
+    after: Score | None = None
+
+
+def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Progress) -> Calibration:
+    """Fit everything.
+
+    Args:
+        recording: With ground truth of at least one robot.
+        swarm: As it is described so far.
+        options: What is fitted.
+        progress: Called now and then with the share done and what is being done.
+
+    Raises:
+        CalibrationError: There is no ground truth, or too little of it, or the recording's clock was set.
+    """
+    if not recording.truth:
+        raise CalibrationError(
+            f"recording '{recording.name}' holds no <robot>/ground_truth; a calibration needs it."
+        )
+    if recording.longest_pause_ns > MAX_PAUSE_NS:
+        raise CalibrationError(
+            f"recording '{recording.name}' has a jump of {recording.longest_pause_ns / 3.6e12:.0f} h"
+            " in its times; a calibration needs a part of it without."
+        )
+    whole = fit_models(recording, swarm, options, progress)
+    folds = _folds(recording, swarm, whole, options)
+    begin = _first_noise(whole, plain=options.plain)
+
+    def report(count: int, found: Score) -> None:
+        rmse_mm = 1e3 * found.position_rmse
+        share = 0.2 + 0.75 * min(1.0, count / options.evaluations)
+        progress(share, f"noise, run {count}: {rmse_mm:.1f} mm, NEES {found.nees:.2f}")
+
+    noise = {**_FLOORS, **fit_noise(folds, begin, _FLOORS, options.evaluations, report)}
+    progress(0.96, "before and after")
+    calibrated = with_noise(whole.swarm, noise)
+    scores = [score([rerun(recording, started_at_truth(s, recording), _TICK_S)]) for s in (swarm, calibrated)]
+    return Calibration(calibrated, whole, noise, *scores)
+
+
+def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: Progress) -> Models:
+    """Fit sensors and motion type by type; with `plain` only look at the errors.
+
+    Raises:
+        CalibrationError: Nothing could be fitted to.
+    """
+    robots = list(swarm.robots)
+    cameras: list[CameraFit] = []
+    motion: list[DriveFit] = []
+    remarks: list[str] = []
+    types = list(dict.fromkeys(robot.type for robot in robots))
+    for number, name in enumerate(types):
+        members = [index for index, robot in enumerate(swarm.robots) if robot.type == name]
+        progress(0.1 * number / len(types), f"cameras of type '{name}'")
+        fits = fit_cameras(recording, swarm, members)
+        cameras += fits
+        progress(0.1 * (number + 0.5) / len(types), f"motion of type '{name}'")
+        drive = _fit_drive(recording, swarm, members, options)
+        motion += [] if drive is None else [drive]
+        remarks += _remarks(swarm, members, fits, drive)
+        if options.plain:
+            continue
+        sensed = {fit.robot.name: fit.robot for fit in fits}
+        for index in members:
+            seen = sensed.get(robots[index].name, robots[index])
+            robots[index] = seen if drive is None else _with_motion(seen, drive)
+        moved = fit_offsets(recording, replace(swarm, robots=tuple(robots)), members) if drive else {}
+        for index, robot in moved.items():
+            robots[index] = robot
+    if not motion and not any(fit.count for fit in cameras):
+        raise CalibrationError(
+            f"recording '{recording.name}' holds too little ground truth together with odometry or sightings;"
+            " a minute of a moving robot that sees markers is the least."
+        )
+    return Models(replace(swarm, robots=tuple(robots)), tuple(cameras), tuple(motion), tuple(remarks))
+
+
+def _fit_drive(
+    recording: Recording, swarm: Swarm, members: Sequence[int], options: Options
+) -> DriveFit | None:
+    """The motion of a type; None without a robot whose ground truth is dense."""
+    drives = []
+    for index in members:
+        track, truth = recording.track(index), recording.truth.get(swarm.robots[index].name)
+        if truth is None or track.stamp_ns.size < 2:
+            continue
+        begin_ns, end_ns = int(track.stamp_ns[0]), int(track.stamp_ns[-1])
+        drive = Drive(steps_of(track, swarm.robots[index].odometry), true_motion(truth, begin_ns, end_ns))
+        if windows(drive.motion, WINDOW_S)[0].size >= _MIN_WINDOWS:
+            drives.append(drive)
+    if not drives:
+        return None
+    prompt = Lateness(0.0, 0.0)
+    before = explained(drives, prompt, None)
+    if options.plain:
+        return DriveFit(tuple(members), tuple(drives), prompt, None, before, before)
+    late = fit_lateness(drives)
+    response = fit_response(drives, late, table=options.response)
+    return DriveFit(tuple(members), tuple(drives), late, response, before, explained(drives, late, response))
+
+
+def _with_motion(robot: Robot, drive: DriveFit) -> Robot:
+    """The robot with its type's delay, lag and shares."""
+    late, response = drive.late, drive.response
+    numbers = {
+        "delay_s": round(late.delay_s, 4),
+        "lag_s": round(late.lag_s, 4),
+        "distance_scale": 1.0,
+        "turn_scale": 1.0,
+    }
+    if response is not None and len(response.speeds) == len(response.turn_rates) == 1:
+        numbers["distance_scale"] = response.speed_share[0][0]
+        numbers["turn_scale"] = response.turn_share[0][0]
+        response = None
+    return replace(robot, odometry=replace(robot.odometry, **numbers), response=response)
+
+
+def _folds(recording: Recording, swarm: Swarm, whole: Models, options: Options) -> list[Fold]:
+    """Each half of the recording with the models of the other; where one gives none, of the whole."""
+    if options.plain:
+        return [Fold(recording, started_at_truth(whole.swarm, recording))]
+    first_ns, last_ns = recording.range_ns
+    middle_ns = (first_ns + last_ns) // 2
+    halves = [recording.between(first_ns, middle_ns), recording.between(middle_ns, last_ns + 1)]
+    folds = []
+    for run, fitted in ((halves[0], halves[1]), (halves[1], halves[0])):
+        try:
+            models = fit_models(fitted, swarm, options, unwatched)
+        except CalibrationError:
+            models = whole
+        folds.append(Fold(run, started_at_truth(models.swarm, run)))
+    return folds
+
+
+def _first_noise(models: Models, *, plain: bool) -> dict[str, float]:
+    """Where the fit of noise begins: the scatter of sightings, half the errors of windows for each cause."""
+    polar = np.concatenate([fit.sightings.polar for fit in models.cameras] or [np.zeros(0, dtype=bool)])
+    errors = [fit.before if plain else fit.after for fit in models.cameras]
+    error = np.concatenate(errors or [np.zeros((0, 3))])
+    begin: dict[str, float] = {}
+    if polar.any():
+        metres = np.concatenate([fit.sightings.value[:, 0] for fit in models.cameras])[polar]
+        begin["range_sigma_per_m"] = _CORRELATION * spread(error[polar, 0] / np.maximum(metres, 0.1))
+        begin["bearing_sigma"] = _CORRELATION * spread(error[polar, 1])
+    if (~polar).any():
+        names = ("forward_sigma", "left_sigma", "heading_sigma")
+        begin |= {n: _CORRELATION * max(1e-4, spread(error[~polar, k])) for k, n in enumerate(names)}
+    if models.motion:
+        begin |= _first_motion_noise(models.motion, plain=plain)
+    else:
+        model = OdometryModel()
+        begin |= {"distance_noise": model.wheel_noise, "turn_noise": 0.01, "turn_drift": 1e-4}
+    return begin
+
+
+def _first_motion_noise(motion: Sequence[DriveFit], *, plain: bool) -> dict[str, float]:
+    """Each cause explains a part of the mean squared errors of windows."""
+    path = turn = seconds = path2 = turn2 = 0.0
+    for fit in motion:
+        for drive in fit.drives:
+            first, last = windows(drive.motion, WINDOW_S)
+            path += float(np.sum(np.abs(drive.motion.path[last] - drive.motion.path[first])))
+            turn += float(np.sum(np.abs(drive.motion.turn[last] - drive.motion.turn[first])))
+            seconds += WINDOW_S * first.size
+        path2 += float(np.sum(fit.after[:, 0] ** 2))
+        turn2 += float(np.sum(fit.after[:, 1] ** 2))
+    path, turn, path2, turn2 = max(path, 1e-3), max(turn, 1e-3), max(path2, 1e-7), max(turn2, 1e-7)
+    begin = {} if plain else {"turn_bias_sigma": np.sqrt(0.1 * turn2 / (seconds * WINDOW_S))}
+    return begin | {
+        "distance_noise": 0.5 * path2 / path,
+        "distance_turn_noise": 0.5 * path2 / turn,
+        "lateral_noise": 0.05 * path2 / path,
+        "turn_drift": 0.3 * turn2 / seconds,
+        "turn_noise": 0.3 * turn2 / turn,
+        "turn_change_noise": 0.2 * turn2 / turn,
+    }
+
+
+def _remarks(
+    swarm: Swarm, members: Sequence[int], fits: Sequence[CameraFit], drive: DriveFit | None
+) -> list[str]:
+    """What could not be fitted."""
+    poor = [fit.robot.name for fit in fits if not fit.count]
+    remarks = [
+        f"{name} has too few sightings with ground truth: it gets the mean of its type." for name in poor
+    ]
+    if not fits and any(swarm.robots[index].camera is not None for index in members):
+        names = ", ".join(swarm.robots[index].name for index in members)
+        remarks.append(f"no camera of {names} could be calibrated: too few sightings with ground truth.")
+    if drive is None:
+        names = ", ".join(swarm.robots[index].name for index in members)
+        remarks.append(f"the motion of {names} could not be calibrated: none has dense ground truth.")
+    return remarks

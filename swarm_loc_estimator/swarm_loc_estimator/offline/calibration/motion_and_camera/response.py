@@ -1,0 +1,267 @@
+"""Calibrate the motion response of a type of robot: scale factors by speed and turn rate, delay, lag.
+
+Speeds and turn rates of an odometry that is a command, or slips, are true in part only, and late. The shares
+are linear in the true motion, so a table of them is a linear regression; delay and lag are searched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.offline.calibration.motion_and_camera.robust import ridge, spread
+from swarm_loc_estimator.offline.calibration.motion_and_camera.windows import (
+    Steps,
+    TrueMotion,
+    gathered,
+    windows,
+)
+from swarm_loc_estimator.swarm.motion_response import MotionResponse
+
+LONGEST_DELAY_S = 0.5
+LONGEST_LAG_S = 1.0
+
+WINDOW_S = 5.0
+"""Errors of motion are looked at over so long."""
+
+_SHORT_WINDOW_S = 0.5
+_NODES = (0, 2, 5)
+"""So many points above 0 are tried for the table; none: one share everywhere."""
+_BLOCKS = 5
+_CLEAR_SIGMAS = 2.0
+_NEAR_ZERO = 0.05
+_CLEARLY = 0.85
+"""Lateness is believed where it lessens the errors of short windows to this share."""
+_MOVING = 1e-3
+"""Slower than this is standing [m/s, rad/s]."""
+_SMOOTHNESS, _TO_ONE = 0.02, 0.001
+"""Weight of the prior that neighbouring shares are alike, and that shares are 1."""
+_FIRST_LATENESS = (0.05, 0.1)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One robot's reported and true motion."""
+
+    steps: Steps
+    motion: TrueMotion
+
+
+@dataclass(frozen=True)
+class Lateness:
+    """When a reported motion happens.
+
+    Attributes:
+        delay_s: After its stamp.
+        lag_s: Time constant with which it is followed.
+    """
+
+    delay_s: float
+    lag_s: float
+
+
+def fit_lateness(drives: Sequence[Drive]) -> Lateness:
+    """Delay and lag that explain the turns of short windows best, with one share driving and one in place."""
+
+    def cost(late: FloatArray) -> float:
+        delay_s, lag_s = late
+        if not (-LONGEST_DELAY_S <= delay_s <= LONGEST_DELAY_S and 0.0 <= lag_s <= LONGEST_LAG_S):
+            return float("inf")
+        total = 0.0
+        for drive in drives:
+            moving = np.abs(drive.steps.speed) > _MOVING
+            values = drive.steps.turn_rate[:, None] * np.column_stack([moving, ~moving])
+            first, last = windows(drive.motion, _SHORT_WINDOW_S)
+            integral = gathered(values, drive.steps, drive.motion, delay_s, lag_s)
+            basis, wanted = (
+                integral[last] - integral[first],
+                drive.motion.turn[last] - drive.motion.turn[first],
+            )
+            share = ridge(basis, wanted, 1e-9 * np.eye(2), np.ones(2), rounds=2)
+            total += float(np.sum(np.abs(wanted - basis @ share)))  # not squared: slips are no lateness
+        return total
+
+    simplex = np.array(_FIRST_LATENESS) + np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.15]])
+    found = minimize(
+        cost,
+        np.array(_FIRST_LATENESS),
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "xatol": 3e-3, "fatol": 0.0, "maxfev": 60},
+    )
+    if found.fun > _CLEARLY * cost(np.zeros(2)):
+        return Lateness(0.0, 0.0)
+    return Lateness(float(found.x[0]), float(found.x[1]) if found.x[1] > 2e-3 else 0.0)
+
+
+def nodes_of(values: FloatArray, duration_s: FloatArray, count: int) -> FloatArray:
+    """Grid points for reported values (n,): 0, and points evenly spaced over what was driven for long.
+
+    Args:
+        values: Absolute speeds or turn rates.
+        duration_s: (n,) how long each held.
+        count: Points above 0; fewer where the values hardly vary.
+    """
+    used = values > _MOVING
+    if not used.any():
+        return np.zeros(1)
+    order = np.argsort(values[used])
+    held = np.cumsum(duration_s[used][order])
+    low, high = np.interp([0.01, 0.99], held / held[-1], values[used][order])
+    if low < _NEAR_ZERO * high:  # a point so near to 0 would say what 0 says
+        low = high / count
+    spaced = np.linspace(low, high, count) if high > 1.2 * low else np.array([high])
+    return np.concatenate([[0.0], np.round(spaced, 4)])
+
+
+def fit_response(drives: Sequence[Drive], late: Lateness, *, table: bool) -> MotionResponse:
+    """The shares of speed and turn rate that are true, for robots of one type.
+
+    Several grids are tried on stretches of time that they were not fitted to; the smallest wins that does
+    about as well as the best: a table has to earn its numbers.
+
+    Args:
+        drives: Of all robots of the type.
+        late: Their delay and lag.
+        table: Whether there may be more than one share of each.
+    """
+    grids = [_grid(drives, count) for count in (_NODES if table else _NODES[:1])]
+    held_out = [_held_out_error(drives, late, *grid) for grid in grids]
+    best = held_out[int(np.argmin([np.mean(errors) for errors in held_out]))]
+    chosen = next(
+        grid
+        for grid, errors in zip(grids, held_out, strict=True)
+        if np.mean(errors - best) <= _CLEAR_SIGMAS * np.std(errors - best) / np.sqrt(_BLOCKS - 1)
+    )
+    tables = [_solved(_regression(drives, late, *chosen, column), *chosen).round(4) for column in range(2)]
+    return MotionResponse(
+        *(tuple(axis.tolist()) for axis in chosen),
+        *(tuple(tuple(row) for row in table.tolist()) for table in tables),
+    )
+
+
+def _grid(drives: Sequence[Drive], count: int) -> tuple[FloatArray, FloatArray]:
+    """Speeds and turn rates of a grid with so many points above 0; no points: one share everywhere."""
+    if not count:
+        return np.zeros(1), np.zeros(1)
+    speed = np.concatenate([np.abs(drive.steps.speed) for drive in drives])
+    turn_rate = np.concatenate([np.abs(drive.steps.turn_rate) for drive in drives])
+    duration_s = np.concatenate([drive.steps.duration_s for drive in drives])
+    driving = speed > _MOVING
+    return nodes_of(speed, duration_s, count), nodes_of(turn_rate[driving], duration_s[driving], count)
+
+
+def _held_out_error(
+    drives: Sequence[Drive], late: Lateness, speeds: FloatArray, turn_rates: FloatArray
+) -> FloatArray:
+    """Mean absolute errors (blocks,) of path and turn, relative to what was driven, block by block."""
+    total = np.zeros(_BLOCKS)
+    for column in range(2):
+        rows = _regression(drives, late, speeds, turn_rates, column)
+        for block in range(_BLOCKS):
+            held_out = (rows.block == block) & (rows.last_block == block)
+            fitted = (rows.block != block) & (rows.last_block != block)
+            shares = _solved(rows[fitted], speeds, turn_rates).ravel()
+            error = rows.wanted[held_out] - rows.basis[held_out] @ shares
+            total[block] += np.mean(np.abs(error)) / np.mean(np.abs(rows.wanted))
+    return total
+
+
+def hats(values: FloatArray, nodes: FloatArray) -> FloatArray:
+    """(n, k) linear weights of the nodes at values (n,), constant beyond the border."""
+    return np.column_stack([np.interp(values, nodes, row) for row in np.eye(nodes.size)])
+
+
+@dataclass(frozen=True)
+class _Regression:
+    """True motion of windows as a sum of shares.
+
+    Attributes:
+        basis: (m, V W) what each share contributes.
+        wanted: (m,) path [m] or turn [rad].
+        block: (m,) which stretch of time a window begins in.
+        last_block: (m,) and which it ends in.
+    """
+
+    basis: FloatArray
+    wanted: FloatArray
+    block: IntArray
+    last_block: IntArray
+
+    def __getitem__(self, rows: NDArray[np.bool_]) -> _Regression:
+        return _Regression(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+
+def _regression(
+    drives: Sequence[Drive], late: Lateness, speeds: FloatArray, turn_rates: FloatArray, column: int
+) -> _Regression:
+    """All windows, of the path (column 0) or the turn (column 1)."""
+    bases, targets, borders = [], [], []
+    for drive in drives:
+        steps, motion = drive.steps, drive.motion
+        weight = (
+            hats(np.abs(steps.speed), speeds)[:, :, None] * hats(np.abs(steps.turn_rate), turn_rates)[:, None]
+        )
+        reported = steps.turn_rate if column else steps.speed
+        values = weight.reshape(reported.size, -1) * reported[:, None]
+        integral = gathered(values, steps, motion, late.delay_s, late.lag_s)
+        true = motion.turn if column else motion.path
+        first, last = windows(motion, WINDOW_S)
+        bases.append(integral[last] - integral[first])
+        targets.append(true[last] - true[first])
+        # each block holds windows, whichever part of the time is known
+        cuts = np.quantile(first, np.arange(1, _BLOCKS) / _BLOCKS)
+        borders.append(np.searchsorted(cuts, np.column_stack([first, last]), side="right"))
+    return _Regression(np.concatenate(bases), np.concatenate(targets), *np.concatenate(borders).T)
+
+
+def _solved(rows: _Regression, speeds: FloatArray, turn_rates: FloatArray) -> FloatArray:
+    """Shares (V, W)."""
+    typical = np.mean(np.sum(rows.basis, axis=1) ** 2)  # of a window: the prior does not depend on units
+    penalty = _prior(speeds.size, turn_rates.size) * typical
+    shares = ridge(rows.basis, rows.wanted, penalty, np.ones(rows.basis.shape[1]))
+    return np.asarray(np.clip(shares, 0.0, 10.0).reshape(speeds.size, turn_rates.size))
+
+
+def _prior(speeds: int, turn_rates: int) -> FloatArray:
+    """Information (V W, V W) that neighbours in the grid are alike and all shares near 1."""
+    size = speeds * turn_rates
+    index = np.arange(size).reshape(speeds, turn_rates)
+    pairs = np.concatenate(
+        [
+            np.column_stack([index[:-1].ravel(), index[1:].ravel()]),
+            np.column_stack([index[:, :-1].ravel(), index[:, 1:].ravel()]),
+        ]
+    )
+    difference = np.zeros((len(pairs), size))
+    difference[np.arange(len(pairs)), pairs[:, 0]] = 1.0
+    difference[np.arange(len(pairs)), pairs[:, 1]] = -1.0
+    information: FloatArray = (_SMOOTHNESS * difference.T @ difference + _TO_ONE * np.eye(size)) / size
+    return information
+
+
+def explained(drives: Sequence[Drive], late: Lateness, response: MotionResponse | None) -> FloatArray:
+    """Errors (m, 2) of path [m] and turn [rad] of 5 s windows."""
+    errors = []
+    for drive in drives:
+        steps, motion = drive.steps, drive.motion
+        reported = np.column_stack([steps.speed, steps.turn_rate])
+        if response is not None:
+            speed = hats(np.abs(steps.speed), np.array(response.speeds))
+            turn_rate = hats(np.abs(steps.turn_rate), np.array(response.turn_rates))
+            for column, table in enumerate((response.speed_share, response.turn_share)):
+                reported[:, column] *= np.einsum("nv,vw,nw->n", speed, np.array(table), turn_rate)
+        integral = gathered(reported, steps, motion, late.delay_s, late.lag_s)
+        first, last = windows(motion, WINDOW_S)
+        true = np.column_stack([motion.path, motion.turn])
+        errors.append((true[last] - true[first]) - (integral[last] - integral[first]))
+    return np.concatenate(errors)
+
+
+def spread_of(errors: FloatArray) -> tuple[float, float]:
+    """Standard deviation of the good part of path [m] and turn [rad]."""
+    return spread(errors[:, 0]), spread(errors[:, 1])

@@ -1,0 +1,88 @@
+"""Robust least squares with Gaussian priors, and the prior that robots of a type give each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from swarm_loc_estimator.common.arrays import FloatArray
+
+_BEND = 3.0
+"""From this many sigmas on a residual counts linearly."""
+_NORMAL = 1.4826
+"""Standard deviation per median absolute deviation, for normal errors."""
+
+
+def spread(residuals: FloatArray) -> float:
+    """Standard deviation of the good part of residuals about zero."""
+    return float(_NORMAL * np.median(np.abs(residuals))) if residuals.size else float("nan")
+
+
+def softened(residuals: FloatArray) -> FloatArray:
+    """Residuals in sigmas whose squares grow linearly from `_BEND` sigmas on (pseudo-Huber)."""
+    bent: FloatArray = np.sqrt(2.0 * (np.sqrt(1.0 + (residuals / _BEND) ** 2) - 1.0)) * _BEND
+    return np.copysign(bent, residuals)
+
+
+def fit_with_prior(
+    residuals: Callable[[FloatArray], FloatArray], mean: FloatArray, sigma: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Robust least squares about a normal prior.
+
+    Args:
+        residuals: From parameters (p,) to residuals (m,) in sigmas.
+        mean: (p,) of the prior, where the search begins.
+        sigma: (p,) of the prior; positive.
+
+    Returns:
+        The parameters (p,) and their standard deviations (p,).
+    """
+
+    def cost(scaled: FloatArray) -> FloatArray:
+        return np.concatenate([softened(residuals(mean + sigma * scaled)), scaled])
+
+    found = least_squares(cost, np.zeros(mean.size), method="lm", diff_step=1e-4, max_nfev=50 * mean.size)
+    covariance = np.linalg.inv(found.jac.T @ found.jac)
+    return mean + sigma * found.x, sigma * np.sqrt(np.diag(covariance))
+
+
+def population(values: FloatArray, sigma: FloatArray, wide: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The prior that the robots of a type are for each other: mean (p,) and standard deviation (p,).
+
+    Args:
+        values: (n, p) parameters of each robot fitted alone.
+        sigma: (n, p) how sure they are.
+        wide: (p,) the prior that they were fitted with; no wider prior comes out, and at least a tenth of it.
+    """
+    weight = 1.0 / (sigma**2 + (0.3 * wide) ** 2)
+    mean = np.sum(weight * values, axis=0) / np.sum(weight, axis=0)
+    between = np.sum(weight * (values - mean) ** 2, axis=0) / np.sum(weight, axis=0)
+    count = values.shape[0]
+    between *= count / max(count - 1, 1)
+    if count == 1:
+        return mean, wide
+    return mean, np.clip(np.sqrt(between), 0.1 * wide, wide)
+
+
+def ridge(
+    basis: FloatArray, wanted: FloatArray, penalty: FloatArray, prior: FloatArray, rounds: int = 6
+) -> FloatArray:
+    """Parameters (p,) of basis (m, p) @ parameters = wanted (m,), robustly.
+
+    Args:
+        basis: (m, p).
+        wanted: (m,).
+        penalty: (p, p) information of the prior in units of the good rows' own, per row.
+        prior: (p,) mean of the prior.
+        rounds: Of reweighting.
+    """
+    weight = np.ones(wanted.size)
+    for _ in range(rounds):
+        weighted = basis * weight[:, None]
+        normal = weighted.T @ basis / wanted.size + penalty
+        found: FloatArray = np.linalg.solve(normal, weighted.T @ wanted / wanted.size + penalty @ prior)
+        error = wanted - basis @ found
+        weight = 1.0 / np.maximum(1.0, np.abs(error) / (2.0 * max(spread(error), 1e-12)))
+    return found

@@ -1,0 +1,167 @@
+"""Clean what the camera saw: misread ids, orientations a quarter turn off, fiducials in two places.
+
+Robots stand most of the time. Sightings that follow each other at one place, whatever id they were read as,
+make a `Place`; whose it is, and which of four orientations a fiducial has there, is what most of them say.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.offline.datasets.droplets.text import Exchange, Sighting
+
+SAME_PLACE_PX = 3.5
+"""A robot that stands is seen within this of where it was."""
+SAME_TURN = math.radians(8.0)
+MAX_GAP_S = 30.0
+"""A robot unseen for longer may have been elsewhere."""
+_QUARTER = 0.5 * math.pi
+
+
+@dataclass
+class Place:
+    """A robot that stands, or goes very slowly.
+
+    Attributes:
+        moments: Numbers of the exchanges at which it was seen.
+        seen: What was seen, one per moment.
+        turned: One per moment: the orientation but for quarter turns, continuous [rad].
+    """
+
+    moments: list[int] = field(default_factory=list)
+    seen: list[Sighting] = field(default_factory=list)
+    turned: list[float] = field(default_factory=list)
+
+    @property
+    def owner(self) -> int:
+        """The id that it was read as most often."""
+        return Counter(one.id for one in self.seen).most_common(1)[0][0]
+
+    @property
+    def votes(self) -> int:
+        """How often it was read as its owner."""
+        return sum(one.id == self.owner for one in self.seen)
+
+    @property
+    def quarter(self) -> int:
+        """By how many quarter turns what most sightings of its owner say is off from `turned`."""
+        owner = self.owner
+        votes = Counter(
+            round((one.orientation - turned) / _QUARTER) % 4
+            for one, turned in zip(self.seen, self.turned, strict=True)
+            if one.id == owner
+        )
+        return votes.most_common(1)[0][0]
+
+    def distance_to(self, sighting: Sighting) -> float:
+        """How far from where it was last seen [px]; infinite where it has turned meanwhile."""
+        last = self.seen[-1]
+        turn = abs(_within_quarter(sighting.orientation - self.turned[-1]))
+        return math.hypot(sighting.x - last.x, sighting.y - last.y) if turn < SAME_TURN else math.inf
+
+    def add(self, moment: int, sighting: Sighting) -> None:
+        """A sighting that belongs here."""
+        self.moments.append(moment)
+        self.seen.append(sighting)
+        before = self.turned[-1] if self.turned else sighting.orientation
+        self.turned.append(before + _within_quarter(sighting.orientation - before))
+
+
+@dataclass(frozen=True)
+class CameraPose:
+    """Where the camera sees a robot that stands: x, y [px], orientation [rad], as in `Sighting`."""
+
+    x: float
+    y: float
+    orientation: float
+
+
+@dataclass
+class CleanTruth:
+    """Where all robots stood.
+
+    Attributes:
+        poses: One per exchange: robot -> where it stands; those that are not known are missing.
+        remarks: What was put right or dropped -> how often.
+    """
+
+    poses: list[dict[int, CameraPose]]
+    remarks: Counter[str]
+
+
+def clean(exchanges: Sequence[Exchange]) -> CleanTruth:
+    """Where all robots stood at each exchange."""
+    remarks = Counter[str]()
+    owned: dict[int, list[Place]] = {}
+    for place in find_places(exchanges):
+        if len(place.seen) < 2:
+            remarks["sightings of robots on the move or seen once dropped"] += len(place.seen)
+        else:
+            owned.setdefault(place.owner, []).append(place)
+    poses: list[dict[int, CameraPose]] = [{} for _ in exchanges]
+    for owner, places in owned.items():
+        for place in _without_rivals(places, remarks):
+            _write(place, owner, poses, remarks)
+    return CleanTruth(poses, remarks)
+
+
+def find_places(exchanges: Sequence[Exchange]) -> list[Place]:
+    """All places, in the order in which robots came there."""
+    places, open_places = list[Place](), list[Place]()
+    for moment, exchange in enumerate(exchanges):
+        open_places = [
+            place
+            for place in open_places
+            if exchange.time_s - exchanges[place.moments[-1]].time_s <= MAX_GAP_S
+        ]
+        taken: set[int] = set()
+        for sighting in exchange.sightings:
+            free = [place for place in open_places if id(place) not in taken]
+            nearest = min(free, key=lambda place, one=sighting: place.distance_to(one), default=None)  # type: ignore[misc]
+            if nearest is None or nearest.distance_to(sighting) > SAME_PLACE_PX:
+                nearest = Place()
+                places.append(nearest)
+                open_places.append(nearest)
+            nearest.add(moment, sighting)
+            taken.add(id(nearest))
+    return places
+
+
+def _without_rivals(places: list[Place], remarks: Counter[str]) -> list[Place]:
+    """The places of one robot of which no two are at one time: those that more sightings speak for."""
+    kept: list[Place] = []
+    for place in sorted(places, key=lambda one: -one.votes):
+        first, last = place.moments[0], place.moments[-1]
+        if any(first <= other.moments[-1] and other.moments[0] <= last for other in kept):
+            remarks["sightings of a robot in two places dropped"] += len(place.seen)
+        else:
+            kept.append(place)
+    return kept
+
+
+def _write(
+    place: Place,
+    owner: int,
+    poses: list[dict[int, CameraPose]],
+    remarks: Counter[str],
+) -> None:
+    """Write a robot's poses while it stood at a place, also between sightings."""
+    quarter = place.quarter
+    for k, moment in enumerate(place.moments):
+        seen, turned = place.seen[k], place.turned[k] + quarter * _QUARTER
+        remarks["ids misread, put right"] += seen.id != owner
+        remarks["orientations a quarter or half turn off, put right"] += (
+            seen.id == owner and abs(float(wrap_angle(seen.orientation - turned))) > 0.5 * _QUARTER
+        )
+        until = place.moments[k + 1] if k + 1 < len(place.moments) else moment + 1
+        for between in range(moment, until):
+            poses[between][owner] = CameraPose(seen.x, seen.y, turned)
+
+
+def _within_quarter(angle: float) -> float:
+    """An angle but for quarter turns, within half of one [rad]."""
+    return angle - _QUARTER * round(angle / _QUARTER)

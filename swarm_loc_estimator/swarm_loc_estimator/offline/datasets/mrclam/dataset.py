@@ -1,0 +1,252 @@
+"""Read a folder of the UTIAS multi-robot cooperative localization and mapping dataset.
+
+K. Y. K. Leung, Y. Halpern, T. D. Barfoot, H. H. T. Liu: The UTIAS multi-robot cooperative localization and
+mapping dataset, The International Journal of Robotics Research 30(8), 2011. Subjects with odometry are
+robots, subjects with a surveyed position are landmarks; which files are there decides, not the set's number.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
+
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+MAX_TRUTH_GAP_NS = 500_000_000
+
+_ODOMETRY = re.compile(r"Robot(\d+)_Odometry\.dat")
+_MISFIT = 0.5
+"""A barcode whose median sighting is further than this from its landmark is wrong [m]."""
+_SIGHTINGS_TO_JUDGE = 10
+
+
+class MrclamError(UserError):
+    """A folder that is no such dataset; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class RobotLog:
+    """One robot's files.
+
+    Attributes:
+        subject: Its number.
+        odometry: Poses of its own frame, starting at the origin; the command of a row holds until the next.
+        twist: (N, 2) commanded forward speed [m/s] and turn rate [rad/s].
+        sighting_ns: (M,) stamps, not decreasing.
+        sighting: (M, 2) range [m] and bearing [rad, positive to the left].
+        barcode: (M,) what was seen.
+        truth: Ground truth in map; None when there is none.
+    """
+
+    subject: int
+    odometry: Trajectory
+    twist: FloatArray
+    sighting_ns: IntArray
+    sighting: FloatArray
+    barcode: npt.NDArray[np.int64]
+    truth: Trajectory | None
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """One set.
+
+    Attributes:
+        robots: In the order of their subjects.
+        barcode_of: Subject -> barcode.
+        landmarks: Subject -> x [m], y [m].
+        remarks: What was found and done, one sentence each.
+    """
+
+    robots: tuple[RobotLog, ...]
+    barcode_of: Mapping[int, int]
+    landmarks: Mapping[int, tuple[float, float]]
+    remarks: tuple[str, ...]
+
+
+def read_dataset(folder: Path) -> Dataset:
+    """Read a folder, and put right barcodes that contradict the ground truth.
+
+    Raises:
+        MrclamError: It holds no such dataset, or a damaged file.
+    """
+    subjects = sorted(
+        int(match[1]) for path in folder.glob("Robot*") if (match := _ODOMETRY.fullmatch(path.name))
+    )
+    if not subjects:
+        raise MrclamError(
+            f"'{folder}' holds no Robot<number>_Odometry.dat; expected a folder of the MRCLAM dataset."
+        )
+    barcodes = _table(folder / "Barcodes.dat", 2)
+    landmarks = _table(folder / "Landmark_Groundtruth.dat", 3)
+    sparse = _sparse_truth(folder / "sparse_groundtruth.csv")
+    remarks: list[str] = []
+    robots = tuple(_read_robot(folder, subject, sparse, remarks) for subject in subjects)
+    dataset = Dataset(
+        robots,
+        {int(row[0]): int(row[1]) for row in barcodes},
+        {int(row[0]): (float(row[1]), float(row[2])) for row in landmarks},
+        tuple(remarks),
+    )
+    return correct_barcodes(dataset)
+
+
+def integrate(stamp_ns: IntArray, twist: FloatArray) -> Trajectory:
+    """Poses that the commands lead to, from the origin: exact arcs, each command until the next row's stamp.
+
+    Args:
+        stamp_ns: (N,).
+        twist: (N, 2) forward speed [m/s], turn rate [rad/s].
+    """
+    step_s = np.diff(stamp_ns) * 1e-9
+    turn = twist[:-1, 1] * step_s
+    heading = np.concatenate([[0.0], np.cumsum(turn)])
+    middle = heading[:-1] + 0.5 * turn
+    chord = twist[:-1, 0] * step_s * np.sinc(0.5 * turn / math.pi)
+    x = np.concatenate([[0.0], np.cumsum(chord * np.cos(middle))])
+    y = np.concatenate([[0.0], np.cumsum(chord * np.sin(middle))])
+    return Trajectory(stamp_ns, np.column_stack([x, y, se2.wrap_angle(heading)]))
+
+
+def correct_barcodes(dataset: Dataset) -> Dataset:
+    """Exchange barcodes of landmarks that were clearly noted wrongly.
+
+    Every sighting by a robot whose true pose is known says where the barcode hangs. A barcode that is far
+    from its own landmark and close to that of another wrong one was exchanged with it; each is remarked.
+    """
+    places = _seen_places(dataset)
+    subjects = [subject for subject in dataset.landmarks if subject in dataset.barcode_of]
+    misfit = {
+        subject: _misfit(places.get(dataset.barcode_of[subject]), dataset.landmarks[subject])
+        for subject in subjects
+    }
+    wrong = [subject for subject in subjects if misfit[subject] > _MISFIT]
+    cost = np.array(
+        [[_misfit(places.get(dataset.barcode_of[b]), dataset.landmarks[a]) for b in wrong] for a in wrong]
+    ).reshape(len(wrong), len(wrong))
+    barcode_of = dict(dataset.barcode_of)
+    for row, column in zip(*linear_sum_assignment(cost), strict=True):
+        subject, donor = wrong[row], wrong[column]
+        if cost[row, column] < _MISFIT and donor != subject:
+            barcode_of[subject] = dataset.barcode_of[donor]
+    remarks = [_barcode_remark(subject, dataset.barcode_of, barcode_of, misfit[subject]) for subject in wrong]
+    return replace(dataset, barcode_of=barcode_of, remarks=(*dataset.remarks, *remarks))
+
+
+def _barcode_remark(subject: int, noted: Mapping[int, int], used: Mapping[int, int], misfit: float) -> str:
+    """What is wrong with a landmark's barcode, and what was done."""
+    far = f"sightings of barcode {noted[subject]} lie {misfit:.2f} m from landmark {subject}"
+    if used[subject] == noted[subject]:
+        return f"{far}, and no exchange explains it; it was left as noted."
+    donor = next(other for other, barcode in noted.items() if barcode == used[subject])
+    return f"{far}; barcode {used[subject]}, noted for landmark {donor}, fits and is used instead."
+
+
+def _seen_places(dataset: Dataset) -> dict[int, FloatArray]:
+    """Barcode -> (K, 2) places in map where robots with a known pose saw it."""
+    found: list[FloatArray] = []
+    names: list[npt.NDArray[np.int64]] = []
+    for robot in dataset.robots:
+        if robot.truth is None:
+            continue
+        pose, known = interpolate(robot.truth, robot.sighting_ns, MAX_TRUTH_GAP_NS)
+        distance, bearing = robot.sighting[known].T
+        local = np.column_stack([distance * np.cos(bearing), distance * np.sin(bearing)])
+        found.append(se2.transform_points(pose[known], local))
+        names.append(robot.barcode[known])
+    if not found:
+        return {}
+    places, barcodes = np.concatenate(found), np.concatenate(names)
+    return {int(barcode): places[barcodes == barcode] for barcode in np.unique(barcodes)}
+
+
+def _misfit(places: FloatArray | None, landmark: tuple[float, float]) -> float:
+    """Median distance of sightings from a landmark; 0 (no objection) when there are too few to judge."""
+    if places is None or len(places) < _SIGHTINGS_TO_JUDGE:
+        return 0.0
+    return float(np.median(np.hypot(*(places - np.array(landmark)).T)))
+
+
+def _read_robot(folder: Path, subject: int, sparse: FloatArray, remarks: list[str]) -> RobotLog:
+    """One robot's files; what is missing becomes a remark."""
+    odometry = _in_order(_table(folder / f"Robot{subject}_Odometry.dat", 3))
+    if len(odometry) == 0:
+        raise MrclamError(f"'{folder / f'Robot{subject}_Odometry.dat'}' holds no rows.")
+    measured = folder / f"Robot{subject}_Measurement.dat"
+    sightings = _in_order(_table(measured, 4)) if measured.exists() else np.empty((0, 4))
+    if not measured.exists():
+        remarks.append(f"robot {subject} has no measurement file: it sees nothing.")
+    stamp_ns, twist = _nanoseconds(odometry[:, 0]), odometry[:, 1:3]
+    return RobotLog(
+        subject,
+        integrate(stamp_ns, twist),
+        twist,
+        _nanoseconds(sightings[:, 0]),
+        sightings[:, 2:4],
+        sightings[:, 1].astype(np.int64),
+        _truth(folder, subject, sparse, remarks),
+    )
+
+
+def _truth(folder: Path, subject: int, sparse: FloatArray, remarks: list[str]) -> Trajectory | None:
+    """Dense ground truth, else the sparse one, else none."""
+    path = folder / f"Robot{subject}_Groundtruth.dat"
+    table = _table(path, 4) if path.exists() else sparse[sparse[:, 0] == subject][:, 1:5]
+    if len(table) == 0:
+        remarks.append(f"robot {subject} has no ground truth: it starts unknown and is not evaluated.")
+        return None
+    if not path.exists():
+        remarks.append(f"robot {subject} has sparse ground truth only: {len(table)} poses.")
+    table = _in_order(table)
+    pose = table[:, 1:4].copy()
+    pose[:, 2] = se2.wrap_angle(pose[:, 2])
+    return Trajectory(_nanoseconds(table[:, 0]), pose)
+
+
+def _sparse_truth(path: Path) -> FloatArray:
+    """(N, 5) subject, time, x, y, theta; empty when there is no such file."""
+    return _table(path, 5, delimiter=",") if path.exists() else np.empty((0, 5))
+
+
+def _table(path: Path, columns: int, delimiter: str | None = None) -> FloatArray:
+    """The first columns of a text file of numbers."""
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "loadtxt: input contained no data")
+            table = np.loadtxt(path, comments="#", delimiter=delimiter, usecols=range(columns), ndmin=2)
+    except (OSError, ValueError) as error:
+        raise MrclamError(f"'{path}' cannot be read: {' '.join(str(error).split())}.") from error
+    if len(table) and not np.isfinite(table).all():
+        raise MrclamError(
+            f"'{path}' holds a number that is not finite in row {_first_bad(table)} of its data."
+        )
+    return table.reshape(-1, columns)
+
+
+def _first_bad(table: FloatArray) -> int:
+    """The first row, counted from 1, with a number that is not finite."""
+    return int(np.flatnonzero(~np.isfinite(table).all(axis=1))[0]) + 1
+
+
+def _in_order(table: FloatArray) -> FloatArray:
+    """Rows by time, equal ones as they stand."""
+    return table[np.argsort(table[:, 0], kind="stable")]
+
+
+def _nanoseconds(time_s: FloatArray) -> IntArray:
+    """Stamps; the files have milliseconds, a double of today's seconds is good to a quarter microsecond."""
+    return np.round(time_s * 1e6).astype(np.int64) * 1000

@@ -1,0 +1,94 @@
+"""Write a run as one MCAP file that any viewer shows: poses, /tf, markers, ground truth, map and goals."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import BoolArray
+from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.messages.encoders import encode_pose_stamped
+from swarm_loc_estimator.common.messages.estimates import EstimateMessage
+from swarm_loc_estimator.common.messages.markers import MarkersEncoder
+from swarm_loc_estimator.common.messages.outputs import SwarmPosesEncoder, TransformsEncoder
+from swarm_loc_estimator.common.messages.typestore import MARKERS, POSE_STAMPED, SWARM_POSES, TRANSFORMS
+from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.mapping.grid_messages import OCCUPANCY_GRID
+from swarm_loc_estimator.timeline.estimate import Status
+
+if TYPE_CHECKING:
+    from swarm_loc_estimator.offline.result import ReplayResult
+
+_MAP = "map"
+
+
+def write_mcap(result: ReplayResult, path: Path) -> None:
+    """Write the file; one that is there is replaced.
+
+    Transforms go from map straight to `<robot>/base_link`, since nobody else says where that is.
+
+    Args:
+        result: The run.
+        path: Where to, such as run.mcap.
+
+    Raises:
+        BagError: It cannot be written.
+    """
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".mcap_") as folder:
+        bag = Path(folder) / "run"
+        with BagWriter(bag, compress=True) as writer:
+            _add_estimates(result, writer)
+            _add_places("ground_truth", result.truth, writer)
+            _add_places("goal", result.goals, writer)
+            if result.maps:
+                writer.add_topic("map", OCCUPANCY_GRID, is_latched=True)
+            for one in result.maps:
+                writer.write("map", one.log_ns, one.data)
+        shutil.move(bag / "run.mcap", path)
+
+
+def _add_places(topic: str, places: Mapping[str, Trajectory], writer: BagWriter) -> None:
+    """A PoseStamped for each place of each robot."""
+    for name, track in places.items():
+        writer.add_topic(f"{name}/{topic}", POSE_STAMPED)
+        messages = encode_pose_stamped(_MAP, track.stamp_ns, track.pose)
+        for stamp_ns, message in zip(track.stamp_ns.tolist(), messages, strict=True):
+            writer.write(f"{name}/{topic}", stamp_ns, message)
+
+
+def _add_estimates(result: ReplayResult, writer: BagWriter) -> None:
+    """Poses, transforms and markers of each instant."""
+    for topic, kind in (("swarm/poses", SWARM_POSES), ("tf", TRANSFORMS), ("swarm/markers", MARKERS)):
+        writer.add_topic(topic, kind)
+    names = [robot.name for robot in result.swarm.robots]
+    poses, markers = SwarmPosesEncoder(names, _MAP), MarkersEncoder(result.swarm, _MAP)
+    transforms = TransformsEncoder(_MAP, [f"{name}/base_link" for name in names])
+    seen = dict(result.sightings)
+    newest = None
+    for one in estimates(result):
+        newest = seen.get(one.stamp_ns, newest)
+        columns = (one.pose, one.covariance, one.fix_age_s, one.status)
+        writer.write("swarm/poses", one.stamp_ns, poses.encode(one.stamp_ns, *columns))
+        located: BoolArray = ~np.isnan(one.pose[:, 0])
+        if located.any():
+            writer.write("tf", one.stamp_ns, transforms.encode(one.stamp_ns, located, one.pose))
+        writer.write("swarm/markers", one.stamp_ns, markers.encode(one, newest))
+
+
+def estimates(result: ReplayResult, stride: int = 1) -> Iterator[EstimateMessage]:
+    """The poses of a run as messages hold them, every so many; ages of fixes are not known."""
+    names = tuple(robot.name for robot in result.swarm.robots)
+    not_kept = np.full(len(names), np.nan)
+    for k in range(0, len(result.stamp_ns), stride):
+        pose = result.pose[k]
+        located = np.isfinite(pose).all(axis=1)
+        status = (
+            np.where(located, Status.TRACKED, Status.WAITING) if result.status is None else result.status[k]
+        )
+        stamp_ns, covariance = int(result.stamp_ns[k]), result.covariance[k]
+        yield EstimateMessage(stamp_ns, _MAP, names, pose, covariance, not_kept, status.astype(np.uint8))

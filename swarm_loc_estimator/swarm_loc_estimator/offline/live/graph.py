@@ -1,0 +1,182 @@
+"""Run a graph as child processes in a ROS domain of its own, and listen to it.
+
+The graph is one that a command and a launch file start, too. It gets a ROS domain that no other has, and
+stays on this machine: nothing of it mixes with robots that are about.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import rclpy
+from domain_coordinator import domain_id
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.signals import SignalHandlerOptions
+from typing_extensions import Self
+
+from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.launching.graph import NodeSpec
+from swarm_loc_estimator.common.launching.processes import Child, node_command, start, stop
+from swarm_loc_estimator.offline.live.recorder import Recorder
+
+START_PATIENCE_S = 600.0
+"""An estimator that must be compiled first takes three minutes, and more where others are at work, too."""
+_ALONE = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": ""}
+_WAKE_S = 0.05
+
+
+class LiveError(UserError):
+    """The live graph did not do what it should; the text is one sentence."""
+
+
+class LiveGraph:
+    """A graph that runs as child processes while this process listens; use it as a context manager.
+
+    Args:
+        nodes: The graph, the estimator first; the others start when its poses can be heard here.
+        log: File that the nodes' own output goes to.
+
+    Attributes:
+        recorder: What came out so far.
+
+    Raises:
+        LiveError: The estimator does not start.
+    """
+
+    recorder: Recorder
+
+    def __init__(self, nodes: Sequence[NodeSpec], log: Path) -> None:
+        self._nodes = {node.full_name: node for node in nodes}
+        self._log = log
+        self._children: dict[str, Child] = {}
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            self._log.parent.mkdir(parents=True, exist_ok=True)
+            self._output = stack.enter_context(self._log.open("wb"))
+            stack.enter_context(_own_domain())
+            context = rclpy.Context()
+            rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+            stack.callback(context.try_shutdown)
+            self.recorder = Recorder(context=context)
+            stack.callback(self.recorder.destroy_node)
+            self._executor = EventsExecutor(context=context)
+            stack.callback(self._executor.shutdown)
+            self._executor.add_node(self.recorder)
+            stack.callback(self._stop)
+            self._start_all()
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def process(self, name: str) -> subprocess.Popen[bytes]:
+        """The process of a node, by its full name."""
+        return self._children[name].process
+
+    def kill(self, name: str) -> None:
+        """Kill a node."""
+        self.process(name).kill()
+        self.process(name).wait()
+
+    def restart(self, name: str) -> None:
+        """Start a node anew; kill it first, if it still runs."""
+        self.kill(name)
+        self._start(self._nodes[name])
+
+    def wait_for(
+        self,
+        condition: Callable[[], bool],
+        what: str,
+        patience_s: float,
+        needed: Collection[str] | None = None,
+    ) -> None:
+        """Listen until a condition holds.
+
+        Args:
+            condition: Of what was recorded; looked at after each event and now and then.
+            what: The condition in words, to follow "did not".
+            patience_s: How long nothing may come before that is an error.
+            needed: Nodes that must go on meanwhile; None: all that have started.
+
+        Raises:
+            LiveError: A node has ended, or patience has.
+        """
+        heard, since_s = -1, time.monotonic()
+        while not condition():
+            for name in self._children if needed is None else needed:
+                if self.process(name).poll() is not None:
+                    raise LiveError(
+                        f"Node {name} has ended, status {self.process(name).returncode};{self._see}"
+                    )
+            if len(self.recorder.raw) != heard:
+                heard, since_s = len(self.recorder.raw), time.monotonic()
+            if time.monotonic() > since_s + patience_s:
+                raise LiveError(f"The graph did not {what} within {patience_s:.0f} s;{self._see}")
+            self._executor.spin_once(timeout_sec=_WAKE_S)
+
+    def _start_all(self) -> None:
+        """Start the estimator, and the others when this process hears it: no pose is missed."""
+        estimator, *others = self._nodes.values()
+        self._start(estimator)
+        self.wait_for(
+            lambda: self.recorder.count_publishers("swarm/poses") > 0,
+            "announce its poses",
+            START_PATIENCE_S,
+        )
+        for node in others:
+            self._start(node)
+
+    @property
+    def _see(self) -> str:
+        """Where to look, with what stands there last."""
+        said = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        return f" its nodes' output is in {self._log}" + (f", at last: {said[-1]}" if said else ".")
+
+    def _start(self, node: NodeSpec) -> None:
+        self._children[node.full_name] = Child(node, start(node_command(node), self._output))
+
+    def _stop(self) -> None:
+        stop(list(self._children.values()), self._note)
+
+    def _note(self, line: str) -> None:
+        self._output.write(f"{line}\n".encode())
+
+
+def cpu_seconds(pid: int) -> float:
+    """CPU time that a process has used [s]."""
+    fields = Path("/proc", str(pid), "stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    user_and_system = int(fields[11]) + int(fields[12])
+    return user_and_system / os.sysconf("SC_CLK_TCK")
+
+
+def resident_mb(pid: int) -> float:
+    """Memory of a process [MB]."""
+    lines = Path("/proc", str(pid), "status").read_text(encoding="ascii").splitlines()
+    (kilobytes,) = [line.split()[1] for line in lines if line.startswith("VmRSS:")]
+    return int(kilobytes) / 1e3
+
+
+@contextmanager
+def _own_domain() -> Iterator[None]:
+    """Give this process and its children a ROS domain of their own on this machine."""
+    reservation = domain_id()
+    alone = {**_ALONE, "ROS_DOMAIN_ID": str(reservation.__enter__())}
+    before = {name: os.environ.get(name) for name in alone}
+    os.environ.update(alone)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+        reservation.__exit__(None, None, None)  # an error handed in would be taken for a domain in use

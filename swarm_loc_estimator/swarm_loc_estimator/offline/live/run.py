@@ -1,0 +1,234 @@
+"""Play a bag into the live graph over DDS, and record the poses that it publishes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.launching.graph import GraphOptions, NodeSpec, ParameterValue, graph_nodes
+from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
+from swarm_loc_estimator.offline.live.graph import (
+    START_PATIENCE_S,
+    LiveError,
+    LiveGraph,
+    cpu_seconds,
+    resident_mb,
+)
+from swarm_loc_estimator.offline.live.recorder import Recorder, read_history, read_poses
+from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.offline.truth import TruthReader
+from swarm_loc_estimator.sensors.topics import input_topics
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+
+ESTIMATOR, PLAYER = "estimator", "player"
+_SILENCE_PATIENCE_S = 30.0
+_END_PATIENCE_S = 10.0
+
+
+@dataclass(frozen=True)
+class LiveRun:
+    """What came out of a live graph.
+
+    Attributes:
+        result: Poses as received, ground truth of the bag, what the estimator dropped.
+        arrival_ns: Topic for the estimator -> (M,) increasing, when its messages had arrived in the bag; the
+            player has published all of them.
+        taken: Stamp of poses -> topic -> messages that the estimator had taken in for them; of some poses.
+        rate: Speed at which the bag was played.
+        status: (T, N) of `SwarmPose.status`.
+        received: Those that the estimator took in.
+        estimator_core: CPU time of the estimator's process per second while the bag played.
+        age_s: (A,) time of reception minus stamp of poses, in the bag's time, of those that came when it was
+            known here.
+        start_up_s: From the start of the estimator's process to its first poses, which come when all topics
+            of the bag have been found and the player has begun.
+        memory_mb: Of the estimator's process at the end.
+    """
+
+    result: ReplayResult
+    arrival_ns: Mapping[str, NDArray[np.int64]]
+    taken: Mapping[int, Mapping[str, int]]
+    rate: float
+    status: NDArray[np.uint8]
+    received: int
+    estimator_core: float
+    age_s: FloatArray
+    start_up_s: float
+    memory_mb: float
+
+    @property
+    def sent(self) -> int:
+        """Messages for the estimator that were published."""
+        return sum(map(len, self.arrival_ns.values()))
+
+    @property
+    def lost(self) -> int:
+        """Messages that went missing on the way."""
+        return self.sent - self.received
+
+
+@dataclass(frozen=True)
+class BagContent:
+    """What is known of a bag before it is played.
+
+    Attributes:
+        begin_ns: First log time.
+        end_ns: Last one.
+        arrival_ns: Topic for the estimator -> (M,) increasing, log times of its messages.
+        truth: Robot name -> ground truth.
+        remarks: What could not be read, one sentence each.
+    """
+
+    begin_ns: int
+    end_ns: int
+    arrival_ns: Mapping[str, NDArray[np.int64]]
+    truth: Mapping[str, Trajectory]
+    remarks: tuple[str, ...]
+
+
+Watch = Callable[[Recorder, BagContent], None]
+
+
+def read_bag(bag: Path, swarm: Swarm) -> BagContent:
+    """Read what evaluation needs of a bag.
+
+    Raises:
+        BagError: Nothing in the bag can be read.
+    """
+    truth, inputs = TruthReader(swarm), [topic.name for topic in input_topics(swarm)]
+    with BagReader(bag) as reader:
+        begin_ns, end_ns = reader.time_range_ns
+        recorded = [topic.name for topic in reader.topics if topic.name in set(inputs)]
+        arrivals = [[np.zeros(0, dtype=np.int64)] for _ in recorded]
+        for batch in reader.batches([*truth.topics, *recorded]):
+            truth.add(batch.chosen(batch.topic < len(truth.topics)))
+            for number, parts in enumerate(arrivals, len(truth.topics)):
+                parts.append(batch.log_ns[batch.topic == number])
+        tracks = truth.tracks()
+        remarks = (*reader.losses, *truth.remarks())
+    arrival_ns = {topic: np.concatenate(parts) for topic, parts in zip(recorded, arrivals, strict=True)}
+    return BagContent(begin_ns, end_ns, arrival_ns, tracks, remarks)
+
+
+def play_live(
+    options: GraphOptions,
+    *,
+    log: Path,
+    inputs_only: bool = False,
+    watch: Watch = lambda _recorder, _content: None,
+) -> LiveRun:
+    """Play a whole bag into a live graph and collect the poses that come out.
+
+    Args:
+        options: The graph, with the bag.
+        log: File for the nodes' output.
+        inputs_only: Whether nothing but the estimator's inputs is played.
+        watch: Called about once per event while the bag plays, to show progress.
+
+    Raises:
+        ValueError: The options have no bag.
+        LiveError: The graph did not play to the end.
+        GraphError: An executable is missing.
+        BagError: Nothing in the bag can be read.
+        SwarmFileError: The description cannot be used.
+    """
+    if options.bag is None:
+        raise ValueError("there is no bag to play")
+    bag, swarm = Path(options.bag), load_swarm(Path(options.swarm_file))
+    content = read_bag(bag, swarm)
+    nodes = [
+        _player_of(node, [*content.arrival_ns], inputs_only=inputs_only) if node.name == PLAYER else node
+        for node in graph_nodes(options)
+    ]
+    begin_s = time.monotonic()
+    with LiveGraph(nodes, log) as graph:
+        recorder, estimator, player = graph.recorder, graph.process(ESTIMATOR), graph.process(PLAYER)
+
+        def has_ended() -> bool:
+            watch(recorder, content)
+            return player.poll() is not None
+
+        graph.wait_for(lambda: bool(recorder.raw), "publish poses", START_PATIENCE_S)
+        cpu_s, wall_s = cpu_seconds(estimator.pid), time.monotonic()
+        start_up_s = wall_s - begin_s
+        graph.wait_for(has_ended, "go on publishing poses", _SILENCE_PATIENCE_S, needed=[ESTIMATOR])
+        played_s = time.monotonic() - wall_s
+        core = (cpu_seconds(estimator.pid) - cpu_s) / played_s
+        if player.returncode:
+            raise LiveError(f"The player ended with status {player.returncode}; see {log}.")
+        _wait_for_the_rest(graph, content)
+        memory_mb = resident_mb(estimator.pid)
+    history = read_history(recorder.raw)
+    result = ReplayResult(
+        f"{bag.name}, live at {options.rate:g} x",
+        swarm,
+        *history[:3],
+        status=history.status,
+        truth=content.truth,
+        counters=dict(recorder.drops),
+        remarks=content.remarks,
+        data_s=(content.end_ns - content.begin_ns) * 1e-9,
+        wall_s=played_s,
+    )
+    age_s = _ages(np.array(recorder.received_ns, dtype=np.int64), result.stamp_ns)
+    return LiveRun(
+        result,
+        content.arrival_ns,
+        recorder.taken,
+        options.rate,
+        history.status,
+        recorder.inputs,
+        core,
+        age_s,
+        start_up_s,
+        memory_mb,
+    )
+
+
+def _player_of(player: NodeSpec, inputs: Sequence[str], *, inputs_only: bool) -> NodeSpec:
+    """A player that begins once all inputs are heard, however slowly they are discovered."""
+    chosen: dict[str, ParameterValue] = {"wait_for_subscribers": max(1, len(inputs))}
+    if inputs_only:
+        chosen["topics"] = [*inputs]
+    return replace(player, parameters={**player.parameters, **chosen})
+
+
+def _ages(received_ns: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> FloatArray:
+    """Ages of poses at reception [s], where that time is known; before the first /clock it is zero."""
+    known = received_ns > 0
+    return (received_ns - stamp_ns)[known].astype(np.float64) * 1e-9
+
+
+def _wait_for_the_rest(graph: LiveGraph, content: BagContent) -> None:
+    """Wait for poses of the bag's end, and for what the estimator then says of its inputs."""
+    sent = sum(map(len, content.arrival_ns.values()))
+    recorder, last_ns = graph.recorder, content.end_ns - round(EstimatorParameters().tick_period_s * 1e9)
+    graph.wait_for(
+        lambda: read_poses(recorder.raw[-1]).stamp_ns > last_ns,
+        "publish poses of the bag's end",
+        _END_PATIENCE_S,
+        needed=[ESTIMATOR],
+    )
+    told: dict[int, int] = {}  # how many inputs by the n-th diagnostics
+
+    def has_all() -> bool:
+        """Whether everything has been taken in, or no more is."""
+        told[recorder.diagnostics] = recorder.inputs
+        before = told.get(recorder.diagnostics - 1)
+        return recorder.inputs in (sent, before)
+
+    graph.wait_for(
+        has_all,
+        "publish diagnostics",
+        _END_PATIENCE_S,
+        needed=[ESTIMATOR],
+    )

@@ -1,0 +1,183 @@
+"""Error metrics against ground truth: RMSE of position and heading, NEES for consistency."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+
+class MetricsError(ValueError):
+    """Arrays that do not belong together; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Estimate minus truth of one robot, where both are known.
+
+    Attributes:
+        stamp_ns: (N,).
+        error: (N, 3) x [m], y [m], heading [rad, wrapped] in map.
+        sigma: (N, 3) one standard deviation of x, y, theta as estimated; NaN where unknown.
+        nees: (N,) squared error normalised by the covariance, ideally 3 on average; infinite where the
+            covariance is not positive definite, NaN where there is none.
+    """
+
+    stamp_ns: IntArray
+    error: FloatArray
+    sigma: FloatArray
+    nees: FloatArray
+
+    @property
+    def position(self) -> FloatArray:
+        """(N,) distance between estimate and truth [m]."""
+        return np.asarray(np.hypot(self.error[:, 0], self.error[:, 1]))
+
+
+@dataclass(frozen=True)
+class ErrorSummary:
+    """A row of an error table; NaN throughout when there was nothing to compare.
+
+    Attributes:
+        count: Number of compared poses.
+        position_rmse: [m]; likewise mean, median, p95 (95 %) and max.
+        heading_rmse: [rad]; likewise of the absolute heading error.
+        nees: Mean normalised squared error, ideally 3.
+    """
+
+    count: int
+    position_rmse: float
+    position_mean: float
+    position_median: float
+    position_p95: float
+    position_max: float
+    heading_rmse: float
+    heading_mean: float
+    heading_median: float
+    heading_p95: float
+    heading_max: float
+    nees: float
+
+
+def compare(
+    estimate: Trajectory, covariance: FloatArray | None, truth: Trajectory, max_gap_ns: int = DEFAULT_GAP_NS
+) -> Errors:
+    """Errors at every time where estimate and truth are known.
+
+    Dense truth is interpolated at the estimate's stamps. A truth that stands alone, further than the gap from
+    its neighbours, would never meet an estimate's stamp; there the estimate is interpolated instead.
+
+    Args:
+        estimate: Poses from the estimator; rows that are not finite are not compared.
+        covariance: (N, 3, 3) of x, y, theta in map, one per estimate; None when unknown.
+        truth: Ground truth.
+        max_gap_ns: Longest distance between neighbours to interpolate across.
+
+    Raises:
+        MetricsError: The covariances do not fit the estimate.
+    """
+    if covariance is not None and covariance.shape != (len(estimate.stamp_ns), 3, 3):
+        raise MetricsError(
+            f"covariances of shape {covariance.shape} do not fit {len(estimate.stamp_ns)} poses."
+        )
+    truth_there, known = interpolate(truth, estimate.stamp_ns, max_gap_ns)
+    known &= np.isfinite(estimate.pose).all(axis=1)
+    index = np.flatnonzero(known)
+    stamp_ns, found, wanted = estimate.stamp_ns[index], estimate.pose[index], truth_there[index]
+    alone = truth.stamp_ns[_alone(truth.stamp_ns, max_gap_ns)]
+    alone = alone[~np.isin(alone, stamp_ns)]
+    at_alone, reached = interpolate(estimate, alone, max_gap_ns)
+    reached &= np.isfinite(at_alone).all(axis=1)
+    nearest = _nearest(estimate.stamp_ns, alone[reached])
+    lone_truth, _ = interpolate(truth, alone[reached], max_gap_ns)
+    stamp_ns = np.concatenate([stamp_ns, alone[reached]])
+    order = np.argsort(stamp_ns, kind="stable")
+    error = np.concatenate([found - wanted, at_alone[reached] - lone_truth])[order]
+    error[:, 2] = se2.wrap_angle(error[:, 2])
+    used = np.concatenate([index, nearest])[order]
+    matrices = np.full((len(used), 3, 3), np.nan) if covariance is None else covariance[used]
+    sigma = np.sqrt(np.diagonal(matrices, axis1=1, axis2=2).clip(min=0.0))
+    return Errors(stamp_ns[order], error, sigma, nees(error, matrices))
+
+
+def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Normalised squared errors.
+
+    Args:
+        error: (N, 3).
+        covariance: (N, 3, 3).
+
+    Returns:
+        (N,) infinite where the covariance is not positive definite, NaN where it is unknown.
+    """
+    result = np.full(len(error), np.nan)
+    known = np.isfinite(covariance).all(axis=(1, 2))
+    values = np.full(len(error), -1.0)
+    values[known] = np.linalg.eigvalsh(covariance[known])[:, 0]
+    result[known] = np.inf
+    good = values > 0.0
+    solved = np.linalg.solve(covariance[good], error[good][:, :, None])[:, :, 0]
+    result[good] = np.einsum("ni,ni->n", error[good], solved)
+    return result
+
+
+def summarise(errors: Errors) -> ErrorSummary:
+    """One row of an error table."""
+    position, heading = errors.position, np.abs(errors.error[:, 2])
+    if len(position) == 0:
+        return ErrorSummary(0, *[float("nan")] * 11)
+    known = errors.nees[~np.isnan(errors.nees)]
+    return ErrorSummary(
+        len(position),
+        *_figures(position),
+        *_figures(heading),
+        nees=float(known.mean()) if known.size else float("nan"),
+    )
+
+
+def pool(errors: Sequence[Errors]) -> Errors:
+    """The errors of several robots as one, in the order given."""
+    if not errors:
+        return Errors(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+    return Errors(
+        np.concatenate([one.stamp_ns for one in errors]),
+        np.concatenate([one.error for one in errors]),
+        np.concatenate([one.sigma for one in errors]),
+        np.concatenate([one.nees for one in errors]),
+    )
+
+
+def _figures(values: FloatArray) -> tuple[float, float, float, float, float]:
+    """Root mean square, mean, median, 95 % and maximum of errors without sign."""
+    rmse = float(np.sqrt(np.mean(values * values)))
+    median, p95 = (float(figure) for figure in np.percentile(values, [50, 95]))
+    return rmse, float(values.mean()), median, p95, float(values.max())
+
+
+def _alone(stamp_ns: IntArray, max_gap_ns: int) -> npt.NDArray[np.bool_]:
+    """(N,) whether a stamp is further than the gap from both neighbours."""
+    far = np.diff(stamp_ns) > max_gap_ns
+    ends = np.ones(1, np.bool_)
+    lonely: npt.NDArray[np.bool_] = np.concatenate([ends, far]) & np.concatenate([far, ends])
+    return lonely[: len(stamp_ns)]
+
+
+def _nearest(stamp_ns: IntArray, query_ns: IntArray) -> npt.NDArray[np.intp]:
+    """(M,) index of the closest stamp."""
+    if len(query_ns) == 0:
+        return np.empty(0, np.intp)
+    after = np.searchsorted(stamp_ns, query_ns).clip(1, max(len(stamp_ns) - 1, 1))
+    after = np.minimum(after, len(stamp_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    closer = np.abs(stamp_ns[before] - query_ns) <= np.abs(stamp_ns[after] - query_ns)
+    nearest: npt.NDArray[np.intp] = np.where(closer, before, after)
+    return nearest

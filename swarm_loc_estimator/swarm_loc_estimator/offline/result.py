@@ -1,0 +1,92 @@
+"""Result of a run of the estimator: poses, covariances, ground truth, counters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.offline.metrics import Errors, compare
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from swarm_loc_estimator.offline.surroundings import AerialImage, RecordedMap
+    from swarm_loc_estimator.swarm.swarm import Swarm
+    from swarm_loc_estimator.timeline.sightings import Sightings
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """Estimated poses of all robots over time, and what there is to compare them with.
+
+    Attributes:
+        title: What was replayed, such as the bag's name.
+        swarm: Whom it is about.
+        stamp_ns: (T,) when the poses hold.
+        pose: (T, N, 3) x [m], y [m], theta [rad] in map; NaN while a robot waits for a fix.
+        covariance: (T, N, 3, 3) of x, y, theta.
+        truth: Robot name -> ground truth; robots without are missing.
+        counters: Counted things by name, such as drops by reason.
+        remarks: What else must be said, one sentence each, such as what could not be read of the bag.
+        data_s: Duration of the data [s].
+        wall_s: Duration of the replay [s].
+        status: (T, N) of `Status`; None: not known.
+        sightings: What the robots saw every half second, with its instant [ns]; empty: not kept.
+        images: Aerial images with who is who in them; empty: none, or not kept.
+        maps: What the mapper told, as it was recorded.
+        goals: Robot name -> where the mapper sent it; robots without are missing.
+        self_calibrated: The swarm with what the filter has estimated beside the poses; None: nothing.
+    """
+
+    title: str
+    swarm: Swarm
+    stamp_ns: npt.NDArray[np.int64]
+    pose: npt.NDArray[np.float64]
+    covariance: npt.NDArray[np.float64]
+    truth: Mapping[str, Trajectory] = field(default_factory=dict)
+    counters: Mapping[str, int] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    data_s: float = 0.0
+    wall_s: float = 0.0
+    self_calibrated: Swarm | None = None
+    status: npt.NDArray[np.uint8] | None = None
+    sightings: tuple[tuple[int, Sightings], ...] = ()
+    images: tuple[AerialImage, ...] = ()
+    maps: tuple[RecordedMap, ...] = ()
+    goals: Mapping[str, Trajectory] = field(default_factory=dict)
+
+    @property
+    def speed_factor(self) -> float:
+        """How much faster than the data's own time the replay ran."""
+        return self.data_s / self.wall_s if self.wall_s > 0.0 else float("nan")
+
+    def chosen(self, rows: npt.NDArray[np.bool_]) -> ReplayResult:
+        """The same with the poses at some of the stamps (T,) only."""
+        return replace(
+            self,
+            stamp_ns=self.stamp_ns[rows],
+            pose=self.pose[rows],
+            covariance=self.covariance[rows],
+            status=None if self.status is None else self.status[rows],
+        )
+
+    def track(self, index: int) -> Trajectory:
+        """The estimated poses of a robot where it has one."""
+        known = np.isfinite(self.pose[:, index]).all(axis=1)
+        return Trajectory(self.stamp_ns[known], self.pose[known, index])
+
+    @cached_property
+    def errors(self) -> Mapping[str, Errors]:
+        """Robot name -> errors, for robots with ground truth."""
+        found = {}
+        for index, robot in enumerate(self.swarm.robots):
+            if robot.name in self.truth:
+                known = np.isfinite(self.pose[:, index]).all(axis=1)
+                covariance = self.covariance[known, index]
+                found[robot.name] = compare(self.track(index), covariance, self.truth[robot.name])
+        return found

@@ -1,1 +1,0 @@
-"""Numbers with units and ranges, and tables of them: what users may set."""

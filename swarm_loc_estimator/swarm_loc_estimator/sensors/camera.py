@@ -1,0 +1,315 @@
+"""Camera detections to measurements: association by marker id, pose in the plane, covariance.
+
+A detection is a marker's pose in the camera's optical frame (x right, y down, z forward). It becomes a
+measurement in the sensor frame of the plane: at the camera's place on the robot, turned by its yaw, with
+the mount's pitch and roll taken out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.small_matrix import assign
+from swarm_loc_estimator.filter.gating import gate_threshold
+from swarm_loc_estimator.filter.measurement_model import (
+    MEASUREMENT_DTYPE,
+    NOBODY,
+    POLAR,
+    MeasurementArray,
+    MeasurementColumns,
+)
+from swarm_loc_estimator.swarm.swarm import CameraMount, Face, SensorModel, Swarm
+
+CONTENT_POSITION = 1
+"""Detection content: position only (MarkerDetection.CONTENT_POSITION)."""
+CONTENT_POSE = 2
+"""Detection content: position and orientation."""
+CONTENT_POSE_TWO = 3
+"""Detection content: likewise, with a mirrored second solution."""
+
+_FATES = ("measured", "unknown_id", "own_marker", "no_camera", "bad_content", "non_finite", "absurd")
+_MEASURED, _UNKNOWN_ID, _OWN_MARKER, _NO_CAMERA, _BAD_CONTENT, _NON_FINITE, _ABSURD = range(len(_FATES))
+_MAX_DISTANCE_M = 1e3
+_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_SENSOR_DTYPE = np.dtype([(f.name, np.float64) for f in fields(SensorModel)])
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """What became of detections.
+
+    Attributes:
+        measurements: (m,) of MEASUREMENT_DTYPE.
+        measured: (d,) which detections they come from.
+        dropped: Reason -> count, for `unknown_id`, `own_marker`, `no_camera`, `bad_content`, `non_finite` and
+            `absurd`.
+    """
+
+    measurements: MeasurementArray
+    measured: NDArray[np.bool_]
+    dropped: dict[str, int]
+
+
+class _Cameras(NamedTuple):
+    """All cameras, per robot: whether it has one, S (N, 3), axes optical to level (N, 3, 3), errors, gate."""
+
+    present: NDArray[np.bool_]
+    mount: FloatArray
+    level: FloatArray
+    sensor: NDArray[np.void]
+    gate: FloatArray
+
+
+class _Markers(NamedTuple):
+    """All markers by ascending id (k,): whose, which landmark, M (k, 3), heading NaN if it has none.
+
+    `variance` (k,) is that of a face's place on its robot; a landmark's is up to the filter.
+    """
+
+    id: IntArray
+    owner: IntArray
+    landmark: IntArray
+    pose: FloatArray
+    variance: FloatArray
+
+
+class _Detections(NamedTuple):
+    """The fields of detections (d,) that count."""
+
+    id: NDArray[np.uint32]
+    content: NDArray[np.uint8]
+    position: FloatArray
+    orientation: FloatArray
+    covariance: FloatArray
+    alternative_position: FloatArray
+    alternative_orientation: FloatArray
+
+
+class SightingConverter:
+    """Converts the detections of all cameras of a swarm at once.
+
+    Args:
+        swarm: Cameras, their calibration, and whose the markers are.
+    """
+
+    def __init__(self, swarm: Swarm) -> None:
+        mounts = [robot.camera or CameraMount() for robot in swarm.robots]
+        tilts = [Rotation.from_euler("YX", [m.pitch, m.roll]).as_matrix() @ _FROM_OPTICAL for m in mounts]
+        sensors = [
+            tuple(getattr(robot.sensor, name) for name in _SENSOR_DTYPE.names or ()) for robot in swarm.robots
+        ]
+        self._cameras = _Cameras(
+            present=np.array([robot.camera is not None for robot in swarm.robots], dtype=bool),
+            mount=np.array([[m.x, m.y, m.yaw] for m in mounts]).reshape(-1, 3),
+            level=np.array(tilts).reshape(-1, 3, 3),
+            sensor=np.array(sensors, dtype=_SENSOR_DTYPE),
+            gate=gate_threshold([robot.sensor.gate_probability for robot in swarm.robots]),
+        )
+        owners = sorted(swarm.owner_of.items())
+        markers = [owner.marker for _, owner in owners]
+        number = {mark.id: k + 1 for k, mark in enumerate(swarm.landmarks)}
+        self._markers = _Markers(
+            id=np.array([marker_id for marker_id, _ in owners], dtype=np.int64),
+            owner=np.array([owner.robot_index for _, owner in owners], dtype=np.int64),
+            landmark=np.array([number.get(marker_id, 0) for marker_id, _ in owners], dtype=np.int64),
+            pose=np.array([[m.x, m.y, np.nan if m.yaw is None else m.yaw] for m in markers]).reshape(-1, 3),
+            variance=np.array([m.position_sigma**2 if isinstance(m, Face) else 0.0 for m in markers]),
+        )
+
+    def convert(self, robots: IntArray, stamps_ns: IntArray, detections: NDArray[np.void]) -> Conversion:
+        """Turn detections into measurements.
+
+        Args:
+            robots: (d,) index of the robot whose camera saw each.
+            stamps_ns: (d,) exposure times.
+            detections: (d,) with fields id, content, position (3,), orientation (4,) xyzw, covariance (6, 6),
+                alternative_position, alternative_orientation, as published in the optical frame.
+        """
+        measurements = np.zeros(robots.size, dtype=MEASUREMENT_DTYPE)
+        measurements["stamp_ns"] = stamps_ns
+        measurements["received_from"] = measurements["observer"] = robots
+        fates = np.zeros(robots.size, dtype=np.int64)
+        _convert_all(
+            _Detections(*(detections[name] for name in _Detections._fields)),
+            self._cameras,
+            self._markers,
+            MeasurementColumns.views(measurements),
+            measurements["marker_id"],
+            fates,
+        )
+        counts = np.bincount(fates, minlength=len(_FATES)).tolist()
+        dropped = {_FATES[fate]: counts[fate] for fate in range(1, len(_FATES)) if counts[fate]}
+        measured: NDArray[np.bool_] = fates == _MEASURED
+        measurements = measurements[measured]
+        self._note_stamp_variance(measurements)
+        return Conversion(measurements, measured, dropped)
+
+    def _note_stamp_variance(self, measurements: MeasurementArray) -> None:
+        """Say how unsure the stamps are.
+
+        All that a picture shows shares the error of its stamp. Told of each alone, times their number, it is
+        not taken for smaller than it is by who takes them for independent.
+        """
+        variance = np.square(self._cameras.sensor["time_sigma_s"])[measurements["observer"]]
+        if variance.any():
+            pictures = np.stack([measurements["observer"], measurements["stamp_ns"]])
+            _, picture, count = np.unique(pictures, axis=1, return_inverse=True, return_counts=True)
+            measurements["stamp_variance"] = variance * count[picture]
+
+
+@compiled
+def _convert_all(
+    detections: _Detections,
+    cameras: _Cameras,
+    markers: _Markers,
+    out: MeasurementColumns,
+    marker_id: IntArray,
+    fates: IntArray,
+) -> None:
+    """Fill the measurements (d,), whose stamps and observers are there, and say what became of each."""
+    position, other_position = np.empty(3), np.empty(3)
+    for k in range(fates.size):
+        robot = out.observer[k]
+        place = min(np.searchsorted(markers.id, detections.id[k]), markers.id.size - 1)
+        fates[k] = _fate(detections, k, cameras, markers, robot, place)
+        if fates[k] != _MEASURED:
+            continue
+        sensor, level, marker = cameras.sensor[robot], cameras.level[robot], markers.pose[place]
+        marker_id[k] = markers.id[place]
+        out.stamp_ns[k] += round(sensor.time_offset_s * 1e9)
+        out.target[k], out.landmark[k] = markers.owner[place], markers.landmark[place]
+        assign(out.sensor[k], cameras.mount[robot])
+        out.gate[k] = cameras.gate[robot]
+        out.marker[k, 0], out.marker[k, 1] = marker[0], marker[1]
+        _levelled(level, detections.position[k], position)
+        _scale(position, 1.0 / sensor.distance_scale)
+        if detections.content[k] == CONTENT_POSITION or math.isnan(marker[2]):
+            out.kind[k] = POLAR
+            _calibrate(sensor, position, out.target[k], out.value[k], out.covariance[k])
+            out.covariance[k, 0, 0] += markers.variance[place]
+            out.covariance[k, 1, 1] += markers.variance[place] / max(out.value[k, 0] ** 2, 1e-6)
+            continue
+        out.has_heading[k], out.marker[k, 2] = 1, marker[2]
+        out.value[k, 0], out.value[k, 1] = position[0], position[1]
+        out.value[k, 2] = _face_heading(level, detections.orientation[k])
+        if detections.content[k] == CONTENT_POSE_TWO:
+            out.has_alternative[k] = 1
+            _levelled(level, detections.alternative_position[k], other_position)
+            _scale(other_position, 1.0 / sensor.distance_scale)
+            out.alternative[k, 0], out.alternative[k, 1] = other_position[0], other_position[1]
+            out.alternative[k, 2] = _face_heading(level, detections.alternative_orientation[k])
+        _pose_noise(sensor, level, detections.covariance[k], out.covariance[k])
+        out.covariance[k, 0, 0] += markers.variance[place]
+        out.covariance[k, 1, 1] += markers.variance[place]
+
+
+@inlined
+def _fate(
+    detections: _Detections, k: int, cameras: _Cameras, markers: _Markers, robot: int, place: int
+) -> int:
+    """Whether detection k, of the marker that may be at `place`, becomes a measurement, or why not."""
+    if place < 0 or markers.id[place] != detections.id[k]:
+        return _UNKNOWN_ID
+    if markers.owner[place] == robot:
+        return _OWN_MARKER
+    if not cameras.present[robot]:
+        return _NO_CAMERA
+    if not CONTENT_POSITION <= detections.content[k] <= CONTENT_POSE_TWO:
+        return _BAD_CONTENT
+    position, valid = detections.position[k], True
+    for i in range(3):
+        valid = valid and math.isfinite(position[i])
+    if detections.content[k] != CONTENT_POSITION:
+        valid = valid and _is_rotation(detections.orientation[k])
+        for i in range(6):
+            for j in range(6):
+                valid = valid and math.isfinite(detections.covariance[k, i, j])
+    if detections.content[k] == CONTENT_POSE_TWO:
+        valid = valid and _is_rotation(detections.alternative_orientation[k])
+        for i in range(3):
+            valid = valid and math.isfinite(detections.alternative_position[k, i])
+    if not valid:
+        return _NON_FINITE
+    if max(abs(position[0]), abs(position[1]), abs(position[2])) > _MAX_DISTANCE_M:
+        return _ABSURD
+    return _MEASURED
+
+
+@compiled
+def _is_rotation(quaternion: FloatArray) -> bool:
+    """Whether a quaternion (4,) is finite and not zero."""
+    norm = 0.0
+    for i in range(4):
+        norm += quaternion[i] * quaternion[i]
+    return math.isfinite(norm) and norm > 1e-12
+
+
+@compiled
+def _levelled(level: FloatArray, optical: FloatArray, out: FloatArray) -> None:
+    """Write a vector (3,) of the optical frame in the level axes forward, left, up of the camera."""
+    for i in range(3):
+        out[i] = level[i, 0] * optical[0] + level[i, 1] * optical[1] + level[i, 2] * optical[2]
+
+
+@compiled
+def _scale(vector: FloatArray, factor: float) -> None:
+    """Multiply a vector (3,), in place."""
+    for i in range(3):
+        vector[i] *= factor
+
+
+@compiled
+def _face_heading(level: FloatArray, quaternion: FloatArray) -> float:
+    """Heading in the sensor plane of the z axis of an orientation xyzw (4,), the direction out of a face."""
+    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    out_of_face, axes = np.empty(3), np.empty(3)
+    out_of_face[0], out_of_face[1] = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x)
+    out_of_face[2] = w * w - x * x - y * y + z * z
+    _levelled(level, out_of_face, axes)
+    return math.atan2(axes[1], axes[0])
+
+
+@compiled
+def _calibrate(
+    sensor: SensorModel, position: FloatArray, target: int, value: FloatArray, noise: FloatArray
+) -> None:
+    """Write calibrated range and bearing (3,) and their covariance (3, 3); see `SensorModel`."""
+    logged = math.atan2(position[1], position[0])
+    curve = sensor.range_log_scale + sensor.range_skew * logged + sensor.range_curve * logged * logged
+    distance = math.hypot(position[0], position[1]) * math.exp(curve) + sensor.range_offset
+    if target != NOBODY:
+        distance += sensor.robot_range_offset
+    value[0] = distance
+    value[1] = (sensor.bearing_scale + sensor.bearing_curve * logged) * logged + sensor.bearing_offset
+    noise[0, 0] = (sensor.range_sigma + sensor.range_sigma_per_m * abs(distance)) ** 2
+    noise[1, 1] = sensor.bearing_sigma**2
+    noise[2, 2] = 1.0
+
+
+@compiled
+def _pose_noise(sensor: SensorModel, level: FloatArray, published: FloatArray, noise: FloatArray) -> None:
+    """Write the covariance (3, 3) of forward, left, heading; the sensor model is for unknown ones (-1)."""
+    if published[0, 0] < 0.0:
+        noise[0, 0], noise[1, 1] = sensor.forward_sigma**2, sensor.left_sigma**2
+        noise[2, 2] = sensor.heading_sigma**2
+        return
+    to_plane = np.zeros((3, 6))
+    for i in range(3):
+        to_plane[0, i], to_plane[1, i] = level[0, i], level[1, i]
+        to_plane[2, 3 + i] = level[2, i]  # the rotation about the vertical
+    for i in range(3):
+        for j in range(3):
+            for a in range(6):
+                for b in range(6):
+                    noise[i, j] += to_plane[i, a] * published[a, b] * to_plane[j, b]
+    noise[0, 0] += sensor.residual_position_sigma**2
+    noise[1, 1] += sensor.residual_position_sigma**2
+    noise[2, 2] += sensor.residual_heading_sigma**2

@@ -1,0 +1,195 @@
+"""Decode the raw messages of all inputs to columns, the same for a live node and for replay.
+
+What the inputs of a swarm are stands in `topics.py`, how each kind is read in `channels.py`. Bytes that are
+no message of the topic's type are counted and go no further.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.shared import swarm_key
+from swarm_loc_estimator.sensors.channels import CHANNELS, Known
+from swarm_loc_estimator.sensors.messages import RawInputs, in_order_of_arrival
+from swarm_loc_estimator.sensors.shared_channels import SHARED_CHANNELS
+from swarm_loc_estimator.sensors.topics import InputKind, InputTopic, input_topics
+from swarm_loc_estimator.swarm.swarm import Swarm
+
+MAX_PAUSE_NS = 3_600_000_000_000
+"""Where arrivals are further apart, the clock was set, as when a robot without one gets the time."""
+
+_STATISTICS_DTYPE = np.dtype(
+    [
+        (name, np.int64)
+        for name in (
+            "received",
+            "malformed",
+            "last_stamp_ns",
+            "first_arrival_ns",
+            "last_arrival_ns",
+            "late_sum_ns",
+            "late_max_ns",
+            "late_count",
+        )
+    ]
+)
+
+
+class InputStatistics:
+    """What came in on one topic.
+
+    Args:
+        row: (1,) of _STATISTICS_DTYPE, where it is counted.
+    """
+
+    def __init__(self, row: NDArray[np.void]) -> None:
+        self._row = row
+
+    @property
+    def received(self) -> int:
+        """Messages so far, malformed ones included."""
+        return int(self._row["received"][0])
+
+    @property
+    def malformed(self) -> int:
+        """Those that were no message of the topic's type."""
+        return int(self._row["malformed"][0])
+
+    @property
+    def last_stamp_ns(self) -> int | None:
+        """Stamp of the newest well-formed one; None before the first."""
+        return int(self._row["last_stamp_ns"][0]) if self.received > self.malformed else None
+
+    @property
+    def last_arrival_ns(self) -> int | None:
+        """When it arrived."""
+        return int(self._row["last_arrival_ns"][0]) if self.received > self.malformed else None
+
+    @property
+    def mean_period_ns(self) -> float | None:
+        """Mean time between two well-formed ones; None before the second."""
+        row, count = self._row[0], self.received - self.malformed
+        return float(row["last_arrival_ns"] - row["first_arrival_ns"]) / (count - 1) if count > 1 else None
+
+    @property
+    def late_count(self) -> int:
+        """How many well-formed ones came since `restart`."""
+        return int(self._row["late_count"][0])
+
+    @property
+    def late_sum_ns(self) -> int:
+        """Sum of their arrivals minus their stamps."""
+        return int(self._row["late_sum_ns"][0])
+
+    @property
+    def late_max_ns(self) -> int | None:
+        """Largest one; None when nothing came."""
+        return int(self._row["late_max_ns"][0]) if self.late_count else None
+
+    def restart(self) -> None:
+        """Begin a new interval for the lateness."""
+        for name in ("late_sum_ns", "late_max_ns", "late_count"):
+            self._row[name] = 0
+
+
+class Ingest:
+    """Reads the messages of a swarm's topics.
+
+    Args:
+        swarm: Whose topics they are.
+        map_frame: Name of the frame `map` in messages.
+        topics: Which of them there may be; None: all that a swarm may have.
+
+    Attributes:
+        topics: The inputs; their index here is the topic's number in a batch.
+        handle_of: Topic name -> that number.
+        statistics: Per topic what came in.
+        map_frame: Name of the frame `map`.
+    """
+
+    def __init__(
+        self, swarm: Swarm, map_frame: str = "map", topics: tuple[InputTopic, ...] | None = None
+    ) -> None:
+        self.topics = input_topics(swarm) if topics is None else topics
+        self.map_frame = map_frame
+        self.handle_of: Mapping[str, int] = {topic.name: handle for handle, topic in enumerate(self.topics)}
+        self._robot = np.array([topic.robot for topic in self.topics], dtype=np.int64)
+        place = {kind: number for number, kind in enumerate(InputKind)}
+        self._kind = np.array([place[topic.kind] for topic in self.topics], dtype=np.int64)
+        known = Known(map_frame, len(swarm.robots), swarm_key(robot.name for robot in swarm.robots))
+        create = {**CHANNELS, **SHARED_CHANNELS}
+        self._channels = {kind: create[kind](len(self.topics), known) for kind in InputKind}
+        self._counted = np.zeros(len(self.topics), dtype=_STATISTICS_DTYPE)
+        self.statistics = [InputStatistics(self._counted[k : k + 1]) for k in range(len(self.topics))]
+
+    def read(self, batch: MessageBatch) -> Iterator[RawInputs]:
+        """Read messages, numbered as `topics`, in order of arrival.
+
+        Yields:
+            One part for each stretch in which time neither goes back nor jumps ahead.
+        """
+        passed_ns = np.diff(batch.log_ns)
+        jumps = np.flatnonzero((passed_ns < 0) | (passed_ns > MAX_PAUSE_NS)) + 1
+        for begin, end in itertools.pairwise([0, *jumps.tolist(), batch.size]):
+            if begin < end:
+                yield self._read_forwards(batch.chosen(slice(begin, end)))
+
+    def received(self) -> dict[str, int]:
+        """Messages so far by kind of topic, such as `<robot>/odom`; kinds of which none came are missing."""
+        kinds = np.bincount(self._kind, weights=self._counted["received"], minlength=len(InputKind))
+        counts = {kind.pattern: int(kinds[number]) for number, kind in enumerate(InputKind)}
+        return {topic: count for topic, count in counts.items() if count}
+
+    def frame_id(self, handle: int) -> str:
+        """Frame of the newest message on a topic, "" before the first."""
+        return self._channels[self.topics[handle].kind].frame_id(handle)
+
+    def _read_forwards(self, batch: MessageBatch) -> RawInputs:
+        kinds = self._kind[batch.topic]
+        present = np.bincount(kinds, minlength=len(InputKind))
+        rows: dict[str, Any] = {}
+        dropped: Counter[str] = Counter()
+        for number, (kind, channel) in enumerate(self._channels.items()):
+            if not present[number]:
+                continue
+            part = batch if present[number] == batch.size else batch.chosen(kinds == number)
+            read = channel.read(part, self._robot[part.topic])
+            _count(self._counted, part.topic, part.log_ns, read.stamp_ns, read.valid)
+            # the same may come of each robot alone and of many together
+            before = rows.get(kind.rows)
+            rows[kind.rows] = read.rows if before is None else in_order_of_arrival([before, read.rows])
+            dropped.update(read.dropped, bad_message=int(np.sum(~read.valid)))
+        return RawInputs(int(batch.log_ns[0]), int(batch.log_ns[-1]), dropped=+dropped, **rows)
+
+
+@compiled
+def _count(
+    counted: NDArray[np.void],
+    topic: IntArray,
+    arrival_ns: IntArray,
+    stamp_ns: IntArray,
+    valid: NDArray[np.bool_],
+) -> None:
+    """Note messages (n,) in the statistics (t,) of their topics."""
+    for k in range(topic.size):
+        one = counted[topic[k]]
+        one.received += 1
+        if not valid[k]:
+            one.malformed += 1
+            continue
+        if one.received - one.malformed == 1:
+            one.first_arrival_ns = arrival_ns[k]
+        late_ns = arrival_ns[k] - stamp_ns[k]
+        one.last_stamp_ns, one.last_arrival_ns = stamp_ns[k], arrival_ns[k]
+        one.late_max_ns = max(one.late_max_ns, late_ns) if one.late_count else late_ns
+        one.late_sum_ns += late_ns
+        one.late_count += 1

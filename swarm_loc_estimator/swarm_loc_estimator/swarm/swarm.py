@@ -1,0 +1,367 @@
+"""The description of a swarm: robots, what they carry, how their sensors err, and the landmarks.
+
+Everything here is immutable and in SI units and radians. Each number states its unit and allowed range
+beside its default, so that the reader of `swarm.yaml`, the documentation and the calibration share one
+table; a new parameter is one line in one of these classes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from swarm_loc_estimator.common.number_spec import number
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from swarm_loc_estimator.swarm.motion_response import MotionResponse
+    from swarm_loc_estimator.swarm.robot_ir import RobotIr
+
+Pose2 = tuple[float, float, float]
+"""x [m], y [m], heading [rad]."""
+
+
+TURN = 6.2832
+"""Angles may be written up to a whole turn either way [rad]."""
+
+
+@dataclass(frozen=True)
+class OdometryModel:
+    """How a robot's odometry errs: noise of the motion, and a calibration of the motion it reports.
+
+    The reported speed v and turn rate w of a step become distance_scale * v and turn_scale * w, further
+    scaled by the robot's `MotionResponse` if it has one. They take effect `delay_s` after their stamp,
+    through a first-order lag `lag_s`. base_link moves along `course_offset` and lies `axle_offset` ahead of
+    the wheels' axle. Errors that last - a bias of the turn rate, scales that are not quite known - are
+    estimated along with the pose where their sigma is not zero.
+    """
+
+    wheel_separation: float = number(0.053, "m", 0.001, 10.0, "distance between the two wheels")
+    wheel_noise: float = number(
+        2e-4, "m", 0.0, 1.0, "variance of each wheel's path per metre it rolls [m^2/m]"
+    )
+    distance_noise: float = number(
+        0.0, "m", 0.0, 1.0, "additional variance of the path per metre driven [m^2/m]"
+    )
+    distance_turn_noise: float = number(
+        0.0, "m^2/rad", 0.0, 1.0, "additional variance of the path per radian turned"
+    )
+    lateral_noise: float = number(0.0, "m", 0.0, 1.0, "variance across the path per metre driven [m^2/m]")
+    turn_noise: float = number(
+        0.0, "rad", 0.0, 10.0, "additional variance of the turn per radian turned [rad^2/rad]"
+    )
+    turn_change_noise: float = number(
+        0.0, "rad s", 0.0, 10.0, "additional variance of the turn per change of turn rate [rad^2/(rad/s)]"
+    )
+    distance_drift: float = number(0.0, "m^2/s", 0.0, 1.0, "variance of the path per second while moving")
+    lateral_drift: float = number(0.0, "m^2/s", 0.0, 1.0, "variance across the path per second while moving")
+    turn_drift: float = number(0.0, "rad^2/s", 0.0, 10.0, "variance of the turn per second while moving")
+    distance_scale: float = number(1.0, "1", 0.1, 10.0, "true path per reported path")
+    distance_scale_sigma: float = number(
+        0.0, "1", 0.0, 1.0, "how unsure distance_scale is, relative; 0: exact, else it is estimated"
+    )
+    turn_scale: float = number(1.0, "1", 0.1, 10.0, "true turn per reported turn")
+    turn_scale_sigma: float = number(
+        0.0, "1", 0.0, 1.0, "how unsure turn_scale is, relative; 0: exact, else it is estimated"
+    )
+    turn_bias_sigma: float = number(
+        0.0, "rad/s", 0.0, 10.0, "size of a turn rate besides while moving, estimated; 0: there is none"
+    )
+    turn_bias_time_s: float = number(
+        60.0, "s", 0.1, 1e6, "time constant with which that turn rate changes (Gauss-Markov)"
+    )
+    course_offset: float = number(
+        0.0, "rad", -math.pi, math.pi, "direction of motion against base_link's x axis"
+    )
+    axle_offset: float = number(0.0, "m", -1.0, 1.0, "base_link ahead of the wheels' axle")
+    delay_s: float = number(0.0, "s", -2.0, 2.0, "the motion happens this much after its stamp")
+    lag_s: float = number(0.0, "s", 0.0, 10.0, "time constant with which the motion follows the report")
+    timeout_s: float = number(1.0, "s", 0.01, 60.0, "after this much silence the motion counts as unknown")
+    max_speed: float = number(1.0, "m/s", 0.001, 100.0, "no step is believed that would need more")
+    max_turn_rate: float = number(10.0, "rad/s", 0.01, 1000.0, "bounds the turn while the motion is unknown")
+    speed_change: float = number(
+        0.1, "m/s/s^0.5", 0.0, 100.0, "random walk of the speed past the newest message"
+    )
+    turn_rate_change: float = number(
+        2.0, "rad/s/s^0.5", 0.0, 1000.0, "random walk of the turn rate past the newest message"
+    )
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether anything of it is estimated from the start."""
+        return max(self.distance_scale_sigma, self.turn_scale_sigma, self.turn_bias_sigma) > 0.0
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """How a robot's sightings err: noise, calibration and gate.
+
+    Whatever is seen is closer or farther by distance_scale. A sighting without heading has a range r [m] and
+    a bearing b [rad], positive to the left, which become
+    distance = r * exp(range_log_scale + range_skew * b + range_curve * b^2) + range_offset, to a robot's
+    marker with robot_range_offset more, and
+    bearing = bearing_scale * b + bearing_curve * b^2 + bearing_offset, taken `time_offset_s` after the stamp.
+    """
+
+    forward_sigma: float = number(
+        0.02, "m", 0.0, 10.0, "noise along the optical axis, sightings with heading", above=True
+    )
+    left_sigma: float = number(
+        0.01, "m", 0.0, 10.0, "noise across the optical axis, sightings with heading", above=True
+    )
+    heading_sigma: float = number(0.1, "rad", 0.0, 10.0, "noise of the marker's heading", above=True)
+    residual_position_sigma: float = number(
+        0.0,
+        "m",
+        0.0,
+        10.0,
+        "error forward and left besides the noise that a detection tells, as of calibration",
+    )
+    residual_heading_sigma: float = number(0.0, "rad", 0.0, 10.0, "likewise of the marker's heading")
+    range_sigma: float = number(
+        0.15, "m", 0.0, 10.0, "noise of the range, sightings without heading", above=True
+    )
+    range_sigma_per_m: float = number(
+        0.0, "1", 0.0, 10.0, "growth of the range noise with distance [m per m]"
+    )
+    bearing_sigma: float = number(
+        0.05, "rad", 0.0, 10.0, "noise of the bearing, sightings without heading", above=True
+    )
+    distance_scale: float = number(1.0, "1", 0.1, 10.0, "distance as seen per true distance")
+    distance_scale_sigma: float = number(
+        0.0, "1", 0.0, 1.0, "how unsure distance_scale is, relative; 0: exact, else it is estimated"
+    )
+    range_log_scale: float = number(0.0, "1", -2.0, 2.0, "a of the range curve")
+    range_skew: float = number(0.0, "1/rad", -10.0, 10.0, "c of the range curve")
+    range_curve: float = number(
+        0.0, "1/rad^2", -10.0, 10.0, "q of the range curve; 0.5 when depth is logged as range"
+    )
+    range_offset: float = number(0.0, "m", -5.0, 5.0, "added to the scaled range")
+    robot_range_offset: float = number(0.0, "m", -5.0, 5.0, "added besides to the range of a robot's marker")
+    bearing_curve: float = number(0.0, "1/rad", -10.0, 10.0, "quadratic term of the bearing")
+    bearing_offset: float = number(0.0, "rad", -TURN, TURN, "added to the scaled bearing")
+    bearing_scale: float = number(1.0, "1", 0.1, 10.0, "true bearing per logged bearing")
+    time_offset_s: float = number(
+        0.0, "s", -2.0, 2.0, "the picture was taken this much after its stamp (negative: before)"
+    )
+    time_sigma_s: float = number(
+        0.0, "s", 0.0, 2.0, "noise of that time from picture to picture, the same for all that one shows"
+    )
+    gate_probability: float = number(
+        0.9999, "1", 0.5, 1.0, "share of good sightings that must pass the gate; 1 passes all"
+    )
+
+
+@dataclass(frozen=True)
+class CameraMount:
+    """Where the camera sits in base_link (x forward, y left, z up).
+
+    The camera looks along R = Rz(yaw) Ry(pitch) Rx(roll) times base_link's x axis; positive pitch looks down.
+    """
+
+    x: float = number(0.0, "m", -10.0, 10.0, "forward of base_link")
+    y: float = number(0.0, "m", -10.0, 10.0, "left of base_link")
+    z: float = number(0.0, "m", -10.0, 10.0, "above base_link")
+    yaw: float = number(0.0, "rad", -TURN, TURN, "turned to the left")
+    yaw_sigma: float = number(
+        0.0, "rad", 0.0, 1.0, "how unsure yaw is; 0: exact, else it is estimated along with the pose"
+    )
+    pitch: float = number(0.0, "rad", -TURN, TURN, "turned down")
+    roll: float = number(0.0, "rad", -TURN, TURN, "turned about the optical axis")
+
+
+@dataclass(frozen=True)
+class Face:
+    """A marker on a robot's body, in base_link.
+
+    Attributes:
+        name: What the robot's type calls this side.
+        id: Marker id, unique in the swarm.
+        x: [m], forward.
+        y: [m], left.
+        z: [m], up.
+        yaw: Direction out of the face [rad]; None when the marker shows no heading.
+        size: Side of the marker, black border included [m].
+        position_sigma: How unsure x and y are, each [m].
+    """
+
+    name: str
+    id: int
+    x: float = number(0.0, "m", -10.0, 10.0, "forward of base_link")
+    y: float = number(0.0, "m", -10.0, 10.0, "left of base_link")
+    z: float = number(0.0, "m", -10.0, 10.0, "above base_link")
+    yaw: float | None = number(None, "rad", -TURN, TURN, "direction out of the face; null: shows no heading")
+    size: float = number(0.036, "m", 0.001, 10.0, "side of the marker, black border included")
+    position_sigma: float = number(
+        0.0, "m", 0.0, 10.0, "how unsure x and y are; adds to the noise of its sightings"
+    )
+
+
+@dataclass(frozen=True)
+class Landmark:
+    """A marker that does not move, in map.
+
+    Attributes:
+        id: Marker id, unique in the swarm.
+        x: [m].
+        y: [m].
+        z: [m].
+        yaw: Direction out of the marker's face [rad]; None when it shows no heading.
+        size: Side of the marker, black border included [m].
+        position_sigma: How unsure x and y are, each [m].
+        yaw_sigma: How unsure yaw is [rad].
+    """
+
+    id: int
+    x: float = number(0.0, "m", -1e6, 1e6, "in map")
+    y: float = number(0.0, "m", -1e6, 1e6, "in map")
+    z: float = number(0.0, "m", -1e4, 1e4, "in map")
+    yaw: float | None = number(None, "rad", -TURN, TURN, "direction out of its face; null: shows no heading")
+    size: float = number(0.05, "m", 0.001, 10.0, "side of the marker, black border included")
+    position_sigma: float = number(
+        0.0, "m", 0.0, 100.0, "how unsure x and y are; 0: exact, else they are estimated along with the poses"
+    )
+    yaw_sigma: float = number(0.0, "rad", 0.0, 10.0, "how unsure yaw is; 0: exact, else it is estimated")
+
+    @property
+    def is_estimated(self) -> bool:
+        """Whether its place is not exact."""
+        return self.position_sigma > 0.0 or self.yaw_sigma > 0.0
+
+
+@dataclass(frozen=True)
+class StartSigma:
+    """How sure the start pose is, one standard deviation."""
+
+    x: float = number(0.01, "m", 0.0, 1e3, "along map x", above=True)
+    y: float = number(0.01, "m", 0.0, 1e3, "along map y", above=True)
+    theta: float = number(0.02, "rad", 0.0, 10.0, "heading", above=True)
+
+
+@dataclass(frozen=True)
+class RandomWalk:
+    """How a robot moves that sends no odometry: nothing is known but how fast its pose may change."""
+
+    position: float = number(0.0, "m^2/s", 0.0, 1e3, "variance of x and of y per second; 0: it stands")
+    heading: float = number(0.0, "rad^2/s", 0.0, 1e3, "variance of the heading per second")
+
+    @property
+    def moves(self) -> bool:
+        """Whether it does at all."""
+        return self.position > 0.0 or self.heading > 0.0
+
+
+@dataclass(frozen=True)
+class Robot:
+    """One robot.
+
+    Attributes:
+        name: Its namespace and prefix of its frames.
+        type: The type its settings come from; "" when it has none.
+        odometry: Noise and calibration of its motion.
+        response: Share of the reported motion that is true; None: all of it.
+        camera: Where its camera sits; None when it has none and only others see it.
+        sensor: Noise, calibration and gate of its sightings.
+        faces: Markers on its body.
+        start: Pose in map at the first datum; None: unknown, it waits for a fix.
+        start_sigma: How sure the start is.
+        stands: Whether it has no odometry, and does not move but as `random_walk` says.
+        random_walk: How it may move without odometry.
+        ir: Its infrared board; None when it has none.
+    """
+
+    name: str
+    type: str = ""
+    odometry: OdometryModel = OdometryModel()
+    response: MotionResponse | None = None
+    camera: CameraMount | None = CameraMount()
+    sensor: SensorModel = SensorModel()
+    faces: tuple[Face, ...] = ()
+    start: Pose2 | None = None
+    start_sigma: StartSigma = StartSigma()
+    stands: bool = False
+    random_walk: RandomWalk = RandomWalk()
+    ir: RobotIr | None = None
+
+
+@dataclass(frozen=True)
+class MarkerOwner:
+    """Whom a marker id belongs to.
+
+    Attributes:
+        robot_index: Index into `Swarm.robots`; -1 for a landmark.
+        landmark_index: Index into `Swarm.landmarks`; -1 for a robot's face.
+        marker: The face (in base_link) or the landmark (in map).
+    """
+
+    robot_index: int
+    landmark_index: int
+    marker: Face | Landmark
+
+
+class SwarmError(ValueError):
+    """A swarm that contradicts itself; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class Swarm:
+    """All robots and landmarks.
+
+    Raises:
+        SwarmError: A robot name, a marker id or the id of an infrared board appears twice, or a robot with
+            odometry walks at random.
+    """
+
+    robots: tuple[Robot, ...] = ()
+    landmarks: tuple[Landmark, ...] = ()
+
+    def __post_init__(self) -> None:
+        if twice := _given_twice((robot.name, "") for robot in self.robots):
+            raise SwarmError(f"robot name '{twice[0]}' is given to two robots; names must be unique.")
+        if twice := _given_twice(self._named_ids()):
+            marker_id, one, other = twice
+            raise SwarmError(f"marker id {marker_id} belongs to both {one} and {other}; ids must be unique.")
+        if twice := _given_twice((r.ir.id, f"robot '{r.name}'") for r in self.robots if r.ir is not None):
+            board, one, other = twice
+            raise SwarmError(f"ir.id {board} belongs to both {one} and {other}; ids must be unique.")
+        if walking := [r.name for r in self.robots if r.random_walk.moves and not r.stands]:
+            raise SwarmError(
+                f"robot '{walking[0]}' has a random_walk, which must be 0 where odometry is not null."
+            )
+
+    def _named_ids(self) -> Iterator[tuple[int, str]]:
+        """Every marker id with its owner in words."""
+        for robot in self.robots:
+            for face in robot.faces:
+                yield face.id, f"face '{face.name}' of robot '{robot.name}'"
+        for landmark in self.landmarks:
+            yield landmark.id, f"landmark {landmark.id}"
+
+    @cached_property
+    def index_of(self) -> Mapping[str, int]:
+        """Robot name -> index."""
+        return {robot.name: index for index, robot in enumerate(self.robots)}
+
+    @cached_property
+    def owner_of(self) -> Mapping[int, MarkerOwner]:
+        """Marker id -> whom it belongs to."""
+        owners = {
+            face.id: MarkerOwner(index, -1, face)
+            for index, robot in enumerate(self.robots)
+            for face in robot.faces
+        }
+        owners.update({mark.id: MarkerOwner(-1, index, mark) for index, mark in enumerate(self.landmarks)})
+        return owners
+
+
+def _given_twice(owners: Iterable[tuple[object, str]]) -> tuple[object, str, str] | None:
+    """The first key that has two owners, with both."""
+    owner_of: dict[object, str] = {}
+    for key, owner in owners:
+        if key in owner_of:
+            return key, owner_of[key], owner
+        owner_of[key] = owner
+    return None

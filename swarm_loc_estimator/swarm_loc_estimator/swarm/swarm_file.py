@@ -1,0 +1,316 @@
+"""Read and check a swarm description: `swarm.yaml` to `Swarm`.
+
+```yaml
+fileversion: 1
+defaults:                 # any of odometry, random_walk, response, camera, sensor, ir, faces, start_sigma
+  sensor: {range_sigma: 0.1}
+  landmark: {size: 0.06, position_sigma: 0.01, yaw_sigma: 0.02}  # without sigmas: surveyed exactly
+types:
+  epuck:                  # the same keys; what is not said comes from defaults
+    odometry: {wheel_separation: 0.053}
+    response:                               # null: all of the reported motion is true
+      speeds: [0.0, 0.1]
+      turn_rates: [0.0, 0.5, 1.0]
+      speed_share: [[1.0, 0.9, 0.9], [1.0, 0.8, 0.7]]
+      turn_share: [[1.0, 0.9, 0.9], [1.0, 0.9, 0.9]]
+    camera: {x: 0.035, z: 0.028}            # null: it has none
+    faces:                                  # markers on the body; null takes one away
+      front: {x: 0.035, yaw: 0.0, size: 0.036, position_sigma: 0.001}
+  droplet:
+    odometry: null                          # null: it has none, and stands where it is
+    random_walk: {position: 1e-4, heading: 0.05}   # or moves, nobody knows where to
+    camera: null
+    ir:                                     # its infrared board; null: it has none
+      platform: droplet                     # a packaged one, or the path of a file, from here
+      estimator: likelihood                 # or closed_form
+robots:
+  epuck1:                 # the same keys; what is not said comes from its type
+    type: epuck
+    ids: {front: 12}      # which marker is on which face
+    start: {x: 0.0, y: 0.0, theta: 0.0}     # null or left out: unknown
+  droplet1:
+    type: droplet
+    ir:
+      id: 0x6B6F          # by which exchanges name it
+      gains: {sensor: [1, 1, 1, 1, 1, 1], emitter: [1, 1, 1, 1, 1, 1]}   # null or left out: never calibrated
+landmarks:
+  100: {x: 1.2, y: -0.4, yaw: 3.14159, size: 0.05}      # yaw null or left out: shows no heading
+```
+Numbers, units, ranges and defaults are those of the classes in `core.description`.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.number_spec import number_specs
+from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
+from swarm_loc_estimator.filter.calibration_states import ParameterTable
+from swarm_loc_estimator.swarm.ir_section import IrSection, Values
+from swarm_loc_estimator.swarm.motion_response import MotionResponse, MotionResponseError
+from swarm_loc_estimator.swarm.swarm import (
+    CameraMount,
+    Face,
+    Landmark,
+    OdometryModel,
+    Pose2,
+    RandomWalk,
+    Robot,
+    SensorModel,
+    StartSigma,
+    Swarm,
+    SwarmError,
+)
+from swarm_loc_estimator.swarm.tree_checks import Numbers, TreeChecks, nearest
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Mapping
+    from pathlib import Path
+
+FILE_VERSION = 1
+
+_SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks")
+_LAYER = ("odometry", "random_walk", "response", "camera", "sensor", "ir", "faces", "start_sigma")
+_DEFAULTS = (*_LAYER, "landmark")
+_ROBOT = ("type", *_LAYER, "ids", "start")
+MODELS: dict[str, type] = {
+    "odometry": OdometryModel,
+    "random_walk": RandomWalk,
+    "camera": CameraMount,
+    "sensor": SensorModel,
+    "start_sigma": StartSigma,
+}
+_MAY_BE_NONE = ("odometry", "camera")
+_START = {
+    "x": number_specs(Landmark)["x"],
+    "y": number_specs(Landmark)["y"],
+    "theta": number_specs(CameraMount)["yaw"],
+}
+LANDMARK_DEFAULTS = {name: number_specs(Landmark)[name] for name in ("size", "position_sigma", "yaw_sigma")}
+_RESPONSE = ("speeds", "turn_rates", "speed_share", "turn_share")
+_MAX_ID = 2**32 - 1
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+_MAX_NAME = 64
+"""Characters; topics and frames are built from names, and DDS bounds them."""
+MAX_ROBOTS = 1000
+"""So many have been simulated and run live; larger swarms are not known to work."""
+MAX_STATES = 10_000
+"""Of a filter whose covariance is one matrix: 800 MB for so many, and several of them are kept."""
+
+
+class SwarmFileError(UserError):
+    """A swarm description that cannot be used; the message is one sentence with file, key and value."""
+
+
+def load_swarm(path: Path) -> Swarm:
+    """Read and check a swarm description.
+
+    Args:
+        path: The file.
+
+    Raises:
+        SwarmFileError: One sentence with file, dotted key, value and what is allowed.
+    """
+    try:
+        tree = read_tree(path)
+    except YamlTreeError as error:
+        raise SwarmFileError(str(error)) from error
+    return _Loader(path, SwarmFileError).swarm(tree)
+
+
+@dataclass
+class _Layer:
+    """What one of defaults, type and robot says; what it leaves out is missing here.
+
+    Attributes:
+        sections: Key -> values by name; None: there is no such thing.
+        response: Share of the motion that is true.
+        says_response: Whether the layer says so.
+        faces: Name -> place; None: taken away.
+    """
+
+    sections: dict[str, Values | None]
+    response: MotionResponse | None
+    says_response: bool
+    faces: dict[str, Numbers | None]
+
+
+class _Loader(TreeChecks):
+    """Checks the tree of one file on the way to the dataclasses."""
+
+    def __init__(self, path: Path, error: type[ValueError]) -> None:
+        super().__init__(path, error)
+        self._ir = IrSection(self, path.parent)
+
+    def swarm(self, tree: Tree) -> Swarm:
+        """The whole file."""
+        sections = self.mapping(tree, "the file", _SECTIONS)
+        version = sections.get("fileversion")
+        if version != FILE_VERSION or isinstance(version, bool):
+            raise self.error("fileversion", version, f"must be {FILE_VERSION}")
+        defaults = self._layer(sections.get("defaults", {}), "defaults", _DEFAULTS)
+        types = {
+            name: self._layer(tree, f"types.{name}", _LAYER)
+            for name, tree in self._named(sections.get("types", {}), "types")
+        }
+        named = self._named(sections.get("robots", {}), "robots")
+        if not named:
+            raise self.said("robots is empty but must name at least one robot")
+        if len(named) > MAX_ROBOTS:
+            raise self.said(f"robots names {len(named)} robots but must name at most {MAX_ROBOTS}")
+        robots = tuple(self._robot(name, tree, defaults, types) for name, tree in named)
+        landmarks = self._landmarks(sections.get("landmarks", {}), sections.get("defaults", {}))
+        states = ParameterTable.of(robots, landmarks).filter_size
+        if states > MAX_STATES:
+            raise self.said(
+                f"what has a sigma makes a filter of {states} states but must make at most {MAX_STATES}"
+            )
+        try:
+            return Swarm(robots, landmarks)
+        except SwarmError as error:
+            raise self.said(str(error).removesuffix(".")) from error
+
+    def _robot(self, name: str, tree: Tree, defaults: _Layer, types: Mapping[str, _Layer]) -> Robot:
+        """One robot from its three layers."""
+        key = f"robots.{name}"
+        mapping = self.mapping(tree, key, _ROBOT)
+        type_name = mapping.get("type", "")
+        if type_name and (not isinstance(type_name, str) or type_name not in types):
+            raise self.error(f"{key}.type", type_name, f"must be one of the types{nearest(type_name, types)}")
+        own = self._layer(mapping, key, _ROBOT, of_robot=True)
+        layers = [defaults, *([types[type_name]] if type_name else []), own]
+        sections = {section: _said(layers, section) for section in (*MODELS, "ir")}
+        models: dict[str, Any] = {
+            section: None if (values := sections[section]) is None else cls(**values)
+            for section, cls in MODELS.items()
+        }
+        return Robot(
+            name=name,
+            type=type_name or "",
+            response=next((layer.response for layer in reversed(layers) if layer.says_response), None),
+            faces=self._faces(key, layers, mapping.get("ids", {})),
+            start=self._start(mapping.get("start"), f"{key}.start"),
+            stands=models["odometry"] is None,
+            ir=self._ir.board(sections["ir"], f"{key}.ir"),
+            **{**models, "odometry": models["odometry"] or OdometryModel()},
+        )
+
+    def _layer(self, tree: Tree, key: str, known: Collection[str], *, of_robot: bool = False) -> _Layer:
+        """The settings that one layer says."""
+        mapping = self.mapping(tree, key, known)
+        sections: dict[str, Values | None] = {
+            section: None
+            if mapping[section] is None and section in _MAY_BE_NONE
+            else self.numbers(mapping[section], f"{key}.{section}", number_specs(cls))
+            for section, cls in MODELS.items()
+            if section in mapping
+        }
+        if "ir" in mapping:
+            sections["ir"] = self._ir.layer(mapping["ir"], f"{key}.ir", of_robot=of_robot)
+        faces = self._named(mapping.get("faces", {}), f"{key}.faces")
+        specs = number_specs(Face)
+        return _Layer(
+            sections,
+            self._response(mapping.get("response"), f"{key}.response"),
+            "response" in mapping,
+            {
+                name: None if face is None else self.numbers(face, f"{key}.faces.{name}", specs)
+                for name, face in faces
+            },
+        )
+
+    def _response(self, tree: Tree, key: str) -> MotionResponse | None:
+        """A table of shares, or that there is none; said as a whole by one layer."""
+        if tree is None:
+            return None
+        mapping = self.mapping(tree, key, _RESPONSE)
+        for name in _RESPONSE:
+            if name not in mapping:
+                raise self.said(f"{key} lacks {name}, a list of numbers")
+        axes = {
+            name: self.list_of_numbers(mapping[name], f"{key}.{name}") for name in ("speeds", "turn_rates")
+        }
+        tables = {
+            name: tuple(
+                self.list_of_numbers(row, f"{key}.{name}[{index}]")
+                for index, row in enumerate(self.items(mapping[name], f"{key}.{name}"))
+            )
+            for name in ("speed_share", "turn_share")
+        }
+        try:
+            return MotionResponse(
+                axes["speeds"], axes["turn_rates"], tables["speed_share"], tables["turn_share"]
+            )
+        except MotionResponseError as error:
+            raise self.said(f"{key.removesuffix('response')}{error}".removesuffix(".")) from error
+
+    def _faces(self, key: str, layers: Iterable[_Layer], ids_tree: Tree) -> tuple[Face, ...]:
+        """The robot's markers: where they sit from the layers, which they are from its ids."""
+        places: dict[str, Numbers] = {}
+        for layer in layers:
+            for name, numbers in layer.faces.items():
+                if numbers is None:
+                    places.pop(name, None)
+                else:
+                    places[name] = {**places.get(name, {}), **numbers}
+        ids = self.mapping(ids_tree, f"{key}.ids", places)
+        missing = [name for name in places if name not in ids]
+        if missing:
+            raise self.said(
+                f"{key}.ids has no id for face '{missing[0]}'; give one or set faces.{missing[0]} to null"
+            )
+        return tuple(
+            Face(name, self._marker_id(ids[name], f"{key}.ids.{name}"), **numbers)  # type: ignore[arg-type]
+            for name, numbers in places.items()
+        )
+
+    def _landmarks(self, tree: Tree, defaults: Tree) -> tuple[Landmark, ...]:
+        """All landmarks, in the order of the file."""
+        shared_tree = self.mapping(defaults, "defaults").get("landmark", {})
+        shared = self.numbers(shared_tree, "defaults.landmark", LANDMARK_DEFAULTS)
+        result = []
+        for number, place in self.mapping(tree, "landmarks").items():
+            key = f"landmarks.{number}"
+            numbers = self.numbers(place, key, number_specs(Landmark), required=("x", "y"))
+            result.append(Landmark(self._marker_id(number, key), **{**shared, **numbers}))  # type: ignore[arg-type]
+        return tuple(result)
+
+    def _start(self, tree: Tree, key: str) -> Pose2 | None:
+        """A start pose, or that there is none."""
+        if tree is None:
+            return None
+        numbers = self.numbers(tree, key, _START, required=tuple(_START))
+        return (float(numbers["x"] or 0.0), float(numbers["y"] or 0.0), float(numbers["theta"] or 0.0))
+
+    def _marker_id(self, value: Tree, key: str) -> int:
+        """A marker id."""
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= _MAX_ID:
+            raise self.error(key, value, f"must be a marker id, a whole number in [0, {_MAX_ID}]")
+        return value
+
+    def _named(self, tree: Tree, key: str) -> list[tuple[str, Tree]]:
+        """A mapping from names that can stand in topics and frames."""
+        mapping = self.mapping(tree, key)
+        for name in mapping:
+            if not isinstance(name, str) or not _NAME.fullmatch(name):
+                raise self.error(
+                    f"a name in {key}",
+                    name,
+                    "must be letters, digits and underscores and start with a letter",
+                )
+            if len(name) > _MAX_NAME:
+                raise self.error(f"a name in {key}", name, f"must have at most {_MAX_NAME} characters")
+        return list(mapping.items())
+
+
+def _said(layers: Iterable[_Layer], section: str) -> Values | None:
+    """The values of a section; the last layer that says null takes all away, those behind bring it back."""
+    values: Values | None = {}
+    for layer in layers:
+        if section in layer.sections:
+            said = layer.sections[section]
+            values = None if said is None else {**(values or {}), **said}
+    return values

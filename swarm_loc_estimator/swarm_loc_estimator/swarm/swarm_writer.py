@@ -1,0 +1,147 @@
+"""Write a swarm description: what robots of a type share stands with the type, the rest with the robot."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from swarm_loc_estimator.common.number_spec import number_specs
+from swarm_loc_estimator.common.yaml_tree import tree_text
+from swarm_loc_estimator.swarm.ir_section import ir_tree
+from swarm_loc_estimator.swarm.motion_response import MotionResponse
+from swarm_loc_estimator.swarm.swarm import (
+    Face,
+    Landmark,
+    Robot,
+    Swarm,
+)
+from swarm_loc_estimator.swarm.swarm_file import FILE_VERSION, LANDMARK_DEFAULTS, MODELS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+_WHOLE = frozenset({"camera", "faces", "response"})
+Mapping = dict[Any, Any]
+
+
+def save_swarm(swarm: Swarm, path: Path, comment: str = "") -> None:
+    """Write a swarm description that `load_swarm` reads back equal.
+
+    Args:
+        swarm: What to write.
+        path: The file; replaced when it exists, its folder created when missing.
+        comment: Lines that say where the numbers come from.
+    """
+    text = "".join(f"# {line}\n" for line in [*comment.splitlines(), *_units()])
+    text += tree_text(_tree(swarm, path.parent))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)
+
+
+def _units() -> list[str]:
+    """One comment per group of numbers, with the unit of each."""
+    groups = {**MODELS, "faces": Face, "landmarks": Landmark}
+    lines = ["Units:"]
+    for name, cls in groups.items():
+        units = ", ".join(f"{key} [{spec.unit}]" for key, spec in number_specs(cls).items())
+        lines += textwrap.wrap(f"{name}: {units}", 100, initial_indent="  ", subsequent_indent="      ")
+    return lines
+
+
+def _tree(swarm: Swarm, folder: Path) -> Mapping:
+    """The content of a file in a folder."""
+    types: Mapping = {}
+    for robot in swarm.robots:
+        if robot.type and robot.type not in types:
+            alike = [_layer(other, folder) for other in swarm.robots if other.type == robot.type]
+            types[robot.type] = _shared(alike)
+    robots = {robot.name: _robot(robot, types.get(robot.type, {}), folder) for robot in swarm.robots}
+    landmarks = {mark.id: _numbers(mark, keep=("x", "y")) for mark in swarm.landmarks}
+    defaults = _taken_out(LANDMARK_DEFAULTS, list(landmarks.values()))
+    tree = {
+        "fileversion": FILE_VERSION,
+        "defaults": {"landmark": defaults} if defaults else {},
+        "types": types,
+        "robots": robots,
+        "landmarks": landmarks,
+    }
+    return {key: value for key, value in tree.items() if value}
+
+
+def _taken_out(names: Iterable[str], entries: list[Mapping]) -> Mapping:
+    """Those of the named values that all entries share, taken out of them."""
+    shared = {name: entries[0][name] for name in names if entries and name in entries[0]}
+    shared = {name: value for name, value in shared.items() if all(e.get(name) == value for e in entries)}
+    for entry in entries:
+        for name in shared:
+            del entry[name]
+    return shared
+
+
+def _numbers(model: Any, keep: tuple[str, ...] = ()) -> Mapping:
+    """The numbers of a dataclass that differ from its defaults."""
+    values = asdict(model)
+    defaults = {name: type(model).__dataclass_fields__[name].default for name in number_specs(type(model))}
+    return {name: values[name] for name in defaults if values[name] != defaults[name] or name in keep}
+
+
+def _layer(robot: Robot, folder: Path) -> Mapping:
+    """Everything about a robot that a type can say, as far as it differs from the defaults."""
+    layer: Mapping = {section: _numbers(getattr(robot, section)) for section in MODELS if section != "camera"}
+    layer["response"] = {} if robot.response is None else _lists(robot.response)
+    layer["camera"] = None if robot.camera is None else _numbers(robot.camera)
+    if robot.stands:
+        layer["odometry"] = None
+    layer["ir"] = {} if robot.ir is None else ir_tree(robot.ir, folder)
+    layer["faces"] = {face.name: _numbers(face) for face in robot.faces}
+    return layer
+
+
+def _lists(response: MotionResponse) -> Mapping:
+    """The table of a motion response."""
+    return {name: _listed(value) for name, value in asdict(response).items()}
+
+
+def _listed(value: Any) -> Any:
+    """Tuples as lists, which YAML has."""
+    return [_listed(item) for item in value] if isinstance(value, tuple) else value
+
+
+def _shared(layers: list[Mapping]) -> Mapping:
+    """What all robots of a type have in common; cameras and faces as a whole, the rest number by number."""
+    shared: Mapping = {}
+    for section, first in layers[0].items():
+        if section in _WHOLE or any(layer[section] is None for layer in layers):
+            if all(layer[section] == first for layer in layers):
+                shared[section] = first
+        else:
+            shared[section] = {
+                name: value
+                for name, value in first.items()
+                if all(layer[section].get(name) == value for layer in layers)
+            }
+    return {section: value for section, value in shared.items() if value != {}}
+
+
+def _robot(robot: Robot, shared: Mapping, folder: Path) -> Mapping:
+    """A robot without what its type says."""
+    entry: Mapping = {"type": robot.type} if robot.type else {}
+    for section, value in _layer(robot, folder).items():
+        rest = value
+        if section in shared:
+            same = value == shared[section]
+            whole = section in _WHOLE
+            rest = {} if same or whole else {k: v for k, v in value.items() if k not in shared[section]}
+        if rest != {}:
+            entry[section] = rest
+    if robot.ir is not None:
+        entry["ir"] = {"id": robot.ir.id, **entry.get("ir", {})}
+    if robot.faces:
+        entry["ids"] = {face.name: face.id for face in robot.faces}
+    if robot.start is not None:
+        entry["start"] = dict(zip(("x", "y", "theta"), robot.start, strict=True))
+    return entry

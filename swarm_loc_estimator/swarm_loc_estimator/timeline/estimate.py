@@ -1,0 +1,125 @@
+"""Estimates: poses of all robots at an instant, their covariances and the drivers' frames."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.se2_scalar import composed, wrap
+from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
+from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED, add_hidden_errors
+from swarm_loc_estimator.filter.integrity.fault_detection import is_contradicted
+from swarm_loc_estimator.filter.prediction import new_scratch, write_predicted
+from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.odometry.look_up import look_up, new_sample
+from swarm_loc_estimator.odometry.preintegration import Preintegrated, TrackArrays
+
+
+class Status(IntEnum):
+    """How a robot stands; the values of SwarmPose.status."""
+
+    WAITING = 0  # not located
+    TRACKED = 1
+    STALE = 2  # located, but its odometry is silent
+    UNCONFIRMED = 3  # where its description says; no sighting has confirmed it yet
+    CONTRADICTED = 4  # its newest sightings do not agree with its pose
+
+
+_WAITING, _TRACKED, _STALE = int(Status.WAITING), int(Status.TRACKED), int(Status.STALE)
+_UNCONFIRMED, _CONTRADICTED = int(Status.UNCONFIRMED), int(Status.CONTRADICTED)
+
+
+class SwarmEstimate(NamedTuple):
+    """Poses of all robots at one instant.
+
+    Attributes:
+        stamp_ns: The instant.
+        poses: (N, 3) x [m], y [m], theta [rad] in `map`; NaN for robots that are not located.
+        covariances: (N, 3, 3) of x, y, theta; NaN likewise.
+        map_to_odom: (N, 3) from `map` to the driver's own odom frame; NaN likewise.
+        status: (N,) of `Status`.
+        fix_age_s: (N,) since the newest measurement tied to a landmark or an absolute fix; -1: never.
+    """
+
+    stamp_ns: int
+    poses: FloatArray
+    covariances: FloatArray
+    map_to_odom: FloatArray
+    status: NDArray[np.uint8]
+    fix_age_s: FloatArray
+
+
+def estimate_at(state: SwarmState, tracks: TrackArrays, timeout_s: FloatArray, now_ns: int) -> SwarmEstimate:
+    """The estimate at an instant.
+
+    Args:
+        state: Belief at its newest measurements.
+        tracks: Odometry, which leads from there to the instant.
+        timeout_s: (N,) silence of the odometry after which a robot is stale.
+        now_ns: The instant.
+    """
+    estimate = _new_estimate(now_ns, state.tracked.size)
+    _write_all(state.arrays(), tracks, timeout_s, estimate)
+    return estimate
+
+
+@compiled
+def _new_estimate(now_ns: int, robots: int) -> SwarmEstimate:
+    """An estimate of so many robots, none of them located."""
+    return SwarmEstimate(
+        now_ns,
+        np.full((robots, 3), np.nan),
+        np.full((robots, 3, 3), np.nan),
+        np.full((robots, 3), np.nan),
+        np.full(robots, _WAITING, dtype=np.uint8),
+        np.full(robots, -1.0),
+    )
+
+
+@compiled
+def _write_all(belief: BeliefArrays, tracks: TrackArrays, timeout_s: FloatArray, out: SwarmEstimate) -> None:
+    """Fill an estimate."""
+    sample, scratch, t, error = new_sample(1), new_scratch(), np.empty(3), np.empty((3, 3))
+    track, raw = sample.pose[0], sample.raw[0]
+    for i in range(belief.tracked.size):
+        if belief.last_fix_ns[i] != NEVER_NS:
+            out.fix_age_s[i] = (out.stamp_ns - belief.last_fix_ns[i]) * 1e-9
+        if not belief.tracked[i]:
+            continue
+        look_up(tracks, i, out.stamp_ns, sample, 0)
+        out.status[i] = _status(belief.integrity, i, sample.silence_s[0] > timeout_s[i])
+        to = Preintegrated(out.stamp_ns, sample.covariance[0], sample.jacobian[0])
+        write_predicted(belief, i, to, scratch, t, error)
+        x, y, theta = composed(t[0], t[1], t[2], track[0], track[1], track[2])
+        out.poses[i, 0], out.poses[i, 1], out.poses[i, 2] = x, y, wrap(theta)
+        _pose_covariance(x, y, error, out.covariances[i])
+        add_hidden_errors(belief.integrity, i, out.covariances[i])
+        cos, sin = np.cos(theta - raw[2]), np.sin(theta - raw[2])
+        out.map_to_odom[i, 0] = x - cos * raw[0] + sin * raw[1]
+        out.map_to_odom[i, 1] = y - sin * raw[0] - cos * raw[1]
+        out.map_to_odom[i, 2] = wrap(theta - raw[2])
+
+
+@inlined
+def _status(integrity: IntegrityArrays, robot: int, silent: bool) -> int:
+    """The status of a robot that is located."""
+    if silent:
+        return _STALE
+    if integrity.confirmations[robot] < CONFIRMED:
+        return _UNCONFIRMED
+    return _CONTRADICTED if is_contradicted(integrity, robot) else _TRACKED
+
+
+@inlined
+def _pose_covariance(x: float, y: float, error: FloatArray, out: FloatArray) -> None:
+    """Write the covariance (3, 3) of x, y, theta from that of the right-invariant error."""
+    shear = (-y, x, 0.0)
+    for a in range(3):
+        for b in range(3):
+            out[a, b] = error[a, b] + shear[a] * error[2, b] + error[a, 2] * shear[b]
+            out[a, b] += shear[a] * error[2, 2] * shear[b]

@@ -1,0 +1,228 @@
+"""The central estimator: odometry and sightings of a swarm in, poses out; no ROS, no clock of its own."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.filter.belief import NEVER_NS
+from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
+from swarm_loc_estimator.identification.memory import Identities, Outcome
+from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.sensors.infrared import BrightnessConverter
+from swarm_loc_estimator.sensors.messages import OdometryRows, RawInputs, ValidInputs, joined
+from swarm_loc_estimator.sensors.validation import (
+    REJECT_REASONS,
+    InputValidator,
+    about_robots,
+    reject_reasons,
+)
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline.contradictions import Contradiction, contradictions
+from swarm_loc_estimator.timeline.estimate import Status, SwarmEstimate, estimate_at
+from swarm_loc_estimator.timeline.fusion import Fusion, Verdict
+from swarm_loc_estimator.timeline.self_calibration import learned, learns
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.timeline import GoOn, Timeline
+
+__all__ = ["Status", "SwarmEstimate", "SwarmEstimator"]
+
+
+class SwarmEstimator:
+    """Joint, buffered estimation of all poses of a swarm.
+
+    Data may come in any order and late; each counts at its own stamp when it is no older than the
+    horizon. All that arrives is used at the next `tick`. Every datum not used has a reason in `drops`.
+
+    Args:
+        swarm: Robots and landmarks.
+        settings: How to buffer and gate.
+    """
+
+    def __init__(self, swarm: Swarm, settings: EstimatorSettings | None = None) -> None:
+        self.swarm = swarm
+        self.settings = (settings or EstimatorSettings()).chosen_for(swarm)
+        self._timeout_s = np.array([robot.odometry.timeout_s for robot in swarm.robots])
+        self._tracks = OdometryTracks(swarm.robots)
+        self._validator = InputValidator(swarm, self.settings)
+        self._brightness = BrightnessConverter(swarm)
+        self._fusion = Fusion(swarm, self.settings, self._tracks)
+        grouped_s = self.settings.state_period_s + self.settings.fusion_period_s
+        self._reach_ns = self._tracks.reach_ns + round(0.5e9 * grouped_s)  # used so far from their stamps
+        self._timeline = Timeline(self.settings, self._fusion.step, self._fusion.new_state(), self._reach_ns)
+        self._horizon_ns = round(self.settings.horizon_s * 1e9)
+        self._jump_back_ns = round(self.settings.jump_back_s * 1e9)
+        self.time_jumps = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        self._now_ns: int | None = None
+        self._odometry: list[OdometryRows] = []
+
+    def reset(self) -> None:
+        """Forget all data and begin anew with the configured starts; the counters go on."""
+        self.drop("reset", sum(rows.robot.size for rows in self._odometry) + self._timeline.waiting)
+        self._validator.drops.update(self._timeline_drops())
+        self._tracks.clear()
+        self._timeline.restart(self._fusion.new_state())
+        self._brightness.restart()
+        self._begin()
+
+    def receive(self, messages: RawInputs) -> None:
+        """Take in messages; when they show that time has jumped back, begin anew with them."""
+        self._check_clock(messages.begin_ns)
+        self._check_clock(messages.end_ns)
+        self.add(self.validate(messages))
+
+    @property
+    def note(self) -> str:
+        """What users should know of how the swarm is estimated, as a sentence; "" when there is nothing."""
+        count, largest = len(self.swarm.robots), self.settings.sparse_from
+        if count < largest or self._fusion.is_sparse:
+            return ""
+        return (
+            f"{count} robots are estimated with a full covariance, which grows with the cube of their number,"
+            f" because fusion_period_s is 0; otherwise {largest} robots and more (sparse_from) would take a"
+            " sparse one."
+        )
+
+    def validate(self, messages: RawInputs) -> ValidInputs:
+        """Turn messages into what can be used of them, and count the rest; nothing is taken in yet."""
+        return self._validator.validate(messages)
+
+    def add(self, arrivals: ValidInputs) -> None:
+        """Take in what has arrived since the last tick, in order of arrival."""
+        if arrivals.odometry.robot.size:
+            self._odometry.append(arrivals.odometry)
+        self._timeline.add(arrivals.measurements)
+        if arrivals.brightness.robot.size:
+            change = self._brightness.take(arrivals.brightness)
+            self._timeline.add(change.added)
+            self._timeline.withdraw(change.withdrawn)
+
+    def set_pose(self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike) -> str:
+        """Set a robot to a pose (3,) in `map` with covariance (3, 3), whatever was believed.
+
+        Returns:
+            Why that cannot be, a reason of `drops`: "not_localized" before its odometry; "" when it is done.
+        """
+        if self._odometry:
+            self._use_odometry()
+        command = about_robots(robot, stamp_ns, np.array([pose]), np.array([covariance]), Kind.SET_POSE)
+        fault = REJECT_REASONS[reject_reasons(command)[0]] or (
+            "" if self._tracks.begun(robot, stamp_ns) else "not_localized"
+        )
+        if fault:
+            self.drop(fault)
+        else:
+            self._timeline.add(command)
+        return fault
+
+    def forget(self, robot: int, stamp_ns: int) -> None:
+        """Take a robot out of the estimate; it waits for a fix."""
+        self._timeline.add(about_robots(robot, stamp_ns, np.zeros((1, 3)), np.eye(3)[None], Kind.FORGET))
+
+    def drop(self, reason: str, count: int = 1) -> None:
+        """Count data that could not even be handed in."""
+        if count:
+            self._validator.drops[reason] += count
+
+    @property
+    def drops(self) -> dict[str, int]:
+        """Data not used, by reason, since construction."""
+        total = self._validator.drops + self._brightness.drops + Counter(self._timeline_drops())
+        return {reason: count for reason, count in sorted(total.items()) if count}
+
+    @property
+    def used(self) -> int:
+        """Measurements used since the last reset."""
+        return int(self._timeline.verdict_counts()[Verdict.USED])
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What was used since the last reset, by name."""
+        others = {
+            "constraints kept": int(self._timeline.verdict_counts()[Verdict.CONSTRAINT]),
+            "infrared exchanges measured": self._brightness.measured,
+        }
+        outcomes = self._timeline.state.images.outcomes
+        others |= {f"identities {one.name.lower().replace('_', ' ')}": int(outcomes[one]) for one in Outcome}
+        return {"measurements used": self.used} | {name: count for name, count in others.items() if count}
+
+    def recent(self) -> tuple[MeasurementArray, NDArray[np.uint8], FloatArray]:
+        """The measurements within the horizon, their verdicts and normalised innovations squared."""
+        return self._timeline.measurements, self._timeline.verdicts, self._timeline.nis
+
+    @property
+    def identities(self) -> Identities | None:
+        """Who is who in the newest aerial image; None before the first."""
+        return self._timeline.state.images.newest
+
+    def contradictions(self, now_ns: int) -> list[Contradiction]:
+        """What contradicts the belief or the description at an instant, robots first."""
+        return contradictions(self.swarm, self._timeline.state, self._tracks, now_ns)
+
+    @property
+    def is_self_calibrated(self) -> bool:
+        """Whether there is anything to learn: described with a sigma, or contradicted."""
+        return learns(self.swarm) or bool((self._timeline.state.contradicted_ns > NEVER_NS).any())
+
+    def learned(self) -> Swarm:
+        """The swarm with cameras, odometry and landmarks as they are now estimated."""
+        return learned(self.swarm, self._timeline.state)
+
+    @property
+    def is_fusing(self) -> bool:
+        """Whether some of what the last `tick` began to fuse was left to the next ones."""
+        return self._timeline.is_under_way
+
+    def tick(self, now_ns: int, *, fuse: bool = True, go_on: GoOn = lambda: True) -> SwarmEstimate:
+        """Use all that has arrived and give the poses at `now_ns`; measurements wait unless `fuse`.
+
+        Fusing stops where `go_on` says that there is no time for another step, and goes on at the next tick;
+        until it is done, odometry leads on from what was known before it began.
+        """
+        newest_ns = self._check_clock(now_ns)
+        oldest_ns = newest_ns - self._horizon_ns
+        self._tracks.trim(oldest_ns, self._timeline.oldest_due_ns(oldest_ns) - 2 * self._reach_ns)
+        if self._odometry:
+            self._use_odometry()
+        if fuse:
+            self._timeline.advance(newest_ns, go_on)
+            self._brightness.forget_before(oldest_ns)
+        return self._estimate(now_ns)
+
+    def _check_clock(self, now_ns: int) -> int:
+        """Begin anew when time has jumped back, as at the loop of a bag; return the newest time since."""
+        if self._now_ns is not None and now_ns < self._now_ns - self._jump_back_ns:
+            self.reset()
+            self.time_jumps += 1
+        self._now_ns = now_ns if self._now_ns is None else max(now_ns, self._now_ns)
+        return self._now_ns
+
+    def _use_odometry(self) -> None:
+        rows = joined(self._odometry)
+        self._odometry = []
+        change = self._tracks.extend(rows.robot, rows.stamp_ns, rows.pose)
+        self.drop("odometry_duplicate", change.duplicates)
+        self.drop("odometry_too_old", change.too_old)
+        self.drop("odometry_jump", change.jumps)
+        self._timeline.invalidate(change.changed_from_ns)
+
+    def _timeline_drops(self) -> dict[str, int]:
+        verdicts = self._timeline.verdict_counts()
+        return {
+            "gated": int(verdicts[Verdict.GATED]),
+            "not_localized": int(verdicts[Verdict.NOT_LOCALIZED]),
+            "aerial_unassigned": int(verdicts[Verdict.UNASSIGNED]),
+            "aerial_ambiguous": int(verdicts[Verdict.AMBIGUOUS]),
+            "duplicate": self._timeline.duplicates,
+            "too_old": self._timeline.too_old,
+        }
+
+    def _estimate(self, now_ns: int) -> SwarmEstimate:
+        state = self._fusion.with_starts(self._timeline.state, now_ns)
+        return estimate_at(state, self._tracks.arrays, self._timeout_s, now_ns)

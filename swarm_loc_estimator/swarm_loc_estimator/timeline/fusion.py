@@ -1,0 +1,371 @@
+"""Steps of the joint EKF: robots are initialized and lost, measurements fused in order or together."""
+
+from __future__ import annotations
+
+import itertools
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.filter import sequential_update
+from swarm_loc_estimator.filter.batch_update import (
+    assess_all,
+    confirm_all,
+    count_all_gated,
+    evaluate_all,
+    predict_all,
+    related_columns,
+)
+from swarm_loc_estimator.filter.belief import correct
+from swarm_loc_estimator.filter.calibration_states import ParameterTable
+from swarm_loc_estimator.filter.correlated_noise import at_first, record_constraint, record_pair
+from swarm_loc_estimator.filter.innovation import InnovationBatch, new_batch
+from swarm_loc_estimator.filter.integrity.divergence import WELL_CONFIRMED, LossLimits
+from swarm_loc_estimator.filter.integrity.fault_detection import is_elsewhere
+from swarm_loc_estimator.filter.joint_filter import JointFilter, Robots
+from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray, MeasurementColumns
+from swarm_loc_estimator.filter.sequential_update import update_in_order
+from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
+from swarm_loc_estimator.filter.state import InitialPose, Starts, SwarmState
+from swarm_loc_estimator.identification.assignment import AMBIGUOUS
+from swarm_loc_estimator.initialization.initializer import Initializer
+from swarm_loc_estimator.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.sensors.aerial import PictureFusion, as_fixes, relieve_seen
+from swarm_loc_estimator.sensors.messages import chosen
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline.fusion_period import middle_of_period
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
+
+_SURER_AT_FIRST = 1.5
+"""By this factor a heading must be surer than one that is lost, for a robot to be initialized."""
+_NO_IMAGE_NS = np.iinfo(np.int64).min
+_PAIRS_PER_ROBOT = 32
+"""A robot remembers what so many others have told it by infrared."""
+_CONTRADICTED_DESCRIPTION, _CONTRADICTED_WITHIN_NS = 2, 60_000_000_000
+"""When so many robots and landmarks are contradicted within that time, so is all that was concluded."""
+_MAX_ROBOTS_OPENED = 30
+"""With more robots only those are estimated anew that are contradicted: all would cost too much."""
+_MANY = 64
+"""From so many measurements on, one update with all of them costs less than one each, at any swarm size."""
+
+
+class Verdict(IntEnum):
+    """What became of a measurement."""
+
+    OPEN = sequential_update.OPEN  # not looked at yet
+    USED = sequential_update.USED
+    GATED = sequential_update.GATED  # its innovation is too unlikely
+    CONSTRAINT = 3  # kept to locate a robot that waits
+    NOT_LOCALIZED = 4  # neither side is located, or a robot has sent no odometry
+    UNASSIGNED = 5  # an anonymous detection that is no robot's
+    AMBIGUOUS = 6  # an anonymous detection that may be one robot's or another one's
+
+
+class Fusion:
+    """The steps of the filter over one swarm.
+
+    Args:
+        swarm: Who takes part.
+        settings: Limits for giving a robot up.
+        tracks: The robots' odometry.
+
+    Attributes:
+        is_sparse: Whether only covariances of neighbours are kept: in a large swarm.
+    """
+
+    def __init__(self, swarm: Swarm, settings: EstimatorSettings, tracks: OdometryTracks) -> None:
+        self._tracks = tracks
+        self._limits = LossLimits(
+            settings.lost_sigma, settings.lost_heading_sigma, settings.lost_after, settings.max_doubt
+        )
+        self._period_ns = round(settings.fusion_period_s * 1e9)
+        self.is_sparse = self._period_ns > 0 and len(swarm.robots) >= settings.sparse_from
+        self._has_start = np.array([r.start is not None for r in swarm.robots], dtype=bool)
+        self._start: FloatArray = np.array([r.start or (0.0, 0.0, 0.0) for r in swarm.robots]).reshape(-1, 3)
+        sigma = [(r.start_sigma.x, r.start_sigma.y, r.start_sigma.theta) for r in swarm.robots]
+        self._start_variance: FloatArray = np.square(sigma).reshape(-1, 3)
+        surer = settings.lost_heading_sigma / _SURER_AT_FIRST
+        self._initializer = Initializer(tracks, settings.fix_window_s, surer)
+        self._pictures = PictureFusion(swarm, settings, tracks)
+        self._table = ParameterTable.of(swarm.robots, swarm.landmarks, in_blocks=self.is_sparse)
+        self._pairs = _PAIRS_PER_ROBOT if any(robot.ir is not None for robot in swarm.robots) else 0
+
+    def new_state(self) -> SwarmState:
+        """Nothing is known yet."""
+        joint: JointFilter | None = SparseFilter(self._table) if self.is_sparse else None
+        return SwarmState(self._table, self._pairs, joint)
+
+    def with_starts(self, state: SwarmState, stamp_ns: int) -> SwarmState:
+        """The state, together with those robots at their starts about whom there was no measurement yet.
+
+        Not those that walk at random: nobody knows since when.
+        """
+        robots = np.flatnonzero(state.start_pending)
+        ready = robots[~self._tracks.walks(robots) & self._may_start(state, robots, stamp_ns)]
+        if ready.size:
+            state = state.copy()
+            self._initialize_at_start(state, ready, np.full(ready.size, stamp_ns))
+        return state
+
+    def _may_start(self, state: SwarmState, robots: IntArray, stamps_ns: IntArray | int) -> BoolArray:
+        """Whether robots (k,) may start at configured poses: their odometry has begun by instants (k,)."""
+        pending: BoolArray = state.start_pending[robots] & self._has_start[robots]
+        return pending & self._tracks.begun(robots, stamps_ns)
+
+    def _initialize_at_start(self, state: SwarmState, robots: IntArray, stamps_ns: IntArray) -> None:
+        """Where their tracks begin; or, if they walk at random, with the first measurements about them."""
+        tracks, start, walks = self._tracks.arrays, self._start[robots], self._tracks.walks(robots)
+        transform = se2.compose(start, se2.inverse(tracks.begin_pose[robots]))
+        error = se2.error_covariance(start, self._start_variance[robots][:, :, None] * np.eye(3))
+        begun_ns = np.where(walks, stamps_ns, tracks.begin_ns[robots])
+        covariance, jacobian = self._tracks.at(robots, stamps_ns)[2:4]
+        covariance[~walks], jacobian[~walks] = 0.0, 0.0  # where a track begins, nothing is preintegrated yet
+        state.start(robots, Starts(transform, error, begun_ns, covariance, jacobian))
+
+    def _initialize_measured(self, state: SwarmState, measurements: MeasurementArray) -> bool:
+        """Initialize robots at their starts with the first measurement (m,) about them; whether any was.
+
+        Not before: only a measurement about a robot is computed again when its first odometry arrives late.
+        """
+        initialized = False
+        for side in ("observer", "target"):
+            new = np.append(state.start_pending, False)[measurements[side]]  # NOBODY (-1) finds the last
+            robots, stamps_ns = measurements[side][new], measurements["stamp_ns"][new]
+            ready = self._may_start(state, robots, stamps_ns)
+            chosen_robots, first = np.unique(robots[ready], return_index=True)
+            if chosen_robots.size:
+                self._initialize_at_start(state, chosen_robots, stamps_ns[ready][first])
+                initialized = True
+        return initialized
+
+    def step(
+        self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        """Fuse measurements into the state.
+
+        One after the other, each at its exact stamp; or, where many share a period of `fusion_period_s`,
+        together: each is related to the poses at its own stamp, but the noise gathered between the stamps
+        is taken in the middle of the period.
+
+        Args:
+            state: Changed in place.
+            measurements: (m,) in order of their stamps.
+            verdicts: (m,) written, of `Verdict`.
+            nis: (m,) normalised innovations squared, written; NaN where there is none.
+        """
+        nis[:] = np.nan
+        anonymous = measurements["kind"] == Kind.ANONYMOUS
+        if not anonymous.any():
+            self._fuse(state, measurements, verdicts, nis)
+            return
+        image_ns = np.where(anonymous, measurements["stamp_ns"], _NO_IMAGE_NS)
+        edges = [0, *(np.flatnonzero(np.diff(image_ns)) + 1).tolist(), measurements.size]
+        for begin, end in itertools.pairwise(edges):
+            part = slice(begin, end)
+            fuse = self._fuse_image if anonymous[begin] else self._fuse
+            fuse(state, measurements[part], verdicts[part], nis[part])
+
+    def _fuse(
+        self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        """Fuse measurements that name their robots."""
+        measured = measurements["kind"] < Kind.SET_POSE
+        if state.filter.sequential:
+            if self._period_ns and measurements.size >= _MANY and measured.all():
+                self._fuse_together(state, measurements, verdicts, nis)
+            else:
+                self._fuse_in_order(state, measurements, verdicts, nis)
+            return
+        edges = [0, *(np.flatnonzero(np.diff(measured)) + 1).tolist(), measurements.size]
+        for begin, end in itertools.pairwise(edges):
+            part = slice(begin, end)
+            if measured[begin]:
+                self._fuse_together(state, measurements[part], verdicts[part], nis[part])
+            else:
+                self._fuse_in_order(state, measurements[part], verdicts[part], nis[part])
+
+    def _fuse_image(
+        self, state: SwarmState, image: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        """Fuse the anonymous detections of an aerial image."""
+        robots, stamp_ns = np.flatnonzero(state.start_pending), int(image["stamp_ns"][0])
+        ready = robots[self._may_start(state, robots, stamp_ns)]
+        if ready.size:
+            self._initialize_at_start(state, ready, np.full(ready.size, stamp_ns))
+        assignment = self._pictures.assigned(state, image)
+        known = assignment.robot >= 0
+        if known.any():
+            fixes, fates = as_fixes(image[known], assignment.robot[known]), verdicts[known]
+            squares = nis[known]
+            self._fuse(state, fixes, fates, squares)
+            verdicts[known], nis[known] = fates, squares
+            relieve_seen(state, assignment.robot[known][fates == Verdict.USED])
+        unknown = (
+            Verdict.CONSTRAINT if self._pictures.identify(state, image, assignment) else Verdict.UNASSIGNED
+        )
+        unclear = assignment.robot[~known] == AMBIGUOUS
+        verdicts[~known] = np.where(unclear, Verdict.AMBIGUOUS, unknown)
+
+    def _fuse_in_order(
+        self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        columns = MeasurementColumns.of(measurements)
+        k = 0
+        while True:
+            k, reason, robot = update_in_order(
+                columns, k, self._tracks.arrays, state.arrays(), self._limits, verdicts, nis
+            )
+            if reason == sequential_update.FINISHED:
+                return
+            if reason == sequential_update.LOST:
+                state.lose(robot)
+                continue
+            if reason == sequential_update.CONTRADICTED:
+                self._open(state, robot, int(measurements["stamp_ns"][k]))
+                continue
+            one = measurements[k : k + 1]
+            if one["kind"][0] >= Kind.SET_POSE:
+                verdicts[k] = self._apply_command(state, one)
+            elif self._initialize_measured(state, one):
+                continue
+            else:
+                verdicts[k] = self._note(state, one)
+            k += 1
+
+    def _fuse_together(
+        self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        for part in self._parts(measurements):
+            self._fuse_part(state, measurements[part], verdicts[part], nis[part])
+
+    def _parts(self, measurements: MeasurementArray) -> list[slice]:
+        """Parts of measurements (m,) in which no pair tells twice what comes again: its mean is to count."""
+        edges, told = [0], set[tuple[int, int]]()
+        if self._pairs:
+            comes_again: BoolArray = measurements["systematic_share"].max(axis=1) > 0.0
+            pairs = zip(measurements["observer"].tolist(), measurements["target"].tolist(), strict=True)
+            for k, pair in itertools.compress(enumerate(pairs), comes_again):
+                if pair in told:
+                    edges.append(k)
+                    told.clear()
+                told.add(pair)
+        return [slice(begin, end) for begin, end in itertools.pairwise([*edges, measurements.size])]
+
+    def _fuse_part(
+        self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        """Fuse measurements (m,) together, against one belief."""
+        self._initialize_measured(state, measurements)
+        known = np.append(state.tracked, True)  # NOBODY (-1) finds the last
+        tied = known[measurements["observer"]] & known[measurements["target"]]
+        if tied.any():
+            fields = MeasurementColumns.of(measurements if tied.all() else measurements[tied])
+            batch, lost = self._predict(state, fields)
+            good = ~(lost[fields.observer] | lost[fields.target])
+            if not good.all():
+                fields, batch = chosen(fields, good), chosen(batch, good)
+                tied[tied] = good
+            if good.any():
+                verdicts[tied], nis[tied] = self._update(state, fields, batch)
+        untied = np.flatnonzero(~tied)
+        sides = zip(measurements["observer"][untied], measurements["target"][untied], strict=True)
+        for k, (observer, target) in zip(untied.tolist(), sides, strict=True):
+            # most of what comes before a swarm is located; who is known changes on the way
+            if state.is_known(observer) == state.is_known(target):
+                verdicts[k] = Verdict.NOT_LOCALIZED
+            else:
+                verdicts[k] = self._note(state, measurements[k : k + 1])
+
+    def _predict(self, state: SwarmState, fields: MeasurementColumns) -> tuple[InnovationBatch, BoolArray]:
+        """Predict the robots involved to the middle of the period; those too uncertain leave.
+
+        Returns:
+            A batch (m,) with poses and motion, and (N + 1,) whether each robot, and nobody, was lost.
+        """
+        batch, lost = new_batch(fields.stamp_ns.size), np.zeros(state.tracked.size + 1, dtype=bool)
+        stamp_ns = middle_of_period(int(fields.stamp_ns[0]), self._period_ns)
+        predict_all(fields, stamp_ns, self._tracks.arrays, state.arrays(), self._limits, batch, lost[:-1])
+        for robot in np.flatnonzero(lost):
+            state.lose(int(robot))
+        return batch, lost
+
+    def _update(
+        self, state: SwarmState, fields: MeasurementColumns, batch: InnovationBatch
+    ) -> tuple[NDArray[np.uint8], FloatArray]:
+        """Hold measurements (m,) against one belief, use those that pass; return verdicts and their NIS."""
+        belief, passed, newest_ns = state.arrays(), batch.passed, int(fields.stamp_ns[-1])
+        state.filter.relate_pairs(
+            related_columns(fields, belief), self._robots(state, newest_ns), batch.across
+        )
+        evaluate_all(fields, belief, batch)
+        looks = (batch.distance, batch.whitened, batch.cause)
+        contradicted = assess_all(fields, belief, self._limits, looks, passed)
+        lost = confirm_all(fields, belief, passed)
+        systematic = (fields.systematic_share > 0.0).any(axis=1)
+        for k in np.flatnonzero(passed & systematic).tolist():
+            record_pair(fields, k, belief, batch.pair[k])
+        if passed.any():
+            used = slice(None) if passed.all() else passed
+            evaluated = (batch.jacobian[used], batch.innovation[used], batch.noise[used])
+            correction = state.filter.update(batch.columns[used], *evaluated)
+            belief = state.arrays()  # the filter may have new ones
+            correct(belief, correction)
+        lost |= count_all_gated(fields, belief, passed, self._limits)
+        for robot in np.flatnonzero(lost):
+            state.lose(int(robot))
+        for source in np.flatnonzero(contradicted).tolist():
+            self._open(state, source, newest_ns)
+        return np.where(passed, Verdict.USED, Verdict.GATED).astype(np.uint8), batch.nis
+
+    def _robots(self, state: SwarmState, stamp_ns: int) -> Robots:
+        """Where all robots are at an instant."""
+        return Robots(self._poses(state, stamp_ns)[:, :2], state.tracked.copy())
+
+    def _poses(self, state: SwarmState, stamp_ns: int) -> FloatArray:
+        """Poses (N, 3) of all robots in `map` at an instant."""
+        robots = np.arange(state.tracked.size)
+        return se2.compose(state.transform, self._tracks.at(robots, np.full(robots.size, stamp_ns)).pose)
+
+    def _note(self, state: SwarmState, one: MeasurementArray) -> Verdict:
+        """Keep a measurement (1,) as a constraint if it ties a waiting robot to something located."""
+        if not self._initializer.note(state, at_first(one)):
+            return Verdict.NOT_LOCALIZED
+        sides = np.array([one["observer"][0], one["target"][0]])
+        if self._pairs and (sides >= 0).all():
+            tracks = self._tracks.at(sides, np.repeat(one["stamp_ns"], 2))
+            record_constraint(MeasurementColumns.of(one), 0, state.arrays(), tracks)
+        return Verdict.CONSTRAINT
+
+    def _open(self, state: SwarmState, source: int, stamp_ns: int) -> None:
+        """Estimate what a contradicted robot or landmark was described by, or locate the robot anew."""
+        robots = state.tracked.size
+        if source < robots and is_elsewhere(state.integrity, source):
+            state.lose(source)
+            return
+        poses = self._poses(state, stamp_ns)
+        state.contradicted_ns[source] = stamp_ns
+        lately = np.sum(state.contradicted_ns > stamp_ns - _CONTRADICTED_WITHIN_NS)
+        if lately < _CONTRADICTED_DESCRIPTION or state.all_opened or robots > _MAX_ROBOTS_OPENED:
+            state.open(source, poses[min(source, robots - 1)])
+        else:
+            state.open_all(poses)
+
+    def _apply_command(self, state: SwarmState, command: MeasurementArray) -> Verdict:
+        """Set the pose of a robot or forget it, as the command (1,) says."""
+        robot, stamp_ns = int(command["target"][0]), int(command["stamp_ns"][0])
+        if command["kind"][0] == Kind.FORGET:
+            state.lose(robot)
+            return Verdict.USED
+        if not self._tracks.begun(robot, stamp_ns):
+            return Verdict.NOT_LOCALIZED
+        track = self._tracks.at(command["target"], command["stamp_ns"])
+        pose, covariance = command["value"][0], command["covariance"][0]
+        transform = se2.compose(pose, se2.inverse(track.pose[0]))
+        at = Preintegrated(stamp_ns, track.covariance[0], track.jacobian[0])
+        initial = InitialPose(transform, se2.error_covariance(pose, covariance))
+        state.initialize(robot, initial, at, WELL_CONFIRMED)
+        return Verdict.USED

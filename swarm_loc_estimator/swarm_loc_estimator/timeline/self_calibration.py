@@ -1,0 +1,87 @@
+"""Exports self-calibration results as a swarm description."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.filter.calibration_states import (
+    CAMERA_SCALE,
+    CAMERA_YAW,
+    DISTANCE_SCALE,
+    TURN_BIAS,
+    TURN_SCALE,
+    ParameterTable,
+)
+from swarm_loc_estimator.filter.integrity.noise_inflation import with_hidden_noise
+from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
+
+
+def learns(swarm: Swarm) -> bool:
+    """Whether there is anything to learn: a camera, odometry or landmark whose description has a sigma."""
+    lasting = np.delete(ParameterTable.of(swarm.robots).column, TURN_BIAS, axis=1)
+    return bool((lasting >= 0).any()) or any(mark.is_estimated for mark in swarm.landmarks)
+
+
+def learned(swarm: Swarm, state: SwarmState) -> Swarm:
+    """The swarm with all that is estimated where the belief has it, and as unsure as it is.
+
+    The bias of a turn rate is left out, since it changes. The landmarks' sigmas are those of each alone: an
+    error that all of them share is not told apart.
+    """
+    return Swarm(
+        tuple(
+            _robot(robot, index, state) if state.tracked[index] else robot
+            for index, robot in enumerate(swarm.robots)
+        ),
+        tuple(
+            _landmark(mark, index, state) if state.landmark_column(index) >= 0 else mark
+            for index, mark in enumerate(swarm.landmarks)
+        ),
+    )
+
+
+def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
+    """A robot with its parameters."""
+    value, sigma = state.parameter[index].tolist(), state.parameter_sigma(index).tolist()
+    odometry, camera, sensor = robot.odometry, robot.camera, robot.sensor
+    path, turn, seen = (1.0 + value[which] for which in (DISTANCE_SCALE, TURN_SCALE, CAMERA_SCALE))
+    return replace(
+        robot,
+        odometry=replace(
+            odometry,
+            distance_scale=path * odometry.distance_scale,
+            distance_scale_sigma=sigma[DISTANCE_SCALE] / path,
+            turn_scale=turn * odometry.turn_scale,
+            turn_scale_sigma=sigma[TURN_SCALE] / turn,
+        ),
+        camera=camera
+        and replace(
+            camera,
+            yaw=float(se2.wrap_angle(camera.yaw + value[CAMERA_YAW])),
+            yaw_sigma=sigma[CAMERA_YAW],
+        ),
+        sensor=replace(
+            with_hidden_noise(sensor, float(state.integrity.hidden_noise[index])),
+            distance_scale=seen * sensor.distance_scale,
+            distance_scale_sigma=sigma[CAMERA_SCALE] / seen,
+        ),
+    )
+
+
+def _landmark(mark: Landmark, number: int, state: SwarmState) -> Landmark:
+    """A landmark at its place."""
+    x, y, yaw = se2.compose(state.landmark[number], [mark.x, mark.y, mark.yaw or 0.0]).tolist()
+    covariance = se2.pose_covariance([x, y, yaw], state.landmark_covariance(number))
+    return replace(
+        mark,
+        x=x,
+        y=y,
+        yaw=None if mark.yaw is None else yaw,
+        position_sigma=math.sqrt(0.5 * float(np.trace(covariance[:2, :2]))),
+        yaw_sigma=mark.yaw_sigma if mark.yaw is None else math.sqrt(float(covariance[2, 2])),
+    )

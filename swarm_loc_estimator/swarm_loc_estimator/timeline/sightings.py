@@ -1,0 +1,62 @@
+"""What the robots have measured lately, and what became of it: the newest measurement of each pair."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
+from swarm_loc_estimator.timeline.fusion import Verdict
+
+RECENT_NS = 2_000_000_000
+"""Older measurements do not tell what a robot sees now."""
+_SHOWN = (int(Kind.CARTESIAN), int(Kind.POLAR))
+
+
+class Sightings(NamedTuple):
+    """One row per pair (M,), in the order of observer and target.
+
+    Attributes:
+        observer: Index of the robot that measured; -1: an absolute fix.
+        target: Index of the robot measured; below 0: landmark -1 - target.
+        verdict: Of `Verdict`.
+        nis: Normalised innovation squared; NaN: not computed.
+        age_s: Time since it was measured [s].
+    """
+
+    observer: NDArray[np.int32]
+    target: NDArray[np.int32]
+    verdict: NDArray[np.uint8]
+    nis: NDArray[np.float32]
+    age_s: NDArray[np.float32]
+
+
+def newest_sightings(
+    recent: tuple[MeasurementArray, NDArray[np.uint8], NDArray[np.float64]], now_ns: int
+) -> Sightings:
+    """The newest measurement of each pair within the last two seconds.
+
+    Args:
+        recent: Measurements (m,) in the order of their stamps, their verdicts and NIS.
+        now_ns: The instant.
+    """
+    rows, verdicts, nis = recent
+    first = int(np.searchsorted(rows["stamp_ns"], now_ns - RECENT_NS))
+    rows, verdicts, nis = rows[first:], verdicts[first:], nis[first:]
+    robot, landmark = rows["target"], rows["landmark"]
+    target = np.where(landmark > 0, -landmark, robot)
+    observer = rows["observer"]
+    chosen = np.flatnonzero(np.isin(rows["kind"], _SHOWN) & ((landmark > 0) | (robot >= 0)))[::-1]
+    # np.unique keeps the first of equal keys: by the reversed order the newest
+    _, places = np.unique((observer[chosen] << 32) + target[chosen], return_index=True)
+    kept = chosen[places]
+    computed = np.isin(verdicts[kept], (Verdict.USED, Verdict.GATED))
+    return Sightings(
+        observer[kept].astype(np.int32),
+        target[kept].astype(np.int32),
+        verdicts[kept].astype(np.uint8),
+        np.where(computed, nis[kept], np.nan).astype(np.float32),
+        ((now_ns - rows["stamp_ns"][kept]) * 1e-9).astype(np.float32),
+    )

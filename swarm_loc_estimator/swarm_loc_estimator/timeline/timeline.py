@@ -1,0 +1,275 @@
+"""Out-of-sequence measurements: checkpoints, to which the filter goes back when something comes late.
+
+The state after some of the steps is kept (checkpoints). What arrives late takes the filter back to the
+checkpoint before it, and everything since is computed again; so the result is that of an orderly arrival.
+The e-puck paper's buffer (V-B) assigns a measurement to the closest stored state: `state_period_s` does that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
+from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.timeline.buffer import MeasurementBuffer
+from swarm_loc_estimator.timeline.fusion import Verdict
+from swarm_loc_estimator.timeline.fusion_period import end_of_period, middle_of_period
+from swarm_loc_estimator.timeline.settings import EstimatorSettings
+
+Step = Callable[[SwarmState, MeasurementArray, NDArray[np.uint8], FloatArray], None]
+GoOn = Callable[[], bool]
+"""Whether there is time for another step."""
+
+_CHECKPOINTS = 40
+_FORGOTTEN_AT_ONCE = 4
+_LARGE = 64
+"""Robots of a swarm whose periods are worth waiting for: fusing a smaller one anew takes little."""
+_BEFORE_ALL, _AFTER_ALL = np.iinfo(np.int64).min, np.iinfo(np.int64).max
+
+
+@dataclass(frozen=True)
+class _Checkpoint:
+    """The state after the step `key`."""
+
+    key: int
+    state: SwarmState
+
+
+class Timeline:
+    """Buffered measurements with their verdicts, and the newest state.
+
+    Args:
+        settings: Horizon, and how stamps are grouped into steps.
+        step: Fuses the measurements of one step into a state, see `Fusion.step`.
+        state: Where to begin.
+        reach_ns: How far before its stamp late odometry may change what measurements meant, and they may
+            count; they are kept so much longer than the horizon.
+
+    Attributes:
+        state: The newest of which all is computed.
+        is_under_way: Whether steps are left to compute of what the last `advance` began.
+    """
+
+    def __init__(self, settings: EstimatorSettings, step: Step, state: SwarmState, reach_ns: int) -> None:
+        self._step = step
+        self._horizon_ns = round(settings.horizon_s * 1e9)
+        self._state_period_ns = round(settings.state_period_s * 1e9)
+        self._fusion_period_ns = round(settings.fusion_period_s * 1e9)
+        waits = self._fusion_period_ns and state.tracked.size >= _LARGE
+        self._fusion_delay_ns = round(settings.fusion_delay_s * 1e9) if waits else None
+        self._kept_ns = self._horizon_ns + reach_ns
+        self._spacing_ns = self._kept_ns // _CHECKPOINTS
+        self.restart(state)
+
+    def restart(self, state: SwarmState) -> None:
+        """Drop all measurements and go on from `state`."""
+        self.state = self._ahead = state
+        self.is_under_way = False
+        self._head_key = _BEFORE_ALL
+        self._checkpoints = [_Checkpoint(_BEFORE_ALL, state.copy())]
+        self._new: list[MeasurementArray] = []
+        self._withdrawn: list[MeasurementArray] = []
+        self._redo_from_ns: int | None = None
+        self._buffer = MeasurementBuffer()
+        self.settled: NDArray[np.int64] = np.zeros(len(Verdict), dtype=np.int64)
+        self.duplicates = 0
+        self.too_old = 0
+
+    @property
+    def measurements(self) -> MeasurementArray:
+        """Those within the horizon (m,), in order."""
+        return self._buffer.measurements
+
+    @property
+    def verdicts(self) -> NDArray[np.uint8]:
+        """(m,) what became of them, of `Verdict`."""
+        return self._buffer.verdicts
+
+    @property
+    def nis(self) -> FloatArray:
+        """(m,) their normalised innovations squared."""
+        return self._buffer.nis
+
+    def add(self, measurements: MeasurementArray) -> None:
+        """Take measurements (m,) in; they count from the next `advance` on."""
+        if measurements.size:
+            self._new.append(measurements)
+
+    def withdraw(self, measurements: MeasurementArray) -> None:
+        """Take back measurements (m,) that were added, as if they had never come."""
+        if measurements.size:
+            self._withdrawn.append(measurements)
+
+    @property
+    def waiting(self) -> int:
+        """How many measurements wait for the next `advance`."""
+        return sum(measurements.size for measurements in self._new)
+
+    def oldest_due_ns(self, otherwise_ns: int) -> int:
+        """The instant of the oldest measurement that is left to compute, if it is before another instant."""
+        due_ns = [otherwise_ns] if self._redo_from_ns is None else [otherwise_ns, self._redo_from_ns]
+        due_ns += self._buffer.stamp_ns[self._count_until(self._head_key) :][:1].tolist()
+        return min(due_ns)
+
+    def invalidate(self, changed_from_ns: NDArray[np.int64]) -> None:
+        """Have the steps computed again whose robots' tracks have changed.
+
+        Args:
+            changed_from_ns: (N,) per robot the instant after which its track changed.
+        """
+        rows = self._buffer.measurements
+        first = _first_touched(
+            self._buffer.stamp_ns, rows["observer"], rows["target"], changed_from_ns, self._fusion_period_ns
+        )
+        if first < len(self._buffer):
+            self._redo_from(int(self._buffer.stamp_ns[first]))
+
+    def verdict_counts(self) -> NDArray[np.int64]:
+        """How many measurements got each verdict since the start (len(Verdict),)."""
+        return self.settled + np.bincount(self.verdicts, minlength=len(Verdict))
+
+    def advance(self, now_ns: int, go_on: GoOn = lambda: True) -> None:
+        """Compute all steps that new or changed data touch, and let go of what lies beyond the horizon.
+
+        A period of a large swarm waits for `fusion_delay_s` after its end, until most of it has come. Where
+        `go_on` says after a step that there is no time for another one, the rest is left to the next calls,
+        and what has come since waits until that is done.
+        """
+        if not self.is_under_way:
+            if self._new:
+                self._merge(now_ns - self._horizon_ns)
+            if self._withdrawn:
+                self._remove(now_ns - self._horizon_ns)
+            if self._redo_from_ns is not None:
+                self._go_back(self._key(self._redo_from_ns))
+                self._redo_from_ns = None
+        due_ns = _AFTER_ALL if self._fusion_delay_ns is None else now_ns - self._fusion_delay_ns
+        self.is_under_way = not self._compute(due_ns, go_on)
+        if not self.is_under_way:
+            self.state = self._ahead
+            self._forget_before(self._key(self.oldest_due_ns(now_ns - self._kept_ns)))
+
+    def _key(self, stamp_ns: int) -> int:
+        """The step that a stamp belongs to, as the last stamp that is of the step."""
+        return end_of_period(stamp_ns, self._fusion_period_ns) if self._fusion_period_ns else stamp_ns
+
+    def _count_until(self, key: int) -> int:
+        """How many measurements belong to steps up to `key`."""
+        return int(self._buffer.stamp_ns.searchsorted(key, side="right"))
+
+    def _redo_from(self, stamp_ns: int) -> None:
+        """Have the steps from that of a stamp on computed at the next `advance`."""
+        self._redo_from_ns = stamp_ns if self._redo_from_ns is None else min(stamp_ns, self._redo_from_ns)
+
+    def _merge(self, oldest_ns: int) -> None:
+        """Sort new measurements in."""
+        count, new = self.waiting, self._not_older(self._new, oldest_ns)
+        self._new = []
+        self.too_old += count - new.size
+        merged = self._buffer.merge(new)
+        self.duplicates += merged.duplicates
+        if merged.first_ns is not None:
+            self._redo_from(merged.first_ns)
+
+    def _remove(self, oldest_ns: int) -> None:
+        """Take withdrawn measurements out, unless what replaces them has just been refused as too old."""
+        gone, self._withdrawn = self._not_older(self._withdrawn, oldest_ns), []
+        first_ns = self._buffer.remove(gone)
+        if first_ns is not None:
+            self._redo_from(first_ns)
+
+    def _not_older(self, parts: list[MeasurementArray], oldest_ns: int) -> MeasurementArray:
+        """Measurements (m,) of some parts whose own stamps are not older than an instant.
+
+        Where stored states are wanted, they come with the stamps of the closest ones.
+        """
+        rows, period = parts[0] if len(parts) == 1 else np.concatenate(parts), self._state_period_ns
+        fresh = rows["stamp_ns"] >= oldest_ns
+        if not fresh.all():
+            rows = rows[fresh]
+        if period:
+            rows = rows.copy()
+            stamp_ns = rows["stamp_ns"]  # what one aerial image shows must not mix with another one's
+            nearest_ns = (stamp_ns + period // 2) // period * period
+            rows["stamp_ns"] = np.where(rows["kind"] == Kind.ANONYMOUS, stamp_ns, nearest_ns)
+        return rows
+
+    def _go_back(self, key: int) -> None:
+        """Go back to before step `key`, if it is not ahead."""
+        if key <= self._head_key:
+            while self._checkpoints[-1].key >= key:
+                self._checkpoints.pop()
+            self._head_key = self._checkpoints[-1].key
+            self._ahead = self._checkpoints[-1].state.copy()
+
+    def _compute(self, due_ns: int, go_on: GoOn) -> bool:
+        """Do the steps that end until `due_ns`, as long as there is time; whether all of them are done."""
+        buffer, begin = self._buffer, self._count_until(self._head_key)
+        while begin < len(buffer):
+            end = self._end_of_steps(begin)
+            key = self._key(int(buffer.stamp_ns[end - 1]))
+            if key > due_ns:
+                break
+            rows = slice(begin, end)
+            self._step(self._ahead, buffer.measurements[rows], buffer.verdicts[rows], buffer.nis[rows])
+            self._head_key = key
+            if key - max(self._checkpoints[-1].key, -(2**62)) >= self._spacing_ns:
+                self._checkpoints.append(_Checkpoint(key, self._ahead.copy()))
+            begin = end
+            if begin < len(buffer) and not go_on():
+                return False
+        return True
+
+    def _end_of_steps(self, begin: int) -> int:
+        """Where those steps end that are computed together with the one at `begin`, up to a checkpoint."""
+        stamps_ns, length_ns = self._buffer.stamp_ns, self._fusion_period_ns or self._spacing_ns
+        last_ns = end_of_period(int(stamps_ns[begin]), length_ns)
+        return (
+            stamps_ns.size if stamps_ns[-1] <= last_ns else int(stamps_ns.searchsorted(last_ns, side="right"))
+        )
+
+    def _forget_before(self, key: int) -> None:
+        """Keep one checkpoint before step `key` and only the measurements after it."""
+        older = 0
+        while older < len(self._checkpoints) and self._checkpoints[older].key < key:
+            older += 1
+        if older < _FORGOTTEN_AT_ONCE:
+            return
+        del self._checkpoints[: older - 1]
+        passed = self._count_until(self._checkpoints[0].key)
+        self.settled += np.bincount(self.verdicts[:passed], minlength=len(Verdict))
+        self._buffer.drop_first(passed)
+
+
+@compiled
+def _first_touched(
+    stamps_ns: NDArray[np.int64],
+    observers: NDArray[np.int64],
+    targets: NDArray[np.int64],
+    changed_from_ns: NDArray[np.int64],
+    period_ns: int,
+) -> int:
+    """The first measurement (of m, by stamp) of a robot whose track (of N) changed before it; m when none.
+
+    Or before the instant that the measurements of its period are predicted to. One that names nobody, an
+    anonymous detection, may be of any robot.
+    """
+    if not stamps_ns.size:
+        return 0
+    earliest_ns = max(changed_from_ns.min(), stamps_ns[0] - 1) - period_ns
+    for k in range(np.searchsorted(stamps_ns, earliest_ns, side="right"), stamps_ns.size):
+        if observers[k] < 0 and targets[k] < 0:
+            return k
+        reach_ns = stamps_ns[k]
+        if period_ns:
+            reach_ns = max(reach_ns, middle_of_period(stamps_ns[k], period_ns))
+        for robot in (observers[k], targets[k]):
+            if robot >= 0 and reach_ns > changed_from_ns[robot]:
+                return k
+    return stamps_ns.size

@@ -1,0 +1,129 @@
+"""Frames, the pieces that a page is told: a kind, an instant, and columns of numbers as one binary message.
+
+    uint32 length of the header | header as JSON, blanks up to a multiple of 8 | columns, each likewise padded
+
+The header names kind and stamp [ms] and lists the columns as name, type and length; all is little-endian.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from swarm_loc_estimator.common.messages.estimates import EstimateMessage
+from swarm_loc_estimator.mapping.grid_messages import GridMessage
+from swarm_loc_estimator.timeline.sightings import Sightings
+
+_TYPES = {"float64": "f8", "float32": "f4", "int32": "i4", "uint8": "u1", "int8": "i1"}
+_ALIGNMENT = 8
+
+
+class Frame(NamedTuple):
+    """One piece.
+
+    Attributes:
+        kind: What it tells: "poses", "sightings", "truth", "aerial", "goals" or "map".
+        stamp_ns: When that was so.
+        data: The bytes for the page.
+    """
+
+    kind: str
+    stamp_ns: int
+    data: bytes
+
+
+def pack(kind: str, stamp_ns: int, columns: Mapping[str, npt.NDArray[Any]], **extra: object) -> Frame:
+    """A frame of columns (float64, float32, int32, uint8 or int8).
+
+    Args:
+        kind: See `Frame`.
+        stamp_ns: When that was so.
+        columns: By name; each is made flat.
+        extra: What else stands in the header.
+    """
+    flat = {name: np.ascontiguousarray(column).reshape(-1) for name, column in columns.items()}
+    listed = [[name, _TYPES[str(column.dtype)], column.size] for name, column in flat.items()]
+    header = json.dumps({"kind": kind, "stamp": stamp_ns * 1e-6, "columns": listed, **extra}).encode()
+    header += b" " * (-(4 + len(header)) % _ALIGNMENT)
+    parts = [struct.pack("<I", len(header)), header]
+    for column in flat.values():
+        data = column.tobytes()
+        parts += [data, bytes(-len(data) % _ALIGNMENT)]
+    return Frame(kind, stamp_ns, b"".join(parts))
+
+
+def unpack(data: bytes) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+    """Header and columns of a frame's bytes, as the page reads them."""
+    size = struct.unpack_from("<I", data)[0]
+    header: dict[str, Any] = json.loads(data[4 : 4 + size])
+    at, columns = 4 + size, {}
+    for name, kind, length in header["columns"]:
+        columns[name] = np.frombuffer(data, f"<{kind}", length, at)
+        at += -(-columns[name].nbytes // _ALIGNMENT) * _ALIGNMENT
+    return header, columns
+
+
+def poses_frame(estimate: EstimateMessage) -> Frame:
+    """Where all robots are believed to be; waiting robots have NaN."""
+    pose, covariance = estimate.pose, estimate.covariance
+    single = {
+        "theta": pose[:, 2],
+        "sxx": covariance[:, 0, 0],
+        "sxy": covariance[:, 0, 1],
+        "syy": covariance[:, 1, 1],
+        "stt": covariance[:, 2, 2],
+        "age": estimate.fix_age_s,
+    }
+    columns: dict[str, npt.NDArray[Any]] = {"x": pose[:, 0], "y": pose[:, 1]}
+    columns |= {name: column.astype(np.float32) for name, column in single.items()}
+    return pack("poses", estimate.stamp_ns, {**columns, "status": estimate.status})
+
+
+def sightings_frame(stamp_ns: int, sightings: Sightings) -> Frame:
+    """What each robot sees, and what became of it."""
+    return pack("sightings", stamp_ns, sightings._asdict())
+
+
+def places_frame(
+    kind: str, stamp_ns: int, robot: Sequence[int], pose: npt.NDArray[np.float64], **extra: object
+) -> Frame:
+    """Poses (n, 3) in map of some robots, or of nobody known (-1): ground truth, goals, aerial detections."""
+    columns: dict[str, npt.NDArray[Any]] = {
+        "robot": np.array(robot, dtype=np.int32),
+        "x": pose[:, 0],
+        "y": pose[:, 1],
+        "theta": pose[:, 2].astype(np.float32),
+    }
+    return pack(kind, stamp_ns, columns, **extra)
+
+
+def aerial_frame(
+    stamp_ns: int, position: npt.NDArray[np.float64], known: Mapping[int, tuple[int, float]]
+) -> Frame:
+    """What an aerial image shows.
+
+    Args:
+        stamp_ns: Of the image.
+        position: (n, 2) of its detections in map [m].
+        known: Detection -> the robot that it is believed to be, and the probability of that.
+    """
+    who = [known.get(place, (-1, 0.0)) for place in range(len(position))]
+    columns: dict[str, npt.NDArray[Any]] = {
+        "robot": np.array([robot for robot, _ in who], dtype=np.int32),
+        "x": position[:, 0],
+        "y": position[:, 1],
+        "probability": np.array([sure for _, sure in who], dtype=np.float32),
+    }
+    return pack("aerial", stamp_ns, columns)
+
+
+def map_frame(stamp_ns: int, grid: GridMessage) -> Frame:
+    """The map as it is known at an instant."""
+    height, width = grid.cells.shape
+    shape = {"width": width, "height": height, "resolution": grid.resolution, "origin": grid.origin}
+    return pack("map", stamp_ns, {"cells": grid.cells}, **shape)

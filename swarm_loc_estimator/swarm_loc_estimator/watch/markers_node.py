@@ -1,0 +1,143 @@
+"""Shows the swarm to RViz and Foxglove: markers of all robots, and each robot's filtered odometry.
+
+    ./run swarm_loc_estimator markers_node --ros-args -p swarm_file:=swarm.yaml
+
+It publishes `swarm/markers` and `<robot>/odometry/filtered`. As long as nobody subscribes to these it listens
+to nothing; else to `swarm/poses`, `swarm/sightings` and, for the twist, `<robot>/odom`.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nav_msgs.msg import Odometry
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from visualization_msgs.msg import MarkerArray
+
+from swarm_loc_estimator.common.messages.cdr import CdrError, decode_odometry
+from swarm_loc_estimator.common.messages.encoders import UNKNOWN_COVARIANCE, encode_odometry
+from swarm_loc_estimator.common.messages.estimates import EstimateMessage, SwarmPosesReader, decode_sightings
+from swarm_loc_estimator.common.messages.markers import MarkersEncoder
+from swarm_loc_estimator.common.messages.planar import PLANE, planar_covariance
+from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.timeline.sightings import Sightings
+from swarm_loc_estimator.watch.markers_parameters import MarkersParameters
+from swarm_loc_msgs.msg import SwarmPoses, SwarmSightings
+
+_LOOK_S = 0.5
+_FLEETING = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
+_RELIABLE = QoSProfile(depth=10)
+_THROTTLE_S = 30.0
+_OLD_NS = 1_000_000_000
+_UNKNOWN_TWIST = (0.0, 0.0, 0.0)
+
+
+class MarkersNode(ConfiguredNode[MarkersParameters]):
+    """Converts estimates while somebody wants to see them.
+
+    Args:
+        node_arguments: Further arguments of `rclpy.node.Node`.
+    """
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("markers", MarkersParameters, **node_arguments)
+        self._swarm = load_swarm(Path(self.chosen.swarm_file))
+        self._names = tuple(robot.name for robot in self._swarm.robots)
+        self._reader = SwarmPosesReader()
+        self._encoder: MarkersEncoder | None = None
+        self._period_ns = round(1e9 / self.chosen.rate)
+        self._told_ns = 0
+        self._newest_ns = 0
+        self._seen: tuple[int, Sightings] | None = None
+        self._twist: dict[int, tuple[float, float, float]] = {}
+        self._markers = self.create_publisher(MarkerArray, "swarm/markers", _RELIABLE)
+        self._filtered = [
+            self.create_publisher(Odometry, f"{name}/odometry/filtered", _RELIABLE) for name in self._names
+        ]
+        self._heard: dict[str, Subscription] = {}
+        self.create_timer(_LOOK_S, self._look_around, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.get_logger().info(f"ready: {len(self._names)} robots of '{self.chosen.swarm_file}'")
+
+    def _look_around(self) -> None:
+        """Listen to what is needed for those who listen here."""
+        markers = bool(self._markers.get_subscription_count())
+        robots = [k for k, one in enumerate(self._filtered) if one.get_subscription_count()]
+        self._listen("swarm/poses", SwarmPoses, self._on_poses, wanted=markers or bool(robots))
+        self._listen("swarm/sightings", SwarmSightings, self._on_sightings, wanted=markers)
+        for k, name in enumerate(self._names):
+            self._listen(f"{name}/odom", Odometry, partial(self._on_odometry, k), wanted=k in robots)
+
+    def _listen(self, topic: str, message_class: type, use: Any, *, wanted: bool) -> None:
+        """Subscribe, or no longer."""
+        if wanted and topic not in self._heard:
+            self._heard[topic] = self.create_subscription(message_class, topic, use, _FLEETING, raw=True)
+        elif not wanted and topic in self._heard:
+            self.destroy_subscription(self._heard.pop(topic))
+
+    def _on_odometry(self, robot: int, data: bytes) -> None:
+        try:
+            self._twist[robot] = decode_odometry(data).twist
+        except CdrError:
+            self._warn(f"{self._names[robot]}/odom")
+
+    def _on_sightings(self, data: bytes) -> None:
+        try:
+            self._seen = decode_sightings(data)
+        except CdrError:
+            self._warn("swarm/sightings")
+
+    def _on_poses(self, data: bytes) -> None:
+        try:
+            estimate = self._reader.read(data)
+        except CdrError:
+            self._warn("swarm/poses")
+            return
+        if estimate.names != self._names:
+            self._warn("swarm/poses of another swarm")
+            return
+        self._publish_odometry(estimate)
+        if (
+            abs(estimate.stamp_ns - self._told_ns) >= self._period_ns
+            and self._markers.get_subscription_count()
+        ):
+            self._told_ns = estimate.stamp_ns
+            self._encoder = self._encoder or MarkersEncoder(self._swarm, estimate.frame_id)
+            self._markers.publish(self._encoder.encode(estimate, self._sightings_at(estimate.stamp_ns)))
+
+    def _sightings_at(self, stamp_ns: int) -> Sightings | None:
+        """The newest, unless they are old."""
+        if self._seen is None or abs(stamp_ns - self._seen[0]) > _OLD_NS:
+            return None
+        return self._seen[1]
+
+    def _publish_odometry(self, estimate: EstimateMessage) -> None:
+        """Pose in map and the robot's own twist, for those robots that somebody listens to."""
+        for k, publisher in enumerate(self._filtered):
+            if not np.isfinite(estimate.pose[k]).all() or not publisher.get_subscription_count():
+                continue
+            covariance = planar_covariance(0.0, 0.0, 0.0)
+            covariance[PLANE] = estimate.covariance[k]
+            twist = self._twist.get(k, _UNKNOWN_TWIST)
+            (message,) = encode_odometry(
+                estimate.frame_id,
+                f"{self._names[k]}/base_link",
+                np.array([estimate.stamp_ns]),
+                estimate.pose[k : k + 1],
+                np.array([twist]),
+                covariance,
+                UNKNOWN_COVARIANCE,
+            )
+            publisher.publish(message)
+
+    def _warn(self, what: str) -> None:
+        self.get_logger().warning(f"{what} cannot be read", throttle_duration_sec=_THROTTLE_S)
+
+
+main = partial(run_node, "markers_node", MarkersNode)

@@ -1,0 +1,268 @@
+"""The server of the page: HTML once, then frames over a WebSocket, and commands back; in a thread of its own.
+
+Whoever has frames hands them over and goes on: nothing here makes it wait, however slow or many the pages.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket as sockets
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol
+
+from aiohttp import WSMsgType, web
+
+from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.watch.access import Access, is_loopback
+from swarm_loc_estimator.watch.frames import Frame
+from swarm_loc_estimator.watch.history import History
+from swarm_loc_estimator.watch.page import content_security_policy, page
+from swarm_loc_estimator.watch.viewer import RECEIVED, LeftOut, Viewer
+
+MAX_VIEWERS = 32
+_MAX_COMMAND_BYTES = 4096
+_SEND_BUFFER_BYTES = 262144
+_HEARTBEAT_S = 10.0
+_START_PATIENCE_S = 10.0
+
+Command = Mapping[str, Any]
+
+
+class Answer(Protocol):
+    """Takes the answer to a command; from any thread."""
+
+    def __call__(self, said: str, *, ok: bool = True) -> None:
+        """One sentence, and whether the command was obeyed."""
+
+
+OnCommand = Callable[[Command, Answer], None]
+"""Takes a page's command; called in the server's thread."""
+
+
+class ServerError(UserError):
+    """The server cannot listen; the message is one sentence."""
+
+
+class ServerLoad(NamedTuple):
+    """How the server and its pages get on.
+
+    Attributes:
+        pages: Open now.
+        slow: Of these, those for which frames were left out since the last time.
+        left_out: Frames left out for pages that were busy with older ones, of all pages so far.
+        texts_left_out: Likewise texts.
+        refused: Pages that were not let in so far.
+    """
+
+    pages: int
+    slow: int
+    left_out: int
+    texts_left_out: int
+    refused: int
+
+
+class WatchServer:
+    """Serves the page.
+
+    Args:
+        about: What pages are told first, see `about.py`.
+        access: Where to listen, and who may look.
+        port: 0 for any that is free.
+        rate: Frames of a kind that a page gets per second, at most.
+        on_command: Is told of commands.
+
+    Raises:
+        ServerError: The port is taken, or the address is not this machine's.
+    """
+
+    def __init__(
+        self, about: dict[str, Any], access: Access, port: int, rate: float, on_command: OnCommand
+    ) -> None:
+        self._about = about
+        self._access = access
+        self._rate = rate
+        self._on_command = on_command
+        self._history = History()
+        self._viewers: set[Viewer] = set()
+        self._gone = LeftOut(0, 0)
+        self._refused = 0
+        self._told: dict[int, int] = {}
+        self._loop = asyncio.new_event_loop()
+        self._runner = web.AppRunner(self._application(), access_log=None, shutdown_timeout=1.0)
+        self._listening = threading.Event()
+        self._faults: list[OSError] = []
+        self._thread = threading.Thread(target=self._run, args=(port,), name="watch_server", daemon=True)
+        self._thread.start()
+        self._listening.wait(_START_PATIENCE_S)
+        for fault in self._faults:
+            self._thread.join()
+            reason = fault.strerror or fault
+            raise ServerError(f"parameter port = {port}: {access.address} cannot be listened on: {reason}.")
+        self.port: int = self._runner.addresses[0][1]
+
+    @property
+    def url(self) -> str:
+        """Where to look."""
+        host = self._access.address if is_loopback(self._access.address) else _own_name()
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{self.port}/" + (f"?token={self._access.token}" if self._access.token else "")
+
+    @property
+    def has_viewers(self) -> bool:
+        """Whether somebody looks."""
+        return bool(self._viewers)
+
+    @property
+    def selected(self) -> set[int]:
+        """Indices of the robots whose numbers are shown."""
+        return {viewer.selected for viewer in tuple(self._viewers)} - {-1}
+
+    def load(self) -> ServerLoad:
+        """How it gets on; slow pages since the last call."""
+        counts = {id(viewer): viewer.left_out for viewer in tuple(self._viewers)}
+        slow = sum(count.frames > self._told.get(key, 0) for key, count in counts.items())
+        self._told = {key: count.frames for key, count in counts.items()}
+        frames, texts = (sum(parts) for parts in zip(self._gone, *counts.values(), strict=True))
+        return ServerLoad(len(counts), slow, frames, texts, self._refused)
+
+    def publish(self, frame: Frame) -> None:
+        """Hand a frame over; from any thread."""
+        self._loop.call_soon_threadsafe(self._take, frame)
+
+    def tell(self, message: dict[str, Any], robot: int | None = None) -> None:
+        """Hand a text over; from any thread.
+
+        Args:
+            message: For the pages.
+            robot: Only for those that show this robot.
+        """
+        self._loop.call_soon_threadsafe(self._note, message, robot)
+
+    def close(self) -> None:
+        """End; all connections are closed."""
+        if self._thread.is_alive():
+            self._loop.call_soon_threadsafe(self._loop.stop)
+            self._thread.join()
+
+    def _take(self, frame: Frame) -> None:
+        if self._history.add(frame):
+            self._note({"kind": "anew"}, None)
+        for viewer in self._viewers:
+            viewer.offer(frame)
+
+    def _note(self, message: dict[str, Any], robot: int | None) -> None:
+        for viewer in self._viewers:
+            if robot is None or viewer.selected == robot:
+                viewer.note(message)
+
+    def _run(self, port: int) -> None:
+        """The thread."""
+        asyncio.set_event_loop(self._loop)
+        try:
+            self._loop.run_until_complete(self._listen(port))
+            self._listening.set()
+            self._loop.run_forever()
+        except OSError as error:
+            self._faults.append(error)
+        finally:
+            self._loop.run_until_complete(self._runner.cleanup())
+            self._loop.run_until_complete(self._loop.shutdown_asyncgens())
+            self._loop.close()
+            self._listening.set()
+
+    async def _listen(self, port: int) -> None:
+        await self._runner.setup()
+        await web.TCPSite(self._runner, self._access.address, port).start()
+
+    def _application(self) -> web.Application:
+        application = web.Application()
+        application.router.add_get("/", self._on_page)
+        application.router.add_get("/socket", self._on_socket)
+        application.on_shutdown.append(self._close_all)
+        return application
+
+    def _check(self, request: web.Request) -> None:
+        """Refuse who may not look."""
+        origin = request.headers.get("Origin")
+        refusal = self._access.refusal(request.host, origin, request.query.get("token", ""))
+        if refusal:
+            self._refused += 1
+            raise web.HTTPForbidden(text=refusal)
+
+    async def _on_page(self, request: web.Request) -> web.Response:
+        self._check(request)
+        headers = {
+            "Content-Security-Policy": content_security_policy(),
+            "Cache-Control": "no-store",
+            "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff",
+        }
+        return web.Response(text=page(), content_type="text/html", headers=headers)
+
+    async def _on_socket(self, request: web.Request) -> web.WebSocketResponse:
+        self._check(request)
+        if len(self._viewers) >= MAX_VIEWERS:
+            self._refused += 1
+            raise web.HTTPServiceUnavailable(text=f"{MAX_VIEWERS} pages are open, which is the limit.")
+        socket = web.WebSocketResponse(
+            heartbeat=_HEARTBEAT_S, max_msg_size=_MAX_COMMAND_BYTES, writer_limit=_SEND_BUFFER_BYTES
+        )
+        await socket.prepare(request)
+        viewer = Viewer(socket, self._rate)
+        past = self._history.frames()
+        self._viewers.add(viewer)
+        sending = asyncio.ensure_future(self._send(socket, viewer, past))
+        try:
+            async for message in socket:
+                if message.type == WSMsgType.TEXT:
+                    self._on_text(viewer, message.data)
+        finally:
+            self._viewers.discard(viewer)
+            self._gone = LeftOut(*map(sum, zip(self._gone, viewer.left_out, strict=True)))
+            sending.cancel()
+        return socket
+
+    async def _send(self, socket: web.WebSocketResponse, viewer: Viewer, past: list[Frame]) -> None:
+        """All that a page gets; a connection that breaks ends it, and its reader, too."""
+        try:
+            await socket.send_str(json.dumps(self._about))
+            await viewer.send_past(past)
+            await viewer.send_for_ever()
+        except ConnectionError:
+            await socket.close()
+
+    def _on_text(self, viewer: Viewer, text: str) -> None:
+        """A page's word."""
+        if text == RECEIVED:
+            viewer.on_received()
+            return
+        try:
+            command = json.loads(text)
+            todo, robot = str(command["do"]), int(command.get("robot", -1))
+        except (ValueError, TypeError, KeyError, AttributeError):
+            viewer.note({"kind": "said", "text": "The page's command cannot be read.", "ok": False})
+            return
+        if not -1 <= robot < len(self._about["names"]):
+            viewer.note({"kind": "said", "text": f"There is no robot number {robot}.", "ok": False})
+            return
+        if todo == "select":
+            viewer.selected = robot
+            return
+
+        def answer(said: str, *, ok: bool = True) -> None:
+            message = {"kind": "said", "text": said, "ok": ok}
+            self._loop.call_soon_threadsafe(viewer.note, message)
+
+        self._on_command({**command, "do": todo, "robot": robot}, answer)
+
+    async def _close_all(self, _application: web.Application) -> None:
+        """Close the connections, so that pages know."""
+        for viewer in tuple(self._viewers):
+            await viewer.close()
+
+
+def _own_name() -> str:
+    """How others may call this machine."""
+    return sockets.gethostname()

@@ -1,0 +1,223 @@
+"""Serves a web page on which people watch the swarm live, in any browser.
+
+    ./run swarm_loc_estimator watch_node --ros-args -p swarm_file:=swarm.yaml
+
+It subscribes to `swarm/poses`, `swarm/sightings` (while somebody looks), `/diagnostics`, `aerial/detections`,
+`aerial/identities`, `map`, `<robot>/ground_truth` and `<robot>/goal`; and publishes `/diagnostics`, and
+`<robot>/cmd_vel` where driving is allowed. Parameters: see `doc/watch.md`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import OccupancyGrid
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
+
+from swarm_loc_estimator.common.messages.cdr import CdrError
+from swarm_loc_estimator.common.messages.estimates import SwarmPosesReader, decode_sightings
+from swarm_loc_estimator.common.messages.typestore import SWARM_POSES
+from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node
+from swarm_loc_estimator.common.ros.topic_graph import TopicGraph
+from swarm_loc_estimator.mapping.grid_messages import decode_occupancy_grid
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.watch.about import about
+from swarm_loc_estimator.watch.access import Access
+from swarm_loc_estimator.watch.frames import Frame, map_frame, poses_frame, sightings_frame
+from swarm_loc_estimator.watch.newest_messages import NewestMessages
+from swarm_loc_estimator.watch.robot_commands import RobotCommands
+from swarm_loc_estimator.watch.robot_places import AerialNames, Places
+from swarm_loc_estimator.watch.server import WatchServer
+from swarm_loc_estimator.watch.watch_diagnostics import WatchDiagnostics
+from swarm_loc_estimator.watch.watch_parameters import WatchParameters
+from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities, SwarmPoses, SwarmSightings
+
+_FLEETING = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Hears every publisher, and what comes too fast for it is lost to it alone."""
+_LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_OUTPUT_QOS = QoSProfile(depth=10)
+_WORK_S, _LOOK_S, _DIAGNOSTICS_S = 0.05, 1.0, 1.0
+_PLACES_PERIOD_S = 0.1
+_PATIENCE_S = 5.0
+_THROTTLE_S = 30.0
+
+
+class WatchNode(ConfiguredNode[WatchParameters]):
+    """Converts what is published into frames, and hands them to the server.
+
+    Args:
+        node_arguments: Further arguments of `rclpy.node.Node`.
+    """
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("watch", WatchParameters, **node_arguments)
+        path = Path(self.chosen.swarm_file)
+        self._swarm = load_swarm(path)
+        self._names = tuple(robot.name for robot in self._swarm.robots)
+        self._reader = SwarmPosesReader()
+        self._graph = TopicGraph(self)
+        self._newest_ns = 0
+        self._places_s = -1.0
+        self._heard_s = time.monotonic()
+        self._drops: Counter[str] = Counter()
+        self._aerial = AerialNames(dict(self._swarm.index_of))
+        self._sightings: Subscription | None = None
+        self._truth, self._truth_places = self._places("truth", "ground_truth", keeps=False)
+        self._goals, self._goal_places = self._places("goals", "goal", keeps=True)
+        self._commands = RobotCommands(self, self._names, self.chosen, time.monotonic_ns)
+        title = self.chosen.title or path.resolve().parent.name
+        told = about(self._swarm, title, teleop=self.chosen.teleop, commands=self.chosen.commands)
+        access = Access(self.chosen.address, self.chosen.token)
+        self.server = WatchServer(told, access, self.chosen.port, self.chosen.rate, self._commands.order)
+        self._subscribe()
+        self._diagnostics = WatchDiagnostics(self.get_name())
+        self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", _OUTPUT_QOS)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_WORK_S, self._commands.work, clock=steady)
+        self.create_timer(_LOOK_S, self._look_around, clock=steady)
+        self.create_timer(_DIAGNOSTICS_S, self._publish_diagnostics, clock=steady)
+        self.get_logger().info(f"watch the swarm at {self.server.url}")
+
+    @property
+    def subscriptions(self) -> Iterator[Subscription]:
+        """Those that an executor handles; the others are looked at when new poses come."""
+        taken = self._truth.subscriptions | self._goals.subscriptions if hasattr(self, "_goals") else ()
+        return (one for one in super().subscriptions if one not in taken)
+
+    def destroy_node(self) -> None:
+        """Close the page's connections, too."""
+        self.server.close()
+        super().destroy_node()
+
+    def _places(self, kind: str, topic: str, *, keeps: bool) -> tuple[NewestMessages, Places]:
+        topics = [f"{name}/{topic}" for name in self._names]
+        drop = partial(self._drop, f"<robot>/{topic}")
+        return NewestMessages(self, PoseStamped, topics), Places(kind, drop, keeps=keeps)
+
+    def _subscribe(self) -> None:
+        raw: Callable[..., Subscription] = partial(self.create_subscription, raw=True)
+        raw(SwarmPoses, "swarm/poses", self._on_poses, _FLEETING)
+        raw(DiagnosticArray, "/diagnostics", self._on_diagnostics, _FLEETING)
+        self.create_subscription(
+            AnonymousDetectionArray,
+            "aerial/detections",
+            lambda message: self._publish(self._aerial.detections(message)),
+            _FLEETING,
+        )
+        self.create_subscription(
+            RobotIdentities,
+            "aerial/identities",
+            lambda message: self._publish(self._aerial.identities(message)),
+            _FLEETING,
+        )
+        follow = SubscriptionEventCallbacks(incompatible_qos=self._follow_map)
+        self._map = raw(OccupancyGrid, "map", self._on_map, _LATCHED, event_callbacks=follow)
+
+    def _follow_map(self, _event: object) -> None:
+        """The map's publisher keeps none for late subscribers, or is best effort: hear it all the same."""
+        if self._map.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
+            return
+        self.destroy_subscription(self._map)
+        self._map = self.create_subscription(OccupancyGrid, "map", self._on_map, _FLEETING, raw=True)
+        self.get_logger().info("map is not published transient local: it is shown once it comes anew")
+
+    def _publish(self, frame: Frame | None) -> None:
+        if frame is not None:
+            self.server.publish(frame)
+
+    def _on_poses(self, data: bytes) -> None:
+        try:
+            estimate = self._reader.read(data)
+        except CdrError:
+            self._drop("swarm/poses", "malformed")
+            return
+        if estimate.names != self._names:
+            self._drop("swarm/poses", "other_swarm")
+            return
+        if estimate.stamp_ns < self._newest_ns:  # time has jumped back, the server begins anew
+            self._truth_places.clear()
+            self._goal_places.clear()
+        self._newest_ns = estimate.stamp_ns
+        self._heard_s = time.monotonic()
+        self.server.publish(poses_frame(estimate))
+        if self._heard_s > self._places_s + _PLACES_PERIOD_S:
+            self._places_s = self._heard_s
+            self._truth.take(self._truth_places.take)
+            self._goals.take(self._goal_places.take)
+            self._publish(self._truth_places.frame())
+            self._publish(self._goal_places.frame())
+
+    def _on_sightings(self, data: bytes) -> None:
+        try:
+            self.server.publish(sightings_frame(*decode_sightings(data)))
+        except CdrError:
+            self._drop("swarm/sightings", "malformed")
+
+    def _on_map(self, data: bytes) -> None:
+        try:
+            self.server.publish(map_frame(self._newest_ns, decode_occupancy_grid(data)))
+        except CdrError:
+            self._drop("map", "malformed")
+
+    def _on_diagnostics(self, data: bytes) -> None:
+        """Tell what is said of the robots that somebody has chosen; to others it costs nothing."""
+        chosen = self.server.selected
+        if not chosen:
+            return
+        wanted = {f"{self.chosen.estimator}: {self._names[robot]}": robot for robot in chosen}
+        for status in deserialize_message(data, DiagnosticArray).status:
+            robot = wanted.get(status.name)
+            if robot is not None:
+                values = {pair.key: pair.value for pair in status.values}
+                report = {"robot": robot, "message": status.message, "values": values}
+                stamp_ms = self._newest_ns * 1e-6
+                self.server.tell({"kind": "report", "stamp": stamp_ms, **report}, robot)
+
+    def _look_around(self) -> None:
+        """Hear what is published by now, and sightings as long as somebody looks; name what is missing."""
+        published = dict(self.get_topic_names_and_types())
+        self._truth.look_for_publishers(published)
+        self._goals.look_for_publishers(published)
+        if self.server.has_viewers and self._sightings is None:
+            self._sightings = self.create_subscription(
+                SwarmSightings, "swarm/sightings", self._on_sightings, _FLEETING, raw=True
+            )
+        elif not self.server.has_viewers and self._sightings is not None:
+            self.destroy_subscription(self._sightings)
+            self._sightings = None
+        if time.monotonic() > self._heard_s + _PATIENCE_S:
+            self._heard_s = time.monotonic()
+            why = self._graph.why_missing("swarm/poses", SWARM_POSES)
+            missing = f"nothing received on swarm/poses{why}"
+            self.get_logger().warning(f"waiting: {missing}", throttle_duration_sec=_THROTTLE_S)
+            self.server.tell({"kind": "said", "text": f"Waiting: {missing}.", "ok": False})
+
+    def _publish_diagnostics(self) -> None:
+        drops = {
+            **self._drops,
+            **({"command too_many": dropped} if (dropped := self._commands.dropped) else {}),
+        }
+        message = DiagnosticArray(status=[self._diagnostics.status(self.server.load(), drops)])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics_publisher.publish(message)
+
+    def _drop(self, topic: str, reason: str) -> None:
+        """Count a message that cannot be used, and tell of it now and then."""
+        self._drops[f"{topic} {reason}"] += 1
+        words = ", ".join(f"{count} {name}" for name, count in self._drops.items())
+        self.get_logger().warning(f"dropped so far: {words}", throttle_duration_sec=_THROTTLE_S)
+
+
+main = partial(run_node, "watch_node", WatchNode)

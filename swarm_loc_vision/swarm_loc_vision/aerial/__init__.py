@@ -1,0 +1,1 @@
+"""Robots seen from above: camera pose by control points, anonymous detections."""

@@ -1,0 +1,77 @@
+"""An overhead camera that finds robots without telling which is which, as a ROS 2 node.
+
+    ./run swarm_loc_vision aerial_camera_node --ros-args -r __ns:=/aerial -p control_points_file:=points.yaml
+
+It subscribes to `camera_info`, and to `image_raw` or `image_raw/compressed`, and publishes `detections` in
+`map` with the images' own stamps, and `/diagnostics`. Parameters: see `doc/aerial_camera_node.md`.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+from rclpy.qos import QoSProfile
+
+from swarm_loc_estimator.common.ros.running import run_node
+from swarm_loc_msgs.msg import AnonymousDetectionArray
+from swarm_loc_vision.aerial.aerial_parameters import AerialParameters, aerial_camera
+from swarm_loc_vision.aerial.ground.control_points import PoseFit
+from swarm_loc_vision.common.camera_node import CameraNode
+
+
+class AerialCameraNode(CameraNode[AerialParameters]):
+    """Receives overhead images, lets the core find the robots, publishes."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("aerial_camera", AerialParameters, **node_arguments)
+        self._camera = aerial_camera(self.chosen)
+        self._said = ""
+        publisher = self.create_publisher(AnonymousDetectionArray, "detections", QoSProfile(depth=10))
+        self.watch(self._camera, self.chosen.image_transport, publisher)
+        self.trouble()
+
+    def detect(self, message: Any) -> bytes:
+        """The serialized detections of an image; see `AerialCamera.detect`."""
+        return self._camera.detect(message)
+
+    def figures(self) -> dict[str, str]:
+        """Robots per image, and the camera's pose."""
+        camera = self._camera
+        fit = camera.control.fit if camera.control else None
+        mean = camera.robots / camera.used if camera.used else 0.0
+        return {
+            "images used": str(camera.used),
+            "robots per image": f"{mean:.3g}",
+            "robots with heading": str(camera.headings),
+            "robot diameter [m]": f"{camera.diameter:.4g}" if camera.diameter else "not known yet",
+            **_pose_figures(fit),
+            "moves of the camera": str(camera.control.moves if camera.control else 0),
+        }
+
+    def trouble(self) -> str:
+        """Why no robots can be found; said in the log, too, whenever it changes."""
+        why = self._camera.why_nothing
+        if why and why != self._said:
+            self._say(why)
+        return why
+
+    def _say(self, why: str) -> None:
+        self._said = why
+        self.get_logger().error(why)
+
+
+def _pose_figures(fit: PoseFit | None) -> dict[str, str]:
+    """Of the camera's pose."""
+    if fit is None:
+        return {"control points": "0"}
+    worst = int(fit.residuals.argmax())
+    return {
+        "control points": str(len(fit.names)),
+        "reprojection residual [px]": f"{fit.rms_px:.3g}",
+        "largest residual [px]": f"{fit.residuals[worst]:.3g} of {fit.names[worst]}",
+        "camera height [m]": f"{fit.ground.centre[2]:.4g}",
+    }
+
+
+main = partial(run_node, "aerial_camera_node", AerialCameraNode)

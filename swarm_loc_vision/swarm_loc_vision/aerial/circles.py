@@ -1,0 +1,189 @@
+"""Circles: edges along rays from a centre, how much of the rim they cover, centre to sub-pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.aerial.contrast import Brightness, logarithm
+from swarm_loc_vision.aerial.rectification import Plain
+
+RAYS = 64
+_NEAREST, _FARTHEST, _SAMPLES = 0.45, 1.6, 47
+_SIDE = 5
+"""Samples on each side of an edge that are compared; a quarter of the diameter's half."""
+_WIDEST = 0.3
+"""By which share a rim may be wider or narrower than expected."""
+_OFF = 0.12
+"""Farther from the circle than this share of its radius an edge is not its own."""
+_BLOCK = 30_000
+"""OpenCV's images have fewer than 2^15 rows."""
+_ROUNDS = 3
+_EVERY, _LIKELY = 4, 0.4
+"""At first every fourth ray is looked along, and this share of them must meet an edge."""
+_MIN_RAYS = 12
+_NOISES = 0.5
+"""Of one pixel, that an edge's step must reach: its two sides are means over many."""
+_SLACK_PX = 0.03
+"""Error of an edge that its neighbours share [px], beside what the residuals show."""
+
+_ANGLES = 2.0 * np.pi * np.arange(RAYS) / RAYS
+DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+_SHARES = np.linspace(_NEAREST, _FARTHEST, _SAMPLES)
+
+
+class Circles(NamedTuple):
+    """Candidates that were measured, one row each.
+
+    Attributes:
+        centre: (C, 2) column and row [px].
+        radius: (C,) [px].
+        coverage: (C,) share of the rays that meet an edge of the circle.
+        contrast: (C,) median step of these edges, of the logarithm of brightness.
+        spread: (C,) root mean square distance of these edges from the circle [px].
+        covariance: (C, 2, 2) of the centre [px^2].
+    """
+
+    centre: FloatArray
+    radius: FloatArray
+    coverage: FloatArray
+    contrast: FloatArray
+    spread: FloatArray
+    covariance: FloatArray
+
+    def chosen(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Circles:
+        """Some of the rows."""
+        return Circles(*(column[rows] for column in self))
+
+
+def sampled(image: Plain, cells: FloatArray) -> FloatArray:
+    """Values (...) of an image at columns and rows (..., 2), linear between pixels."""
+    columns, rows = np.ascontiguousarray(cells.reshape(-1, 2).T, np.float32)[..., None]
+    out = np.empty(len(columns), np.float32)
+    for begin in range(0, len(columns), _BLOCK):
+        part = slice(begin, begin + _BLOCK)
+        values = cv2.remap(
+            image, columns[part], rows[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        out[part] = values[:, 0]
+    return out.reshape(cells.shape[:-1]).astype(float)
+
+
+Light = Callable[[FloatArray], FloatArray]
+"""What is to be left out of the images of discs: (C, ...) counts at places (..., 2) in their radii."""
+
+
+def likely(
+    image: Brightness, centres: FloatArray, radius: float, polarity: float, min_contrast: float
+) -> FloatArray:
+    """Those of candidates (C, 2) with enough edges around to be discs of about a radius [px]."""
+    rims = Rims(image, polarity, min_contrast)
+    is_edge = rims.edges(centres, np.full(len(centres), radius), every=_EVERY)[2]
+    return np.asarray(centres[is_edge.mean(axis=1) >= _LIKELY], float)
+
+
+@dataclass(frozen=True)
+class Rims:
+    """Measures rims of discs.
+
+    Attributes:
+        image: Where they are.
+        polarity: Of the discs.
+        min_contrast: The least step of an edge, of the logarithm of brightness.
+    """
+
+    image: Brightness
+    polarity: float
+    min_contrast: float
+
+    def measure(self, centre: FloatArray, radius: FloatArray, without: Light | None = None) -> Circles:
+        """Discs near centres (C, 2), of about radii (C,) [px]."""
+        low, high = (1.0 - _WIDEST) * radius, (1.0 + _WIDEST) * radius
+        found = radius
+        for _ in range(_ROUNDS):
+            start = np.clip(found, low, high)
+            edge, step, is_edge = self.edges(centre, start, without=without)
+            shift, found, covariance, spread, own = _fit(edge, is_edge, start)
+            centre = centre + shift
+        coverage = np.where((found >= low) & (found <= high), own.mean(axis=1), 0.0)
+        contrast = _masked_median(step, own, np.zeros(len(step)))
+        return Circles(centre, found, coverage, contrast, spread, covariance)
+
+    def edges(
+        self, centre: FloatArray, radius: FloatArray, *, every: int = 1, without: Light | None = None
+    ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Of every so many rays the strongest edge: its radius (C, R) [px], its step, whether it counts."""
+        places = _SHARES[:, None] * DIRECTIONS[::every, None]
+        cells = centre[:, None, None] + radius[:, None, None, None] * places
+        if without is None:
+            values = sampled(self.image.log, cells)
+        else:
+            values = logarithm(sampled(self.image.plain, cells) - without(places))
+        return _strongest(values, radius, self.polarity, self._least)
+
+    def _least(self, darkest: FloatArray) -> FloatArray:
+        """The least steps where the darker side of an edge is so dark."""
+        return np.maximum(self.min_contrast, _NOISES * self.image.log_noise(darkest))
+
+
+def _masked_median(values: FloatArray, mask: NDArray[np.bool_], otherwise: FloatArray) -> FloatArray:
+    """(C,) medians of those of each row (C, R) that a mask has."""
+    rows = zip(values, mask, otherwise, strict=True)
+    return np.array([np.median(row[own]) if own.any() else default for row, own, default in rows])
+
+
+def _strongest(
+    values: FloatArray, radius: FloatArray, polarity: float, least: Callable[[FloatArray], FloatArray]
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """As `Rims.edges`, by values (C, R, S) along the rays."""
+    sums = np.concatenate([np.zeros((*values.shape[:2], 1)), np.cumsum(values, axis=2)], axis=2)
+    inner = (sums[..., _SIDE:-_SIDE] - sums[..., : -2 * _SIDE]) / _SIDE
+    outer = (sums[..., 2 * _SIDE :] - sums[..., _SIDE:-_SIDE]) / _SIDE
+    steps = polarity * (inner - outer)
+    best = np.argmax(steps, axis=2)
+    between = np.clip(best, 1, steps.shape[2] - 2)
+    rows = np.indices(best.shape)
+    left, mid, right = (steps[rows[0], rows[1], between + k] for k in (-1, 0, 1))
+    bend = left - 2.0 * mid + right
+    with np.errstate(divide="ignore", invalid="ignore"):
+        offset = np.where(bend < 0.0, 0.5 * (left - right) / bend, 0.0)
+    offset = np.clip(offset, -1.0, 1.0)
+    pitch = _SHARES[1] - _SHARES[0]
+    share = _SHARES[0] + pitch * (between + offset + _SIDE - 0.5)
+    step = steps[rows[0], rows[1], best]
+    darkest = np.minimum(inner.min(axis=2), outer.min(axis=2))
+    inside = (best > 0) & (best < steps.shape[2] - 1)
+    return share * radius[:, None], step, inside & (step > least(darkest))
+
+
+def _fit(
+    edge: FloatArray, is_edge: NDArray[np.bool_], radius: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Circles through edges: shift of the centre (C, 2), radius, covariance, spread, and whose own edges."""
+    design = np.concatenate([DIRECTIONS, np.ones((RAYS, 1))], axis=1)
+    solution = np.zeros((len(edge), 3))
+    solution[:, 2] = radius
+    middle = _masked_median(edge, is_edge, radius)
+    residual = edge - middle[:, None]
+    for limit in (0.3, 0.2, _OFF):
+        weight = is_edge * (np.abs(residual) <= limit * middle[:, None])
+        normal = np.einsum("cr,ri,rj->cij", weight, design, design) + 1e-6 * np.eye(3)
+        solution = np.linalg.solve(normal, np.einsum("cr,ri,cr->ci", weight, design, edge)[..., None])[..., 0]
+        residual = edge - solution @ design.T
+    own = is_edge & (np.abs(residual) <= _OFF * middle[:, None])
+    count = own.sum(axis=1)
+    spread = np.sqrt(np.sum(own * residual**2, axis=1) / np.maximum(count - 3, 1))
+    normal = np.einsum("cr,ri,rj->cij", own.astype(float), design, design) + 1e-6 * np.eye(3)
+    # neighbouring rays share pixels: about every other one is a measurement of its own
+    variance = 2.0 * spread**2 + _SLACK_PX**2
+    covariance = variance[:, None, None] * np.linalg.inv(normal)[:, :2, :2]
+    few = count < _MIN_RAYS
+    own[few] = False
+    shift = np.where(few[:, None], 0.0, solution[:, :2])
+    return shift, np.where(few, radius, solution[:, 2]), covariance, spread, own

@@ -1,0 +1,273 @@
+"""Aerial detector: an overhead image in, places and headings of robots out, none of them named."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.aerial.circles import Circles, Rims, likely
+from swarm_loc_vision.aerial.contrast import brightness, noise_of
+from swarm_loc_vision.aerial.diameter import commonest, ladder
+from swarm_loc_vision.aerial.ground.ground_camera import GroundCamera
+from swarm_loc_vision.aerial.heading import Marks, find_marks
+from swarm_loc_vision.aerial.rectification import (
+    Rectification,
+    RectificationError,
+    rectification,
+)
+from swarm_loc_vision.aerial.settings import AerialSettings
+from swarm_loc_vision.aerial.voting import BRIGHT, DARK, Edges, peaks
+from swarm_loc_vision.common.gray import Gray
+
+POLARITIES = {"auto": (BRIGHT, DARK), "bright": (BRIGHT,), "dark": (DARK,)}
+"""Whether robots are brighter or darker than the floor; by name."""
+
+_SIZES_PX = 16.0, 32.0
+"""Diameters of robots in the rectified image, least and largest."""
+_ROUGH_PX = 14.0
+_MAX_SHARE = 0.25
+"""Of the image's lesser side, the largest robot that is looked for."""
+_SPARE, _SPARE_SHARE = 60, 4
+_APART = 0.75
+"""Of a diameter: two robots are farther apart."""
+_MAX_SPREAD, _MAX_SPREAD_PX = 0.03, 0.2
+"""Root mean square distance of a disc's rim from a circle, in radii, and beyond that [px]."""
+_SAME_SIZE = 0.2
+"""By this share a disc may be wider or narrower than the others of its image."""
+_SAME_CONTRAST = 0.45
+"""So much of the others' contrast a disc must have: shadows have less."""
+_TOUCHING, _USUAL = 1.3, 0.65
+"""Discs nearer than so many diameters may touch; one alone must show so much of the usual share of rim."""
+_MARK_ROUNDS = 2
+_MOST, _CLEAR = 0.6, 0.85
+"""Share of the discs with a mark from which on others need so much of their rim."""
+
+
+@dataclass(frozen=True)
+class AerialDetections:
+    """The robots in an image, one row each, in no order.
+
+    Attributes:
+        place: (N, 2) of their centres in map [m].
+        theta: (N,) headings in map [rad]; NaN: the pattern shows none.
+        covariance: (N, 3, 3) of x, y and theta; of a heading that is not known it is that of any heading.
+        pixel: (N, 2) of the centres in the raw image.
+        diameter: (N,) [m].
+        coverage: (N,) share of the rim that shows an edge.
+        dropped: Discs that were not taken, by reason.
+    """
+
+    place: FloatArray
+    theta: FloatArray
+    covariance: FloatArray
+    pixel: FloatArray
+    diameter: FloatArray
+    coverage: FloatArray
+    dropped: Mapping[str, int]
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+
+class _Found(NamedTuple):
+    """Discs of one polarity."""
+
+    rims: Rims
+    circles: Circles
+
+    @property
+    def score(self) -> float:
+        """How clear they are together."""
+        return float(np.sum(_quality(self.circles)))
+
+
+class AerialDetector:
+    """Finds discs of one size on a level plane, and the mark on them.
+
+    Args:
+        settings: Its numbers.
+        ground: The camera; without a diameter in the settings the first images tell it.
+        polarity: One of POLARITIES.
+
+    Attributes:
+        diameter: Of the robots [m]; 0: not known yet.
+    """
+
+    def __init__(self, settings: AerialSettings, ground: GroundCamera, polarity: str = "auto") -> None:
+        self._settings, self._ground = settings, ground
+        self._polarities = POLARITIES[polarity]
+        self.diameter = settings.robot_diameter
+        self._grid: Rectification | None = None
+
+    def detect(self, gray: Gray) -> AerialDetections:
+        """The robots in an image (height, width).
+
+        Raises:
+            RectificationError: The camera does not see the plane, or robots on it look too small.
+        """
+        noise = noise_of(gray)
+        if not self.diameter:
+            self.diameter = self._estimated(gray, noise)
+            if not self.diameter:
+                return _nothing({"size_unknown": 1})
+        if self._grid is None:
+            settings = self._settings
+            self._grid = rectification(self._ground, settings, self.diameter, _SIZES_PX)
+        found, dropped = self._discs(gray, self._grid, self.diameter, noise)
+        return self._located(self._grid, found, dropped)
+
+    def _discs(
+        self, gray: Gray, grid: Rectification, diameter: float, noise: float
+    ) -> tuple[_Found, dict[str, int]]:
+        """Discs of the polarity that shows clearer ones."""
+        settings = self._settings
+        wide = diameter / grid.metres_per_px
+        image = brightness(grid.apply(gray), wide, noise)
+        edges = Edges(image.log, grid.seen, settings.min_contrast)
+        most = _SPARE_SHARE * settings.max_robots + _SPARE
+        kinds: list[tuple[_Found, dict[str, int]]] = []
+        for polarity in self._polarities:
+            centres = peaks(edges.votes(wide, polarity), wide, most)
+            centres = likely(image, centres, 0.5 * wide, polarity, settings.min_contrast)
+            rims = Rims(image, polarity, settings.min_contrast)
+            circles = rims.measure(centres, np.full(len(centres), 0.5 * wide))
+            kinds.append(self._chosen(rims, circles, grid))
+        return max(kinds, key=lambda kind: kind[0].score)
+
+    def _chosen(self, rims: Rims, circles: Circles, grid: Rectification) -> tuple[_Found, dict[str, int]]:
+        """Those that are discs, none over another, all alike."""
+        covered = circles.coverage >= self._settings.min_coverage
+        circles = circles.chosen((_quality(circles) > 0.0) & covered & _inside(grid, circles.centre))
+        circles = circles.chosen(_apart(circles))
+        if not len(circles.radius):
+            return _Found(rims, circles), {}
+        quality = _quality(circles)
+        alike = np.abs(circles.radius / commonest(circles.radius, quality) - 1.0) <= _SAME_SIZE
+        dropped = {"other_size": int(np.sum(~alike))}
+        circles = circles.chosen(alike)
+        whole = _whole(circles)
+        dropped["not_whole"] = int(np.sum(~whole))
+        circles = circles.chosen(whole)
+        most = self._settings.max_robots
+        dropped["too_many"] = max(len(circles.radius) - most, 0)
+        order = np.argsort(-_quality(circles), kind="stable")[:most]
+        return _Found(rims, circles.chosen(order)), dropped
+
+    def _located(self, grid: Rectification, found: _Found, dropped: dict[str, int]) -> AerialDetections:
+        """Discs in map: the mark first, and then the rim without what the mark adds beside it."""
+        circles, rims, settings = found.circles, found.rims, self._settings
+        if not len(circles.radius):
+            return _nothing(dropped)
+        is_strong = circles.contrast >= _SAME_CONTRAST * commonest(circles.contrast, _quality(circles))
+        for _ in range(_MARK_ROUNDS):
+            marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
+            again = rims.measure(circles.centre, circles.radius, marks.light)
+            is_better = (marks.step != 0.0) & (again.coverage >= settings.min_coverage)
+            circles = Circles(
+                *(
+                    np.where(is_better.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+                    for new, old in zip(again, circles, strict=True)
+                )
+            )
+        marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
+        has_mark = np.isfinite(marks.theta)
+        is_strong |= has_mark  # a shadow on it or beside it may weaken a rim, but shows no mark
+        alike = _marked_alike(circles, has_mark) | ~is_strong
+        dropped |= {"other_contrast": int(np.sum(~is_strong)), "without_mark": int(np.sum(~alike))}
+        kept = alike & is_strong
+        circles, marks = circles.chosen(kept), Marks(*(column[kept] for column in marks))
+        places = grid.places(circles.centre)
+        of_pixel = self._ground.pixel_covariances(places, circles.covariance * grid.metres_per_px**2)
+        of_pixel = of_pixel + settings.pixel_sigma**2 * np.eye(2)
+        spread = self._ground.covariances(places, of_pixel, settings.robot_height_sigma)
+        return AerialDetections(
+            place=places[:, :2],
+            theta=marks.theta,
+            covariance=_with_heading(spread, marks),
+            pixel=self._ground.pixels(places),
+            diameter=2.0 * circles.radius * grid.metres_per_px,
+            coverage=circles.coverage,
+            dropped=dropped,
+        )
+
+    def _estimated(self, gray: Gray, noise: float) -> float:
+        """Diameter of the robots by one image [m]; 0: there are none."""
+        settings, ground = self._settings, self._ground
+        middle = ground.places(np.array([0.5 * gray.shape[1], 0.5 * gray.shape[0]]), settings.robot_height)
+        if not np.isfinite(middle).all():
+            raise RectificationError("the middle of the image does not show the floor.")
+        per_metre = float(ground.scale(np.append(middle, settings.robot_height)))
+        least, largest = settings.min_diameter_px / per_metre, _MAX_SHARE * min(gray.shape) / per_metre
+        diameters, scores = [np.zeros(0)], [np.zeros(0)]
+        for diameter in ladder(1.2 * least, largest).tolist():
+            grid = rectification(ground, settings, diameter, (_ROUGH_PX, _ROUGH_PX))
+            found, _ = self._discs(gray, grid, diameter, noise)
+            diameters.append(2.0 * found.circles.radius * grid.metres_per_px)
+            scores.append(_quality(found.circles))
+        return commonest(np.concatenate(diameters), np.concatenate(scores))
+
+
+def _quality(circles: Circles) -> FloatArray:
+    """(C,) how clear discs are, 0 to 1: how much of their rims is seen, and how round it is."""
+    limit = _MAX_SPREAD * circles.radius + _MAX_SPREAD_PX
+    return np.asarray(circles.coverage**2 * np.maximum(1.0 - (circles.spread / limit) ** 2, 0.0))
+
+
+def _whole(circles: Circles) -> NDArray[np.bool_]:
+    """Which discs show as much of their rims as they should: those alone as much as the others.
+
+    A rim may be hidden by a disc that touches it, hardly by anything else.
+    """
+    away = np.linalg.norm(circles.centre[:, None] - circles.centre, axis=2)
+    np.fill_diagonal(away, np.inf)
+    alone = away.min(axis=1, initial=np.inf) > _TOUCHING * 2.0 * circles.radius
+    usual = np.median(circles.coverage) if len(circles.coverage) else 0.0
+    return np.asarray(~alone | (circles.coverage >= _USUAL * usual))
+
+
+def _marked_alike(circles: Circles, has_mark: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which discs may carry the same pattern: where most show a mark, those without must be clear discs."""
+    quality = _quality(circles)
+    if quality[has_mark].sum() < _MOST * quality.sum():
+        return np.ones(len(quality), np.bool_)
+    return np.asarray(has_mark | (circles.coverage >= _CLEAR))
+
+
+def _inside(grid: Rectification, centre: FloatArray) -> NDArray[np.bool_]:
+    """Whether the image shows centres (C, 2)."""
+    rows, columns = grid.seen.shape
+    cells = np.rint(centre).astype(np.int64)
+    inside = np.asarray(((cells >= 0) & (cells < [columns, rows])).all(axis=1))
+    cells = np.clip(cells, 0, [columns - 1, rows - 1])
+    return np.asarray(inside & grid.seen[cells[:, 1], cells[:, 0]])
+
+
+def _apart(circles: Circles) -> NDArray[np.int64]:
+    """Rows of the clearest circles of which none lies over another."""
+    kept: list[int] = []
+    for row in np.argsort(-_quality(circles), kind="stable").tolist():
+        away = np.linalg.norm(circles.centre[kept] - circles.centre[row], axis=1)
+        if (away >= 2.0 * _APART * circles.radius[row]).all():
+            kept.append(row)
+    return np.array(kept, np.int64)
+
+
+def _with_heading(spread: FloatArray, turned: Marks) -> FloatArray:
+    """(N, 3, 3) of x, y and theta from that of x and y (N, 2, 2)."""
+    covariance = np.zeros((len(spread), 3, 3))
+    covariance[:, :2, :2] = spread
+    covariance[:, 2, 2] = np.where(np.isfinite(turned.theta), turned.variance, np.pi**2 / 3.0)
+    return covariance
+
+
+def _nothing(dropped: Mapping[str, int]) -> AerialDetections:
+    """No robots."""
+    none = np.zeros(0)
+    return AerialDetections(
+        np.zeros((0, 2)), none, np.zeros((0, 3, 3)), np.zeros((0, 2)), none, none, dropped
+    )

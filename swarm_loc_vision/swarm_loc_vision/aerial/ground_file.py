@@ -1,0 +1,126 @@
+"""Control points of an overhead camera in a YAML file: points, floor markers, intrinsics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.number_spec import NumberSpec, number_specs
+from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree, tree_text
+from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks, nearest
+from swarm_loc_vision.aerial.ground.control_points import ControlPointError, ControlPoints, check_points
+from swarm_loc_vision.aerial.ground.floor_markers import FloorMarker
+from swarm_loc_vision.aerial.ground.ground_control import Ground
+from swarm_loc_vision.common.camera import Camera, CameraError
+from swarm_loc_vision.markers.families import Family, families
+
+_PLACE = NumberSpec("m", -1e4, 1e4, False, "in map")
+_PIXEL = NumberSpec("px", -1e5, 1e5, False, "in the raw image")
+_POINT = {"x": _PLACE, "y": _PLACE, "z": _PLACE, "u": _PIXEL, "v": _PIXEL}
+_REQUIRED = ("x", "y", "u", "v")
+_CAMERA = {
+    "width": NumberSpec("px", 1, 1e5, False, "columns"),
+    "height": NumberSpec("px", 1, 1e5, False, "rows"),
+    **{name: NumberSpec("px", -1e6, 1e6, False, "intrinsics") for name in ("fx", "fy", "cx", "cy")},
+}
+
+
+class GroundFileError(UserError):
+    """A file of control points that cannot be used; the message is one sentence."""
+
+
+def load_ground(path: Path) -> Ground:
+    """Read control points.
+
+    Raises:
+        GroundFileError: It cannot be read, or a value is wrong, or the points can tell no pose.
+    """
+    try:
+        tree = read_tree(path)
+    except YamlTreeError as error:
+        raise GroundFileError(str(error)) from error
+    return _Reader(path).ground(tree)
+
+
+def save_ground(ground: Ground, path: Path, comment: str = "") -> None:
+    """Write control points and floor markers so that `load_ground` reads them back."""
+    points = ground.points
+    rows = zip(points.names, points.places.tolist(), points.pixels.tolist(), strict=True)
+    tree = {
+        "points": {name: dict(zip("xyzuv", [*place, *pixel], strict=True)) for name, place, pixel in rows},
+        "family": ground.family.name,
+        "markers": {
+            one.id: {name: getattr(one, name) for name in number_specs(FloorMarker)} for one in ground.markers
+        },
+    }
+    text = "".join(f"# {line}\n" for line in comment.splitlines()) + tree_text(tree)
+    path.write_text(text, encoding="utf-8")
+
+
+class _Reader:
+    """Takes values out of one file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._checks = path, TreeChecks(path, GroundFileError)
+
+    def ground(self, tree: Tree) -> Ground:
+        checks = self._checks
+        known = ("points", "family", "markers", "camera")
+        sections = checks.mapping(tree, WHOLE_FILE, known)
+        points = self._points(checks.mapping(sections.get("points"), "points"))
+        family = self._family(sections.get("family", "aruco_mip_36h12"))
+        markers = self._markers(checks.mapping(sections.get("markers"), "markers"), family)
+        if not markers:
+            try:
+                check_points(points)
+            except ControlPointError as error:
+                raise GroundFileError(f"{self._path}: {error}") from error
+        return Ground(points, markers, family, self._camera(sections.get("camera")))
+
+    def _points(self, tree: dict[Any, Tree]) -> ControlPoints:
+        rows = [
+            self._checks.numbers(entry, f"points.{name}", _POINT, required=_REQUIRED)
+            for name, entry in tree.items()
+        ]
+        values = np.array([[row.get(key) or 0.0 for key in _POINT] for row in rows], float).reshape(-1, 5)
+        return ControlPoints([str(name) for name in tree], values[:, :3], values[:, 3:])
+
+    def _family(self, name: Tree) -> Family:
+        known = families()
+        if not isinstance(name, str) or name not in known:
+            raise self._checks.said(f"family is {name!r}, which is none{nearest(str(name), known)}")
+        return known[name]
+
+    def _markers(self, tree: dict[Any, Tree], family: Family) -> tuple[FloorMarker, ...]:
+        markers = []
+        for marker_id, entry in tree.items():
+            if not isinstance(marker_id, int) or not 0 <= marker_id < len(family.words):
+                raise self._checks.said(
+                    f"markers has {marker_id!r}, but ids of {family.name} are 0 to {len(family.words) - 1}"
+                )
+            numbers = self._checks.numbers(
+                entry, f"markers.{marker_id}", number_specs(FloorMarker), required=("x", "y", "size")
+            )
+            markers.append(
+                FloorMarker(marker_id, **{key: float(value or 0.0) for key, value in numbers.items()})
+            )
+        return tuple(markers)
+
+    def _camera(self, tree: Tree) -> Camera | None:
+        if tree is None:
+            return None
+        section = self._checks.mapping(
+            tree, "camera", (*_CAMERA, "distortion_model", "distortion"), required=tuple(_CAMERA)
+        )
+        plain = {key: value for key, value in section.items() if key in _CAMERA}
+        numbers = {key: float(v or 0.0) for key, v in self._checks.numbers(plain, "camera", _CAMERA).items()}
+        distortion = self._checks.list_of_numbers(section.get("distortion", []), "camera.distortion")
+        model = str(section.get("distortion_model", "plumb_bob"))
+        width, height = (int(numbers.pop(key)) for key in ("width", "height"))
+        try:
+            return Camera(width, height, **numbers, distortion=distortion, model=model)
+        except CameraError as error:
+            raise GroundFileError(f"{self._path}: {error}") from error

@@ -1,0 +1,118 @@
+"""Rectified images: a level plane as if seen straight from above, with the same size for every robot."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.aerial.ground.ground_camera import GroundCamera
+from swarm_loc_vision.aerial.settings import AerialSettings
+from swarm_loc_vision.common.gray import Gray
+
+Plain = NDArray[np.float32]
+
+_CELL_PX = 16
+"""Raw pixels from one place to the next at which the extent of a plane is looked up."""
+_MAX_AREA = 12_000_000
+"""Pixels of a rectified image."""
+
+
+class RectificationError(ValueError):
+    """A plane that cannot be rectified; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class Rectification:
+    """A grid over a level plane, and the raw pixels that show it.
+
+    Attributes:
+        origin: (2,) x, y of the middle of its first pixel, the corner of least x and least y [m].
+        metres_per_px: Of the grid.
+        height: Of the plane [m].
+        maps: (2, rows, columns) raw pixels u and v, columns along x, rows along y; -1 where nothing is seen.
+        seen: (rows, columns) whether the raw image shows it.
+        blur_px: Of the raw image before it is sampled, where the grid is coarser than the image.
+    """
+
+    origin: FloatArray
+    metres_per_px: float
+    height: float
+    maps: Plain
+    seen: NDArray[np.bool_]
+    blur_px: float
+
+    def apply(self, image: Gray) -> Plain:
+        """The plane as the image shows it (rows, columns)."""
+        raw = cv2.GaussianBlur(image, (0, 0), self.blur_px) if self.blur_px else image
+        raw = raw.astype(np.float32)
+        flat = cv2.remap(raw, self.maps[0], self.maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(flat, np.float32)
+
+    def places(self, cells: FloatArray) -> FloatArray:
+        """(..., 3) in map of columns and rows (..., 2) of the grid."""
+        flat = self.origin + cells * self.metres_per_px
+        return np.concatenate([flat, np.full((*flat.shape[:-1], 1), self.height)], axis=-1)
+
+
+def rectification(
+    ground: GroundCamera, settings: AerialSettings, diameter: float, size_px: tuple[float, float]
+) -> Rectification:
+    """The part of a plane in which robots are large enough to be found.
+
+    Args:
+        ground: The camera.
+        settings: Height of the plane, region, and how small robots may look in the raw image.
+        diameter: Of robots [m].
+        size_px: Least and largest diameter of robots in the rectified image; in between as in the raw one.
+
+    Raises:
+        RectificationError: The camera does not see the plane, or robots on it look too small.
+    """
+    height, least_px = settings.robot_height, settings.min_diameter_px
+    flat, scale = _visible(ground, height)
+    lower, upper = settings.region
+    usable = scale * diameter >= least_px
+    if not len(flat):
+        raise RectificationError(f"the camera does not see the plane {height:g} m above the floor.")
+    if not usable.any():
+        raise RectificationError(
+            f"robots of {diameter:g} m look smaller than {least_px:g} px everywhere: the largest is"
+            f" {diameter * scale.max():.2g} px."
+        )
+    low, high = flat[usable].min(axis=0), flat[usable].max(axis=0)
+    low, high = np.maximum(low - 0.5 * diameter, lower), np.minimum(high + 0.5 * diameter, upper)
+    if not (high - low > diameter).all():
+        raise RectificationError("the camera does not see the region from x_min, y_min to x_max, y_max.")
+    native = diameter * float(np.median(scale[usable]))
+    wanted = min(max(native, size_px[0]), size_px[1])
+    step = max(diameter / wanted, math.sqrt(float(np.prod(high - low)) / _MAX_AREA))
+    columns, rows = (int(n) for n in np.ceil((high - low) / step) + 1)
+    grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1) * step + low
+    places = np.concatenate([grid, np.full((rows, columns, 1), height)], axis=-1)
+    maps = np.moveaxis(ground.pixels(places), -1, 0)
+    camera = ground.camera
+    inside = (maps >= 0.0) & (maps <= np.array([camera.width - 1, camera.height - 1])[:, None, None])
+    seen = np.asarray(inside.all(axis=0))
+    shrink = native / (diameter / step)
+    blur = 0.5 * math.sqrt(max(shrink**2 - 1.0, 0.0)) if shrink > 1.2 else 0.0
+    return Rectification(low, step, height, np.where(seen, maps, -1.0).astype(np.float32), seen, blur)
+
+
+def _visible(ground: GroundCamera, height: float) -> tuple[FloatArray, FloatArray]:
+    """Places (K, 2) of a plane, evenly spread in the image, and pixels per metre there."""
+    camera = ground.camera
+    across, down = (
+        np.linspace(0.0, n - 1.0, max(math.ceil(n / _CELL_PX), 2)) for n in (camera.width, camera.height)
+    )
+    flat = ground.places(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2), height)
+    places = np.concatenate([flat, np.full((len(flat), 1), height)], axis=-1)
+    scale = np.full(len(flat), np.nan)
+    shown = np.isfinite(flat).all(axis=1)
+    scale[shown] = ground.scale(places[shown])
+    good = np.isfinite(scale) & (scale > 0.0)
+    return flat[good], scale[good]

@@ -1,0 +1,1 @@
+"""Images, cameras, sampling and what all camera nodes share."""

@@ -1,0 +1,163 @@
+"""Camera model: intrinsics, and distortion between raw pixels and ideal ones, those of a pinhole."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.common.lens import (
+    CX,
+    CY,
+    FISHEYE,
+    FX,
+    FY,
+    K1,
+    K2,
+    K3,
+    K4,
+    K5,
+    K6,
+    LENS_KIND,
+    LENS_SIZE,
+    P1,
+    P2,
+    RADIAL,
+    STRAIGHT,
+    raw_pixels,
+)
+
+_MODELS = {"": (0,), "plumb_bob": (0, 4, 5), "rational_polynomial": (0, 8), "equidistant": (0, 4)}
+"""Distortion models of sensor_msgs/CameraInfo, and how many coefficients they may have."""
+
+_LONGEST_FOCAL = 100.0
+"""Of all lenses that could see a marker, in widths of the image."""
+_STRONGEST = 1e4
+_MAX_OFF_AXIS = math.tan(math.radians(80.0))
+"""Further out a flat image is stretched too much to tell straight sides."""
+_ROUNDS, _EXACT_PX = 50, 1e-4
+_MAX_ERROR_PX = 0.01
+"""By which an ideal pixel may miss the raw one it is of; where it does by more, there is none."""
+
+
+class CameraError(ValueError):
+    """A camera that cannot be used; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of a camera.
+
+    Attributes:
+        width: Of the image [px].
+        height: Likewise.
+        fx: Focal length [px].
+        fy: Likewise.
+        cx: Principal point [px].
+        cy: Likewise.
+        distortion: Coefficients, as OpenCV orders them.
+        model: Distortion model, as sensor_msgs/CameraInfo names it.
+
+    Raises:
+        CameraError: It is not calibrated, or its numbers cannot be.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    model: str = "plumb_bob"
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if not np.isfinite(numbers).all():
+            raise CameraError("the camera's calibration has numbers that are not finite.")
+        if self.fx <= 0.0 or self.fy <= 0.0:
+            raise CameraError(
+                f"the camera is not calibrated: its focal lengths are {self.fx:g} and {self.fy:g} px,"
+                " but must be above 0 px."
+            )
+        if self.width <= 0 or self.height <= 0:
+            raise CameraError(f"the camera's image has {self.width} x {self.height} pixels.")
+        longest = _LONGEST_FOCAL * max(self.width, self.height)
+        if max(self.fx, self.fy) > longest or max(map(abs, self.distortion), default=0.0) > _STRONGEST:
+            raise CameraError(
+                f"the camera's calibration cannot be: focal lengths must be at most {longest:g} px"
+                f" and distortion coefficients within {_STRONGEST:g}."
+            )
+        if self.model not in _MODELS:
+            known = ", ".join(filter(None, _MODELS))
+            raise CameraError(f"the camera's distortion model '{self.model}' is not one of {known}.")
+        if len(self.distortion) not in _MODELS[self.model]:
+            raise CameraError(
+                f"the camera's distortion model '{self.model}' has {len(self.distortion)} coefficients,"
+                f" but must have {' or '.join(map(str, _MODELS[self.model]))}."
+            )
+
+    @classmethod
+    def from_matrix(
+        cls, size: tuple[int, int], matrix: FloatArray, distortion: Sequence[float], model: str = "plumb_bob"
+    ) -> Camera:
+        """From width and height, K (3, 3) and the distortion's coefficients."""
+        (fx, _, cx), (_, fy, cy), _ = np.asarray(matrix, float).tolist()
+        return cls(*size, fx, fy, cx, cy, tuple(map(float, distortion)), model)
+
+    @cached_property
+    def matrix(self) -> FloatArray:
+        """K (3, 3) [px]."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def intrinsics(self) -> FloatArray:
+        """(4,) fx, fy, cx, cy [px]."""
+        return np.array([self.fx, self.fy, self.cx, self.cy])
+
+    @cached_property
+    def lens(self) -> FloatArray:
+        """The constants of `lens.distorted`."""
+        lens = np.zeros(LENS_SIZE)
+        lens[[FX, FY, CX, CY]] = self.fx, self.fy, self.cx, self.cy
+        if self.model == "equidistant" or any(self.distortion):
+            lens[LENS_KIND] = FISHEYE if self.model == "equidistant" else RADIAL
+            places = [K1, K2, K3, K4] if self.model == "equidistant" else [K1, K2, P1, P2, K3, K4, K5, K6]
+            lens[places[: len(self.distortion)]] = self.distortion
+        return lens
+
+    def to_ideal(self, pixels: FloatArray) -> FloatArray:
+        """(..., 2) pixels of an image without distortion, from raw ones; NaN where there are none.
+
+        That is where a fisheye sees what lies far off its axis, and where the model of a lens has no inverse.
+        """
+        if self.lens[LENS_KIND] == STRAIGHT or not pixels.size:
+            return np.array(pixels)
+        flat = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
+        coefficients = np.array(self.distortion or (0.0,) * 4)
+        if self.model == "equidistant":
+            ideal = cv2.fisheye.undistortPoints(flat, self.matrix, coefficients, P=self.matrix)
+        else:
+            ideal = cv2.undistortPoints(flat, self.matrix, coefficients, P=self.matrix)
+        found = np.asarray(ideal, np.float64).reshape(pixels.shape)
+        missed = pixels - self.to_raw(found)
+        for _ in range(_ROUNDS):  # OpenCV stops after few, up to a pixel away at the rim of a strong lens
+            if not np.nanmax(np.abs(missed), initial=0.0) > _EXACT_PX:
+                break
+            found += missed
+            missed = pixels - self.to_raw(found)
+        is_wrong = ~(np.abs(missed).max(axis=-1) < _MAX_ERROR_PX)
+        with np.errstate(over="ignore"):  # where there is no inverse the search runs away
+            off_axis = np.linalg.norm((found - self.intrinsics[2:]) / self.intrinsics[:2], axis=-1)
+        found[is_wrong | (off_axis > _MAX_OFF_AXIS)] = np.nan
+        return found
+
+    def to_raw(self, pixels: FloatArray) -> FloatArray:
+        """(..., 2) raw pixels, from those of an image without distortion."""
+        raw = raw_pixels(self.lens, np.ascontiguousarray(pixels, float).reshape(-1, 2))
+        return np.asarray(raw.reshape(pixels.shape))

@@ -1,0 +1,205 @@
+"""Sample brightness: profiles across the sides of quadrangles, and the cells inside.
+
+Places are given as in an image of the same camera without distortion ("ideal" pixels), where straight lines
+are straight, and looked up in the raw image through the lens, the array that `camera.Camera` makes.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_vision.common.lens import raw_pixel
+
+Gray = NDArray[np.uint8]
+
+GRID = 10
+"""Cells read along a side: the marker's 6, a ring of its border around them, and a ring around that."""
+MAX_PROFILES = 40
+_MIN_REACH_PX, _MAX_REACH_PX = 1.5, 6.0
+_STEP_PX = 0.5
+_MIN_SHARED_CELL_PX = 2.0
+_SPREAD = 0.4
+_MIN_CLEAR_CELL_PX = 4.5
+"""Cells narrower than this do not all reach the brightness of ink and paper."""
+
+
+@compiled
+def _brightness(image: Gray, u: float, v: float) -> float:
+    """Brightness at a raw pixel inside the image, bilinear."""
+    i, j = int(u), int(v)
+    a, b = u - i, v - j
+    upper = image[j, i] + a * (float(image[j, i + 1]) - image[j, i])
+    lower = image[j + 1, i] + a * (float(image[j + 1, i + 1]) - image[j + 1, i])
+    return float(upper + b * (lower - upper))
+
+
+@compiled
+def _is_inside(image: Gray, u: float, v: float) -> bool:
+    """Whether `_brightness` may be asked; not where a number is not one."""
+    return bool(0.0 <= u < image.shape[1] - 1 and 0.0 <= v < image.shape[0] - 1)
+
+
+@compiled
+def profile_crossings(
+    image: Gray,
+    lens: FloatArray,
+    quads: FloatArray,
+    reaches: FloatArray,
+    spacing: float,
+    crossings: FloatArray,
+) -> None:
+    """Where brightness crosses half way between dark and light, along profiles across the sides.
+
+    Args:
+        image: (height, width).
+        lens: See `camera.Camera`.
+        quads: (N, 4, 2) clockwise, dark inside [ideal px].
+        reaches: (N,) how far to both sides a profile looks [px].
+        spacing: Of the profiles along a side, and at most MAX_PROFILES of them [px].
+        crossings: (N, 4, MAX_PROFILES, 3) filled with the place along side k, from corner k to k + 1 [px],
+            how far outside it the crossing lies [px], and the contrast there; contrast 0: there is none.
+    """
+    most = 2 * math.ceil(_MAX_REACH_PX / _STEP_PX) + 1
+    profiles = np.empty((4, MAX_PROFILES, most))
+    dark, light = np.empty((4, MAX_PROFILES)), np.empty((4, MAX_PROFILES))
+    for n in range(len(quads)):
+        reach = min(max(reaches[n], _MIN_REACH_PX), _MAX_REACH_PX)
+        half = math.ceil(reach / _STEP_PX)
+        taken = 0
+        for k in range(4):
+            crossings[n, k, :, 2] = 0.0
+            u, v = quads[n, k, 0], quads[n, k, 1]
+            du, dv = quads[n, (k + 1) % 4, 0] - u, quads[n, (k + 1) % 4, 1] - v
+            length = math.hypot(du, dv)
+            if not length > 1.0:  # also when not a number
+                continue
+            du, dv = du / length, dv / length
+            skip = min(0.2 * length, 1.0 + 0.5 * reach)
+            usable = length - 2.0 * skip
+            count = min(max(int(usable / spacing) + 1, 4), MAX_PROFILES)
+            for m in range(count):
+                along = skip + usable * m / (count - 1)
+                middle_u, middle_v = u + along * du, v + along * dv
+                raw_u, raw_v = raw_pixel(lens, middle_u, middle_v)
+                out_u, out_v = raw_pixel(lens, middle_u + dv, middle_v - du)  # straight enough over a profile
+                profile = profiles[k, m]
+                if _profile(image, raw_u, raw_v, out_u - raw_u, out_v - raw_v, half, profile):
+                    dark[k, m], light[k, m] = _extremes(profile, half)
+                    crossings[n, k, m, 0] = along
+                    crossings[n, k, m, 2] = light[k, m] - dark[k, m]
+                    taken += 1
+        is_small = reach < _MIN_CLEAR_CELL_PX and taken > 0
+        common = _common_level(crossings[n, :, :, 2], dark, light) if is_small else 0.0
+        for k in range(4):
+            for m in range(MAX_PROFILES):
+                if crossings[n, k, m, 2] > 0.0:
+                    own = 0.5 * (dark[k, m] + light[k, m])
+                    place, found = _crossing(profiles[k, m], half, common if is_small else own)
+                    if not found and is_small:
+                        place, found = _crossing(profiles[k, m], half, own)
+                    crossings[n, k, m, 1] = place * _STEP_PX
+                    if not found:
+                        crossings[n, k, m, 2] = 0.0
+
+
+@compiled
+def _common_level(contrasts: FloatArray, dark: FloatArray, light: FloatArray) -> float:
+    """The middle level of the clearest quarter of a small marker's profiles.
+
+    Where cells are hardly wider than the blur, a white cell behind the border keeps many profiles from
+    getting dark, and what is behind the narrow margin keeps them from getting light. Half way between their
+    own extremes they would be biased.
+    """
+    all_dark, all_light = np.empty(contrasts.size), np.empty(contrasts.size)
+    count = 0
+    for k in range(contrasts.shape[0]):
+        for m in range(contrasts.shape[1]):
+            if contrasts[k, m] > 0.0:
+                all_dark[count], all_light[count] = dark[k, m], light[k, m]
+                count += 1
+    quarter = (count + 3) // 4
+    darkest = np.sort(all_dark[:count])[:quarter].mean()
+    return float(0.5 * (darkest + np.sort(all_light[:count])[count - quarter :].mean()))
+
+
+@compiled
+def _profile(image: Gray, u: float, v: float, du: float, dv: float, half: int, profile: FloatArray) -> bool:
+    """Brightness along 2 half + 1 points around a raw pixel; False when they leave the image."""
+    du, dv = _STEP_PX * du, _STEP_PX * dv
+    for end in (-half, half):
+        if not _is_inside(image, u + end * du, v + end * dv):
+            return False
+    for j in range(2 * half + 1):
+        profile[j] = _brightness(image, u + (j - half) * du, v + (j - half) * dv)
+    return True
+
+
+@compiled
+def _extremes(profile: FloatArray, half: int) -> tuple[float, float]:
+    """The darkest inner and the lightest outer brightness of a profile (2 half + 1,)."""
+    dark, light = profile[half], profile[half]
+    for j in range(half):
+        dark = min(dark, profile[j])
+        light = max(light, profile[half + 1 + j])
+    return dark, light
+
+
+@compiled
+def _crossing(profile: FloatArray, half: int, level: float) -> tuple[float, bool]:
+    """Where a profile (2 half + 1,) rises through a level next to its centre [steps], and whether it does."""
+    best, found = 0.0, False
+    for j in range(2 * half):
+        low, high = profile[j], profile[j + 1]
+        if low < level <= high:
+            place = j - half + (level - low) / (high - low)
+            if not found or abs(place) < abs(best):
+                best, found = place, True
+    return best, found
+
+
+@compiled
+def read_cells(image: Gray, lens: FloatArray, homographies: FloatArray, side: int, cells: FloatArray) -> None:
+    """Mean brightness in the middle of cells.
+
+    Args:
+        image: (height, width).
+        lens: See `camera.Camera`.
+        homographies: (N, 3, 3) from the marker, 0 to 1 along each side, to ideal pixels.
+        side: Cells along a marker's side, border included.
+        cells: (N, GRID, GRID) filled, upper left first.
+    """
+    first = 0.5 * (side - GRID)
+    for n in range(len(homographies)):
+        h = homographies[n]
+        points, spread = _points_per_cell(h, side)
+        for row in range(GRID):
+            for column in range(GRID):
+                total = 0.0
+                for i in range(points):
+                    y = (first + row + 0.5 + spread * (i - 0.5 * (points - 1))) / side
+                    for j in range(points):
+                        x = (first + column + 0.5 + spread * (j - 0.5 * (points - 1))) / side
+                        w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+                        u = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w
+                        v = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
+                        u, v = raw_pixel(lens, u, v)
+                        u = min(max(u, 0.0), image.shape[1] - 1.001)
+                        v = min(max(v, 0.0), image.shape[0] - 1.001)
+                        total += _brightness(image, u, v)
+                cells[n, row, column] = total / (points * points)
+
+
+@compiled
+def _points_per_cell(h: FloatArray, side: int) -> tuple[int, float]:
+    """Points along a cell's side, and their distance [cells]; one where a pixel is half a cell."""
+    w = 0.5 * (h[2, 0] + h[2, 1]) + h[2, 2]
+    u, v = (0.5 * (h[0, 0] + h[0, 1]) + h[0, 2]) / w, (0.5 * (h[1, 0] + h[1, 1]) + h[1, 2]) / w
+    a, b = (h[0, 0] - u * h[2, 0]) / w, (h[0, 1] - u * h[2, 1]) / w
+    c, d = (h[1, 0] - v * h[2, 0]) / w, (h[1, 1] - v * h[2, 1]) / w
+    cell = math.sqrt(abs(a * d - b * c)) / side
+    return (1, 0.0) if cell < _MIN_SHARED_CELL_PX else (2, _SPREAD)

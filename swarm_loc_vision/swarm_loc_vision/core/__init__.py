@@ -1,1 +1,0 @@
-"""Square markers in images: families, detection, sub-pixel corners and poses. No ROS."""

@@ -1,1 +1,0 @@
-"""Robots seen from above: camera pose by control points, anonymous detections. No ROS."""

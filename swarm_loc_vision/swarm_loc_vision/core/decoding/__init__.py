@@ -1,1 +1,0 @@
-"""Marker families, ids and their codes."""

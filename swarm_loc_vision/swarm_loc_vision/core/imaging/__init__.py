@@ -1,1 +1,0 @@
-"""Images, cameras and sampling."""

@@ -1,1 +1,0 @@
-"""Poses of markers and of bodies that carry several."""

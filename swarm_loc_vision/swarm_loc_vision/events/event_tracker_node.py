@@ -1,0 +1,202 @@
+"""Tracks blinking lights in the events of one robot, as a ROS 2 node in the robot's namespace.
+
+    ./run swarm_loc_vision event_tracker_node --ros-args -r __ns:=/pushbot1 -p calibration:=pushbot1.yaml
+
+It takes `events` and publishes `laser` (the spot of the own laser and the distance that follows), `lights`
+(bearings of other robots' LEDs) and `/diagnostics`, every 20 ms of the events' time. Parameters: see
+`doc/event_tracker_node.md`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from functools import partial
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
+from std_msgs.msg import Header
+
+from swarm_loc_estimator.common.messages.event_encoding import EventError, decode_events
+from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node
+from swarm_loc_msgs.msg import EventPacket, LaserDistance, LightBearing, LightBearingArray
+from swarm_loc_vision.events.bearing import direction, direction_jacobian
+from swarm_loc_vision.events.event_tracker_parameters import (
+    EventTrackerParameters,
+    laser_calibration,
+    light_sources,
+    make_tracker,
+)
+from swarm_loc_vision.events.settings import Sighting, WindowReport
+from swarm_loc_vision.events.windows import WindowedTracker
+from swarm_loc_vision.laser.calibration import UNKNOWN, Distance
+
+EVENT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+_OUTPUT_QOS = QoSProfile(depth=50)
+_PERIOD_S = 1.0
+_PATIENCE_S = 5.0
+_LASER_PATIENCE_S, _SEEN_PATIENCE_S = 15.0, 60.0
+"""For the laser, before it was seen and afterwards: robots in large halls often have nothing within range."""
+_THROTTLE_S = 30.0
+_MAX_PIXELS = 1 << 21
+"""Of a sensor; the tracker remembers the last bursts of each."""
+
+
+class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
+    """Decodes packets, lets the core track, publishes."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("event_tracker", EventTrackerParameters, **node_arguments)
+        self._sources = light_sources(self.chosen)
+        self._calibration = laser_calibration(self.chosen)
+        self._has_laser = not self._sources[0].is_above
+        robot = self.get_namespace().strip("/")
+        self._base_frame = f"{robot}/{self.chosen.base_frame}" if robot else self.chosen.base_frame
+        self._size = (0, 0)
+        self._tracker: WindowedTracker | None = None
+        self._counts: Counter[str] = Counter()
+        self._next_seq: int | None = None
+        self._packet_s = self._laser_s = time.monotonic()
+        self._told = ""
+        self._laser = self.create_publisher(LaserDistance, "laser", _OUTPUT_QOS)
+        self._lights = self.create_publisher(LightBearingArray, "lights", _OUTPUT_QOS)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
+        self.create_subscription(EventPacket, "events", self._on_events, EVENT_QOS)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # runs also while simulated time stands still
+        self.create_timer(_PERIOD_S, self._on_diagnostics, clock=steady)
+
+    def _on_events(self, message: EventPacket) -> None:
+        self._packet_s = time.monotonic()
+        self._counts["packets"] += 1
+        if self._next_seq is not None and message.seq > self._next_seq:
+            self._counts["packets lost on the way"] += message.seq - self._next_seq
+        self._next_seq = message.seq + 1
+        size = (message.width, message.height)
+        try:
+            _check(size)
+            events = decode_events(
+                memoryview(message.events), message.encoding, size, is_bigendian=message.is_bigendian
+            )
+        except EventError as error:
+            self._drop(str(error))
+            return
+        if self._tracker is None or size != self._size:
+            self._size, self._tracker = size, make_tracker(self.chosen, self._sources, size)
+        stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+        self._counts["events"] += len(events.x)
+        for report in self._tracker.track(events.x, events.y, events.is_on, stamp_ns + events.time_ns):
+            self._publish(report)
+
+    def _drop(self, reason: str) -> None:
+        self._counts[f"dropped: {reason}"] += 1
+        self.get_logger().warning(f"dropped a packet: {reason}", throttle_duration_sec=_THROTTLE_S)
+
+    def _publish(self, report: WindowReport) -> None:
+        if report.stamp_ns < 0:
+            self._drop("its stamp is before zero")
+            return
+        self._counts["reports"] += 1
+        laser = [one for one in report.sightings if not self._sources[one.source].is_above]
+        lights = [one for one in report.sightings if self._sources[one.source].is_above]
+        if self._has_laser:
+            self._laser.publish(self._laser_message(report.stamp_ns, laser[0] if laser else None))
+        if len(self._sources) > self._has_laser:
+            header = self._header(report.stamp_ns)
+            self._lights.publish(
+                LightBearingArray(header=header, lights=[self._light_message(one) for one in lights])
+            )
+            self._counts["lights"] += len(lights)
+
+    def _header(self, stamp_ns: int) -> Header:
+        return Header(stamp=Time(nanoseconds=stamp_ns).to_msg(), frame_id=self._base_frame)
+
+    def _laser_message(self, stamp_ns: int, seen: Sighting | None) -> LaserDistance:
+        """The spot and the distance that follows; NaN where there is none."""
+        message = LaserDistance(header=self._header(seen.stamp_ns if seen else stamp_ns))
+        message.distance = message.sigma = message.u_px = message.v_px = math.nan
+        message.covariance = np.array([-1.0, 0.0, 0.0, 0.0])
+        if seen is None:
+            self._counts["windows without the laser"] += 1
+            return message
+        self._laser_s = time.monotonic()
+        found = self._distance(seen)
+        self._counts["distances"] += not math.isnan(found.distance)
+        message.distance, message.sigma = found
+        message.u_px, message.v_px, message.events = seen.u, seen.v, seen.events
+        message.covariance = seen.covariance.ravel()
+        return message
+
+    def _distance(self, seen: Sighting) -> Distance:
+        if self._calibration is None:
+            return UNKNOWN
+        return self._calibration.distance(seen.v, float(seen.covariance[1, 1]), seen.locking)
+
+    def _light_message(self, seen: Sighting) -> LightBearing:
+        lens = self.chosen.lens
+        u, v = seen.u - lens.centre_column, seen.v - lens.centre_row
+        bearing, elevation = direction(u, v, lens.focal_px)
+        jacobian = direction_jacobian(u, v, lens.focal_px)
+        return LightBearing(
+            frequency=self._sources[seen.source].frequency,
+            bearing=math.remainder(bearing + lens.camera_yaw, 2.0 * math.pi),
+            elevation=elevation,
+            covariance=(jacobian @ seen.covariance @ jacobian.T).ravel(),
+            u_px=seen.u,
+            v_px=seen.v,
+            events=seen.events,
+        )
+
+    def _on_diagnostics(self) -> None:
+        trouble = self._trouble()
+        if trouble and trouble != self._told:
+            self.get_logger().warning(trouble, throttle_duration_sec=_THROTTLE_S)
+        self._told = trouble
+        jumps = self._tracker.time_jumps if self._tracker else 0
+        values = {
+            **{name: str(count) for name, count in sorted(self._counts.items())},
+            "time jumps": str(jumps),
+        }
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.WARN if trouble else DiagnosticStatus.OK,
+            name=f"{self.get_namespace().strip('/')}/{self.get_name()}".lstrip("/"),
+            message=trouble or "tracking",
+            values=[KeyValue(key=key, value=value) for key, value in values.items()],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+    def _trouble(self) -> str:
+        """What keeps the node from its work; said in the log when it begins."""
+        now_s = time.monotonic()
+        if now_s > self._packet_s + _PATIENCE_S:
+            self._laser_s = now_s
+            topic = self.resolve_topic_name("events")
+            return f"waiting: nothing has come on {topic} for {_PATIENCE_S:g} s and more"
+        has_seen = self._counts["reports"] > self._counts["windows without the laser"]
+        patience_s = _SEEN_PATIENCE_S if has_seen else _LASER_PATIENCE_S
+        if self._has_laser and now_s > self._laser_s + patience_s:
+            return (
+                f"the laser at {self._sources[0].frequency:g} Hz has not been seen for {patience_s:g} s and"
+                " more: is it on, at this frequency, and something within its range?"
+            )
+        return ""
+
+
+def _check(size: tuple[int, int]) -> None:
+    """Refuse a sensor that cannot be.
+
+    Raises:
+        EventError: It has no pixels, or too many.
+    """
+    if not 0 < size[0] * size[1] <= _MAX_PIXELS:
+        raise EventError(f"a sensor of {size[0]} x {size[1]} px is not one of 1 to {_MAX_PIXELS}")
+
+
+main = partial(run_node, "event_tracker_node", EventTrackerNode)

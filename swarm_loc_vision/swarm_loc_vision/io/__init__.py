@@ -1,1 +1,0 @@
-"""Images and detections as messages and in bags. No ROS here."""

@@ -1,0 +1,162 @@
+"""Calibrates the laser of one robot: drives it straight at a wall, fits the hyperbola, writes a YAML file.
+
+    ./run swarm_loc_vision calibrate_laser --ros-args -r __ns:=/pushbot1 -p output:=pushbot1.yaml
+
+With `bag:=FOLDER` the drive is one that was recorded. Otherwise the
+robot's driver and its `event_tracker_node` must run. Put the robot square to a wall, measure from the
+middle between its wheels to the wall, and start. It takes `odom` and `laser` and publishes `cmd_vel`.
+Parameters: see `doc/calibrate_laser.md`.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from geometry_msgs.msg import Twist, Vector3
+from nav_msgs.msg import Odometry
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.qos import QoSProfile
+
+from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_estimator.common.parameters import ParameterError, text
+from swarm_loc_estimator.common.ros.running import ConfiguredNode, Stop, run_node
+from swarm_loc_msgs.msg import LaserDistance
+from swarm_loc_vision.laser.calibration import LaserCalibration
+from swarm_loc_vision.laser.fit import CalibrationError, fit_hyperbola
+from swarm_loc_vision.laser.laser_file import save_laser
+from swarm_loc_vision.laser.recorded_drive import recorded_drive
+from swarm_loc_vision.laser.wall_drive import WallDrive
+
+_QOS = QoSProfile(depth=10)
+_COMMAND_S = 0.05
+_WAKE_S = 0.1
+_PATIENCE_S = 10.0
+_SETTLE_S = 0.5
+"""Odometry and rows that were under way when it stopped."""
+
+
+@dataclass(frozen=True)
+class CalibrateLaserParameters:
+    """Parameters of `calibrate_laser`."""
+
+    start_distance: float = number(
+        2.5, "m", 0.2, 100.0, "from base_link to the wall at the begin, measured by hand"
+    )
+    start_sigma: float = number(0.005, "m", 1e-5, 1.0, "its standard deviation")
+    stop_distance: float = number(0.16, "m", 0.05, 10.0, "from base_link to the wall where the robot stops")
+    speed: float = number(0.1, "m/s", 0.01, 1.0, "at which it drives")
+    camera_x: float = number(0.04, "m", -1.0, 1.0, "the camera before base_link")
+    output: str = text("", "path of the file that is written", required=True)
+    bag: str = text("", "path of a recorded drive, with the robot's odom and laser; empty: drive now")
+
+
+class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
+    """Drives, collects, and fits at the end."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("calibrate_laser", CalibrateLaserParameters, **node_arguments)
+        chosen = self.chosen
+        if chosen.stop_distance >= 0.5 * chosen.start_distance:
+            raise ParameterError(
+                f"parameter stop_distance = {chosen.stop_distance} must be less than half of"
+                f" start_distance = {chosen.start_distance}."
+            )
+        self._drive = WallDrive(chosen.start_distance, chosen.stop_distance)
+        self._heard_s = {"odom": -math.inf, "laser": -math.inf}
+        self._command = self.create_publisher(Twist, "cmd_vel", QoSProfile(depth=1))
+        self.create_subscription(Odometry, "odom", self._on_odometry, _QOS)
+        self.create_subscription(LaserDistance, "laser", self._on_laser, _QOS)
+        self.create_timer(_COMMAND_S, self._on_command, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._begin_s = time.monotonic()
+        self._speed = 0.0
+        self._error: CalibrationError | None = None
+
+    def run(self, stop: Stop) -> int:
+        """Drive to the wall, or read of such a drive, then fit and write; the exit status."""
+        if self.chosen.bag:
+            drive = recorded_drive(Path(self.chosen.bag), self.get_namespace().strip("/"), self._drive)
+            return self._fit(drive)
+        executor = EventsExecutor()
+        executor.add_node(self)
+        done_s = math.inf
+        while not stop.requested and time.monotonic() < done_s + _SETTLE_S:
+            executor.spin_once(timeout_sec=_WAKE_S)
+            if self._error is not None:
+                break
+            if self._drive.is_done or self._is_silent():
+                done_s = min(done_s, time.monotonic())
+            self._speed = self.chosen.speed if math.isinf(done_s) and self._hears_all() else 0.0
+        self._command.publish(Twist())
+        executor.shutdown()
+        if self._error is not None:
+            raise self._error
+        return 130 if stop.requested else self._finish()
+
+    def _finish(self) -> int:
+        if not self._drive.is_done:
+            missing = min(self._heard_s, key=lambda name: self._heard_s[name])
+            raise CalibrationError(
+                f"nothing has come on {self.resolve_topic_name(missing)} for {_PATIENCE_S:g} s, and the robot"
+                f" has driven {self._drive.driven:.2f} m."
+            )
+        return self._fit(self._drive)
+
+    def _fit(self, drive: WallDrive) -> int:
+        chosen = self.chosen
+        calibration = fit_hyperbola(drive.drive(chosen.start_sigma, chosen.camera_x))
+        save_laser(Path(chosen.output), calibration)
+        print(summary(calibration, drive.count, chosen.output), file=sys.stdout)
+        return 0
+
+    def _hears_all(self) -> bool:
+        return min(self._heard_s.values()) > time.monotonic() - 1.0
+
+    def _is_silent(self) -> bool:
+        last_s = max(self._begin_s, min(self._heard_s.values()))
+        return time.monotonic() > last_s + _PATIENCE_S
+
+    def _on_command(self) -> None:
+        self._command.publish(Twist(linear=Vector3(x=self._speed)))
+
+    def _on_odometry(self, message: Odometry) -> None:
+        self._heard_s["odom"] = time.monotonic()
+        place, turn = message.pose.pose.position, message.pose.pose.orientation
+        theta = 2.0 * math.atan2(turn.z, turn.w)
+        if not all(map(math.isfinite, (place.x, place.y, theta))):
+            return
+        try:
+            self._drive.take_odometry(_nanoseconds(message), place.x, place.y, theta)
+        except CalibrationError as error:
+            self._error = error
+
+    def _on_laser(self, message: LaserDistance) -> None:
+        self._heard_s["laser"] = time.monotonic()
+        self._drive.take_row(_nanoseconds(message), message.v_px)
+
+
+def _nanoseconds(message: Odometry | LaserDistance) -> int:
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def summary(calibration: LaserCalibration, count: int, path: str) -> str:
+    """What was found, for people."""
+    near, far = calibration.min_depth, calibration.max_depth
+    _, sigma = calibration.distance(calibration.row(1.0), 0.0)
+    return (
+        f"{count} rows between {near:.2f} and {far:.2f} m:"
+        f" p_inf = {calibration.row_at_infinity:.2f} px, f b = {calibration.focal_base:.3f} px m,"
+        f" sigma_px = {calibration.row_sigma:.3f}; a distance of 1 m is known to {100.0 * sigma:.1f} cm.\n"
+        f"wrote {path}"
+    )
+
+
+main = partial(run_node, "calibrate_laser", CalibrateLaserNode)

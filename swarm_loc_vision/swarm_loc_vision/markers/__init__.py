@@ -1,0 +1,1 @@
+"""Square markers in images: families, detection, sub-pixel corners and poses."""

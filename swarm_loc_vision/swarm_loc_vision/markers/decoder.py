@@ -1,0 +1,255 @@
+"""Decode the brightness of cells: the nearest code word over all ids and rotations, and its margin.
+
+Blur mixes neighbouring cells, so cells are sharpened first. A cell near the threshold says little: a word may
+differ there at little cost, while a difference in a clear cell costs a whole bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_vision.common.sampling import GRID
+from swarm_loc_vision.markers.families import BITS, CELLS, Family, rotated, unpacked
+
+Words = NDArray[np.uint64]
+
+FALSE_READINGS = 1e-5
+"""Of random squares, so many may be read as a marker in use, by whole bits at one threshold. Weighed bits and
+the second threshold add to it: with all 4096 ids one or two of 100 000 are read."""
+_SHARPENING = 0.2
+"""How much of the difference to its four neighbours is added to a cell, each."""
+_MAX_DARK_ERRORS = 3.0
+"""Cells of the 28 of the border's inner ring that may look light."""
+_MAX_SLOPE = 0.5
+"""Over the contrast: by how much the border's darkness may differ from side to side."""
+_MIDDLE, _LOW = 0.5, 0.28
+"""Where dark ends between ink and paper; and where, if half the marker lies in a shadow."""
+_MIN_CORRELATION = 0.4
+"""Between a candidate and its word. The cells of a black square with a speck of light are neither
+dark nor light and fit any word at little cost: 0.37 at most, where markers in motion have 0.5 and more."""
+_FAR = 1e9
+_WEIGHED = 4
+"""Words that differ in so many bits more than the nearest one may still be nearer when bits are weighed."""
+
+
+class Readings(NamedTuple):
+    """What candidates say, one row each.
+
+    Attributes:
+        word: Index of the nearest word, -1: no marker in use.
+        quarters: Counter-clockwise quarter turns that the marker is turned by in the image.
+        errors: Weighed bits by which the candidate differs from it.
+        margin: Weighed bits that could still flip before another reading would be nearer.
+        contrast: Light minus dark cells [counts].
+    """
+
+    word: NDArray[np.int64]
+    quarters: NDArray[np.int64]
+    errors: FloatArray
+    margin: FloatArray
+    contrast: FloatArray
+
+
+class Dictionary:
+    """Words in use of families with the same border.
+
+    Args:
+        family_ids: For each family the ids in use.
+
+    Attributes:
+        codes: (N,) the family's code of each word.
+        ids: (N,) its id in it.
+        strips: (N, 4, cells) the row of cells behind the border along each side, clockwise; 1 is white.
+        correctable: Bits that may differ; see `FALSE_READINGS`.
+    """
+
+    def __init__(self, family_ids: Sequence[tuple[Family, NDArray[np.int64]]]) -> None:
+        self.codes = np.concatenate([np.full(len(ids), family.code) for family, ids in family_ids])
+        self.ids = np.concatenate([ids for _, ids in family_ids])
+        words = np.concatenate([family.words[ids] for family, ids in family_ids])
+        border = family_ids[0][0].border
+        self._words = np.concatenate([rotated(words, quarters) for quarters in range(4)])
+        self.correctable = correctable_bits(len(words))
+        cells = unpacked(words)
+        rows = np.stack([np.rot90(cells, k, axes=(1, 2))[:, 0] for k in range(4)], axis=1)
+        self.strips = np.pad(rows, ((0, 0), (0, 0), (border, border)))
+
+    def read(self, cells: FloatArray, min_contrast: float) -> Readings:
+        """Read candidates.
+
+        Args:
+            cells: (N, GRID, GRID) of `sampling.read_cells`.
+            min_contrast: Between light and dark cells [counts].
+        """
+        count = len(cells)
+        readings = Readings(
+            np.full(count, -1), np.zeros(count, np.int64), np.zeros(count), np.zeros(count), np.zeros(count)
+        )
+        _read(cells, self._words, min_contrast, float(self.correctable), readings)
+        return readings
+
+
+def correctable_bits(words: int) -> int:
+    """Most whole bits that may differ while random squares are read at most at a rate of FALSE_READINGS."""
+    near, bits = 1, 0
+    while bits < BITS // 4:
+        near += math.comb(BITS, bits + 1)
+        if 4.0 * words * near / 2.0**BITS > FALSE_READINGS:
+            break
+        bits += 1
+    return bits
+
+
+@compiled
+def _read(
+    cells: FloatArray, words: Words, min_contrast: float, correctable: float, readings: Readings
+) -> None:
+    """Fill the readings."""
+    word, quarters, errors, margin, contrast = readings
+    clear, flat = np.empty(BITS), np.empty((GRID - 2, GRID - 2))
+    bits = np.empty(len(words), np.uint8)
+    for n in range(len(cells)):
+        before = np.uint64(0)
+        light = _flatten(cells[n], flat)
+        for level in (_MIDDLE, _LOW):
+            contrast[n] = light if light > 0.0 and _clear_cells(flat, light, level, clear) else 0.0
+            if contrast[n] < min_contrast:
+                continue
+            seen = np.uint64(0)
+            for bit in range(BITS):
+                seen = (seen << np.uint64(1)) | np.uint64(clear[bit] > 0.0)
+            if level == _LOW and seen == before:
+                continue
+            before = seen
+            best, distance, runner_up = nearest(words, seen, clear, bits)
+            if distance > correctable or runner_up <= distance:
+                continue
+            if np.abs(clear).mean() - 2.0 * distance / BITS < _MIN_CORRELATION:
+                continue
+            quarters[n], word[n] = divmod(best, len(words) // 4)
+            errors[n], margin[n] = distance, 0.5 * (runner_up - distance)
+            break
+
+
+@compiled
+def _flatten(cells: FloatArray, sharp: FloatArray) -> float:
+    """Write sharpened brightness above what is dark, (GRID - 2, GRID - 2); that of light, 0 if there is none.
+
+    Dark is a plane through the border's inner ring, which takes in light that falls off; light is the mean
+    of the lighter cells.
+    """
+    for row in range(GRID - 2):
+        for column in range(GRID - 2):
+            here = cells[row + 1, column + 1]
+            around = (
+                cells[row, column + 1]
+                + cells[row + 2, column + 1]
+                + cells[row + 1, column]
+                + cells[row + 1, column + 2]
+            )
+            sharp[row, column] = here + _SHARPENING * (4.0 * here - around)
+    middle = 0.5 * (GRID - 3)
+    mean, by_x, by_y, square, n = 0.0, 0.0, 0.0, 0.0, 0
+    for row in range(GRID - 2):
+        for column in range(GRID - 2):
+            if 0 < row < GRID - 3 and 0 < column < GRID - 3:
+                continue
+            mean += sharp[row, column]
+            by_x += (column - middle) * sharp[row, column]
+            by_y += (row - middle) * sharp[row, column]
+            square += (column - middle) ** 2
+            n += 1
+    mean, by_x, by_y = mean / n, by_x / square, by_y / square
+    lightest = 0.0
+    for row in range(GRID - 2):
+        for column in range(GRID - 2):
+            sharp[row, column] -= mean + by_x * (column - middle) + by_y * (row - middle)
+            if 0 < row < GRID - 3 and 0 < column < GRID - 3:
+                lightest = max(lightest, sharp[row, column])
+    total, light = 0.0, 0
+    for row in range(1, GRID - 3):
+        for column in range(1, GRID - 3):
+            if sharp[row, column] > 0.5 * lightest:
+                total += sharp[row, column]
+                light += 1
+    if light == 0:
+        return 0.0
+    high = total / light
+    return high if (abs(by_x) + abs(by_y)) * (GRID - 3) <= _MAX_SLOPE * high else 0.0
+
+
+@compiled
+def _clear_cells(flat: FloatArray, light: float, level: float, clear: FloatArray) -> bool:
+    """From brightness to -1 (dark) ... 1 (light), in `clear`; whether the border is dark.
+
+    What lies at `level` between dark and `light`, 0 to 1, is neither.
+    """
+    wrong = 0.0
+    for row in range(GRID - 2):
+        for column in range(GRID - 2):
+            above = flat[row, column] / light - level
+            value = min(max(above / (level if above < 0.0 else min(1.0 - level, 2.0 * level)), -1.0), 1.0)
+            if 0 < row < GRID - 3 and 0 < column < GRID - 3:
+                clear[(row - 1) * CELLS + column - 1] = value
+            elif value > 0.0:
+                wrong += value
+    return wrong <= _MAX_DARK_ERRORS
+
+
+@compiled
+def nearest(
+    words: Words, seen: np.uint64, clear: FloatArray, bits: NDArray[np.uint8]
+) -> tuple[int, float, float]:
+    """The nearest word to what was seen.
+
+    Args:
+        words: (N,) all that there are.
+        seen: The candidate's bits.
+        clear: (BITS,) how clear each is, -1 to 1.
+        bits: (N,) filled with the number of bits that differ.
+
+    Returns:
+        Index of the nearest word, its weighed distance, and that of the second nearest. A second that
+        is far off is the one with the fewest bits that differ: another may weigh a tenth of a bit less.
+    """
+    fewest, second = np.uint8(BITS), np.uint8(BITS)
+    for i in range(len(words)):
+        bits[i] = _bits_set(words[i] ^ seen)
+        fewest = min(fewest, bits[i])
+    for i in range(len(words)):  # a loop of its own: together the compiler does not turn them into vectors
+        second = min(second, bits[i] if bits[i] > fewest else np.uint8(BITS))
+    reach = max(fewest + _WEIGHED, second)  # so that there is a second nearest, however far it is
+    best, distance, runner_up = -1, _FAR, _FAR
+    for i in range(len(words)):
+        if bits[i] > reach:
+            continue
+        different = words[i] ^ seen
+        cost = 0.0
+        for bit in range(BITS):
+            if (different >> np.uint64(BITS - 1 - bit)) & np.uint64(1):
+                cost += abs(clear[bit])
+        if cost < distance:
+            best, distance, runner_up = i, cost, distance
+        elif cost < runner_up:
+            runner_up = cost
+    return best, distance, runner_up
+
+
+@compiled
+def _bits_set(x: np.uint64) -> np.uint8:
+    """Number of ones, by shifts and sums, which the compiler turns into vectors."""
+    x -= (x >> np.uint64(1)) & np.uint64(0x5555555555555555)
+    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    x += x >> np.uint64(8)
+    x += x >> np.uint64(16)
+    x += x >> np.uint64(32)
+    count: np.uint8 = np.uint8(x & np.uint64(0x7F))
+    return count

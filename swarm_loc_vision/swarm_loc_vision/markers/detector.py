@@ -1,0 +1,199 @@
+"""Detector of square fiducial markers: an image in, their corners, ids and poses out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_vision.common.camera import Camera
+from swarm_loc_vision.common.homographies import homographies
+from swarm_loc_vision.common.lens import LENS_SIZE
+from swarm_loc_vision.common.sampling import GRID, read_cells
+from swarm_loc_vision.markers.bodies import Body, Seen, solve_bodies
+from swarm_loc_vision.markers.decoder import Dictionary
+from swarm_loc_vision.markers.detector_settings import DetectorSettings
+from swarm_loc_vision.markers.edges import refine, refine_read
+from swarm_loc_vision.markers.families import Family
+from swarm_loc_vision.markers.pose import Poses, Upright, marker_poses
+from swarm_loc_vision.markers.quads import find_quads
+
+Gray = NDArray[np.uint8]
+
+_ROUGH_PX = 3.0
+"""Distance of the profiles across the sides of candidates."""
+_MIN_EDGE = 2.0
+"""Contrast of a candidate's sides over `min_contrast`, which counts from the mean and not from dark."""
+_MAX_CANDIDATES = 8192
+"""Of more, in an image full of texture, the smallest are dropped."""
+_BLOCK = 256
+"""Candidates that are read at once, which bounds the memory that they take."""
+_SAME = 0.3
+"""Readings nearer than this share of a marker's diagonal are of the same one."""
+
+
+@dataclass(frozen=True)
+class Detections:
+    """The markers in an image, one row each.
+
+    Attributes:
+        family: Code of its family.
+        id: Its id.
+        margin: Weighed bits that could still flip before another reading would be nearer.
+        errors: Weighed bits by which it differs from its id's word.
+        contrast: Light minus dark cells [counts].
+        corners: (N, 4, 2) clockwise from the marker's own upper left [raw px].
+        poses: Its pose and the mirrored one; None without a camera.
+        misfits: Markers whose corners fit no square by far: the camera may not be the calibrated one.
+        dropped: Candidates that could not be read, by reason.
+    """
+
+    family: IntArray
+    id: IntArray
+    margin: FloatArray
+    errors: FloatArray
+    contrast: FloatArray
+    corners: FloatArray
+    poses: Poses | None
+    misfits: int
+    dropped: Mapping[str, int]
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+
+class _Markers(NamedTuple):
+    """Candidates that were read, one row each; as `Detections`, with ideal corners and their covariance."""
+
+    family: NDArray[Any]
+    id: NDArray[Any]
+    margin: NDArray[Any]
+    errors: NDArray[Any]
+    contrast: NDArray[Any]
+    corners: NDArray[Any]
+    covariance: NDArray[Any]
+
+    def chosen(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> _Markers:
+        """Some of the rows."""
+        return _Markers(*(column[rows] for column in self))
+
+
+class MarkerDetector:
+    """Finds the markers in use.
+
+    Args:
+        settings: Its numbers.
+        families: Families in use and for each its ids in use; None: all of its ids.
+        camera: What takes the images; without one there are no poses, and it has no distortion.
+        lengths: Sides of markers that differ from `settings.marker_length`, by id [m].
+        up: (3,) direction up in the camera frame, for `settings.tilt_sigma`.
+        bodies: Things that carry several markers.
+    """
+
+    def __init__(
+        self,
+        settings: DetectorSettings,
+        families: Sequence[tuple[Family, IntArray | None]],
+        camera: Camera | None = None,
+        *,
+        lengths: Mapping[int, float] | None = None,
+        up: FloatArray | None = None,
+        bodies: Sequence[Body] = (),
+    ) -> None:
+        self._settings = settings
+        self._camera = camera
+        self._lens = camera.lens if camera else np.zeros(LENS_SIZE)
+        self._lengths = lengths or {}
+        self._bodies = bodies
+        self._upright = None if up is None or not settings.tilt_sigma else Upright(up, settings.tilt_sigma)
+        by_side: dict[int, list[tuple[Family, IntArray]]] = {}
+        for family, ids in families:
+            used = np.arange(len(family.words)) if ids is None else ids
+            by_side.setdefault(family.side, []).append((family, used))
+        self._dictionaries = {side: Dictionary(used) for side, used in by_side.items()}
+
+    def detect(self, gray: Gray) -> Detections:
+        """The markers in an image (height, width)."""
+        quads = find_quads(gray, self._settings.min_side_px, self._settings.min_contrast)
+        surplus = max(len(quads) - _MAX_CANDIDATES, 0)
+        if surplus:
+            quads = quads[np.sort(np.argsort(_diagonals(quads))[surplus:])]
+        count = len(quads)
+        if self._camera:
+            quads = self._camera.to_ideal(quads)
+            quads = quads[np.isfinite(quads).all(axis=(1, 2))]
+        dropped = {"too_many_candidates": surplus, "too_far_off_axis": count - len(quads)}
+        blocks = np.split(quads, range(_BLOCK, len(quads), _BLOCK))
+        found = [self._read(gray, block, side) for side in self._dictionaries for block in blocks]
+        markers = _best(_joined(found))
+        corners = self._camera.to_raw(markers.corners) if self._camera else markers.corners
+        return Detections(*markers[:5], corners, *self._poses(markers), dropped)
+
+    def _read(self, gray: Gray, quads: FloatArray, side: int) -> _Markers:
+        """The candidates that are markers of so many cells along a side."""
+        min_contrast, dictionary = self._settings.min_contrast, self._dictionaries[side]
+        rough = refine(gray, self._lens, quads, side, _ROUGH_PX)
+        corners = rough.corners[rough.contrast >= _MIN_EDGE * min_contrast]
+        cells = np.empty((len(corners), GRID, GRID))
+        read_cells(gray, self._lens, homographies(corners), side, cells)
+        readings = dictionary.read(cells, _MIN_EDGE * min_contrast)
+        good = readings.word >= 0
+        word, quarters = readings.word[good], readings.quarters[good]
+        own = (np.arange(4) - quarters[:, None]) % 4  # the marker's own first corner first
+        fine = refine_read(
+            gray,
+            self._lens,
+            np.take_along_axis(corners[good], own[..., None], axis=1),
+            dictionary.strips[word],
+        )
+        markers = _Markers(
+            dictionary.codes[word],
+            dictionary.ids[word],
+            readings.margin[good],
+            readings.errors[good],
+            readings.contrast[good],
+            fine.corners,
+            fine.covariance,
+        )
+        return markers.chosen(fine.contrast > 0.0)
+
+    def _poses(self, markers: _Markers) -> tuple[Poses | None, int]:
+        """Poses of all markers, those of bodies together, and how many markers misfit."""
+        if self._camera is None:
+            return None, 0
+        default = self._settings.marker_length
+        lengths = np.array([self._lengths.get(int(i), default) for i in markers.id], dtype=float)
+        intrinsics = self._camera.intrinsics
+        poses, is_misfit = marker_poses(
+            markers.corners, markers.covariance, lengths, intrinsics, self._upright
+        )
+        if self._bodies:
+            seen = Seen(markers.id, markers.corners, markers.covariance, lengths, poses)
+            solve_bodies(seen, self._bodies, intrinsics, self._upright)
+        return poses, int(is_misfit.sum())
+
+
+def _joined(found: Sequence[_Markers]) -> _Markers:
+    """All rows."""
+    return _Markers(*map(np.concatenate, zip(*found, strict=True)))
+
+
+def _best(markers: _Markers) -> _Markers:
+    """One reading for each place: that with the fewest errors, and of like ones the clearest."""
+    if not len(markers.id):
+        return markers
+    middle, kept = markers.corners.mean(axis=1), np.zeros(len(markers.id), np.bool_)
+    near = KDTree(middle).query_ball_point(middle, _SAME * _diagonals(markers.corners))
+    for i in np.lexsort((-markers.contrast, markers.errors)):
+        kept[i] = not kept[near[i]].any()
+    return markers.chosen(kept)
+
+
+def _diagonals(quads: FloatArray) -> FloatArray:
+    """(N,) lengths of a diagonal of quadrangles (N, 4, 2) [px]."""
+    return np.asarray(np.linalg.norm(quads[:, 0] - quads[:, 2], axis=1))

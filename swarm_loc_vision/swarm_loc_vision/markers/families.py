@@ -1,0 +1,116 @@
+"""Families of square markers: 6 x 6 cells inside a black border, each id a word of 36 bits.
+
+All families share one form, so one decoder reads them: the cells row by row from the upper left, the first
+one in bit 35, 1 is white.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_vision.markers import bch
+
+CELLS = 6
+"""Cells along a side, without the border."""
+BITS = CELLS * CELLS
+
+CODE_ARTOOLKIT_BCH = 0
+CODE_ARUCO_MIP_36H12 = 1
+CODE_APRILTAG_36H11 = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """One kind of marker.
+
+    Attributes:
+        name: As parameters name it.
+        code: FAMILY_* of swarm_loc_msgs/MarkerDetection.
+        border: Width of the black border [cells].
+        words: (N,) uint64, the cells of id 0, 1, 2 ...
+    """
+
+    name: str
+    code: int
+    border: int
+    words: NDArray[np.uint64]
+
+    @property
+    def side(self) -> int:
+        """Cells along a side, border included."""
+        return CELLS + 2 * self.border
+
+    def pattern(self, marker_id: int) -> NDArray[np.uint8]:
+        """(side, side) 1 where a cell is white, upper left first.
+
+        Raises:
+            ValueError: The family has no such id.
+        """
+        if not 0 <= marker_id < len(self.words):
+            raise ValueError(f"{self.name} has ids 0 to {len(self.words) - 1}, not {marker_id}.")
+        return np.pad(unpacked(self.words[marker_id : marker_id + 1])[0], self.border)
+
+
+def packed(cells: NDArray[np.uint8]) -> NDArray[np.uint64]:
+    """Words (N,) of cells (N, 6, 6), 1 white."""
+    shifts = np.arange(BITS - 1, -1, -1, dtype=np.uint64)
+    bits: NDArray[np.uint64] = cells.reshape(-1, BITS).astype(np.uint64) << shifts
+    words: NDArray[np.uint64] = np.bitwise_or.reduce(bits, axis=1)
+    return words
+
+
+def unpacked(words: NDArray[np.uint64]) -> NDArray[np.uint8]:
+    """Cells (N, 6, 6), 1 white, of words (N,)."""
+    shifts = np.arange(BITS - 1, -1, -1, dtype=np.uint64)
+    cells: NDArray[np.uint8] = ((words[:, None] >> shifts) & np.uint64(1)).astype(np.uint8)
+    return cells.reshape(-1, CELLS, CELLS)
+
+
+def rotated(words: NDArray[np.uint64], quarters: int) -> NDArray[np.uint64]:
+    """The words (N,) of markers turned counter-clockwise by quarter turns, as they then look."""
+    return packed(np.rot90(unpacked(words), quarters, axes=(1, 2)))
+
+
+def _opencv_words(dictionary: int, *, quarters: int) -> NDArray[np.uint64]:
+    """The words of one of OpenCV's dictionaries, turned by quarter turns."""
+    source = cv2.aruco.getPredefinedDictionary(dictionary)
+    count = len(source.bytesList)
+    images = np.stack([source.generateImageMarker(i, CELLS + 2) for i in range(count)])
+    cells = (images[:, 1:-1, 1:-1] > 0).astype(np.uint8)
+    return rotated(packed(cells), quarters)
+
+
+@lru_cache(maxsize=1)
+def families() -> dict[str, Family]:
+    """All families by name.
+
+    OpenCV turns AprilTag's tags by half a turn against the images that AprilTag publishes; here they are
+    upright as published.
+    """
+    words = bch.codewords()
+    mip = _opencv_words(cv2.aruco.DICT_ARUCO_MIP_36h12, quarters=0)
+    tags = _opencv_words(cv2.aruco.DICT_APRILTAG_36h11, quarters=2)
+    known = (
+        Family("artoolkit_bch_thin", CODE_ARTOOLKIT_BCH, 1, words),
+        Family("artoolkit_bch_thick", CODE_ARTOOLKIT_BCH, 3, words),
+        Family("aruco_mip_36h12", CODE_ARUCO_MIP_36H12, 1, mip),
+        Family("apriltag_36h11", CODE_APRILTAG_36H11, 1, tags),
+    )
+    return {family.name: family for family in known}
+
+
+def family_named(name: str) -> Family:
+    """The family of a name.
+
+    Raises:
+        ValueError: There is none; the message names those that are.
+    """
+    known = families()
+    if name not in known:
+        raise ValueError(f"there is no marker family '{name}', only {', '.join(known)}.")
+    return known[name]

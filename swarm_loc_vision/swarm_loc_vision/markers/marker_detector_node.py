@@ -1,0 +1,66 @@
+"""A camera's marker detector as a ROS 2 node.
+
+    ./run swarm_loc_vision marker_detector_node --ros-args -r __ns:=/epuck1 -p family:=aruco_mip_36h12
+
+It subscribes to `camera_info`, and to `image_raw` or `image_raw/compressed`, and publishes `detections` with
+the images' own stamps and frames, and `/diagnostics`. Parameters: see
+`doc/marker_detector_node.md`.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+from rclpy.qos import QoSProfile
+
+from swarm_loc_estimator.common.jit import is_warm
+from swarm_loc_estimator.common.ros.running import run_node
+from swarm_loc_msgs.msg import MarkerDetectionArray
+from swarm_loc_vision.common.camera_node import CameraNode
+from swarm_loc_vision.common.transports import TRANSPORTS
+from swarm_loc_vision.markers.camera_detector import CameraDetector
+from swarm_loc_vision.markers.detector_parameters import DetectorParameters, detector_maker
+from swarm_loc_vision.markers.precompile import WARM_UP, warm_up
+
+_MAX_MISFIT_SHARE = 0.1
+"""Of the markers since the last diagnostics; if more fit no square the camera is not the calibrated one."""
+
+
+class MarkerDetectorNode(CameraNode[DetectorParameters]):
+    """Receives images, lets the core find the markers, publishes."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("marker_detector", DetectorParameters, **node_arguments)
+        parameters = self.chosen
+        create_detector = detector_maker(parameters)
+        if not is_warm(WARM_UP):
+            self.get_logger().info("compiling the detector for this machine: about half a minute")
+        warm_up()
+        gray_of = TRANSPORTS[parameters.image_transport].gray_of
+        self._camera = CameraDetector(create_detector, gray_of, parameters.settings.ambiguity)
+        self._told = (0, 0)  # markers and misfits
+        publisher = self.create_publisher(MarkerDetectionArray, "detections", QoSProfile(depth=10))
+        self.watch(self._camera, parameters.image_transport, publisher)
+        self.get_logger().info(f"ready: markers of family {parameters.family}")
+
+    def detect(self, message: Any) -> bytes:
+        """The serialized detections of an image; see `CameraDetector.detect`."""
+        return self._camera.detect(message)
+
+    def figures(self) -> dict[str, str]:
+        """How many markers were found."""
+        camera = self._camera
+        return {"markers": str(camera.markers), "markers that fit no square": str(camera.misfits)}
+
+    def trouble(self) -> str:
+        """That many of the markers since the last time fit no square."""
+        camera = self._camera
+        markers, misfits = camera.markers - self._told[0], camera.misfits - self._told[1]
+        self._told = camera.markers, camera.misfits
+        if misfits <= _MAX_MISFIT_SHARE * markers:
+            return ""
+        return f"{misfits} of {markers} markers fit no square: is camera_info that of this camera?"
+
+
+main = partial(run_node, "marker_detector_node", MarkerDetectorNode)

@@ -1,0 +1,380 @@
+"""Planar pose estimation: weighted least squares on the corners of markers, with covariance.
+
+IPPE gives two starts for a plane. Each is refined by weighted least squares on the corners, with the
+knowledge, if there is any, that the marker stands upright. What the corners are unsure of becomes the pose's
+covariance.
+
+Marker frame: x right and y up as seen by one who faces it, z out of it. Camera frame: x right, y down, z
+forward. Rotations are perturbed from the left, so covariances are about the camera's axes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_vision.markers.ippe import two_starts
+
+_ROUNDS = 12
+_STILL = 1e-6
+"""A step whose weighed square is smaller ends the search."""
+_NOWHERE = 1e12
+_TRUST = 6.0
+"""The corners' covariance counts like so many degrees of freedom; where corners fit worse than it says, as on
+a marker that is partly covered, the pose is as much less sure. A marker alone has two of its own."""
+_MISFIT = 100.0
+"""Chi square, of two degrees of freedom, above which not the corners' noise is what they do not fit by, but
+their model: a lens that is not the calibrated one, a bent marker."""
+_SAME = 1.0 + 2.0 * math.cos(0.05)
+"""Solutions that are turned against each other by less than 0.05 rad are the same one. Multiplied element by
+element, rotations add up to 1 + 2 cos of the angle between them."""
+
+
+class Upright(NamedTuple):
+    """Knowledge that something stands upright.
+
+    Attributes:
+        up: (3,) unit vector in the camera frame.
+        tilt_sigma: Standard deviation of the tilt about either horizontal axis [rad].
+    """
+
+    up: FloatArray
+    tilt_sigma: float
+
+
+class Poses(NamedTuple):
+    """Two solutions for each of N things, the better one first.
+
+    Attributes:
+        rotation: (N, 2, 3, 3) to the camera frame.
+        position: (N, 2, 3) in the camera frame [m].
+        covariance: (N, 2, 6, 6) of position and rotation [m^2, rad^2].
+        chi2: (N, 2) weighed square of what is left of the corners' differences [1]; infinite: no solution.
+    """
+
+    rotation: FloatArray
+    position: FloatArray
+    covariance: FloatArray
+    chi2: FloatArray
+
+
+class _Sight(NamedTuple):
+    """What is known of the pose of one marker, or of a body with M of them.
+
+    Attributes:
+        points: (4 M, 3) corners in the body's frame.
+        pixels: (4 M, 2) where they are seen.
+        weights: (M, 8, 8) of each four.
+        intrinsics: fx, fy, cx, cy.
+        axis: (3,) of the body, which points up.
+        up: (3,) in the camera frame.
+        tilt_weight: One over the tilt's variance; 0 when nothing is known.
+    """
+
+    points: FloatArray
+    pixels: FloatArray
+    weights: FloatArray
+    intrinsics: FloatArray
+    axis: FloatArray
+    up: FloatArray
+    tilt_weight: float
+
+
+def square(length: float) -> FloatArray:
+    """(4, 3) corners of a marker in its own frame, clockwise from the upper left [m]."""
+    half = 0.5 * length
+    return np.array([[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]])
+
+
+def marker_poses(
+    corners: FloatArray,
+    covariance: FloatArray,
+    lengths: FloatArray,
+    intrinsics: FloatArray,
+    upright: Upright | None = None,
+) -> tuple[Poses, NDArray[np.bool_]]:
+    """Both solutions for each marker, or one where both starts lead to the same, and which markers misfit.
+
+    Where corners fit no square by far, each coordinate is taken for as unsure as plain least squares leaves
+    it, on top of what its covariance says.
+
+    Args:
+        corners: (N, 4, 2) clockwise from the marker's own upper left [ideal px].
+        covariance: (N, 8, 8) of the corners [px^2].
+        lengths: (N,) sides [m].
+        intrinsics: (4,) fx, fy, cx, cy [px].
+        upright: Given when the markers' y axes are known to point up.
+    """
+    directions = (corners - intrinsics[2:]) / intrinsics[:2]
+    points = np.stack([square(length) for length in lengths]) if len(lengths) else np.zeros((0, 4, 3))
+    starts = two_starts(points, directions, None if upright is None else upright.up)
+
+    def refined(rows: NDArray[np.int64], covariance: FloatArray) -> Poses:
+        count, poses = len(rows), (starts[0][rows], starts[1][rows])
+        found = Poses(*poses, np.zeros((count, 2, 6, 6)), np.full((count, 2), np.inf))
+        weights = np.asarray(np.linalg.inv(covariance), np.float64)
+        _refine_markers(points[rows], corners[rows], weights, intrinsics, *_tilt(upright), found)
+        return found
+
+    poses = refined(np.arange(len(corners)), covariance)
+    is_misfit = np.isfinite(poses.chi2.min(axis=1)) & (poses.chi2.min(axis=1) > _MISFIT)
+    if is_misfit.any():
+        rows = np.flatnonzero(is_misfit)
+        left = refined(rows, np.tile(np.eye(8), (len(rows), 1, 1))).chi2.min(axis=1)
+        unsure = covariance[rows] + 0.5 * left[:, None, None] * np.eye(8)
+        for column, again in zip(poses, refined(rows, unsure), strict=True):
+            column[rows] = again
+    surplus = np.maximum(1.0, (_TRUST + poses.chi2.min(axis=1)) / (_TRUST + 2.0))
+    solved = np.isfinite(surplus)
+    poses.covariance[solved] *= surplus[solved, None, None, None]
+    poses.chi2[solved] /= surplus[solved, None]
+    worse = poses.chi2[:, 0] > poses.chi2[:, 1]
+    for column in poses:
+        column[worse] = column[worse, ::-1]
+    turned = np.einsum("nij,nij->n", poses.rotation[:, 0], poses.rotation[:, 1])
+    poses.chi2[turned >= _SAME, 1] = np.inf
+    return poses, is_misfit
+
+
+def body_pose(
+    points: FloatArray,
+    pixels: FloatArray,
+    covariance: FloatArray,
+    intrinsics: FloatArray,
+    starts: tuple[FloatArray, FloatArray],
+    upright: Upright | None = None,
+) -> Poses:
+    """The pose of a body whose z axis points up, from several of its markers; the best from all starts.
+
+    Args:
+        points: (M, 4, 3) corners in the body's frame [m].
+        pixels: (M, 4, 2) in the image [ideal px].
+        covariance: (M, 8, 8) of each marker's corners [px^2].
+        intrinsics: (4,) fx, fy, cx, cy [px].
+        starts: Rotations (S, 3, 3) and positions (S, 3) to search from.
+        upright: Given when the body is known to stand upright.
+
+    Returns:
+        N = 1; the second solution is the best one of another kind, if a start led to one.
+    """
+    weights = np.asarray(np.linalg.inv(covariance), np.float64)
+    axis, flat = np.array([0.0, 0.0, 1.0]), (points.reshape(-1, 3), pixels.reshape(-1, 2))
+    sight = _Sight(*flat, weights, intrinsics, axis, *_tilt(upright))
+    rotations, positions = starts[0].copy(), starts[1].copy()
+    covariances = np.zeros((len(rotations), 6, 6))
+    chi2 = np.full(len(rotations), np.inf)
+    for i in range(len(rotations)):
+        chi2[i] = _refine(sight, rotations[i], positions[i], covariances[i])
+    order = np.argsort(chi2, kind="stable")
+    best = order[0]
+    turned = np.einsum("ij,sij->s", rotations[best], rotations)
+    others = [i for i in order if turned[i] < _SAME]
+    chosen = [best, others[0] if others else best]
+    found = Poses(*(column[chosen][None] for column in (rotations, positions, covariances, chi2)))
+    if not others:
+        found.chi2[0, 1] = np.inf
+    return found
+
+
+def _tilt(upright: Upright | None) -> tuple[FloatArray, float]:
+    """Up, and the weight of the tilt; 0 when nothing is known."""
+    known = upright or Upright(np.zeros(3), np.inf)
+    return np.ascontiguousarray(known.up, float), 1.0 / known.tilt_sigma**2
+
+
+@compiled
+def _refine_markers(
+    points: FloatArray,
+    corners: FloatArray,
+    weights: FloatArray,
+    intrinsics: FloatArray,
+    up: FloatArray,
+    tilt_weight: float,
+    poses: Poses,
+) -> None:
+    """Refine both starts of each marker."""
+    rotation, position, covariance, chi2 = poses
+    axis = np.array([0.0, 1.0, 0.0])
+    for n in range(len(corners)):
+        sight = _Sight(points[n], corners[n], weights[n : n + 1], intrinsics, axis, up, tilt_weight)
+        for s in range(2):
+            if position[n, s, 2] > 0.0:
+                chi2[n, s] = _refine(sight, rotation[n, s], position[n, s], covariance[n, s])
+
+
+@compiled
+def _refine(sight: _Sight, rotation: FloatArray, position: FloatArray, covariance: FloatArray) -> float:
+    """Weighted least squares on corners and tilt, Levenberg and Marquardt.
+
+    Args:
+        sight: What is known.
+        rotation: (3, 3) start, and result.
+        position: (3,) likewise.
+        covariance: (6, 6) filled.
+
+    Returns:
+        The weighed square of the differences; infinite without a solution.
+    """
+    normal, trial_normal = np.empty((6, 6)), np.empty((6, 6))
+    slope, trial_slope, step = np.empty(6), np.empty(6), np.empty(6)
+    trial_rotation, trial_position = np.empty((3, 3)), np.empty(3)
+    factor = np.empty((6, 6))
+    cost = _equations(sight, rotation, position, normal, slope)
+    damping = 1e-4
+    for _ in range(_ROUNDS):
+        if not cost < _NOWHERE:
+            return np.inf
+        if not _factorized(normal, damping, factor):
+            return np.inf
+        _solved(factor, slope, step)
+        gain = 0.0
+        for i in range(6):
+            gain += step[i] * slope[i]
+            if i < 3:
+                trial_position[i] = position[i] + step[i]
+        _rotated(rotation, step, trial_rotation)
+        trial = _equations(sight, trial_rotation, trial_position, trial_normal, trial_slope)
+        if trial <= cost:
+            rotation[:], position[:] = trial_rotation, trial_position
+            normal[:], slope[:] = trial_normal, trial_slope
+            cost = trial
+            damping *= 0.1
+            if gain < _STILL:
+                break
+        else:
+            damping *= 10.0
+    if not _factorized(normal, 0.0, factor):
+        return np.inf
+    unit = np.zeros(6)
+    for i in range(6):
+        unit[:] = 0.0
+        unit[i] = 1.0
+        _solved(factor, unit, step)
+        covariance[i] = step
+    return cost
+
+
+@compiled
+def _equations(
+    sight: _Sight, rotation: FloatArray, position: FloatArray, normal: FloatArray, slope: FloatArray
+) -> float:
+    """Normal equations (6, 6) and (6,) at a pose, and its cost; infinite where a corner lies behind."""
+    normal[:] = 0.0
+    slope[:] = 0.0
+    cost = 0.0
+    jacobian, weighed = np.zeros((8, 6)), np.empty(6)
+    rest = np.empty(8)
+    points, pixels, weights, intrinsics = sight.points, sight.pixels, sight.weights, sight.intrinsics
+    fx, fy = intrinsics[0], intrinsics[1]
+    for m in range(len(weights)):
+        for k in range(4):
+            x, y, z = 0.0, 0.0, 0.0
+            for i in range(3):
+                x += rotation[0, i] * points[4 * m + k, i]
+                y += rotation[1, i] * points[4 * m + k, i]
+                z += rotation[2, i] * points[4 * m + k, i]
+            depth = z + position[2]
+            if not depth > 1e-6:
+                return np.inf
+            u, v = (x + position[0]) / depth, (y + position[1]) / depth
+            rest[2 * k] = pixels[4 * m + k, 0] - intrinsics[2] - fx * u
+            rest[2 * k + 1] = pixels[4 * m + k, 1] - intrinsics[3] - fy * v
+            # d(point) = dt + omega x (R p)
+            a, b = fx / depth, fy / depth
+            jacobian[2 * k, 0], jacobian[2 * k, 2] = a, -a * u
+            jacobian[2 * k, 3], jacobian[2 * k, 4], jacobian[2 * k, 5] = -a * u * y, a * (z + u * x), -a * y
+            jacobian[2 * k + 1, 1], jacobian[2 * k + 1, 2] = b, -b * v
+            jacobian[2 * k + 1, 3], jacobian[2 * k + 1, 4] = -b * (z + v * y), b * v * x
+            jacobian[2 * k + 1, 5] = b * x
+        for i in range(8):
+            weighed[:] = 0.0
+            weighed_rest = 0.0
+            for j in range(8):
+                weight = weights[m, i, j]
+                weighed_rest += weight * rest[j]
+                for c in range(6):
+                    weighed[c] += weight * jacobian[j, c]
+            cost += rest[i] * weighed_rest
+            for c in range(6):
+                slope[c] += jacobian[i, c] * weighed_rest
+                for d in range(6):
+                    normal[c, d] += jacobian[i, c] * weighed[d]
+    if sight.tilt_weight > 0.0:
+        cost += _add_tilt(sight, rotation, normal, slope)
+    return cost
+
+
+@compiled
+def _add_tilt(sight: _Sight, rotation: FloatArray, normal: FloatArray, slope: FloatArray) -> float:
+    """Add that a body's axis points up: their cross product is zero but for the tilt."""
+    axis, up, tilt_weight = sight.axis, sight.up, sight.tilt_weight
+    top = np.empty(3)
+    for i in range(3):
+        top[i] = rotation[i, 0] * axis[0] + rotation[i, 1] * axis[1] + rotation[i, 2] * axis[2]
+    aligned = top[0] * up[0] + top[1] * up[1] + top[2] * up[2]
+    cost = 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        rest = top[j] * up[k] - top[k] * up[j]  # the turn that would set it upright
+        cost += tilt_weight * rest * rest
+        # d(rest) = -(up . top) omega + (omega . up) top: minus that is the Jacobian of the model
+        for c in range(3):
+            by_c = (aligned if c == i else 0.0) - up[c] * top[i]
+            slope[3 + c] += tilt_weight * by_c * rest
+            for d in range(3):
+                by_d = (aligned if d == i else 0.0) - up[d] * top[i]
+                normal[3 + c, 3 + d] += tilt_weight * by_c * by_d
+    return cost
+
+
+@compiled
+def _factorized(normal: FloatArray, damping: float, factor: FloatArray) -> bool:
+    """Lower Cholesky factor (6, 6) of a matrix whose diagonal is raised by a share; False: not positive."""
+    for i in range(6):
+        for j in range(i + 1):
+            total = normal[i, j] * (1.0 + damping) if i == j else normal[i, j]
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i == j:
+                if not total > 0.0:
+                    return False
+                factor[i, i] = math.sqrt(total)
+            else:
+                factor[i, j] = total / factor[j, j]
+    return True
+
+
+@compiled
+def _solved(factor: FloatArray, right: FloatArray, x: FloatArray) -> None:
+    """Solve with a Cholesky factor (6, 6)."""
+    for i in range(6):
+        x[i] = right[i]
+        for k in range(i):
+            x[i] -= factor[i, k] * x[k]
+        x[i] /= factor[i, i]
+    for i in range(5, -1, -1):
+        for k in range(i + 1, 6):
+            x[i] -= factor[k, i] * x[k]
+        x[i] /= factor[i, i]
+
+
+@compiled
+def _rotated(rotation: FloatArray, step: FloatArray, result: FloatArray) -> None:
+    """Exp of the last three elements of a step, times a rotation (Rodrigues)."""
+    x, y, z = step[3], step[4], step[5]
+    angle2 = x * x + y * y + z * z
+    angle = math.sqrt(angle2)
+    a = math.sin(angle) / angle if angle > 1e-6 else 1.0 - angle2 / 6.0
+    b = (1.0 - math.cos(angle)) / angle2 if angle > 1e-6 else 0.5 - angle2 / 24.0
+    for c in range(3):
+        p, q, r = rotation[0, c], rotation[1, c], rotation[2, c]
+        dot = x * p + y * q + z * r
+        cos = 1.0 - b * angle2
+        result[0, c] = cos * p + a * (y * r - z * q) + b * dot * x
+        result[1, c] = cos * q + a * (z * p - x * r) + b * dot * y
+        result[2, c] = cos * r + a * (x * q - y * p) + b * dot * z

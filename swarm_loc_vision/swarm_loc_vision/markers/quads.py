@@ -1,0 +1,329 @@
+"""Quadrangle candidates by adaptive thresholding and contour following.
+
+A marker's border is darker than the paper around it. So an image is compared with its local mean, the
+outlines of what is dark are followed, and outlines made of four straight sides are kept. In full resolution
+with a small neighbourhood for small markers and with a large one for those that touch something dark, and in
+half resolution for blurred ones.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from cv2.typing import MatLike
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import compiled
+
+Gray = NDArray[np.uint8]
+IntArray = NDArray[np.int32]
+
+_MIN_SIDE_PX = 3
+"""Of an image that has an inside."""
+_DARK = 255
+_FOLLOWED = 1
+"""Value of a dark pixel whose left neighbour was seen to be light while an outline was followed."""
+_SAME = 0.15
+"""Quadrangles nearer than this share of their size are the same."""
+_NOISE_SIGMAS = 1.25
+"""Fewer, and specks of noise would cost most of the time."""
+_SMOOTHING_PX = 0.5
+"""Standard deviation of the blur that keeps noise from tearing outlines; more would close narrow cells."""
+_NOISE_ROWS = 16
+"""The noise is measured in every so many rows."""
+_DEVIATION = 0.75
+"""Standard deviation of noise, blurred as above, over the median of its second differences."""
+_MIN_AREA = 0.6
+"""Of a quadrangle, over the square of the least side."""
+_MIN_COMPACTNESS = 0.008
+"""Area of a quadrangle over the square of its outline: a square seen at 75 degrees has 0.04, a fourth of that
+when a gap leads inside and all around."""
+_SLACK_PX, _SLACK = 1.0, 0.05
+"""By how much an outline may leave a side [px], and over its length; light that falls in through a gap of the
+border, or something that lies on it, may take more of the outline away."""
+_MIN_SEEN = 0.5
+"""Share of a side that has to be there."""
+_LEFT = 4
+"""Of the eight directions, which count counter-clockwise from the right."""
+_LONGEST_OUTLINE = 4
+"""Points of an outline over height plus width of the image."""
+WINDOWS = ((7, 25), (35,))
+"""Sides of the neighbourhoods that are compared with [px], in full and in half resolution."""
+
+
+def find_quads(gray: Gray, min_side: float, min_contrast: float) -> FloatArray:
+    """Quadrangles around something dark, in full and in half resolution; those found twice are given once.
+
+    Args:
+        gray: (height, width).
+        min_side: Of a quadrangle worth finding [px].
+        min_contrast: By which it is darker than what is around it, noise apart [counts].
+
+    Returns:
+        (N, 4, 2) corners, clockwise as one sees it, on the boundary between dark and light [px].
+    """
+    scaled: MatLike = cv2.GaussianBlur(gray, (3, 3), _SMOOTHING_PX)
+    found: list[FloatArray] = []
+    for halvings, windows in enumerate(WINDOWS):
+        scale = 1 << halvings
+        if min(gray.shape) < _MIN_SIDE_PX * scale:
+            break
+        if halvings:
+            height, width = (size // 2 for size in scaled.shape)
+            even = scaled[: 2 * height, : 2 * width]
+            scaled = cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA)
+        contrast = max(min_contrast, _NOISE_SIGMAS * _noise(scaled))
+        for window in windows:
+            quads = _quads(_dark(scaled, window, contrast), min_side / scale)
+            found.append((quads + 0.5) * scale - 0.5)
+    return _distinct(np.concatenate([np.zeros((0, 4, 2)), *found]))
+
+
+def _distinct(quads: FloatArray) -> FloatArray:
+    """Without those that lie where an earlier one of the same size lies."""
+    if not len(quads):
+        return quads
+    middle = quads.mean(axis=1)
+    size = np.abs(quads - middle[:, None]).mean(axis=(1, 2))
+    places = np.column_stack([middle, size])
+    same = KDTree(places).query_ball_point(places, _SAME * size, p=np.inf, return_sorted=True)
+    return quads[[near[0] == i for i, near in enumerate(same)]]
+
+
+def _dark(gray: MatLike, window: int, contrast: float) -> NDArray[np.uint8]:
+    """255 where an image is darker than around; its frame is light, so that outlines end inside."""
+    mean = cv2.blur(gray, (window, window))
+    dark = cv2.threshold(cv2.subtract(mean, gray), contrast - 0.5, _DARK, cv2.THRESH_BINARY)[1]
+    surplus = -dark.shape[1] % 8
+    if surplus:
+        dark = cv2.copyMakeBorder(dark, 0, 0, 0, surplus, cv2.BORDER_CONSTANT, value=0)
+    dark[[0, -1]] = 0
+    dark[:, [0, -1 - surplus]] = 0
+    return np.asarray(dark, np.uint8)
+
+
+def _noise(gray: MatLike) -> float:
+    """Standard deviation of the noise [counts]; second differences hardly see what an image shows."""
+    rows = gray[::_NOISE_ROWS].astype(np.int16)
+    return _DEVIATION * float(np.median(np.abs(rows[:, :-2] - 2 * rows[:, 1:-1] + rows[:, 2:])))
+
+
+def _quads(dark: NDArray[np.uint8], min_side: float) -> FloatArray:
+    """(N, 4, 2) quadrangles among the outlines."""
+    height, width = dark.shape
+    points = np.empty((_LONGEST_OUTLINE * (height + width), 2), np.int32)
+    ahead = np.array([1, 1 - width, -width, -width - 1, -1, width - 1, width, width + 1])
+    return _follow(dark.reshape(-1), dark.view(np.uint64), ahead, min_side, points)
+
+
+@compiled
+def _follow(
+    dark: NDArray[np.uint8],
+    eights: NDArray[np.uint64],
+    ahead: NDArray[np.int64],
+    min_side: float,
+    points: IntArray,
+) -> FloatArray:
+    """Follow each outline once and keep those that are quadrangles.
+
+    Args:
+        dark: (height * width) 255 where dark; changed, see `_FOLLOWED`.
+        eights: (height, width / 8) the same memory.
+        ahead: (8,) from a pixel to the next one in each of the eight directions.
+        min_side: Of a quadrangle [px].
+        points: Room for an outline; longer ones are no markers.
+    """
+    height, words = eights.shape
+    width = 8 * words
+    quads = np.empty((64, 4, 2))
+    count = 0
+    quad = np.empty((4, 2))
+    min_points = int(3.2 * min_side)
+    for v in range(1, height - 1):
+        for word in range(words):
+            if eights[v, word] == 0:
+                continue
+            begin = v * width + 8 * word
+            for start in range(begin, begin + 8):
+                if dark[start] != _DARK or dark[start - 1] != 0:
+                    continue
+                length = _outline(dark, ahead, start, points)
+                if length < min_points or length > len(points):
+                    continue
+                for i in range(length):
+                    place = points[i, 0]
+                    points[i, 1] = place // width
+                    points[i, 0] = place - width * points[i, 1]
+                if not _quadrangle(points, length, min_side, quad):
+                    continue
+                if count == len(quads):
+                    larger = np.empty((2 * count, 4, 2))
+                    larger[:count] = quads
+                    quads = larger
+                quads[count] = quad
+                count += 1
+    return quads[:count]
+
+
+@compiled
+def _outline(dark: NDArray[np.uint8], ahead: NDArray[np.int64], start: int, points: IntArray) -> int:
+    """Follow the outline through a dark pixel that is light to its left.
+
+    Border following of Suzuki and Abe (1985), 8-connected.
+
+    Returns:
+        Number of its points; only as many as fit are written, as places in `dark`, into points[:, 0].
+    """
+    dark[start] = _FOLLOWED
+    back = -1
+    for turn in range(1, 8):  # clockwise from the light pixel to the left
+        direction = (_LEFT - turn) & 7
+        if dark[start + ahead[direction]] != 0:
+            back = direction
+            break
+    if back < 0:
+        return 1
+    end = start + ahead[back]
+    here, length = start, 0
+    while True:
+        if length < len(points):
+            points[length, 0] = here
+        length += 1
+        direction = (back + 1) & 7  # counter-clockwise from where it came from
+        while dark[here + ahead[direction]] == 0:
+            if direction == _LEFT:
+                dark[here] = _FOLLOWED
+            direction = (direction + 1) & 7
+        there = here + ahead[direction]
+        if there == start and here == end:
+            return length
+        here, back = there, (direction + 4) & 7
+
+
+@compiled
+def _quadrangle(points: IntArray, length: int, min_side: float, quad: FloatArray) -> bool:
+    """Whether an outline is a quadrangle around something dark; its corners into `quad`."""
+    twice_area = 0
+    for i in range(length):
+        j = i + 1 if i + 1 < length else 0
+        twice_area += points[i, 0] * points[j, 1] - points[j, 0] * points[i, 1]
+    # followed counter-clockwise as seen: negative where v points down; the outlines of holes are positive
+    if twice_area >= 0:
+        return False
+    corners = np.empty(4, np.int64)
+    area = _corner_points(points, length, corners)
+    if area < max(_MIN_AREA * min_side**2, _MIN_COMPACTNESS * length**2, -0.375 * twice_area):
+        return False
+    return _sides(points, length, corners, min_side, quad)
+
+
+@compiled
+def _corner_points(points: IntArray, length: int, corners: NDArray[np.int64]) -> float:
+    """Indices of the four points of an outline that span the largest quadrangle, ascending; its area."""
+    mean_u, mean_v = 0.0, 0.0
+    for i in range(length):
+        mean_u += points[i, 0]
+        mean_v += points[i, 1]
+    mean_u, mean_v = mean_u / length, mean_v / length
+    first, farthest = 0, -1.0
+    for i in range(length):
+        distance = (points[i, 0] - mean_u) ** 2 + (points[i, 1] - mean_v) ** 2
+        if distance > farthest:
+            first, farthest = i, distance
+    third, farthest = first, -1.0
+    for i in range(length):
+        distance = float((points[i, 0] - points[first, 0]) ** 2 + (points[i, 1] - points[first, 1]) ** 2)
+        if distance > farthest:
+            third, farthest = i, distance
+    corners[0], corners[2] = first, third
+    corners[1] = _farthest(points, length, first, third)
+    corners[3] = _farthest(points, length, third, first)
+    for _ in range(2):
+        for k in range(4):
+            corners[k] = _farthest(points, length, corners[k - 1], corners[(k + 1) % 4])
+    twice = 0
+    for k in range(4):
+        a, b = corners[k - 1], corners[k]
+        if a == b:
+            return 0.0
+        twice += points[a, 0] * points[b, 1] - points[b, 0] * points[a, 1]
+    return -0.5 * twice
+
+
+@compiled
+def _farthest(points: IntArray, length: int, begin: int, end: int) -> int:
+    """Index of the point farthest outside the chord between two points, on the way from one to the other."""
+    du = points[end, 0] - points[begin, 0]
+    dv = points[end, 1] - points[begin, 1]
+    best, farthest = begin, -1
+    i = begin
+    while i != end:
+        outside = abs(du * (points[i, 1] - points[begin, 1]) - dv * (points[i, 0] - points[begin, 0]))
+        if outside > farthest:
+            best, farthest = i, outside
+        i = i + 1 if i + 1 < length else 0
+    return best
+
+
+@compiled
+def _sides(
+    points: IntArray, length: int, corners: NDArray[np.int64], min_side: float, quad: FloatArray
+) -> bool:
+    """Whether an outline is straight between its corners; where the straight lines meet into `quad`.
+
+    The lines are moved outwards by half a pixel, from the outermost dark pixels to the boundary.
+    """
+    lines = np.empty((4, 3))  # normal (outwards) and offset
+    for k in range(4):
+        begin, end = corners[k], corners[(k + 1) % 4]
+        count = end - begin if end > begin else end - begin + length
+        du = points[end, 0] - points[begin, 0]
+        dv = points[end, 1] - points[begin, 1]
+        chord = math.hypot(du, dv)
+        if chord < 0.6 * min_side:
+            return False
+        steps = max(abs(du), abs(dv))
+        skip = min(int(0.15 * steps), 12)
+        slack = _SLACK_PX + _SLACK * chord
+        n, su, sv, suu, suv, svv = 0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for step in range(skip, count - skip + 1):
+            i = begin + step if begin + step < length else begin + step - length
+            u, v = float(points[i, 0] - points[begin, 0]), float(points[i, 1] - points[begin, 1])
+            if abs(du * v - dv * u) > slack * chord:  # where a gap leads inside
+                continue
+            n += 1
+            su += u
+            sv += v
+            suu += u * u
+            suv += u * v
+            svv += v * v
+        if n < max(_MIN_SEEN * (steps - 2 * skip), 2):
+            return False
+        su, sv = su / n, sv / n
+        suu, suv, svv = suu / n - su * su, suv / n - su * sv, svv / n - sv * sv
+        angle = 0.5 * math.atan2(2.0 * suv, suu - svv)
+        normal_u, normal_v = -math.sin(angle), math.cos(angle)
+        spread = 0.5 * (suu + svv) - math.hypot(0.5 * (suu - svv), suv)
+        if spread > (0.4 + 0.02 * chord) ** 2:
+            return False
+        if normal_u * -dv + normal_v * du > 0.0:  # the dark is to the left of the way: outwards is right
+            normal_u, normal_v = -normal_u, -normal_v
+        lines[k, 0], lines[k, 1] = normal_u, normal_v
+        lines[k, 2] = normal_u * (points[begin, 0] + su) + normal_v * (points[begin, 1] + sv) + 0.5
+    for k in range(4):
+        a, b = lines[k - 1], lines[k]
+        determinant = a[0] * b[1] - a[1] * b[0]
+        if abs(determinant) < 0.1:
+            return False
+        # counter-clockwise in, clockwise out
+        quad[3 - k, 0] = (a[2] * b[1] - b[2] * a[1]) / determinant
+        quad[3 - k, 1] = (a[0] * b[2] - b[0] * a[2]) / determinant
+        corner = corners[k]
+        slack = 2.0 + 0.15 * min_side + 0.02 * length
+        if math.hypot(quad[3 - k, 0] - points[corner, 0], quad[3 - k, 1] - points[corner, 1]) > slack:
+            return False
+    return True
