@@ -1,6 +1,7 @@
 # make demo     sets up what is missing, then localizes a simulated swarm through the live graph
 # make test     lint, types, unit tests without ROS, node tests over DDS
 # make bench-NAME [ARGS="..."]   prints a table, draws it under out/, writes out/bench/NAME.json
+# make house     prints the figures of the layout, writes out/bench/house.json
 # make setup | lint | types | unit | node | clean
 
 PYTHON ?= python3
@@ -11,7 +12,7 @@ MYPY := ./run -- mypy --num-workers 2
 PYTEST := ./run -- env -u PYTHONDONTWRITEBYTECODE PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 pytest \
     -p xdist.plugin -p pytest_timeout -p _hypothesis_pytestplugin --numprocesses 2 --dist worksteal
 
-.PHONY: demo test lint types unit node setup clean
+.PHONY: demo test lint types unit node house setup clean
 
 demo: setup
 	@./run swarm_loc_estimator demo $(ARGS)
@@ -36,6 +37,9 @@ node: setup
 
 setup:
 	@$(PYTHON) tools/setup_workspace.py
+
+house:
+	@$(PYTHON) tools/house.py $(ARGS)
 
 bench-%:
 	@$(PYTHON) tools/setup_workspace.py --bench
