@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import HealthCheck, settings
 
-from swarm_loc_estimator.common.jit import is_warm
-from swarm_loc_vision.markers.precompile import WARM_UP, warm_up
+from swarm_loc_estimator.common.jit import is_precompiled
+from swarm_loc_vision.markers.precompile import precompile
 
 if TYPE_CHECKING:
     from node_world import Ros  # unit tests do without ROS
@@ -28,9 +28,9 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile before any test's time runs, once and not in every worker; `make setup` does the estimator."""
     if hasattr(session.config, "workerinput"):
         return
-    if not is_warm(WARM_UP):
+    if not is_precompiled(precompile):
         print("compiling the marker detector for this machine: about half a minute", flush=True)
-        warm_up()
+        precompile()
 
 
 def pytest_collection_finish() -> None:

@@ -24,7 +24,7 @@ from swarm_loc_estimator.offline.report.style import INK, colour_of
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.settings import EstimatorSettings
-from swarm_loc_vision.markers.precompile import warm_up
+from swarm_loc_vision.markers.precompile import precompile
 
 OUTPUT_NS = 100_000_000
 """Of the poses, which come twice as often, those that the other rows of the benchmark have, too."""
@@ -66,7 +66,7 @@ def rendered_worlds(
     Raises:
         LiveError: A node has ended, or nothing goes on.
     """
-    warm_up()  # once, not in every robot's detector at a time
+    precompile()  # once, not in every robot's detector at a time
     swarm, worlds = starting_swarm(), []
     for count, seed in enumerate(seeds, start=1):
         folder = OUT / "epuck_rendered" / f"seed{seed}"

@@ -26,7 +26,7 @@ from swarm_loc_estimator.offline.live.recorder import read_history, read_poses
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
-from swarm_loc_vision.markers.precompile import warm_up
+from swarm_loc_vision.markers.precompile import precompile
 
 _ROBOTS = 5
 _BEFORE_S, _AFTER_S = 8.0, 10.0
@@ -106,7 +106,7 @@ def run_live(name: str, seed: int, folder: Path, say: Say) -> Score:
     Raises:
         LiveError: A node has ended, or nothing goes on.
     """
-    warm_up()  # once, not in every robot's detector at a time
+    precompile()  # once, not in every robot's detector at a time
     links, swarm = folder / "links", _swarm()
     links.mkdir(parents=True, exist_ok=True)
     save_swarm(swarm, folder / "swarm.yaml")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.common.homographies import homographies
 from swarm_loc_vision.markers.families import Family
 from swarm_loc_vision.markers.pose import square
@@ -187,7 +187,7 @@ def _paint(
     _sample(image, low, high, to_cells, shares[:, None] * way, shades, grid)
 
 
-@compiled
+@cached_njit
 def _sample(
     image: NDArray[np.float32],
     low: NDArray[np.int64],

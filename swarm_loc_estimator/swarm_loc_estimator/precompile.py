@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.common.jit import note_warm
+from swarm_loc_estimator.common.jit import note_precompiled
 from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
 from swarm_loc_estimator.common.messages.encoders import (
     encode_brightness,
@@ -31,8 +30,6 @@ from swarm_loc_estimator.swarm.swarm import Face, Landmark, OdometryModel, Robot
 from swarm_loc_estimator.timeline.estimator import SwarmEstimator
 from swarm_loc_estimator.timeline.settings import EstimatorSettings
 
-WARM_UP = Path(__file__)
-"""What all compiled code that this module imports is remembered by, see `is_warm`."""
 _SECOND = 1_000_000_000
 _FIRST_LANDMARK = 10
 _LANDMARKS = 30  # three robots see more than are fused one by one where many may be fused together
@@ -42,19 +39,19 @@ _FACING = (0.0, 1.0, 0.0, 0.0)  # x y z w: a marker that looks at the camera
 _AWAY = (0.0, 0.7, 0.0, 0.7)
 
 
-def warm_up() -> None:
-    """Run small estimators through all that they do: three minutes unless `is_warm`, then a second.
+def precompile() -> None:
+    """Run small estimators through all that they do: three minutes unless `is_precompiled`, then a second.
 
-    Infrared comes last: another process may have done `warm_up_infrared` by then.
+    Infrared comes last: another process may have done `precompile_infrared` by then.
     """
     for infrared in (False, True):
         for fusion_period_s in (0.0, 0.1):
             _run(EstimatorSettings(fusion_period_s=fusion_period_s), infrared=infrared)
         _run(EstimatorSettings(sparse_from=2), infrared=infrared)
-    note_warm(WARM_UP)
+    note_precompiled(precompile)
 
 
-def warm_up_infrared() -> None:
+def precompile_infrared() -> None:
     """Solve an exchange: that takes a third of the time to compile, and can be done in a process beside."""
     MaximumLikelihood(_DROPLET).solve(_LIGHT[None])
 

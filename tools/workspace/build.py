@@ -34,6 +34,14 @@ COPIED = (
 """Files of a package that end up in a build as they were then; all others are linked."""
 LINKED_ONE_BY_ONE = "launch/*"
 
+_NOT_YET = 3
+_IS_PRECOMPILED = f"""
+import sys
+from swarm_loc_estimator.common.jit import is_precompiled
+from swarm_loc_estimator.precompile import precompile
+sys.exit(0 if is_precompiled(precompile) else {_NOT_YET})
+"""
+
 
 def ensure() -> None:
     """Make sure that all packages are built as their sources are.
@@ -75,15 +83,17 @@ def compile_estimator() -> None:
     stamp = Stamp(STATE / "stamps" / "compiled")
     if stamp.read() == inputs:
         return
-    say("  compiling the estimator, about three minutes")
-    program, env = "from swarm_loc_estimator.precompile import warm_up; warm_up()", environment()
-    with _compiling_beside(env):
-        status, output = run_logged([VENV_PYTHON, "-c", program], "compile.log", lambda _: None, env)
-        if status:
-            reason = output.strip().splitlines()[-1:] or ["no output"]
-            raise WorkspaceError(
-                f"The estimator does not start: {reason[0]} (whole output: {LOGS / 'compile.log'})."
-            )
+    env = environment()
+    if subprocess.run([VENV_PYTHON, "-c", _IS_PRECOMPILED], env=env, check=False).returncode == _NOT_YET:
+        say("  compiling the estimator, about two minutes")
+        program = "from swarm_loc_estimator.precompile import precompile; precompile()"
+        with _compiling_beside(env):
+            status, output = run_logged([VENV_PYTHON, "-c", program], "compile.log", lambda _: None, env)
+            if status:
+                reason = output.strip().splitlines()[-1:] or ["no output"]
+                raise WorkspaceError(
+                    f"The estimator does not start: {reason[0]} (whole output: {LOGS / 'compile.log'})."
+                )
     stamp.write(inputs)
 
 
@@ -93,8 +103,8 @@ def _compiling_beside(env: Mapping[str, str]) -> Iterator[None]:
 
     Should it fail, they are compiled when they are first needed.
     """
-    program = "from swarm_loc_estimator.precompile import warm_up_infrared; warm_up_infrared()\n"
-    program += "from swarm_loc_vision.markers.precompile import warm_up; warm_up()"
+    program = "from swarm_loc_estimator.precompile import precompile_infrared; precompile_infrared()\n"
+    program += "from swarm_loc_vision.markers.precompile import precompile; precompile()"
     silent = subprocess.DEVNULL
     beside = subprocess.Popen([VENV_PYTHON, "-c", program], env=env, stdout=silent, stderr=silent)
     with beside:

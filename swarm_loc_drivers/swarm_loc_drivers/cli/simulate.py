@@ -23,10 +23,10 @@ from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simula
 from swarm_loc_estimator.cli.graph import say
 from swarm_loc_estimator.common.arguments import number_in
 from swarm_loc_estimator.common.command_errors import exit_with_message
-from swarm_loc_estimator.common.jit import is_warm
+from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.launching.processes import run_graph
 from swarm_loc_estimator.common.number_spec import number_specs
-from swarm_loc_vision.markers.precompile import WARM_UP, warm_up
+from swarm_loc_vision.markers.precompile import precompile
 
 
 def parse(arguments: Sequence[str] | None) -> SimulationOptions:
@@ -72,10 +72,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(arguments)
     swarm = simulated_swarm(options)
     if (
-        not has_pushbots(swarm) and not options.aerial and not is_warm(WARM_UP)
+        not has_pushbots(swarm) and not options.aerial and not is_precompiled(precompile)
     ):  # once, not in every robot's detector at a time
         say("compiling the marker detector for this machine: about half a minute")
-        warm_up()
+        precompile()
     with link_folder() as links:
         return run_graph(graph_of(options, swarm, links), say)
 

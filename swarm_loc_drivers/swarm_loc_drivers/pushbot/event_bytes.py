@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.pushbot.hardware import TIMESTAMPS
 from swarm_loc_estimator.common.arrays import IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 CONFIRMATIONS = 8
 """So many events in a row must agree with a jump of time."""
@@ -87,7 +87,7 @@ class EventParser:
         return Parsed(x, y, polarity, times[:events], texts)
 
 
-@compiled
+@cached_njit
 def _parse(
     data: NDArray[np.uint8],
     stamp_bytes: int,
@@ -158,7 +158,7 @@ def _parse(
     return at, events, lines
 
 
-@compiled
+@cached_njit
 def _line_end(data: NDArray[np.uint8], at: int) -> tuple[int, int]:
     """Where a line ends, and 0: not yet, 1: by a newline, 2: by a byte that is no text, 3: it is too long."""
     for end in range(at, min(len(data), at + MAX_LINE)):
@@ -172,7 +172,7 @@ def _line_end(data: NDArray[np.uint8], at: int) -> tuple[int, int]:
     return (at + MAX_LINE, 3) if len(data) >= at + MAX_LINE else (len(data), 0)
 
 
-@compiled
+@cached_njit
 def _stamp(data: NDArray[np.uint8], at: int, stamp_bytes: int) -> tuple[int, int]:
     """Bytes of the event at `at` and its timestamp as sent; 0: it is not complete, -1: it has no end."""
     left = len(data) - at - 2
@@ -191,7 +191,7 @@ def _stamp(data: NDArray[np.uint8], at: int, stamp_bytes: int) -> tuple[int, int
     return (-1, 0) if left >= 4 else (0, 0)
 
 
-@compiled
+@cached_njit
 def _elapsed(stamp: int, state: IntArray, stamp_bytes: int) -> int:
     """Time since the last event [us]; long timestamps may step back."""
     if stamp_bytes < 0:
@@ -203,7 +203,7 @@ def _elapsed(stamp: int, state: IntArray, stamp_bytes: int) -> int:
     return forward - span if stamp_bytes > 2 and 2 * forward > span else forward
 
 
-@compiled
+@cached_njit
 def _is_plausible(elapsed: int, stamp_bytes: int) -> bool:
     """Whether events can be so far apart [us]."""
     longest = _MAX_SHORT_GAP_US if stamp_bytes == 2 else _MAX_GAP_US

@@ -20,8 +20,8 @@ from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
 from swarm_loc_drivers.pushbot.driver import Listeners, PushbotDriver
 from swarm_loc_drivers.pushbot.event_output import event_message
 from swarm_loc_drivers.pushbot.event_packets import EventPacket
+from swarm_loc_drivers.pushbot.precompile import precompile
 from swarm_loc_drivers.pushbot.pushbot_parameters import PushbotParameters, pushbot_settings
-from swarm_loc_drivers.pushbot.warm_up import warm_up
 from swarm_loc_estimator.common.ros.running import run_node
 from swarm_loc_msgs.msg import EventPacket as EventPacketMessage
 
@@ -50,7 +50,7 @@ class PushbotDriverNode(RobotDriverNode[PushbotParameters]):
         super().__init__("pushbot_driver", PushbotParameters, **node_arguments)
         parameters = self.chosen
         settings = pushbot_settings(parameters)
-        warm_up()
+        precompile()
         transforms = transform_publisher(self) if parameters.publish_tf else None
         frames = f"{self._prefix}{parameters.odom_frame}", f"{self._prefix}{parameters.base_frame}"
         odometry = OdometryOutput(self, "odom", *frames, transforms)

@@ -1,186 +1,276 @@
-"""Compilation of the inner loops by numba, cached for every state of the sources.
+"""Compilation of inner loops by numba, with a cache that is keyed by content.
 
-The estimator's hot paths touch a handful of numbers a hundred thousand times, where calls of array
-functions cost ten to fifty times the arithmetic. Compiled code is cached in the user's cache folder.
+The hot paths touch a handful of numbers a hundred thousand times, where calls of array functions cost ten to
+fifty times the arithmetic. The key of a compiled function is made of its byte code, of that of all compiled
+functions that it reaches, of the constants and record types that they use, and of the argument types; it has
+no paths, times or docstrings. So another clone, another folder or a copy of the cache finds the code again.
 """
 
 from __future__ import annotations
 
-import fcntl
+import enum
 import hashlib
 import inspect
 import os
+import pickle
 import re
-import shutil
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
-from functools import cache
-from importlib.util import find_spec
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
+from numba import core
+from numba.core.caching import NullCache
+from numba.core.compiler import CompileResult
+from numba.core.dispatcher import Dispatcher
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
-_IMPORT = re.compile(r"^from (?P<module>[\w.]+) import (?P<names>\([^)]*\)|.*)$", re.MULTILINE)
 _NUMBERS = {"None", "bool", "int", "float", "tuple"}
 _KEPT_S = 30 * 86400.0
+_DAY_S = 86400.0
+_PLAIN = (int, float, complex, str, bytes, type(None), type(...), np.generic, np.dtype)
+_core: Any = core  # most of it has no types
+_types = _core.types
+_OPTIONS = f"numba {numba.__version__}, Python {sys.version}"
 
 
-def is_warm(source: Path) -> bool:
-    """Whether all compiled code that a module imports, as it is now, has been called before."""
-    return _mark(source).exists()
-
-
-def note_warm(source: Path) -> None:
-    """Remember that all compiled code that a module imports has now been called.
-
-    Caches that have not been used for a month are deleted.
-    """
-    mark = _mark(source)
-    with suppress(OSError):  # where nothing can be kept, the next start compiles again
-        mark.parent.mkdir(parents=True, exist_ok=True)
-        mark.touch()
-        used = {_cache_folder(module) for module in _with_imports(source)}
-        for cached in mark.parent.parent.iterdir():
-            if cached in used:
-                os.utime(cached)
-            elif cached.stat().st_mtime < time.time() - _KEPT_S:  # of other states of the sources
-                shutil.rmtree(cached, ignore_errors=True)
-
-
-def compiled(function: Function) -> Function:
+def cached_njit(function: Function) -> Function:
     """Compile a function on its first call; calls among compiled functions cost nothing."""
-    return _compiled(function, fastmath=False)
+    return _compiled(function)
 
 
-def borrowing(function: Function) -> Function:
-    """The same for functions of large tuples of arrays, to whose arrays no references are counted.
+def norefcount_njit(function: Function) -> Function:
+    """Compile a function of large tuples of arrays without counting references to the arrays.
 
-    Numba's counting for every array touched would cost more than the arithmetic. So nothing is counted
-    within: such a function borrows the arrays of its caller. It cannot allocate one, which does not compile;
-    and it and all that it calls return numbers, for nobody would release an array.
+    Numba's counting for every array touched would cost more than the arithmetic. Such a function borrows the
+    arrays of its caller. It cannot allocate one, which does not compile; and it and all that it calls return
+    numbers, for nobody would release an array.
 
     Raises:
         TypeError: It is declared to return something else.
     """
-    return _borrowing(function, forceinline=False)
+    return _without_references(function, forceinline=False)
 
 
-def inlined(function: Function) -> Function:
-    """The same as `borrowing`, and written out where it is called, if even the call would cost too much."""
-    return _borrowing(function, forceinline=True)
+def inlined_njit(function: Function) -> Function:
+    """Compile as `norefcount_njit` does, and inline the function where even a call would cost too much."""
+    return _without_references(function, forceinline=True)
 
 
-def compiled_sums(function: Function) -> Function:
-    """The same for sums that may be taken in any order, which is several times faster for long ones."""
+def reassociated_njit(function: Function) -> Function:
+    """Compile a function whose sums may be taken in any order: several times faster for long ones."""
     return _compiled(function, fastmath={"reassoc", "contract"})
 
 
-def _borrowing(function: Function, *, forceinline: bool) -> Function:
+def is_precompiled(precompile: Callable[[], None]) -> bool:
+    """Whether a function that compiles all that it reaches has run here since any of that changed."""
+    return _mark(precompile).exists()
+
+
+def note_precompiled(precompile: Callable[[], None]) -> None:
+    """Remember that a function has compiled all that it reaches; delete what nobody has used for a month."""
+    mark = _mark(precompile)
+    with suppress(OSError):  # where nothing can be kept, the next start compiles again
+        mark.parent.mkdir(parents=True, exist_ok=True)
+        mark.touch()
+        for file in mark.parent.iterdir():
+            if file.stat().st_mtime < time.time() - _KEPT_S:
+                file.unlink()
+
+
+def _without_references(function: Function, *, forceinline: bool) -> Function:
     returned = inspect.formatannotation(function.__annotations__["return"])
     if not _NUMBERS.issuperset(re.findall(r"\w+", returned)):
         raise TypeError(
             f"{function.__qualname__} returns {returned}: functions that borrow return numbers only"
         )
-    return _compiled(function, fastmath=False, forceinline=forceinline, nrt=False)
+    return _compiled(function, forceinline=forceinline, nrt=False)
 
 
 def _compiled(
-    function: Function, *, fastmath: bool | set[str], forceinline: bool = False, nrt: bool = True
+    function: Function, *, fastmath: bool | set[str] = False, forceinline: bool = False, nrt: bool = True
 ) -> Function:
-    """Compile a function, with a cache of its module."""
-    # one cache, whether a package is found by a link or not: numba has another one for every path
-    source = Path(function.__code__.co_filename).resolve()
-    function.__code__ = function.__code__.replace(co_filename=str(source))
-    numba.config.CACHE_DIR = str(_cache_folder(source))  # type: ignore[attr-defined]
     # without _nrt a function would count references, or not, as the one that happens to call it first
     compiler = numba.njit(  # type: ignore[call-overload]  # its stubs lack _nrt
-        cache=True,
-        error_model="numpy",
-        fastmath=fastmath,
-        forceinline=forceinline,
-        _nrt=nrt,
+        error_model="numpy", fastmath=fastmath, forceinline=forceinline, _nrt=nrt
     )
-    dispatcher = compiler(function)
-    _let_one_save_at_a_time(dispatcher, _cache_folder(source))
+    dispatcher: Any = compiler(function)
+    if isinstance(dispatcher, Dispatcher):  # else numba is told not to compile
+        cached: Any = dispatcher
+        cached._cache = _ContentCache(dispatcher)  # noqa: SLF001 - numba has no other way in
     return cast("Function", dispatcher)
 
 
-def _let_one_save_at_a_time(dispatcher: Any, folder: Path) -> None:
-    """Let processes that compile a function at once save it one after the other.
+class _ContentCache(NullCache):
+    """Numba's cache of one function: one file for each key, written whole or not at all."""
 
-    Numba writes index and code apart, without a lock: one process's index could name another one's code.
-    """
-    if not hasattr(dispatcher, "_cache"):  # numba is told not to compile
-        return
-    save = dispatcher._cache.save_overload  # noqa: SLF001 - numba has no other way in
+    def __init__(self, dispatcher: Any) -> None:
+        self._dispatcher = dispatcher
 
-    def save_overload(signature: object, result: object) -> None:
-        with ExitStack() as stack:
-            with suppress(OSError):  # where nothing can be kept, there is nothing to lock
-                folder.mkdir(parents=True, exist_ok=True)
-                lock = stack.enter_context((folder / "lock").open("a"))
-                fcntl.flock(lock, fcntl.LOCK_EX)
-            save(signature, result)
+    @property
+    def cache_path(self) -> str:
+        """The folder of all compiled code."""
+        return str(_folder())
 
-    dispatcher._cache.save_overload = save_overload  # noqa: SLF001
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The compiled code for a signature; None where there is none that can be read."""
+        target_context.refresh()
+        file = self._file(sig, target_context.codegen())
+        try:
+            data = file.read_bytes()
+            if time.time() - file.stat().st_mtime > _DAY_S:
+                os.utime(file)
+            rebuild: Any = CompileResult._rebuild  # noqa: SLF001
+            return rebuild(target_context, *pickle.loads(data))  # noqa: S301
+        except (OSError, EOFError, pickle.UnpicklingError, ImportError, AttributeError, ValueError):
+            return None  # never written, cut off, or of types that have moved: it is compiled again
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep compiled code for the next process."""
+        if data.library.has_dynamic_globals:
+            raise TypeError(f"{self._dispatcher.py_func.__qualname__} uses a global that cannot be cached")
+        file = self._file(sig, data.codegen)
+        with suppress(OSError):  # where nothing can be kept, the next start compiles again
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(file, _core.serialize.dumps(data._reduce()))  # noqa: SLF001
+
+    def _file(self, sig: Any, codegen: Any) -> Path:
+        arguments, _ = _core.sigutils.normalize_signature(sig)
+        parts = [_name(self._dispatcher), *map(_described_type, arguments), *_contents([self._dispatcher])]
+        name = re.sub(r"\W", "", self._dispatcher.py_func.__name__)
+        return _folder() / f"{name}-{_digest(parts, codegen)}.nbc"
 
 
-def _mark(source: Path) -> Path:
-    return _cache_folder(source.resolve()) / "warm"
+def write_whole(file: Path, data: bytes) -> None:
+    """Write a file so that whoever reads it sees all of it, or the one before."""
+    with tempfile.NamedTemporaryFile(dir=file.parent, prefix=file.name, suffix=".tmp", delete=False) as new:
+        new.write(data)
+    Path(new.name).replace(file)
 
 
-@cache
-def _cache_folder(source: Path) -> Path:
-    """A cache for every state of a module and of all that it imports.
-
-    Numba alone would miss a change in another file than that of the function called.
-    """
-    place = f"{source} {numba.__version__} {sys.version}".encode()
-    parts = [place, *(module.read_bytes() for module in sorted(_with_imports(source)))]
-    root = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(root) / "swarm_loc_estimator" / hashlib.sha256(b"".join(parts)).hexdigest()[:16]
-
-
-def _with_imports(source: Path) -> set[Path]:
-    """A module, and all of this workspace that it imports, directly or not."""
-    found: set[Path] = set()
-    left = [source.resolve()]
+def _contents(functions: Iterable[Any]) -> list[str]:
+    """What code depends on: a line for each function, compiled or not, and for each one that it reaches."""
+    found: dict[str, str] = {}
+    left = list(functions)
     while left:
-        module = left.pop()
-        if module not in found:
-            found.add(module)
-            left.extend(_imported(module))
-    return found
+        one = left.pop()
+        name, function = _name(one), getattr(one, "py_func", one)
+        if name not in found:
+            options = getattr(one, "targetoptions", {})
+            described = [f"{option}={_described(options[option], (), left)}" for option in sorted(options)]
+            described += _described_code(function.__code__, _globals_of(function), left)
+            found[name] = " ".join(described)
+    return [f"{name} {found[name]}" for name in sorted(found)]
 
 
-@cache
-def _imported(source: Path) -> tuple[Path, ...]:
-    """The modules of this workspace that a module imports itself."""
-    return tuple(
-        file
-        for match in _IMPORT.finditer(source.read_text(encoding="utf-8"))
-        for file in _files(source.parent, match["module"], match["names"])
-        if file.exists()
-    )
+def _name(function: Any) -> str:
+    own = getattr(function, "py_func", function)
+    return f"{own.__module__}.{own.__qualname__}"
 
 
-def _files(beside: Path, module: str, names: str) -> Iterator[Path]:
-    """Where the modules of `from module import names` may be: a module, or modules of a package."""
-    package, *parts = module.split(".")
-    root = _package_folder(package) if package.startswith("swarm_loc_") else beside / package
-    place = root.joinpath(*parts)
-    yield place.with_suffix(".py")
-    yield from (place / f"{name}.py" for name in re.findall(r"\w+", names))
+def _globals_of(function: FunctionType) -> Mapping[str, Any]:
+    """All names from outside that a function may use."""
+    cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+    return {**function.__globals__, **{name: cell.cell_contents for name, cell in cells}}
 
 
-@cache
-def _package_folder(package: str) -> Path:
-    spec = find_spec(package)
-    if spec is None or spec.origin is None:
-        raise ModuleNotFoundError(f"the package '{package}' is not installed", name=package)
-    return Path(spec.origin).resolve().parent
+def _described_code(code: CodeType, names: Mapping[str, Any], reached: list[Any]) -> Iterator[str]:
+    """A code object without its docstring and lines; functions that it names are added to `reached`."""
+    yield f"{code.co_code.hex()} {code.co_varnames} {code.co_names} {code.co_argcount} {code.co_flags}"
+    for place, constant in enumerate(code.co_consts):
+        if isinstance(constant, CodeType):
+            yield from _described_code(constant, names, reached)
+        elif place or not isinstance(constant, str):  # the first one is the docstring
+            yield _described(constant, (), reached)
+    for name in (*code.co_names, *code.co_freevars):
+        if name in names:
+            yield f"{name}={_described(names[name], code.co_names, reached)}"
+
+
+def _described(value: Any, attributes: tuple[str, ...], reached: list[Any]) -> str:
+    """A value that compiled code uses as a constant; of a module the attributes that may be meant."""
+    if isinstance(value, Dispatcher | FunctionType):
+        reached.append(value)
+        return _name(value)
+    if isinstance(value, enum.Enum):
+        return f"{type(value).__qualname__}.{value.name}={_described(value.value, (), reached)}"
+    if isinstance(value, _PLAIN):
+        return f"{type(value).__name__} {value!r}"
+    if isinstance(value, tuple | list):
+        return f"({', '.join(_described(one, attributes, reached) for one in value)})"
+    if isinstance(value, set | frozenset):
+        return f"{{{', '.join(sorted(_described(one, (), reached) for one in value))}}}"
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype!r} {value.shape} {value.tobytes().hex()}"
+    if isinstance(value, ModuleType):
+        inside = [(name, vars(value)[name]) for name in attributes if name in vars(value)]
+        ours = [
+            (n, v)
+            for n, v in inside
+            if isinstance(v, Dispatcher | enum.EnumMeta | type | int | float | tuple)
+        ]
+        return f"{value.__name__}({', '.join(f'{n}={_described(v, (), reached)}' for n, v in ours)})"
+    if isinstance(value, enum.EnumMeta):
+        return f"({', '.join(_described(member, (), reached) for member in cast('Any', value))})"
+    if isinstance(value, type):
+        defaults = [_described(one, (), reached) for one in getattr(value, "_field_defaults", {}).values()]
+        return f"{value.__module__}.{value.__qualname__}{getattr(value, '_fields', '')}{defaults}"
+    if isinstance(value, _types.ExternalFunction):
+        return f"{value.symbol} {value.sig}"
+    return f"{type(value).__module__}.{type(value).__qualname__}"
+
+
+def _described_type(argument: Any) -> str:
+    """A numba type with the names of the fields of its records, which numba's own name leaves out."""
+    parts = [str(argument)]
+    if isinstance(argument, _types.BaseNamedTuple):
+        record = argument.instance_class
+        parts.append(f"{record.__module__}.{record.__qualname__}{argument.fields}")
+    if isinstance(argument, _types.BaseTuple):
+        parts += [_described_type(one) for one in argument]
+    return " ".join(parts)
+
+
+def _mark(precompile: Callable[[], None]) -> Path:
+    """The file that says that a function has compiled all that it reaches, named by that code."""
+    modules: dict[str, ModuleType] = {}
+    left = [precompile.__module__]
+    while left:
+        name = left.pop()
+        if name not in modules:
+            modules[name] = sys.modules[name]
+            used = [getattr(value, "__module__", None) for value in vars(modules[name]).values()]
+            used += [
+                value.__name__ for value in vars(modules[name]).values() if isinstance(value, ModuleType)
+            ]
+            left += [one for one in used if str(one).startswith("swarm_loc_") and one in sys.modules]
+    functions = [function for module in modules.values() for function in _functions_of(module)]
+    codegen = _core.registry.cpu_target.target_context.codegen()
+    return _folder() / f"precompiled-{_digest([_name(precompile), *_contents(functions)], codegen)}"
+
+
+def _functions_of(module: ModuleType) -> Iterator[Any]:
+    """All functions and methods that a module defines."""
+    for value in vars(module).values():
+        if getattr(value, "__module__", None) == module.__name__:
+            for member in vars(value).values() if isinstance(value, type) else [value]:
+                function = getattr(member, "__func__", getattr(member, "fget", member))
+                if isinstance(function, Dispatcher | FunctionType):
+                    yield function
+
+
+def _digest(parts: list[str], codegen: Any) -> str:
+    text = "\n".join([_OPTIONS, repr(codegen.magic_tuple()), *parts])
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _folder() -> Path:
+    root = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(root) / "swarm_loc_estimator"

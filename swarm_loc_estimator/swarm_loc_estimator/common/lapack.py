@@ -17,7 +17,7 @@ from numba.extending import get_cython_function_address
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 
 def _external(library: str, name: str, arguments: int) -> Callable[..., None]:
@@ -78,7 +78,7 @@ def _steps(begin: int, rows: int) -> list[tuple[int, int, int]]:
     return [*upper, (_FIRST, begin, rows), *lower, (_LAST, begin, rows)]
 
 
-@compiled
+@cached_njit
 def _invert(numbers: FloatArray, size: int, plan: IntArray) -> bool:
     """Invert a matrix."""
     if not _invert_factor(numbers, size, plan):
@@ -89,7 +89,7 @@ def _invert(numbers: FloatArray, size: int, plan: IntArray) -> bool:
     return True
 
 
-@compiled
+@cached_njit
 def _invert_factor(numbers: FloatArray, size: int, plan: IntArray) -> bool:
     """Invert the factor in steps; not by recursion, which numba's cache does not survive."""
     sizes = np.empty(3, dtype=np.int32)
@@ -103,7 +103,7 @@ def _invert_factor(numbers: FloatArray, size: int, plan: IntArray) -> bool:
     return True
 
 
-@compiled
+@cached_njit
 def _invert_part(numbers: FloatArray, begin: int, rows: int, size: int, sizes: NDArray[np.int32]) -> bool:
     """Replace a small part on the diagonal by the inverse of its factor; return whether it has one."""
     sizes[0], sizes[1], sizes[2] = rows, size, 0
@@ -116,7 +116,7 @@ def _invert_part(numbers: FloatArray, begin: int, rows: int, size: int, sizes: N
     return True
 
 
-@compiled
+@cached_njit
 def _join_halves(
     numbers: FloatArray, begin: int, rows: int, size: int, sizes: NDArray[np.int32], is_first: bool
 ) -> None:

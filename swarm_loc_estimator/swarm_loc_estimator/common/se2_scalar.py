@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 
-@compiled
+@cached_njit
 def wrap(angle: float) -> float:
     """An angle [rad] in [-pi, pi)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
-@compiled
+@cached_njit
 def direction_of(y: float, x: float) -> float:
     """The angle [rad] in [-pi, pi] of a vector as `math.atan2` has it, to 5e-16, without a branch.
 
@@ -38,7 +38,7 @@ def direction_of(y: float, x: float) -> float:
     return math.copysign(angle, y)
 
 
-@compiled
+@cached_njit
 def composed(
     ax: float, ay: float, atheta: float, bx: float, by: float, btheta: float
 ) -> tuple[float, float, float]:
@@ -47,7 +47,7 @@ def composed(
     return ax + cos * bx - sin * by, ay + sin * bx + cos * by, atheta + btheta
 
 
-@compiled
+@cached_njit
 def between(
     ax: float, ay: float, atheta: float, bx: float, by: float, btheta: float
 ) -> tuple[float, float, float]:
@@ -56,7 +56,7 @@ def between(
     return cos * (bx - ax) + sin * (by - ay), cos * (by - ay) - sin * (bx - ax), btheta - atheta
 
 
-@compiled
+@cached_njit
 def moved_by_twist(
     rho_x: float, rho_y: float, phi: float, x: float, y: float, theta: float
 ) -> tuple[float, float, float]:
@@ -69,14 +69,14 @@ def moved_by_twist(
     return ex, ey, wrap(etheta)
 
 
-@compiled
+@cached_njit
 def adjoint_of(transform: FloatArray) -> tuple[tuple[float, ...], ...]:
     """Ad(T) of a transform (3,), see `se2.adjoint`."""
     cos, sin = math.cos(transform[2]), math.sin(transform[2])
     return (cos, -sin, transform[1]), (sin, cos, -transform[0]), (0.0, 0.0, 1.0)
 
 
-@compiled
+@cached_njit
 def carry(transform: FloatArray, matrix: FloatArray, out: FloatArray) -> None:
     """Write Ad(T) M Ad(T)^T (3, 3), of a transform (3,) and the covariance M (3, 3) of an error behind it."""
     adjoint = adjoint_of(transform)

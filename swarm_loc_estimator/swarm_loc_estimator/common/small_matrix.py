@@ -7,17 +7,17 @@ import math
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 
 
-@compiled
+@cached_njit
 def assign(target: FloatArray, source: FloatArray) -> None:
     """Copy a vector; a slice assignment would cost seconds of compilation at every place it stands."""
     for i in range(target.size):
         target[i] = source[i]
 
 
-@compiled
+@cached_njit
 def assign_matrix(target: FloatArray, source: FloatArray) -> None:
     """Copy a matrix."""
     for i in range(target.shape[0]):
@@ -25,7 +25,7 @@ def assign_matrix(target: FloatArray, source: FloatArray) -> None:
             target[i, j] = source[i, j]
 
 
-@compiled
+@cached_njit
 def add_scaled(target: FloatArray, source: FloatArray, factor: float) -> None:
     """Add `factor` times a matrix."""
     for i in range(target.shape[0]):
@@ -33,7 +33,7 @@ def add_scaled(target: FloatArray, source: FloatArray, factor: float) -> None:
             target[i, j] += factor * source[i, j]
 
 
-@inlined
+@inlined_njit
 def factor_numbers(matrix: FloatArray) -> tuple[float, float, float, float, float, float]:
     """The rows of the lower Cholesky factor of a positive definite matrix (3, 3), one behind the other."""
     a = math.sqrt(matrix[0, 0])
@@ -44,7 +44,7 @@ def factor_numbers(matrix: FloatArray) -> tuple[float, float, float, float, floa
     return a, b, c, d, e, math.sqrt(matrix[2, 2] - d * d - e * e)
 
 
-@compiled
+@cached_njit
 def cholesky3(matrix: FloatArray) -> FloatArray:
     """Lower Cholesky factor (3, 3) of a positive definite matrix (3, 3)."""
     factor = np.zeros((3, 3))
@@ -54,7 +54,7 @@ def cholesky3(matrix: FloatArray) -> FloatArray:
     return factor
 
 
-@compiled
+@cached_njit
 def solve3(factor: FloatArray, right: FloatArray, out: FloatArray) -> None:
     """Write the solution (3,) of L L^T x = right for a lower factor L (3, 3)."""
     a = right[0] / factor[0, 0]

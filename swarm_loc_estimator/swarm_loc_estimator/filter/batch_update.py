@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.small_matrix import assign
 from swarm_loc_estimator.filter import prediction
 from swarm_loc_estimator.filter.belief import BeliefArrays, to_map
@@ -29,7 +29,7 @@ from swarm_loc_estimator.odometry.look_up import look_up, look_up_pose, new_samp
 from swarm_loc_estimator.odometry.preintegration import Preintegrated, TrackArrays
 
 
-@compiled
+@cached_njit
 def predict_all(
     measurements: MeasurementColumns,
     stamp_ns: int,
@@ -63,7 +63,7 @@ def predict_all(
         _write_poses(measurements, k, tracks, belief, limits, batch, uncertain)
 
 
-@inlined
+@inlined_njit
 def _write_poses(
     measurements: MeasurementColumns,
     k: int,
@@ -89,7 +89,7 @@ def _write_poses(
     relative_motion(measurements, k, tracks, belief, batch.pose[k], batch.motion[k])
 
 
-@inlined
+@inlined_njit
 def _is_of_same_image(measurements: MeasurementColumns, k: int, side: int) -> bool:
     """Whether the observer of measurement k was looked up at the same instant for the one before it."""
     if side != 0 or k == 0 or measurements.observer[k] != measurements.observer[k - 1]:
@@ -98,7 +98,7 @@ def _is_of_same_image(measurements: MeasurementColumns, k: int, side: int) -> bo
     return same
 
 
-@compiled
+@cached_njit
 def related_columns(measurements: MeasurementColumns, belief: BeliefArrays) -> IntArray:
     """The first columns (m, 3) of observers, targets and observers' cameras; -1: there is none."""
     columns = np.empty((measurements.stamp_ns.size, 3), dtype=np.int64)
@@ -112,7 +112,7 @@ def related_columns(measurements: MeasurementColumns, belief: BeliefArrays) -> I
     return columns
 
 
-@compiled
+@cached_njit
 def evaluate_all(measurements: MeasurementColumns, belief: BeliefArrays, batch: InnovationBatch) -> None:
     """Evaluate the innovations of all measurements (m,) against one belief, see `evaluate`."""
     scratch = new_scratch()
@@ -120,7 +120,7 @@ def evaluate_all(measurements: MeasurementColumns, belief: BeliefArrays, batch: 
         evaluate(measurements, k, belief, batch, k, scratch)
 
 
-@compiled
+@cached_njit
 def assess_all(
     measurements: MeasurementColumns,
     belief: BeliefArrays,
@@ -142,7 +142,7 @@ def assess_all(
     return contradicted
 
 
-@compiled
+@cached_njit
 def confirm_all(measurements: MeasurementColumns, belief: BeliefArrays, passed: BoolArray) -> BoolArray:
     """Hold all measurements (m,) against poses that were assumed; return which robots (N,) are elsewhere."""
     lost = np.zeros(belief.tracked.size, dtype=np.bool_)
@@ -153,7 +153,7 @@ def confirm_all(measurements: MeasurementColumns, belief: BeliefArrays, passed: 
     return lost
 
 
-@compiled
+@cached_njit
 def count_all_gated(
     measurements: MeasurementColumns, belief: BeliefArrays, passed: BoolArray, limits: LossLimits
 ) -> BoolArray:

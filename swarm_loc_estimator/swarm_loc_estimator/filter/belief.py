@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.se2_scalar import composed, moved_by_twist, wrap
 from swarm_loc_estimator.filter.calibration_states import PARAMETERS, ParameterTable
 
@@ -84,7 +84,7 @@ class BeliefArrays(NamedTuple):
     pair_history: FloatArray
 
 
-@compiled
+@cached_njit
 def own_covariance(belief: BeliefArrays, robot: int) -> FloatArray:
     """The covariance, to be changed in place, in which `own_columns` are those of a robot."""
     if belief.covariance.shape[0] > 0:
@@ -93,7 +93,7 @@ def own_covariance(belief: BeliefArrays, robot: int) -> FloatArray:
     return own
 
 
-@inlined
+@inlined_njit
 def own_column(belief: BeliefArrays, robot: int, which: int) -> int:
     """A column of `own_covariance`: of the robot's pose, or, from 3 on, of its parameters; -1: has none."""
     column: int = 3 * robot + which if which < 3 else belief.table.column[robot, which - 3]
@@ -102,7 +102,7 @@ def own_column(belief: BeliefArrays, robot: int, which: int) -> int:
     return column
 
 
-@inlined
+@inlined_njit
 def covariance_within(belief: BeliefArrays, column: int, i: int, j: int) -> float:
     """A number of the covariance (3, 3) of the body whose first column is given."""
     whole, own = belief.covariance, belief.marginal
@@ -110,7 +110,7 @@ def covariance_within(belief: BeliefArrays, column: int, i: int, j: int) -> floa
     return within
 
 
-@inlined
+@inlined_njit
 def own_within(belief: BeliefArrays, robot: int, i: int, j: int) -> float:
     """A number of the covariance of a robot's pose and parameters, by `own_column`."""
     whole, own = belief.covariance, belief.marginal
@@ -121,7 +121,7 @@ def own_within(belief: BeliefArrays, robot: int, i: int, j: int) -> float:
     return alone
 
 
-@inlined
+@inlined_njit
 def to_map(belief: BeliefArrays, robot: int, pose: FloatArray) -> None:
     """Change a pose (3,) on the robot's track to its pose in `map`, in place."""
     t = belief.transform[robot]
@@ -129,7 +129,7 @@ def to_map(belief: BeliefArrays, robot: int, pose: FloatArray) -> None:
     pose[2] = wrap(theta)
 
 
-@compiled
+@cached_njit
 def correct(belief: BeliefArrays, correction: FloatArray) -> None:
     """Apply a filter's correction (n,) to transforms and parameters of robots located, and to landmarks."""
     for i in range(belief.tracked.size):

@@ -32,7 +32,7 @@ import math
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.se2_scalar import between, composed, wrap
 from swarm_loc_estimator.common.small_matrix import assign, assign_matrix, cholesky3
 from swarm_loc_estimator.filter.belief import BeliefArrays
@@ -63,7 +63,7 @@ def at_first(measurement: MeasurementArray) -> MeasurementArray:
     return wider
 
 
-@inlined
+@inlined_njit
 def use_mean(
     measurements: MeasurementColumns,
     k: int,
@@ -107,14 +107,14 @@ def use_mean(
         pair[_VARIANCE, i] *= noise[i, i] / (variances[i] + noise[i, i])
 
 
-@compiled
+@cached_njit
 def _begin(noise: FloatArray, pair: FloatArray) -> None:
     """A pair's first measurement, of covariance `noise` (3, 3), is all that the pair has told."""
     _postpone(noise, pair)
     assign_matrix(pair[_TOLD : _TOLD + 3], _inverse(noise))
 
 
-@compiled
+@cached_njit
 def _join(
     known: FloatArray, predicted: FloatArray, innovation: FloatArray, noise: FloatArray, pair: FloatArray
 ) -> None:
@@ -144,7 +144,7 @@ def _join(
             pair[_TOLD + i, j] = 0.5 * (told[i, j] + told[j, i])
 
 
-@compiled
+@cached_njit
 def _take_part(known: FloatArray, pair: FloatArray, i: int, variance: float) -> float:
     """The weight of a measurement in the mean of component i, of such variance; write w' and s'."""
     lasting, own = known[_LASTING, i], pair[_OWN, i]
@@ -155,13 +155,13 @@ def _take_part(known: FloatArray, pair: FloatArray, i: int, variance: float) -> 
     return weight
 
 
-@compiled
+@cached_njit
 def _difference(i: int, value: float, other: float) -> float:
     """By what component i, a range or an angle, differs from another one."""
     return wrap(value - other) if i > 0 else value - other
 
 
-@compiled
+@cached_njit
 def _covariance(before: FloatArray, now: FloatArray, weight: float, pair: FloatArray) -> FloatArray:
     """The covariance (3, 3) of a pair's mean: its variances w + s, and the mean of the correlations.
 
@@ -181,7 +181,7 @@ def _covariance(before: FloatArray, now: FloatArray, weight: float, pair: FloatA
     return covariance
 
 
-@compiled
+@cached_njit
 def _postpone(noise: FloatArray, pair: FloatArray) -> None:
     """Enlarge the noise (3, 3) of what a pair tells where the variances expected are not small beside it."""
     for i in range(3):
@@ -189,7 +189,7 @@ def _postpone(noise: FloatArray, pair: FloatArray) -> None:
         noise[i, i] += expected * expected / (expected + noise[i, i])
 
 
-@compiled
+@cached_njit
 def _noise_beside(told: FloatArray, covariance: FloatArray) -> FloatArray:
     """The noise (3, 3) of what adds to an information (3, 3) until all has a covariance (3, 3)."""
     factor = cholesky3(covariance)
@@ -199,7 +199,7 @@ def _noise_beside(told: FloatArray, covariance: FloatArray) -> FloatArray:
     return noise
 
 
-@compiled
+@cached_njit
 def _inverse(matrix: FloatArray) -> FloatArray:
     """The inverse of a matrix (3, 3)."""
     inverse = np.empty((3, 3))
@@ -207,7 +207,7 @@ def _inverse(matrix: FloatArray) -> FloatArray:
     return inverse
 
 
-@compiled
+@cached_njit
 def _carried(known: FloatArray, pair: FloatArray) -> FloatArray:
     """The mean known of a pair (3,), carried on by odometry to where the two robots are now."""
     distance, bearing, heading = known[_MEAN, 0], known[_MEAN, 1], known[_MEAN, 2]
@@ -221,7 +221,7 @@ def _carried(known: FloatArray, pair: FloatArray) -> FloatArray:
     return carried
 
 
-@compiled
+@cached_njit
 def _stand(known: FloatArray, pair: FloatArray) -> bool:
     """Whether neither robot may have moved since the pair was last recorded.
 
@@ -233,13 +233,13 @@ def _stand(known: FloatArray, pair: FloatArray) -> bool:
     return gathered < _STILL * _STILL
 
 
-@compiled
+@cached_njit
 def _motion(start: FloatArray, end: FloatArray) -> tuple[float, float, float]:
     """The pose `end` (3,) seen from the pose `start` (3,)."""
     return between(start[0], start[1], start[2], end[0], end[1], end[2])
 
 
-@compiled
+@cached_njit
 def _left(known: FloatArray, carried: FloatArray, variances: FloatArray) -> FloatArray:
     """What share of what a pair has told is not old (3,), at the variances (3,) that are now expected."""
     arrival = wrap(carried[1] - known[_MEAN, 1]) / _FORGOTTEN
@@ -254,19 +254,19 @@ def _left(known: FloatArray, carried: FloatArray, variances: FloatArray) -> Floa
     return left
 
 
-@compiled
+@cached_njit
 def _write_track(transform: FloatArray, pose: FloatArray, out: FloatArray) -> None:
     """Write where on its track (3,) a robot is whose pose (3,) in `map` is given."""
     out[0], out[1], out[2] = between(transform[0], transform[1], transform[2], pose[0], pose[1], pose[2])
 
 
-@inlined
+@inlined_njit
 def _gathered(covariance: FloatArray) -> float:
     """The variance that a track has gathered: the trace of its covariance (3, 3)."""
     return float(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
 
 
-@compiled
+@cached_njit
 def record_pair(measurements: MeasurementColumns, k: int, belief: BeliefArrays, pair: FloatArray) -> None:
     """Record that a measurement was used, with what `use_mean` has written of its pair (PAIR_ROWS, 3)."""
     place = _place(measurements, k, belief)
@@ -274,7 +274,7 @@ def record_pair(measurements: MeasurementColumns, k: int, belief: BeliefArrays, 
         _keep(measurements, k, belief, place, pair)
 
 
-@compiled
+@cached_njit
 def record_constraint(
     measurements: MeasurementColumns, k: int, belief: BeliefArrays, tracks: OdometrySample
 ) -> None:
@@ -303,7 +303,7 @@ def record_constraint(
     _keep(measurements, k, belief, place, pair)
 
 
-@inlined
+@inlined_njit
 def _place(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int:
     """Where the pair of measurement k is remembered or is to be, in place of the oldest; -1: needs not."""
     places, best = belief.pair_robot.shape[1], 0
@@ -330,7 +330,7 @@ def _place(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> in
     return best
 
 
-@inlined
+@inlined_njit
 def _keep(
     measurements: MeasurementColumns, k: int, belief: BeliefArrays, place: int, pair: FloatArray
 ) -> None:

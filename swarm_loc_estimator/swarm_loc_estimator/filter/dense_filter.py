@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.small_matrix import assign_matrix, cholesky3, solve3
 from swarm_loc_estimator.filter.calibration_states import DRIVES, ParameterTable
 from swarm_loc_estimator.filter.inversion import inverse, invert
@@ -97,7 +97,7 @@ class DenseFilter:
         return correction
 
 
-@compiled
+@cached_njit
 def _gather(
     information: FloatArray,
     gradient: FloatArray,
@@ -120,7 +120,7 @@ def _gather(
                 information[columns[k, a], columns[k, b]] += w0 * h0 + w1 * h1 + w2 * h2
 
 
-@compiled
+@cached_njit
 def update_one(
     covariance: FloatArray,
     columns: IntArray,
@@ -166,7 +166,7 @@ def update_one(
     return correction
 
 
-@compiled
+@cached_njit
 def _projected(covariance: FloatArray, columns: IntArray, jacobian: FloatArray) -> FloatArray:
     """P H^T (n, 3)."""
     size = covariance.shape[0]
@@ -181,7 +181,7 @@ def _projected(covariance: FloatArray, columns: IntArray, jacobian: FloatArray) 
     return ph
 
 
-@compiled
+@cached_njit
 def innovation_covariance(
     projected: FloatArray, columns: IntArray, jacobian: FloatArray, noise: FloatArray
 ) -> FloatArray:

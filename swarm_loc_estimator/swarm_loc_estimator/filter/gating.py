@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 from scipy.special import gammaincinv
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import inlined
+from swarm_loc_estimator.common.jit import inlined_njit
 from swarm_loc_estimator.common.small_matrix import factor_numbers
 
 _STUDENT_DOF = 4.0
@@ -19,7 +19,7 @@ def gate_threshold(probability: ArrayLike) -> FloatArray:
     return threshold
 
 
-@inlined
+@inlined_njit
 def squared_distance(innovation: FloatArray, covariance: FloatArray) -> float:
     """Normalised innovation squared of an innovation (3,) under its covariance (3, 3)."""
     aa, ba, bb, ca, cb, cc = factor_numbers(covariance)
@@ -33,7 +33,7 @@ def squared_distance(innovation: FloatArray, covariance: FloatArray) -> float:
     return distance
 
 
-@inlined
+@inlined_njit
 def position_distance(
     innovation: FloatArray, covariance: FloatArray, more: tuple[float, float] = (0.0, 0.0)
 ) -> float:
@@ -52,7 +52,7 @@ def position_distance(
     return distance
 
 
-@inlined
+@inlined_njit
 def soften_heading(innovation: FloatArray, covariance: FloatArray, noise: FloatArray) -> None:
     """Enlarge the heading's part of `noise` (3, 3) where its innovation is unlikely: flips count little.
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
 from swarm_loc_estimator.filter.belief import BeliefArrays, covariance_within, own_within
 from swarm_loc_estimator.filter.calibration_states import CAMERA_SCALE, CAMERA_YAW
@@ -83,7 +83,7 @@ class InnovationBatch(NamedTuple):
     nis: FloatArray
 
 
-@compiled
+@cached_njit
 def new_batch(count: int) -> InnovationBatch:
     """Room for `count` measurements."""
     return InnovationBatch(
@@ -103,7 +103,7 @@ def new_batch(count: int) -> InnovationBatch:
     )
 
 
-@compiled
+@cached_njit
 def new_scratch() -> Scratch:
     """Room to evaluate measurements in."""
     return Scratch(
@@ -111,7 +111,7 @@ def new_scratch() -> Scratch:
     )
 
 
-@inlined
+@inlined_njit
 def evaluate(
     measurements: MeasurementColumns,
     k: int,
@@ -176,7 +176,7 @@ def evaluate(
     use_mean(measurements, k, belief, (pose, predicted, variances), difference, noise, batch.pair[row])
 
 
-@inlined
+@inlined_njit
 def relative_motion(
     measurements: MeasurementColumns,
     k: int,
@@ -211,7 +211,7 @@ def relative_motion(
             motion[2] += sign * rate[2]
 
 
-@inlined
+@inlined_njit
 def _camera(belief: BeliefArrays, observer: int) -> tuple[tuple[float, float], tuple[int, int]]:
     """Yaw and scale of an observer's camera, and their columns; -1: has none."""
     if observer < 0:
@@ -223,7 +223,7 @@ def _camera(belief: BeliefArrays, observer: int) -> tuple[tuple[float, float], t
     )
 
 
-@inlined
+@inlined_njit
 def _write_jacobian(
     chain: FloatArray,
     bodies: tuple[int, int],
@@ -246,7 +246,7 @@ def _write_jacobian(
             jacobian[i, 6 + j] = chain[i, 3 + j] if camera_columns[j] >= 0 else 0.0
 
 
-@inlined
+@inlined_njit
 def _add_stamp_noise(chain: FloatArray, motion: FloatArray, variance: float, noise: FloatArray) -> None:
     """Add to `noise` (3, 3) what a stamp of such variance does to a value that changes by `motion` (3,)."""
     change = (_along(chain, 0, motion), _along(chain, 1, motion), _along(chain, 2, motion))
@@ -255,14 +255,14 @@ def _add_stamp_noise(chain: FloatArray, motion: FloatArray, variance: float, noi
             noise[i, j] += variance * change[i] * change[j]
 
 
-@inlined
+@inlined_njit
 def _along(chain: FloatArray, row: int, motion: FloatArray) -> float:
     """How fast a component of the value changes."""
     speed: float = chain[row, 0] * motion[0] + chain[row, 1] * motion[1] + chain[row, 2] * motion[2]
     return speed
 
 
-@inlined
+@inlined_njit
 def body_columns(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> tuple[int, int]:
     """The first of the three columns of the observer and of the target of measurement k; -1: has none."""
     observer, target = measurements.observer[k], measurements.target[k]
@@ -272,7 +272,7 @@ def body_columns(measurements: MeasurementColumns, k: int, belief: BeliefArrays)
     return (3 * observer if observer >= 0 else -1), first
 
 
-@inlined
+@inlined_njit
 def _read_across(p: FloatArray, bodies: tuple[int, int], camera: tuple[int, int], out: FloatArray) -> None:
     """Write the covariances `across` (3, 5) of one measurement; those of nobody do not matter."""
     o, t = max(bodies[0], 0), max(bodies[1], 0)
@@ -283,7 +283,7 @@ def _read_across(p: FloatArray, bodies: tuple[int, int], camera: tuple[int, int]
             out[i, 3 + k] = p[t + i, max(camera[k], 0)]
 
 
-@inlined
+@inlined_njit
 def _add_uncertainty(
     belief: BeliefArrays,
     columns: tuple[tuple[int, int], tuple[int, int]],
@@ -333,7 +333,7 @@ def _add_uncertainty(
                     s[j, i] += beside * chain[j, 3 + k]
 
 
-@inlined
+@inlined_njit
 def _turned(chain: FloatArray, row: int, matrix: FloatArray) -> tuple[float, float, float]:
     """The product of the first three columns of a row of `chain` and a matrix (3, 3)."""
     a, b, c = chain[row, 0], chain[row, 1], chain[row, 2]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.lapack import invert_positive
 
 
@@ -27,7 +27,7 @@ def invert(matrix: FloatArray) -> None:
     _mirror(matrix)
 
 
-@compiled
+@cached_njit
 def _mirror(matrix: FloatArray) -> None:
     """Copy the upper triangle, which is the lower one in Fortran's order, to the other one."""
     for i in range(matrix.shape[0]):

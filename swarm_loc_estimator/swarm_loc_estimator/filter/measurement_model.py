@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import inlined
+from swarm_loc_estimator.common.jit import inlined_njit
 from swarm_loc_estimator.common.se2_scalar import composed, wrap
 
 NOBODY = -1
@@ -138,7 +138,7 @@ def predict(
     return value, jacobian
 
 
-@inlined
+@inlined_njit
 def predict_one(
     measurements: MeasurementColumns,
     k: int,
@@ -179,7 +179,7 @@ def predict_one(
             jacobian[1, j] = (ux * left - uy * forward) / (stretch * distance)
 
 
-@inlined
+@inlined_njit
 def innovation(
     measurements: MeasurementColumns, k: int, measured: FloatArray, predicted: FloatArray, out: FloatArray
 ) -> None:

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.se2_scalar import adjoint_of, carry, moved_by_twist
 from swarm_loc_estimator.common.small_matrix import assign, assign_matrix, factor_numbers
 from swarm_loc_estimator.filter.belief import (
@@ -50,13 +50,13 @@ class _Drift(NamedTuple):
     shared: float
 
 
-@compiled
+@cached_njit
 def new_scratch() -> FloatArray:
     """Room (3, 3, 3) to predict in: memory of its own for each robot would cost more."""
     return np.empty((3, 3, 3))
 
 
-@inlined
+@inlined_njit
 def predict(belief: BeliefArrays, robot: int, to: Preintegrated, scratch: FloatArray) -> None:
     """Predict a robot, in place, to an instant; `scratch` is from `new_scratch`."""
     if not _new_noise(belief, robot, to.covariance, scratch):
@@ -75,7 +75,7 @@ def predict(belief: BeliefArrays, robot: int, to: Preintegrated, scratch: FloatA
     belief.predicted_to_ns[robot] = max(to.stamp_ns, belief.predicted_to_ns[robot])
 
 
-@inlined
+@inlined_njit
 def write_predicted(
     belief: BeliefArrays,
     robot: int,
@@ -107,7 +107,7 @@ def write_predicted(
             covariance[i, j] += scratch[0, i, j]
 
 
-@compiled
+@cached_njit
 def _write_drifted(
     belief: BeliefArrays, robot: int, to: Preintegrated, transform: FloatArray, covariance: FloatArray
 ) -> None:
@@ -119,7 +119,7 @@ def _write_drifted(
     _block(own_covariance(belief, robot), columns, weight, count, drift, covariance)
 
 
-@inlined
+@inlined_njit
 def _new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, scratch: FloatArray) -> bool:
     """Write Ad(T) (G2 - G1) Ad(T)^T to `scratch[0]`, and return whether it is a covariance.
 
@@ -140,7 +140,7 @@ def _new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, scratch: Flo
     return True
 
 
-@inlined
+@inlined_njit
 def _has_drives(belief: BeliefArrays, robot: int) -> bool:
     """Whether any parameter of the robot's motion is estimated."""
     estimated = False
@@ -149,7 +149,7 @@ def _has_drives(belief: BeliefArrays, robot: int) -> bool:
     return estimated
 
 
-@compiled
+@cached_njit
 def _new_drift(belief: BeliefArrays, robot: int, to: Preintegrated) -> _Drift:
     """How the pose moves until an instant."""
     x = max(0, to.stamp_ns - belief.predicted_to_ns[robot]) * 1e-9 / belief.table.turn_bias_time_s[robot]
@@ -177,7 +177,7 @@ def _new_drift(belief: BeliefArrays, robot: int, to: Preintegrated) -> _Drift:
     return out
 
 
-@compiled
+@cached_njit
 def _own(belief: BeliefArrays, robot: int, drift: _Drift, columns: IntArray, weight: FloatArray) -> int:
     """Write which columns (3 + DRIVES,) the pose's error comes from, with what weight; return how many."""
     count = 0
@@ -191,7 +191,7 @@ def _own(belief: BeliefArrays, robot: int, drift: _Drift, columns: IntArray, wei
     return count
 
 
-@compiled
+@cached_njit
 def _block(
     p: FloatArray, columns: IntArray, weight: FloatArray, count: int, drift: _Drift, out: FloatArray
 ) -> None:
@@ -205,7 +205,7 @@ def _block(
             out[i, j] = out[j, i] = total
 
 
-@compiled
+@cached_njit
 def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
     """Apply the drift to T and to the covariance of its error with everything, and let the bias decay."""
     drift = _new_drift(belief, robot, to)
@@ -239,7 +239,7 @@ def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
             p[first + i, first + j] = block[i, j]
 
 
-@compiled
+@cached_njit
 def _note_driven(belief: BeliefArrays, robot: int, drift: _Drift) -> None:
     """Note how the drift changes the covariance of the pose's error with those of others."""
     driven = belief.driven[robot]
@@ -251,7 +251,7 @@ def _note_driven(belief: BeliefArrays, robot: int, drift: _Drift) -> None:
         driven[3, TURN_BIAS] *= drift.left
 
 
-@compiled
+@cached_njit
 def _move(twist: FloatArray, transform: FloatArray) -> None:
     """Move a transform (3,), in place, by exp(twist)."""
     x, y, theta = moved_by_twist(twist[0], twist[1], twist[2], transform[0], transform[1], transform[2])

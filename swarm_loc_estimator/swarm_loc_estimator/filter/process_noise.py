@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.filter.calibration_states import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
 from swarm_loc_estimator.swarm.swarm import OdometryModel
 
@@ -36,7 +36,7 @@ class OdometryStep(NamedTuple):
     theta: float
 
 
-@compiled
+@cached_njit
 def add_step_noise(model: OdometryModel, step: OdometryStep, covariance: FloatArray) -> None:
     """Add a step's noise to a covariance (3, 3) in the track's frame.
 
@@ -61,7 +61,7 @@ def add_step_noise(model: OdometryModel, step: OdometryStep, covariance: FloatAr
     _add_in_track_frame((step.x, step.y, course), (along, across, heading, cross), covariance)
 
 
-@compiled
+@cached_njit
 def add_step_jacobian(model: OdometryModel, step: OdometryStep, jacobian: FloatArray) -> None:
     """Add by how much a step moves the pose per unit of each parameter: Ad(O) times its body direction.
 
@@ -85,7 +85,7 @@ def add_step_jacobian(model: OdometryModel, step: OdometryStep, jacobian: FloatA
         jacobian[2, parameter] += angle
 
 
-@compiled
+@cached_njit
 def add_silence(
     model: OdometryModel,
     silence_s: float,
@@ -113,7 +113,7 @@ def add_silence(
     _add_in_track_frame((pose[0], pose[1], course), (along, across, heading, 0.0), covariance)
 
 
-@compiled
+@cached_njit
 def _add_in_track_frame(
     pose: tuple[float, float, float], body: tuple[float, float, float, float], covariance: FloatArray
 ) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.small_matrix import assign
 from swarm_loc_estimator.filter import prediction
 from swarm_loc_estimator.filter.belief import BeliefArrays, correct, to_map
@@ -32,7 +32,7 @@ FINISHED, NOT_LOCALIZED, LOST, CONTRADICTED = 0, 1, 2, 3
 robot or landmark contradicted."""
 
 
-@compiled
+@cached_njit
 def update_in_order(
     measurements: MeasurementColumns,
     begin: int,

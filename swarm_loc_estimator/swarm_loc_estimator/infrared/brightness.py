@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import borrowing, compiled
+from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit
 from swarm_loc_estimator.common.se2_scalar import direction_of
 from swarm_loc_estimator.infrared.curves import amplitudes_at, curves_at
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
@@ -97,7 +97,7 @@ class _Ways(NamedTuple):
     by_turn: FloatArray
 
 
-@compiled
+@cached_njit
 def _predict_all(model: IrModel, poses: FloatArray, readings: FloatArray, slopes: FloatArray) -> None:
     """All poses."""
     room = np.empty((WAY_ROWS, model.angles.size**2))
@@ -105,7 +105,7 @@ def _predict_all(model: IrModel, poses: FloatArray, readings: FloatArray, slopes
         predict_brightness(model, poses[k, 0], poses[k, 1], poses[k, 2], room, readings[k], slopes[k])
 
 
-@borrowing
+@norefcount_njit
 def predict_brightness(
     model: IrModel,
     distance: float,
@@ -156,7 +156,7 @@ def predict_brightness(
             _combine(by_length, ways.bright_slope, by_turn, ways.bright, slope)
 
 
-@borrowing
+@norefcount_njit
 def _lay(model: IrModel, distance: float, bearing: float, heading: float, ways: _Ways) -> None:
     """Write where emitters are, and the ways to them."""
     n, units, rho = model.angles.size, model.units, model.radius
@@ -171,7 +171,7 @@ def _lay(model: IrModel, distance: float, bearing: float, heading: float, ways: 
             ways.y[i * n + j] = y + rho * (emitter_y - units[i, 1])
 
 
-@compiled
+@cached_njit
 def _measure(x: FloatArray, y: FloatArray, length: FloatArray, direction: FloatArray) -> None:
     """Write lengths, none of them zero, and directions [rad] of vectors."""
     for k in range(x.size):
@@ -179,7 +179,7 @@ def _measure(x: FloatArray, y: FloatArray, length: FloatArray, direction: FloatA
         direction[k] = direction_of(y[k], x[k])
 
 
-@borrowing
+@norefcount_njit
 def _write_angles(angles: FloatArray, heading: float, ways: _Ways) -> None:
     """Write at which angles sensors and emitters of these directions [rad] have the ways."""
     n = angles.size
@@ -190,7 +190,7 @@ def _write_angles(angles: FloatArray, heading: float, ways: _Ways) -> None:
             ways.at_emitter[i * n + j] = direction + math.pi - angles[j] - heading
 
 
-@borrowing
+@norefcount_njit
 def _write_changes(rho: float, distance: float, bearing: float, ways: _Ways) -> None:
     """Write what a change of the pose does."""
     ux, uy = math.cos(bearing), math.sin(bearing)
@@ -211,14 +211,14 @@ def _write_changes(rho: float, distance: float, bearing: float, ways: _Ways) -> 
         by_length[2, w], by_turn[2, w] = -share * rho * aside, turned * rho * forward - of_emitter
 
 
-@compiled
+@cached_njit
 def _multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """Write a b."""
     for w in range(out.size):
         out[w] = a[w] * b[w]
 
 
-@compiled
+@cached_njit
 def _combine(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, out: FloatArray) -> None:
     """Write a b + c d."""
     for w in range(out.size):

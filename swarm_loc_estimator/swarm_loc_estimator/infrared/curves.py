@@ -16,7 +16,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.number_spec import number, number_specs
 
 if TYPE_CHECKING:
@@ -181,7 +181,7 @@ class Amplitude:
             )
 
 
-@compiled
+@cached_njit
 def curve_at(table: CurveTable, angle: float) -> tuple[float, float]:
     """The value and slope [1/rad] of a curve at an angle [rad] of any size."""
     a = angle - 2.0 * math.pi * math.floor(angle * (0.5 / math.pi) + 0.5)
@@ -195,7 +195,7 @@ def curve_at(table: CurveTable, angle: float) -> tuple[float, float]:
     return _cubic_at(table.cubics[piece, cell], place - cell, per_radian)
 
 
-@compiled
+@cached_njit
 def curves_at(
     table: CurveTable, angles: FloatArray, piece: FloatArray, values: FloatArray, slopes: FloatArray
 ) -> None:
@@ -223,13 +223,13 @@ def curves_at(
         values[k], slopes[k] = _cubic_at(table.cubics[here, cell], place - cell, per_radian)
 
 
-@compiled
+@cached_njit
 def _cubic_at(c: FloatArray, t: float, per_radian: float) -> tuple[float, float]:
     """The value and slope [1/rad] of one cell's cubic, of which the share t is passed."""
     return c[0] + t * (c[1] + t * (c[2] + t * c[3])), (c[1] + t * (2.0 * c[2] + 3.0 * t * c[3])) * per_radian
 
 
-@compiled
+@cached_njit
 def amplitude_at(law: FloatArray, r: float) -> tuple[float, float]:
     """The brightness [count] of an aligned pair at a distance [m], and its slope [count/m].
 
@@ -241,7 +241,7 @@ def amplitude_at(law: FloatArray, r: float) -> tuple[float, float]:
     return _amplitude(law, r, closeness, closeness * closeness if law[2] == 2.0 else closeness ** law[2])
 
 
-@compiled
+@cached_njit
 def amplitudes_at(law: FloatArray, r: FloatArray, values: FloatArray, slopes: FloatArray) -> None:
     """Write the values and slopes of `amplitude_at` at many distances (k,)."""
     if law[2] == 2.0:  # apart, since a loop that may raise to a power is not vectorized
@@ -253,13 +253,13 @@ def amplitudes_at(law: FloatArray, r: FloatArray, values: FloatArray, slopes: Fl
             values[k], slopes[k] = amplitude_at(law, r[k])
 
 
-@compiled
+@cached_njit
 def _closeness(law: FloatArray, r: float) -> float:
     """One over the distance from the law's pole [1/m]."""
     return 1.0 / float(max(r, law[4]) + law[1])
 
 
-@compiled
+@cached_njit
 def _amplitude(law: FloatArray, r: float, closeness: float, power: float) -> tuple[float, float]:
     """The law's value and slope, with the power of the closeness."""
     value = law[0] * power
@@ -267,7 +267,7 @@ def _amplitude(law: FloatArray, r: float, closeness: float, power: float) -> tup
     return value + law[3] + slope * min(r - law[4], 0.0), slope
 
 
-@compiled
+@cached_njit
 def distance_at(law: FloatArray, brightness: float) -> float:
     """The distance [m] at which an aligned pair is so bright [count], eq. (22); infinite where it never is.
 

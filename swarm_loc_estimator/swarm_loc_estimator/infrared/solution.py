@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
 
 DARKEST = -6.0
@@ -54,7 +54,7 @@ class IrSolutions(NamedTuple):
         return no_solutions(count)
 
 
-@compiled
+@cached_njit
 def no_solutions(count: int) -> IrSolutions:
     """Of so many pairs without any pose, also for compiled code."""
     return IrSolutions(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import adjoint
 from swarm_loc_estimator.common.se2_scalar import carry, moved_by_twist, wrap
 from swarm_loc_estimator.common.small_matrix import assign, cholesky3, solve3
@@ -85,7 +85,7 @@ def _is_ambiguous(
     return False
 
 
-@compiled
+@cached_njit
 def _apart(
     constraints: ConstraintArray, one: FloatArray, others: FloatArray, limits: tuple[float, float]
 ) -> FloatArray:
@@ -113,7 +113,7 @@ def _refined(constraints: ConstraintArray, begin: FloatArray) -> tuple[FloatArra
     return transform, covariance, weight
 
 
-@compiled
+@cached_njit
 def _hypotheses(constraints: ConstraintArray) -> FloatArray:
     """Transforms (h, 3) from each heading shown and each pair of constraints far enough apart."""
     count, h = constraints.size, 0
@@ -139,7 +139,7 @@ def _hypotheses(constraints: ConstraintArray) -> FloatArray:
     return out[:h]
 
 
-@compiled
+@cached_njit
 def _place(turn: float, lx: float, ly: float, mx: float, my: float, out: FloatArray, h: int) -> int:
     """Write the transform h with heading `turn` that brings a point of the track to its place on the map."""
     cos, sin = math.cos(turn), math.sin(turn)
@@ -147,7 +147,7 @@ def _place(turn: float, lx: float, ly: float, mx: float, my: float, out: FloatAr
     return h + 1
 
 
-@compiled
+@cached_njit
 def _drifted(constraints: ConstraintArray, track_noise: FloatArray) -> ConstraintArray:
     """The constraints (k,), their points on the track less sure by what it has drifted since."""
     out, drift = np.empty_like(constraints), np.empty((3, 3))
@@ -164,7 +164,7 @@ def _drifted(constraints: ConstraintArray, track_noise: FloatArray) -> Constrain
     return out
 
 
-@compiled
+@cached_njit
 def _misses(
     constraint: Constraint, x: float, y: float, cos: float, sin: float
 ) -> tuple[float, float, float, float, float]:
@@ -177,7 +177,7 @@ def _misses(
     return dx, dy, scale * yy, -scale * xy, scale * xx
 
 
-@compiled
+@cached_njit
 def _turn_off(constraint: Constraint, heading: float) -> float:
     """By what turn a heading differs from a constraint's, or from the mirrored one; NaN if by much."""
     turn, other = wrap(constraint.turn - heading), wrap(constraint.other_turn - heading)
@@ -186,7 +186,7 @@ def _turn_off(constraint: Constraint, heading: float) -> float:
     return turn if turn * turn < 9.0 * constraint.turn_variance else math.nan
 
 
-@compiled
+@cached_njit
 def _vote(
     constraints: ConstraintArray, transforms: FloatArray
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -204,7 +204,7 @@ def _vote(
     return agreeing, support
 
 
-@compiled
+@cached_njit
 def _refine(
     constraints: ConstraintArray,
     begin: FloatArray,
@@ -315,7 +315,7 @@ def _matrices(constraints: ConstraintArray, side: str) -> FloatArray:
     return np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-1)
 
 
-@compiled
+@cached_njit
 def _unsureness(
     constraints: ConstraintArray,
     track_noise: FloatArray,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2_scalar import carry, composed, wrap
 from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
 from swarm_loc_estimator.filter.belief import BeliefArrays, covariance_within
@@ -115,7 +115,7 @@ def with_constraint(
     return out[:_MAX_CONSTRAINTS]
 
 
-@compiled
+@cached_njit
 def _take_over(
     constraints: ConstraintArray, one: MeasurementArray, window_ns: int, out: ConstraintArray
 ) -> int:
@@ -128,7 +128,7 @@ def _take_over(
     return count
 
 
-@compiled
+@cached_njit
 def _thin_out(constraints: ConstraintArray) -> None:
     """Move the one (of k, in order of time) that leaves the smallest gap, for its age, behind all others.
 
@@ -157,7 +157,7 @@ def _thin_out(constraints: ConstraintArray) -> None:
         constraints[k] = constraints[k + 1]
 
 
-@compiled
+@cached_njit
 def turned(xx: float, xy: float, yy: float, cos: float, sin: float) -> tuple[float, float, float]:
     """A covariance xx, xy, yy turned by an angle."""
     across = 2.0 * cos * sin * xy
@@ -168,7 +168,7 @@ def turned(xx: float, xy: float, yy: float, cos: float, sin: float) -> tuple[flo
     )
 
 
-@compiled
+@cached_njit
 def spread_at(spread: FloatArray, x: float, y: float) -> tuple[float, float, float]:
     """Covariance xx, xy, yy of a point on a frame whose right-invariant error has the covariance (3, 3)."""
     return (
@@ -178,7 +178,7 @@ def spread_at(spread: FloatArray, x: float, y: float) -> tuple[float, float, flo
     )
 
 
-@compiled
+@cached_njit
 def _describe(
     measurements: MeasurementArray,
     camera: FloatArray,
@@ -227,7 +227,7 @@ def _describe(
     assign_matrix(constraint.frame_noise, other.noise)
 
 
-@compiled
+@cached_njit
 def refreshed(constraints: ConstraintArray, belief: BeliefArrays) -> ConstraintArray:
     """Constraints (k,) as they would be from what is believed now of the other sides, without robots lost.
 
@@ -271,7 +271,7 @@ def refreshed(constraints: ConstraintArray, belief: BeliefArrays) -> ConstraintA
     return out[:count]
 
 
-@compiled
+@cached_njit
 def _move(constraint: Constraint, frame: FloatArray) -> float:
     """Move a constraint's place on the map, and its heading, with its frame; return by what turn."""
     then = constraint.frame

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.readings import Readings
 
@@ -150,7 +150,7 @@ class MotionTracker:
             yield Run(label != _DRIVES, label >= _ARRIVES, label == _JUMPS, chosen)
 
 
-@compiled
+@cached_njit
 def _labels(stamp_ns: IntArray, odometry: FloatArray, state: FloatArray, before_ns: int) -> IntArray:
     """Whether a robot drives, stands or arrives at each reading, or jumps; the state goes on."""
     labels = np.zeros(len(stamp_ns), dtype=np.int64)
@@ -175,7 +175,7 @@ def _labels(stamp_ns: IntArray, odometry: FloatArray, state: FloatArray, before_
     return labels
 
 
-@compiled
+@cached_njit
 def _completed(stamp_ns: IntArray, turn: FloatArray, full: float) -> int:
     """See `Stop.completed`."""
     furthest, rest_turn, rest_ns = 0.0, math.inf, 0

@@ -28,7 +28,7 @@ from rclpy.subscription import Subscription
 from rclpy.time import Time
 from std_srvs.srv import Trigger
 
-from swarm_loc_estimator.common.jit import is_warm
+from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.ros.newest_time import newest_time_ns
 from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node
@@ -52,7 +52,7 @@ from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
 from swarm_loc_estimator.nodes.load.fusion_pace import FusionPace
 from swarm_loc_estimator.nodes.load.shedding import Shedding
 from swarm_loc_estimator.nodes.set_pose import NO_CLOCK, PoseCommands
-from swarm_loc_estimator.precompile import WARM_UP, warm_up
+from swarm_loc_estimator.precompile import precompile
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.thinning import SHED_REASONS, Thinning
 from swarm_loc_estimator.sensors.topics import live_topics
@@ -103,9 +103,9 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
     def __init__(self, create_estimator: CreateEstimator = SwarmEstimator, **node_arguments: Any) -> None:
         super().__init__("estimator", EstimatorParameters, **node_arguments)
         self._swarm = load_swarm(Path(self.chosen.swarm_file))
-        if not is_warm(WARM_UP):
+        if not is_precompiled(precompile):
             self.get_logger().info("compiling the estimator for this machine: about three minutes")
-        warm_up()
+        precompile()
         self._estimator = create_estimator(self._swarm, self.chosen.settings)
         shared = self.chosen.shared_topics
         self._ingest = Ingest(self._swarm, self.chosen.map_frame, live_topics(self._swarm, shared=shared))

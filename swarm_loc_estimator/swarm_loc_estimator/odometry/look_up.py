@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
 from swarm_loc_estimator.filter.process_noise import add_silence
 from swarm_loc_estimator.odometry.preintegration import TrackArrays
@@ -32,7 +32,7 @@ class OdometrySample(NamedTuple):
     silence_s: FloatArray
 
 
-@compiled
+@cached_njit
 def new_sample(count: int) -> OdometrySample:
     """Room for `count` look-ups."""
     return OdometrySample(
@@ -44,7 +44,7 @@ def new_sample(count: int) -> OdometrySample:
     )
 
 
-@inlined
+@inlined_njit
 def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample, k: int) -> None:
     """Write where the track of a robot is at an instant, in row k of a sample.
 
@@ -81,7 +81,7 @@ def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample,
     add_silence(model, silence_s, unknown, pose, rate, out.covariance[k])
 
 
-@inlined
+@inlined_njit
 def look_up_pose(tracks: TrackArrays, robot: int, stamp_ns: int, out: FloatArray) -> None:
     """Write the pose (3,) that `look_up` finds, and nothing else."""
     if tracks.filled[robot] == 0:
@@ -94,7 +94,7 @@ def look_up_pose(tracks: TrackArrays, robot: int, stamp_ns: int, out: FloatArray
         _interpolate(tracks.pose[robot, row], tracks.pose[robot, row + 1], fraction, out)
 
 
-@inlined
+@inlined_njit
 def _find_step(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[int, float]:
     """The row behind which an instant lies on a track that has some, and at what fraction of the step.
 
@@ -111,7 +111,7 @@ def _find_step(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[int, flo
     return row, -1.0
 
 
-@inlined
+@inlined_njit
 def rate_at(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[float, float, float]:
     """The velocity forward and left [m/s] and the turn rate [rad/s] of base_link at an instant.
 
@@ -133,7 +133,7 @@ def rate_at(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[float, floa
     return (cos * dx + sin * dy) / duration_s, (cos * dy - sin * dx) / duration_s, turn / duration_s
 
 
-@inlined
+@inlined_njit
 def _along_step(
     tracks: TrackArrays, robot: int, row: int, fraction: float, out: OdometrySample, k: int
 ) -> None:
@@ -147,7 +147,7 @@ def _along_step(
                 target[k, i, j] = before + fraction * (after - before)
 
 
-@compiled
+@cached_njit
 def look_up_all(tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray) -> OdometrySample:
     """Look up m robots at m instants; see `look_up`."""
     out = new_sample(robots.size)
@@ -156,7 +156,7 @@ def look_up_all(tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray) -> O
     return out
 
 
-@inlined
+@inlined_njit
 def _interpolate(start: FloatArray, end: FloatArray, fraction: float, out: FloatArray) -> None:
     """The pose on the arc of constant twist from `start` to `end`; a `fraction` past 1 runs on."""
     turn = end[2] - start[2]

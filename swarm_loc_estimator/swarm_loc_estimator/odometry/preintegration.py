@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.common.small_matrix import add_scaled, assign, assign_matrix
 from swarm_loc_estimator.filter.process_noise import (
@@ -95,7 +95,7 @@ class TrackArrays(NamedTuple):
     walk: FloatArray
 
 
-@compiled
+@cached_njit
 def continue_tracks(
     tracks: TrackArrays,
     oldest_ns: int,
@@ -132,7 +132,7 @@ def continue_tracks(
     return integrate(tracks, robots, delayed, raw, np.ones(robots.size, dtype=np.bool_))[1]
 
 
-@compiled
+@cached_njit
 def integrate(
     tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray, raw: FloatArray, new: NDArray[np.bool_]
 ) -> tuple[int, int]:
@@ -163,7 +163,7 @@ def integrate(
     return duplicates, jumps
 
 
-@inlined
+@inlined_njit
 def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
     """Fill a row from the row before and its raw pose; return whether no robot can drive so fast."""
     model = tracks.model[robot]
@@ -214,7 +214,7 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
     return False
 
 
-@compiled
+@cached_njit
 def _add_unknown(
     model: OdometryModel,
     unknown_s: tuple[float, float],
@@ -236,7 +236,7 @@ def _add_unknown(
         add_scaled(covariance, known, -1.0)
 
 
-@inlined
+@inlined_njit
 def _true_motion(
     tracks: TrackArrays,
     robot: int,
@@ -270,7 +270,7 @@ def _true_motion(
     )
 
 
-@inlined
+@inlined_njit
 def _response(tracks: TrackArrays, robot: int, speed: float, turn_rate: float) -> tuple[float, float]:
     """Shares of speed and turn rate that are true, bilinear in the grid of the robot's response."""
     i, a = _bracket(tracks.response_speed[robot], speed)
@@ -279,7 +279,7 @@ def _response(tracks: TrackArrays, robot: int, speed: float, turn_rate: float) -
     return _bilinear(table[0], i, j, a, b), _bilinear(table[1], i, j, a, b)
 
 
-@inlined
+@inlined_njit
 def _bilinear(table: FloatArray, i: int, j: int, a: float, b: float) -> float:
     """A number of a table (V, W), by shares a and b of the way to the next row and column."""
     ii, jj = min(i + 1, table.shape[0] - 1), min(j + 1, table.shape[1] - 1)
@@ -288,7 +288,7 @@ def _bilinear(table: FloatArray, i: int, j: int, a: float, b: float) -> float:
     return low * (1.0 - a) + high * a
 
 
-@inlined
+@inlined_njit
 def _bracket(axis: FloatArray, value: float) -> tuple[int, float]:
     """The interval of an ascending axis nearest to the value, and how far in the value lies (0 to 1)."""
     i = max(0, min(np.searchsorted(axis, value, side="right") - 1, axis.size - 1))

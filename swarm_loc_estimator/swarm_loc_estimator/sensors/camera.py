@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.small_matrix import assign
 from swarm_loc_estimator.filter.gating import gate_threshold
 from swarm_loc_estimator.filter.measurement_model import (
@@ -165,7 +165,7 @@ class SightingConverter:
             measurements["stamp_variance"] = variance * count[picture]
 
 
-@compiled
+@cached_njit
 def _convert_all(
     detections: _Detections,
     cameras: _Cameras,
@@ -211,7 +211,7 @@ def _convert_all(
         out.covariance[k, 1, 1] += markers.variance[place]
 
 
-@inlined
+@inlined_njit
 def _fate(
     detections: _Detections, k: int, cameras: _Cameras, markers: _Markers, robot: int, place: int
 ) -> int:
@@ -243,7 +243,7 @@ def _fate(
     return _MEASURED
 
 
-@compiled
+@cached_njit
 def _is_rotation(quaternion: FloatArray) -> bool:
     """Whether a quaternion (4,) is finite and not zero."""
     norm = 0.0
@@ -252,21 +252,21 @@ def _is_rotation(quaternion: FloatArray) -> bool:
     return math.isfinite(norm) and norm > 1e-12
 
 
-@compiled
+@cached_njit
 def _levelled(level: FloatArray, optical: FloatArray, out: FloatArray) -> None:
     """Write a vector (3,) of the optical frame in the level axes forward, left, up of the camera."""
     for i in range(3):
         out[i] = level[i, 0] * optical[0] + level[i, 1] * optical[1] + level[i, 2] * optical[2]
 
 
-@compiled
+@cached_njit
 def _scale(vector: FloatArray, factor: float) -> None:
     """Multiply a vector (3,), in place."""
     for i in range(3):
         vector[i] *= factor
 
 
-@compiled
+@cached_njit
 def _face_heading(level: FloatArray, quaternion: FloatArray) -> float:
     """Heading in the sensor plane of the z axis of an orientation xyzw (4,), the direction out of a face."""
     x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
@@ -277,7 +277,7 @@ def _face_heading(level: FloatArray, quaternion: FloatArray) -> float:
     return math.atan2(axes[1], axes[0])
 
 
-@compiled
+@cached_njit
 def _calibrate(
     sensor: SensorModel, position: FloatArray, target: int, value: FloatArray, noise: FloatArray
 ) -> None:
@@ -294,7 +294,7 @@ def _calibrate(
     noise[2, 2] = 1.0
 
 
-@compiled
+@cached_njit
 def _pose_noise(sensor: SensorModel, level: FloatArray, published: FloatArray, noise: FloatArray) -> None:
     """Write the covariance (3, 3) of forward, left, heading; the sensor model is for unknown ones (-1)."""
     if published[0, 0] < 0.0:

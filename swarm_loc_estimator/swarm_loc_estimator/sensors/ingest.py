@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.messages.shared import swarm_key
 from swarm_loc_estimator.sensors.channels import CHANNELS, Known
@@ -171,7 +171,7 @@ class Ingest:
         return RawInputs(int(batch.log_ns[0]), int(batch.log_ns[-1]), dropped=+dropped, **rows)
 
 
-@compiled
+@cached_njit
 def _count(
     counted: NDArray[np.void],
     topic: IntArray,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.small_matrix import cholesky3
 from swarm_loc_estimator.filter.gating import gate_threshold
 from swarm_loc_estimator.filter.measurement_model import (
@@ -186,7 +186,7 @@ def reject_reasons(measurements: MeasurementArray) -> IntArray:
 _BAD_COVARIANCE = REJECT_REASONS.index("bad_covariance")
 
 
-@compiled
+@cached_njit
 def _check_covariances(matrices: FloatArray, reasons: IntArray) -> None:
     """Write where a matrix is not symmetric, positive definite, and of a magnitude to reckon with."""
     scaled = np.empty((3, 3))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementArray
 
 _WORDS = MEASUREMENT_DTYPE.itemsize // 8  # every field is made of 8-byte numbers, the stamp is the first
@@ -135,7 +135,7 @@ class MeasurementBuffer:
         self._begin, self._end = 0, size
 
 
-@compiled
+@cached_njit
 def _merge(columns: _Columns, begin: int, end: int, new: IntArray) -> tuple[int, int]:
     """Merge new rows into those from `begin` to `end`, which have room behind.
 
@@ -174,7 +174,7 @@ def _merge(columns: _Columns, begin: int, end: int, new: IntArray) -> tuple[int,
     return kept, new[order[0], 0] if kept else 0
 
 
-@compiled
+@cached_njit
 def _lower_bound(rows: IntArray, stamps_ns: IntArray, begin: int, end: int, one: IntArray) -> int:
     """The first place in rows[begin:end] that does not come before a row."""
     place: int = begin + np.searchsorted(stamps_ns[begin:end], one[0])
@@ -183,7 +183,7 @@ def _lower_bound(rows: IntArray, stamps_ns: IntArray, begin: int, end: int, one:
     return place
 
 
-@compiled
+@cached_njit
 def _compared(one: IntArray, other: IntArray) -> int:
     """-1 when one row comes before the other, 1 when behind it, 0 when they are equal."""
     for k in range(_ORDER.size):
@@ -194,7 +194,7 @@ def _compared(one: IntArray, other: IntArray) -> int:
     return 0
 
 
-@compiled
+@cached_njit
 def _copy(target: IntArray, source: IntArray) -> None:
     for i in range(target.size):
         target[i] = source[i]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.se2_scalar import composed, wrap
 from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED, add_hidden_errors
@@ -68,7 +68,7 @@ def estimate_at(state: SwarmState, tracks: TrackArrays, timeout_s: FloatArray, n
     return estimate
 
 
-@compiled
+@cached_njit
 def _new_estimate(now_ns: int, robots: int) -> SwarmEstimate:
     """An estimate of so many robots, none of them located."""
     return SwarmEstimate(
@@ -81,7 +81,7 @@ def _new_estimate(now_ns: int, robots: int) -> SwarmEstimate:
     )
 
 
-@compiled
+@cached_njit
 def _write_all(belief: BeliefArrays, tracks: TrackArrays, timeout_s: FloatArray, out: SwarmEstimate) -> None:
     """Fill an estimate."""
     sample, scratch, t, error = new_sample(1), new_scratch(), np.empty(3), np.empty((3, 3))
@@ -105,7 +105,7 @@ def _write_all(belief: BeliefArrays, tracks: TrackArrays, timeout_s: FloatArray,
         out.map_to_odom[i, 2] = wrap(theta - raw[2])
 
 
-@inlined
+@inlined_njit
 def _status(integrity: IntegrityArrays, robot: int, silent: bool) -> int:
     """The status of a robot that is located."""
     if silent:
@@ -115,7 +115,7 @@ def _status(integrity: IntegrityArrays, robot: int, silent: bool) -> int:
     return _CONTRADICTED if is_contradicted(integrity, robot) else _TRACKED
 
 
-@inlined
+@inlined_njit
 def _pose_covariance(x: float, y: float, error: FloatArray, out: FloatArray) -> None:
     """Write the covariance (3, 3) of x, y, theta from that of the right-invariant error."""
     shear = (-y, x, 0.0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TypeVar
 
 from swarm_loc_estimator.common.arrays import IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 Stamps = TypeVar("Stamps", int, IntArray)
 
@@ -19,10 +19,10 @@ def end_of_period(stamp_ns: Stamps, period_ns: int) -> Stamps:
     return -(-stamp_ns // period_ns) * period_ns
 
 
-_end_of_period = compiled(end_of_period)
+_end_of_period = cached_njit(end_of_period)
 
 
-@compiled
+@cached_njit
 def middle_of_period(stamp_ns: int, period_ns: int) -> int:
     """The instant to which robots are predicted for all measurements of the period of a stamp.
 

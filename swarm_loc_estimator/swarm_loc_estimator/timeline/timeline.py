@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.timeline.buffer import MeasurementBuffer
@@ -247,7 +247,7 @@ class Timeline:
         self._buffer.drop_first(passed)
 
 
-@compiled
+@cached_njit
 def _first_touched(
     stamps_ns: NDArray[np.int64],
     observers: NDArray[np.int64],

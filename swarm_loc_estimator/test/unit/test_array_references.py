@@ -12,7 +12,7 @@ from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]
 from numba.core.runtime.nrt import rtsys
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import borrowing, inlined
+from swarm_loc_estimator.common.jit import inlined_njit, norefcount_njit
 from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
 from swarm_loc_estimator.timeline import fusion
 from swarm_loc_estimator.timeline.estimator import SwarmEstimator
@@ -62,7 +62,7 @@ def test_solving_pairs_leaves_no_array_behind(element_sigma: float) -> None:
     assert counts[0] == counts[1] == counts[2]
 
 
-@pytest.mark.parametrize("borrow", [borrowing, inlined])
+@pytest.mark.parametrize("borrow", [norefcount_njit, inlined_njit])
 def test_what_borrows_arrays_returns_none(borrow: Callable[[Callable[..., object]], object]) -> None:
     def view(array: FloatArray) -> FloatArray:
         return array[:1]

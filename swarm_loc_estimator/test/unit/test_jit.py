@@ -1,103 +1,126 @@
-"""The cache of compiled code: used again, and never for other sources than those it was made of."""
+"""The cache of compiled code: found again wherever the sources lie, and never used for other code."""
 
-import fcntl
+from __future__ import annotations
+
 import os
+import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
 
-USED = """
-from swarm_loc_estimator.common.jit import compiled
+import pytest
 
-@compiled
-def factor() -> float:
-    return {factor}
+USED = """
+from typing import NamedTuple
+from swarm_loc_estimator.common import jit as tool
+
+FACTOR = 1.5
+OFFSETS = (0.0, 0.25)
+
+class Record(NamedTuple):
+    low: float
+    high: float
+
+@tool.cached_njit
+def factor(record: Record) -> float:
+    \"\"\"The factor.\"\"\"
+    return FACTOR * record.low + OFFSETS[0]
 """
 USING = """
-from pathlib import Path
-from swarm_loc_estimator.common.jit import compiled, is_warm, note_warm
-from used import factor
+import used
+from swarm_loc_estimator.common.jit import cached_njit, is_precompiled, note_precompiled
 
-@compiled
-def doubled() -> float:
-    return 2.0 * factor()
+@cached_njit
+def doubled(record: used.Record) -> float:
+    return 2.0 * used.factor(record)
 
-here = Path(__file__)
-print(is_warm(here), doubled(), sum(doubled.stats.cache_hits.values()))
-note_warm(here)
+def precompile() -> None:
+    doubled(used.Record(1.0, 3.0))
+
+was = is_precompiled(precompile)
+print(was, doubled(used.Record(1.0, 3.0)), sum(doubled.stats.cache_hits.values()))
+note_precompiled(precompile)
 """
 
 
-def run(folder: Path, cache: Path) -> list[str]:
+def run(folder: Path, cache: Path, used: str = USED) -> list[str]:
+    folder.mkdir(exist_ok=True)
+    (folder / "used.py").write_text(used, encoding="utf-8")
+    (folder / "using.py").write_text(USING, encoding="utf-8")
     env = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
     # Without byte code: Python takes that of a source of the same second and size for its own.
     command = [sys.executable, "-B", str(folder / "using.py")]
     return subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout.split()
 
 
-def test_a_change_in_another_file_is_noticed(tmp_path: Path) -> None:
-    (tmp_path / "using.py").write_text(USING, encoding="utf-8")
-    said = []
-    for factor in ("1.5", "1.5", "2.5"):
-        (tmp_path / "used.py").write_text(USED.format(factor=factor), encoding="utf-8")
-        said.append(run(tmp_path, tmp_path / "cache"))
-    assert said == [["False", "3.0", "0"], ["True", "3.0", "1"], ["False", "5.0", "0"]]
+@pytest.fixture
+def cache(tmp_path: Path) -> Path:
+    """A cache in which the code of `USED` has been compiled."""
+    assert run(tmp_path / "first", tmp_path / "cache") == ["False", "3.0", "0"]
+    return tmp_path / "cache"
 
 
-def test_caches_of_sources_long_gone_are_deleted(tmp_path: Path) -> None:
-    (tmp_path / "using.py").write_text(USING, encoding="utf-8")
-    (tmp_path / "used.py").write_text(USED.format(factor="1.5"), encoding="utf-8")
-    cache = tmp_path / "cache" / "swarm_loc_estimator"
+def test_code_is_found_again_in_another_folder_and_in_a_copy_of_the_cache(
+    tmp_path: Path, cache: Path
+) -> None:
+    assert run(tmp_path / "another clone", cache)[1:] == ["3.0", "1"]
+    copy = shutil.copytree(cache, tmp_path / "copy")
+    assert run(tmp_path / "first", copy)[1:] == ["3.0", "1"]
+
+
+def test_docstrings_comments_and_lines_do_not_matter(tmp_path: Path, cache: Path) -> None:
+    changed = "# a comment\n\n" + USED.replace("The factor.", "What a record is scaled by.")
+    assert run(tmp_path / "first", cache, changed)[1:] == ["3.0", "1"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "result"),
+    [
+        ("FACTOR = 1.5", "FACTOR = 2.5", "5.0"),
+        ("FACTOR = 1.5", "FACTOR = 2", "4.0"),
+        ("(0.0, 0.25)", "(0.25, 0.0)", "3.5"),
+        ("+ OFFSETS[0]", "- OFFSETS[1]", "2.5"),
+        ("    low: float\n    high: float", "    high: float\n    low: float", "9.0"),
+        ("tool.cached_njit", "tool.reassociated_njit", "3.0"),
+    ],
+)
+def test_a_change_of_what_is_called_is_noticed(
+    tmp_path: Path, cache: Path, old: str, new: str, result: str
+) -> None:
+    assert old in USED
+    assert run(tmp_path / "first", cache, USED.replace(old, new)) == ["False", result, "0"]
+
+
+def test_a_file_that_was_cut_off_is_compiled_again(tmp_path: Path, cache: Path) -> None:
+    for file in cache.rglob("*.nbc"):
+        file.write_bytes(file.read_bytes()[:100])
+    assert run(tmp_path / "first", cache)[1:] == ["3.0", "0"]
+    assert run(tmp_path / "first", cache)[1:] == ["3.0", "1"]
+
+
+def test_processes_that_compile_at_once_leave_whole_files(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    run(tmp_path / "first", tmp_path / "other cache")
+    env = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+    command = [sys.executable, "-B", str(tmp_path / "first" / "using.py")]
+    together = [subprocess.Popen(command, env=env, stdout=subprocess.PIPE, text=True) for _ in range(4)]
+    assert {process.communicate()[0].split()[1] for process in together} == {"3.0"}
+    assert [process.returncode for process in together] == [0] * 4
+    assert not [*cache.rglob("*.tmp")]
+    assert run(tmp_path / "first", cache)[1:] == ["3.0", "1"]
+
+
+def test_code_that_nobody_has_used_for_a_month_is_deleted(tmp_path: Path, cache: Path) -> None:
+    folder = cache / "swarm_loc_estimator"
     for name, age_s in (("old", 31 * 86400.0), ("recent", 29 * 86400.0)):
-        (cache / name / "source").mkdir(parents=True)
-        (cache / name / "source" / "code.nbc").touch()
-        os.utime(cache / name, times=(0.0, time.time() - age_s))
-    run(tmp_path, tmp_path / "cache")
-    assert not (cache / "old").exists()
-    assert (cache / "recent" / "source" / "code.nbc").exists()
-    (own,) = (one for one in cache.iterdir() if (one / "warm").exists())
-    os.utime(own, times=(0.0, 0.0))
-    assert run(tmp_path, tmp_path / "cache")[0] == "True"  # in use, however old
-    assert own.stat().st_mtime > time.time() - 86400.0
-
-
-SAVING = """
-from pathlib import Path
-from swarm_loc_estimator.common.jit import _cache_folder, compiled
-
-@compiled
-def one() -> float:
-    return 1.0
-
-print(_cache_folder(Path(__file__)), flush=True)
-input()
-print(one())
-"""
-
-
-def test_what_is_compiled_is_saved_by_one_process_at_a_time(tmp_path: Path) -> None:
-    (tmp_path / "saving.py").write_text(SAVING, encoding="utf-8")
-    env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    command = [sys.executable, str(tmp_path / "saving.py")]
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, env=env, stdin=pipe, stdout=pipe, text=True) as process:
-        assert process.stdout is not None
-        folder = Path(process.stdout.readline().strip())
-        folder.mkdir(parents=True, exist_ok=True)
-        with (folder / "lock").open("a") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            assert process.stdin is not None
-            process.stdin.write("\n")
-            process.stdin.flush()
-            while not waits_for_a_lock(process.pid):
-                assert process.poll() is None
-                time.sleep(0.01)
-            assert not [*folder.rglob("*.nbi")]
-        assert process.communicate()[0] == "1.0\n"
-    assert [*folder.rglob("*.nbi")]
-
-
-def waits_for_a_lock(pid: int) -> bool:
-    lines = Path("/proc/locks").read_text(encoding="utf-8").splitlines()
-    return any("->" in line and str(pid) in line.split() for line in lines)
+        (folder / f"{name}.nbc").touch()
+        os.utime(folder / f"{name}.nbc", times=(0.0, time.time() - age_s))
+    own = {file for file in folder.iterdir() if file.stem not in {"old", "recent"}}
+    for file in own:
+        os.utime(file, times=(0.0, time.time() - 40 * 86400.0))
+    used = [file for file in own if file.name.startswith(("doubled", "precompiled"))]
+    assert run(tmp_path / "first", cache)[2] == "1"
+    assert not (folder / "old.nbc").exists()
+    assert (folder / "recent.nbc").exists()
+    assert all(file.stat().st_mtime > time.time() - 86400.0 for file in used)

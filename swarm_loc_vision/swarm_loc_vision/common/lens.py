@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 LENS_KIND, FX, FY, CX, CY, K1, K2, P1, P2, K3, K4, K5, K6 = range(13)
 LENS_SIZE = 13
@@ -18,7 +18,7 @@ STRAIGHT, RADIAL, FISHEYE = 0.0, 1.0, 2.0
 """Kinds: no distortion; plumb_bob and rational_polynomial; equidistant with K1, K2, K3, K4."""
 
 
-@compiled
+@cached_njit
 def distorted(lens: FloatArray, x: float, y: float) -> tuple[float, float]:
     """The direction (x, y, 1) as the lens bends it."""
     if lens[LENS_KIND] == STRAIGHT:
@@ -40,7 +40,7 @@ def distorted(lens: FloatArray, x: float, y: float) -> tuple[float, float]:
     return bent_x, bent_y
 
 
-@compiled
+@cached_njit
 def raw_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
     """Where the raw image shows an ideal pixel, one of an image without distortion."""
     if lens[LENS_KIND] == STRAIGHT:
@@ -49,7 +49,7 @@ def raw_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
     return lens[CX] + lens[FX] * x, lens[CY] + lens[FY] * y
 
 
-@compiled
+@cached_njit
 def raw_pixels(lens: FloatArray, pixels: FloatArray) -> FloatArray:
     """(N, 2) raw pixels of ideal ones."""
     raw = np.empty_like(pixels)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.common.lens import raw_pixel
 
 Gray = NDArray[np.uint8]
@@ -28,7 +28,7 @@ _MIN_CLEAR_CELL_PX = 4.5
 """Cells narrower than this do not all reach the brightness of ink and paper."""
 
 
-@compiled
+@cached_njit
 def _brightness(image: Gray, u: float, v: float) -> float:
     """Brightness at a raw pixel inside the image, bilinear."""
     i, j = int(u), int(v)
@@ -38,13 +38,13 @@ def _brightness(image: Gray, u: float, v: float) -> float:
     return float(upper + b * (lower - upper))
 
 
-@compiled
+@cached_njit
 def _is_inside(image: Gray, u: float, v: float) -> bool:
     """Whether `_brightness` may be asked; not where a number is not one."""
     return bool(0.0 <= u < image.shape[1] - 1 and 0.0 <= v < image.shape[0] - 1)
 
 
-@compiled
+@cached_njit
 def profile_crossings(
     image: Gray,
     lens: FloatArray,
@@ -107,7 +107,7 @@ def profile_crossings(
                         crossings[n, k, m, 2] = 0.0
 
 
-@compiled
+@cached_njit
 def _common_level(contrasts: FloatArray, dark: FloatArray, light: FloatArray) -> float:
     """The middle level of the clearest quarter of a small marker's profiles.
 
@@ -127,7 +127,7 @@ def _common_level(contrasts: FloatArray, dark: FloatArray, light: FloatArray) ->
     return float(0.5 * (darkest + np.sort(all_light[:count])[count - quarter :].mean()))
 
 
-@compiled
+@cached_njit
 def _profile(image: Gray, u: float, v: float, du: float, dv: float, half: int, profile: FloatArray) -> bool:
     """Brightness along 2 half + 1 points around a raw pixel; False when they leave the image."""
     du, dv = _STEP_PX * du, _STEP_PX * dv
@@ -139,7 +139,7 @@ def _profile(image: Gray, u: float, v: float, du: float, dv: float, half: int, p
     return True
 
 
-@compiled
+@cached_njit
 def _extremes(profile: FloatArray, half: int) -> tuple[float, float]:
     """The darkest inner and the lightest outer brightness of a profile (2 half + 1,)."""
     dark, light = profile[half], profile[half]
@@ -149,7 +149,7 @@ def _extremes(profile: FloatArray, half: int) -> tuple[float, float]:
     return dark, light
 
 
-@compiled
+@cached_njit
 def _crossing(profile: FloatArray, half: int, level: float) -> tuple[float, bool]:
     """Where a profile (2 half + 1,) rises through a level next to its centre [steps], and whether it does."""
     best, found = 0.0, False
@@ -162,7 +162,7 @@ def _crossing(profile: FloatArray, half: int, level: float) -> tuple[float, bool
     return best, found
 
 
-@compiled
+@cached_njit
 def read_cells(image: Gray, lens: FloatArray, homographies: FloatArray, side: int, cells: FloatArray) -> None:
     """Mean brightness in the middle of cells.
 
@@ -194,7 +194,7 @@ def read_cells(image: Gray, lens: FloatArray, homographies: FloatArray, side: in
                 cells[n, row, column] = total / (points * points)
 
 
-@compiled
+@cached_njit
 def _points_per_cell(h: FloatArray, side: int) -> tuple[int, float]:
     """Points along a cell's side, and their distance [cells]; one where a pixel is half a cell."""
     w = 0.5 * (h[2, 0] + h[2, 1]) + h[2, 2]

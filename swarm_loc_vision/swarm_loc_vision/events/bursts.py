@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.events.settings import MAX_SOURCES, LightSource, TrackerSettings
 
 _LONG_AGO_NS = -(1 << 62)
@@ -84,7 +84,7 @@ class BurstMatcher:
         return Hits(source, hit_x, hit_y, times[:count], begins[:count])
 
 
-@compiled
+@cached_njit
 def _match(
     events: tuple[NDArray[np.uint16], NDArray[np.uint16], BoolArray, IntArray],
     lights: tuple[IntArray, BoolArray, IntArray],
@@ -113,7 +113,7 @@ def _match(
     return count
 
 
-@compiled
+@cached_njit
 def _light(elapsed: int, above: bool, periods: IntArray, is_above: BoolArray, gate: int) -> int:
     """The light of a half of the image whose period is nearest to a time between bursts; -1: none."""
     nearest, found = gate, -1

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.events.bursts import Hits
 from swarm_loc_vision.events.settings import LightSource, Sighting, TrackerSettings
 
@@ -71,7 +71,7 @@ def _without_echoes(sightings: list[Sighting], radius: float) -> list[Sighting]:
     ]
 
 
-@compiled
+@cached_njit
 def _locate(
     hits: Hits, density: NDArray[np.int32], radius: float, min_events: int, moments: FloatArray
 ) -> None:
@@ -96,7 +96,7 @@ def _locate(
             _centre(hits, near[:count], peak[source], radius, moments[source])
 
 
-@compiled
+@cached_njit
 def _near(hits: Hits, source: int, peak: IntArray, reach: float, near: IntArray) -> int:
     """Fill the indices of the events of a light around its peak; how many they are."""
     count = 0
@@ -109,7 +109,7 @@ def _near(hits: Hits, source: int, peak: IntArray, reach: float, near: IntArray)
     return count
 
 
-@compiled
+@cached_njit
 def _centre(hits: Hits, near: IntArray, peak: IntArray, radius: float, row: FloatArray) -> None:
     """Centre of the events within a radius of itself."""
     u, v = float(peak[1]), float(peak[2])

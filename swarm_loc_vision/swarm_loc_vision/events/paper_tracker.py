@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.events.centroid_tracker import CentroidTracker
 from swarm_loc_vision.events.settings import LightSource, Sighting, TrackerSettings
 from swarm_loc_vision.events.windows import WindowedTracker
@@ -117,7 +117,7 @@ class PaperTracker(WindowedTracker):
         return found
 
 
-@compiled
+@cached_njit
 def _pull(
     events: tuple[NDArray[np.uint16], NDArray[np.uint16], BoolArray, IntArray],
     lights: tuple[IntArray, BoolArray, FloatArray],

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.common.sampling import GRID
 from swarm_loc_vision.markers.families import BITS, CELLS, Family, rotated, unpacked
 
@@ -107,7 +107,7 @@ def correctable_bits(words: int) -> int:
     return bits
 
 
-@compiled
+@cached_njit
 def _read(
     cells: FloatArray, words: Words, min_contrast: float, correctable: float, readings: Readings
 ) -> None:
@@ -138,7 +138,7 @@ def _read(
             break
 
 
-@compiled
+@cached_njit
 def _flatten(cells: FloatArray, sharp: FloatArray) -> float:
     """Write sharpened brightness above what is dark, (GRID - 2, GRID - 2); that of light, 0 if there is none.
 
@@ -185,7 +185,7 @@ def _flatten(cells: FloatArray, sharp: FloatArray) -> float:
     return high if (abs(by_x) + abs(by_y)) * (GRID - 3) <= _MAX_SLOPE * high else 0.0
 
 
-@compiled
+@cached_njit
 def _clear_cells(flat: FloatArray, light: float, level: float, clear: FloatArray) -> bool:
     """From brightness to -1 (dark) ... 1 (light), in `clear`; whether the border is dark.
 
@@ -203,7 +203,7 @@ def _clear_cells(flat: FloatArray, light: float, level: float, clear: FloatArray
     return wrong <= _MAX_DARK_ERRORS
 
 
-@compiled
+@cached_njit
 def nearest(
     words: Words, seen: np.uint64, clear: FloatArray, bits: NDArray[np.uint8]
 ) -> tuple[int, float, float]:
@@ -242,7 +242,7 @@ def nearest(
     return best, distance, runner_up
 
 
-@compiled
+@cached_njit
 def _bits_set(x: np.uint64) -> np.uint8:
     """Number of ones, by shifts and sums, which the compiler turns into vectors."""
     x -= (x >> np.uint64(1)) & np.uint64(0x5555555555555555)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.common.sampling import MAX_PROFILES, profile_crossings
 from swarm_loc_vision.markers.families import CELLS
 from swarm_loc_vision.markers.side_pixels import side_pixels
@@ -97,7 +97,7 @@ def _narrower(lengths: FloatArray) -> FloatArray:
     return narrower
 
 
-@compiled
+@cached_njit
 def _fit(
     crossings: FloatArray,
     widths: FloatArray,
@@ -121,7 +121,7 @@ def _fit(
             covariance[n, j, j] = line[2] + length * (2.0 * line[3] + length * line[4])
 
 
-@compiled
+@cached_njit
 def _fit_line(crossings: FloatArray, min_variance: float, line: FloatArray) -> float:
     """Least squares, twice: the second time without what lies far off the first line.
 
@@ -169,7 +169,7 @@ def _fit_line(crossings: FloatArray, min_variance: float, line: FloatArray) -> f
     return mean_contrast
 
 
-@compiled
+@cached_njit
 def _intersect(
     corners: FloatArray, ends: FloatArray, of_ends: FloatArray, covariance: FloatArray, contrast: FloatArray
 ) -> None:
@@ -192,7 +192,7 @@ def _intersect(
             contrast[n] = 0.0
 
 
-@compiled
+@cached_njit
 def _meet(corners: FloatArray, ends: FloatArray, moved: FloatArray, jacobian: FloatArray) -> bool:
     """Where the lines along the sides of one quadrangle meet.
 

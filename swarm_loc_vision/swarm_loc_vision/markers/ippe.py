@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 
 def two_starts(
@@ -34,7 +34,7 @@ def two_starts(
     return rotation, position
 
 
-@compiled
+@cached_njit
 def _start(
     points: FloatArray,
     directions: FloatArray,
@@ -53,7 +53,7 @@ def _start(
             _place(points[n], directions[n], rotation[n, s], position[n, s])
 
 
-@compiled
+@cached_njit
 def _ippe(directions: FloatArray, first: FloatArray, second: FloatArray) -> bool:
     """The two rotations (3, 3) of a square, from the directions (4, 2) of its corners at distance 1."""
     # The homography from the square with corners (-1, 1), (1, 1), (1, -1), (-1, -1).
@@ -99,7 +99,7 @@ def _ippe(directions: FloatArray, first: FloatArray, second: FloatArray) -> bool
     return True
 
 
-@compiled
+@cached_njit
 def _turned(
     sight: FloatArray,
     x0: float,
@@ -118,7 +118,7 @@ def _turned(
         rotation[i, 2] = sight[i, 0] * z0 + sight[i, 1] * z1 + sight[i, 2] * z2
 
 
-@compiled
+@cached_njit
 def _set_upright(rotation: FloatArray, up: FloatArray) -> None:
     """Turn a marker's y axis up, with its z axis as it was but level."""
     along = 0.0
@@ -139,7 +139,7 @@ def _set_upright(rotation: FloatArray, up: FloatArray) -> None:
         rotation[i, 0] = rotation[j, 1] * rotation[k, 2] - rotation[k, 1] * rotation[j, 2]
 
 
-@compiled
+@cached_njit
 def _place(points: FloatArray, directions: FloatArray, rotation: FloatArray, position: FloatArray) -> None:
     """Where a turned body must be, by linear least squares."""
     n, sx, sy, sr = 0.0, 0.0, 0.0, 0.0

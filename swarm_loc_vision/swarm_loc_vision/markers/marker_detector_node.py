@@ -14,14 +14,14 @@ from typing import Any
 
 from rclpy.qos import QoSProfile
 
-from swarm_loc_estimator.common.jit import is_warm
+from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.ros.running import run_node
 from swarm_loc_msgs.msg import MarkerDetectionArray
 from swarm_loc_vision.common.camera_node import CameraNode
 from swarm_loc_vision.common.transports import TRANSPORTS
 from swarm_loc_vision.markers.camera_detector import CameraDetector
 from swarm_loc_vision.markers.detector_parameters import DetectorParameters, detector_maker
-from swarm_loc_vision.markers.precompile import WARM_UP, warm_up
+from swarm_loc_vision.markers.precompile import precompile
 
 _MAX_MISFIT_SHARE = 0.1
 """Of the markers since the last diagnostics; if more fit no square the camera is not the calibrated one."""
@@ -34,9 +34,9 @@ class MarkerDetectorNode(CameraNode[DetectorParameters]):
         super().__init__("marker_detector", DetectorParameters, **node_arguments)
         parameters = self.chosen
         create_detector = detector_maker(parameters)
-        if not is_warm(WARM_UP):
+        if not is_precompiled(precompile):
             self.get_logger().info("compiling the detector for this machine: about half a minute")
-        warm_up()
+        precompile()
         gray_of = TRANSPORTS[parameters.image_transport].gray_of
         self._camera = CameraDetector(create_detector, gray_of, parameters.settings.ambiguity)
         self._told = (0, 0)  # markers and misfits

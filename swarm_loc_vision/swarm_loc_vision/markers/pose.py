@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.markers.ippe import two_starts
 
 _ROUNDS = 12
@@ -187,7 +187,7 @@ def _tilt(upright: Upright | None) -> tuple[FloatArray, float]:
     return np.ascontiguousarray(known.up, float), 1.0 / known.tilt_sigma**2
 
 
-@compiled
+@cached_njit
 def _refine_markers(
     points: FloatArray,
     corners: FloatArray,
@@ -207,7 +207,7 @@ def _refine_markers(
                 chi2[n, s] = _refine(sight, rotation[n, s], position[n, s], covariance[n, s])
 
 
-@compiled
+@cached_njit
 def _refine(sight: _Sight, rotation: FloatArray, position: FloatArray, covariance: FloatArray) -> float:
     """Weighted least squares on corners and tilt, Levenberg and Marquardt.
 
@@ -259,7 +259,7 @@ def _refine(sight: _Sight, rotation: FloatArray, position: FloatArray, covarianc
     return cost
 
 
-@compiled
+@cached_njit
 def _equations(
     sight: _Sight, rotation: FloatArray, position: FloatArray, normal: FloatArray, slope: FloatArray
 ) -> float:
@@ -309,7 +309,7 @@ def _equations(
     return cost
 
 
-@compiled
+@cached_njit
 def _add_tilt(sight: _Sight, rotation: FloatArray, normal: FloatArray, slope: FloatArray) -> float:
     """Add that a body's axis points up: their cross product is zero but for the tilt."""
     axis, up, tilt_weight = sight.axis, sight.up, sight.tilt_weight
@@ -332,7 +332,7 @@ def _add_tilt(sight: _Sight, rotation: FloatArray, normal: FloatArray, slope: Fl
     return cost
 
 
-@compiled
+@cached_njit
 def _factorized(normal: FloatArray, damping: float, factor: FloatArray) -> bool:
     """Lower Cholesky factor (6, 6) of a matrix whose diagonal is raised by a share; False: not positive."""
     for i in range(6):
@@ -349,7 +349,7 @@ def _factorized(normal: FloatArray, damping: float, factor: FloatArray) -> bool:
     return True
 
 
-@compiled
+@cached_njit
 def _solved(factor: FloatArray, right: FloatArray, x: FloatArray) -> None:
     """Solve with a Cholesky factor (6, 6)."""
     for i in range(6):
@@ -363,7 +363,7 @@ def _solved(factor: FloatArray, right: FloatArray, x: FloatArray) -> None:
         x[i] /= factor[i, i]
 
 
-@compiled
+@cached_njit
 def _rotated(rotation: FloatArray, step: FloatArray, result: FloatArray) -> None:
     """Exp of the last three elements of a step, times a rotation (Rodrigues)."""
     x, y, z = step[3], step[4], step[5]

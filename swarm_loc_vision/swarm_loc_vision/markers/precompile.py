@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
-from swarm_loc_estimator.common.jit import note_warm
+from swarm_loc_estimator.common.jit import note_precompiled
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.bodies import Placement
 from swarm_loc_vision.markers.detector import MarkerDetector
@@ -14,11 +12,8 @@ from swarm_loc_vision.markers.detector_settings import DetectorSettings
 from swarm_loc_vision.markers.draw import draw_marker
 from swarm_loc_vision.markers.families import family_named
 
-WARM_UP = Path(__file__)
-"""What all compiled code that this module imports is remembered by, see `is_warm`."""
 
-
-def warm_up() -> None:
+def precompile() -> None:
     """Let a detector find two markers of one body, which takes every path through the compiled code."""
     family = family_named("artoolkit_bch_thin")
     image = np.hstack([draw_marker(family, marker_id, margin=4) for marker_id in (1, 2)])
@@ -29,4 +24,4 @@ def warm_up() -> None:
     up = np.array([0.0, -1.0, 0.0])
     settings = DetectorSettings(tilt_sigma=0.1)
     MarkerDetector(settings, [(family, np.array([1, 2]))], camera, up=up, bodies=[body]).detect(image)
-    note_warm(WARM_UP)
+    note_precompiled(precompile)

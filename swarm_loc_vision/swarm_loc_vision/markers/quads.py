@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 Gray = NDArray[np.uint8]
 IntArray = NDArray[np.int32]
@@ -120,7 +120,7 @@ def _quads(dark: NDArray[np.uint8], min_side: float) -> FloatArray:
     return _follow(dark.reshape(-1), dark.view(np.uint64), ahead, min_side, points)
 
 
-@compiled
+@cached_njit
 def _follow(
     dark: NDArray[np.uint8],
     eights: NDArray[np.uint64],
@@ -169,7 +169,7 @@ def _follow(
     return quads[:count]
 
 
-@compiled
+@cached_njit
 def _outline(dark: NDArray[np.uint8], ahead: NDArray[np.int64], start: int, points: IntArray) -> int:
     """Follow the outline through a dark pixel that is light to its left.
 
@@ -204,7 +204,7 @@ def _outline(dark: NDArray[np.uint8], ahead: NDArray[np.int64], start: int, poin
         here, back = there, (direction + 4) & 7
 
 
-@compiled
+@cached_njit
 def _quadrangle(points: IntArray, length: int, min_side: float, quad: FloatArray) -> bool:
     """Whether an outline is a quadrangle around something dark; its corners into `quad`."""
     twice_area = 0
@@ -221,7 +221,7 @@ def _quadrangle(points: IntArray, length: int, min_side: float, quad: FloatArray
     return _sides(points, length, corners, min_side, quad)
 
 
-@compiled
+@cached_njit
 def _corner_points(points: IntArray, length: int, corners: NDArray[np.int64]) -> float:
     """Indices of the four points of an outline that span the largest quadrangle, ascending; its area."""
     mean_u, mean_v = 0.0, 0.0
@@ -254,7 +254,7 @@ def _corner_points(points: IntArray, length: int, corners: NDArray[np.int64]) ->
     return -0.5 * twice
 
 
-@compiled
+@cached_njit
 def _farthest(points: IntArray, length: int, begin: int, end: int) -> int:
     """Index of the point farthest outside the chord between two points, on the way from one to the other."""
     du = points[end, 0] - points[begin, 0]
@@ -269,7 +269,7 @@ def _farthest(points: IntArray, length: int, begin: int, end: int) -> int:
     return best
 
 
-@compiled
+@cached_njit
 def _sides(
     points: IntArray, length: int, corners: NDArray[np.int64], min_side: float, quad: FloatArray
 ) -> bool:

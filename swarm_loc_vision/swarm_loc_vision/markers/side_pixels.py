@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.common.homographies import homographies
 from swarm_loc_vision.common.lens import raw_pixels
 
@@ -92,7 +92,7 @@ def _nodes(quads: FloatArray) -> FloatArray:
     return points + steps[:, None] * outwards[:, :, None]
 
 
-@compiled
+@cached_njit
 def _collect(
     image: Gray, quads: FloatArray, planes: FloatArray, shifts: FloatArray, border: int, found: SidePixels
 ) -> None:
@@ -108,7 +108,7 @@ def _collect(
                 _collect_side(image, n, k, warp, back, size, found)
 
 
-@compiled
+@cached_njit
 def _set_frame(
     quad: FloatArray, plane: FloatArray, k: int, border: int, frame: FloatArray, boundaries: FloatArray
 ) -> None:
@@ -137,7 +137,7 @@ def _set_frame(
     frame[SHEAR] = (at_deep - at_shallow) / (deep - shallow)
 
 
-@compiled
+@cached_njit
 def _place(h: FloatArray, k: int, along: float, depth: float) -> tuple[float, float]:
     """Ideal pixel of a point of a marker, given along side k and inwards from it."""
     x, y = along, depth
@@ -151,7 +151,7 @@ def _place(h: FloatArray, k: int, along: float, depth: float) -> tuple[float, fl
     return (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
 
 
-@compiled
+@cached_njit
 def _set_warp(shifts: FloatArray, warp: FloatArray) -> None:
     """Factors (6, 2) of 1 s s2 d ds ds2 in the shift, s 0 to 1 along the side, d outside it [px]."""
     for axis in range(2):
@@ -164,7 +164,7 @@ def _set_warp(shifts: FloatArray, warp: FloatArray) -> None:
             warp[3 + i, axis] -= warp[i, axis]
 
 
-@compiled
+@cached_njit
 def _shift(warp: FloatArray, axis: int, s: float, d: float) -> float:
     """The polynomial of `_set_warp`."""
     on_line = warp[0, axis] + s * (warp[1, axis] + s * warp[2, axis])
@@ -172,7 +172,7 @@ def _shift(warp: FloatArray, axis: int, s: float, d: float) -> float:
     return float(on_line + d * across)
 
 
-@compiled
+@cached_njit
 def _set_way_back(warp: FloatArray, frame: FloatArray, back: FloatArray) -> bool:
     """Fill the inverse (2, 2) of how pixels go along and outside the middle of a side, if there is any."""
     du, dv, length = frame[DU], frame[DV], frame[LENGTH]
@@ -187,7 +187,7 @@ def _set_way_back(warp: FloatArray, frame: FloatArray, back: FloatArray) -> bool
     return True
 
 
-@compiled
+@cached_njit
 def _collect_side(
     image: Gray, n: int, k: int, warp: FloatArray, back: FloatArray, size: float, found: SidePixels
 ) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.markers.side_pixels import (
     DU,
     DV,
@@ -82,7 +82,7 @@ class _Work(NamedTuple):
     gaps: FloatArray
 
 
-@compiled
+@cached_njit
 def fit_sides(
     pixels: SidePixels,
     strips: Bits,
@@ -115,7 +115,7 @@ def fit_sides(
             covariance[n] = work.normal[:_ENDS, :_ENDS]
 
 
-@compiled
+@cached_njit
 def _fit(pixels: SidePixels, n: int, strips: Bits, border: int, work: _Work) -> float:
     """Fit one marker; the contrast, 0: in vain. `work.normal` becomes the covariance of all parameters."""
     p = work.p
@@ -146,7 +146,7 @@ def _fit(pixels: SidePixels, n: int, strips: Bits, border: int, work: _Work) -> 
     return float(p[_CONTRAST])
 
 
-@compiled
+@cached_njit
 def _add_doubts(frames: FloatArray, border: int, work: _Work) -> None:
     """Add to the covariance of the ends what the model leaves out.
 
@@ -162,7 +162,7 @@ def _add_doubts(frames: FloatArray, border: int, work: _Work) -> None:
                 work.normal[i, j] += together
 
 
-@compiled
+@cached_njit
 def _set_gaps(pixels: SidePixels, n: int, strips: Bits, border: int, noise: float, work: _Work) -> None:
     """By how much more than by chance white cells behind the border stand aside, in `work.gaps` [px].
 
@@ -196,7 +196,7 @@ def _set_gaps(pixels: SidePixels, n: int, strips: Bits, border: int, noise: floa
             work.gaps[k] = reach * max(abs(work.gaps[k] / counts[k]) - by_chance, 0.0)
 
 
-@compiled
+@cached_njit
 def _inner_reach(frame: FloatArray, border: int, across: float) -> float:
     """How far from where the border ends pixels tell of it, 0 where too much else is near [px]."""
     cell = min(frame[NEAR], frame[FAR]) / border
@@ -204,7 +204,7 @@ def _inner_reach(frame: FloatArray, border: int, across: float) -> float:
     return reach if reach > across else 0.0
 
 
-@compiled
+@cached_njit
 def _set_windows(frames: FloatArray, border: int, work: _Work) -> None:
     """For each side blur across and along, the window inside and outside, and next to its corners [px]."""
     p = work.p
@@ -221,7 +221,7 @@ def _set_windows(frames: FloatArray, border: int, work: _Work) -> None:
         work.windows[k, 4] = min(_CLEAR_OF_CORNERS * along + 0.5, 0.25 * frames[k, LENGTH])
 
 
-@compiled
+@cached_njit
 def _set_equations(
     pixels: SidePixels, n: int, strips: Bits, border: int, noise: float, work: _Work
 ) -> tuple[float, float]:
@@ -271,7 +271,7 @@ def _set_equations(
     return total, square
 
 
-@compiled
+@cached_njit
 def _white(a: float, along: float, strip: Bits, border: int, boundaries: FloatArray) -> float:
     """How white the cells behind the border are at a place along a side, blurred, 0 to 1."""
     white, before, last = 0.0, 0, strip.size - border
@@ -283,7 +283,7 @@ def _white(a: float, along: float, strip: Bits, border: int, boundaries: FloatAr
     return white
 
 
-@compiled
+@cached_njit
 def _profile(d: float, gap: float, across: float, white: float) -> tuple[float, float, float]:
     """Brightness, 0 (ink) to 1 (paper), at a place outside a line, its slope, and its change by log blur."""
     z, back = d / across, (d + gap) / across
@@ -291,7 +291,7 @@ def _profile(d: float, gap: float, across: float, white: float) -> tuple[float, 
     return _below(z) + white * _below(-back), (bell - inner) / across, back * inner - z * bell
 
 
-@compiled
+@cached_njit
 def _below(z: float) -> float:
     """The cumulative normal distribution, to 1e-6."""
     place = (z + _TABLE_END) * _TABLE_STEPS
@@ -301,7 +301,7 @@ def _below(z: float) -> float:
     return float(_NORMAL[i] + (place - i) * (_NORMAL[i + 1] - _NORMAL[i]))
 
 
-@compiled
+@cached_njit
 def _set_levels(work: _Work) -> bool:
     """Set dark and contrast, which were zero before, to what the first equations say, if they say any."""
     p, normal, gradient = work.p, work.normal, work.gradient
@@ -314,7 +314,7 @@ def _set_levels(work: _Work) -> bool:
     return bool(p[_CONTRAST] > 0.0)
 
 
-@compiled
+@cached_njit
 def _add_knowledge(noise: float, work: _Work) -> None:
     """Add what is known before the image is seen: about how wide blurs are, and that light is even."""
     p, normal, gradient = work.p, work.normal, work.gradient
@@ -328,7 +328,7 @@ def _add_knowledge(noise: float, work: _Work) -> None:
         gradient[i] += weight * ((0.0 if i == _BLUR_XY else _FIRST_BLUR) - p[i])
 
 
-@compiled
+@cached_njit
 def _advance(noise: float, work: _Work) -> float:
     """Go to the solution, but not too far at once; by how many standard deviations an end moved at most."""
     p, inverse = work.p, work.normal
@@ -351,7 +351,7 @@ def _advance(noise: float, work: _Work) -> float:
     return moved
 
 
-@compiled
+@cached_njit
 def _invert(matrix: FloatArray) -> bool:
     """Invert a positive definite matrix in place by Gauss and Jordan; False when it is not."""
     size = len(matrix)

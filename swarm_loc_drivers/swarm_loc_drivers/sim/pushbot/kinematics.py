@@ -14,7 +14,7 @@ import numpy as np
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan
 from swarm_loc_drivers.sim.pushbot.ray_casting import clearance, is_visible, ray_distance
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.readings import UNSEEN, LightSightings, Readings
 
@@ -209,7 +209,7 @@ class KinematicPushBot:
         return np.where(seen, pixels / FOCAL_BASELINE, UNSEEN)
 
 
-@compiled
+@cached_njit
 def _distances(walls: FloatArray, discs: FloatArray, poses: FloatArray) -> FloatArray:
     """Distances (n,) ahead of poses (n, 3), with other robots at (n, r, 2)."""
     out = np.zeros(len(poses))
@@ -218,7 +218,7 @@ def _distances(walls: FloatArray, discs: FloatArray, poses: FloatArray) -> Float
     return out
 
 
-@compiled
+@cached_njit
 def _free_steps(walls: FloatArray, discs: FloatArray, start: FloatArray, poses: FloatArray) -> int:
     """How many of the steps to poses (n, 3) a robot can make before it touches something."""
     before = clearance(walls, discs[0], BODY_RADIUS, start[0], start[1])
@@ -230,7 +230,7 @@ def _free_steps(walls: FloatArray, discs: FloatArray, start: FloatArray, poses: 
     return len(poses)
 
 
-@compiled
+@cached_njit
 def _seen_lights(walls: FloatArray, own: FloatArray, there: FloatArray) -> tuple[BoolArray, FloatArray]:
     """Whether each of (n, 3) poses sees a light of a robot at (n, 3), and its bearing.
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 _PARALLEL = 1e-12
 
 
-@compiled
+@cached_njit
 def wall_distance(walls: FloatArray, x: float, y: float, angle: float) -> float:
     """Distance [m] from a point to the first of walls (S, 4) along an angle [rad]; infinite without any."""
     cos, sin = math.cos(angle), math.sin(angle)
@@ -28,7 +28,7 @@ def wall_distance(walls: FloatArray, x: float, y: float, angle: float) -> float:
     return nearest
 
 
-@compiled
+@cached_njit
 def disc_distance(discs: FloatArray, radius: float, x: float, y: float, angle: float) -> float:
     """Distance [m] to the first of discs with centres (D, 2) along an angle; infinite without any."""
     cos, sin = math.cos(angle), math.sin(angle)
@@ -42,7 +42,7 @@ def disc_distance(discs: FloatArray, radius: float, x: float, y: float, angle: f
     return nearest
 
 
-@compiled
+@cached_njit
 def ray_distance(
     walls: FloatArray, discs: FloatArray, radius: float, x: float, y: float, angle: float
 ) -> float:
@@ -50,7 +50,7 @@ def ray_distance(
     return min(wall_distance(walls, x, y, angle), disc_distance(discs, radius, x, y, angle))
 
 
-@compiled
+@cached_njit
 def clearance(walls: FloatArray, discs: FloatArray, radius: float, x: float, y: float) -> float:
     """Distance [m] from a point to the nearest wall (S, 4) or rim of a disc with its centre among (D, 2)."""
     nearest = math.inf
@@ -65,7 +65,7 @@ def clearance(walls: FloatArray, discs: FloatArray, radius: float, x: float, y: 
     return nearest
 
 
-@compiled
+@cached_njit
 def is_visible(walls: FloatArray, ax: float, ay: float, bx: float, by: float) -> bool:
     """Whether no wall (S, 4) stands between two points."""
     distance = math.hypot(bx - ax, by - ay)

@@ -11,7 +11,7 @@ from swarm_loc_drivers.sim.pushbot import optics
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraEvents, CameraNoise, EventCamera, Spot
 from swarm_loc_drivers.sim.pushbot.ray_casting import is_visible, ray_distance
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 BODY_RADIUS_M = 0.07
 _MAX_SPOT_M = 5.0
@@ -132,7 +132,7 @@ def _corners(walls: FloatArray) -> FloatArray:
     return corners
 
 
-@compiled
+@cached_njit
 def _visible(walls: FloatArray, place: FloatArray, corners: FloatArray) -> BoolArray:
     """Which corners (n, 2) no wall hides from a place (2,)."""
     visible = np.zeros(len(corners), dtype=np.bool_)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 _NEAR = 0.004  # [m] in front of the camera; what is nearer is cut off
 CORNERS = 12  # a quadrangle cut by five planes has at most nine
 
 
-@compiled
+@cached_njit
 def _inside(plane: int, reach: float, point: FloatArray) -> float:
     """How far a point lies inside one of the five planes around what is drawn; negative outside."""
     x, y, z = float(point[0]), float(point[1]), float(point[2])
@@ -26,14 +26,14 @@ def _inside(plane: int, reach: float, point: FloatArray) -> float:
     return reach * z + y
 
 
-@compiled
+@cached_njit
 def _blend(target: FloatArray, here: FloatArray, there: FloatArray, share: float) -> None:
     """Write the point (3,) that lies `share` of the way from `here` to `there`."""
     for axis in range(3):
         target[axis] = here[axis] + share * (there[axis] - here[axis])
 
 
-@compiled
+@cached_njit
 def cut(polygon: FloatArray, count: int, spare: FloatArray, reach: float) -> int:
     """Cut a convex polygon, its first `count` rows, by the five planes; its new number of corners."""
     for plane in range(5):
@@ -61,7 +61,7 @@ def cut(polygon: FloatArray, count: int, spare: FloatArray, reach: float) -> int
     return count
 
 
-@compiled
+@cached_njit
 def move(rotation: FloatArray, shift: FloatArray, point: FloatArray, moved: FloatArray) -> None:
     """Rotate and shift a point (3,) into `moved`."""
     for axis in range(3):
@@ -70,7 +70,7 @@ def move(rotation: FloatArray, shift: FloatArray, point: FloatArray, moved: Floa
             moved[axis] += rotation[axis, k] * point[k]
 
 
-@compiled
+@cached_njit
 def ball_in_view(centre: FloatArray, radius: float, reach: float) -> bool:
     """Whether a ball touches what is drawn, in the optical frame."""
     slack = radius * math.sqrt(1.0 + reach * reach)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 Image = NDArray[np.float32]
 Changes = NDArray[np.float32]
@@ -41,7 +41,7 @@ def empty_box() -> FloatArray:
     return np.array([math.inf, math.inf, -math.inf, -math.inf])
 
 
-@compiled
+@cached_njit
 def _add_in_row(row: Changes, width: int, left: float, right: float, change: float) -> None:
     """A piece of boundary inside one row, from column `left` to `right` >= `left`."""
     if left >= width:
@@ -73,7 +73,7 @@ def _add_in_row(row: Changes, width: int, left: float, right: float, change: flo
     row[last] += change * (1.0 - before)
 
 
-@compiled
+@cached_njit
 def add_straight(changes: Changes, x0: float, y0: float, x1: float, y1: float, change: float) -> None:
     """A straight boundary between two points, counted in pixels from the corner of the first one."""
     if y1 < y0:
@@ -91,7 +91,7 @@ def add_straight(changes: Changes, x0: float, y0: float, x1: float, y1: float, c
         x = x_next
 
 
-@compiled
+@cached_njit
 def fill(image: Image, changes: Changes, before: float) -> None:
     """Sum changes up into an image that begins with `before` at the left; the changes become zero."""
     for line in range(image.shape[0]):
@@ -103,7 +103,7 @@ def fill(image: Image, changes: Changes, before: float) -> None:
             changes[line, column] = 0.0
 
 
-@compiled
+@cached_njit
 def lay_over(image: Image, layer: Layer) -> None:
     """Put a layer over an image; its changes become zero."""
     changes, covers, box = layer

@@ -13,7 +13,7 @@ import numpy as np
 from swarm_loc_drivers.sim.render.clipping import CORNERS, ball_in_view, cut, move
 from swarm_loc_drivers.sim.render.coverage import Changes, Layer, add_straight
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.common.lens import CX, CY, FX, FY, LENS_KIND, LENS_SIZE, STRAIGHT, distorted
 
 REACH = LENS_SIZE
@@ -47,7 +47,7 @@ class Patches(NamedTuple):
     normal: FloatArray
 
 
-@compiled
+@cached_njit
 def project(lens: FloatArray, x: float, y: float) -> tuple[float, float]:
     """Pixel of the direction (x, y, 1); beyond the lens' reach the image goes on straight."""
     radius = math.sqrt(x * x + y * y)
@@ -57,7 +57,7 @@ def project(lens: FloatArray, x: float, y: float) -> tuple[float, float]:
     return lens[FX] * (u + (x - a)) + lens[CX], lens[FY] * (v + (y - b)) + lens[CY]
 
 
-@compiled
+@cached_njit
 def _add_boundary(
     changes: Changes,
     lens: FloatArray,
@@ -90,7 +90,7 @@ def _add_boundary(
         u0, v0 = u, v
 
 
-@compiled
+@cached_njit
 def _in_view(
     patches: Patches, surface: int, rotation: FloatArray, shift: FloatArray, reach: float, spare: FloatArray
 ) -> bool:
@@ -108,7 +108,7 @@ def _in_view(
     return ball_in_view(spare[0], patches.radius[surface], reach)
 
 
-@compiled
+@cached_njit
 def draw(layer: Layer, patches: Patches, lens: FloatArray, motion: Motion, weight: float) -> None:
     """Note the boundaries of patches as a camera sees them during its exposure.
 

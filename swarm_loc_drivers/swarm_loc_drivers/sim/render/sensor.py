@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.sim.render.coverage import Image
 from swarm_loc_estimator.common.arrays import IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 
-@compiled
+@cached_njit
 def expose(
     image: Image,
     frame: NDArray[np.uint8],

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.bag_file import MAX_LOG_NS
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD = struct.Struct("<BQ")
@@ -123,7 +123,7 @@ def unpack(stored: bytes, chunk: Chunk) -> bytes:
     return bytes(data)
 
 
-@compiled
+@cached_njit
 def find_messages(
     data: NDArray[np.uint8], begin: int, numbers: IntArray, columns: IntArray, count: int
 ) -> Found:
@@ -159,7 +159,7 @@ def find_messages(
     return Found(count, others, unknown, untimed, offset)
 
 
-@compiled
+@cached_njit
 def _number(data: NDArray[np.uint8], offset: int, size: int) -> int:
     """A little-endian number; one beyond 63 bits is negative."""
     number: int = np.int64(0)

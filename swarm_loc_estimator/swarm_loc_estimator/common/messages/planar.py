@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 POSE_DOUBLES = 7
 """Numbers of a geometry_msgs/Pose: position and quaternion."""
@@ -15,7 +15,7 @@ PLANE = np.ix_((0, 1, 5), (0, 1, 5))
 """Where x, y and yaw stand in a 6x6 covariance."""
 
 
-@compiled
+@cached_njit
 def yaw_of(x: float, y: float, z: float, w: float) -> float:
     """The yaw [rad] of a quaternion, which need not be normalised; NaN of zeros."""
     sine, cosine = 2.0 * (w * z + x * y), w * w + x * x - y * y - z * z

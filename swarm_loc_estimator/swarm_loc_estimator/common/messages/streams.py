@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.messages.cdr import (
     DETECTION_DTYPE,
     DETECTION_GAP,
@@ -264,7 +264,7 @@ def _behind_string(data: bytes, offset: int) -> int:
     return offset + 4 + int.from_bytes(data[offset : offset + 4], "little")
 
 
-@compiled
+@cached_njit
 def _read_poses(batch: MessageBatch, models: _Models, k: int, stamp_ns: IntArray, pose: FloatArray) -> int:
     """Write stamps (n,) and poses (n, 3) from message k on; return the first that is not like its topic's."""
     bits = np.empty(7, dtype=np.uint64)
@@ -282,7 +282,7 @@ def _read_poses(batch: MessageBatch, models: _Models, k: int, stamp_ns: IntArray
     return k
 
 
-@compiled
+@cached_njit
 def _scan_detections(
     batch: MessageBatch, models: _Models, k: int, stamp_ns: IntArray, count: IntArray, begin: IntArray
 ) -> int:
@@ -301,7 +301,7 @@ def _scan_detections(
     return k
 
 
-@compiled
+@cached_njit
 def _pack(
     data: BytesArray,
     unlike: BytesArray,
@@ -324,7 +324,7 @@ def _pack(
         row += count[k]
 
 
-@compiled
+@cached_njit
 def _is_alike(batch: MessageBatch, k: int, models: _Models) -> bool:
     """Whether message k has the byte order and the names of its topic's model, and a stamp."""
     data, offset, topic = batch.data, batch.offset[k], batch.topic[k]
@@ -337,7 +337,7 @@ def _is_alike(batch: MessageBatch, k: int, models: _Models) -> bool:
     return bool(_word(data, offset + ENCAPSULATION + 4, 4) < _NANOSECONDS)
 
 
-@compiled
+@cached_njit
 def _stamp_ns(data: BytesArray, offset: int) -> int:
     """The stamp of the message at an offset [ns]."""
     seconds = np.int64(np.int32(np.uint32(_word(data, offset + ENCAPSULATION, 4))))
@@ -345,7 +345,7 @@ def _stamp_ns(data: BytesArray, offset: int) -> int:
     return stamp_ns
 
 
-@compiled
+@cached_njit
 def _word(data: BytesArray, offset: int, size: int) -> np.uint64:
     """A little-endian number."""
     word: np.uint64 = np.uint64(0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.filter.belief import BeliefArrays, IntegrityArrays, covariance_within
 from swarm_loc_estimator.filter.integrity.fault_detection import source_of
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns
@@ -41,7 +41,7 @@ class LossLimits(NamedTuple):
     max_doubt: float
 
 
-@inlined
+@inlined_njit
 def confirm(measurements: MeasurementColumns, k: int, belief: BeliefArrays, passed: bool) -> int:
     """Hold measurement k against poses that were assumed; return a robot that is elsewhere, or -1."""
     observer, target = measurements.observer[k], measurements.target[k]
@@ -60,14 +60,14 @@ def confirm(measurements: MeasurementColumns, k: int, belief: BeliefArrays, pass
     return elsewhere
 
 
-@inlined
+@inlined_njit
 def _count_confirmation(state: IntegrityArrays, robot: int, stamp_ns: int) -> None:
     if stamp_ns - state.confirmed_ns[robot] >= _CONFIRMED_AGAIN_NS:
         state.confirmations[robot] += 1
         state.confirmed_ns[robot] = stamp_ns
 
 
-@inlined
+@inlined_njit
 def is_uncertain(belief: BeliefArrays, robot: int, pose: FloatArray, limits: LossLimits) -> bool:
     """Whether the standard deviation of the robot's position or heading at `pose` (3,) exceeds its limit."""
     first = 3 * robot
@@ -80,7 +80,7 @@ def is_uncertain(belief: BeliefArrays, robot: int, pose: FloatArray, limits: Los
     return uncertain
 
 
-@inlined
+@inlined_njit
 def add_hidden_errors(state: IntegrityArrays, robot: int, covariance: FloatArray) -> None:
     """Add to a pose's covariance (3, 3) what its sensors may hide."""
     if state.doubt[robot] > _DOUBTFUL or state.confirmations[robot] < WELL_CONFIRMED:
@@ -99,7 +99,7 @@ def note_seen(state: IntegrityArrays, robot: int) -> None:
     state.doubt[robot] = max(0.0, state.doubt[robot] - _SEEN_RELIEF)
 
 
-@inlined
+@inlined_njit
 def count_gated(
     measurements: MeasurementColumns, k: int, belief: BeliefArrays, passed: bool, limits: LossLimits
 ) -> int:
@@ -129,7 +129,7 @@ def count_gated(
     return lost
 
 
-@compiled
+@cached_njit
 def _is_off_its_fixes(state: IntegrityArrays, robot: int, stamp_ns: int) -> bool:
     """Count a gated fix of a robot; whether there are too many since the last accepted sight of the map.
 

@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.filter.calibration_states import CAMERA_YAW
 from swarm_loc_estimator.filter.integrity.noise_inflation import raise_hidden_noise
@@ -85,7 +85,7 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
     )
 
 
-@inlined
+@inlined_njit
 def assess(
     measurements: MeasurementColumns,
     k: int,
@@ -137,7 +137,7 @@ def assess(
     return -1
 
 
-@compiled
+@cached_njit
 def _is_estimated(belief: BeliefArrays, node: int) -> bool:
     """Whether what describes a robot or landmark is estimated already."""
     robots, table = belief.tracked.size, belief.table
@@ -146,7 +146,7 @@ def _is_estimated(belief: BeliefArrays, node: int) -> bool:
     return estimated
 
 
-@compiled
+@cached_njit
 def _forgive(state: IntegrityArrays, node: int) -> None:
     """Hold nothing against a robot or landmark any more, nor against its pairs."""
     state.doubt[node] = 0.0
@@ -163,7 +163,7 @@ def pairs_set_aside(state: IntegrityArrays, now_ns: int) -> list[tuple[int, int]
     return [(int(observer), int(state.source[observer, place])) for observer, place in np.argwhere(aside)]
 
 
-@inlined
+@inlined_njit
 def is_set_aside(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> bool:
     """Whether the pair of measurement k has disagreed so often that it does not count."""
     observer, place = measurements.observer[k], _find(measurements, k, belief)
@@ -171,7 +171,7 @@ def is_set_aside(measurements: MeasurementColumns, k: int, belief: BeliefArrays)
     return aside
 
 
-@inlined
+@inlined_njit
 def cause_of(kind: int, innovation: FloatArray, predicted: FloatArray) -> int:
     """What may explain an innovation (3,) of a prediction (3,): NOISE, DESCRIPTION or ELSEWHERE."""
     if kind == POLAR:
@@ -185,7 +185,7 @@ def cause_of(kind: int, innovation: FloatArray, predicted: FloatArray) -> int:
     return DESCRIPTION if error > _NOISE_M else NOISE
 
 
-@inlined
+@inlined_njit
 def small_variances(kind: int, predicted: FloatArray) -> tuple[float, float]:
     """Variances of errors of a position, forward or range and left or bearing, too small to matter."""
     distance = predicted[0] if kind == POLAR else math.hypot(predicted[0], predicted[1])
@@ -193,7 +193,7 @@ def small_variances(kind: int, predicted: FloatArray) -> tuple[float, float]:
     return small, (small / max(distance * distance, 1e-6) if kind == POLAR else small)
 
 
-@inlined
+@inlined_njit
 def is_elsewhere(state: IntegrityArrays, robot: int, within_ns: int = RECENT_NS) -> bool:
     """Whether most of what a robot has measured last can only mean that it is somewhere else."""
     newest_ns, elsewhere, count = state.source_ns[robot, 0], 0, 0
@@ -207,7 +207,7 @@ def is_elsewhere(state: IntegrityArrays, robot: int, within_ns: int = RECENT_NS)
     return 2 * elsewhere > count
 
 
-@inlined
+@inlined_njit
 def is_contradicted(state: IntegrityArrays, robot: int) -> bool:
     """Whether the newest measurements speak against a robot's pose: it is not told as tracked."""
     contradicted: bool = (
@@ -218,7 +218,7 @@ def is_contradicted(state: IntegrityArrays, robot: int) -> bool:
     return contradicted
 
 
-@inlined
+@inlined_njit
 def _relieve(state: IntegrityArrays, observer: int, source: int, place: int) -> None:
     """Count a look that is no surprise for those whom it is about."""
     state.evidence[observer, place] = max(0.0, state.evidence[observer, place] - _RELIEF)
@@ -226,7 +226,7 @@ def _relieve(state: IntegrityArrays, observer: int, source: int, place: int) -> 
         state.doubt[node] = max(0.0, state.doubt[node] - _RELIEF)
 
 
-@compiled
+@cached_njit
 def _blame(
     state: IntegrityArrays, pair: tuple[int, int], weight: float, unexplained: bool, now_ns: int
 ) -> bool:
@@ -248,7 +248,7 @@ def _blame(
     return False
 
 
-@compiled
+@cached_njit
 def _surprises(state: IntegrityArrays, node: int, now_ns: int) -> tuple[int, float]:
     """How many pairs of a robot or landmark are surprises, as observer and as source, and what share."""
     robots, places = state.source.shape
@@ -266,7 +266,7 @@ def _surprises(state: IntegrityArrays, node: int, now_ns: int) -> tuple[int, flo
     return bad, bad / max(1, count)
 
 
-@inlined
+@inlined_njit
 def _weight_of_trend(
     state: IntegrityArrays, observer: int, place: int, whitened: tuple[float, float]
 ) -> float:
@@ -285,13 +285,13 @@ def _weight_of_trend(
     return _TREND_WEIGHT if trending else 0.0
 
 
-@inlined
+@inlined_njit
 def _forget_trend(state: IntegrityArrays, observer: int, place: int) -> None:
     state.whitened[observer, place, 0] = state.whitened[observer, place, 1] = 0.0
     state.squares[observer, place], state.looks[observer, place] = 0.0, 0
 
 
-@inlined
+@inlined_njit
 def _find(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int:
     """Where the pair of measurement k is remembered; -1: nowhere, or it is no pair."""
     observer, source = measurements.observer[k], source_of(measurements, k, belief)
@@ -303,7 +303,7 @@ def _find(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int
     return -1
 
 
-@inlined
+@inlined_njit
 def _new_place(state: IntegrityArrays, observer: int, source: int) -> int:
     """Remember a new pair in place of the one seen longest ago."""
     oldest = 0
@@ -318,7 +318,7 @@ def _new_place(state: IntegrityArrays, observer: int, source: int) -> int:
     return oldest
 
 
-@inlined
+@inlined_njit
 def source_of(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int:
     """What measurement k is of: a robot, N + l for a landmark, or -1."""
     landmark: int = measurements.landmark[k] - 1
@@ -326,7 +326,7 @@ def source_of(measurements: MeasurementColumns, k: int, belief: BeliefArrays) ->
     return belief.tracked.size + landmark if landmark >= 0 else target
 
 
-@inlined
+@inlined_njit
 def noise_of_frequent_looks(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> float:
     """By what factor the noise of measurement k counts more, so soon after another one of its pair."""
     observer, place = measurements.observer[k], _find(measurements, k, belief)

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.filter.belief import BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.filter.measurement_model import POLAR, MeasurementColumns
 from swarm_loc_estimator.swarm.swarm import SensorModel
@@ -23,7 +23,7 @@ _POSITION_SIGMA, _BEARING_SIGMA, _HEADING_SIGMA, _STAMP_SIGMA = 0.004, 0.01, 0.0
 _DOUBTED_UNITS, MAX_UNITS = 2.0, 5.0
 
 
-@inlined
+@inlined_njit
 def stamp_variance(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> float:
     """How unsure the stamp of measurement k is, as described and as found out [s^2]."""
     variance: float = measurements.stamp_variance[k]
@@ -33,7 +33,7 @@ def stamp_variance(measurements: MeasurementColumns, k: int, belief: BeliefArray
     return variance
 
 
-@inlined
+@inlined_njit
 def add_hidden_noise(
     measurements: MeasurementColumns, k: int, belief: BeliefArrays, noise: FloatArray
 ) -> None:
@@ -46,7 +46,7 @@ def add_hidden_noise(
         noise[2, 2] += (units * _HEADING_SIGMA) ** 2
 
 
-@compiled
+@cached_njit
 def raise_hidden_noise(belief: BeliefArrays, observer: int) -> bool:
     """Count one more unit of an observer's noise; False: it cannot be noise any more."""
     units = belief.integrity.hidden_noise[observer]

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.filter.sparse.neighbours import Adjacency
 
 _LEAF = 24
@@ -39,7 +39,7 @@ class Order(NamedTuple):
     begin: IntArray
 
 
-@compiled
+@cached_njit
 def dissect(bodies: IntArray, places: FloatArray, adjacency: Adjacency) -> Order:
     """Part bodies, named by their indices (k,) into places (n, 2), until each group has few."""
     count = bodies.size
@@ -81,7 +81,7 @@ def dissect(bodies: IntArray, places: FloatArray, adjacency: Adjacency) -> Order
     return order
 
 
-@compiled
+@cached_njit
 def _part(part: IntArray, places: FloatArray, adjacency: Adjacency, side: IntArray, trial: IntArray) -> None:
     """Write the side of each body of a part, by the cut with the smallest separator; `trial` is room."""
     smallest, along = math.inf, np.empty(part.size)
@@ -103,7 +103,7 @@ def _part(part: IntArray, places: FloatArray, adjacency: Adjacency, side: IntArr
         trial[body] = _OUTSIDE
 
 
-@compiled
+@cached_njit
 def _separate(part: IntArray, adjacency: Adjacency, side: IntArray) -> int:
     """Move bodies to the separator until no pair lies across, those of most pairs first; return how many."""
     degree, border, count = np.zeros(part.size, dtype=np.int64), np.empty(part.size, dtype=np.int64), 0
@@ -131,7 +131,7 @@ def _separate(part: IntArray, adjacency: Adjacency, side: IntArray) -> int:
     return size
 
 
-@compiled
+@cached_njit
 def _across(body: int, adjacency: Adjacency, side: IntArray) -> int:
     """With how many bodies of the other side a body is paired."""
     count = 0
@@ -141,7 +141,7 @@ def _across(body: int, adjacency: Adjacency, side: IntArray) -> int:
     return count
 
 
-@compiled
+@cached_njit
 def _sort(part: IntArray, side: IntArray) -> tuple[int, int]:
     """Sort a part by its sides, in place, and forget them; return how many are below and separate."""
     old, counts, place = part.copy(), np.zeros(3, dtype=np.int64), 0

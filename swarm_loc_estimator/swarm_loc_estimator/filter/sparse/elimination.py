@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.filter.sparse.factor import Factor, gathered, new_factor
 from swarm_loc_estimator.filter.sparse.symbolic import Pattern
 from swarm_loc_estimator.filter.sparse.translation_adjoint import Information
@@ -54,7 +54,7 @@ def eliminate(pattern: Pattern, prior: Prior, measured: Information) -> Factor:
     raise np.linalg.LinAlgError("the covariance of a front is not positive definite")
 
 
-@compiled
+@cached_njit
 def _eliminate(
     factor: Factor,
     prior: Prior,
@@ -96,7 +96,7 @@ def _eliminate(
             sibling[f], child[parent] = child[parent], f
 
 
-@compiled
+@cached_njit
 def _conditional(covariance: FloatArray, size: int, looser: float) -> FloatArray:
     """Information (d, d) of p(x_J | x_B) for a covariance (d, d), the pivots being the last `size` rows."""
     for k in range(covariance.shape[0]):
@@ -107,7 +107,7 @@ def _conditional(covariance: FloatArray, size: int, looser: float) -> FloatArray
     return information
 
 
-@compiled
+@cached_njit
 def _last_columns(lower: FloatArray, size: int) -> FloatArray:
     """The last columns (d, size) of the inverse of the transpose of a lower triangular matrix (d, d)."""
     rows = lower.shape[0]
@@ -131,7 +131,7 @@ def _last_columns(lower: FloatArray, size: int) -> FloatArray:
     return out
 
 
-@compiled
+@cached_njit
 def _add_blocks(information: FloatArray, local: IntArray, measured: Information, which: IntArray) -> None:
     """Add some blocks of what was measured to a front's information, those of two bodies either way."""
     for k in which:
@@ -143,7 +143,7 @@ def _add_blocks(information: FloatArray, local: IntArray, measured: Information,
                     information[column + j, row + i] += measured.block[k, i, j]
 
 
-@compiled
+@cached_njit
 def _add_update(information: FloatArray, local: IntArray, bodies: IntArray, update: FloatArray) -> None:
     """Add what a front before says of its border (b,)."""
     for r in range(bodies.size):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.filter.sparse.symbolic import Pattern
 
 _FEW = 2
@@ -94,7 +94,7 @@ def _begins(sizes: IntArray) -> IntArray:
     return np.concatenate([[0], np.cumsum(sizes)])
 
 
-@compiled
+@cached_njit
 def write_fronts(factor: Factor, covariance: FloatArray) -> None:
     """Write the covariances within all fronts, from the last front to the first.
 
@@ -109,7 +109,7 @@ def write_fronts(factor: Factor, covariance: FloatArray) -> None:
         _write_front(factor, f, covariance)
 
 
-@compiled
+@cached_njit
 def _write_front(factor: Factor, f: int, covariance: FloatArray) -> None:
     """Write the covariances of the pivots of front f with it, where those of its border stand."""
     pattern = factor.pattern
@@ -125,7 +125,7 @@ def _write_front(factor: Factor, f: int, covariance: FloatArray) -> None:
     _scatter_own(covariance, pivots, own)
 
 
-@compiled
+@cached_njit
 def write_rows(factor: Factor, derived: int, rows: tuple[IntArray, IntArray], covariance: FloatArray) -> None:
     """Write the covariances of wanted rows, and of bodies derived, where those within other fronts stand.
 
@@ -152,7 +152,7 @@ def write_rows(factor: Factor, derived: int, rows: tuple[IntArray, IntArray], co
         _scatter(covariance, wanted, pivots, across)
 
 
-@compiled
+@cached_njit
 def solve(factor: Factor, right: FloatArray) -> None:
     """Multiply the factor's covariance by columns (3 n, c), in place."""
     fronts = factor.pattern.pivot_begin.size - 1
@@ -162,7 +162,7 @@ def solve(factor: Factor, right: FloatArray) -> None:
         _substitute_back(factor, f, right)
 
 
-@compiled
+@cached_njit
 def _substitute(factor: Factor, f: int, right: FloatArray) -> None:
     """Add to the border of front f what its pivots' columns say of it."""
     pattern, columns = factor.pattern, right.shape[1]
@@ -184,7 +184,7 @@ def _substitute(factor: Factor, f: int, right: FloatArray) -> None:
                 right[row, c] += added[r, c]
 
 
-@compiled
+@cached_njit
 def _substitute_back(factor: Factor, f: int, right: FloatArray) -> None:
     """Make the columns of the pivots of front f the solution, where those of its border are."""
     pattern = factor.pattern
@@ -211,14 +211,14 @@ def _substitute_back(factor: Factor, f: int, right: FloatArray) -> None:
         right[3 * pivots[r] : 3 * pivots[r] + 3] = solved[3 * r : 3 * r + 3]
 
 
-@inlined
+@inlined_njit
 def add_rows(rows: FloatArray, first: float, second: float, third: float, out: FloatArray) -> None:
     """Add three rows (3, k), each times a factor, to one (k,)."""
     for c in range(out.size):
         out[c] += first * rows[0, c] + second * rows[1, c] + third * rows[2, c]
 
 
-@compiled
+@cached_njit
 def _rows_of(matrix: FloatArray, bodies: IntArray) -> FloatArray:
     """The rows (3 k, c) of bodies (k,)."""
     out = np.empty((3 * bodies.size, matrix.shape[1]))
@@ -227,7 +227,7 @@ def _rows_of(matrix: FloatArray, bodies: IntArray) -> FloatArray:
     return out
 
 
-@compiled
+@cached_njit
 def gathered(covariance: FloatArray, rows: IntArray, columns: IntArray) -> FloatArray:
     """Covariances (3 r, 3 c) of bodies (r,) with bodies (c,), which stand there either way."""
     out = np.empty((3 * rows.size, 3 * columns.size))
@@ -239,7 +239,7 @@ def gathered(covariance: FloatArray, rows: IntArray, columns: IntArray) -> Float
     return out
 
 
-@compiled
+@cached_njit
 def _scatter(covariance: FloatArray, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
     """Write covariances (3 r, 3 c) of bodies (r,) with bodies (c,), either way."""
     for c in range(columns.size):
@@ -254,7 +254,7 @@ def _scatter(covariance: FloatArray, rows: IntArray, columns: IntArray, values: 
                     covariance[rows[r], columns[c], i, j] = values[3 * r + i, 3 * c + j]
 
 
-@compiled
+@cached_njit
 def _scatter_own(covariance: FloatArray, bodies: IntArray, values: FloatArray) -> None:
     """Write covariances (3 k, 3 k) among bodies (k,), symmetric to the last bit."""
     for r in range(bodies.size):

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import blas
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled, compiled_sums
+from swarm_loc_estimator.common.jit import cached_njit, reassociated_njit
 from swarm_loc_estimator.common.lapack import invert_factor
 from swarm_loc_estimator.filter.sparse.factor import Derived, Factor, add_rows, solve
 from swarm_loc_estimator.filter.sparse.symbolic import Pattern
@@ -99,7 +99,7 @@ def _whiten(columns: FloatArray, matrix: FloatArray) -> None:
         blas.dtrmm(1.0, inverse, columns.T, lower=1, overwrite_b=1)
 
 
-@compiled
+@cached_njit
 def _weigh(measured: Information, shares: FloatArray, out: FloatArray) -> None:
     """Write T G to the first columns of `out` (3 n, k + 1) for G (3 n, k)."""
     size = shares.shape[1]
@@ -113,7 +113,7 @@ def _weigh(measured: Information, shares: FloatArray, out: FloatArray) -> None:
                 add_rows(shares[row : row + 3], block[0, i], block[1, i], block[2, i], other)
 
 
-@compiled_sums
+@reassociated_njit
 def shared(shares: FloatArray, first: IntArray, second: IntArray) -> FloatArray:
     """Covariances (m, 3, 3) that pairs of bodies (m,) have through the copies."""
     out = np.zeros((first.size, 3, 3))
@@ -127,7 +127,7 @@ def shared(shares: FloatArray, first: IntArray, second: IntArray) -> FloatArray:
     return out
 
 
-@compiled
+@cached_njit
 def change_shared(
     covariance: FloatArray, pattern: Pattern, place: IntArray, shares: tuple[FloatArray, FloatArray]
 ) -> None:
@@ -155,7 +155,7 @@ def change_shared(
                             covariance[pivots[c], bodies[r], j, i] = value
 
 
-@compiled
+@cached_njit
 def _chosen(shares: FloatArray, bodies: IntArray) -> FloatArray:
     """The shares (3 m, k) of some bodies (m,)."""
     out = np.empty((3 * bodies.size, shares.shape[2]))

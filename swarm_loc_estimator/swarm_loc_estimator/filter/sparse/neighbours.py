@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 _NEAREST = 8
 
@@ -30,7 +30,7 @@ def adjacency(count: int, pairs: IntArray) -> Adjacency:
     return _adjacency(count, np.ascontiguousarray(pairs))
 
 
-@compiled
+@cached_njit
 def _adjacency(count: int, pairs: IntArray) -> Adjacency:
     """The neighbours of each in order, without sorting them."""
     named = np.zeros(count + 1, dtype=np.int64)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled, inlined
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.filter.calibration_states import BLOCKS, DRIVES, ParameterTable
 from swarm_loc_estimator.filter.sparse.dissection import Order
 from swarm_loc_estimator.filter.sparse.symbolic import Pattern
@@ -98,7 +98,7 @@ def block_pairs(groups: Groups, active: BoolArray, measured: IntArray) -> IntArr
     return _cliques(around[has_blocks[around[:, 0]]], active.size)
 
 
-@compiled
+@cached_njit
 def _cliques(pairs: IntArray, bodies: int) -> IntArray:
     """All pairs (k, 2) of what is paired with the same first one, of so many bodies."""
     order = np.argsort(pairs[:, 0], kind="mergesort")
@@ -124,7 +124,7 @@ def _cliques(pairs: IntArray, bodies: int) -> IntArray:
     return found
 
 
-@compiled
+@cached_njit
 def move(covariance: FloatArray, pattern: Pattern, place: IntArray, moves: Moves) -> None:
     """Let errors become what they are by now, for all pairs of a pattern.
 
@@ -150,7 +150,7 @@ def move(covariance: FloatArray, pattern: Pattern, place: IntArray, moves: Moves
                         _move_pair(covariance, a, b, place, moves, room)
 
 
-@inlined
+@inlined_njit
 def _move_pair(
     covariance: FloatArray, a: int, b: int, place: IntArray, moves: Moves, room: FloatArray
 ) -> None:

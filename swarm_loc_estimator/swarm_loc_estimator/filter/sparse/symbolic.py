@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.filter.sparse.dissection import Order
 from swarm_loc_estimator.filter.sparse.neighbours import Adjacency
 
@@ -52,7 +52,7 @@ def pattern_of(order: Order, adjacency: Adjacency) -> Pattern:
     return Pattern(order.body, order.begin, border, border_begin, front)
 
 
-@compiled
+@cached_njit
 def _borders(order: Order, front: IntArray, adjacency: Adjacency) -> tuple[IntArray, IntArray]:
     """The bodies of all borders, front by front, and where each begins (F + 1,)."""
     pivot, begin = order.body, order.begin
@@ -78,7 +78,7 @@ def _borders(order: Order, front: IntArray, adjacency: Adjacency) -> tuple[IntAr
     return borders[:end].copy(), border_begin
 
 
-@compiled
+@cached_njit
 def _take(bodies: IntArray, f: int, front: IntArray, seen: IntArray, borders: IntArray, end: int) -> int:
     """Write those bodies behind the borders that are pivots later than front f; return the new end."""
     for body in bodies:
@@ -119,7 +119,7 @@ class _Sequence(NamedTuple):
     position: IntArray
 
 
-@compiled
+@cached_njit
 def _want_pairs(old: _Sequence, new: Pattern, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
     """Note all pairs of the new pattern, and of those beside, at the earlier one's front."""
     for f in range(new.pivot_begin.size - 1):
@@ -133,7 +133,7 @@ def _want_pairs(old: _Sequence, new: Pattern, place: IntArray, beside: IntArray,
                 _want_with(old, a, new.border[q], place, beside, wanted)
 
 
-@compiled
+@cached_njit
 def _want_with(old: _Sequence, a: int, b: int, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
     """Note a pair of bodies, with those beside them."""
     _want(old, place[a], place[b], wanted)
@@ -145,7 +145,7 @@ def _want_with(old: _Sequence, a: int, b: int, place: IntArray, beside: IntArray
         _want(old, place[a], place[beside[b]], wanted)
 
 
-@compiled
+@cached_njit
 def _want(old: _Sequence, a: int, b: int, wanted: BoolArray) -> None:
     """Note a pair of bodies; those of one front are known."""
     if old.front[a] < old.front[b]:
@@ -154,7 +154,7 @@ def _want(old: _Sequence, a: int, b: int, wanted: BoolArray) -> None:
         wanted[old.front[b], old.position[a]] = True
 
 
-@compiled
+@cached_njit
 def _close(old: Pattern, position: IntArray, wanted: BoolArray, derived: int) -> tuple[IntArray, IntArray]:
     """Add what the wanted ones follow from: a pair of a pivot follows from those of its border."""
     sequence, fronts = _Sequence(old.front, position), old.pivot_begin.size - 1
@@ -176,7 +176,7 @@ def _close(old: Pattern, position: IntArray, wanted: BoolArray, derived: int) ->
     return rows, begin
 
 
-@compiled
+@cached_njit
 def _follow(old: Pattern, position: IntArray, wanted: BoolArray, f: int) -> int:
     """Want the pairs of the border of front f with all that are wanted there; return how many these are."""
     border = old.border[old.border_begin[f] : old.border_begin[f + 1]]

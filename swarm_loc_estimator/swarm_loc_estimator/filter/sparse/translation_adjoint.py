@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.small_matrix import cholesky3, solve3
 
 
@@ -44,7 +44,7 @@ def carried(places: FloatArray, covariances: FloatArray) -> FloatArray:
     return carried_pairs(places, covariances, places)
 
 
-@compiled
+@cached_njit
 def carried_pairs(places: FloatArray, across: FloatArray, others: FloatArray) -> FloatArray:
     """Lev(r) C Lev(s)^T (n, 3, 3) for places r (n, 2), matrices C (n, 3, 3) and other places s (n, 2)."""
     out = np.empty((across.shape[0], 3, 3))
@@ -68,7 +68,7 @@ def centres(covariances: FloatArray) -> FloatArray:
     return places
 
 
-@compiled
+@cached_njit
 def information_of(
     columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray, places: FloatArray
 ) -> Information:
@@ -114,7 +114,7 @@ def information_of(
     return Information(first[:count], second[:count], block[:count], gradient)
 
 
-@compiled
+@cached_njit
 def summed(measured: Information) -> Information:
     """The same with one block for bodies that are named several times in this order, by the first of them."""
     count, bodies = measured.first.size, len(measured.gradient)
@@ -149,7 +149,7 @@ def summed(measured: Information) -> Information:
     return Information(first, second, block, measured.gradient)
 
 
-@compiled
+@cached_njit
 def _about_place(jacobian: FloatArray, place: FloatArray, out: FloatArray) -> None:
     """Write the columns of a Jacobian by xi (3, 3) as rows by eta."""
     for i in range(3):
@@ -157,7 +157,7 @@ def _about_place(jacobian: FloatArray, place: FloatArray, out: FloatArray) -> No
         out[2, i] = jacobian[i, 2] + place[1] * jacobian[i, 0] - place[0] * jacobian[i, 1]
 
 
-@compiled
+@cached_njit
 def _by_parameters(columns: IntArray, jacobian: FloatArray, out: FloatArray) -> int:
     """Write the columns of a Jacobian (3, c) by parameters as rows of their block; return it, -1: of none."""
     block = -1
@@ -171,7 +171,7 @@ def _by_parameters(columns: IntArray, jacobian: FloatArray, out: FloatArray) -> 
     return block
 
 
-@compiled
+@cached_njit
 def _depends(rows: FloatArray) -> bool:
     """Whether any entry of a matrix (3, 3) is not zero."""
     total = 0.0

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.infrared.brightness import expected
@@ -111,7 +111,7 @@ def _core_squares(errors: FloatArray) -> FloatArray:
     return squares
 
 
-@compiled
+@cached_njit
 def _solve_all(
     model: IrModel,
     readings: FloatArray,
@@ -137,7 +137,7 @@ def _solve_all(
         outcomes[k] = _solve_one(model, model.amplitudes[mode], matrix, sums, poses[k])
 
 
-@compiled
+@cached_njit
 def _best_power(model: IrModel, readings: FloatArray, saturation: FloatArray) -> int:
     """The first power that neither saturates nor is faint, else the last that saturates; -1: all faint."""
     saturated = -1
@@ -154,7 +154,7 @@ def _best_power(model: IrModel, readings: FloatArray, saturation: FloatArray) ->
     return saturated
 
 
-@compiled
+@cached_njit
 def _solve_one(
     model: IrModel, law: FloatArray, matrix: FloatArray, light: FloatArray, pose: FloatArray
 ) -> int:
@@ -191,7 +191,7 @@ def _solve_one(
     return _FOUND
 
 
-@compiled
+@cached_njit
 def _direction(units: FloatArray, light: FloatArray) -> tuple[float, float]:
     """The direction of unit vectors (n, 2) weighed by light (n,), and how one-sided it is, in [0, 1]."""
     x, y, total = 0.0, 0.0, 1e-300
@@ -202,7 +202,7 @@ def _direction(units: FloatArray, light: FloatArray) -> tuple[float, float]:
     return math.atan2(y, x), math.hypot(x, y) / total
 
 
-@compiled
+@cached_njit
 def _distance(
     model: IrModel, law: FloatArray, brightness: float, i: int, j: int, along: float, phi: float
 ) -> float:

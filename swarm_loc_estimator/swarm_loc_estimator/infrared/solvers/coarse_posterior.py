@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.infrared.solvers.start_table import StartRoom, StartTable
 
@@ -19,7 +19,7 @@ _BESIDE = 1.5
 """What is nearer than so many steps of the table, in range, bearing and heading, is the same minimum."""
 
 
-@compiled
+@cached_njit
 def add_spread(table: StartTable, room: StartRoom, pose: FloatArray, covariance: FloatArray) -> float:
     """Add to a pose's covariance (3, 3) what other poses that are likely make it uncertain by.
 

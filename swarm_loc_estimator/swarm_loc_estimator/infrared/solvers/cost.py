@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import borrowing, compiled, compiled_sums
+from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit, reassociated_njit
 from swarm_loc_estimator.infrared.brightness import WAY_ROWS, predict_brightness
 from swarm_loc_estimator.infrared.solvers.reading_cost import (
     BELIEVED,
@@ -45,7 +45,7 @@ class Costs(NamedTuple):
     counts: NDArray[np.int64]
 
 
-@compiled
+@cached_njit
 def new_costs(readings: int) -> Costs:
     """Room for so many readings."""
     return Costs(np.empty(readings), np.empty(readings), np.empty(readings, np.int64), np.empty(2, np.int64))
@@ -125,7 +125,7 @@ class Scratch(NamedTuple):
     first_root: FloatArray
 
 
-@compiled
+@cached_njit
 def new_scratch(modes: int, n: int, gains: bool) -> Scratch:
     """Room for a platform, with or without gains to seek."""
     size, readings = 3 + 2 * n if gains else 3, modes * n * n
@@ -150,7 +150,7 @@ def new_scratch(modes: int, n: int, gains: bool) -> Scratch:
     )
 
 
-@compiled
+@cached_njit
 def with_stray_light(model: IrModel, readings: FloatArray) -> IrModel:
     """The platform with the noise that an exchange has whose readings (F,) are so bright."""
     brightest, e = 0.0, model.errors
@@ -173,7 +173,7 @@ def with_stray_light(model: IrModel, readings: FloatArray) -> IrModel:
     )
 
 
-@borrowing
+@norefcount_njit
 def write_costs(errors: ReadingErrors, pair: Pair) -> None:
     """Write `Pair.costs` for readings that err like this."""
     costs, squared, others = pair.costs, 0, 0
@@ -194,7 +194,7 @@ def write_costs(errors: ReadingErrors, pair: Pair) -> None:
     costs.counts[0], costs.counts[1] = squared, others
 
 
-@borrowing
+@norefcount_njit
 def cost_of(
     model: IrModel, pair: Pair, at: FloatArray, room: Scratch, gradient: FloatArray, hessian: FloatArray
 ) -> float:
@@ -219,7 +219,7 @@ def cost_of(
     return cost
 
 
-@borrowing
+@norefcount_njit
 def _write_factors(pair: Pair, at: FloatArray, factors: FloatArray) -> None:
     """Write the products of gains, with log-gains where they are sought; 0 for dead elements."""
     n, sought = pair.sensor.size, at.size > 3
@@ -236,7 +236,7 @@ def _write_factors(pair: Pair, at: FloatArray, factors: FloatArray) -> None:
         factors[f] = factors[f - n * n]
 
 
-@compiled_sums
+@reassociated_njit
 def _squares(
     expected: FloatArray,
     factors: FloatArray,
@@ -257,7 +257,7 @@ def _squares(
     return cost
 
 
-@borrowing
+@norefcount_njit
 def _add_others(errors: ReadingErrors, pair: Pair, room: Scratch) -> float:
     """What other readings cost besides what they were taken for; corrects the derivatives and the tally."""
     total, tally, costs = 0.0, room.tally, pair.costs
@@ -288,7 +288,7 @@ def _add_others(errors: ReadingErrors, pair: Pair, room: Scratch) -> float:
     return total
 
 
-@compiled_sums
+@reassociated_njit
 def _add_by_pose(
     pulls: FloatArray,
     weights: FloatArray,
@@ -312,7 +312,7 @@ def _add_by_pose(
     hessian[x + 2, x], hessian[x + 2, x + 1], hessian[x + 2, x + 2] = hr, hb, hh
 
 
-@borrowing
+@norefcount_njit
 def _add_by_gains(n: int, room: Scratch, gradient: FloatArray, hessian: FloatArray) -> None:
     """Add the derivatives by log-gains; by its sensor's and its emitter's a reading has the same slope."""
     expected, pulls, slopes, x = room.expected, room.pulls, room.slopes, gradient.size - 3
@@ -335,7 +335,7 @@ def _add_by_gains(n: int, room: Scratch, gradient: FloatArray, hessian: FloatArr
             hessian[x + 2, p] += by_h
 
 
-@borrowing
+@norefcount_njit
 def _add_prior(pair: Pair, at: FloatArray, gradient: FloatArray, hessian: FloatArray) -> float:
     """Add the priors of log-gains: independent errors, and one common to all of a side."""
     n, cost = pair.sensor.size, 0.0
@@ -354,7 +354,7 @@ def _add_prior(pair: Pair, at: FloatArray, gradient: FloatArray, hessian: FloatA
     return cost
 
 
-@borrowing
+@norefcount_njit
 def _add_lasting(weight: float, slopes: FloatArray, lasting: FloatArray) -> None:
     """Add a reading whose noise has a part that is the same every time."""
     for p in range(3):

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import borrowing, compiled
+from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit
 from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
 from swarm_loc_estimator.infrared.solution import IrSolutions, Outcome, checked, no_solutions
@@ -105,7 +105,7 @@ class Models(NamedTuple):
     table: StartTable
 
 
-@compiled
+@cached_njit
 def _solve_all(models: Models, readings: FloatArray, gains: PairGains, saturation: FloatArray) -> IrSolutions:
     """All pairs, first those of known gains, then the others, each kind with room of its own."""
     out = no_solutions(len(readings))
@@ -118,7 +118,7 @@ def _solve_all(models: Models, readings: FloatArray, gains: PairGains, saturatio
     return out
 
 
-@compiled
+@cached_njit
 def _solve_at(
     models: Models,
     readings: FloatArray,
@@ -147,7 +147,7 @@ def _solve_at(
     out.outcomes[k] = _solve_one(Models(exact, soft, models.table), saturation[k], pair, room, out, k)
 
 
-@borrowing
+@norefcount_njit
 def _write_prior(sigma: FloatArray, n: int, prior: FloatArray) -> None:
     """Write `Pair.prior` for the sigmas (4,) of `PairGains`."""
     for side in range(2):
@@ -155,7 +155,7 @@ def _write_prior(sigma: FloatArray, n: int, prior: FloatArray) -> None:
         prior[side, 0], prior[side, 1] = 1.0 / own, common / (own + n * common)
 
 
-@borrowing
+@norefcount_njit
 def _solve_one(
     models: Models, saturation: FloatArray, pair: Pair, room: Room, out: IrSolutions, k: int
 ) -> int:
@@ -199,7 +199,7 @@ def _solve_one(
     return _FOUND
 
 
-@borrowing
+@norefcount_njit
 def _weigh_minima(model: IrModel, pair: Pair, room: Room) -> None:
     """Judge the two minima by the probability around them, not its density; writes the better one first.
 
@@ -225,7 +225,7 @@ def _weigh_minima(model: IrModel, pair: Pair, room: Room) -> None:
         assign(room.best, found)
 
 
-@borrowing
+@norefcount_njit
 def _log_volume(covariance: FloatArray) -> float:
     """Half the logarithm of the determinant of a covariance (3, 3)."""
     c = covariance
@@ -235,7 +235,7 @@ def _log_volume(covariance: FloatArray) -> float:
     return 0.5 * math.log(max(size, 1e-30))
 
 
-@borrowing
+@norefcount_njit
 def _unexplained(model: IrModel, pair: Pair, room: Room, bright: float) -> bool:
     """Whether a pose leaves most of what was read, mean square `bright`, unexplained."""
     tally = room.full.tally
@@ -250,13 +250,13 @@ def _unexplained(model: IrModel, pair: Pair, room: Room, bright: float) -> bool:
     return bool(tally[2] - count > (1.0 - _EXPLAINED_OF_OUTLIERS) * max(total - count, 0.0))
 
 
-@borrowing
+@norefcount_njit
 def _apart(a: FloatArray, b: FloatArray, p: int) -> float:
     """The difference of two poses in range, bearing or heading."""
     return wrap(a[p] - b[p]) if p > 0 else a[p] - b[p]
 
 
-@borrowing
+@norefcount_njit
 def _find_minima(models: Models, pair: Pair, room: Room, measured: int) -> None:
     """Search from all starts that are worth it; writes the best minimum of all and another one."""
     room.minima[:, 3] = math.inf
@@ -279,13 +279,13 @@ def _find_minima(models: Models, pair: Pair, room: Room, measured: int) -> None:
             reached = _search_from(models, pair, room, room.starts[s], reached)
 
 
-@borrowing
+@norefcount_njit
 def _in_doubt(room: Room, reached: int, measured: int) -> bool:
     """Whether the best minimum may not be the best of all: reached but once, or it fits badly."""
     return reached < 2 or 2.0 * room.minima[0, 3] > _SUSPICIOUS * (measured - 3)
 
 
-@borrowing
+@norefcount_njit
 def _search_from(models: Models, pair: Pair, room: Room, start: FloatArray, reached: int) -> int:
     """Search from a start, keep where it ends; how often the best minimum was reached, before and now."""
     at, best = room.full.at, room.minima[0, 3]
@@ -297,7 +297,7 @@ def _search_from(models: Models, pair: Pair, room: Room, start: FloatArray, reac
     return 1 if cost < best else reached
 
 
-@borrowing
+@norefcount_njit
 def _list_starts(models: Models, pair: Pair, room: Room) -> int:
     """Write poses to begin at; returns how many.
 
@@ -314,7 +314,7 @@ def _list_starts(models: Models, pair: Pair, room: Room) -> int:
     return count
 
 
-@borrowing
+@norefcount_njit
 def _search_blurred(model: IrModel, pair: Pair, room: Room, start: FloatArray) -> None:
     """Write where the soft model's search ends as the first start."""
     p = pair
@@ -336,7 +336,7 @@ def _search_blurred(model: IrModel, pair: Pair, room: Room, start: FloatArray) -
         room.starts[0, c] = room.plain.at[c]
 
 
-@borrowing
+@norefcount_njit
 def _keep(minima: FloatArray, pose: FloatArray, cost: float) -> bool:
     """Sort a minimum into the best two that lie apart (2, 4); whether it is the best."""
     best, other = minima[0], minima[1]

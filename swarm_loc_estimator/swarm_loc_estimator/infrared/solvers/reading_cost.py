@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.swarm.ir_board import ReadingErrors
 
 MISSING, MEASURED, SATURATED = 0, 1, 2
@@ -28,7 +28,7 @@ _SURELY = 6.0
 """An explanation whose cost is higher by this is out of the question."""
 
 
-@compiled
+@cached_njit
 def stabilized(errors: ReadingErrors, value: float) -> tuple[float, float]:
     """A brightness on the scale on which noise is one everywhere, and the slope of this scale [1/count].
 
@@ -43,7 +43,7 @@ def stabilized(errors: ReadingErrors, value: float) -> tuple[float, float]:
     return math.copysign(size, value), per_noise / root
 
 
-@compiled
+@cached_njit
 def spread(errors: ReadingErrors, value: float) -> float:
     """The standard deviation of a brightness [count]."""
     if errors.relative == 0.0:
@@ -51,7 +51,7 @@ def spread(errors: ReadingErrors, value: float) -> float:
     return math.sqrt(errors.noise * errors.noise + (errors.relative * value) ** 2)
 
 
-@compiled
+@cached_njit
 def reading_cost(
     errors: ReadingErrors, kind: int, reading: float, stable: float, expected: float
 ) -> tuple[float, float, float, bool, float, float]:
@@ -96,7 +96,7 @@ def reading_cost(
     return cost, pull, weight, True, lasting, square
 
 
-@compiled
+@cached_njit
 def _of_outlier(cost: float, pull: float, weight: float, limit: float) -> tuple[float, float, float]:
     """The cost of a reading that may be an outlier, and its derivatives by the expectation.
 
@@ -109,7 +109,7 @@ def _of_outlier(cost: float, pull: float, weight: float, limit: float) -> tuple[
     return BELIEVED + limit * (1.0 - seen), seen * pull, seen * weight
 
 
-@compiled
+@cached_njit
 def _of_bright(
     errors: ReadingErrors, more: float, cost: float, pull: float, weight: float
 ) -> tuple[float, float, float]:
@@ -126,7 +126,7 @@ def _of_bright(
     return total, own * pull - (1.0 - own) * per_count, own * weight
 
 
-@compiled
+@cached_njit
 def _of_saturated(per_sigma: float, z: float) -> tuple[float, float, float]:
     """The cost of a saturated reading, and its derivatives by the expectation, z sigmas beyond saturation."""
     if z > -_TAIL:

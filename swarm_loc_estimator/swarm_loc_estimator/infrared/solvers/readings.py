@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import borrowing
+from swarm_loc_estimator.common.jit import norefcount_njit
 from swarm_loc_estimator.infrared.solution import DARKEST
 from swarm_loc_estimator.infrared.solvers.cost import Pair
 from swarm_loc_estimator.infrared.solvers.reading_cost import MEASURED, MISSING, SATURATED, stabilized
@@ -13,7 +13,7 @@ from swarm_loc_estimator.infrared.solvers.start_table import Float32Array, compr
 from swarm_loc_estimator.swarm.ir_board import IrModel
 
 
-@borrowing
+@norefcount_njit
 def compress_readings(model: IrModel, pair: Pair, pattern: Float32Array, present: Float32Array) -> None:
     """Write the readings as they would be without the elements' gains, in the form of the table."""
     n = pair.sensor.size
@@ -24,7 +24,7 @@ def compress_readings(model: IrModel, pair: Pair, pattern: Float32Array, present
         present[f] = 1.0 if there else 0.0
 
 
-@borrowing
+@norefcount_njit
 def classify(model: IrModel, saturation: FloatArray, pair: Pair) -> tuple[int, int, float]:
     """Write `cut`, `stable` and `kinds`; returns how many are measured and saturated, and how bright all are.
 

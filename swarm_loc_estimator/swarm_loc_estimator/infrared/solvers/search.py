@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import borrowing
+from swarm_loc_estimator.common.jit import norefcount_njit
 from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.common.small_matrix import assign_matrix
 from swarm_loc_estimator.infrared.solvers.cost import Pair, Scratch, cost_of
@@ -36,7 +36,7 @@ _AROUND = (
 """Where to: the corners of a tetrahedron."""
 
 
-@borrowing
+@norefcount_njit
 def search(
     model: IrModel, pair: Pair, start: FloatArray, still: float, room: Scratch, known: FloatArray
 ) -> float:
@@ -75,7 +75,7 @@ def search(
     return cost
 
 
-@borrowing
+@norefcount_njit
 def _beside(known: FloatArray, at: FloatArray) -> bool:
     """Whether a search has come to a known minimum."""
     x = at.size - 3
@@ -83,7 +83,7 @@ def _beside(known: FloatArray, at: FloatArray) -> bool:
     return bool(max(turned, abs(at[x] / known[0] - 1.0)) < _BESIDE)
 
 
-@borrowing
+@norefcount_njit
 def _step(pair: Pair, room: Scratch, gradient: FloatArray, hessian: FloatArray, damping: float) -> float:
     """Write the next trial; returns by how much the quadratic model lowers the cost there."""
     step, size = room.step, room.step.size
@@ -117,7 +117,7 @@ def _step(pair: Pair, room: Scratch, gradient: FloatArray, hessian: FloatArray, 
     return -slope - bend
 
 
-@borrowing
+@norefcount_njit
 def _factorize(matrix: FloatArray, damping: float, factor: FloatArray, held: bool) -> bool:
     """Cholesky of the lower triangle with its diagonal grown by a share; whether it is positive definite.
 
@@ -144,7 +144,7 @@ def _factorize(matrix: FloatArray, damping: float, factor: FloatArray, held: boo
     return True
 
 
-@borrowing
+@norefcount_njit
 def _solve(factor: FloatArray, vector: FloatArray) -> None:
     """Solve factor factor^T x = vector in place."""
     size = vector.size
@@ -158,7 +158,7 @@ def _solve(factor: FloatArray, vector: FloatArray) -> None:
         vector[p] /= factor[p, p]
 
 
-@borrowing
+@norefcount_njit
 def pose_covariance(
     model: IrModel, pair: Pair, at: FloatArray, room: Scratch, covariance: FloatArray
 ) -> bool:
@@ -192,7 +192,7 @@ def pose_covariance(
     return True
 
 
-@borrowing
+@norefcount_njit
 def _write_share_of_gains(pair: Pair, room: Scratch) -> None:
     """Write which share of the pose's variances, by the factor, comes from errors of the gains.
 
@@ -217,7 +217,7 @@ def _write_share_of_gains(pair: Pair, room: Scratch) -> None:
             room.of_gains[p] += part / row[x + p]
 
 
-@borrowing
+@norefcount_njit
 def _share_of_lasting(room: Scratch, p: int) -> float:
     """Which share of a pose's variance, by the factor, comes from noise that is the same every time."""
     row, part = room.step, 0.0
@@ -230,7 +230,7 @@ def _share_of_lasting(room: Scratch, p: int) -> float:
     return float(part / row[p])
 
 
-@borrowing
+@norefcount_njit
 def _invert(information: FloatArray, room: Scratch) -> bool:
     """Write the inverse of the pose's part of the information's factor; whether there is one."""
     if not _factorize(information, 0.0, room.factor, False):
@@ -244,7 +244,7 @@ def _invert(information: FloatArray, room: Scratch) -> bool:
     return True
 
 
-@borrowing
+@norefcount_njit
 def _add_square(root: FloatArray, matrix: FloatArray, weight: float, keep: float) -> None:
     """Matrix becomes keep * matrix + weight * root^T root, all (3, 3)."""
     for p in range(3):

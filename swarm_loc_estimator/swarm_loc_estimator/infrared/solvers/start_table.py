@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import borrowing, compiled, compiled_sums
+from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit, reassociated_njit
 from swarm_loc_estimator.infrared.brightness import expected
 from swarm_loc_estimator.infrared.curves import AngleCurve, TabulatedCurve, curve_at, distance_at
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform
@@ -75,7 +75,7 @@ class StartRoom(NamedTuple):
     costs: Float32Array
 
 
-@compiled
+@cached_njit
 def new_start_room(table: StartTable) -> StartRoom:
     """Room for one table."""
     directions, levels = table.totals.shape
@@ -127,7 +127,7 @@ def start_table(platform: IrPlatform) -> StartTable:
     return StartTable(ranges.astype(np.float64), angles, patterns, totals)
 
 
-@borrowing
+@norefcount_njit
 def find_starts(
     table: StartTable,
     pattern: Float32Array,
@@ -175,13 +175,13 @@ def find_starts(
     return _best_minima(table, room, starts)
 
 
-@borrowing
+@norefcount_njit
 def compress(model: IrModel, reading: float) -> float:
     """A reading as the table has it."""
     return math.asinh(min(reading, model.saturation) / (_KNEE * model.noise))
 
 
-@compiled
+@cached_njit
 def _level(totals: Float32Array, total: np.float32) -> int:
     """Where among falling totals one is nearest, halving without a branch, which could not be predicted."""
     low, size = 0, totals.size - 1
@@ -192,7 +192,7 @@ def _level(totals: Float32Array, total: np.float32) -> int:
     return low if totals[low] - total < total - totals[low + 1] else low + 1
 
 
-@borrowing
+@norefcount_njit
 def _best_level(
     patterns: Float32Array, pattern: Float32Array, present: Float32Array, dark: np.float32
 ) -> tuple[int, float]:
@@ -205,7 +205,7 @@ def _best_level(
     return best, least
 
 
-@compiled_sums
+@reassociated_njit
 def _sum_of_present(pattern: Float32Array, present: Float32Array) -> np.float32:
     """The total of those readings that there are."""
     total: np.float32 = np.float32(0.0)
@@ -214,7 +214,7 @@ def _sum_of_present(pattern: Float32Array, present: Float32Array) -> np.float32:
     return total
 
 
-@compiled_sums
+@reassociated_njit
 def _misfit(
     expected_here: Float32Array, pattern: Float32Array, present: Float32Array, dark: np.float32
 ) -> np.float32:
@@ -229,7 +229,7 @@ def _misfit(
     return total
 
 
-@compiled_sums
+@reassociated_njit
 def _cost_with_outliers(
     expected_here: Float32Array, pattern: Float32Array, present: Float32Array
 ) -> np.float32:
@@ -245,7 +245,7 @@ def _cost_with_outliers(
     return total
 
 
-@borrowing
+@norefcount_njit
 def _best_minima(table: StartTable, room: StartRoom, starts: FloatArray) -> int:
     """The directions that no neighbour betters, the best `starts` of them."""
     misfit, size, found = room.misfit, table.angles.size, 0
@@ -267,7 +267,7 @@ def _best_minima(table: StartTable, room: StartRoom, starts: FloatArray) -> int:
     return found
 
 
-@borrowing
+@norefcount_njit
 def _is_minimum(misfit: Float32Array, size: int, b: int, h: int) -> bool:
     """Whether no neighbour on the torus of directions is better."""
     here = misfit[b * size + h]

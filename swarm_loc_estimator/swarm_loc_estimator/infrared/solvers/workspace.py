@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.infrared.solvers.cost import Costs, Scratch, new_costs, new_scratch
 from swarm_loc_estimator.infrared.solvers.start_table import (
     Float32Array,
@@ -60,7 +60,7 @@ class Room(NamedTuple):
     covariance: FloatArray
 
 
-@compiled
+@cached_njit
 def new_room(table: StartTable, modes: int, n: int, known: bool) -> Room:
     """Room for one platform, with gains known or not."""
     plain = new_scratch(modes, n, False)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.mapping.exploration.planning_grid import OPEN, UNKNOWN, WALL
 
 _RAYS = 60
@@ -17,7 +17,7 @@ _SURE = 2.0
 _WALL_GAIN = 0.5
 
 
-@compiled
+@cached_njit
 def information_gain(
     state: NDArray[np.int8], evidence: FloatArray, cells: IntArray, reach: int
 ) -> FloatArray:

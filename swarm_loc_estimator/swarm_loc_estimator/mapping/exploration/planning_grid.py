@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.mapping.grid.occupancy import OccupancyMap
 from swarm_loc_estimator.mapping.settings import MapperSettings
 
@@ -67,7 +67,7 @@ def planning_grid(
     return grid
 
 
-@compiled
+@cached_njit
 def paths_from(passable: BoolArray, i: int, j: int) -> tuple[FloatArray, IntArray]:
     """Shortest paths from a cell to all others over passable ones, to eight neighbours each.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.mapping.scans.lines import BINS, LINE, POINT, UNKNOWN, Lines
 
 _FREE, _HIT = 0.25, 0.9
@@ -18,7 +18,7 @@ _SHARP_M = 0.03
 """A wall that is known worse than this tells less of a cell."""
 
 
-@compiled
+@cached_njit
 def draw_stop(
     log_odds: FloatArray,
     corner: FloatArray,
@@ -58,7 +58,7 @@ def draw_stop(
             log_odds[i, j] += hit
 
 
-@compiled
+@cached_njit
 def _draw_free(
     log_odds: FloatArray, x: float, y: float, cos: float, sin: float, end: float, step: float
 ) -> None:

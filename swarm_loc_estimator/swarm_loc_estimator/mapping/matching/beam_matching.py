@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.mapping.scans.beams import Beams
 from swarm_loc_estimator.mapping.scans.lines import BINS, LINE, Lines
 
@@ -48,7 +48,7 @@ class Scans(NamedTuple):
     max_range: float
 
 
-@compiled
+@cached_njit
 def beam_residual(
     scans: Scans, k: int, i: int, j: int, gate: float
 ) -> tuple[int, float, float, float, float, float, float]:
@@ -95,7 +95,7 @@ def beam_residual(
     return FIT, residual, variance, per_metre, nx, ny, float(m)
 
 
-@compiled
+@cached_njit
 def agreement(scans: Scans, k: int, j: int, gate: float, stride: int) -> tuple[int, int, float]:
     """How well beams of stop k, every `stride`-th, agree with lines of stop j: matched, tried, loss."""
     matched, tried, loss = 0, 0, 0.0
@@ -111,7 +111,7 @@ def agreement(scans: Scans, k: int, j: int, gate: float, stride: int) -> tuple[i
     return matched, tried, loss
 
 
-@compiled
+@cached_njit
 def accumulate(
     scans: Scans, k: int, j: int, gate: float, stride: int, H: FloatArray, g: FloatArray
 ) -> tuple[int, int]:
@@ -141,7 +141,7 @@ def accumulate(
     return matched, tried
 
 
-@compiled
+@cached_njit
 def _jacobian(
     scans: Scans, k: int, i: int, j: int, distance: float, nx: float, ny: float, row: FloatArray
 ) -> None:
@@ -158,7 +158,7 @@ def _jacobian(
     row[6] = (-ny * ux + nx * uy) / distance + per_metre * (-ny * dx + nx * dy)
 
 
-@compiled
+@cached_njit
 def match_pairs(
     scans: Scans, pairs: IntArray, weights: FloatArray, gate: float, stride: int
 ) -> tuple[FloatArray, FloatArray]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.mapping.matching.beam_matching import (
     CAUCHY,
     FIT,
@@ -75,7 +75,7 @@ def _shape(lattice: Lattice) -> tuple[int, int, int]:
     return 2 * int(lattice.turn_reach / lattice.turn_step) + 1, cells, cells
 
 
-@compiled
+@cached_njit
 def _scores(scans: Scans, k: int, pivot: int, against: IntArray, lattice: Lattice, stride: int) -> FloatArray:
     """The share of beams that fit, for all offsets."""
     turns, cells = int(lattice.turn_reach / lattice.turn_step), int(lattice.reach / lattice.step)
@@ -97,7 +97,7 @@ def _scores(scans: Scans, k: int, pivot: int, against: IntArray, lattice: Lattic
     return scores
 
 
-@compiled
+@cached_njit
 def _score(scans: Scans, k: int, against: IntArray, stride: int) -> float:
     """The share of every `stride`-th beam of a stop that fits any of others, each less its loss."""
     good, tried = 0.0, 0

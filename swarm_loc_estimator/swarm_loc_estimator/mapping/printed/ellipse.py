@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 _FREE = -0.3
 _ACROSS, _ALONG = 0.1, 0.05
@@ -17,7 +17,7 @@ _REACH = 2.0
 _CAP = 1.0
 
 
-@compiled
+@cached_njit
 def draw_beam(values: FloatArray, corner: FloatArray, cell: float, pose: FloatArray, distance: float) -> None:
     """Draw a beam of some length [m] from a pose (3,) into a grid (nx, ny)."""
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
@@ -44,7 +44,7 @@ def draw_beam(values: FloatArray, corner: FloatArray, cell: float, pose: FloatAr
                 values[i, j] = min(_CAP, values[i, j] + math.exp(-0.5 * square))
 
 
-@compiled
+@cached_njit
 def values_at_ends(
     values: FloatArray, corner: FloatArray, cell: float, poses: FloatArray, distance: float
 ) -> FloatArray:

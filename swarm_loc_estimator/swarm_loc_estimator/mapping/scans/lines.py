@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.mapping.scans.beams import Beams
 
 BINS = 360
@@ -61,7 +61,7 @@ def no_lines(capacity: int) -> Lines:
     return Lines(np.zeros(shape, dtype=np.int8), a, b, distance, variance, turn, np.zeros(shape, dtype=bool))
 
 
-@compiled
+@cached_njit
 def fit_lines(stop: int, ratio: float, max_range: float, beams: Beams, lines: Lines) -> None:
     """Fit the lines of one stop.
 
@@ -92,7 +92,7 @@ def fit_lines(stop: int, ratio: float, max_range: float, beams: Beams, lines: Li
             lines.distance[stop, m] = 1.0 / math.sqrt(sums[m, _YY] / seen)
 
 
-@compiled
+@cached_njit
 def _sums_per_bin(stop: int, ratio: float, beams: Beams) -> tuple[FloatArray, FloatArray]:
     """Sums (BINS, 11), and sums of turns by odometry (BINS,)."""
     sums, turns = np.zeros((BINS, 11)), np.zeros(BINS)
@@ -118,7 +118,7 @@ def _sums_per_bin(stop: int, ratio: float, beams: Beams) -> tuple[FloatArray, Fl
     return sums, turns
 
 
-@compiled
+@cached_njit
 def _fit_bin(stop: int, m: int, total: FloatArray, sigma: float, least: float, lines: Lines) -> bool:
     """Fit the longest window around a bin in which a line holds; whether there is one."""
     here = BINS + m
@@ -148,7 +148,7 @@ def _fit_bin(stop: int, m: int, total: FloatArray, sigma: float, least: float, l
     return False
 
 
-@compiled
+@cached_njit
 def _fit_window(
     total: FloatArray, low: int, high: int, sigma: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -179,7 +179,7 @@ def _fit_window(
     return misfit, a, b, v * d[_SS], -v * d[_CS], v * d[_CC]
 
 
-@compiled
+@cached_njit
 def _is_free(total: FloatArray, m: int) -> bool:
     """Whether so few beams came back from around a bin that there is nothing within range."""
     here = BINS + m

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 
 MIN_OVERLAP = 50
 """So many beams of the first turn must have one of the second beside them."""
@@ -15,7 +15,7 @@ _LOW, _HIGH, _STEP = 0.90, 1.02, 0.0005
 _OUTLIER = 9.0
 
 
-@compiled
+@cached_njit
 def turn_ratio(turn: FloatArray, inverse: FloatArray, sigma: float) -> float:
     """The ratio at which beams (n,) agree best with those one turn later; NaN where too few overlap.
 
@@ -34,7 +34,7 @@ def turn_ratio(turn: FloatArray, inverse: FloatArray, sigma: float) -> float:
     return found
 
 
-@compiled
+@cached_njit
 def _disagreement(turn: FloatArray, inverse: FloatArray, sigma: float, later: float) -> tuple[float, int]:
     """Sum of capped squares between each beam and that a turn `later` [rad], and their number."""
     cost, count, j = 0.0, 0, 0

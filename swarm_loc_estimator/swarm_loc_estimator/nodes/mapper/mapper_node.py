@@ -24,7 +24,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from swarm_loc_estimator.common.jit import is_warm
+from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node
 from swarm_loc_estimator.common.ros.topic_graph import TopicGraph
 from swarm_loc_estimator.mapping.fix_covariance import FixCovariances
@@ -43,7 +43,7 @@ from swarm_loc_estimator.nodes.mapper.mapper_parameters import (
     MapperParameters,
     chosen_robots,
 )
-from swarm_loc_estimator.nodes.mapper.warm_up import WARM_UP, warm_up
+from swarm_loc_estimator.nodes.mapper.precompile import precompile
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_msgs.msg import LaserDistance, LightBearingArray
 
@@ -79,9 +79,9 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self._frequencies = led_frequencies(self.chosen.led_frequencies, names)
         path = self.chosen.load_map
         self._background: OccupancyMap | None = load_map(Path(path), CELL) if path else None
-        if not is_warm(WARM_UP):
+        if not is_precompiled(precompile):
             self.get_logger().info("compiling the mapper for this machine: about half a minute")
-        warm_up()
+        precompile()
         self._graph = TopicGraph(self)
         self._known_drops: dict[str, int] = {}
         self._since_s, self._has_said_missing = time.monotonic(), False

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.infrared.brightness import expected
 from swarm_loc_estimator.infrared.solution import DARKEST
 from swarm_loc_estimator.infrared.solvers.start_table import start_table
@@ -130,7 +130,7 @@ def _stabilized(values: FloatArray, noise: float, relative: float) -> Float32Arr
     return stable
 
 
-@compiled
+@cached_njit
 def _marginalize(
     table: Float32Array,
     log_prior: FloatArray,
@@ -183,7 +183,7 @@ def _marginalize(
                     found[k, side, e, s] = base + math.log(max(found[k, side, e, s], LOWEST))
 
 
-@compiled
+@cached_njit
 def _counts(log: float, base: float, sides: FloatArray, dark: FloatArray, tops: FloatArray) -> bool:
     """Whether a pose is likely enough to count, with all elements whole or any one of them dark."""
     if log > base - _NEGLIGIBLE:
@@ -195,7 +195,7 @@ def _counts(log: float, base: float, sides: FloatArray, dark: FloatArray, tops: 
     return False
 
 
-@compiled
+@cached_njit
 def _by_side(
     light: Float32Array,
     stable: FloatArray,

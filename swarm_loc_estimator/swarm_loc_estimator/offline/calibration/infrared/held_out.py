@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.common.jit import compiled
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.infrared.brightness import expected
 from swarm_loc_estimator.infrared.solution import DARKEST, IrSolutions
@@ -126,7 +126,7 @@ def _about_found(
     return poses, np.log(poses[:, 0]) - np.logaddexp.reduce(drawn, axis=1, initial=-np.inf)
 
 
-@compiled
+@cached_njit
 def _write_likelihoods(
     light: FloatArray,
     readings: FloatArray,

@@ -10,7 +10,7 @@ from compiled_code import compiled_since, signatures, told_by_process
 
 from swarm_loc_estimator.mapping.fix_covariance import FixCovariances
 from swarm_loc_estimator.mapping.settings import MapperSettings
-from swarm_loc_estimator.nodes.mapper.warm_up import warm_up
+from swarm_loc_estimator.nodes.mapper.precompile import precompile
 from swarm_loc_estimator.offline.map_replay import replay_map
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
@@ -24,7 +24,7 @@ def test_nothing_is_compiled_once_robots_report() -> None:
 
 def compiled_late() -> list[str]:
     """What is compiled when robots are replayed though all is warm; in a process of its own."""
-    warm_up()
+    precompile()
     before = signatures()
     robots = load_swarm(BAG / "swarm.yaml").robots
     mapper, feed = replay_map(BAG, robots, MapperSettings(), FREQUENCIES, lambda _share, _what: None)

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
 
 from swarm_loc_drivers.pushbot.event_bytes import EventParser
-from swarm_loc_estimator.common.jit import note_warm
-
-WARM_UP = Path(__file__)
-"""What the compiled code that this module imports is remembered by, see `is_warm`."""
+from swarm_loc_estimator.common.jit import note_precompiled
 
 
-def warm_up() -> None:
+def precompile() -> None:
     """Parse an event and a line."""
     EventParser("16bit", Counter()).feed(b"\xe4\xa5\xe2\x40-S28 1 2\n")
-    note_warm(WARM_UP)
+    note_precompiled(precompile)

@@ -20,7 +20,7 @@ from swarm_loc_estimator.common.messages.shared import (
     swarm_key,
 )
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
-from swarm_loc_estimator.precompile import warm_up
+from swarm_loc_estimator.precompile import precompile
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.messages import RawInputs
 from swarm_loc_estimator.sensors.thinning import Thinning
@@ -45,7 +45,7 @@ def test_nothing_is_compiled_once_data_come() -> None:
 
 def compiled_late() -> list[str]:
     """What is compiled when robots are replayed though all is warm; in a process of its own."""
-    warm_up()
+    precompile()
     before = signatures()
     for name in RECORDED:
         for settings in (EstimatorSettings(), EstimatorSettings(fusion_period_s=0.1)):

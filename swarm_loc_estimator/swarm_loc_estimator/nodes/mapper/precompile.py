@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import note_warm
+from swarm_loc_estimator.common.jit import note_precompiled
 from swarm_loc_estimator.common.messages.planar import yaw_of
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, START_TURN, CooperativeMapper
@@ -16,8 +15,6 @@ from swarm_loc_estimator.mapping.matching.correlative_search import Lattice, sea
 from swarm_loc_estimator.mapping.readings import Readings
 from swarm_loc_estimator.mapping.settings import MapperSettings
 
-WARM_UP = Path(__file__)
-"""What all compiled code that this module imports is remembered by, see `is_warm`."""
 _ROOM = (1.7, 1.1)
 """How far its walls are to the east and west, north and south of the middle [m]."""
 _PERIOD_NS, _TURN_RATE, _SPEED = 20_000_000, 1.0, 0.2
@@ -26,8 +23,8 @@ _SIGMA = 0.016
 """Of an inverse distance [1/m]."""
 
 
-def warm_up() -> None:
-    """Let a robot look around in a room, several times: a minute unless `is_warm`, then a second."""
+def precompile() -> None:
+    """Let a robot look around in a room, several times: a minute unless `is_precompiled`, then a second."""
     mapper = CooperativeMapper(MapperSettings())
     robot = mapper.join(np.zeros(3), np.array([0.01, 0.01, 0.01]))
     pose, stamp_ns = np.zeros(3), 0
@@ -46,7 +43,7 @@ def warm_up() -> None:
     # what is called where a robot comes to an old stop again
     search_offsets(mapper.graph.scans, np.array([1]), np.array([0]), Lattice(0.06, 0.06, 0.03, 0.03))
     yaw_of(0.0, 0.0, 0.0, 1.0)  # what reads odometry
-    note_warm(WARM_UP)
+    note_precompiled(precompile)
 
 
 def _along(pose: FloatArray, way: FloatArray, speed: float) -> FloatArray:
