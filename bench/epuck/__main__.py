@@ -37,7 +37,7 @@ from swarm_loc_drivers.sim.scenarios.dense import DenseSettings, blind_robots, s
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_estimator.offline.live.graph import LiveError
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 if TYPE_CHECKING:
     from swarm_loc_drivers.sim.common.record import SimulatedRun
@@ -144,10 +144,10 @@ def _self_calibrating(robot: Robot) -> Robot:
     )
 
 
-FILTERS: dict[str, tuple[Prepare, EstimatorSettings]] = {
-    "white": (as_described, EstimatorSettings()),
-    "paper": (papers_own, EstimatorSettings(state_period_s=PAPER_STATE_PERIOD_S, max_doubt=1e9)),
-    "selfcal": (self_calibrating, EstimatorSettings()),
+FILTERS: dict[str, tuple[Prepare, Settings]] = {
+    "white": (as_described, Settings()),
+    "paper": (papers_own, Settings(state_period_s=PAPER_STATE_PERIOD_S, max_doubt=1e9)),
+    "selfcal": (self_calibrating, Settings()),
 }
 
 

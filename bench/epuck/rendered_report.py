@@ -23,7 +23,7 @@ from swarm_loc_estimator.offline.report.overview import plot_overview
 from swarm_loc_estimator.offline.report.style import INK, colour_of
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_vision.markers.precompile import precompile
 
 OUTPUT_NS = 100_000_000
@@ -52,7 +52,7 @@ class Rendered:
 
 
 def rendered_worlds(
-    seeds: Sequence[int], duration_s: float, describe: Describe, paper: Describe, settings: EstimatorSettings
+    seeds: Sequence[int], duration_s: float, describe: Describe, paper: Describe, settings: Settings
 ) -> list[Rendered]:
     """Run worlds one after the other, telling how far it is.
 

@@ -13,7 +13,7 @@ from bench.shared.simulated_run import errors_of, inputs_between
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.timeline.contradictions import Kind
-from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimator
+from swarm_loc_estimator.timeline.estimator import Estimator, Status
 
 TICK_NS = 100_000_000
 _MISLEADING_SIGMAS = 5.0
@@ -70,7 +70,7 @@ def score(fault: Fault) -> Score:
     """Run the core over a fault, ticking ten times a second."""
     run = fault.run
     tick_ns = np.arange(run.start_ns + TICK_NS, run.end_ns + 1, TICK_NS)
-    estimator, estimates = SwarmEstimator(run.swarm), []
+    estimator, estimates = Estimator(run.swarm), []
     told: set[tuple[str, Kind]] = set()
     for now_ns, inputs in zip(tick_ns.tolist(), inputs_between(run, tick_ns), strict=True):
         estimator.receive(inputs)

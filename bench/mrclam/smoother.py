@@ -30,7 +30,7 @@ from swarm_loc_estimator.offline.metrics import Errors, compare
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.sensors.validation import InputValidator
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 _FLOOR = np.diag([1e-10, 1e-10, 1e-10])
 """A robot that stands gathers no noise; a factor needs some."""
@@ -110,7 +110,7 @@ def _smooth(recording: Recording, online: ReplayResult) -> Mapping[str, Errors]:
 
 def _tracks_and_measurements(recording: Recording, swarm: Swarm) -> tuple[OdometryTracks, MeasurementArray]:
     """All odometry, calibrated, and all sightings of known markers (m,)."""
-    valid = InputValidator(swarm, EstimatorSettings()).validate(recording.messages)
+    valid = InputValidator(swarm, Settings()).validate(recording.messages)
     tracks = OdometryTracks(swarm.robots)
     tracks.extend(valid.odometry.robot, valid.odometry.stamp_ns, valid.odometry.pose)
     return tracks, valid.measurements

@@ -19,7 +19,7 @@ from bench.shared.simulated_run import errors_of, run_core, ticks
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -100,7 +100,7 @@ def measure(robots: int, seed: int) -> dict[str, float]:
     """CPU time of a run, and the figures of its second half."""
     run = simulate_calibrated(GridSettings(robots, seed, min(40.0, ROBOT_SECONDS / robots)))
     at_ns = ticks(run)
-    core = run_core(run, at_ns, EstimatorSettings())
+    core = run_core(run, at_ns, Settings())
     counted = np.arange(at_ns.size) >= at_ns.size // 2
     errors = errors_of(core.poses, run, at_ns)[counted]
     return {"cpu_s_per_s": core.cpu_s / run.duration_s} | scored(errors, core.covariances[counted])
@@ -129,7 +129,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=(1, 2), help="of the simulation")
     options = parser.parse_args(arguments)
     warm_up = simulate_calibrated(GridSettings(robots=300, duration_s=2.0))
-    run_core(warm_up, ticks(warm_up), EstimatorSettings())  # compiles what is not compiled yet, or loads it
+    run_core(warm_up, ticks(warm_up), Settings())  # compiles what is not compiled yet, or loads it
     results = {(n, seed): measure(n, seed) for n in options.robots for seed in options.seeds}
     names = list(next(iter(results.values())))
     print(table(["robots", "seed", *names], [[*run, *one.values()] for run, one in results.items()]))

@@ -24,7 +24,7 @@ from bench.shared.common import new_plot, save_plot, table, write_figures
 from bench.shared.simulated_run import errors_of, position_rmse, run_core, ticks, without_delay
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.scenarios.grid_shapes import Shape
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -46,7 +46,7 @@ SETTLING_S = 3.0
 """Errors count from here on."""
 
 
-def measure(robots: int, duration_s: float, seed: int, settings: EstimatorSettings) -> dict[str, float]:
+def measure(robots: int, duration_s: float, seed: int, settings: Settings) -> dict[str, float]:
     """All figures of one size."""
     warm_up = simulate_grid(GridSettings(robots=robots, duration_s=WARM_UP_S))
     run_core(warm_up, ticks(warm_up), settings)  # compiles what is not compiled yet, or loads it
@@ -145,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--shape-seeds", type=int, nargs="+", default=(1, 2, 3), help="of the simulation")
     parser.add_argument("--no-live", action="store_true", help="leave the live graph out")
     options = parser.parse_args(arguments)
-    settings = EstimatorSettings()
+    settings = Settings()
     results = {}
     for robots in options.robots:
         print(f"{robots} robots ...", flush=True)

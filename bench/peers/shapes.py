@@ -15,7 +15,7 @@ from bench.shared.simulated_run import errors_of, mean_nees, position_rmse, run_
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.scenarios.grid_shapes import Shape
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 _NEVER = 1_000_000
 
@@ -45,16 +45,16 @@ def measure_shape(shape: Shape, robots: int, runs: ShapeRuns) -> dict[str, float
 
 def _measure(grid: GridSettings, exact_s: float) -> dict[str, float]:
     is_long = exact_s < grid.duration_s
-    own = _scored(grid, EstimatorSettings())
+    own = _scored(grid, Settings())
     compared = replace(grid, duration_s=exact_s) if is_long else grid
-    exact = _scored(compared, EstimatorSettings(sparse_from=_NEVER))
-    beside = _scored(compared, EstimatorSettings()) if is_long else own
+    exact = _scored(compared, Settings(sparse_from=_NEVER))
+    beside = _scored(compared, Settings()) if is_long else own
     ratio = beside["position_rmse_mm"] / exact["position_rmse_mm"]
     reference = {f"exact_{name}": exact[name] for name in ("nees", "tracked_share", "cpu_s_per_s")}
     return own | {"position_rmse_ratio_to_exact": ratio} | reference
 
 
-def _scored(grid: GridSettings, settings: EstimatorSettings) -> dict[str, float]:
+def _scored(grid: GridSettings, settings: Settings) -> dict[str, float]:
     """CPU time of a run, and the figures of its second half."""
     run = simulate_grid(grid)
     at_ns = ticks(run)

@@ -14,14 +14,14 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.runner import ListedSchedule, Runner
 from swarm_loc_estimator.sensors.messages import DetectionRows, OdometryRows, RawInputs, chosen
-from swarm_loc_estimator.timeline.estimator import SwarmEstimator
+from swarm_loc_estimator.timeline.estimator import Estimator
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from swarm_loc_drivers.sim.common.record import SimulatedRun
     from swarm_loc_estimator.common.arrays import FloatArray
-    from swarm_loc_estimator.timeline.settings import EstimatorSettings
+    from swarm_loc_estimator.timeline.settings import Settings
 
 
 _TICK_NS = 100_000_000
@@ -42,9 +42,9 @@ class CoreResult:
     covariances: FloatArray
 
 
-def run_core(run: SimulatedRun, tick_ns: NDArray[np.int64], settings: EstimatorSettings) -> CoreResult:
+def run_core(run: SimulatedRun, tick_ns: NDArray[np.int64], settings: Settings) -> CoreResult:
     """Feed a run in order of arrival to the estimator, and tick it."""
-    runner = Runner(SwarmEstimator(run.swarm, settings), ListedSchedule(tick_ns))
+    runner = Runner(Estimator(run.swarm, settings), ListedSchedule(tick_ns))
     parts = inputs_between(run, tick_ns)
     begun = time.process_time()
     for inputs in parts:

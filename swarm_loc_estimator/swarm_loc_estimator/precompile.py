@@ -27,8 +27,8 @@ from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.robot_ir import IrMethod, RobotIr
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, OdometryModel, Robot, Swarm
-from swarm_loc_estimator.timeline.estimator import SwarmEstimator
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimator
+from swarm_loc_estimator.timeline.settings import Settings
 
 _SECOND = 1_000_000_000
 _FIRST_LANDMARK = 10
@@ -46,8 +46,8 @@ def precompile() -> None:
     """
     for infrared in (False, True):
         for fusion_period_s in (0.0, 0.1):
-            _run(EstimatorSettings(fusion_period_s=fusion_period_s), infrared=infrared)
-        _run(EstimatorSettings(sparse_from=2), infrared=infrared)
+            _run(Settings(fusion_period_s=fusion_period_s), infrared=infrared)
+        _run(Settings(sparse_from=2), infrared=infrared)
     note_precompiled(precompile)
 
 
@@ -56,7 +56,7 @@ def precompile_infrared() -> None:
     MaximumLikelihood(_DROPLET).solve(_LIGHT[None])
 
 
-def _run(settings: EstimatorSettings, *, infrared: bool) -> None:
+def _run(settings: Settings, *, infrared: bool) -> None:
     robots = [Robot(name, faces=(Face("front", k, yaw=0.0),)) for k, name in enumerate("ab")]
     calibrated = OdometryModel(distance_scale_sigma=0.01)
     robots.append(Robot("c", odometry=calibrated, faces=(Face("front", 2, yaw=0.0),), start=(0.0, 0.0, 0.0)))
@@ -65,7 +65,7 @@ def _run(settings: EstimatorSettings, *, infrared: bool) -> None:
     places = range(_LANDMARKS)
     marks = tuple(Landmark(_FIRST_LANDMARK + k, x=1.0, y=0.2 * k, yaw=3.1) for k in places)
     swarm = Swarm(tuple(robots), marks)
-    estimator, ingest = SwarmEstimator(swarm, settings), Ingest(swarm)
+    estimator, ingest = Estimator(swarm, settings), Ingest(swarm)
     for step in range(8):
         now_ns = 10 * _SECOND + step * _SECOND // 4
         backlog = []

@@ -32,9 +32,9 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
-SETTINGS = EstimatorSettings(lost_heading_sigma=1.5, fix_window_s=60.0)
+SETTINGS = Settings(lost_heading_sigma=1.5, fix_window_s=60.0)
 """Headings of robots that turn by themselves are seldom surer than the default; it is 7 to 20 s from one
 exchange of two robots to the next."""
 LIVE_RATE = 10.0

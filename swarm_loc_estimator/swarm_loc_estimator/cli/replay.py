@@ -39,7 +39,7 @@ from swarm_loc_estimator.offline.report.report import write_report
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 _NOTHING_TO_LEARN = (
     "--learned: the swarm description has no sigma of a camera, of odometry or of a landmark, and nothing"
@@ -53,7 +53,7 @@ _COLUMNS = ("stamp_ns", "robot", "x_m", "y_m", "theta_rad", *_COVARIANCE)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
-    settings = parameters_of(EstimatorSettings, options.set)
+    settings = parameters_of(Settings, options.set)
     swarm = load_swarm(options.swarm or swarm_beside(options.bag))
     with ProgressLine() as progress:
         result = replay(

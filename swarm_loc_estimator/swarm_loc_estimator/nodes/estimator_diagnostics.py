@@ -18,7 +18,7 @@ from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
 from swarm_loc_estimator.sensors.topics import InputKind, InputTopic
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.contradictions import Contradiction
-from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate
+from swarm_loc_estimator.timeline.estimator import Estimate, Status
 from swarm_loc_estimator.timeline.fusion import Verdict
 
 _FULL_LOAD = 0.95
@@ -151,7 +151,7 @@ class Diagnostics:
         return "; ".join(f"nothing received on {listed(names)}{cause}" for cause, names in by_cause.items())
 
     def reports(
-        self, now_ns: int, estimate: SwarmEstimate, recent: Recent, drops: Mapping[str, int]
+        self, now_ns: int, estimate: Estimate, recent: Recent, drops: Mapping[str, int]
     ) -> list[Report]:
         """One per robot, then the swarm's inputs and drops; begins a new interval.
 
@@ -195,7 +195,7 @@ class Diagnostics:
         return [f"{topic} has {len(names)} publishers: {listed(names)}" for topic, names in some.items()]
 
     def _robot_report(
-        self, index: int, robot: Robot, estimate: SwarmEstimate, now_ns: int, elapsed_s: float
+        self, index: int, robot: Robot, estimate: Estimate, now_ns: int, elapsed_s: float
     ) -> Report:
         """State and inputs of one robot."""
         troubles = self._rivals_on([topic.name for _, topic in self._inputs_of[index]])

@@ -59,8 +59,8 @@ from swarm_loc_estimator.sensors.topics import live_topics
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.contradictions import Contradiction, Kind
-from swarm_loc_estimator.timeline.estimator import SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
+from swarm_loc_estimator.timeline.settings import Settings
 
 _BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
 _DIAGNOSTICS_PERIOD_S = 1.0
@@ -89,7 +89,7 @@ _MOST_TOLD = 8
 _PATIENCE_S = 5.0
 """How long nothing may come before the log names what is missing."""
 
-CreateEstimator = Callable[[Swarm, EstimatorSettings], SwarmEstimator]
+CreateEstimator = Callable[[Swarm, Settings], Estimator]
 
 
 class EstimatorNode(ConfiguredNode[EstimatorParameters]):
@@ -100,7 +100,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         node_arguments: Further arguments of `rclpy.node.Node`.
     """
 
-    def __init__(self, create_estimator: CreateEstimator = SwarmEstimator, **node_arguments: Any) -> None:
+    def __init__(self, create_estimator: CreateEstimator = Estimator, **node_arguments: Any) -> None:
         super().__init__("estimator", EstimatorParameters, **node_arguments)
         self._swarm = load_swarm(Path(self.chosen.swarm_file))
         if not is_precompiled(precompile):
@@ -109,7 +109,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         self._estimator = create_estimator(self._swarm, self.chosen.settings)
         shared = self.chosen.shared_topics
         self._ingest = Ingest(self._swarm, self.chosen.map_frame, live_topics(self._swarm, shared=shared))
-        self._estimate: SwarmEstimate | None = None
+        self._estimate: Estimate | None = None
         self._jumps = 0
         self._pace = FusionPace(self.chosen.fusion_load, self.chosen.settings.horizon_s)
         self._shedding = Shedding(self.chosen.fusion_load, self.chosen.settings.horizon_s)
@@ -187,7 +187,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         self._cost.note(busy_s)
         self._shedding.note(busy_s, fusing_s)
 
-    def _estimate_at(self, now_ns: int, begin_s: float) -> tuple[SwarmEstimate, float]:
+    def _estimate_at(self, now_ns: int, begin_s: float) -> tuple[Estimate, float]:
         """Fuse what there is time for; the poses at an instant, and how long fusing took [s].
 
         Fusing a large swarm takes longer than a tick: it is spread over several, and rests then. Meanwhile

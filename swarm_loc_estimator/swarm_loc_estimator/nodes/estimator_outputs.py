@@ -14,7 +14,7 @@ from swarm_loc_estimator.common.messages.outputs import SwarmPosesEncoder, Trans
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.sightings import newest_sightings
 from swarm_loc_msgs.msg import RobotIdentities, SwarmPoses, SwarmSightings
 
@@ -52,7 +52,7 @@ class EstimateOutputs:
         self._tf = node.create_publisher(TFMessage, "/tf", _TF) if parameters.publish_tf else None
         self._tf_encoder = TransformsEncoder(frame, [f"{name}/{parameters.odom_frame}" for name in names])
 
-    def publish(self, estimate: SwarmEstimate) -> None:
+    def publish(self, estimate: Estimate) -> None:
         """Publish all poses; robots that wait for a fix are in `swarm/poses` only, as waiting."""
         e = estimate
         located = e.status != Status.WAITING
@@ -79,7 +79,7 @@ class EstimateOutputs:
             encode_identities(self._frame, identities.stamp_ns, self._names, identities.place, probability)
         )
 
-    def publish_sightings(self, estimator: SwarmEstimator, now_ns: int) -> None:
+    def publish_sightings(self, estimator: Estimator, now_ns: int) -> None:
         """Publish what the robots see and what became of it, a few times a second and if somebody listens."""
         if abs(now_ns - self._sightings_ns) < _SIGHTINGS_PERIOD_NS:
             return

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from swarm_loc_estimator.common.number_spec import number
 from swarm_loc_estimator.common.parameters import flag, text
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,4 @@ class EstimatorParameters:
         False,
         "listen to swarm/odom, swarm/detections and swarm/fixes in place of topics of each robot",
     )
-    settings: EstimatorSettings = field(
-        default_factory=EstimatorSettings, metadata={"numbers_of": EstimatorSettings}
-    )
+    settings: Settings = field(default_factory=Settings, metadata={"numbers_of": Settings})

@@ -12,7 +12,7 @@ from rclpy.qos import QoSProfile
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.planar import PLANE, yaw_of
 from swarm_loc_estimator.swarm.swarm import StartSigma, Swarm
-from swarm_loc_estimator.timeline.estimator import SwarmEstimator
+from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_msgs.srv import SetRobotPose
 
 NO_CLOCK = "use_sim_time is true but no /clock has come"
@@ -62,7 +62,7 @@ class PoseCommands:
     """
 
     def __init__(
-        self, node: Node, swarm: Swarm, estimator: SwarmEstimator, map_frame: str, *, by_topics: bool
+        self, node: Node, swarm: Swarm, estimator: Estimator, map_frame: str, *, by_topics: bool
     ) -> None:
         self._node = node
         self._swarm = swarm

@@ -12,8 +12,8 @@ from swarm_loc_estimator.offline.recorded_bag import Progress, read_bag, unwatch
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.offline.runner import ListedSchedule, PeriodicSchedule, Runner
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.timeline.estimator import SwarmEstimator
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimator
+from swarm_loc_estimator.timeline.settings import Settings
 
 TICK_S = 0.1
 """Default time between two outputs [s]."""
@@ -22,7 +22,7 @@ TICK_S = 0.1
 def replay(
     bag: Path,
     swarm: Swarm,
-    settings: EstimatorSettings | None = None,
+    settings: Settings | None = None,
     *,
     tick_s: float = TICK_S,
     stamp_ns: npt.NDArray[np.int64] | None = None,
@@ -45,7 +45,7 @@ def replay(
     """
     periodic = PeriodicSchedule(round(tick_s * 1e9))
     schedule = periodic if stamp_ns is None else ListedSchedule(stamp_ns)
-    runner = Runner(SwarmEstimator(swarm, settings), schedule, keep_sightings=keep_sightings)
+    runner = Runner(Estimator(swarm, settings), schedule, keep_sightings=keep_sightings)
     summary = read_bag(bag, swarm, runner.take, progress)
     runner.finish(summary.range_ns[1])
     remarks = list(summary.remarks)

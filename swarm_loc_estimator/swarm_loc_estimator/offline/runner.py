@@ -19,7 +19,7 @@ from swarm_loc_estimator.offline.spool import Spool
 from swarm_loc_estimator.offline.surroundings import AerialImages
 from swarm_loc_estimator.sensors.ingest import MAX_PAUSE_NS
 from swarm_loc_estimator.sensors.messages import RawInputs
-from swarm_loc_estimator.timeline.estimator import SwarmEstimator
+from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.sightings import Sightings, newest_sightings
 
 _TICKS_AT_ONCE = 256
@@ -107,7 +107,7 @@ class Runner:
 
     def __init__(
         self,
-        estimator: SwarmEstimator,
+        estimator: Estimator,
         schedule: Schedule,
         *,
         keep_sightings: bool = False,

@@ -33,7 +33,7 @@ from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import estimate_at
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 _GATE = float(gate_threshold(0.9999))
 _MAX_FREE = 200
@@ -59,7 +59,7 @@ class PictureFusion:
         tracks: The robots' odometry.
     """
 
-    def __init__(self, swarm: Swarm, settings: EstimatorSettings, tracks: OdometryTracks) -> None:
+    def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks) -> None:
         self._tracks = tracks
         self._settings = settings
         self._moves = np.array([not robot.stands for robot in swarm.robots], dtype=bool)

@@ -34,7 +34,7 @@ from swarm_loc_estimator.sensors.messages import (
     chosen,
 )
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 VALID = 0
 REJECT_REASONS = ("", "non_finite", "absurd", "bad_covariance")
@@ -62,7 +62,7 @@ class InputValidator:
         drops: Reason -> how much could not be used.
     """
 
-    def __init__(self, swarm: Swarm, settings: EstimatorSettings) -> None:
+    def __init__(self, swarm: Swarm, settings: Settings) -> None:
         self.drops: Counter[str] = Counter()
         self._converter = SightingConverter(swarm)
         self._stands = np.array([robot.stands for robot in swarm.robots], dtype=bool)

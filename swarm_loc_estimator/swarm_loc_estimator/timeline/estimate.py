@@ -34,7 +34,7 @@ _WAITING, _TRACKED, _STALE = int(Status.WAITING), int(Status.TRACKED), int(Statu
 _UNCONFIRMED, _CONTRADICTED = int(Status.UNCONFIRMED), int(Status.CONTRADICTED)
 
 
-class SwarmEstimate(NamedTuple):
+class Estimate(NamedTuple):
     """Poses of all robots at one instant.
 
     Attributes:
@@ -54,7 +54,7 @@ class SwarmEstimate(NamedTuple):
     fix_age_s: FloatArray
 
 
-def estimate_at(state: SwarmState, tracks: TrackArrays, timeout_s: FloatArray, now_ns: int) -> SwarmEstimate:
+def estimate_at(state: SwarmState, tracks: TrackArrays, timeout_s: FloatArray, now_ns: int) -> Estimate:
     """The estimate at an instant.
 
     Args:
@@ -69,9 +69,9 @@ def estimate_at(state: SwarmState, tracks: TrackArrays, timeout_s: FloatArray, n
 
 
 @cached_njit
-def _new_estimate(now_ns: int, robots: int) -> SwarmEstimate:
+def _new_estimate(now_ns: int, robots: int) -> Estimate:
     """An estimate of so many robots, none of them located."""
-    return SwarmEstimate(
+    return Estimate(
         now_ns,
         np.full((robots, 3), np.nan),
         np.full((robots, 3, 3), np.nan),
@@ -82,7 +82,7 @@ def _new_estimate(now_ns: int, robots: int) -> SwarmEstimate:
 
 
 @cached_njit
-def _write_all(belief: BeliefArrays, tracks: TrackArrays, timeout_s: FloatArray, out: SwarmEstimate) -> None:
+def _write_all(belief: BeliefArrays, tracks: TrackArrays, timeout_s: FloatArray, out: Estimate) -> None:
     """Fill an estimate."""
     sample, scratch, t, error = new_sample(1), new_scratch(), np.empty(3), np.empty((3, 3))
     track, raw = sample.pose[0], sample.raw[0]

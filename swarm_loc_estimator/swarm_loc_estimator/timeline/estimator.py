@@ -22,16 +22,16 @@ from swarm_loc_estimator.sensors.validation import (
 )
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.contradictions import Contradiction, contradictions
-from swarm_loc_estimator.timeline.estimate import Status, SwarmEstimate, estimate_at
+from swarm_loc_estimator.timeline.estimate import Estimate, Status, estimate_at
 from swarm_loc_estimator.timeline.fusion import Fusion, Verdict
 from swarm_loc_estimator.timeline.self_calibration import learned, learns
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.timeline import GoOn, Timeline
 
-__all__ = ["Status", "SwarmEstimate", "SwarmEstimator"]
+__all__ = ["Estimate", "Estimator", "Status"]
 
 
-class SwarmEstimator:
+class Estimator:
     """Joint, buffered estimation of all poses of a swarm.
 
     Data may come in any order and late; each counts at its own stamp when it is no older than the
@@ -42,9 +42,9 @@ class SwarmEstimator:
         settings: How to buffer and gate.
     """
 
-    def __init__(self, swarm: Swarm, settings: EstimatorSettings | None = None) -> None:
+    def __init__(self, swarm: Swarm, settings: Settings | None = None) -> None:
         self.swarm = swarm
-        self.settings = (settings or EstimatorSettings()).chosen_for(swarm)
+        self.settings = (settings or Settings()).chosen_for(swarm)
         self._timeout_s = np.array([robot.odometry.timeout_s for robot in swarm.robots])
         self._tracks = OdometryTracks(swarm.robots)
         self._validator = InputValidator(swarm, self.settings)
@@ -179,7 +179,7 @@ class SwarmEstimator:
         """Whether some of what the last `tick` began to fuse was left to the next ones."""
         return self._timeline.is_under_way
 
-    def tick(self, now_ns: int, *, fuse: bool = True, go_on: GoOn = lambda: True) -> SwarmEstimate:
+    def tick(self, now_ns: int, *, fuse: bool = True, go_on: GoOn = lambda: True) -> Estimate:
         """Use all that has arrived and give the poses at `now_ns`; measurements wait unless `fuse`.
 
         Fusing stops where `go_on` says that there is no time for another step, and goes on at the next tick;
@@ -223,6 +223,6 @@ class SwarmEstimator:
             "too_old": self._timeline.too_old,
         }
 
-    def _estimate(self, now_ns: int) -> SwarmEstimate:
+    def _estimate(self, now_ns: int) -> Estimate:
         state = self._fusion.with_starts(self._timeline.state, now_ns)
         return estimate_at(state, self._tracks.arrays, self._timeout_s, now_ns)

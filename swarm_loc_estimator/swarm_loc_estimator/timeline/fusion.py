@@ -38,7 +38,7 @@ from swarm_loc_estimator.sensors.aerial import PictureFusion, as_fixes, relieve_
 from swarm_loc_estimator.sensors.messages import chosen
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.fusion_period import middle_of_period
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 _SURER_AT_FIRST = 1.5
 """By this factor a heading must be surer than one that is lost, for a robot to be initialized."""
@@ -77,7 +77,7 @@ class Fusion:
         is_sparse: Whether only covariances of neighbours are kept: in a large swarm.
     """
 
-    def __init__(self, swarm: Swarm, settings: EstimatorSettings, tracks: OdometryTracks) -> None:
+    def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks) -> None:
         self._tracks = tracks
         self._limits = LossLimits(
             settings.lost_sigma, settings.lost_heading_sigma, settings.lost_after, settings.max_doubt

@@ -20,7 +20,7 @@ class SettingsError(UserError):
 
 
 @dataclass(frozen=True)
-class EstimatorSettings:
+class Settings:
     """How measurements are buffered, judged and given up on; each number with its range beside it.
 
     Raises:
@@ -106,7 +106,7 @@ class EstimatorSettings:
             if not spec.allows(value):
                 raise SettingsError(f"parameter {name} = {value} must lie in {spec.range_text}.")
 
-    def chosen_for(self, swarm: Swarm) -> EstimatorSettings:
+    def chosen_for(self, swarm: Swarm) -> Settings:
         """The same with the fusion period that is usual for a swarm, where none is given."""
         if self.fusion_period_s >= 0.0:
             return self

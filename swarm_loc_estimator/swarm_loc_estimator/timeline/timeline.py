@@ -20,7 +20,7 @@ from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.timeline.buffer import MeasurementBuffer
 from swarm_loc_estimator.timeline.fusion import Verdict
 from swarm_loc_estimator.timeline.fusion_period import end_of_period, middle_of_period
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 Step = Callable[[SwarmState, MeasurementArray, NDArray[np.uint8], FloatArray], None]
 GoOn = Callable[[], bool]
@@ -56,7 +56,7 @@ class Timeline:
         is_under_way: Whether steps are left to compute of what the last `advance` began.
     """
 
-    def __init__(self, settings: EstimatorSettings, step: Step, state: SwarmState, reach_ns: int) -> None:
+    def __init__(self, settings: Settings, step: Step, state: SwarmState, reach_ns: int) -> None:
         self._step = step
         self._horizon_ns = round(settings.horizon_s * 1e9)
         self._state_period_ns = round(settings.state_period_s * 1e9)

@@ -33,8 +33,8 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 from swarm_loc_estimator.sensors.messages import RawInputs
 from swarm_loc_estimator.timeline.contradictions import Contradiction, Kind
-from swarm_loc_estimator.timeline.estimator import SwarmEstimate
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimate
+from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.timeline import GoOn
 from swarm_loc_msgs.msg import SwarmPose
 from swarm_loc_msgs.srv import SetRobotPose
@@ -299,7 +299,7 @@ class StandIn:
         self.identities = None
         self.is_fusing = False
         self.note = ""
-        self.settings = EstimatorSettings()
+        self.settings = Settings()
 
     def receive(self, messages: RawInputs) -> None:
         """Remember whose and when."""
@@ -313,15 +313,13 @@ class StandIn:
         """Nothing may go missing."""
         assert not count, reason
 
-    def tick(self, now_ns: int, *, fuse: bool, go_on: GoOn) -> SwarmEstimate:
+    def tick(self, now_ns: int, *, fuse: bool, go_on: GoOn) -> Estimate:
         """Always the same."""
         assert fuse
         assert go_on()
         poses = np.array([[1.0, 2.0, 0.5], [np.nan, np.nan, np.nan]])
         covariances = np.tile(np.eye(3), (2, 1, 1))
-        return SwarmEstimate(
-            now_ns, poses, covariances, poses, np.array([1, 0], np.uint8), np.array([0.25, -1.0])
-        )
+        return Estimate(now_ns, poses, covariances, poses, np.array([1, 0], np.uint8), np.array([0.25, -1.0]))
 
 
 def test_the_node_only_carries_between_topics_and_estimator(ros: Ros, swarm_file: Any) -> None:

@@ -22,7 +22,7 @@ from swarm_loc_estimator.offline.live.recorder import Recorder
 from swarm_loc_estimator.offline.live.run import ESTIMATOR, play_live, read_bag
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Status
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 DEMO = Path(__file__).parents[3] / "bags" / "eight_five_robots"
 SWARM_FILE = DEMO / "swarm.yaml"
@@ -42,7 +42,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_live_poses_are_those_of_replay(bag: Path, tmp_path: Path) -> None:
-    settings = EstimatorSettings(horizon_s=11.0)  # longer than the bag
+    settings = Settings(horizon_s=11.0)  # longer than the bag
     # however slow the machine, every tick fuses and nothing is too old
     patient = {"estimator": {"ros__parameters": {"fusion_load": 1.0, "horizon_s": settings.horizon_s}}}
     (tmp_path / "parameters.yaml").write_text(json.dumps(patient), encoding="utf-8")

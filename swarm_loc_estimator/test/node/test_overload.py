@@ -16,7 +16,7 @@ from node_world import TRUE_POSES, Ros, detection_bytes, odometry_bytes, overrid
 
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 from swarm_loc_estimator.sensors.messages import RawInputs
-from swarm_loc_estimator.timeline.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.timeline import GoOn
 from swarm_loc_msgs.msg import MarkerDetectionArray, SwarmPose, SwarmPoses
 
@@ -25,7 +25,7 @@ COST_S = 0.03
 """Sixteen sightings come in a tick of 200 ms: they would take 480 ms."""
 
 
-class SlowEstimator(SwarmEstimator):
+class SlowEstimator(Estimator):
     """Takes its time for each sighting that it fuses."""
 
     def __init__(self, *arguments: Any) -> None:
@@ -42,7 +42,7 @@ class SlowEstimator(SwarmEstimator):
         self.odometry += messages.odometry.robot.size
         super().receive(messages)
 
-    def tick(self, now_ns: int, *, fuse: bool = True, go_on: GoOn = lambda: True) -> SwarmEstimate:
+    def tick(self, now_ns: int, *, fuse: bool = True, go_on: GoOn = lambda: True) -> Estimate:
         """Fuse slowly."""
         if fuse:
             time.sleep(self.cost_s * self._waiting)

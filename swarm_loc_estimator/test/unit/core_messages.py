@@ -18,7 +18,7 @@ from swarm_loc_estimator.sensors.messages import (
     OdometryRows,
     RawInputs,
 )
-from swarm_loc_estimator.timeline.estimator import SwarmEstimator
+from swarm_loc_estimator.timeline.estimator import Estimator
 
 SECOND = 10**9
 T0 = 1_000 * SECOND
@@ -58,7 +58,7 @@ def joined(detections: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
 
 
 def give_fix(
-    estimator: SwarmEstimator, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike, now_ns: int
+    estimator: Estimator, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike, now_ns: int
 ) -> None:
     """Hand in an absolute fix: pose (3,) in `map`, heading NaN if not measured, and covariance (3, 3)."""
     fix = FixRows(
@@ -81,12 +81,12 @@ class Event:
     detections: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, dtype=DETECTION_DTYPE))
     aerial: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, dtype=ANONYMOUS_DTYPE))
 
-    def give(self, estimator: SwarmEstimator, now_ns: int) -> None:
+    def give(self, estimator: Estimator, now_ns: int) -> None:
         """Hand the message in."""
         give(estimator, [(now_ns, self)])
 
 
-def give(estimator: SwarmEstimator, arrivals: Sequence[tuple[int, Event]]) -> None:
+def give(estimator: Estimator, arrivals: Sequence[tuple[int, Event]]) -> None:
     """Hand in messages (arrival, event) in order of their arrivals, as a node does at a tick."""
     moved = [(e.robot, e.stamp_ns, now_ns, e.pose) for now_ns, e in arrivals if e.pose is not None]
     seen = [(e.robot, e.stamp_ns, now_ns) for now_ns, e in arrivals for _ in range(e.detections.size)]

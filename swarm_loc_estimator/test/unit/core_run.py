@@ -7,18 +7,18 @@ from collections.abc import Container, Iterable
 from core_messages import SECOND, Event, give
 from core_world import World
 
-from swarm_loc_estimator.timeline.estimator import SwarmEstimate, SwarmEstimator
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.fusion import Verdict
 from swarm_loc_estimator.timeline.timeline import GoOn
 
 
 def play(
-    estimator: SwarmEstimator,
+    estimator: Estimator,
     events: Iterable[tuple[int, Event]],
     ticks_ns: Iterable[int],
     resting_ns: Container[int] = (),
     go_on: GoOn = lambda: True,
-) -> list[SwarmEstimate]:
+) -> list[Estimate]:
     """Hand in events (arrival, event) as they arrive, and tick, not fusing at some; return all estimates."""
     waiting = sorted(events, key=lambda pair: pair[0])
     estimates, k = [], 0
@@ -42,7 +42,7 @@ def ticks(begin_ns: int, end_ns: int, period_s: float = 0.1) -> list[int]:
     return [*range(begin_ns, end_ns, round(period_s * SECOND)), end_ns]
 
 
-def settled(estimator: SwarmEstimator) -> dict[str, int]:
+def settled(estimator: Estimator) -> dict[str, int]:
     """How many measurements ended with which verdict."""
     counts = estimator._timeline.verdict_counts()
     return {verdict.name: int(counts[verdict]) for verdict in Verdict}

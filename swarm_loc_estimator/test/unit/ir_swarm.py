@@ -21,8 +21,8 @@ from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains
 from swarm_loc_estimator.swarm.robot_ir import RobotIr
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, StartSigma, Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.timeline.estimator import SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
+from swarm_loc_estimator.timeline.settings import Settings
 
 SECOND = 10**9
 T0 = 1_000 * SECOND
@@ -256,13 +256,13 @@ def brightness_rows(arrived: Sequence[tuple[Light, int]]) -> BrightnessRows:
 def play(
     run: Run,
     arrivals: Sequence[tuple[int, Event]] | None = None,
-    settings: EstimatorSettings | None = None,
+    settings: Settings | None = None,
     period_s: float = 0.5,
-) -> tuple[SwarmEstimator, list[SwarmEstimate]]:
+) -> tuple[Estimator, list[Estimate]]:
     """Let messages arrive, by default each at its stamp, and tick now and then."""
-    estimator = SwarmEstimator(run.swarm, settings)
+    estimator = Estimator(run.swarm, settings)
     waiting = sorted(arrivals or [(event.stamp_ns, event) for event in run.events], key=lambda pair: pair[0])
-    period_ns, estimates, begin = round(period_s * SECOND), list[SwarmEstimate](), 0
+    period_ns, estimates, begin = round(period_s * SECOND), list[Estimate](), 0
     for now_ns in range(T0 + period_ns, waiting[-1][0] + 2 * period_ns, period_ns):
         end = begin
         while end < len(waiting) and waiting[end][0] <= now_ns:

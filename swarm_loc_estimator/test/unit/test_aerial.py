@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
+from swarm_loc_estimator.timeline.settings import Settings
 
 UNKNOWN = Plan(4, 15.0, 0.15, start_known=(False,))
 Arrival = tuple[int, Event]
@@ -27,14 +27,14 @@ def run(
     world: World,
     arrivals: Sequence[Arrival],
     period_s: float = 0.25,
-    settings: EstimatorSettings | None = None,
-) -> tuple[SwarmEstimator, list[SwarmEstimate]]:
-    estimator = SwarmEstimator(world.swarm, settings)
+    settings: Settings | None = None,
+) -> tuple[Estimator, list[Estimate]]:
+    estimator = Estimator(world.swarm, settings)
     last_ns = max(arrival_ns for arrival_ns, _ in arrivals)
     return estimator, play(estimator, arrivals, ticks(T0, last_ns, period_s))
 
 
-def errors(world: World, estimates: Sequence[SwarmEstimate]) -> FloatArray:
+def errors(world: World, estimates: Sequence[Estimate]) -> FloatArray:
     """Errors (T, N, 3), NaN of robots that wait."""
     return np.array([wrapped(one.poses - world.at(one.stamp_ns)) for one in estimates])
 
@@ -115,7 +115,7 @@ def test_any_lateness_loss_and_repetition_gives_the_same(
     rng = np.random.default_rng(seed)
     plan = Plan(3, 7.0, 0.2, start_known=start_known, carried=(0,) if carried else ())
     world = seen_from_above(plan, View(detected=0.9, false=0.3, headings=headings), seed).world
-    chosen = EstimatorSettings(state_period_s=state_period_s)
+    chosen = Settings(state_period_s=state_period_s)
     events = [event for event in world.events if rng.uniform() < 0.9]
     orderly = [(event.stamp_ns, event) for event in events]
     late = [(event.stamp_ns + int(rng.uniform(0, late_s) * SECOND), event) for event in events]

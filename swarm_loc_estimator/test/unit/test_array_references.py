@@ -15,7 +15,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import inlined_njit, norefcount_njit
 from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
 from swarm_loc_estimator.timeline import fusion
-from swarm_loc_estimator.timeline.estimator import SwarmEstimator
+from swarm_loc_estimator.timeline.estimator import Estimator
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_a_run_leaves_no_array_behind(many: int, monkeypatch: pytest.MonkeyPatch
     world = simulate(Plan(3, 4.0), 1)
     counts = []
     for _ in range(3):
-        estimator = SwarmEstimator(world.swarm)
+        estimator = Estimator(world.swarm)
         play(estimator, on_time(world), ticks(T0, int(world.stamp_ns[-1])))
         assert settled(estimator)["USED"] > 20
         del estimator

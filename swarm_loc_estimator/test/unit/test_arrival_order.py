@@ -15,29 +15,29 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.timeline import fusion, timeline
-from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
+from swarm_loc_estimator.timeline.settings import Settings
 
 Arrival = tuple[int, Event]
-EXACT = EstimatorSettings(fusion_period_s=0.0)
+EXACT = Settings(fusion_period_s=0.0)
 
 
 @dataclass
 class Outcome:
     """An estimator at the end of a run, and its last estimate."""
 
-    estimator: SwarmEstimator
-    estimate: SwarmEstimate
+    estimator: Estimator
+    estimate: Estimate
 
 
 def outcome(
     world: World,
     arrivals: Sequence[Arrival],
     at_ns: Sequence[int],
-    settings: EstimatorSettings = EXACT,
+    settings: Settings = EXACT,
     resting_ns: Container[int] = (),
 ) -> Outcome:
-    estimator = SwarmEstimator(world.swarm, settings)
+    estimator = Estimator(world.swarm, settings)
     return Outcome(estimator, play(estimator, arrivals, at_ns, resting_ns)[-1])
 
 
@@ -114,7 +114,7 @@ def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
     rng = np.random.default_rng(seed)
     plan = Plan(robots, 3.5, 0.2, content=content, start_known=start_known, outliers=outliers, flips=0.1)
     world = simulate(replace(plan, lasting=lasting, survey=lasting), seed)
-    chosen = EstimatorSettings(
+    chosen = Settings(
         fusion_period_s=fusion_period_s,
         fusion_delay_s=delay_s or 0.0,
         sparse_from=2 if sparse else 250,
@@ -157,14 +157,14 @@ def test_fusing_a_few_steps_at_each_tick_gives_the_same(
     rng = np.random.default_rng(seed)
     world = simulate(Plan(4, 3.5, 0.2, start_known=start_known, outliers=0.1, flips=0.1), seed)
     # so long a horizon that nothing is too old, however long it waits
-    chosen = EstimatorSettings(
+    chosen = Settings(
         fusion_period_s=fusion_period_s, sparse_from=2 if sparse else 250, horizon_s=20.0, lost_after=2
     )
     arrivals = [(event.stamp_ns + int(rng.uniform(0, late_s) * SECOND), event) for event in world.events]
     at_ns = ticks(T0, T0 + 6 * SECOND, 0.09)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fusion, "_MANY", 5)
-        in_parts = SwarmEstimator(world.swarm, chosen)
+        in_parts = Estimator(world.swarm, chosen)
         estimates = play(in_parts, arrivals, at_ns, go_on=lambda: bool(rng.uniform() < part))
         assert all(np.isfinite(one.poses[one.status != Status.WAITING]).all() for one in estimates)
         for _ in range(2):  # what was begun, then what has come since
@@ -176,7 +176,7 @@ def test_fusing_a_few_steps_at_each_tick_gives_the_same(
 def test_poses_are_given_while_fusing_takes_several_ticks() -> None:
     """By what was known before it began: never by less."""
     world = small()
-    estimator = SwarmEstimator(world.swarm, replace(EXACT, fusion_period_s=0.2))
+    estimator = Estimator(world.swarm, replace(EXACT, fusion_period_s=0.2))
     play(estimator, delayed(driving(world, 1.0), lambda _: 0.0), ticks(T0, T0 + SECOND))
     late = [sighting(world, t, 0.1 * t) for t in (0.31, 0.51, 0.71, 0.91)]
     arrivals = [(T0 + SECOND + 1, event) for event in late]
@@ -287,7 +287,7 @@ def test_what_shares_a_stamp_counts_the_same_in_any_order(what: str) -> None:
         pair[1].detections["position"][0, 0] += 0.01
     outcomes = []
     for order in (pair, pair[::-1]):
-        estimator = SwarmEstimator(world.swarm, EXACT)
+        estimator = Estimator(world.swarm, EXACT)
         play(estimator, base, ticks(T0, T0 + SECOND))
         for number, event in enumerate(order):
             if what == "orders":
@@ -299,7 +299,7 @@ def test_what_shares_a_stamp_counts_the_same_in_any_order(what: str) -> None:
     assert_same(*outcomes)
 
 
-def _give_order(estimator: SwarmEstimator, number: int) -> None:
+def _give_order(estimator: Estimator, number: int) -> None:
     """A seat, or a fix at the same instant."""
     pose, covariance = np.array([0.0, 0.1, 0.2]), 1e-4 * np.eye(3)
     if number:
@@ -311,7 +311,7 @@ def _give_order(estimator: SwarmEstimator, number: int) -> None:
 def test_a_repeated_message_counts_once_and_two_sightings_of_a_marker_twice() -> None:
     world = small()
     events = driving(world, 1.0)
-    estimator = SwarmEstimator(world.swarm, EXACT)
+    estimator = Estimator(world.swarm, EXACT)
     play(estimator, delayed(events + events, lambda _: 0.0), ticks(T0, T0 + SECOND))
     rows = sum(event.pose is not None for event in events)
     assert estimator.drops == {"duplicate": len(events) - rows, "odometry_duplicate": rows}
@@ -324,7 +324,7 @@ def test_a_repeated_message_counts_once_and_two_sightings_of_a_marker_twice() ->
 def test_stored_states_keep_all_sightings_of_a_period() -> None:
     world = small()
     events = driving(world, 2.0)
-    estimator = SwarmEstimator(world.swarm, replace(EXACT, state_period_s=0.5))
+    estimator = Estimator(world.swarm, replace(EXACT, state_period_s=0.5))
     play(estimator, delayed(events, lambda _: 0.0), ticks(T0, T0 + 2 * SECOND))
     assert "duplicate" not in estimator.drops
     assert sum(settled(estimator).values()) == sum(event.detections.size for event in events)
@@ -335,7 +335,7 @@ def test_late_orders_count_at_their_own_time() -> None:
     arrivals = delayed(driving(world, 3.0), lambda _: 0.0)
     results = []
     for asked_s in (1.0, 2.4):
-        estimator = SwarmEstimator(world.swarm, EXACT)
+        estimator = Estimator(world.swarm, EXACT)
         play(
             estimator,
             [a for a in arrivals if a[0] <= T0 + asked_s * SECOND],
@@ -350,7 +350,7 @@ def test_late_orders_count_at_their_own_time() -> None:
 
 def test_a_clock_that_wobbles_neither_resets_nor_breaks() -> None:
     world = small()
-    estimator = SwarmEstimator(world.swarm, EXACT)
+    estimator = Estimator(world.swarm, EXACT)
     play(estimator, delayed(driving(world, 6.0), lambda _: 0.0), ticks(T0, T0 + 6 * SECOND))
     back_ns = T0 + 6 * SECOND - 4 * SECOND // 10
     sighting(world, 3.65, 0.365).give(estimator, back_ns)
@@ -365,7 +365,7 @@ def test_the_same_data_give_the_same_bytes(sparse_from: int, lasting: float) -> 
     plan = Plan(3, 3.0, flips=0.1, content=POSE_TWO, lasting=lasting, survey=lasting)
     world, chosen = (
         simulate(plan, 3),
-        EstimatorSettings(sparse_from=sparse_from),
+        Settings(sparse_from=sparse_from),
     )
     a, b = (outcome(world, on_time(world), ticks(T0, T0 + 3 * SECOND), chosen).estimate for _ in range(2))
     assert a.poses.tobytes() == b.poses.tobytes()

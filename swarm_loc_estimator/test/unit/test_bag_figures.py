@@ -11,15 +11,13 @@ from swarm_loc_estimator.offline.metrics import pool, summarise
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 BAGS = Path(__file__).parents[3] / "bags"
 BEGINNING_S = 30.0
 
 
-def replayed(
-    bag: str, description: str = "swarm.yaml", settings: EstimatorSettings | None = None
-) -> ReplayResult:
+def replayed(bag: str, description: str = "swarm.yaml", settings: Settings | None = None) -> ReplayResult:
     return replay(BAGS / bag, load_swarm(BAGS / bag / description), settings)
 
 
@@ -54,7 +52,7 @@ def test_five_robots_that_calibrate_themselves_are_located_to_millimetres() -> N
     """3.3 mm in the world of systematic errors, 7 mm if not described, 21 mm by the paper's filter."""
     assert_good(replayed("eight_five_robots_w2", "self_calibrating.yaml"), 0.0045, 1.5, (0.8, 3.5))
     assert_good(replayed("eight_five_robots_w2"), 0.0095, 1.8, (0.8, 4.5))
-    paper = replayed("eight_five_robots_w2", settings=EstimatorSettings(max_doubt=1e9))
+    paper = replayed("eight_five_robots_w2", settings=Settings(max_doubt=1e9))
     assert summarise(pool([*paper.errors.values()])).position_rmse > 0.015
 
 

@@ -42,7 +42,7 @@ from swarm_loc_estimator.sensors.camera import CONTENT_POSE
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
 from swarm_loc_estimator.swarm.swarm import CameraMount, OdometryModel, Robot, SensorModel
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 BAGS = Path(__file__).parents[3] / "bags"
 DROPLETS, FAST = BAGS / "droplets_twenty", BAGS / "eight_one_robot_fast"
@@ -277,7 +277,7 @@ def test_how_often_poses_are_wanted_changes_nothing_in_the_filter_of_a_dense_swa
     np.testing.assert_allclose(often.pose[rows], seldom.pose[:-1], atol=1e-9)
     np.testing.assert_allclose(often.covariance[rows], seldom.covariance[:-1], atol=1e-9)
     for period_s in (0.0, TICK_S):  # one measurement after the other, and more of them together
-        other = rerun(recording, swarm, TICK_S, EstimatorSettings(fusion_period_s=period_s))
+        other = rerun(recording, swarm, TICK_S, Settings(fusion_period_s=period_s))
         assert np.nanmax(np.abs(other.pose - seldom.pose)) > 1e-6
 
 

@@ -17,7 +17,7 @@ from swarm_loc_estimator.common.messages.typestore import BRIGHTNESS, POSE_WITH_
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.messages import RawInputs
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
-from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimator
+from swarm_loc_estimator.timeline.estimator import Estimator, Status
 
 SECOND = 1_000_000_000
 T0 = 1_000 * SECOND
@@ -136,7 +136,7 @@ def test_the_variance_of_its_heading_says_whether_a_fix_has_one(variance: float,
 
 def test_fixes_locate_robots_that_stand_and_robots_that_drive() -> None:
     """Through the very path of live nodes and replay; heading from the fix, or from three places."""
-    estimator, ingest = SwarmEstimator(SWARM), Ingest(SWARM)
+    estimator, ingest = Estimator(SWARM), Ingest(SWARM)
     for k in range(30):
         now_ns, path = T0 + k * SECOND // 10, 0.02 * k
         blind = np.diag([1e-6, 1e-6, -1.0])
@@ -168,7 +168,7 @@ def test_odometry_of_a_robot_that_has_none_is_dropped() -> None:
         "b/odom", "b", np.array([T0]), np.zeros((1, 3)), np.zeros((1, 3)), np.eye(6), np.eye(6)
     )
     found, _ = read(("b/odom", pose, T0))
-    estimator = SwarmEstimator(SWARM)
+    estimator = Estimator(SWARM)
     estimator.receive(found)
     assert estimator.drops == {"no_odometry": 1}
 
@@ -181,6 +181,6 @@ def test_fixes_that_cannot_be_used_are_dropped_with_a_reason() -> None:
         ("b/fix", encode_fix("map", T0, (0.0, 0.0, 0.0), flat), T0),
         ("b/fix", encode_fix("map", T0 + SECOND, (0.0, 0.0, 0.0), good), T0),
     )
-    estimator = SwarmEstimator(SWARM)
+    estimator = Estimator(SWARM)
     estimator.receive(found)
     assert estimator.drops == {"absurd": 1, "bad_covariance": 1, "future_stamp": 1, "non_finite": 1}

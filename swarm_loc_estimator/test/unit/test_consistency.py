@@ -15,8 +15,8 @@ from scipy.stats import chi2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline import fusion
-from swarm_loc_estimator.timeline.estimator import SwarmEstimator
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimator
+from swarm_loc_estimator.timeline.settings import Settings
 
 SEEDS = range(6)
 
@@ -24,10 +24,10 @@ world_of = lru_cache(maxsize=len(SEEDS))(simulate)
 """For tests that let several estimators run over one world, and change nothing in it."""
 
 
-def errors(world: World, settings: EstimatorSettings, period_s: float) -> tuple[FloatArray, FloatArray]:
+def errors(world: World, settings: Settings, period_s: float) -> tuple[FloatArray, FloatArray]:
     """Errors (T, N, 3) and covariances (T, N, 3, 3) of a run, every `period_s`."""
     end_ns = int(world.stamp_ns[-1])
-    estimates = play(SwarmEstimator(world.swarm, settings), on_time(world), ticks(T0, end_ns, period_s))
+    estimates = play(Estimator(world.swarm, settings), on_time(world), ticks(T0, end_ns, period_s))
     error = np.array([estimate.poses - world.at(estimate.stamp_ns) for estimate in estimates])
     return wrapped(error), np.array([estimate.covariances for estimate in estimates])
 
@@ -48,7 +48,7 @@ def test_the_normalised_error_is_chi_square_distributed(content: int, flips: flo
     squared = []
     for seed in SEEDS:
         world = simulate(Plan(robots, 8.0, content=content, flips=flips, landmarks=6), 100 + seed)
-        error, covariance = errors(world, EstimatorSettings(), 1.0)
+        error, covariance = errors(world, Settings(), 1.0)
         squared.append(nees(error, covariance)[2:].mean(axis=0))
     assert_chi_square(squared)
 
@@ -57,10 +57,10 @@ def assert_estimated(worlds: Sequence[World], trusting: Callable[[World], Swarm]
     """What is wrong with worlds is estimated: errors are as the filter says, and less than of who trusts."""
     squared, own, others = [], [], []
     for world in worlds:
-        error, covariance = errors(world, EstimatorSettings(), 1.0)
+        error, covariance = errors(world, Settings(), 1.0)
         squared.append(nees(error, covariance)[5:].mean(axis=0))
         own.append(np.square(error[5:, :, :2]).mean())
-        error, _ = errors(replace(world, swarm=trusting(world)), EstimatorSettings(), 1.0)
+        error, _ = errors(replace(world, swarm=trusting(world)), Settings(), 1.0)
         others.append(np.square(error[5:, :, :2]).mean())
     assert_chi_square(squared)
     assert np.mean(own) < 0.7 * np.nanmean(others)  # not a number where it got lost
@@ -106,7 +106,7 @@ def test_without_noise_the_error_vanishes(content: int, fusion_period_s: float) 
         if robot.start
     ]
     world = replace(world, swarm=replace(world.swarm, robots=tuple(wrong)))
-    settings = EstimatorSettings(fusion_period_s=fusion_period_s)
+    settings = Settings(fusion_period_s=fusion_period_s)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fusion, "_MANY", 3)
         error, _ = errors(world, settings, 0.5)
@@ -114,7 +114,7 @@ def test_without_noise_the_error_vanishes(content: int, fusion_period_s: float) 
     assert np.abs(error[-1]).max() < 0.006
 
 
-def rmse(speed: float, settings: EstimatorSettings, period_s: float = 0.25) -> float:
+def rmse(speed: float, settings: Settings, period_s: float = 0.25) -> float:
     """Root mean square of the distances from the truth, looked at every `period_s` [m]."""
     squared = []
     for seed in SEEDS:
@@ -130,7 +130,7 @@ def test_the_closest_stored_state_is_as_good_for_robots_that_stand_and_worse_for
     Between, measurements wait in a state ahead of the odometry, up to which unknown motion is assumed.
     """
     period_s = 0.4
-    exact = EstimatorSettings(fusion_period_s=0.0)
+    exact = Settings(fusion_period_s=0.0)
     closest = replace(exact, state_period_s=period_s)
     standing, fast = (
         [rmse(speed, settings, period_s=period_s) for settings in (closest, exact)] for speed in (0.0, 0.3)
@@ -140,7 +140,7 @@ def test_the_closest_stored_state_is_as_good_for_robots_that_stand_and_worse_for
 
 
 def test_fusing_together_costs_little_accuracy() -> None:
-    together, exact = EstimatorSettings(fusion_period_s=0.2), EstimatorSettings(fusion_period_s=0.0)
+    together, exact = Settings(fusion_period_s=0.2), Settings(fusion_period_s=0.0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fusion, "_MANY", 3)
         assert rmse(0.1, together) < 1.1 * rmse(0.1, exact)
@@ -151,10 +151,10 @@ def test_neighbours_help_where_landmarks_are_few() -> None:
     with_all, without = [], []
     for seed in SEEDS:
         world = simulate(plan, seed)
-        error, _ = errors(world, EstimatorSettings(), 0.5)
+        error, _ = errors(world, Settings(), 0.5)
         with_all.append(np.square(error[8:, :, :2]).sum(axis=-1).mean())
         for event in world.events:
             event.detections["id"][event.detections["id"] < 1000] = 99
-        error, _ = errors(world, EstimatorSettings(), 0.5)
+        error, _ = errors(world, Settings(), 0.5)
         without.append(np.square(error[8:, :, :2]).sum(axis=-1).mean())
     assert np.sqrt(np.mean(with_all)) < 0.8 * np.sqrt(np.mean(without))

@@ -30,8 +30,8 @@ from swarm_loc_estimator.odometry.look_up import new_sample
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.robot_ir import RobotIr
 from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
-from swarm_loc_estimator.timeline.estimator import SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
+from swarm_loc_estimator.timeline.settings import Settings
 
 VARIANCES = np.array([1e-4, 2e-3, 5e-3])
 VALUE = (0.15, 0.4, -2.0)
@@ -297,7 +297,7 @@ def test_a_pair_whose_relative_pose_is_known_exactly_tells_nothing(share: float)
 class StandingPair:
     """An estimator of two robots that stand where `VALUE` says, their starts known so well."""
 
-    def __init__(self, sigma: float, settings: EstimatorSettings) -> None:
+    def __init__(self, sigma: float, settings: Settings) -> None:
         robots = [
             Robot(
                 f"r{k}",
@@ -309,9 +309,9 @@ class StandingPair:
             )
             for k, pose in enumerate(standing(VALUE))
         ]
-        self.estimator = SwarmEstimator(Swarm(tuple(robots)), settings)
+        self.estimator = Estimator(Swarm(tuple(robots)), settings)
 
-    def hear(self, stamps_ns: Sequence[int], share: float) -> SwarmEstimate:
+    def hear(self, stamps_ns: Sequence[int], share: float) -> Estimate:
         """Fuse exchanges at instants, together; return the estimate at the last one."""
         rows = np.concatenate([Exchange(share, stamp_ns=stamp_ns).row() for stamp_ns in stamps_ns])
         rows["gate"] = 9.0
@@ -328,7 +328,7 @@ class StandingPair:
 @pytest.mark.parametrize("sigma", [1e-6, 1e-12])
 @pytest.mark.parametrize("sparse_from", [2, 250])
 def test_robots_whose_starts_are_as_good_as_exact_stay_there(sparse_from: int, sigma: float) -> None:
-    pair = StandingPair(sigma, EstimatorSettings(sparse_from=sparse_from))
+    pair = StandingPair(sigma, Settings(sparse_from=sparse_from))
     for second in range(1, 6):
         estimate = pair.hear([second * 10**9], 0.9)
     np.testing.assert_allclose(estimate.poses, standing(VALUE), atol=1e-9)
@@ -338,8 +338,8 @@ def test_robots_whose_starts_are_as_good_as_exact_stay_there(sparse_from: int, s
 def test_exchanges_that_are_fused_together_tell_no_more_than_their_mean() -> None:
     """Those of one pair in one period, too: as much as one after the other."""
     share, stamps_ns = 0.9, [10**9 + k * 10**8 for k in range(1, 10)]
-    one_by_one = StandingPair(0.1, EstimatorSettings(fusion_period_s=0.0))
-    together = StandingPair(0.1, EstimatorSettings(fusion_period_s=1.0, sparse_from=2))
+    one_by_one = StandingPair(0.1, Settings(fusion_period_s=0.0))
+    together = StandingPair(0.1, Settings(fusion_period_s=1.0, sparse_from=2))
     covariances = []
     for pair in (one_by_one, together):
         covariances.append(pair.hear(stamps_ns, share).covariances)

@@ -12,7 +12,7 @@ from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE
 from swarm_loc_estimator.nodes.estimator_diagnostics import Diagnostics, Recent, TickCost, load_report
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
-from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate
+from swarm_loc_estimator.timeline.estimator import Estimate, Status
 from swarm_loc_estimator.timeline.fusion import Verdict
 
 SECOND = 1_000_000_000
@@ -63,9 +63,9 @@ class World:
         list(self.ingest.read(MessageBatch.of([(self.ingest.handle_of[f"{robot}/odom"], data, now_ns)])))
 
 
-def estimate(now_ns: int, *status: Status) -> SwarmEstimate:
+def estimate(now_ns: int, *status: Status) -> Estimate:
     n = len(status)
-    return SwarmEstimate(
+    return Estimate(
         now_ns,
         np.zeros((n, 3)),
         np.tile(4.0 * np.eye(3), (n, 1, 1)),

@@ -13,8 +13,8 @@ from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.sensors.validation import about_robots
 from swarm_loc_estimator.swarm.swarm import Robot
-from swarm_loc_estimator.timeline.estimator import SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
+from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.timeline import Timeline
 
 PERIOD_NS = SECOND // 5
@@ -28,7 +28,7 @@ def test_what_is_to_be_fused_again_is_not_forgotten_while_fusing_takes_several_t
         stepped.extend(rows["stamp_ns"].tolist())
 
     state = SwarmState(ParameterTable.of((Robot("a"),), ()))
-    timeline = Timeline(EstimatorSettings(fusion_period_s=1e-9 * PERIOD_NS, horizon_s=1.0), step, state, 0)
+    timeline = Timeline(Settings(fusion_period_s=1e-9 * PERIOD_NS, horizon_s=1.0), step, state, 0)
     stamp_ns = T0 + PERIOD_NS * np.arange(1, 6, dtype=np.int64)
     every = np.tile(np.eye(3), (stamp_ns.size, 1, 1))
     timeline.add(about_robots(0, stamp_ns, np.zeros((stamp_ns.size, 3)), every, Kind.CARTESIAN))
@@ -45,15 +45,15 @@ def test_what_is_to_be_fused_again_is_not_forgotten_while_fusing_takes_several_t
 def test_odometry_is_there_for_all_that_is_left_to_fuse_however_long_that_takes(sparse: bool) -> None:
     """Longer than odometry is kept otherwise."""
     world, begin_ns = simulate(Plan(4, 18.0, 0.3), seed=1), T0 + 6 * SECOND
-    chosen = EstimatorSettings(fusion_period_s=0.05, sparse_from=2 if sparse else 250)
+    chosen = Settings(fusion_period_s=0.05, sparse_from=2 if sparse else 250)
     sightings = [event for event in world.events if event.pose is None and event.stamp_ns <= begin_ns]
     late_ns = begin_ns - round(chosen.horizon_s * 1e9)
     arrivals = [(event.stamp_ns, event) for event in world.events if event.pose is not None]
     arrivals += [(one.stamp_ns if one.stamp_ns < late_ns else begin_ns, one) for one in sightings]
     before, after = ticks(T0, begin_ns - 1, 0.25), ticks(begin_ns, T0 + 18 * SECOND, 0.25)
 
-    def run(*, at_once: bool) -> tuple[SwarmEstimator, SwarmEstimate]:
-        estimator = SwarmEstimator(world.swarm, chosen)
+    def run(*, at_once: bool) -> tuple[Estimator, Estimate]:
+        estimator = Estimator(world.swarm, chosen)
         play(estimator, [one for one in arrivals if one[0] < begin_ns], before)
         left = [one for one in arrivals if one[0] >= begin_ns]
         return estimator, play(estimator, left, after, go_on=lambda: at_once)[-1]

@@ -19,9 +19,9 @@ from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.sensors.validation import about_robots
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
 from swarm_loc_estimator.timeline import timeline
-from swarm_loc_estimator.timeline.estimator import SwarmEstimator
+from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.fusion_period import end_of_period, middle_of_period
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.timeline import Timeline
 
 PERIOD_NS = SECOND // 5
@@ -47,7 +47,7 @@ class Fused:
         self.at_ns: list[int] = []
         self._now_ns = 0
         state = SwarmState(ParameterTable.of(([Robot(f"robot{k}") for k in range(robots)]), ()))
-        chosen = EstimatorSettings(fusion_period_s=1e-9 * PERIOD_NS, fusion_delay_s=delay_s)
+        chosen = Settings(fusion_period_s=1e-9 * PERIOD_NS, fusion_delay_s=delay_s)
         self.timeline = Timeline(chosen, self._step, state, 0)
 
     def advance(self, now_ns: int) -> None:
@@ -112,13 +112,13 @@ def test_odometry_is_kept_for_what_waits_beyond_the_horizon() -> None:
     world = simulate(Plan(4, 18.0, 0.2), seed=3)
     robots = tuple(replace(one, odometry=replace(one.odometry, timeout_s=0.1)) for one in world.swarm.robots)
     world = replace(world, swarm=replace(world.swarm, robots=robots))
-    chosen = EstimatorSettings(fusion_period_s=1.0, fusion_delay_s=1.0, horizon_s=0.05)
+    chosen = Settings(fusion_period_s=1.0, fusion_delay_s=1.0, horizon_s=0.05)
     at_ns = ticks(T0, T0 + 20 * SECOND)
-    at_once = SwarmEstimator(world.swarm, chosen)
+    at_once = Estimator(world.swarm, chosen)
     expected = play(at_once, on_time(world), at_ns)[-1]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(timeline, "_LARGE", 4)
-        waiting = SwarmEstimator(world.swarm, chosen)
+        waiting = Estimator(world.swarm, chosen)
         found = play(waiting, on_time(world), at_ns)[-1]
     assert waiting.used == at_once.used > 100
     np.testing.assert_allclose(found.poses, expected.poses, atol=1e-9)
@@ -140,5 +140,5 @@ def test_many_calibrated_robots_have_longer_periods_unless_one_is_given(
 ) -> None:
     kinds = [OdometryModel(distance_scale_sigma=0.03)] * calibrated + [OdometryModel()] * (700 - calibrated)
     swarm = Swarm(tuple(Robot(f"r{k}", odometry=kind) for k, kind in enumerate(kinds)), ())
-    estimator = SwarmEstimator(swarm, EstimatorSettings(fusion_period_s=given_s))
+    estimator = Estimator(swarm, Settings(fusion_period_s=given_s))
     assert estimator.settings.fusion_period_s == period_s

@@ -12,8 +12,8 @@ from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, NOBO
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.swarm.swarm import RandomWalk, Robot, Swarm
 from swarm_loc_estimator.timeline.contradictions import Kind as Contradicted
-from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimator
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimator, Status
+from swarm_loc_estimator.timeline.settings import Settings
 
 ROOT, NEIGHBOUR = 0, 1
 LIMITS = LossLimits(1.0, 0.3, 12, 10.0)
@@ -65,7 +65,7 @@ def test_a_fix_that_is_wrong_is_forgiven_with_a_landmark_in_its_place() -> None:
 
 
 def test_a_robot_that_was_carried_away_is_not_told_as_tracked_until_it_is_found() -> None:
-    estimator = SwarmEstimator(WALKER, EstimatorSettings())
+    estimator = Estimator(WALKER, Settings())
     told, named = [], []
     for second in range(18):
         stamp_ns = T0 + second * SECOND

@@ -16,13 +16,13 @@ from ir_swarm import SECOND, Event, Light, Plan, Run, play, simulate, write_bag
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimate, Status
+from swarm_loc_estimator.timeline.settings import Settings
 
-SLOW = EstimatorSettings(horizon_s=4.0, fix_window_s=60.0)
+SLOW = Settings(horizon_s=4.0, fix_window_s=60.0)
 
 
-def errors(run: Run, estimate: SwarmEstimate) -> FloatArray:
+def errors(run: Run, estimate: Estimate) -> FloatArray:
     difference: FloatArray = wrapped(estimate.poses - run.truth[estimate.stamp_ns])
     return difference
 
@@ -74,7 +74,7 @@ def test_robots_that_all_start_unknown_wait_however_much_they_hear() -> None:
 
 def outcome(
     run: Run, arrivals: Sequence[tuple[int, Event]], period_s: float
-) -> tuple[SwarmEstimate, dict[str, int], dict[str, int]]:
+) -> tuple[Estimate, dict[str, int], dict[str, int]]:
     estimator, estimates = play(run, arrivals, SLOW, period_s)
     end_ns = max(run.truth) + 4 * SECOND
     last = estimator.tick(end_ns)

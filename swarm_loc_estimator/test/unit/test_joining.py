@@ -19,18 +19,18 @@ from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.validation import about_robots
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline import fusion
-from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
+from swarm_loc_estimator.timeline.settings import Settings
 
 
-def errors(world: World, estimates: list[SwarmEstimate]) -> FloatArray:
+def errors(world: World, estimates: list[Estimate]) -> FloatArray:
     """Distances (T, N) between estimates and truth [m]; NaN where not located."""
     return np.array([np.hypot(*(e.poses - world.at(e.stamp_ns))[:, :2].T) for e in estimates])
 
 
-def run(world: World, seconds: float, keep: Callable[[Event], bool] = lambda _: True) -> list[SwarmEstimate]:
+def run(world: World, seconds: float, keep: Callable[[Event], bool] = lambda _: True) -> list[Estimate]:
     arrivals = [arrival for arrival in on_time(world) if keep(arrival[1])]
-    return play(SwarmEstimator(world.swarm), arrivals, ticks(T0, T0 + round(seconds * SECOND)))
+    return play(Estimator(world.swarm), arrivals, ticks(T0, T0 + round(seconds * SECOND)))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -68,7 +68,7 @@ def test_mirrored_headings_do_not_mislead_a_robot_that_starts_unknown(seed: int)
     assert np.nanmax(errors(world, run(world, 10.0))) < 0.3
 
 
-def standing(content: int, marks: int, mirrored: float = 0.0) -> list[SwarmEstimate]:
+def standing(content: int, marks: int, mirrored: float = 0.0) -> list[Estimate]:
     """A robot that stands before landmarks and starts unknown."""
     world = simulate(Plan(1, 0.1, noise=0.0, start_known=(False,), landmarks=max(1, marks)), 0)
     base, arrivals = (0.1, 0.05, 0.3), []
@@ -83,7 +83,7 @@ def standing(content: int, marks: int, mirrored: float = 0.0) -> list[SwarmEstim
             found = detection(mark.id, one, content)
             found["alternative_orientation"] = quaternion(other[:3, :3])
             arrivals.append((stamp_ns, Event(0, stamp_ns, None, found)))
-    return play(SwarmEstimator(world.swarm), arrivals, ticks(T0, T0 + 6 * SECOND))
+    return play(Estimator(world.swarm), arrivals, ticks(T0, T0 + 6 * SECOND))
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_a_start_that_sightings_contradict_gives_way_to_them() -> None:
     x, y, theta = robot.start or (0.0, 0.0, 0.0)
     wrong = replace(robot, start=(x + 1.0, y - 1.0, theta + 1.0))
     world = replace(world, swarm=replace(world.swarm, robots=(wrong,)))
-    estimator = SwarmEstimator(world.swarm)
+    estimator = Estimator(world.swarm)
     estimates = play(estimator, on_time(world), ticks(T0, T0 + 8 * SECOND))
     status = np.array([estimate.status[0] for estimate in estimates])
     assert status[0] == Status.UNCONFIRMED
@@ -140,9 +140,9 @@ def test_a_robot_too_unsure_after_a_silence_waits_and_is_found_again(
 ) -> None:
     monkeypatch.setattr(fusion, "_MANY", many)
     world, silent_ns, heard_ns = simulate(Plan(1, 8.0), 1), T0 + 2 * SECOND, T0 + 7 * SECOND // 2
-    limits = EstimatorSettings(lost_sigma=lost_sigma, lost_heading_sigma=lost_heading_sigma)
+    limits = Settings(lost_sigma=lost_sigma, lost_heading_sigma=lost_heading_sigma)
     arrivals = [(t, e) for t, e in on_time(world) if not silent_ns < t < heard_ns]
-    estimates = play(SwarmEstimator(world.swarm, limits), arrivals, ticks(T0, T0 + 8 * SECOND))
+    estimates = play(Estimator(world.swarm, limits), arrivals, ticks(T0, T0 + 8 * SECOND))
     before = [e.status[0] for e in estimates if e.stamp_ns < heard_ns]
     after = [e.status[0] for e in estimates if e.stamp_ns >= heard_ns]
     assert Status.WAITING not in before
@@ -160,7 +160,7 @@ def test_a_robot_unsure_at_one_of_many_measurements_is_lost_in_whatever_order_th
     tracks = OdometryTracks(swarm.robots)
     stamps_ns = T0 + np.array([0, SECOND // 10])
     tracks.extend(np.zeros(2, dtype=np.int64), stamps_ns, np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]))
-    limits = EstimatorSettings(lost_sigma=0.05, lost_heading_sigma=10.0)
+    limits = Settings(lost_sigma=0.05, lost_heading_sigma=10.0)
     steps = fusion.Fusion(swarm, limits, tracks)
     state = steps.new_state()
     state.initialize(0, InitialPose(np.zeros(3), np.diag([1e-6, 1e-6, 1.0])), Preintegrated.begin(T0))
@@ -173,7 +173,7 @@ def test_a_robot_unsure_at_one_of_many_measurements_is_lost_in_whatever_order_th
 def test_a_robot_silent_for_a_minute_comes_back() -> None:
     world = simulate(Plan(2, 70.0, camera_hz=1.0), 2)
     begin_ns, end_ns = T0 + 5 * SECOND, T0 + 65 * SECOND
-    estimator = SwarmEstimator(world.swarm)
+    estimator = Estimator(world.swarm)
     arrivals = [(t, e) for t, e in on_time(world) if e.robot != 0 or not begin_ns < t < end_ns]
     estimates = play(estimator, arrivals, ticks(T0, T0 + 70 * SECOND, 0.5))
     status = np.array([estimate.status for estimate in estimates])
@@ -193,7 +193,7 @@ def test_a_robot_that_leaves_does_not_hold_the_others_up() -> None:
 
 def test_an_operator_seats_and_forgets_a_robot() -> None:
     world = simulate(Plan(1, 6.0, landmarks=0), 1)
-    estimator = SwarmEstimator(world.swarm)
+    estimator = Estimator(world.swarm)
     play(estimator, on_time(world), ticks(T0, T0 + 3 * SECOND))
     stamp_ns = T0 + 2 * SECOND
     assert not estimator.set_pose(0, stamp_ns, world.at(stamp_ns)[0], np.diag([1e-6, 1e-6, 1e-6]))
@@ -207,7 +207,7 @@ def test_an_operator_seats_and_forgets_a_robot() -> None:
 
 def test_a_robot_that_waits_enters_with_the_third_exact_fix_and_the_clues_before_are_counted() -> None:
     world = simulate(Plan(1, 4.0, landmarks=0, start_known=(False,)), 5)
-    estimator, status = SwarmEstimator(world.swarm), []
+    estimator, status = Estimator(world.swarm), []
     for stamp_ns, event in on_time(world):
         event.give(estimator, stamp_ns)
         if (stamp_ns - T0) % SECOND == 0:
@@ -220,7 +220,7 @@ def test_a_robot_that_waits_enters_with_the_third_exact_fix_and_the_clues_before
 
 def test_fixes_from_outside_locate_and_hold_a_robot() -> None:
     world = simulate(Plan(1, 6.0, landmarks=0, start_known=(False,)), 5)
-    estimator = SwarmEstimator(world.swarm)
+    estimator = Estimator(world.swarm)
     rng = np.random.default_rng(0)
     estimates = []
     for stamp_ns, event in on_time(world):

@@ -17,17 +17,17 @@ from swarm_loc_estimator.offline.report.table import SELF_CALIBRATED
 from swarm_loc_estimator.sensors.camera import SightingConverter
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.timeline.estimator import SwarmEstimator
+from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.self_calibration import learns
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_five_robots_w2"
 PLAN = Plan(2, 40.0, speed=0.15, lasting=1.0, survey=1.0)
 
 
-def run(world: World, settings: EstimatorSettings | None = None) -> tuple[Swarm, FloatArray]:
+def run(world: World, settings: Settings | None = None) -> tuple[Swarm, FloatArray]:
     """What a run teaches, and its errors (T, N, 3)."""
-    estimator = SwarmEstimator(world.swarm, settings)
+    estimator = Estimator(world.swarm, settings)
     estimates = play(estimator, on_time(world), ticks(T0, int(world.stamp_ns[-1]), 1.0))
     return estimator.learned(), wrapped(np.array([e.poses - world.at(e.stamp_ns) for e in estimates]))
 
@@ -36,7 +36,7 @@ def run(world: World, settings: EstimatorSettings | None = None) -> tuple[Swarm,
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_what_is_learned_is_near_the_truth_and_as_sure_as_it_says(seed: int, sparse_from: int) -> None:
     world, true = simulate(PLAN, seed), lasting_errors(PLAN, seed)
-    taught, _ = run(world, EstimatorSettings(sparse_from=sparse_from))
+    taught, _ = run(world, Settings(sparse_from=sparse_from))
     off, before = [], []
     for i, (robot, described) in enumerate(zip(taught.robots, world.swarm.robots, strict=True)):
         odometry, sensor = robot.odometry, robot.sensor
@@ -87,7 +87,7 @@ def test_what_was_learned_may_be_trusted_from_then_on() -> None:
         world = simulate(PLAN, 10 + seed)
         taught, _ = run(world)
         for swarm, squared in ((world.swarm, before), (taught, after)):
-            _, errors = run(replace(world, swarm=exact(swarm)), EstimatorSettings(max_doubt=1e9))
+            _, errors = run(replace(world, swarm=exact(swarm)), Settings(max_doubt=1e9))
             squared.append(float(np.nanmean(np.square(errors[5:, :, :2]))))  # not a number where one got lost
     assert np.mean(after) < 0.25 * np.mean(before)
 
@@ -115,7 +115,7 @@ def test_there_is_nothing_to_learn_where_nothing_has_a_sigma() -> None:
 
 def test_a_robot_that_was_not_located_keeps_its_description() -> None:
     swarm = simulate(Plan(1, 1.0, lasting=1.0), 0).swarm
-    assert SwarmEstimator(swarm).learned() == swarm
+    assert Estimator(swarm).learned() == swarm
 
 
 def test_the_replay_command_writes_what_it_learned_and_reports_it(

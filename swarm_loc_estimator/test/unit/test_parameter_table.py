@@ -19,7 +19,7 @@ from swarm_loc_estimator.common.parameters import (
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
 from swarm_loc_estimator.nodes.mapper.mapper_parameters import MapperParameters
 from swarm_loc_estimator.nodes.player.player_parameters import PlayerParameters
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.watch.markers_parameters import MarkersParameters
 from swarm_loc_estimator.watch.watch_parameters import WatchParameters
 
@@ -47,11 +47,11 @@ def test_defaults_make_the_default_object() -> None:
 
 def test_every_setting_of_the_estimator_is_a_parameter() -> None:
     names = {spec.name for spec in parameter_specs(EstimatorParameters)}
-    assert {field.name for field in fields(EstimatorSettings)} <= names
+    assert {field.name for field in fields(Settings)} <= names
 
 
 def test_settings_from_texts_are_whole_numbers_where_the_setting_is_one() -> None:
-    read = parameters_of(EstimatorSettings, ["horizon_s=3", "lost_after=5"])
+    read = parameters_of(Settings, ["horizon_s=3", "lost_after=5"])
     assert (read.horizon_s, type(read.horizon_s), read.lost_after, type(read.lost_after)) == (
         3.0,
         float,
@@ -65,7 +65,7 @@ def test_settings_from_texts_are_whole_numbers_where_the_setting_is_one() -> Non
         ("nothing=1", "--set nothing=1: 'nothing' is no parameter; there are horizon_s, "),
     ):
         with pytest.raises(ParameterError, match=said):
-            parameters_of(EstimatorSettings, [pair])
+            parameters_of(Settings, [pair])
     with pytest.raises(ParameterError, match="'loop' is no parameter"):
         parameters_of(PlayerParameters, ["loop=true"], {"bag": "x", "loop": True})
     assert parameters_of(PlayerParameters, ["loop=true", "topics=a,b"], {"bag": "x"}) == PlayerParameters(

@@ -26,8 +26,8 @@ from swarm_loc_estimator.sensors.messages import RawInputs
 from swarm_loc_estimator.sensors.thinning import Thinning
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.timeline.estimator import SwarmEstimator
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimator
+from swarm_loc_estimator.timeline.settings import Settings
 
 BAGS = Path(__file__).parents[3] / "bags"
 SECOND = 1_000_000_000
@@ -48,19 +48,19 @@ def compiled_late() -> list[str]:
     precompile()
     before = signatures()
     for name in RECORDED:
-        for settings in (EstimatorSettings(), EstimatorSettings(fusion_period_s=0.1)):
+        for settings in (Settings(), Settings(fusion_period_s=0.1)):
             run(BAGS / name, settings)
-    run(BAGS / "eight_five_robots", EstimatorSettings(), late=True)
-    run(BAGS / "eight_five_robots", EstimatorSettings(sparse_from=2))
-    run(BAGS / "eight_five_robots", EstimatorSettings(), moved_landmarks=True)
-    for settings in (EstimatorSettings(fusion_period_s=0.1), EstimatorSettings(sparse_from=2)):
+    run(BAGS / "eight_five_robots", Settings(), late=True)
+    run(BAGS / "eight_five_robots", Settings(sparse_from=2))
+    run(BAGS / "eight_five_robots", Settings(), moved_landmarks=True)
+    for settings in (Settings(fusion_period_s=0.1), Settings(sparse_from=2)):
         run(BAGS / "eight_five_robots", settings, relayed=True)
     return compiled_since(before)
 
 
 def run(
     bag: Path,
-    settings: EstimatorSettings,
+    settings: Settings,
     *,
     late: bool = False,
     moved_landmarks: bool = False,
@@ -79,7 +79,7 @@ def run(
     if moved_landmarks:
         marks = (replace(mark, x=mark.x + 0.3 * (k % 3)) for k, mark in enumerate(swarm.landmarks))
         swarm = replace(swarm, landmarks=tuple(marks))
-    estimator, begun_ns = SwarmEstimator(swarm, settings), list[int]()
+    estimator, begun_ns = Estimator(swarm, settings), list[int]()
     thinning, ingest = Thinning(len(swarm.robots)), Ingest(swarm)
 
     def take(inputs: RawInputs) -> None:

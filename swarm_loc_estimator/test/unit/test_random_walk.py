@@ -9,12 +9,12 @@ from core_messages import SECOND, T0, give_fix
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import RandomWalk, Robot, StartSigma, Swarm, SwarmError
-from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
+from swarm_loc_estimator.timeline.settings import Settings
 
 WALK = RandomWalk(1e-4, 4e-3)
 SWARM = Swarm((Robot("walker", camera=None, stands=True, random_walk=WALK),))
-EXACT = EstimatorSettings(fusion_period_s=0.0)
+EXACT = Settings(fusion_period_s=0.0)
 FIX_SIGMA = np.array([0.02, 0.02, 0.05])
 FIXES, FIX_S = 15, 2
 HIDDEN = 0.03
@@ -48,9 +48,9 @@ def test_errors_are_as_large_as_they_are_told() -> None:
     assert 2.2 < np.mean(nees) < 4.0  # 3 +- .32
 
 
-def in_time(fixes: FloatArray) -> SwarmEstimate:
+def in_time(fixes: FloatArray) -> Estimate:
     """The estimate at the last of fixes that each arrive when they are taken."""
-    estimator = SwarmEstimator(SWARM, EXACT)
+    estimator = Estimator(SWARM, EXACT)
     for k, fix in enumerate(fixes):
         stamp_ns = T0 + k * FIX_S * SECOND
         give_fix(estimator, 0, stamp_ns, fix, np.diag(FIX_SIGMA**2), stamp_ns)
@@ -60,7 +60,7 @@ def in_time(fixes: FloatArray) -> SwarmEstimate:
 
 def test_a_pose_grows_less_sure_as_the_walk_says() -> None:
     _, fixes = walked(3)
-    estimator = SwarmEstimator(SWARM, EXACT)
+    estimator = Estimator(SWARM, EXACT)
     for k in range(3):
         give_fix(estimator, 0, T0 + k * SECOND, fixes[0], np.diag(FIX_SIGMA**2), T0 + 2 * SECOND)
     now, later = (estimator.tick(T0 + s * SECOND).covariances[0] for s in (2, 7))
@@ -75,7 +75,7 @@ def test_the_order_of_arrival_does_not_matter(seed: int) -> None:
     end_ns = T0 + 2 * SECOND
     estimates = []
     for order in (np.arange(4), rng.permutation(4), np.arange(4)):
-        estimator = SwarmEstimator(SWARM, EXACT)
+        estimator = Estimator(SWARM, EXACT)
         for k in order.tolist():
             stamp_ns = T0 + k * SECOND // 2
             give_fix(estimator, 0, stamp_ns, fixes[-1], np.diag(FIX_SIGMA**2), end_ns)
@@ -91,7 +91,7 @@ def test_a_start_counts_from_the_first_measurement_on() -> None:
     start = Robot(
         "walker", camera=None, stands=True, random_walk=WALK, start=(0.3, 0.1, 0.5), start_sigma=StartSigma()
     )
-    estimator = SwarmEstimator(Swarm((start,)), EXACT)
+    estimator = Estimator(Swarm((start,)), EXACT)
     assert estimator.tick(T0).status[0] == Status.WAITING  # nobody knows since when it walks
     vague = np.diag([1.0, 1.0, 1.0])
     give_fix(estimator, 0, T0 + SECOND, [0.3, 0.1, 0.5], vague, T0 + SECOND)
@@ -104,8 +104,8 @@ def test_a_robot_of_unsure_heading_is_located_where_such_headings_are_not_lost()
     sigma, poses = np.array([0.02, 0.02, 0.45]), walked(5)[0]
     found = []
     for limit in (0.3, 1.5):
-        settings = EstimatorSettings(fusion_period_s=0.0, lost_heading_sigma=limit)
-        estimator = SwarmEstimator(SWARM, settings)
+        settings = Settings(fusion_period_s=0.0, lost_heading_sigma=limit)
+        estimator = Estimator(SWARM, settings)
         for k in range(3):
             stamp_ns = T0 + k * SECOND
             give_fix(estimator, 0, stamp_ns, poses[0], np.diag(sigma**2), stamp_ns)

@@ -7,7 +7,7 @@ import numpy as np
 from swarm_loc_estimator.offline.runner import ListedSchedule, PeriodicSchedule, Runner
 from swarm_loc_estimator.sensors.messages import OdometryRows, RawInputs
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.timeline.estimator import SwarmEstimator
+from swarm_loc_estimator.timeline.estimator import Estimator
 
 SECOND = 1_000_000_000
 HOUR = 3600 * SECOND
@@ -40,7 +40,7 @@ def test_listed_instants_all_come_once() -> None:
 def test_what_arrives_at_a_tick_counts_at_the_next_one() -> None:
     """As the live node reads what had come before its tick began."""
     swarm = Swarm((Robot("a", start=(0.0, 0.0, 0.0)),))
-    runner = Runner(SwarmEstimator(swarm), PeriodicSchedule(SECOND))
+    runner = Runner(Estimator(swarm), PeriodicSchedule(SECOND))
     stamps_ns = np.array([SECOND // 2, SECOND])
     pose = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]])
     odometry = OdometryRows(np.zeros(2, dtype=np.int64), stamps_ns, pose, stamps_ns)
@@ -53,6 +53,6 @@ def test_what_arrives_at_a_tick_counts_at_the_next_one() -> None:
 
 
 def test_without_inputs_there_are_no_poses() -> None:
-    runner = Runner(SwarmEstimator(Swarm((Robot("a"),))), PeriodicSchedule(SECOND))
+    runner = Runner(Estimator(Swarm((Robot("a"),))), PeriodicSchedule(SECOND))
     runner.finish(HOUR)
     assert runner.result("nothing", (0, HOUR), {}, {}).pose.shape == (0, 1, 3)

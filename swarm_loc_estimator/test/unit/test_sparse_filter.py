@@ -14,8 +14,8 @@ from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.swarm.swarm import CameraMount, Landmark, Robot, Swarm
-from swarm_loc_estimator.timeline.estimator import SwarmEstimator
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimator
+from swarm_loc_estimator.timeline.settings import Settings
 
 SIGMA = np.array([0.02, 0.02, 0.035])
 START = np.diag([1e-4, 1e-4, 4e-4])
@@ -190,6 +190,6 @@ def test_what_is_contradicted_is_estimated() -> None:
 @pytest.mark.parametrize("yaw_sigma", [0.0, 0.01])
 def test_a_large_swarm_is_sparse_whether_it_is_calibrated_or_not(yaw_sigma: float) -> None:
     robots = tuple(Robot(f"r{k}", camera=CameraMount(yaw_sigma=yaw_sigma)) for k in range(3))
-    assert SwarmEstimator(Swarm(robots, ()), EstimatorSettings(sparse_from=3)).note == ""
-    one_by_one = EstimatorSettings(sparse_from=3, fusion_period_s=0.0)
-    assert "because fusion_period_s is 0" in SwarmEstimator(Swarm(robots, ()), one_by_one).note
+    assert Estimator(Swarm(robots, ()), Settings(sparse_from=3)).note == ""
+    one_by_one = Settings(sparse_from=3, fusion_period_s=0.0)
+    assert "because fusion_period_s is 0" in Estimator(Swarm(robots, ()), one_by_one).note

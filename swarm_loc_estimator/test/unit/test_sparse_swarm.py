@@ -16,30 +16,28 @@ from scipy.stats import chi2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.timeline import fusion
-from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
+from swarm_loc_estimator.timeline.settings import Settings
 
-SPARSE = EstimatorSettings(sparse_from=2, fusion_period_s=0.2)
+SPARSE = Settings(sparse_from=2, fusion_period_s=0.2)
 DENSE = replace(SPARSE, sparse_from=1000)
 
 world_of = lru_cache(maxsize=16)(simulate)
 """For tests that change nothing in it."""
 
 
-def run(
-    world: World, settings: EstimatorSettings = SPARSE, period_s: float = 0.2
-) -> tuple[SwarmEstimator, list[SwarmEstimate]]:
+def run(world: World, settings: Settings = SPARSE, period_s: float = 0.2) -> tuple[Estimator, list[Estimate]]:
     """A world through an estimator of its own, all in time."""
-    estimator = SwarmEstimator(world.swarm, settings)
+    estimator = Estimator(world.swarm, settings)
     end_ns = int(world.stamp_ns[-1])
     return estimator, play(estimator, on_time(world), ticks(T0, end_ns, period_s))
 
 
-def is_sparse(estimator: SwarmEstimator) -> bool:
+def is_sparse(estimator: Estimator) -> bool:
     return isinstance(estimator._timeline.state.filter, SparseFilter)
 
 
-def distances(world: World, estimates: list[SwarmEstimate]) -> FloatArray:
+def distances(world: World, estimates: list[Estimate]) -> FloatArray:
     """(T, N) between estimates and truth [m]; NaN where not located."""
     return np.array([np.hypot(*(e.poses - world.at(e.stamp_ns))[:, :2].T) for e in estimates])
 

@@ -28,7 +28,7 @@ from swarm_loc_estimator.swarm.swarm import (
     Swarm,
 )
 from swarm_loc_estimator.timeline import fusion
-from swarm_loc_estimator.timeline.estimator import SwarmEstimator
+from swarm_loc_estimator.timeline.estimator import Estimator
 
 TIME_SIGMA_S = 0.04
 SEER = Robot("seer", camera=CameraMount(x=0.04))
@@ -131,7 +131,7 @@ def test_a_robot_whose_motion_is_unknown_gives_no_rate() -> None:
 def mean_nees(world: World, swarm: Swarm) -> FloatArray:
     """(N,) of each robot over time."""
     end_ns = int(world.stamp_ns[-1])
-    estimates = play(SwarmEstimator(swarm), on_time(world), ticks(T0, end_ns, 1.0))
+    estimates = play(Estimator(swarm), on_time(world), ticks(T0, end_ns, 1.0))
     error = wrapped(np.array([one.poses - world.at(one.stamp_ns) for one in estimates]))
     mean: FloatArray = nees(error, np.array([one.covariances for one in estimates]))[2:].mean(axis=0)
     return mean

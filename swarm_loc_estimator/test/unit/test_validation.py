@@ -12,8 +12,8 @@ from core_world import MOUNT, Plan, World, simulate
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.timeline.estimator import Status, SwarmEstimate, SwarmEstimator
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
+from swarm_loc_estimator.timeline.settings import Settings
 
 END = T0 + 4 * SECOND
 
@@ -22,7 +22,7 @@ def world() -> World:
     return simulate(Plan(2, 4.0), 1)
 
 
-def assert_sound(estimate: SwarmEstimate) -> None:
+def assert_sound(estimate: Estimate) -> None:
     """What is located has finite numbers and positive definite covariances, the rest is not a number."""
     located = estimate.status != Status.WAITING
     assert np.isnan(estimate.poses[~located]).all()
@@ -49,8 +49,8 @@ BAD_NUMBERS = [
 
 def test_no_number_in_a_sighting_breaks_anything() -> None:
     run = world()
-    clean = play(SwarmEstimator(run.swarm), on_time(run), ticks(T0, END))[-1]
-    estimator = SwarmEstimator(run.swarm)
+    clean = play(Estimator(run.swarm), on_time(run), ticks(T0, END))[-1]
+    estimator = Estimator(run.swarm)
     bad = [
         Event(k % 2, T0 + SECOND + k * SECOND // 50, None, spoiled(*number))
         for k, number in enumerate(BAD_NUMBERS)
@@ -66,7 +66,7 @@ def test_no_number_in_a_sighting_breaks_anything() -> None:
 @pytest.mark.parametrize("fusion_period_s", [0.0, 0.5])
 def test_absurd_published_covariances_never_break_the_filter(sigma: float, fusion_period_s: float) -> None:
     run = world()
-    estimator = SwarmEstimator(run.swarm, EstimatorSettings(fusion_period_s=fusion_period_s))
+    estimator = Estimator(run.swarm, Settings(fusion_period_s=fusion_period_s))
     for event in run.events:
         for one in event.detections:
             one["covariance"] = sigma**2 * np.eye(6)
@@ -88,7 +88,7 @@ def test_absurd_published_covariances_never_break_the_filter(sigma: float, fusio
 )
 def test_absurd_odometry_is_counted_and_does_no_harm(pose: tuple[float, float, float], reason: str) -> None:
     run = world()
-    estimator = SwarmEstimator(run.swarm)
+    estimator = Estimator(run.swarm)
     bad = Event(0, T0 + 2 * SECOND + 1, pose)
     estimates = play(estimator, [*on_time(run), (bad.stamp_ns, bad)], ticks(T0, END))
     assert estimator.drops[reason] >= 1
@@ -118,7 +118,7 @@ def test_seats_and_fixes_are_checked(
     order: str, pose: FloatArray, covariance: FloatArray, reason: str
 ) -> None:
     run = world()
-    estimator = SwarmEstimator(run.swarm)
+    estimator = Estimator(run.swarm)
     play(estimator, on_time(run), ticks(T0, END))
     before = estimator.drops.get(reason, 0)
     if order == "seat":
@@ -130,7 +130,7 @@ def test_seats_and_fixes_are_checked(
 
 
 def test_a_robot_is_seated_from_its_first_odometry_on_and_before_that_refused() -> None:
-    estimator = SwarmEstimator(world().swarm)
+    estimator = Estimator(world().swarm)
     assert estimator.set_pose(0, T0, GOOD, 1e-4 * np.eye(3)) == "not_localized"
     assert estimator.tick(T0).status[0] == Status.WAITING
     assert estimator.drops == {"not_localized": 1}
@@ -143,10 +143,10 @@ def test_a_robot_is_seated_from_its_first_odometry_on_and_before_that_refused() 
 def test_an_ancient_first_odometry_does_not_poison_the_track() -> None:
     """As from a driver whose clock was not set yet."""
     run = world()
-    estimator = SwarmEstimator(run.swarm)
+    estimator = Estimator(run.swarm)
     early = [(T0 - 1, Event(robot, 0, (0.0, 0.0, 0.0))) for robot in (0, 1)]
     last = play(estimator, early + on_time(run), ticks(T0, END))[-1]
-    plain = play(SwarmEstimator(run.swarm), on_time(run), ticks(T0, END))[-1]
+    plain = play(Estimator(run.swarm), on_time(run), ticks(T0, END))[-1]
     np.testing.assert_allclose(last.poses, plain.poses, atol=1e-9)
     assert estimator.drops["odometry_too_old"] == 2
 
@@ -165,7 +165,7 @@ def test_after_any_silence_the_covariance_is_sound_and_the_robot_found_again(sil
     events = [e for e in events if e.robot == 1 or not begin_ns <= e.stamp_ns < begin_ns + SECOND // 2]
     arrivals = [(event.stamp_ns, event) for event in events]
     at_ns = ticks(T0, begin_ns, 0.05) + ticks(begin_ns + gap_ns, end_ns, 0.05)
-    estimates = play(SwarmEstimator(run.swarm), arrivals, at_ns)
+    estimates = play(Estimator(run.swarm), arrivals, at_ns)
     for estimate in estimates:
         assert_sound(estimate)
     error = estimates[-1].poses - run.at(END)
@@ -179,7 +179,7 @@ def test_precise_sightings_during_a_silence_keep_the_covariance_positive(turn_ra
     run = simulate(Plan(1, 0.1, noise=0.0, landmarks=1), 0)
     start = (0.0, 0.0, 0.0)
     swarm = replace(run.swarm, robots=(replace(run.swarm.robots[0], start=start),))
-    estimator = SwarmEstimator(swarm)
+    estimator = Estimator(swarm)
     mark = swarm.landmarks[0]
     frame = marker_frame(mark.x, mark.y, mark.z, mark.yaw or 0.0)
     for k in range(80):
@@ -198,7 +198,7 @@ def test_precise_sightings_during_a_silence_keep_the_covariance_positive(turn_ra
 def test_poses_before_the_newest_measurement_have_sound_covariances(state_period_s: float) -> None:
     run = simulate(Plan(2, 4.0, speed=0.5), 2)
     for estimate in play(
-        SwarmEstimator(run.swarm, EstimatorSettings(state_period_s=state_period_s)),
+        Estimator(run.swarm, Settings(state_period_s=state_period_s)),
         on_time(run),
         ticks(T0, END, 0.05),
     ):
@@ -220,7 +220,7 @@ def test_every_detection_is_used_or_counted(seed: int) -> None:
         for _ in range(1 + (change > 0.95)):
             arrivals.append((stamp_ns, replace(event, stamp_ns=stamp, detections=detections)))
             handed += 1 if event.pose else detections.size
-    estimator = SwarmEstimator(run.swarm)
+    estimator = Estimator(run.swarm)
     play(estimator, arrivals, ticks(T0, END))
     rows = sum(event.pose is not None for _, event in arrivals)
     used_rows = int(estimator._tracks.arrays.filled.sum())
@@ -233,7 +233,7 @@ def test_every_detection_is_used_or_counted(seed: int) -> None:
 
 def test_a_jump_back_in_time_resets_once_and_goes_on() -> None:
     run = world()
-    estimator = SwarmEstimator(run.swarm)
+    estimator = Estimator(run.swarm)
     first = play(estimator, on_time(run), ticks(T0, END))[-1]
     used = estimator.used
     event = next(event for event in run.events if event.detections.size)
@@ -250,7 +250,7 @@ def test_a_jump_back_in_time_resets_once_and_goes_on() -> None:
 
 def test_data_from_before_the_jump_are_from_the_future_after_it() -> None:
     run = world()
-    estimator = SwarmEstimator(run.swarm)
+    estimator = Estimator(run.swarm)
     play(estimator, on_time(run), ticks(T0, END))
     Event(0, END, (0.0, 0.0, 0.0)).give(estimator, T0)
     Event(0, END, None, spoiled("position", 0.0)).give(estimator, T0)
@@ -259,7 +259,7 @@ def test_data_from_before_the_jump_are_from_the_future_after_it() -> None:
 
 @pytest.mark.parametrize(("ahead_ns", "drops"), [(90_000_000, {}), (110_000_000, {"future_stamp": 2})])
 def test_a_stamp_may_be_ahead_of_the_clock_by_its_tolerance(ahead_ns: int, drops: dict[str, int]) -> None:
-    estimator = SwarmEstimator(world().swarm, EstimatorSettings(future_tolerance_s=0.1))
+    estimator = Estimator(world().swarm, Settings(future_tolerance_s=0.1))
     estimator.tick(T0)
     Event(0, T0 + ahead_ns, (0.0, 0.0, 0.0)).give(estimator, T0)
     Event(0, T0 + ahead_ns, None, detection(1000, marker_frame(0.0, 0.0, 1.0, 0.0))).give(estimator, T0)
@@ -274,14 +274,14 @@ def test_an_estimator_started_in_the_middle_finds_everybody() -> None:
     run = simulate(Plan(3, 8.0, start_known=(False,)), 4)
     late = [arrival for arrival in on_time(run) if arrival[0] > END]
     end_ns = T0 + 8 * SECOND
-    last = play(SwarmEstimator(run.swarm), late, ticks(END, end_ns))[-1]
+    last = play(Estimator(run.swarm), late, ticks(END, end_ns))[-1]
     assert (last.status == Status.TRACKED).all()
     assert np.linalg.norm(last.poses[:, :2] - run.at(end_ns)[:, :2], axis=1).max() < 0.06
 
 
 def test_memory_stays_bounded_over_a_long_run() -> None:
     run = world()
-    estimator = SwarmEstimator(run.swarm)
+    estimator = Estimator(run.swarm)
     sizes = []
     for lap in range(12):
         for event in run.events:

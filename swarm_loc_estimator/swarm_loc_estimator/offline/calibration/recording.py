@@ -33,7 +33,7 @@ from swarm_loc_estimator.sensors.messages import (
 )
 from swarm_loc_estimator.sensors.validation import InputValidator
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 _NONE = np.zeros(0, dtype=np.int64)
 START_GAP_NS = 500_000_000
@@ -170,7 +170,7 @@ def read_recording(bag: Path, swarm: Swarm, progress: Progress = unwatched) -> R
     """
     parts: list[RawInputs] = []
     summary = read_bag(bag, swarm, parts.append, progress)
-    validator = InputValidator(swarm, EstimatorSettings())
+    validator = InputValidator(swarm, Settings())
     odometry = joined([NO_ODOMETRY, *(validator.validate(part).odometry for part in parts)])
     detections = [_per_message(part.detections) for part in parts]
     unused = (f"{count} inputs are not used: {reason}." for reason, count in validator.drops.items())

@@ -13,7 +13,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.offline.live.run import LiveRun
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.timeline.settings import EstimatorSettings
+from swarm_loc_estimator.timeline.settings import Settings
 
 _EQUAL_M = 1e-6
 
@@ -55,7 +55,7 @@ class Agreement:
         return float(np.nanmax(chosen)) if chosen.size else float("nan")
 
 
-def compare_with_replay(live: LiveRun, bag: Path, settings: EstimatorSettings | None = None) -> Agreement:
+def compare_with_replay(live: LiveRun, bag: Path, settings: Settings | None = None) -> Agreement:
     """Replay a bag at the very stamps of live poses.
 
     Args:
