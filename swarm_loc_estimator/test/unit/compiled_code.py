@@ -10,7 +10,7 @@ import sys
 from numba.core.dispatcher import Dispatcher
 
 
-def told_by_process(script: str) -> list[str]:
+def printed_by_process(script: str) -> list[str]:
     """The names that a script prints, run by itself: in this process other tests have compiled already."""
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -22,7 +22,9 @@ def signatures() -> dict[str, int]:
     """Compiled function -> for how many kinds of arguments it was compiled as called by what is not."""
     found = [one for one in gc.get_objects() if isinstance(one, Dispatcher)]
     known = {f"{one.py_func.__module__}.{one.py_func.__qualname__}": len(one.signatures) for one in found}
-    return {name: count for name, count in known.items() if ".io.bags." not in name}  # these only read bags
+    return {
+        name: count for name, count in known.items() if ".common.bags." not in name
+    }  # these only read bags
 
 
 def compiled_since(before: dict[str, int]) -> list[str]:

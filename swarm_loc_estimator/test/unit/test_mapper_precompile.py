@@ -6,7 +6,7 @@ import json
 import sys
 from pathlib import Path
 
-from compiled_code import compiled_since, signatures, told_by_process
+from compiled_code import compiled_since, printed_by_process, signatures
 
 from swarm_loc_estimator.mapping.fix_covariance import FixCovariances
 from swarm_loc_estimator.mapping.settings import MapperSettings
@@ -19,7 +19,7 @@ FREQUENCIES = {"pushbot1": 1000.0, "pushbot2": 1050.0}
 
 
 def test_nothing_is_compiled_once_robots_report() -> None:
-    assert told_by_process(__file__) == []
+    assert printed_by_process(__file__) == []
 
 
 def compiled_late() -> list[str]:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from compiled_code import compiled_since, signatures, told_by_process
+from compiled_code import compiled_since, printed_by_process, signatures
 
 from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
@@ -40,7 +40,7 @@ class EnoughError(Exception):
 
 
 def test_nothing_is_compiled_once_data_come() -> None:
-    assert told_by_process(__file__) == []
+    assert printed_by_process(__file__) == []
 
 
 def compiled_late() -> list[str]:
