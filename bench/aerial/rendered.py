@@ -20,10 +20,9 @@ from sensor_msgs.msg import Image
 
 from bench.graph.listener import Listener
 from bench.shared.common import OUT, Cell, ProgressLine, table
-from swarm_loc_drivers.sim.common.error_model import WORLDS
-from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
-from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
+from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_drivers.sim.simulation import SimulationOptions, seen_from_above, simulation_nodes
+from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launching.graph import NodeSpec

@@ -28,14 +28,16 @@ from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
 from bench.shared.common import OUT, Cell, new_plot, save_plot, table, write_figures
-from swarm_loc_drivers.sim.recording.droplet_bag import write_droplet_bag
-from swarm_loc_drivers.sim.scenarios.droplet_run import (
+from swarm_loc_drivers.sim.scenarios.bags import write_droplet_bag
+from swarm_loc_drivers.sim.scenarios.droplets import (
     FIXED,
     TURN_S,
     DropletRunSettings,
+    DropletSwarmSettings,
+    describe_droplets,
     simulate_droplets,
+    starts,
 )
-from swarm_loc_drivers.sim.scenarios.droplet_table import DropletSwarmSettings, describe_droplets, starts
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launching.graph import NodeSpec, ParameterValue
 from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_infrared

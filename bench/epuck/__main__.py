@@ -27,20 +27,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.epuck.dense import DenseSettings, blind_robots, simulate_dense
 from bench.epuck.rendered_report import rendered_worlds
 from bench.epuck.rendered_report import report as report_rendered
 from bench.shared.common import Cell, new_plot, save_plot, table, write_figures
 from bench.shared.simulated_run import errors_of, mean_nees, run_core
 from bench.vision import report as vision_report
-from swarm_loc_drivers.sim.common.error_model import W0, W2, W2_FAST, ErrorModel
-from swarm_loc_drivers.sim.scenarios.dense import DenseSettings, blind_robots, simulate_dense
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
+from swarm_loc_drivers.sim.worlds import W0, W2, W2_FAST, ErrorModel
 from swarm_loc_estimator.offline.live.graph import LiveError
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.settings import Settings
 
 if TYPE_CHECKING:
-    from swarm_loc_drivers.sim.common.record import SimulatedRun
+    from swarm_loc_drivers.sim.run import SimulatedRun
 
 SLOW, FAST = 0.06, 0.08
 W0_SEEDS, DENSE_SEEDS, WORLDS, FAST_WORLDS = 6, 3, 24, 8

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 
 from bench.graph.listener import TYPE_OF, Listener, Say
-from swarm_loc_drivers.sim.common.error_model import WORLDS
-from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
-from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
+from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_drivers.sim.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import DetectionArrayMessage, decode_detections
 from swarm_loc_estimator.common.messages.encoders import UNKNOWN_COVARIANCE, encode_detections

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.graph.shared_bag import write_shared_bag
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
-from swarm_loc_drivers.sim.common.record import SimulatedRun
-from swarm_loc_drivers.sim.recording.bag import write_bag
-from swarm_loc_drivers.sim.recording.shared_bag import write_shared_bag
+from swarm_loc_drivers.sim.run import SimulatedRun
+from swarm_loc_drivers.sim.scenarios.bags import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.common.launching.graph import GraphOptions
 from swarm_loc_estimator.offline.live.run import play_live

@@ -8,16 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from swarm_loc_drivers.sim.common.markers import observe_markers
-from swarm_loc_drivers.sim.common.record import (
+from swarm_loc_drivers.sim.run import (
     FRAME_DTYPE,
     ODOMETRY_DTYPE,
     SIGHTING_DTYPE,
     Records,
     SimulatedRun,
+    Trajectories,
 )
-from swarm_loc_drivers.sim.common.trajectories import Trajectories
 from swarm_loc_drivers.sim.scenarios.eight import VIEW, EightSettings, camera_exposures, drive_eight
+from swarm_loc_drivers.sim.sightings import observe_markers
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.swarm.swarm import Swarm

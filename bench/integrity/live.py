@@ -13,10 +13,9 @@ import numpy as np
 
 from bench.graph.listener import Listener, Say
 from bench.integrity.scoring import Estimated, Score, scored
-from swarm_loc_drivers.sim.common.error_model import W0
-from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
-from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
+from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_drivers.sim.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import decode_detections, decode_odometry

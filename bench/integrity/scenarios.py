@@ -9,10 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bench.integrity import faults
-from swarm_loc_drivers.sim.common.error_model import W0, W2, ErrorModel
-from swarm_loc_drivers.sim.common.record import SimulatedRun
-from swarm_loc_drivers.sim.common.trajectories import Trajectories
+from swarm_loc_drivers.sim.run import SimulatedRun, Trajectories
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings
+from swarm_loc_drivers.sim.worlds import W0, W2, ErrorModel
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.swarm.swarm import SensorModel

@@ -24,7 +24,7 @@ from swarm_loc_estimator.timeline.settings import Settings
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from swarm_loc_drivers.sim.common.record import Records, SimulatedRun
+    from swarm_loc_drivers.sim.run import Records, SimulatedRun
     from swarm_loc_estimator.common.arrays import FloatArray
 
 SIZES = (100, 300, 1000)

@@ -18,7 +18,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from swarm_loc_drivers.sim.common.record import SimulatedRun
+    from swarm_loc_drivers.sim.run import SimulatedRun
 
 STEP_NS = 50_000_000
 _QUARTER = np.array([[0.0, -1.0], [1.0, 0.0]])

@@ -27,7 +27,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from swarm_loc_drivers.sim.common.record import SimulatedRun
+    from swarm_loc_drivers.sim.run import SimulatedRun
 
 _FLOOR = np.diag([1e-11, 1e-11, 1e-11])
 """Odometry of a straight millisecond has no sideways noise; a factor needs some. Far below what matters."""

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from typing import SupportsFloat, SupportsIndex, SupportsInt
 
-    from swarm_loc_drivers.sim.common.record import SimulatedRun
+    from swarm_loc_drivers.sim.run import SimulatedRun
 
 KEYFRAME_NS = 200_000_000
 SETTLED_NS = 80_000_000

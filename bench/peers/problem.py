@@ -15,7 +15,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from swarm_loc_drivers.sim.common.record import Records, SimulatedRun
+    from swarm_loc_drivers.sim.run import Records, SimulatedRun
 
 
 @dataclass(frozen=True)

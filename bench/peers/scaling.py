@@ -22,14 +22,13 @@ from bench.peers import filterpy_ekf, gtsam_batch, gtsam_lag
 from bench.peers.shapes import ShapeRuns, measure_shape, scored, show
 from bench.shared.common import new_plot, save_plot, table, write_figures
 from bench.shared.simulated_run import errors_of, position_rmse, run_core, ticks, without_delay
-from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
-from swarm_loc_drivers.sim.scenarios.grid_shapes import Shape
+from swarm_loc_drivers.sim.scenarios.grid import GridSettings, Shape, simulate_grid
 from swarm_loc_estimator.timeline.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from swarm_loc_drivers.sim.common.record import SimulatedRun
+    from swarm_loc_drivers.sim.run import SimulatedRun
 
 SIZES = (5, 20, 50, 100, 200, 300, 500, 1000)
 SHAPE_SIZES = (300, 1000)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.shared.common import Cell, new_plot, save_plot, table
-from swarm_loc_drivers.sim.pushbot import optics
+from swarm_loc_drivers.sim.pushbot.optics import assembled
 from swarm_loc_drivers.sim.pushbot.wall_drive import WallDriveSettings, drive_at_wall
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.laser.calibration import LaserCalibration
@@ -40,7 +40,7 @@ class Calibrated(NamedTuple):
 def calibrate(seed: int) -> Calibrated:
     """Calibrate a robot, and hold both relations against how it was put together."""
     rng = np.random.default_rng(seed)
-    built = optics.assembled(rng)
+    built = assembled(rng)
     drive, depths = drive_at_wall(rng, built, WallDriveSettings())
     found = fit_hyperbola(drive)
     a, b = fit_logarithm(drive)

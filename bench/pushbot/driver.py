@@ -15,8 +15,8 @@ from swarm_loc_drivers.pushbot.commands import Lights
 from swarm_loc_drivers.pushbot.hardware import SECOND_FIRMWARE, TIMESTAMPS
 from swarm_loc_drivers.pushbot.session import PushbotSession
 from swarm_loc_drivers.pushbot.settings import PushbotSettings, WheelGeometry
-from swarm_loc_drivers.sim.pushbot.firmware.event_stream import EventRing
-from swarm_loc_drivers.sim.pushbot.firmware.pushbot_firmware import PushbotFirmware
+from swarm_loc_drivers.sim.pushbot.board import EventRing
+from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 
 ROBOTS = (1, 2, 10)
 _CORES = 2

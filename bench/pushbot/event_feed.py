@@ -11,9 +11,9 @@ import time
 import numpy as np
 
 from swarm_loc_drivers.pushbot.hardware import SECOND_FIRMWARE
-from swarm_loc_drivers.sim.common.body import Blinking
-from swarm_loc_drivers.sim.common.link_host import FirmwareHost
-from swarm_loc_drivers.sim.pushbot.firmware.pushbot_firmware import PushbotFirmware
+from swarm_loc_drivers.sim.link_host import FirmwareHost
+from swarm_loc_drivers.sim.pushbot.event_camera import Blinking
+from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 
 _STEP_S = 0.005
 _POLLS = 4

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from swarm_loc_drivers.sim.pushbot.exploration import Arrival, Exploration
+from swarm_loc_drivers.sim.pushbot.exploration import Arrival, Exploration, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan
-from swarm_loc_drivers.sim.pushbot.kinematics import PushBotNoise
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.shared.common import Cell, new_plot, save_plot, table
-from swarm_loc_drivers.sim.common.body import Blinking
-from swarm_loc_drivers.sim.pushbot.event_camera import CameraEvents, CameraNoise, EventCamera, Spot
+from swarm_loc_drivers.sim.pushbot.event_camera import Blinking, CameraEvents, CameraNoise, EventCamera, Spot
 from swarm_loc_drivers.sim.pushbot.optics import spot_brightness
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.events.centroid_tracker import CentroidTracker

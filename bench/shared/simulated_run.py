@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from swarm_loc_drivers.sim.common.record import in_order_of_arrival
-from swarm_loc_drivers.sim.recording.detections import as_detections
+from swarm_loc_drivers.sim.run import in_order_of_arrival
+from swarm_loc_drivers.sim.scenarios.bags import as_detections
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.runner import ListedSchedule, Runner
@@ -19,7 +19,7 @@ from swarm_loc_estimator.timeline.estimator import Estimator
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from swarm_loc_drivers.sim.common.record import SimulatedRun
+    from swarm_loc_drivers.sim.run import SimulatedRun
     from swarm_loc_estimator.common.arrays import FloatArray
     from swarm_loc_estimator.timeline.settings import Settings
 

@@ -29,7 +29,7 @@ from playwright.sync_api import Browser
 from bench.shared.common import OUT, ProgressLine, new_plot, save_plot, table, write_figures
 from bench.watch.browser import WatchedPage, chromium, running_browser
 from bench.watch.publisher import homes
-from swarm_loc_drivers.sim.recording.bag import write_bag
+from swarm_loc_drivers.sim.scenarios.bags import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.common.launching.graph import GraphOptions, NodeSpec, ParameterValue, graph_nodes
 from swarm_loc_estimator.common.launching.processes import Child, node_command, start, stop

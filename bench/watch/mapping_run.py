@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from bench.pushbot.runs import RunSettings
-from swarm_loc_drivers.sim.pushbot.exploration import Arrival, Exploration
+from swarm_loc_drivers.sim.pushbot.exploration import Arrival, Exploration, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
-from swarm_loc_drivers.sim.pushbot.kinematics import PushBotNoise
 from swarm_loc_estimator.common.messages.estimates import EstimateMessage
 from swarm_loc_estimator.mapping.grid_messages import GridMessage
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper

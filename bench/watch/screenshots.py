@@ -19,7 +19,7 @@ from bench.pushbot.runs import RunSettings
 from bench.shared.common import OUT
 from bench.watch.browser import WatchedPage, chromium, running_browser
 from bench.watch.mapping_run import mapping_run
-from swarm_loc_drivers.sim.recording.bag import write_bag
+from swarm_loc_drivers.sim.scenarios.bags import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.common.arguments import swarm_beside
 from swarm_loc_estimator.offline.replay import replay

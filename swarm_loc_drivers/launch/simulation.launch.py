@@ -8,8 +8,8 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
 from swarm_loc_drivers.link_folder import link_folder
-from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
+from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.launching.options import options_from
 from swarm_loc_estimator.common.launching.ros_launch import argument_texts, node_action
 

@@ -6,7 +6,7 @@ from swarm_loc_estimator.start import program
 
 droplet_driver_node = program("swarm_loc_drivers.droplet.droplet_driver_node")
 droplet_fleet_node = program("swarm_loc_drivers.droplet.droplet_fleet_node")
-droplet_steering_node = program("swarm_loc_drivers.droplet.droplet_steering_node")
+droplet_steering_node = program("swarm_loc_drivers.sim.scenarios.droplet_steering_node")
 droplet_world_node = program("swarm_loc_drivers.sim.droplet.droplet_world_node")
 eight_steering_node = program("swarm_loc_drivers.sim.scenarios.eight_steering_node")
 epuck_driver_node = program("swarm_loc_drivers.epuck.epuck_driver_node")

@@ -23,20 +23,22 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.droplet.world import DROPLET_WORLDS
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
-from swarm_loc_drivers.sim.recording.aerial_bag import write_aerial_bag
-from swarm_loc_drivers.sim.recording.bag import write_bag
-from swarm_loc_drivers.sim.recording.droplet_bag import write_droplet_bag
-from swarm_loc_drivers.sim.recording.image_bag import write_image_bag
-from swarm_loc_drivers.sim.recording.pushbot_bag import PushbotBagSettings, write_pushbot_bag
 from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_drivers.sim.scenarios.droplet_run import DropletRunSettings, simulate_droplets
+from swarm_loc_drivers.sim.scenarios.bags import (
+    write_aerial_bag,
+    write_bag,
+    write_droplet_bag,
+    write_image_bag,
+)
+from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, simulate_droplets
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_drivers.sim.scenarios.eight_images import simulate_eight_images
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
+from swarm_loc_drivers.sim.scenarios.pushbot_bag import PushbotBagSettings, write_pushbot_bag
 from swarm_loc_drivers.sim.scenarios.wandering import WanderingSettings, simulate_wandering
+from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.arguments import number_in
 from swarm_loc_estimator.common.command_errors import exit_with_message
 
@@ -123,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
             "--world",
             choices=sorted(WORLDS),
             default="w0",
-            help="imperfections; see sim/common/error_model.py",
+            help="imperfections; see sim/worlds.py",
         )
         one.add_argument("--speed", type=number_in(0.001, 0.12, "m/s"), default=0.06, help="[m/s]")
         one.add_argument("--start-unknown", action="store_true", help="swarm.yaml tells no start poses")

@@ -16,10 +16,10 @@ import sys
 from collections.abc import Sequence
 
 from swarm_loc_drivers.link_folder import link_folder
-from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
 from swarm_loc_drivers.sim.pushbot_simulation import has_pushbots
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
+from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.cli.graph import say
 from swarm_loc_estimator.common.arguments import number_in
 from swarm_loc_estimator.common.command_errors import exit_with_message

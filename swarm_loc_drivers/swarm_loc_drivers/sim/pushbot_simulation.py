@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from swarm_loc_drivers.sim.common.world_error import WorldError, start_of
 from swarm_loc_drivers.sim.pushbot.optics import MAX_ROBOTS, laser_hz, led_hz
+from swarm_loc_drivers.sim.worlds import WorldError, start_of
 from swarm_loc_estimator.common.launching.graph import NodeSpec, ParameterValue
 from swarm_loc_estimator.swarm.swarm import Swarm
 

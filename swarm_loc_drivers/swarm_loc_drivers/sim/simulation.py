@@ -9,14 +9,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.epuck.world import check_swarm
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.pushbot_simulation import has_pushbots, pushbot_nodes
 from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
 from swarm_loc_drivers.sim.scenarios.eight import ARENA
-from swarm_loc_drivers.sim.scenarios.eight_floor import eight_floor
+from swarm_loc_drivers.sim.scenarios.eight_images import eight_floor
+from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.launching.graph import NodeSpec, ParameterValue
 from swarm_loc_estimator.common.launching.options import check_parameter_file
 from swarm_loc_estimator.common.number_spec import number

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from droplet_rig import SECOND, world_of
 
-from swarm_loc_drivers.sim.common.link_host import FirmwareHost
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
 from swarm_loc_drivers.sim.droplet.world import STEP_NS, SimulatedDroplet
+from swarm_loc_drivers.sim.link_host import FirmwareHost
 
 
 def main() -> None:

@@ -14,9 +14,9 @@ from pathlib import Path
 from epuck_body import DrivenBody
 
 from swarm_loc_drivers.epuck.hardware import EPUCK_MODELS
-from swarm_loc_drivers.sim.common.link_host import FirmwareHost
-from swarm_loc_drivers.sim.epuck.firmware.serial_firmware import SerialFirmware
-from swarm_loc_drivers.sim.epuck.firmware.wifi_firmware import WifiFirmware
+from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
+from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware
+from swarm_loc_drivers.sim.link_host import FirmwareHost
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ from node_world import Program, Ros, overrides, stamp_ns
 from rosgraph_msgs.msg import Clock
 
 from swarm_loc_drivers.droplet.droplet_fleet_node import DropletFleetNode
-from swarm_loc_drivers.sim.scenarios.droplet_table import DropletSwarmSettings, describe_droplets, starts
+from swarm_loc_drivers.sim.scenarios.droplets import DropletSwarmSettings, describe_droplets, starts
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm

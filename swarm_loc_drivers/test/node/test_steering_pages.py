@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_drivers.droplet.droplet_steering_node import DropletSteeringParameters
+from swarm_loc_drivers.sim.scenarios.droplet_steering_node import DropletSteeringParameters
 from swarm_loc_drivers.sim.scenarios.eight_steering_node import SteeringParameters
 from swarm_loc_estimator.common.parameters import markdown_table
 

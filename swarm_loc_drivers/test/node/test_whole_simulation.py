@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
 
-from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
-from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
+from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_drivers.sim.simulation import SimulationOptions, simulation_nodes
 from swarm_loc_estimator.offline.live.graph import LiveGraph
 from swarm_loc_estimator.offline.live.recorder import Poses

@@ -17,8 +17,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 
 from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, describe
-from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
+from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 SECOND = 1_000_000_000

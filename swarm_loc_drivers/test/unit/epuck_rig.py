@@ -19,9 +19,9 @@ from swarm_loc_drivers.common.odometry_state import OdometryState
 from swarm_loc_drivers.epuck.driver import EpuckDriver, Listeners
 from swarm_loc_drivers.epuck.hardware import EPUCK2, EpuckModel
 from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, EpuckSettings
-from swarm_loc_drivers.sim.common.link_host import FirmwareHost
-from swarm_loc_drivers.sim.epuck.firmware.serial_firmware import SerialFirmware
-from swarm_loc_drivers.sim.epuck.firmware.wifi_firmware import WifiFirmware
+from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
+from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware
+from swarm_loc_drivers.sim.link_host import FirmwareHost
 from swarm_loc_estimator.common import se2
 
 PATIENCE_S = 60.0

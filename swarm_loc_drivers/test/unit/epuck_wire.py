@@ -18,8 +18,8 @@ from swarm_loc_drivers.epuck.serial_session import SerialSession
 from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession, EpuckSettings, Reading
 from swarm_loc_drivers.epuck.wheel_odometry import WheelOdometry
 from swarm_loc_drivers.epuck.wifi_session import WifiSession
-from swarm_loc_drivers.sim.epuck.firmware.serial_firmware import SerialFirmware
-from swarm_loc_drivers.sim.epuck.firmware.wifi_firmware import WifiFirmware
+from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
+from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware
 from swarm_loc_estimator.common import se2
 
 MS = 1_000_000

@@ -18,7 +18,7 @@ from swarm_loc_drivers.pushbot.session import PushbotSession
 from swarm_loc_drivers.pushbot.settings import PushbotSettings, WheelGeometry, WheelTicks
 from swarm_loc_drivers.pushbot.wheel_odometry import PushbotOdometry
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
-from swarm_loc_drivers.sim.pushbot.firmware.pushbot_firmware import PushbotFirmware
+from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, outline
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldSettings, SimulatedPushbot
 from swarm_loc_estimator.common import se2

@@ -16,9 +16,9 @@ from droplet_rig import IDEAL, IDS, LINK, NOISE, SECOND, TRIANGLE, asking, sessi
 from swarm_loc_drivers.common.odometry_state import OdometryState
 from swarm_loc_drivers.droplet.driver import OWN, DropletDriver, DropletListeners, DropletSettings
 from swarm_loc_drivers.droplet.exchange import Brightness, PollingSettings
-from swarm_loc_drivers.sim.common.link_host import FirmwareHost
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
 from swarm_loc_drivers.sim.droplet.world import STEP_NS, DropletWorld, SimulatedDroplet, nominal_gait
+from swarm_loc_drivers.sim.link_host import FirmwareHost
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 

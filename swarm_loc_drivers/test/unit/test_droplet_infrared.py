@@ -10,8 +10,7 @@ from droplet_rig import IDEAL, LINK, QUIET, SECOND, TRIANGLE, world_of
 
 from swarm_loc_drivers.droplet.hardware import FULL_POWER
 from swarm_loc_drivers.droplet.infrared_timing import EXCHANGE_NS, message_ns
-from swarm_loc_drivers.sim.common.body import Command, Measured
-from swarm_loc_drivers.sim.droplet.infrared import InfraredSettings
+from swarm_loc_drivers.sim.droplet.infrared import ExchangeReadings, InfraredCommand, InfraredSettings
 from swarm_loc_drivers.sim.droplet.world import NEAR_POWER, STEP_NS, DropletErrors, DropletWorld
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -34,7 +33,7 @@ def exchange(world: DropletWorld, emitter: int = 0, power: int = FULL_POWER) -> 
     found: dict[int, FloatArray] = {}
     for robot, heard in enumerate(world.infrared.heard):
         for one in heard:
-            if isinstance(one, Measured):
+            if isinstance(one, ExchangeReadings):
                 found[robot] = one.readings.astype(float)
         heard.clear()
     return found
@@ -112,7 +111,7 @@ def test_messages_are_for_one_or_for_all() -> None:
     run(world, message_ns(6))
     assert [len(heard) for heard in world.infrared.heard] == [0, 0, 1]
     (heard,) = world.infrared.heard[2]
-    assert isinstance(heard, Command)
+    assert isinstance(heard, InfraredCommand)
     assert heard.line == "get_id"
 
 
@@ -144,7 +143,7 @@ def test_who_measures_hears_nothing_else() -> None:
     run(world, EXCHANGE_NS // 2)
     world.infrared.send(2, "get_id", 0, world.poses)
     run(world, EXCHANGE_NS)
-    assert [type(one) for one in world.infrared.heard[1]] == [Measured]
+    assert [type(one) for one in world.infrared.heard[1]] == [ExchangeReadings]
 
 
 def test_who_measured_when_a_message_began_does_not_understand_it() -> None:
@@ -156,11 +155,11 @@ def test_who_measured_when_a_message_began_does_not_understand_it() -> None:
     run(world, 2 * STEP_NS)
     assert not world.infrared.status(0)
     run(world, message_ns(6))
-    assert [type(one) for one in world.infrared.heard[1]] == [Measured]
+    assert [type(one) for one in world.infrared.heard[1]] == [ExchangeReadings]
     assert world.infrared.counts["exchanges"] == 1
     world.infrared.send(2, "get_id", 0, world.poses)
     run(world, message_ns(6))
-    assert [type(one) for one in world.infrared.heard[1]] == [Measured, Command]
+    assert [type(one) for one in world.infrared.heard[1]] == [ExchangeReadings, InfraredCommand]
 
 
 def test_light_of_two_at_once_adds_up() -> None:
@@ -171,7 +170,7 @@ def test_light_of_two_at_once_adds_up() -> None:
     run(world, 30_000_000)
     world.infrared.emit(2, FULL_POWER, world.poses)
     run(world, EXCHANGE_NS)
-    (both,) = (one.readings for one in world.infrared.heard[1] if isinstance(one, Measured))
+    (both,) = (one.readings for one in world.infrared.heard[1] if isinstance(one, ExchangeReadings))
     assert (both >= alone).all()
     assert both.sum() > 1.2 * alone.sum()
 

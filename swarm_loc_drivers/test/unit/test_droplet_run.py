@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 
 from swarm_loc_drivers.cli.generate_bag import main
-from swarm_loc_drivers.sim.scenarios.droplet_run import DropletRun, DropletRunSettings, simulate_droplets
-from swarm_loc_drivers.sim.scenarios.droplet_table import PITCH, DropletSwarmSettings, starts
+from swarm_loc_drivers.sim.scenarios.droplets import (
+    PITCH,
+    DropletRun,
+    DropletRunSettings,
+    DropletSwarmSettings,
+    simulate_droplets,
+    starts,
+)
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.messages.cdr import decode_brightness, decode_fix

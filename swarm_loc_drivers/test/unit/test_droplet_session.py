@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from swarm_loc_drivers.common.robot_driver import SessionError
 from swarm_loc_drivers.droplet.exchange import Brightness, Power
 from swarm_loc_drivers.droplet.hardware import FULL_POWER
-from swarm_loc_drivers.sim.common.link_host import ConsoleFirmware
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, Print, print_2014, print_2016
 from swarm_loc_drivers.sim.droplet.world import NEAR_POWER, DropletErrors
+from swarm_loc_drivers.sim.link_host import ConsoleFirmware
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected

@@ -14,8 +14,8 @@ from swarm_loc_drivers.epuck import serial_protocol as epuck_serial
 from swarm_loc_drivers.epuck import wifi_protocol as epuck_wifi
 from swarm_loc_drivers.epuck.hardware import EPUCK1, EPUCK2, EpuckModel
 from swarm_loc_drivers.epuck.rgb565 import decode_rgb565
-from swarm_loc_drivers.sim.epuck.firmware.serial_firmware import SerialFirmware
-from swarm_loc_drivers.sim.epuck.firmware.wifi_firmware import (
+from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
+from swarm_loc_drivers.sim.epuck.wifi_firmware import (
     DELAY_NS,
     FAILED_EXCHANGE_NS,
     IMAGE_NS,

@@ -18,8 +18,8 @@ from swarm_loc_drivers.common.robot_driver import SessionError
 from swarm_loc_drivers.epuck import serial_protocol as protocol
 from swarm_loc_drivers.epuck.hardware import EPUCK1, EPUCK2
 from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, EpuckSettings, Reading
-from swarm_loc_drivers.sim.epuck.firmware.serial_firmware import SerialFirmware
-from swarm_loc_drivers.sim.epuck.firmware.wifi_firmware import DELAY_NS, WifiFirmware
+from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
+from swarm_loc_drivers.sim.epuck.wifi_firmware import DELAY_NS, WifiFirmware
 
 CYCLE_NS = 2 * DELAY_NS
 EXPOSURE_PERIOD_NS = 66 * MS

@@ -8,8 +8,6 @@ import pytest
 
 from swarm_loc_drivers.epuck.proximity import raw_of_distance
 from swarm_loc_drivers.epuck.wheels import WheelGeometry
-from swarm_loc_drivers.sim.common.error_model import W0, W2, ErrorModel
-from swarm_loc_drivers.sim.common.world_error import WorldError
 from swarm_loc_drivers.sim.epuck.world import (
     STEP_NS,
     EpuckWorld,
@@ -17,9 +15,10 @@ from swarm_loc_drivers.sim.epuck.world import (
     Exposure,
     SimulatedEpuck,
 )
-from swarm_loc_drivers.sim.render.camera_rig import Arena
 from swarm_loc_drivers.sim.render.lens import CameraModel
+from swarm_loc_drivers.sim.render.rigs import Arena
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, EightSettings, describe
+from swarm_loc_drivers.sim.worlds import W0, W2, ErrorModel, WorldError
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_vision.markers.families import family_named

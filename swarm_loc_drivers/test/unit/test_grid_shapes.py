@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.sim.common.record import SimulatedRun
-from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
-from swarm_loc_drivers.sim.scenarios.grid_shapes import Shape
+from swarm_loc_drivers.sim.run import SimulatedRun
+from swarm_loc_drivers.sim.scenarios.grid import GridSettings, Shape, simulate_grid
 from swarm_loc_estimator.common.arrays import IntArray
 
 ROBOTS = 9

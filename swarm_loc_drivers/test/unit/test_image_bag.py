@@ -9,12 +9,12 @@ import pytest
 from render_helpers import pixels_of
 
 from swarm_loc_drivers.cli.generate_bag import main
-from swarm_loc_drivers.sim.common.error_model import W0
-from swarm_loc_drivers.sim.recording.image_bag import CAMERA_INFO, COMPRESSED_IMAGE
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.renderer import RobotCamera
+from swarm_loc_drivers.sim.scenarios.bags import CAMERA_INFO, COMPRESSED_IMAGE
 from swarm_loc_drivers.sim.scenarios.eight import CAMERA, EightSettings
 from swarm_loc_drivers.sim.scenarios.eight_images import FAMILY, simulate_eight_images
+from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.messages.typestore import typestore

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 
 from swarm_loc_drivers.epuck.wheels import WheelGeometry
-from swarm_loc_drivers.sim.common.error_model import W0
 from swarm_loc_drivers.sim.epuck.world import OVERHEAD, EpuckWorld, EpuckWorldSettings, Exposure
-from swarm_loc_drivers.sim.render.camera_rig import Arena
 from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_drivers.sim.render.overhead import OverheadSettings, overhead_model
+from swarm_loc_drivers.sim.render.rigs import Arena, OverheadSettings, overhead_model
 from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, START_NS, EightSettings, describe
-from swarm_loc_drivers.sim.scenarios.eight_floor import eight_floor
+from swarm_loc_drivers.sim.scenarios.eight_images import eight_floor
+from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.aerial.detector import AerialDetector

@@ -9,19 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.sim.pushbot.exploration import Exploration
+from swarm_loc_drivers.sim.pushbot.exploration import Exploration, KinematicPushBot, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import (
     FLOOR_PLANS,
     FloorPlan,
     FloorPlanError,
+    clearance,
     floor_plan,
+    is_visible,
     outline,
     polygon,
+    ray_distance,
 )
-from swarm_loc_drivers.sim.pushbot.kinematics import KinematicPushBot, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.optics import laser_hz
-from swarm_loc_drivers.sim.pushbot.ray_casting import clearance, is_visible, ray_distance
-from swarm_loc_drivers.sim.recording.pushbot_bag import PushbotBagSettings, write_pushbot_bag
+from swarm_loc_drivers.sim.scenarios.pushbot_bag import PushbotBagSettings, write_pushbot_bag
 from swarm_loc_estimator.cli.replay_map import main as replay_map
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader

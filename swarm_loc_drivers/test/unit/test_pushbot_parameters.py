@@ -11,13 +11,13 @@ import pytest
 
 from swarm_loc_drivers.pushbot.exploration_parameters import ExplorationParameters
 from swarm_loc_drivers.pushbot.pushbot_parameters import PushbotParameters, pushbot_settings
-from swarm_loc_drivers.sim.common.world_error import WorldError
 from swarm_loc_drivers.sim.pushbot.pushbot_world_parameters import (
     PushbotWorldParameters,
     make_pushbot_world,
 )
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
+from swarm_loc_drivers.sim.worlds import WorldError
 from swarm_loc_estimator.common.parameters import ParameterError, markdown_table
 from swarm_loc_vision.laser.laser_file import load_laser
 

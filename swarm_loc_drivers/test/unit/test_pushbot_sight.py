@@ -7,11 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.sim.common.body import Blinking
-from swarm_loc_drivers.sim.pushbot.event_camera import CameraEvents, CameraNoise
+from swarm_loc_drivers.sim.pushbot.event_camera import Blinking, CameraEvents, CameraNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import outline
-from swarm_loc_drivers.sim.pushbot.optics import CENTRE_PX, FOCAL_PX, assembled_robots
-from swarm_loc_drivers.sim.pushbot.sight import HallSight
+from swarm_loc_drivers.sim.pushbot.optics import CENTRE_PX, FOCAL_PX, HallSight, assembled_robots
 from swarm_loc_estimator.common.arrays import FloatArray
 
 STILL = CameraNoise(noise_rate=0.0)

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from swarm_loc_drivers.epuck.wheels import WheelGeometry
-from swarm_loc_drivers.sim.common.error_model import W2
 from swarm_loc_drivers.sim.epuck.world import EpuckWorld, EpuckWorldSettings
-from swarm_loc_drivers.sim.render.camera_rig import Arena
 from swarm_loc_drivers.sim.render.lens import CameraModel
+from swarm_loc_drivers.sim.render.rigs import Arena
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, FACE_DISTANCE, EightSettings, describe
+from swarm_loc_drivers.sim.worlds import W2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.markers.detector import MarkerDetector
 from swarm_loc_vision.markers.detector_settings import DetectorSettings

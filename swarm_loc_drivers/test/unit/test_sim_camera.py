@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.sim.common.camera import View, deliver, hidden, schedule_exposures
-from swarm_loc_drivers.sim.common.error_model import W0, W2
-from swarm_loc_drivers.sim.common.record import SIGHTING_DTYPE, SimulatedRun
+from swarm_loc_drivers.sim.run import SIGHTING_DTYPE, SimulatedRun
 from swarm_loc_drivers.sim.scenarios.eight import VIEW, EightSettings, describe, simulate_eight, wall_markers
-from swarm_loc_drivers.sim.scenarios.grid import SENSOR, GridSettings, simulate_grid
-from swarm_loc_drivers.sim.scenarios.grid_shapes import Shape, cells
+from swarm_loc_drivers.sim.scenarios.grid import SENSOR, GridSettings, Shape, cells, simulate_grid
+from swarm_loc_drivers.sim.sightings import View, deliver, hidden, schedule_exposures
+from swarm_loc_drivers.sim.worlds import W0, W2
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from swarm_loc_drivers.sim.recording.detections import as_detections
+from swarm_loc_drivers.sim.scenarios.bags import as_detections
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.sensors.camera import SightingConverter

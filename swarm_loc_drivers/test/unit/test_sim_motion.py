@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.sim.common.differential_drive import (
+from swarm_loc_drivers.sim.differential_drive import (
     Controller,
     Drive,
     LastingNoise,
@@ -14,8 +14,8 @@ from swarm_loc_drivers.sim.common.differential_drive import (
     twist_of,
     wheel_paths,
 )
-from swarm_loc_drivers.sim.common.trajectories import Trajectories
-from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
+from swarm_loc_drivers.sim.run import Trajectories
+from swarm_loc_drivers.sim.scenarios.eight import Lemniscate
 
 SEPARATION = 0.053
 IDEAL = Drive(SEPARATION, wheel_noise=0.0)

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.sim.common.error_model import WORLDS
 from swarm_loc_drivers.sim.epuck.epuck_world_parameters import WorldParameters, make_world
 from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_drivers.sim.scenarios.eight import EightSettings, describe
-from swarm_loc_drivers.sim.scenarios.eight_steering import EightSteering
+from swarm_loc_drivers.sim.scenarios.eight import EightSettings, EightSteering, describe
+from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.parameters import ParameterError, markdown_table, parameter_specs
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 

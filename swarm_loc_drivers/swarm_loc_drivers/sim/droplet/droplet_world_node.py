@@ -17,14 +17,13 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.qos import QoSProfile
 
 from swarm_loc_drivers.common.odometry_output import stamp_message, yaw_quaternion
-from swarm_loc_drivers.sim.common.world_node import Pace, WorldNode
 from swarm_loc_drivers.sim.droplet.droplet_world_parameters import (
     DropletWorldParameters,
     make_droplet_world,
 )
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
-from swarm_loc_drivers.sim.droplet.fixes import Fix, Tracker
-from swarm_loc_drivers.sim.droplet.world import STEP_NS, SimulatedDroplet
+from swarm_loc_drivers.sim.droplet.world import STEP_NS, Fix, SimulatedDroplet, Tracker
+from swarm_loc_drivers.sim.world_node import Pace, WorldNode
 from swarm_loc_estimator.common.messages.planar import planar_covariance
 from swarm_loc_estimator.common.ros.running import run_node
 

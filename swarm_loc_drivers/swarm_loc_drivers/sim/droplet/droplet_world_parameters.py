@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_drivers.sim.common.world_error import WorldError, start_of
 from swarm_loc_drivers.sim.droplet.world import (
     DROPLET_WORLDS,
     DropletWorld,
     DropletWorldSettings,
 )
 from swarm_loc_drivers.sim.scenarios.eight import START_NS
+from swarm_loc_drivers.sim.worlds import WorldError, start_of
 from swarm_loc_estimator.common.number_spec import number
 from swarm_loc_estimator.common.parameters import ParameterError, choice, text, texts
 from swarm_loc_estimator.swarm.robot_ir import RobotIr

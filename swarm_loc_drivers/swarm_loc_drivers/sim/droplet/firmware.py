@@ -6,7 +6,8 @@ firmware prints none), and that emitters shine as `set_ir` has said (in exchange
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,46 @@ from swarm_loc_drivers.droplet.infrared_timing import (
     PRINT_DELAY_NS,
     SET_POWER_DELAY_NS,
 )
-from swarm_loc_drivers.sim.common.body import Command, DropletBody, Measured
+from swarm_loc_drivers.sim.droplet.infrared import ExchangeReadings, InfraredCommand
+
+
+class DropletBody(Protocol):
+    """Motors, infrared and clock of one Droplet; called by the thread that serves the firmware's bytes."""
+
+    @property
+    def robot_id(self) -> int:
+        """What its chip was made with, never 0."""
+
+    @property
+    def trims(self) -> Sequence[Sequence[int]]:
+        """Calibration in its memory: per direction the trims of the three motors, see `protocols.droplet`."""
+
+    @property
+    def lengths(self) -> Sequence[int]:
+        """Likewise path [mm] or turn [deg] per 1000 steps of each direction."""
+
+    def move(self, direction: int | None) -> None:
+        """Run the motors of a direction until the next call; None: stand."""
+
+    def infrared_status(self) -> int:
+        """Bits: 1 a message is coming in, 2 one is going out, 4 and 8 an exchange is going on."""
+
+    def send(self, line: str, target: int) -> None:
+        """Send a command to another robot; target 0: to all."""
+
+    def emit(self, power: int) -> None:
+        """Call all robots around, and light the emitters one after the other at a power of 0 to 256."""
+
+    def heard(self) -> Sequence[InfraredCommand | ExchangeReadings]:
+        """What has come by infrared since the last call."""
+
+    def deaf_until_ns(self) -> int:
+        """The firmware does nothing else before this time: an exchange needs it whole [ns]."""
+
+    @property
+    def now_ns(self) -> int:
+        """The world's time [ns]."""
+
 
 _BUFFER = 64
 _RECEIVE_QUEUE = 2
@@ -104,7 +144,7 @@ class DropletFirmware:
             for byte in queued:
                 self._character(byte)
         for heard in self._body.heard():
-            if isinstance(heard, Command):
+            if isinstance(heard, InfraredCommand):
                 self._at(heard.end_ns + HANDLING_NS, lambda line=heard.line: self._execute(line))  # type: ignore[misc]
             else:
                 self._unread += 1
@@ -234,7 +274,7 @@ class DropletFirmware:
         else:
             self._body.send(line, target)
 
-    def _report(self, measured: Measured) -> None:
+    def _report(self, measured: ExchangeReadings) -> None:
         self._unread -= 1
         self._output += self._print_matrix(measured.emitter, self._body.robot_id, measured.readings)
 

@@ -1,19 +1,183 @@
-"""Infrared channel between Droplets: messages that get lost or collide, exchanges that take a while."""
+"""Infrared channel between Droplets: messages that get lost or collide, exchanges of brightness."""
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.droplet import infrared_timing as timing
-from swarm_loc_drivers.sim.common.body import Command, Measured
-from swarm_loc_drivers.sim.droplet.light import DropletLight, distance_to_segments
-from swarm_loc_drivers.sim.droplet.transmissions import Exchange, Message, overlap
-from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.swarm.ir_board import IrPlatform
+from swarm_loc_drivers.droplet.hardware import ELEMENTS, FULL_POWER
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
+
+
+class InfraredCommand(NamedTuple):
+    """A line that came by infrared.
+
+    Attributes:
+        line: What to do.
+        end_ns: When its last byte came.
+    """
+
+    line: str
+    end_ns: int
+
+
+class ExchangeReadings(NamedTuple):
+    """An exchange in which this robot measured.
+
+    Attributes:
+        emitter: Id of the robot that emitted.
+        readings: (n, n) emitters by sensors, baseline taken off [count].
+        end_ns: When the exchange was over.
+    """
+
+    emitter: int
+    readings: NDArray[np.int64]
+    end_ns: int
+
+
+def overlap(one: InfraredMessage | Exchange, other: InfraredMessage | Exchange) -> bool:
+    """Whether two transmissions are on their way at the same time."""
+    return one.begin_ns < other.end_ns and one.end_ns > other.begin_ns
+
+
+@dataclass
+class InfraredMessage:
+    """A transmission.
+
+    Attributes:
+        sender: Index of the robot.
+        begin_ns: When.
+        end_ns: When it is through.
+        hearers: Indices of the robots in its reach at its begin.
+        line: The command; "" for the call that begins an exchange.
+        target: Id of whom it is for; 0: all.
+    """
+
+    sender: int
+    begin_ns: int
+    end_ns: int
+    hearers: NDArray[np.int64]
+    line: str = ""
+    target: int = 0
+    done: bool = False
+
+    def reaches(self, robot: int) -> bool:
+        """Whether a robot sends it or may hear it."""
+        return robot == self.sender or robot in self.hearers
+
+
+@dataclass
+class Exchange:
+    """An exchange.
+
+    Attributes:
+        emitter: Index of the robot.
+        begin_ns: When the call began.
+        power: Of its emitters.
+        receivers: (k,) indices of the robots that have heard the call.
+        readings: (k, n, n) emitters by sensors, as far as measured.
+        flashes: How many.
+        done: Whether it is over and its readings are told.
+    """
+
+    emitter: int
+    begin_ns: int
+    power: int
+    receivers: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    readings: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0, 0), dtype=np.int64))
+    flashes: int = 0
+    done: bool = False
+
+    @property
+    def end_ns(self) -> int:
+        """When the last flash is over."""
+        return self.begin_ns + timing.EXCHANGE_NS
+
+    def has(self, robot: int) -> bool:
+        """Whether a robot emits or measures."""
+        return robot == self.emitter or robot in self.receivers
+
+    def lit(self, now_ns: int) -> int | None:
+        """The emitter that is lit now."""
+        since_ns = now_ns - self.begin_ns - timing.LEAD_NS
+        flash, within = divmod(since_ns, timing.FLASH_NS + timing.GAP_NS)
+        return flash if since_ns >= 0 and flash < ELEMENTS and within < timing.FLASH_NS else None
+
+
+class DropletLight:
+    """The light of one emitter at a time.
+
+    Args:
+        platform: The board of all robots.
+        gains: (2, N, n) true factors of the sensors and of the emitters of all robots.
+        near_power: Power at which the emitters follow the board's near model, below 256.
+    """
+
+    def __init__(self, platform: IrPlatform, gains: FloatArray, near_power: int) -> None:
+        self._platform = platform
+        self._gains = gains
+        self._powers = (0.0, float(near_power), float(FULL_POWER))
+        angles = np.array(platform.angles)
+        self._elements = platform.radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+
+    def falling_on(
+        self, poses: FloatArray, receivers: NDArray[np.int64], transmitter: int, emitter: int, power: int
+    ) -> FloatArray:
+        """Counts (k, n) that the sensors of receivers (k,) would read without noise.
+
+        Args:
+            poses: (N, 3) of all robots in map.
+            receivers: Their indices.
+            transmitter: Index of the robot that emits.
+            emitter: Which of its emitters is lit.
+            power: How bright, 0 to 256.
+        """
+        seen = se2.between(poses[receivers], poses[transmitter])
+        distance, bearing = np.hypot(seen[:, 0], seen[:, 1]), np.arctan2(seen[:, 1], seen[:, 0])
+        relative = np.stack([distance, bearing, seen[:, 2]], axis=-1)
+        count = len(receivers)
+        gains = PairGains(
+            self._gains[0, receivers],
+            np.repeat(self._gains[1, [transmitter]], count, axis=0),
+            np.zeros((count, 4)),
+        )
+        far_near = expected(self._platform, relative, gains)[..., emitter]  # (k, modes, n)
+        levels = np.stack([np.zeros_like(far_near[:, 0]), far_near[:, -1], far_near[:, 0]])
+        share = np.array([np.interp(power, self._powers, corner) for corner in np.eye(3)])
+        light: FloatArray = np.einsum("l,lkn->kn", share, levels)
+        return np.where(self._blocked(poses, receivers, transmitter, emitter), 0.0, light)
+
+    def _blocked(
+        self, poses: FloatArray, receivers: NDArray[np.int64], transmitter: int, emitter: int
+    ) -> BoolArray:
+        """Which sensors (k, n) have another robot between them and the emitter."""
+        sensors = se2.transform_points(poses[receivers, None], self._elements)
+        lit = se2.transform_points(poses[transmitter], self._elements[emitter])
+        others = np.ones((len(receivers), len(poses)), dtype=bool)
+        others[:, transmitter] = False
+        others[np.arange(len(receivers)), receivers] = False
+        near = distance_to_segments(sensors, lit, poses[:, :2]) < self._platform.radius
+        return np.asarray((near & others[:, None]).any(axis=-1))
+
+
+def distance_to_segments(begins: FloatArray, end: FloatArray, points: FloatArray) -> FloatArray:
+    """Distances (..., N) of points (N, 2) from the segments from `begins` (..., 2) to one `end` (2,)."""
+    way = end - begins
+    square = np.maximum((way**2).sum(axis=-1, keepdims=True), 1e-18)
+    there = points - begins[..., None, :]
+    along = np.clip((there * way[..., None, :]).sum(axis=-1) / square, 0.0, 1.0)
+    nearest = begins[..., None, :] + along[..., None] * way[..., None, :]
+    distance: FloatArray = np.linalg.norm(points - nearest, axis=-1)
+    return distance
+
 
 _REMEMBERED_NS = 1_000_000_000
 """So long messages and exchanges that are over are kept: longer than any message takes."""
@@ -68,13 +232,13 @@ class DropletInfrared:
         self._platform, self._light, self._ids, self._settings = platform, light, ids, settings
         self._rng = rng
         self._now_ns = now_ns
-        self._messages: list[Message] = []
+        self._messages: list[InfraredMessage] = []
         self._exchanges: list[Exchange] = []
         self._ambient = rng.uniform(0.0, settings.ambient, (len(ids), platform.n))
         self._baseline = np.rint(self._ambient).astype(np.int64)
         self._drift_due_ns = now_ns
         self._baseline_due_ns = now_ns + rng.integers(0, _BASELINE_PERIOD_NS, len(ids))
-        self.heard: list[list[Command | Measured]] = [[] for _ in ids]
+        self.heard: list[list[InfraredCommand | ExchangeReadings]] = [[] for _ in ids]
         self.deaf_until_ns = [0 for _ in ids]
         self.counts: Counter[str] = Counter()
 
@@ -82,13 +246,13 @@ class DropletInfrared:
         """A robot begins to send a command."""
         end_ns = self._now_ns + timing.message_ns(len(line))
         self._messages.append(
-            Message(sender, self._now_ns, end_ns, self._in_reach(sender, poses), line, target)
+            InfraredMessage(sender, self._now_ns, end_ns, self._in_reach(sender, poses), line, target)
         )
 
     def emit(self, emitter: int, power: int, poses: FloatArray) -> None:
         """A robot begins an exchange."""
         end_ns = self._now_ns + timing.CALL_NS
-        self._messages.append(Message(emitter, self._now_ns, end_ns, self._in_reach(emitter, poses)))
+        self._messages.append(InfraredMessage(emitter, self._now_ns, end_ns, self._in_reach(emitter, poses)))
         self._exchanges.append(Exchange(emitter, self._now_ns, power))
         self.deaf_until_ns[emitter] = self._exchanges[-1].end_ns
 
@@ -137,7 +301,7 @@ class DropletInfrared:
         near[sender] = False
         return np.flatnonzero(near)
 
-    def _deliver(self, message: Message) -> None:
+    def _deliver(self, message: InfraredMessage) -> None:
         """A message is through: to those who could hear and understand it."""
         understood = self._rng.random(len(message.hearers)) >= self._settings.loss
         clear = np.array([self._is_clear(robot, message) for robot in message.hearers.tolist()], dtype=bool)
@@ -149,9 +313,9 @@ class DropletInfrared:
             return
         for robot in reached.tolist():
             if message.target in (0, self._ids[robot]):
-                self.heard[robot].append(Command(message.line, message.end_ns))
+                self.heard[robot].append(InfraredCommand(message.line, message.end_ns))
 
-    def _is_clear(self, robot: int, message: Message) -> bool:
+    def _is_clear(self, robot: int, message: InfraredMessage) -> bool:
         """Whether a robot listens all the time of a message, and hears nothing else."""
         if any(
             one.has(robot) and overlap(one, message) and one.emitter != message.sender
@@ -163,7 +327,7 @@ class DropletInfrared:
             for other in self._messages
         )
 
-    def _begin_to_measure(self, call: Message, receivers: NDArray[np.int64]) -> None:
+    def _begin_to_measure(self, call: InfraredMessage, receivers: NDArray[np.int64]) -> None:
         """Robots have heard a call."""
         for exchange in self._exchanges:
             if exchange.emitter == call.sender and exchange.begin_ns == call.begin_ns:
@@ -192,7 +356,7 @@ class DropletInfrared:
         self.counts["exchanges"] += 1
         emitter = int(self._ids[exchange.emitter])
         for robot, readings in zip(exchange.receivers.tolist(), exchange.readings, strict=True):
-            self.heard[robot].append(Measured(emitter, readings, exchange.end_ns))
+            self.heard[robot].append(ExchangeReadings(emitter, readings, exchange.end_ns))
 
     def _drift(self) -> None:
         """The ambient light changes; robots measure it now and then."""

@@ -16,9 +16,9 @@ from swarm_loc_drivers.droplet.console import TERMINATOR
 from swarm_loc_drivers.droplet.exchange import Brightness
 from swarm_loc_drivers.droplet.mover import DropletMover
 from swarm_loc_drivers.droplet.session import DropletSession, SessionSettings
-from swarm_loc_drivers.sim.common.link_host import ConsoleFirmware
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, Print
 from swarm_loc_drivers.sim.droplet.world import DropletWorld, SimulatedDroplet
+from swarm_loc_drivers.sim.link_host import ConsoleFirmware
 
 _TIMEOUT_S = 1.0
 STRIDE_S = 2.0

@@ -1,6 +1,6 @@
 """One world of Droplets, stepped in simulated time: motors shake, robots creep and veer, infrared flashes.
 
-What happens is fixed by the seed and by when the robots are told what.
+The seed and the times of the robots' commands fix what happens. A tracker above the table sees some robots.
 """
 
 from __future__ import annotations
@@ -11,13 +11,66 @@ from dataclasses import dataclass
 import numpy as np
 
 from swarm_loc_drivers.droplet.hardware import DIRECTIONS, ELEMENTS, WALKS, Gait, gait
-from swarm_loc_drivers.sim.common.body import Command, Measured
-from swarm_loc_drivers.sim.common.world_error import WorldError
-from swarm_loc_drivers.sim.droplet.infrared import DropletInfrared, InfraredSettings
-from swarm_loc_drivers.sim.droplet.light import DropletLight
+from swarm_loc_drivers.sim.droplet.infrared import (
+    DropletInfrared,
+    DropletLight,
+    ExchangeReadings,
+    InfraredCommand,
+    InfraredSettings,
+)
+from swarm_loc_drivers.sim.worlds import WorldError
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
+
+
+@dataclass(frozen=True)
+class Fix:
+    """Where a robot was seen.
+
+    Attributes:
+        robot: Its index.
+        stamp_ns: When.
+        pose: (3,) in map, with noise.
+    """
+
+    robot: int
+    stamp_ns: int
+    pose: FloatArray
+
+
+class Tracker:
+    """Sees some robots.
+
+    Args:
+        robots: Their indices.
+        rate_hz: Of each [1/s].
+        sigmas: Of its position [m] and of its heading [rad], one standard deviation.
+        seed: Fixes the noise.
+    """
+
+    def __init__(
+        self, robots: tuple[int, ...], rate_hz: float, sigmas: tuple[float, float], seed: int
+    ) -> None:
+        self.sigmas = sigmas
+        self._robots = robots
+        self._period_ns = round(1e9 / rate_hz)
+        self._rng = np.random.default_rng([seed, *robots])
+        self._due_ns: int | None = None
+
+    def look(self, now_ns: int, poses: FloatArray) -> list[Fix]:
+        """What it sees now, if it is time, of robots at poses (N, 3)."""
+        if self._due_ns is None:
+            self._due_ns = now_ns
+        if now_ns < self._due_ns:
+            return []
+        self._due_ns += self._period_ns
+        position, heading = self.sigmas
+        scale = np.array([position, position, heading])
+        return [
+            Fix(robot, now_ns, poses[robot] + scale * self._rng.standard_normal(3)) for robot in self._robots
+        ]
+
 
 STEP_NS = 5_000_000
 NEAR_POWER = 40
@@ -198,7 +251,7 @@ class SimulatedDroplet:
         """Begin an exchange."""
         self._world.infrared.emit(self._robot, power, self._world.poses)
 
-    def heard(self) -> Sequence[Command | Measured]:
+    def heard(self) -> Sequence[InfraredCommand | ExchangeReadings]:
         """What has come since the last call."""
         everybody = self._world.infrared.heard
         heard = everybody[self._robot]

@@ -23,12 +23,12 @@ from swarm_loc_drivers.common.odometry_output import nanoseconds
 from swarm_loc_drivers.epuck.camera_output import CameraOutput
 from swarm_loc_drivers.epuck.hardware import EPUCK_MODELS
 from swarm_loc_drivers.epuck.pending_images import Unanswered
-from swarm_loc_drivers.sim.common.world_node import Pace, WorldNode
 from swarm_loc_drivers.sim.epuck.epuck_world_parameters import WorldParameters, make_world
-from swarm_loc_drivers.sim.epuck.firmware.serial_firmware import SerialFirmware
-from swarm_loc_drivers.sim.epuck.firmware.wifi_firmware import WifiFirmware
+from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
+from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware
 from swarm_loc_drivers.sim.epuck.world import OVERHEAD, STEP_NS, SimulatedEpuck
-from swarm_loc_drivers.sim.render.overhead import overhead_model
+from swarm_loc_drivers.sim.render.rigs import overhead_model
+from swarm_loc_drivers.sim.world_node import Pace, WorldNode
 from swarm_loc_estimator.common.ros.running import run_node
 from swarm_loc_msgs.msg import AnonymousDetectionArray, MarkerDetectionArray
 

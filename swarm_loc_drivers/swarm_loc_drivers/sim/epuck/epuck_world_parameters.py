@@ -7,14 +7,12 @@ from pathlib import Path
 
 from swarm_loc_drivers.epuck.hardware import EPUCK2, EPUCK_MODELS
 from swarm_loc_drivers.epuck.wheels import WheelGeometry
-from swarm_loc_drivers.sim.common.error_model import WORLDS
-from swarm_loc_drivers.sim.common.world_error import WorldError
 from swarm_loc_drivers.sim.epuck.world import EpuckWorld, EpuckWorldSettings
-from swarm_loc_drivers.sim.render.camera_rig import Arena
 from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_drivers.sim.render.overhead import OverheadSettings
+from swarm_loc_drivers.sim.render.rigs import Arena, OverheadSettings
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, CAMERA_RATE_HZ, START_NS
 from swarm_loc_drivers.sim.scenarios.eight_images import FAMILY
+from swarm_loc_drivers.sim.worlds import WORLDS, WorldError
 from swarm_loc_estimator.common.number_spec import number
 from swarm_loc_estimator.common.parameters import ParameterError, choice, text
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Swarm
@@ -29,9 +27,7 @@ class WorldParameters:
     """Parameters of `epuck_world_node`; the cameras' are those of `CameraModel` and `OverheadSettings`."""
 
     swarm_file: str = text("", "path of the swarm description; every robot needs a start", required=True)
-    world: str = choice(
-        "w2", tuple(WORLDS), "which errors robots and cameras have; see sim/common/error_model.py"
-    )
+    world: str = choice("w2", tuple(WORLDS), "which errors robots and cameras have; see sim/worlds.py")
     seed: int = number(1, "1", 0, 2**31 - 1, "fixes the errors")
     rate: float = number(
         1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"

@@ -1,31 +1,80 @@
 """One world of e-pucks, stepped in simulated time: motors turn wheels, wheels slip, cameras look.
 
-What happens is fixed by the seed and by when the robots are told what; images are drawn only when somebody
-wants to see them, and look the same whenever that is.
+The seed and the times of the robots' commands fix what happens; images are drawn only on demand, and look
+the same whenever that is.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_drivers.epuck.hardware import PROXIMITY_BEARINGS, PROXIMITY_RADIUS_M
+from swarm_loc_drivers.epuck.proximity import FIELD_OF_VIEW, raw_of_distance
 from swarm_loc_drivers.epuck.wheels import WheelGeometry
-from swarm_loc_drivers.sim.common.differential_drive import Drive, LastingNoise, roll
-from swarm_loc_drivers.sim.common.error_model import ErrorModel
-from swarm_loc_drivers.sim.common.hidden_geometry import hidden_geometry
-from swarm_loc_drivers.sim.common.trajectories import Trajectories
-from swarm_loc_drivers.sim.common.world_error import WorldError, start_of
-from swarm_loc_drivers.sim.epuck.proximity import proximity_values
-from swarm_loc_drivers.sim.render.camera_rig import Arena, CameraRig
+from swarm_loc_drivers.sim.differential_drive import Drive, LastingNoise, roll
 from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_drivers.sim.render.overhead import OverheadRig, OverheadSettings
+from swarm_loc_drivers.sim.render.rigs import Arena, CameraRig, OverheadRig, OverheadSettings
 from swarm_loc_drivers.sim.render.views import Views
+from swarm_loc_drivers.sim.run import Trajectories
+from swarm_loc_drivers.sim.worlds import ErrorModel, WorldError, hidden_geometry, start_of
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_vision.aerial.ground.floor_markers import FloorMarker
+
+_LARGEST = 4095
+_NOISE = 6.0
+_RAYS = np.array([-0.5, 0.0, 0.5]) * FIELD_OF_VIEW
+"""A sensor reports the nearest of what these rays of its cone meet."""
+
+
+def proximity_values(
+    poses: FloatArray, robot: int, arena: tuple[float, float], rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Raw values (8,) of one robot.
+
+    Args:
+        poses: (N, 3) of all robots in map.
+        robot: Index of the one.
+        arena: Its size along x and y, around map's origin [m].
+        rng: Source of the noise.
+    """
+    x, y, heading = poses[robot]
+    outwards = heading + np.array(PROXIMITY_BEARINGS)
+    origins = np.array([x, y]) + PROXIMITY_RADIUS_M * np.column_stack([np.cos(outwards), np.sin(outwards)])
+    angles = outwards[:, None] + _RAYS
+    rays = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    others = np.delete(poses[:, :2], robot, axis=0)
+    distance = np.minimum(_to_walls(origins, rays, arena), _to_discs(origins, rays, others)).min(axis=1)
+    raw = raw_of_distance(distance) + _NOISE * rng.standard_normal(len(distance))
+    return np.clip(np.rint(raw), 0, _LARGEST).astype(np.int64)
+
+
+def _to_walls(origins: FloatArray, rays: FloatArray, arena: tuple[float, float]) -> FloatArray:
+    """Along rays (S, R, 2) from origins (S, 2) to the walls (S, R) [m]; 0 from outside of them."""
+    half = 0.5 * np.array(arena)
+    with np.errstate(divide="ignore"):
+        along = (half - np.sign(rays) * origins[:, None]) / np.abs(rays)
+    nearest: FloatArray = np.maximum(along.min(axis=-1), 0.0)
+    return nearest
+
+
+def _to_discs(origins: FloatArray, rays: FloatArray, centres: FloatArray) -> FloatArray:
+    """Along rays (S, R, 2) to robots at (M, 2) (S, R) [m]; infinite where they meet none."""
+    if not len(centres):
+        return np.full(rays.shape[:2], math.inf)
+    to_centre = centres - origins[:, None, None]
+    along = (to_centre * rays[:, :, None]).sum(axis=-1)
+    beside = (to_centre**2).sum(axis=-1) - along**2
+    depth = np.sqrt(np.maximum(PROXIMITY_RADIUS_M**2 - beside, 0.0))
+    met = (beside < PROXIMITY_RADIUS_M**2) & (along > 0.0)
+    nearest: FloatArray = np.where(met, np.maximum(along - depth, 0.0), math.inf).min(axis=-1)
+    return nearest
+
 
 GrayImage = NDArray[np.uint8]
 

@@ -1,7 +1,8 @@
 """Events of a simulated event camera: blinking spots, edges that move, noise; refractory pixels, one bus.
 
-A pixel tells when the logarithm of its brightness has changed by its threshold. A light that is switched on
-makes each pixel of its image send a burst, the longer the brighter, one event after each refractory time.
+A pixel sends an event when the logarithm of its brightness has changed by its threshold. A light that is
+switched on makes each pixel of its image send a burst, the longer the brighter, one event after each
+refractory time.
 """
 
 from __future__ import annotations
@@ -14,9 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.pushbot.hardware import SENSOR_PX
-from swarm_loc_drivers.sim.common.body import Blinking
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.number_spec import number
+
+
+class Blinking(NamedTuple):
+    """A light that is lit in the first part of each period; a period of 0: it is dark.
+
+    Attributes:
+        period_us: [us].
+        lit_us: [us].
+    """
+
+    period_us: int = 0
+    lit_us: int = 0
+
 
 _REACH_PX = 4
 """Half the width of the part of the image that a spot is computed in."""

@@ -1,4 +1,8 @@
-"""Simulated PushBots that explore a floor plan: they look around, and go where a mapper sends them."""
+"""PushBots that explore a floor plan without firmware: truth, odometry, distances, and a mapper's goals.
+
+What the firmware's emulator does byte by byte is done here a whole turn or drive at a time, so that hundreds
+of hours of mapping can be simulated.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +14,247 @@ from typing import Protocol
 
 import numpy as np
 
-from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan
-from swarm_loc_drivers.sim.pushbot.kinematics import KinematicPushBot, PushBotNoise
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, clearance, is_visible, ray_distance
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.exploration.goal import Goal
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN
-from swarm_loc_estimator.mapping.readings import LightSightings, Readings
+from swarm_loc_estimator.mapping.readings import UNSEEN, LightSightings, Readings
+
+PERIOD_S = 0.02
+"""Between two reports of the event tracker."""
+TURN_RATE, SPEED = 1.0, 0.2
+"""[rad/s], [m/s]."""
+BODY_RADIUS = 0.06
+FOCAL_BASELINE = 90.0 * 0.07
+"""Focal length times distance of laser and lens [px m]."""
+_MAX_PX = 40.0
+_LED_RADIUS = 0.045
+_LED_RANGE = 3.0
+_HALF_FIELD = math.radians(35.0)
+
+
+@dataclass(frozen=True)
+class PushBotNoise:
+    """Imperfections; standard deviations.
+
+    Attributes:
+        slip: Share of every turn that is lost.
+        turn: Of a turn, per square root of a full turn [rad].
+        distance: Of a drive, per path.
+        heading: While driving, per square root of a metre [rad].
+        pixel: Of where the tracker sees the laser [px].
+        dropout: Share of readings that see nothing.
+        outlier: Share of readings that are nonsense.
+        bearing: Of where it sees a light [rad].
+    """
+
+    slip: float = 0.0
+    turn: float = math.radians(0.64)
+    distance: float = 0.015
+    heading: float = math.radians(0.3)
+    pixel: float = 0.1
+    dropout: float = 0.01
+    outlier: float = 0.003
+    bearing: float = math.radians(1.0)
+
+
+@dataclass(frozen=True)
+class LaserLimits:
+    """Between which distances a reflection is seen [m]."""
+
+    low: float = 0.10
+    high: float = 2.5
+
+
+class KinematicPushBot:
+    """One robot.
+
+    Args:
+        plan: Where it is.
+        pose: (3,) at the start.
+        noise: What it is like.
+        rng: Source of the noise.
+        limits: Of its laser.
+
+    Attributes:
+        time_s: Until now.
+        trace: (n, 3) true pose every `PERIOD_S` until now.
+        bumps: How often something stopped it.
+    """
+
+    def __init__(
+        self,
+        plan: FloorPlan,
+        pose: FloatArray,
+        noise: PushBotNoise,
+        rng: np.random.Generator,
+        limits: LaserLimits | None = None,
+    ) -> None:
+        self._plan = plan
+        self._noise = noise
+        self._rng = rng
+        self._limits = limits or LaserLimits()
+        self._traces = [np.asarray(pose, dtype=float)[None]]
+        self._odometry = np.zeros(3)
+        self._steps = 0
+        self.bumps = 0
+
+    @property
+    def pose(self) -> FloatArray:
+        """True pose (3,) now."""
+        pose: FloatArray = self._traces[-1][-1]
+        return pose
+
+    @property
+    def time_s(self) -> float:
+        """Time of this robot [s]."""
+        return self._steps * PERIOD_S
+
+    @property
+    def trace(self) -> FloatArray:
+        """(n, 3) true poses, one every `PERIOD_S`."""
+        if len(self._traces) > 1:
+            self._traces = [np.concatenate(self._traces)]
+        return self._traces[0]
+
+    def positions_at(self, steps: IntArray) -> FloatArray:
+        """True positions (n, 2) at steps of time (n,); the last known ones beyond."""
+        trace = self.trace
+        positions: FloatArray = trace[np.minimum(steps, len(trace) - 1)]
+        return positions
+
+    def turn(self, angle: float, others: list[KinematicPushBot], rate: float = TURN_RATE) -> Readings:
+        """Turn on the spot by an angle of the odometry [rad] at a rate [rad/s]; what it reads meanwhile."""
+        count = max(1, round(abs(angle) / (rate * PERIOD_S)))
+        step = angle / count
+        noise = self._noise.turn * math.sqrt(abs(step) / (2.0 * math.pi))
+        true = np.cumsum(step * (1.0 - self._noise.slip) + noise * self._rng.standard_normal(count))
+        poses = np.tile(self.pose, (count, 1))
+        poses[:, 2] += true
+        reported = np.tile(self._odometry, (count, 1))
+        reported[:, 2] += step * np.arange(1, count + 1)
+        return self._moved(poses, reported, others)
+
+    def rest(self, duration_s: float, others: list[KinematicPushBot]) -> Readings:
+        """Stand still for a while [s]."""
+        count = round(duration_s / PERIOD_S)
+        return self._moved(np.tile(self.pose, (count, 1)), np.tile(self._odometry, (count, 1)), others)
+
+    def drive(self, length: float, others: list[KinematicPushBot]) -> Readings:
+        """Drive ahead by a length of the odometry [m], until something is in the way."""
+        count = max(1, round(length / (SPEED * PERIOD_S)))
+        step = length / count
+        scale = 1.0 + self._noise.distance * self._rng.standard_normal()
+        noise = self._noise.heading * math.sqrt(step)
+        headings = self.pose[2] + np.cumsum(noise * self._rng.standard_normal(count))
+        moves = step * scale * np.stack([np.cos(headings), np.sin(headings)], axis=-1)
+        poses = np.column_stack([self.pose[:2] + np.cumsum(moves, axis=0), headings])
+        discs = self._discs(others, count)
+        free = _free_steps(self._plan.walls, discs, self.pose, poses)
+        self.bumps += free < count
+        poses = poses[: max(free, 1)] if free else self.pose[None]
+        ahead = np.array([math.cos(self._odometry[2]), math.sin(self._odometry[2]), 0.0])
+        reported = self._odometry + step * np.arange(1, len(poses) + 1)[:, None] * ahead * (free > 0)
+        return self._moved(poses, reported, others)
+
+    def lights(self, readings: Readings, others: dict[int, KinematicPushBot]) -> LightSightings:
+        """Lights of other robots, by their numbers, that it saw while it took the newest readings (n,)."""
+        steps = np.round(readings.stamp_ns / (1e9 * PERIOD_S)).astype(np.int64)
+        own = self.positions_at(steps)
+        rows: list[tuple[int, int, float]] = []
+        for number, other in others.items():
+            there = other.positions_at(steps)
+            seen, bearing = _seen_lights(self._plan.walls, own, there)
+            chosen = np.flatnonzero(seen)
+            rows += [(int(readings.stamp_ns[k]), number, float(bearing[k])) for k in chosen]
+        rows.sort()
+        stamp_ns, target, bearings = (np.array(c) for c in zip(*rows, strict=True)) if rows else ([], [], [])
+        count = len(rows)
+        noisy = np.asarray(bearings, dtype=float) + self._noise.bearing * self._rng.standard_normal(count)
+        return LightSightings(
+            np.asarray(stamp_ns, dtype=np.int64),
+            np.asarray(target, dtype=np.int64),
+            noisy,
+            np.full(count, self._noise.bearing),
+        )
+
+    def _discs(self, others: list[KinematicPushBot], count: int) -> FloatArray:
+        """Positions (count, others, 2) of other robots in the next steps."""
+        steps = self._steps + 1 + np.arange(count)
+        return (
+            np.stack([one.positions_at(steps)[:, :2] for one in others], axis=1)
+            if others
+            else np.zeros((count, 0, 2))
+        )
+
+    def _moved(self, poses: FloatArray, odometry: FloatArray, others: list[KinematicPushBot]) -> Readings:
+        """Go on to poses (n, 3) with odometry (n, 3), and read at each."""
+        count = len(poses)
+        distances = _distances(self._plan.walls, self._discs(others, count), poses)
+        self._traces.append(poses)
+        stamp_ns = np.round((self._steps + 1 + np.arange(count)) * PERIOD_S * 1e9).astype(np.int64)
+        self._steps += count
+        self._odometry = odometry[-1].copy()
+        reported = odometry.copy()
+        reported[:, 2] = wrap_angle(odometry[:, 2])
+        return Readings(stamp_ns, reported, self._inverse(distances), self._noise.pixel / FOCAL_BASELINE)
+
+    def _inverse(self, distances: FloatArray) -> FloatArray:
+        """Inverse distances (n,) that the tracker reports of true distances (n,)."""
+        count, rng, noise = len(distances), self._rng, self._noise
+        pixels = FOCAL_BASELINE / distances + noise.pixel * rng.standard_normal(count)
+        lowest = FOCAL_BASELINE / self._limits.high
+        nonsense = rng.random(count) < noise.outlier
+        pixels = np.where(nonsense, rng.uniform(lowest, _MAX_PX, count), pixels)
+        seen: BoolArray = (distances > self._limits.low) & (distances < self._limits.high) & (pixels > lowest)
+        seen &= rng.random(count) >= noise.dropout
+        return np.where(seen, pixels / FOCAL_BASELINE, UNSEEN)
+
+
+@cached_njit
+def _distances(walls: FloatArray, discs: FloatArray, poses: FloatArray) -> FloatArray:
+    """Distances (n,) ahead of poses (n, 3), with other robots at (n, r, 2)."""
+    out = np.zeros(len(poses))
+    for k in range(len(poses)):
+        out[k] = ray_distance(walls, discs[k], BODY_RADIUS, poses[k, 0], poses[k, 1], poses[k, 2])
+    return out
+
+
+@cached_njit
+def _free_steps(walls: FloatArray, discs: FloatArray, start: FloatArray, poses: FloatArray) -> int:
+    """How many of the steps to poses (n, 3) a robot can make before it touches something."""
+    before = clearance(walls, discs[0], BODY_RADIUS, start[0], start[1])
+    for k in range(len(poses)):
+        room = clearance(walls, discs[k], BODY_RADIUS, poses[k, 0], poses[k, 1])
+        if room < BODY_RADIUS and room < before:
+            return k
+        before = room
+    return len(poses)
+
+
+@cached_njit
+def _seen_lights(walls: FloatArray, own: FloatArray, there: FloatArray) -> tuple[BoolArray, FloatArray]:
+    """Whether each of (n, 3) poses sees a light of a robot at (n, 3), and its bearing.
+
+    A robot has a light at the front and one at the back; the nearer one is seen.
+    """
+    seen, bearing = np.zeros(len(own), dtype=np.bool_), np.zeros(len(own))
+    for k in range(len(own)):
+        nearest = math.inf
+        for side in (-1.0, 1.0):
+            x = there[k, 0] + side * _LED_RADIUS * math.cos(there[k, 2])
+            y = there[k, 1] + side * _LED_RADIUS * math.sin(there[k, 2])
+            distance = math.hypot(x - own[k, 0], y - own[k, 1])
+            if distance < nearest:
+                nearest = distance
+                angle = math.atan2(y - own[k, 1], x - own[k, 0]) - own[k, 2]
+                bearing[k] = (angle + math.pi) % (2.0 * math.pi) - math.pi
+                seen[k] = is_visible(walls, own[k, 0], own[k, 1], x, y)
+        seen[k] = seen[k] and nearest < _LED_RANGE and abs(bearing[k]) < _HALF_FIELD
+    return seen, bearing
+
 
 START_SIGMA = np.array([0.10, 0.10, math.radians(5.0)])
 """How well the starts of all robots but the first are known; that one's is the origin of the map."""

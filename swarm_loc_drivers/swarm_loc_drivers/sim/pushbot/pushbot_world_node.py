@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from swarm_loc_drivers.pushbot.hardware import GENERATIONS
-from swarm_loc_drivers.sim.common.world_node import Pace, WorldNode
-from swarm_loc_drivers.sim.pushbot.firmware.pushbot_firmware import PushbotFirmware
+from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 from swarm_loc_drivers.sim.pushbot.pushbot_world_parameters import (
     PushbotWorldParameters,
     make_pushbot_world,
 )
 from swarm_loc_drivers.sim.pushbot.world import STEP_NS, SimulatedPushbot
+from swarm_loc_drivers.sim.world_node import Pace, WorldNode
 from swarm_loc_estimator.common.ros.running import run_node
 
 

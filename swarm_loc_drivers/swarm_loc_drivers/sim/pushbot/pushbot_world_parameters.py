@@ -7,7 +7,6 @@ from pathlib import Path
 
 from swarm_loc_drivers.pushbot.hardware import GENERATIONS, SECOND_FIRMWARE
 from swarm_loc_drivers.pushbot.settings import WheelGeometry
-from swarm_loc_drivers.sim.common.world_error import WorldError, start_of
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS, floor_plan
 from swarm_loc_drivers.sim.pushbot.world import (
@@ -16,6 +15,7 @@ from swarm_loc_drivers.sim.pushbot.world import (
     PushbotWorld,
     PushbotWorldSettings,
 )
+from swarm_loc_drivers.sim.worlds import WorldError, start_of
 from swarm_loc_estimator.common.number_spec import number
 from swarm_loc_estimator.common.parameters import ParameterError, choice, text
 from swarm_loc_estimator.swarm.swarm import Swarm

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_drivers.sim.common.body import Blinking
-from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise, EventCamera, Spot
+from swarm_loc_drivers.sim.pushbot.event_camera import Blinking, CameraNoise, EventCamera, Spot
 from swarm_loc_drivers.sim.pushbot.optics import (
     CAMERA_X_M,
     LaserOptics,

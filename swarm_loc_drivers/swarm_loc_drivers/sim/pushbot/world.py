@@ -1,6 +1,6 @@
 """One world of PushBots, stepped in simulated time: motors, slipping wheels, walls, lasers, event cameras.
 
-What happens is fixed by the seed and by when the robots are told what.
+The seed and the times of the robots' commands fix what happens.
 """
 
 from __future__ import annotations
@@ -13,17 +13,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.pushbot.settings import WheelGeometry
-from swarm_loc_drivers.sim.common.body import Blinking
-from swarm_loc_drivers.sim.common.differential_drive import Drive, LastingNoise, roll
-from swarm_loc_drivers.sim.common.world_error import WorldError
-from swarm_loc_drivers.sim.pushbot import optics
-from swarm_loc_drivers.sim.pushbot.drivetrain import Drivetrain
-from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
-from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan
-from swarm_loc_drivers.sim.pushbot.ray_casting import clearance
-from swarm_loc_drivers.sim.pushbot.sight import BODY_RADIUS_M, HallSight, Lights
+from swarm_loc_drivers.sim.differential_drive import Drive, LastingNoise, roll
+from swarm_loc_drivers.sim.pushbot.event_camera import Blinking, CameraNoise
+from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, clearance
+from swarm_loc_drivers.sim.pushbot.optics import (
+    BODY_RADIUS_M,
+    HallSight,
+    Lights,
+    assembled_robots,
+)
+from swarm_loc_drivers.sim.worlds import WorldError
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import Pose2
+
+_FREE_RATE = 6000.0
+"""A wheel at full voltage [ticks/s]; the firmware's fastest velocity needs four fifths of it."""
+_LAG_S = 0.02
+
+
+class Drivetrain:
+    """Two wheels of each of N robots.
+
+    Args:
+        count: N.
+        step_s: Time of a step [s].
+
+    Attributes:
+        duties: (N, 2) share of the battery's voltage, left and right.
+        ticks: (N, 2) that the wheels have turned.
+    """
+
+    def __init__(self, count: int, step_s: float) -> None:
+        self.duties = np.zeros((count, 2))
+        self.ticks = np.zeros((count, 2))
+        self._rates = np.zeros((count, 2))
+        self._step_s = step_s
+        self._kept = np.exp(-step_s / _LAG_S)
+
+    def step(self) -> FloatArray:
+        """Let time pass; the ticks (N, 2) done in it."""
+        self._rates = _FREE_RATE * self.duties + self._kept * (self._rates - _FREE_RATE * self.duties)
+        done = self._rates * self._step_s
+        self.ticks += done
+        return done
+
 
 STEP_NS = 5_000_000
 _MS_PER_STEP = 5
@@ -86,7 +119,7 @@ class PushbotWorld:
         self.poses: FloatArray = np.array(starts, dtype=float).reshape(count, 3)
         """(N, 3) where the robots truly are, in map."""
         self.drivetrain = Drivetrain(count, 1e-3)
-        self.optics = optics.assembled_robots(settings.seed, count)
+        self.optics = assembled_robots(settings.seed, count)
         """How the robots were put together; for evaluation."""
         self.lights: list[Lights] = [(Blinking(), Blinking(), Blinking()) for _ in range(count)]
         """Laser, rear and front LED of each robot."""

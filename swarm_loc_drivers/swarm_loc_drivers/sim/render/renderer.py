@@ -11,11 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from swarm_loc_drivers.sim.render.coverage import Layer, empty_box, fill, lay_over
-from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_drivers.sim.render.raster import REACH, Motion, Patches, draw, project
+from swarm_loc_drivers.sim.render.lens import CameraModel, expose
+from swarm_loc_drivers.sim.render.raster import (
+    REACH,
+    Layer,
+    Motion,
+    Patches,
+    draw,
+    empty_box,
+    fill,
+    lay_over,
+    project,
+)
 from swarm_loc_drivers.sim.render.scene import ROOM
-from swarm_loc_drivers.sim.render.sensor import expose
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import CameraMount

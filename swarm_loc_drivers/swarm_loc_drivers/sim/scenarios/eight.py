@@ -12,15 +12,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ellipk, ellipkinc
 
-from swarm_loc_drivers.sim.common.camera import Exposures, View, schedule_exposures
-from swarm_loc_drivers.sim.common.differential_drive import Controller, Drive, drive, report_odometry
-from swarm_loc_drivers.sim.common.error_model import W0, ErrorModel
-from swarm_loc_drivers.sim.common.markers import observe_markers
-from swarm_loc_drivers.sim.common.record import Records, SimulatedRun
-from swarm_loc_drivers.sim.common.trajectories import Trajectories
-from swarm_loc_drivers.sim.common.transport import ODOMETRY_LATENESS
-from swarm_loc_drivers.sim.scenarios.lemniscate import Lemniscate
+from swarm_loc_drivers.common.velocity_command import Velocity
+from swarm_loc_drivers.sim.differential_drive import Controller, Drive, drive, report_odometry
+from swarm_loc_drivers.sim.run import ODOMETRY_LATENESS, Records, SimulatedRun, Trajectories
+from swarm_loc_drivers.sim.sightings import Exposures, View, observe_markers, schedule_exposures
+from swarm_loc_drivers.sim.worlds import W0, ErrorModel
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import (
@@ -32,6 +30,35 @@ from swarm_loc_estimator.swarm.swarm import (
     StartSigma,
     Swarm,
 )
+
+_TABLE_SIZE = 20001
+
+
+class Lemniscate:
+    """x = a cos t / (1 + sin^2 t), y = x sin t, by the length travelled from its right end.
+
+    Args:
+        half_width: a [m].
+    """
+
+    def __init__(self, half_width: float) -> None:
+        self.half_width = half_width
+        self.length = 4.0 * half_width * float(ellipk(-1.0))
+        """Once around [m]."""
+        self._parameter = np.linspace(0.0, 2.0 * np.pi, _TABLE_SIZE)
+        self._travelled = half_width * ellipkinc(self._parameter, -1.0)
+
+    def at(self, travelled: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pose (..., 3) and curvature (...) [1/m], positive to the left, at lengths `travelled` (...) [m]."""
+        t = np.interp(np.mod(travelled, self.length), self._travelled, self._parameter)
+        sin, cos = np.sin(t), np.cos(t)
+        scale = 1.0 / (1.0 + sin * sin)
+        x, y = self.half_width * cos * scale, self.half_width * sin * cos * scale
+        dx = -sin * (3.0 - sin * sin)  # direction of travel, up to a positive factor
+        dy = 1.0 - 3.0 * sin * sin
+        curvature = 3.0 * cos * np.sqrt(scale) / self.half_width
+        return np.stack([x, y, np.arctan2(dy, dx)], axis=-1), curvature
+
 
 HALF_WIDTH = 0.60
 ARENA = (2.4, 1.6)
@@ -177,3 +204,31 @@ def follow(path: Lemniscate, offset: FloatArray, speed: float, step_s: float) ->
         return forward, speed * (curvature + _ACROSS_GAIN * error[:, 1] + _HEADING_GAIN * error[:, 2])
 
     return control
+
+
+class EightSteering:
+    """Keeps each robot at its place on the eight, which moves on at constant speed.
+
+    Args:
+        robots: How many; robot i begins i-th of as many equal parts along the eight.
+        speed: [m/s].
+    """
+
+    def __init__(self, robots: int, speed: float) -> None:
+        path = Lemniscate(HALF_WIDTH)
+        offsets = np.arange(robots) * path.length / robots
+        self._control = [follow(path, offset[None], speed, 1e-9) for offset in offsets]
+        self._begin_ns: int | None = None
+
+    def command(self, robot: int, stamp_ns: int, pose: FloatArray) -> Velocity:
+        """What a robot should do now.
+
+        Args:
+            robot: Its index.
+            stamp_ns: When it was at `pose`; the first one of all robots is when the eight begins.
+            pose: (3,) in map.
+        """
+        if self._begin_ns is None or stamp_ns < self._begin_ns:
+            self._begin_ns = stamp_ns
+        speed, turn_rate = self._control[robot](stamp_ns - self._begin_ns, pose[None])
+        return float(speed[0]), 0.0, float(turn_rate[0])

@@ -1,4 +1,4 @@
-"""Scenario of the eight with rendered images in place of sightings."""
+"""The eight with rendered images in place of sightings, and the ground control on its floor."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.sim.common.camera import deliver
-from swarm_loc_drivers.sim.common.hidden_geometry import HiddenGeometry, hidden_geometry
-from swarm_loc_drivers.sim.common.record import SIGHTING_DTYPE, SimulatedRun
-from swarm_loc_drivers.sim.render.camera_rig import Arena, CameraRig
 from swarm_loc_drivers.sim.render.lens import CameraModel
+from swarm_loc_drivers.sim.render.rigs import Arena, CameraRig
+from swarm_loc_drivers.sim.run import SIGHTING_DTYPE, SimulatedRun
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, EightSettings, camera_exposures, drive_eight
+from swarm_loc_drivers.sim.sightings import deliver
+from swarm_loc_drivers.sim.worlds import HiddenGeometry, hidden_geometry
+from swarm_loc_vision.aerial.ground.floor_markers import FloorMarker
+from swarm_loc_vision.aerial.ground.ground_control import Ground
 from swarm_loc_vision.markers.families import family_named
 
 FAMILY = "artoolkit_bch_thin"
@@ -62,3 +64,18 @@ def simulate_eight_images(settings: EightSettings, camera: CameraModel) -> Image
         loss=settings.errors.frame_loss,
     )
     return ImageRun(SimulatedRun(swarm, truth, odometry, frames, nothing), settings, camera, hidden)
+
+
+_SIZE, _FROM_WALL = 0.12, 0.15
+
+
+def eight_floor() -> Ground:
+    """Six markers along the longer walls; their ids are the last ones of the family."""
+    family = family_named(FAMILY)
+    x, y = 0.5 * ARENA[0] - _FROM_WALL, 0.5 * ARENA[1] - _FROM_WALL
+    places = [(a * x, b * y) for b in (-1.0, 1.0) for a in (-1.0, 0.0, 1.0)]
+    first = len(family.words) - len(places)
+    markers = tuple(
+        FloorMarker(first + k, round(a, 6), round(b, 6), size=_SIZE) for k, (a, b) in enumerate(places)
+    )
+    return Ground(markers=markers, family=family)

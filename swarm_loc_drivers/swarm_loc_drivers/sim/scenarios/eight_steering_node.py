@@ -15,8 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from swarm_loc_drivers.sim.common.truth_steering import TruthSteering
-from swarm_loc_drivers.sim.scenarios.eight_steering import EightSteering
+from swarm_loc_drivers.sim.scenarios.eight import EightSteering
+from swarm_loc_drivers.sim.truth_steering import TruthSteering
 from swarm_loc_estimator.common.number_spec import number
 from swarm_loc_estimator.common.parameters import flag, text
 from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node

@@ -11,10 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from swarm_loc_drivers.sim.common.differential_drive import Controller
-from swarm_loc_drivers.sim.common.error_model import W0
-from swarm_loc_drivers.sim.common.record import LivedRun
-from swarm_loc_drivers.sim.common.transport import CAMERA_LATENESS, arrival_ns
+from swarm_loc_drivers.sim.differential_drive import Controller
+from swarm_loc_drivers.sim.run import CAMERA_LATENESS, LivedRun, arrival_ns
 from swarm_loc_drivers.sim.scenarios.eight import (
     ARENA,
     START_NS,
@@ -22,6 +20,7 @@ from swarm_loc_drivers.sim.scenarios.eight import (
     EightSettings,
     drive_robots,
 )
+from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DTYPE

@@ -1,1 +1,0 @@
-"""What all simulated worlds share: motion, sensors, errors, transport."""

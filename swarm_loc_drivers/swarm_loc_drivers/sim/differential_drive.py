@@ -1,0 +1,170 @@
+"""Differential-drive motion model: true wheels slip at random, odometry reports the commanded motion.
+
+The wheels follow Siegwart and Nourbakhsh: a wheel that is meant to roll ds really rolls ds plus noise of
+variance `wheel_noise` * abs(ds), independently of the other wheel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_drivers.sim.run import ODOMETRY_DTYPE, Lateness, Records, arrival_ns, in_order_of_arrival
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+
+Controller = Callable[[int, FloatArray], tuple[FloatArray, FloatArray]]
+"""(step index, true poses (N, 3)) -> commanded speed (N,) [m/s] and turn rate (N,) [rad/s]."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A differential drive and its imperfections.
+
+    Attributes:
+        wheel_separation: [m].
+        wheel_noise: Variance of a wheel's path per metre rolled [m].
+        turn_slip: Share of every commanded turn that is lost, in [0, 1).
+    """
+
+    wheel_separation: float
+    wheel_noise: float
+    turn_slip: float = 0.0
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What came of driving.
+
+    Attributes:
+        truth: (T + 1, N, 3) true poses in map.
+        reported: (T + 1, N, 3) poses by odometry, each robot's own frame, starting at zero.
+    """
+
+    truth: FloatArray
+    reported: FloatArray
+
+
+class LastingNoise:
+    """Unit noise that acts over a while instead of within one step.
+
+    White noise would shake a wheel anew at every step, however short: a camera that looks for 8 ms would see
+    the robot jump. Real wheels slip over millimetres, and a robot is heavy. So each draw is spread evenly
+    over the steps of `time_s`, of which every step takes the mean. Sums over longer times keep the variance
+    of sums of white noise but for a third of `time_s`, so that `wheel_noise` means what it says.
+
+    Args:
+        rng: Source.
+        shape: Of one step's noise.
+        step_s: [s].
+        time_s: How long a draw acts [s].
+    """
+
+    def __init__(
+        self, rng: np.random.Generator, shape: tuple[int, ...], step_s: float, time_s: float
+    ) -> None:
+        self._rng = rng
+        self._draws = rng.standard_normal((max(1, round(time_s / step_s)), *shape))
+        self._oldest = 0
+
+    def next(self) -> FloatArray:
+        """The noise of the next step."""
+        self._draws[self._oldest] = self._rng.standard_normal(self._draws.shape[1:])
+        self._oldest = (self._oldest + 1) % len(self._draws)
+        mean: FloatArray = self._draws.mean(axis=0)
+        return mean
+
+
+def wheel_paths(speed: FloatArray, turn_rate: FloatArray, separation: float, step_s: float) -> FloatArray:
+    """Paths (..., 2) [m] of the right and left wheel in one step."""
+    half_turn = 0.5 * separation * turn_rate
+    return np.stack([speed + half_turn, speed - half_turn], axis=-1) * step_s
+
+
+def twist_of(wheels: FloatArray, separation: float) -> FloatArray:
+    """The twist (..., 3) of one step in the robot's own frame, from its wheels' paths (..., 2) [m]."""
+    right, left = wheels[..., 0], wheels[..., 1]
+    return np.stack([0.5 * (right + left), np.zeros_like(right), (right - left) / separation], axis=-1)
+
+
+def roll(
+    poses: FloatArray,
+    speed: FloatArray,
+    turn_rate: FloatArray,
+    model: Drive,
+    step_s: float,
+    noise: FloatArray,
+) -> FloatArray:
+    """Where robots at `poses` (N, 3) come in one step.
+
+    Args:
+        poses: In map.
+        speed: Commanded (N,) [m/s].
+        turn_rate: Commanded (N,) [rad/s].
+        model: How they err.
+        step_s: [s].
+        noise: (N, 2) of the right and left wheel, of variance `model.wheel_noise` [m^0.5].
+    """
+    rolled = wheel_paths(speed, (1.0 - model.turn_slip) * turn_rate, model.wheel_separation, step_s)
+    rolled += noise * np.sqrt(np.abs(rolled))
+    return se2.compose(poses, se2.exp(twist_of(rolled, model.wheel_separation)))
+
+
+def drive(
+    rng: np.random.Generator,
+    start: FloatArray,
+    control: Controller,
+    model: Drive,
+    *,
+    step_s: float,
+    steps: int,
+) -> Driven:
+    """Drive N robots from `start` (N, 3) for `steps` steps of `step_s`, commanded by `control`."""
+    truth = np.empty((steps + 1, *start.shape))
+    truth[0] = start
+    speeds, turn_rates = np.empty((2, steps, len(start)))
+    noise = rng.standard_normal((steps, len(start), 2)) * np.sqrt(model.wheel_noise)
+    for k in range(steps):
+        speeds[k], turn_rates[k] = control(k, truth[k])
+        truth[k + 1] = roll(truth[k], speeds[k], turn_rates[k], model, step_s, noise[k])
+    commanded = wheel_paths(speeds, turn_rates, model.wheel_separation, step_s)
+    return Driven(truth, integrate(twist_of(commanded, model.wheel_separation)))
+
+
+def integrate(twists: FloatArray) -> FloatArray:
+    """Odometry (T + 1, N, 3) from zero: each step is laid along its middle heading, e-puck paper eq. (1)."""
+    heading = np.concatenate([np.zeros((1, *twists.shape[1:-1])), np.cumsum(twists[..., 2], axis=0)])
+    middle = heading[:-1] + 0.5 * twists[..., 2]
+    steps = twists[..., :1] * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
+    position = np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
+    return np.concatenate([position, se2.wrap_angle(heading)[..., None]], axis=-1)
+
+
+def report_odometry(
+    rng: np.random.Generator, stamp_ns: NDArray[np.int64], reported: FloatArray, every: int, late: Lateness
+) -> Records:
+    """The odometry messages of N robots, each at its own phase of the common clock.
+
+    Args:
+        rng: Source of phases and delays.
+        stamp_ns: (T,).
+        reported: (T, N, 3) in each robot's odom frame.
+        every: Steps between two messages of a robot.
+        late: Delay on the way.
+
+    Returns:
+        (M,) of ODOMETRY_DTYPE in order of arrival. Every robot's first message is at the first stamp.
+    """
+    robots = reported.shape[1]
+    phase = rng.integers(1, every + 1, robots)
+    step = np.arange(len(stamp_ns))[:, None]
+    chosen, robot = np.nonzero((step == 0) | ((step - phase) % every == 0))
+    messages = np.zeros(len(chosen), ODOMETRY_DTYPE)
+    messages["robot"] = robot
+    messages["stamp_ns"] = stamp_ns[chosen]
+    messages["pose"] = reported[chosen, robot]
+    messages["arrival_ns"] = arrival_ns(rng, messages["stamp_ns"], late)
+    return in_order_of_arrival(messages, int(stamp_ns[-1]))

@@ -1,1 +1,0 @@
-"""Emulated firmware: answers the bytes of a driver with what a simulated robot does."""

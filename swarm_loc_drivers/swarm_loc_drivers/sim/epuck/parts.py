@@ -1,0 +1,126 @@
+"""An e-puck as its firmware finds it: the interface to a body, and motors, camera and sensors on it."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_drivers.epuck.hardware import EpuckModel, as_counter
+from swarm_loc_drivers.epuck.rgb565 import Image
+from swarm_loc_drivers.epuck.wifi_protocol import SENSORS_DTYPE
+
+
+class EpuckBody(Protocol):
+    """Motors, step counters, proximity sensors, camera and clock of one e-puck.
+
+    All of it is called by the thread that serves the emulated firmware's bytes.
+    """
+
+    def set_wheel_speeds(self, left: float, right: float) -> None:
+        """Turn the wheels at these rates [steps/s] until the next call: the motors have no watchdog.
+
+        The firmware has clamped and quantised the rates already, so they need not be whole numbers.
+        """
+
+    def wheel_steps(self) -> tuple[int, int]:
+        """Return the whole steps done since power-on, left and right: open loop, blind to slip, unbounded."""
+
+    def proximity(self) -> NDArray[np.int64]:
+        """Return eight raw values in [0, 4095], ps0..ps7 clockwise from the front; close things give more."""
+
+    def image(self) -> tuple[NDArray[np.uint8], int] | None:
+        """Return the newest exposed frame and its exposure stamp [ns]; None before the first.
+
+        The frame is (height, width) grey or (height, width, 3) RGB, of any size.
+        """
+
+    @property
+    def now_ns(self) -> int:
+        """The world's time [ns]."""
+
+
+CAMERA_WIDTH, CAMERA_HEIGHT = 640, 480
+
+GRAVITY_EPUCK2 = 768
+"""One g in its raw accelerations."""
+_AMBIENT = 3600
+_TOF_MM = 2000
+_BATTERY = 3200
+_TEMPERATURE = 25
+_SELECTOR = 3
+_MICROPHONE = 40
+
+
+class Motors:
+    """The stepper motors: clamped and quantised speeds, counters that a host may preset.
+
+    Args:
+        body: The robot.
+        model: Its generation.
+
+    Attributes:
+        commanded: The speeds as they were commanded, left and right [steps/s].
+    """
+
+    def __init__(self, body: EpuckBody, model: EpuckModel) -> None:
+        self._body = body
+        self._model = model
+        self._origin = (0, 0)
+        self.commanded = (0, 0)
+
+    def set_speeds(self, left: int, right: int) -> None:
+        """Turn the wheels [steps/s]; the firmware keeps speeds in 16 bits."""
+        self.commanded = (as_counter(left), as_counter(right))
+        self._body.set_wheel_speeds(*map(self._model.rate, self.commanded))
+
+    def steps(self) -> tuple[int, int]:
+        """The counters, unbounded."""
+        left, right = self._body.wheel_steps()
+        return left - self._origin[0], right - self._origin[1]
+
+    def counters(self) -> tuple[int, int]:
+        """The counters as they are sent, 16 bits."""
+        left, right = self.steps()
+        return as_counter(left), as_counter(right)
+
+    def preset(self, left: int, right: int) -> None:
+        """Make the counters what the host says."""
+        done_left, done_right = self._body.wheel_steps()
+        self._origin = (done_left - left, done_right - right)
+
+
+def camera_image(body: EpuckBody, width: int, height: int, zoom: int) -> Image:
+    """The newest frame (height, width, 3) RGB as the camera delivers it, black before the first.
+
+    The middle width * zoom x height * zoom of the camera's 640x480 is delivered, one pixel for zoom x zoom.
+    """
+    newest = body.image()
+    if newest is None:
+        return np.zeros((height, width, 3), np.uint8)
+    frame = newest[0] if newest[0].ndim == 3 else np.repeat(newest[0][:, :, None], 3, axis=2)
+    rows, columns = frame.shape[:2]
+    part_rows = max(1, min(rows, round(rows * height * zoom / CAMERA_HEIGHT)))
+    part_columns = max(1, min(columns, round(columns * width * zoom / CAMERA_WIDTH)))
+    top, left = (rows - part_rows) // 2, (columns - part_columns) // 2
+    part = frame[top : top + part_rows, left : left + part_columns]
+    small: Image = cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
+    return small
+
+
+def sensor_values(body: EpuckBody, motors: Motors) -> NDArray[np.void]:
+    """What the sensors of a robot that stands level in a quiet room say, () of SENSORS_DTYPE."""
+    values = np.zeros((), SENSORS_DTYPE)
+    values["acceleration"] = (0, 0, GRAVITY_EPUCK2)
+    values["acceleration_polar"] = (GRAVITY_EPUCK2, 0.0, 0.0)
+    values["temperature"] = _TEMPERATURE
+    values["proximity"] = body.proximity()
+    values["ambient"] = _AMBIENT
+    values["tof"] = _TOF_MM
+    values["microphones"] = _MICROPHONE
+    values["left_counter"], values["right_counter"] = motors.counters()
+    values["battery"] = _BATTERY
+    values["selector"] = _SELECTOR
+    return values

@@ -1,0 +1,249 @@
+"""Pseudo-terminals and TCP ports behind which emulated firmware answers.
+
+Everything happens in the thread that calls `poll`, so a world that steps its bodies there needs no locks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import selectors
+import socket
+import tty
+from pathlib import Path
+from typing import Protocol
+
+from typing_extensions import Self
+
+_CHUNK = 4096
+_MAX_CLIENTS = 9
+"""From power-on: the firmware never closes a client's socket, and has ten with the server's own."""
+
+
+class _Port(Protocol):
+    """Something with a file descriptor that can be read."""
+
+    def fileno(self) -> int: ...
+
+    def on_readable(self) -> None:
+        """Take what has come."""
+
+    def on_cycle(self) -> None:
+        """Send what is due."""
+
+    def close(self) -> None:
+        """End it."""
+
+
+class ConsoleFirmware(Protocol):
+    """A firmware behind a serial port."""
+
+    def receive(self, data: bytes) -> bytes:
+        """Take bytes; what the robot answers."""
+
+    def stream(self) -> bytes:
+        """What the robot sends by itself."""
+
+
+class StreamFirmware(Protocol):
+    """A firmware behind a TCP port."""
+
+    def receive(self, data: bytes) -> None:
+        """Take bytes."""
+
+    def stream(self) -> bytes:
+        """What the robot sends by itself; called when all before is on its way."""
+
+    def disconnect(self) -> None:
+        """The client has gone."""
+
+
+class _PtyPort:
+    """A pseudo-terminal; it stays open while clients come and go, as a robot's Bluetooth module does."""
+
+    def __init__(self, firmware: ConsoleFirmware, link: Path | None) -> None:
+        self._firmware = firmware
+        self._link = link
+        self._master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.path = Path(os.ttyname(self._slave))
+        if link is not None:
+            link.unlink(missing_ok=True)
+            link.symlink_to(self.path)
+
+    def fileno(self) -> int:
+        return self._master
+
+    def on_readable(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            self._send(self._firmware.receive(os.read(self._master, _CHUNK)))
+
+    def on_cycle(self) -> None:
+        self._send(self._firmware.stream())
+
+    def _send(self, data: bytes) -> None:
+        """What the client does not take is lost, as on a wire."""
+        if data:
+            with contextlib.suppress(BlockingIOError):
+                os.write(self._master, data)
+
+    def close(self) -> None:
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+        os.close(self._master)
+        os.close(self._slave)
+
+
+class _FlowControlledPort(_PtyPort):
+    """A pseudo-terminal with RTS/CTS: what the client does not take waits, and the firmware waits with it."""
+
+    def __init__(self, firmware: StreamFirmware, link: Path | None) -> None:
+        super().__init__(_Quiet(firmware), link)
+        self._unsent = b""
+
+    def on_cycle(self) -> None:
+        self._unsent = self._unsent or self._firmware.stream()
+        with contextlib.suppress(BlockingIOError):
+            while self._unsent:
+                self._unsent = self._unsent[os.write(self._master, self._unsent) :]
+
+
+class _Quiet:
+    """A firmware that answers as it streams."""
+
+    def __init__(self, firmware: StreamFirmware) -> None:
+        self._firmware = firmware
+
+    def receive(self, data: bytes) -> bytes:
+        self._firmware.receive(data)
+        return b""
+
+    def stream(self) -> bytes:
+        return self._firmware.stream()
+
+
+class _TcpPort:
+    """A TCP server for one client at a time; the next one waits, and sending waits for the client."""
+
+    def __init__(
+        self, firmware: StreamFirmware, host: str, port: int, selector: selectors.BaseSelector
+    ) -> None:
+        self._firmware = firmware
+        self._selector = selector
+        self._server = socket.create_server((host, port), backlog=1)
+        self._server.setblocking(False)
+        self._client: socket.socket | None = None
+        self._gone: list[socket.socket] = []
+        self._unsent = b""
+        self.port: int = self._server.getsockname()[1]
+
+    def fileno(self) -> int:
+        return self._server.fileno()
+
+    def on_readable(self) -> None:
+        """Accept a client, and until it is gone listen to it only."""
+        with contextlib.suppress(BlockingIOError):
+            self._client, _ = self._server.accept()
+            self._client.setblocking(False)
+            self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._selector.unregister(self._server)
+            self._selector.register(self._client, selectors.EVENT_READ, self._on_client)
+
+    def _on_client(self) -> None:
+        """Take commands, notice the end."""
+        assert self._client is not None  # noqa: S101
+        try:
+            data = self._client.recv(_CHUNK)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if data:
+            self._firmware.receive(data)
+        else:
+            self._drop_client()
+
+    def on_cycle(self) -> None:
+        if self._client is None:
+            return
+        self._unsent = self._unsent or self._firmware.stream()
+        try:
+            self._unsent = self._unsent[self._client.send(self._unsent) :] if self._unsent else b""
+        except BlockingIOError:
+            return
+        except OSError:
+            self._drop_client()
+
+    def _drop_client(self) -> None:
+        assert self._client is not None  # noqa: S101
+        self._selector.unregister(self._client)
+        self._gone.append(self._client)
+        self._client, self._unsent = None, b""
+        self._firmware.disconnect()
+        if len(self._gone) < _MAX_CLIENTS:
+            self._selector.register(self._server, selectors.EVENT_READ, self.on_readable)
+
+    def close(self) -> None:
+        for one in (self._client, self._server, *self._gone):
+            if one is not None:
+                one.close()
+
+
+class FirmwareHost:
+    """Serves the bytes of any number of emulated robots."""
+
+    def __init__(self) -> None:
+        self._selector = selectors.DefaultSelector()
+        self._ports: list[_Port] = []
+
+    def serve_pty(self, firmware: ConsoleFirmware, link: Path | None = None) -> Path:
+        """Put a firmware behind a pseudo-terminal.
+
+        Args:
+            firmware: Who answers.
+            link: A name for the terminal that stays the same; None for none.
+
+        Returns:
+            The path for a driver.
+        """
+        port = _PtyPort(firmware, link)
+        self._add(port)
+        return link or port.path
+
+    def serve_flow_controlled(self, firmware: StreamFirmware, link: Path | None = None) -> Path:
+        """The same with RTS/CTS: nothing is lost when the client takes its time, the firmware waits."""
+        port = _FlowControlledPort(firmware, link)
+        self._add(port)
+        return link or port.path
+
+    def serve_tcp(self, firmware: StreamFirmware, host: str = "127.0.0.1", port: int = 0) -> int:
+        """Put a firmware behind a TCP port, 0 for any that is free; returns the port."""
+        server = _TcpPort(firmware, host, port, self._selector)
+        self._add(server)
+        return server.port
+
+    def _add(self, port: _Port) -> None:
+        self._ports.append(port)
+        self._selector.register(port, selectors.EVENT_READ, port.on_readable)
+
+    def poll(self, timeout_s: float) -> None:
+        """Wait for bytes no longer than this, answer them, and send what the streams have due."""
+        for key, _ in self._selector.select(timeout_s):
+            key.data()
+        for port in self._ports:
+            port.on_cycle()
+
+    def close(self) -> None:
+        """Take all robots off their links, as when they are switched off."""
+        self._selector.close()
+        for port in self._ports:
+            port.close()
+        self._ports.clear()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,1 +1,0 @@
-"""Emulated firmware of PushBots, after EDVSBoardOS of the eDVS4337."""

@@ -1,1 +1,0 @@
-"""Simulated runs as bags."""

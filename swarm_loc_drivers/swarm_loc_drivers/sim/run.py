@@ -1,0 +1,180 @@
+"""Data of a simulated run, the same for every simulated swarm: true tracks, odometry, images, delays.
+
+Sensor data is kept as flat structured arrays, because a run of a thousand robots has a million entries.
+`stamp_ns` is when something happened, `arrival_ns` when a receiver got it; a receiver sees the data in
+order of arrival. Ground truth stands apart and is for evaluation only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.swarm.swarm import Swarm
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """Poses of N robots at T common stamps; between two stamps a robot keeps its twist.
+
+    Attributes:
+        stamp_ns: (T,) int64, evenly spaced.
+        poses: (T, N, 3), x [m], y [m], theta [rad] in map.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    poses: NDArray[np.float64]
+
+    def at(self, robot: NDArray[np.integer] | int, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The pose (..., 3) of each `robot` at each `stamp_ns` (broadcast together).
+
+        Raises:
+            ValueError: A stamp lies outside the simulated time.
+        """
+        index, share = self._locate(stamp_ns)
+        return _interpolate(self.poses[index, robot], self.poses[index + 1, robot], share)
+
+    def all_at(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The poses (M, N, 3) of all robots at stamps (M,).
+
+        Raises:
+            ValueError: A stamp lies outside the simulated time.
+        """
+        index, share = self._locate(stamp_ns)
+        return _interpolate(self.poses[index], self.poses[index + 1], share[:, None])
+
+    def _locate(self, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Index of the stamp before each time, and how far on it is to the next one, in [0, 1]."""
+        stamp_ns = np.asarray(stamp_ns, dtype=np.int64)
+        if stamp_ns.size and (stamp_ns.min() < self.stamp_ns[0] or stamp_ns.max() > self.stamp_ns[-1]):
+            raise ValueError(
+                f"stamps {stamp_ns.min()}..{stamp_ns.max()} ns leave the simulated time "
+                f"{self.stamp_ns[0]}..{self.stamp_ns[-1]} ns."
+            )
+        step_ns = int(self.stamp_ns[1] - self.stamp_ns[0])
+        index = np.minimum((stamp_ns - self.stamp_ns[0]) // step_ns, len(self.stamp_ns) - 2)
+        return index, (stamp_ns - self.stamp_ns[index]) / step_ns
+
+
+def _interpolate(
+    before: NDArray[np.float64], after: NDArray[np.float64], share: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The pose (..., 3) that lies `share` (...) of the way along the constant twist between two poses."""
+    return se2.compose(before, se2.exp(share[..., None] * se2.log(se2.between(before, after))))
+
+
+ODOMETRY_DTYPE = np.dtype(
+    [("robot", "<i4"), ("stamp_ns", "<i8"), ("arrival_ns", "<i8"), ("pose", "<f8", (3,))]
+)
+"""One odometry message: pose x [m], y [m], theta [rad] in the robot's odom frame, which starts at zero."""
+
+FRAME_DTYPE = np.dtype(
+    [("robot", "<i4"), ("stamp_ns", "<i8"), ("arrival_ns", "<i8"), ("first", "<i8"), ("count", "<i4")]
+)
+"""One camera image that arrived: its sightings are `sightings[first : first + count]`; count may be 0."""
+
+SIGHTING_DTYPE = np.dtype([("marker_id", "<u4"), ("value", "<f8", (3,))])
+"""One marker: forward [m] and left [m] of the camera, its normal from the optical axis [rad]."""
+
+Records = NDArray[Any]
+"""A structured array of one of the types above."""
+
+
+@dataclass(frozen=True)
+class LivedRun:
+    """What every simulated swarm has.
+
+    Attributes:
+        swarm: The description that a user would have; it does not know the hidden errors of the world.
+        truth: Where the robots really were, in map.
+        odometry: (M,) of ODOMETRY_DTYPE in order of arrival.
+    """
+
+    swarm: Swarm
+    truth: Trajectories
+    odometry: Records
+
+    @property
+    def start_ns(self) -> int:
+        """First simulated moment."""
+        return int(self.truth.stamp_ns[0])
+
+    @property
+    def end_ns(self) -> int:
+        """Last simulated moment; nothing arrives later."""
+        return int(self.truth.stamp_ns[-1])
+
+    @property
+    def duration_s(self) -> float:
+        """Simulated time [s]."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+
+@dataclass(frozen=True)
+class SimulatedRun(LivedRun):
+    """A simulated swarm with cameras from start to end.
+
+    Attributes:
+        frames: (F,) of FRAME_DTYPE in order of arrival; lost images are not there.
+        sightings: (S,) of SIGHTING_DTYPE, grouped by frame.
+    """
+
+    frames: Records
+    sightings: Records
+
+    def masked(self, kept: NDArray[np.bool_]) -> SimulatedRun:
+        """The run with some of its sightings (S,) only; frames stay, empty ones too."""
+        frames = self.frames.copy()
+        frame = np.repeat(np.arange(len(frames)), frames["count"])
+        frames["count"] = np.bincount(frame[kept], minlength=len(frames))
+        frames["first"] = np.cumsum(frames["count"]) - frames["count"]
+        return replace(self, frames=frames, sightings=self.sightings[kept])
+
+    def arrivals(self) -> Iterator[tuple[str, int]]:
+        """All data in order of arrival: ("odometry" or "frame", index into that array)."""
+        count = len(self.odometry)
+        arrival_ns = np.concatenate([self.odometry["arrival_ns"], self.frames["arrival_ns"]])
+        for index in np.argsort(arrival_ns, kind="stable").tolist():
+            yield ("odometry", index) if index < count else ("frame", index - count)
+
+
+def in_order_of_arrival(records: Records, end_ns: int) -> Records:
+    """The records that arrive until `end_ns`, sorted by arrival."""
+    ordered = records[np.argsort(records["arrival_ns"], kind="stable")]
+    return ordered[ordered["arrival_ns"] <= end_ns]
+
+
+@dataclass(frozen=True)
+class Lateness:
+    """Delay between the moment something happened and its arrival, uniform between two bounds.
+
+    Attributes:
+        low_s: Shortest delay [s].
+        high_s: Longest delay [s].
+    """
+
+    low_s: float
+    high_s: float
+
+
+CAMERA_LATENESS = Lateness(0.150, 0.300)
+"""Exposure, marker detection and wireless link of the e-puck paper, section V-B."""
+
+ODOMETRY_LATENESS = Lateness(0.002, 0.020)
+"""A few bytes on the same wireless link."""
+
+
+def arrival_ns(rng: np.random.Generator, stamp_ns: NDArray[np.int64], late: Lateness) -> NDArray[np.int64]:
+    """Arrival (M,) of what happened at `stamp_ns` (M,); each is delayed on its own, so order may change."""
+    delay_s = rng.uniform(late.low_s, late.high_s, len(stamp_ns))
+    return stamp_ns + np.rint(delay_s * 1e9).astype(np.int64)
+
+
+def survivors(rng: np.random.Generator, count: int, loss: float) -> NDArray[np.bool_]:
+    """Which of `count` messages arrive (count,), when each is lost with probability `loss`."""
+    return rng.random(count) >= loss

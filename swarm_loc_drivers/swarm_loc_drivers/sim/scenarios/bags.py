@@ -1,0 +1,338 @@
+"""Write simulated runs as bags, as a recorder of the real swarm would have left them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from swarm_loc_drivers.common.calibration_file import CameraCalibration
+from swarm_loc_drivers.sim.run import CAMERA_LATENESS, LivedRun, Records, SimulatedRun, arrival_ns, survivors
+from swarm_loc_drivers.sim.scenarios.droplets import FIX_SIGMAS, DropletRun
+from swarm_loc_drivers.sim.scenarios.eight_images import ImageRun
+from swarm_loc_drivers.sim.scenarios.wandering import AerialRun
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.common.messages.encoders import (
+    UNKNOWN_COVARIANCE,
+    encode_anonymous,
+    encode_brightness,
+    encode_detections,
+    encode_fix,
+    encode_odometry,
+    encode_pose_stamped,
+)
+from swarm_loc_estimator.common.messages.typestore import (
+    ANONYMOUS_DETECTIONS,
+    BRIGHTNESS,
+    DETECTIONS,
+    ODOMETRY,
+    POSE_STAMPED,
+    POSE_WITH_COVARIANCE,
+    encode,
+    typestore,
+)
+from swarm_loc_estimator.sensors.camera import CONTENT_POSE
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+
+FAMILY = 0
+"""MarkerDetection.FAMILY_ARTOOLKIT_BCH."""
+
+
+def as_detections(run: SimulatedRun) -> Records:
+    """All sightings (S,) of a run, of DETECTION_DTYPE; markers stand upright at their described heights."""
+    markers = run.swarm.owner_of
+    camera_height = np.array([0.0 if r.camera is None else r.camera.z for r in run.swarm.robots])
+    observer = np.repeat(run.frames["robot"], run.frames["count"])
+    height = np.array([markers[int(marker)].marker.z for marker in run.sightings["marker_id"]])
+    forward, left, heading = run.sightings["value"].T
+    detections = np.zeros(len(run.sightings), DETECTION_DTYPE)
+    detections["id"] = run.sightings["marker_id"]
+    detections["family"], detections["content"] = FAMILY, CONTENT_POSE
+    detections["id_margin"] = np.nan
+    detections["corners_px"] = np.nan
+    detections["position"] = np.column_stack([-left, camera_height[observer] - height, forward])
+    detections["orientation"] = marker_orientation(heading)
+    detections["covariance"][:, 0, 0] = -1.0
+    detections["alternative_orientation"][:, 3] = 1.0
+    detections["alternative_ratio"] = np.nan
+    return detections
+
+
+def marker_orientation(heading: np.typing.NDArray[np.float64]) -> np.typing.NDArray[np.float64]:
+    """Quaternions (S, 4) x y z w, in the optical frame, of upright markers.
+
+    Args:
+        heading: (S,) direction out of the face [rad], 0 along the optical axis, positive to the left.
+    """
+    sin, cos, zero = np.sin(heading), np.cos(heading), np.zeros_like(heading)
+    right = np.stack([-cos, zero, -sin], axis=-1)
+    up = np.stack([zero, zero - 1.0, zero], axis=-1)
+    out = np.stack([-sin, zero, cos], axis=-1)
+    quaternions: np.typing.NDArray[np.float64] = Rotation.from_matrix(
+        np.stack([right, up, out], axis=-1)
+    ).as_quat()
+    return quaternions
+
+
+TRUTH_PERIOD_NS = 100_000_000
+
+
+class Stream(NamedTuple):
+    """The messages of one topic with their times of arrival."""
+
+    topic: str
+    type: str
+    arrival_ns: NDArray[np.int64]
+    data: list[bytes]
+
+
+def write_bag(run: SimulatedRun, folder: Path, comment: str) -> int:
+    """Write `<robot>/odom`, `<robot>/detections` and `<robot>/ground_truth` of all robots.
+
+    Args:
+        run: What to write; log times are times of arrival, so that lateness is real on replay.
+        folder: The bag, created; must not exist.
+        comment: First lines of `swarm.yaml`, where the run comes from.
+
+    Returns:
+        Number of messages.
+
+    Raises:
+        BagError: The folder is there already, or cannot be created.
+    """
+    detections = as_detections(run)
+    streams: list[Stream] = []
+    for index in range(len(run.swarm.robots)):
+        streams += [
+            odometry_stream(run, index),
+            _detection_stream(run, index, detections),
+            truth_stream(run, index),
+        ]
+    return write_streams(streams, run.swarm, folder, comment)
+
+
+def write_streams(streams: Sequence[Stream], swarm: Swarm, folder: Path, comment: str) -> int:
+    """Write topics in order of arrival, and `swarm.yaml`; arguments and errors as for `write_bag`."""
+    arrival_ns = np.concatenate([stream.arrival_ns for stream in streams])
+    owner = np.repeat(np.arange(len(streams)), [len(stream.data) for stream in streams])
+    place = np.concatenate([np.arange(len(stream.data)) for stream in streams])
+    order = np.argsort(arrival_ns, kind="stable")
+    with BagWriter(folder, compress=True) as bag:
+        for stream in streams:
+            bag.add_topic(stream.topic, stream.type)
+        for which, at_ns, one in zip(
+            owner[order].tolist(), arrival_ns[order].tolist(), place[order].tolist(), strict=True
+        ):
+            bag.write(streams[which].topic, at_ns, streams[which].data[one])
+    save_swarm(swarm, folder / "swarm.yaml", comment)
+    return len(order)
+
+
+def odometry_stream(run: LivedRun, robot: int) -> Stream:
+    """The robot's odometry; velocities are those of the step before each message."""
+    name = run.swarm.robots[robot].name
+    rows = run.odometry[run.odometry["robot"] == robot]
+    by_stamp = np.argsort(rows["stamp_ns"], kind="stable")
+    stamps_s = (rows["stamp_ns"][by_stamp] - run.start_ns) * 1e-9
+    pose = rows["pose"][by_stamp]
+    twist = np.zeros((len(rows), 3))
+    motion = se2.log(se2.between(pose[:-1], pose[1:]))
+    twist[by_stamp[1:]] = motion / np.diff(stamps_s)[:, None]
+    data = encode_odometry(
+        f"{name}/odom",
+        f"{name}/base_link",
+        rows["stamp_ns"],
+        rows["pose"],
+        twist,
+        UNKNOWN_COVARIANCE,
+        UNKNOWN_COVARIANCE,
+    )
+    return Stream(f"{name}/odom", ODOMETRY, rows["arrival_ns"], data)
+
+
+def _detection_stream(run: SimulatedRun, robot: int, detections: Records) -> Stream:
+    """The robot's images, also those that show nothing: they tell that the camera is alive."""
+    name = run.swarm.robots[robot].name
+    frames = run.frames[run.frames["robot"] == robot]
+    optical_frame = f"{name}/camera_optical_frame"
+    data = [
+        encode_detections(optical_frame, stamp_ns, detections[first : first + count])
+        for _, stamp_ns, _, first, count in frames.tolist()
+    ]
+    return Stream(f"{name}/detections", DETECTIONS, frames["arrival_ns"], data)
+
+
+def truth_stream(run: LivedRun, robot: int) -> Stream:
+    """Where the robot really was, ten times a second."""
+    stamp_ns = np.arange(run.start_ns, run.end_ns + 1, TRUTH_PERIOD_NS)
+    data = encode_pose_stamped("map", stamp_ns, run.truth.at(robot, stamp_ns))
+    return Stream(f"{run.swarm.robots[robot].name}/ground_truth", POSE_STAMPED, stamp_ns, data)
+
+
+def write_aerial_bag(run: AerialRun, folder: Path, comment: str) -> int:
+    """Write `aerial/detections`, and `<robot>/odom` and `<robot>/ground_truth` of all robots.
+
+    Args:
+        run: What to write; log times are times of arrival.
+        folder: The bag, created; must not exist.
+        comment: First lines of `swarm.yaml`, where the run comes from.
+
+    Returns:
+        Number of messages.
+
+    Raises:
+        BagError: The folder is there already, or cannot be created.
+    """
+    data = [
+        encode_anonymous("map", stamp_ns, image)
+        for stamp_ns, image in zip(run.stamp_ns.tolist(), run.images, strict=True)
+    ]
+    streams = [Stream("aerial/detections", ANONYMOUS_DETECTIONS, run.arrival_ns, data)]
+    for index in range(len(run.swarm.robots)):
+        streams += [odometry_stream(run, index), truth_stream(run, index)]
+    return write_streams(streams, run.swarm, folder, comment)
+
+
+SATURATION = 240
+"""As the drivers say it: full scale less the largest ambient light [count]."""
+LOSS = 0.05
+"""Share of matrices and fixes that never arrive."""
+
+
+def write_droplet_bag(run: DropletRun, folder: Path, comment: str, seed: int) -> int:
+    """Write `<robot>/odom`, `brightness`, `fix` and `ground_truth` of all robots.
+
+    Args:
+        run: What to write; log times are times of arrival.
+        folder: The bag, created; must not exist.
+        comment: First lines of `swarm.yaml`, where the run comes from.
+        seed: Fixes what is late and what is lost.
+
+    Returns:
+        Number of messages.
+
+    Raises:
+        BagError: The folder is there already, or cannot be created.
+    """
+    streams: list[Stream] = []
+    for index in range(len(run.swarm.robots)):
+        rng = np.random.default_rng([seed, index])
+        streams.append(odometry_stream(run, index))
+        streams.append(_arriving(rng, run, _brightness(run, index)))
+        fixes = _fixes(run, index)
+        if fixes.data:
+            streams.append(_arriving(rng, run, fixes))
+        streams.append(truth_stream(run, index))
+    return write_streams(streams, run.swarm, folder, comment)
+
+
+def _arriving(rng: np.random.Generator, run: DropletRun, stream: Stream) -> Stream:
+    """What of a stream arrives, and when; its times are those of publication."""
+    late_ns = arrival_ns(rng, stream.arrival_ns, CAMERA_LATENESS)
+    kept = np.flatnonzero(survivors(rng, len(stream.data), LOSS) & (late_ns <= run.end_ns))
+    return stream._replace(arrival_ns=late_ns[kept], data=[stream.data[k] for k in kept])
+
+
+def _brightness(run: DropletRun, robot: int) -> Stream:
+    """What the robot's sensors read, when it was published."""
+    name, board = run.swarm.robots[robot].name, run.swarm.robots[robot].ir
+    assert board is not None  # noqa: S101 - all Droplets have one
+    own = [one for one in run.matrices if one.receiver == robot]
+    data = [
+        encode_brightness(
+            f"{name}/base_link",
+            one.brightness.stamp_ns,
+            (board.id, one.brightness.transmitter),
+            one.brightness.readings,
+            int(one.brightness.power),
+            SATURATION,
+        )
+        for one in own
+    ]
+    published_ns = np.array([one.published_ns for one in own], dtype=np.int64)
+    return Stream(f"{name}/brightness", BRIGHTNESS, published_ns, data)
+
+
+def _fixes(run: DropletRun, robot: int) -> Stream:
+    """Where a tracker has seen the robot."""
+    own = [fix for fix in run.fixes if fix.robot == robot]
+    position, heading = FIX_SIGMAS
+    covariance = np.diag([position**2, position**2, heading**2])
+    data = [encode_fix("map", fix.stamp_ns, fix.pose, covariance) for fix in own]
+    stamps_ns = np.array([fix.stamp_ns for fix in own], dtype=np.int64)
+    return Stream(f"{run.swarm.robots[robot].name}/fix", POSE_WITH_COVARIANCE, stamps_ns, data)
+
+
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+JPEG_QUALITY = 85
+_SECOND = 1_000_000_000
+
+
+def write_image_bag(recorded: ImageRun, folder: Path, comment: str) -> int:
+    """Write `<robot>/image_raw/compressed`, `camera_info`, `odom` and `ground_truth` of all robots.
+
+    The folder, the comment, the result and the errors are those of `bag.write_bag`.
+    """
+    run = recorded.run
+    frames = run.frames
+    headers = [
+        _header(run.swarm.robots[robot].name, stamp_ns)
+        for robot, stamp_ns in zip(frames["robot"].tolist(), frames["stamp_ns"].tolist(), strict=True)
+    ]
+    images = [_image(header, image) for header, image in zip(headers, recorded.images(), strict=True)]
+    infos = [_info(header, recorded.camera.calibration) for header in headers]
+    streams: list[Stream] = []
+    for index, robot in enumerate(run.swarm.robots):
+        own = np.flatnonzero(frames["robot"] == index)
+        arrival_ns = frames["arrival_ns"][own]
+        streams += [
+            odometry_stream(run, index),
+            Stream(f"{robot.name}/camera_info", CAMERA_INFO, arrival_ns, [infos[k] for k in own]),
+            Stream(
+                f"{robot.name}/image_raw/compressed", COMPRESSED_IMAGE, arrival_ns, [images[k] for k in own]
+            ),
+            truth_stream(run, index),
+        ]
+    return write_streams(streams, run.swarm, folder, comment)
+
+
+def _header(robot: str, stamp_ns: int) -> Any:
+    """The header of an image and of its calibration."""
+    types = typestore().types
+    stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, _SECOND))
+    return types["std_msgs/msg/Header"](stamp, f"{robot}/camera_optical_frame")
+
+
+def _image(header: Any, image: NDArray[np.uint8]) -> bytes:
+    """A grey image as sensor_msgs/CompressedImage."""
+    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    kind = typestore().types[COMPRESSED_IMAGE]
+    return encode(kind(header, "mono8; jpeg compressed mono8", data.reshape(-1)), COMPRESSED_IMAGE)
+
+
+def _info(header: Any, calibration: CameraCalibration) -> bytes:
+    """The calibration as sensor_msgs/CameraInfo."""
+    types = typestore().types
+    message = types[CAMERA_INFO](
+        header,
+        calibration.height,
+        calibration.width,
+        calibration.model,
+        np.array(calibration.distortion),
+        np.array(calibration.matrix),
+        np.array(calibration.rectification),
+        np.array(calibration.projection),
+        binning_x=0,
+        binning_y=0,
+        roi=types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, do_rectify=False),
+    )
+    return encode(message, CAMERA_INFO)

@@ -1,0 +1,153 @@
+"""What is wrong with a simulated world: error models, hidden systematic errors, swarms it cannot hold."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.swarm.swarm import Pose2, Robot, SensorModel, Swarm
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """Imperfections of one simulated world; all sigmas are one standard deviation.
+
+    Attributes:
+        forward_sigma: White noise along the optical axis [m].
+        left_sigma: White noise across it [m].
+        heading_sigma: White noise of a marker's heading [rad].
+        flip_probability: Share of sightings whose heading is the mirror solution of the planar pose problem.
+        gross_probability: Share of sightings that are nonsense.
+        camera_yaw_sigma: Unknown turn of each camera on its robot [rad].
+        scale_sigma: Unknown scale of each camera's distances [1].
+        map_position_sigma: Error of every landmark's surveyed position, per axis [m].
+        map_heading_sigma: Error of its surveyed direction [rad].
+        face_position_sigma: Error of every on-robot marker's position, per axis [m].
+        exposure_early_s: Images are taken up to this long before their stamp, uniformly [s].
+        turn_slip: Share of every commanded turn that is lost.
+        wheel_noise: Variance of a wheel's path per metre rolled [m].
+        frame_loss: Share of images that never arrive.
+        described: The sensor model that the swarm description gives.
+    """
+
+    forward_sigma: float
+    left_sigma: float
+    heading_sigma: float
+    flip_probability: float
+    gross_probability: float
+    camera_yaw_sigma: float
+    scale_sigma: float
+    map_position_sigma: float
+    map_heading_sigma: float
+    face_position_sigma: float
+    exposure_early_s: float
+    turn_slip: float
+    wheel_noise: float
+    frame_loss: float
+    described: SensorModel
+
+
+PRINTED_SENSOR = SensorModel(forward_sigma=0.026, left_sigma=0.029, heading_sigma=0.508)
+"""The sigmas that the e-puck paper prints below its figure 5."""
+
+W0 = ErrorModel(
+    forward_sigma=PRINTED_SENSOR.forward_sigma,
+    left_sigma=PRINTED_SENSOR.left_sigma,
+    heading_sigma=PRINTED_SENSOR.heading_sigma,
+    flip_probability=0.0,
+    gross_probability=0.0,
+    camera_yaw_sigma=0.0,
+    scale_sigma=0.0,
+    map_position_sigma=0.0,
+    map_heading_sigma=0.0,
+    face_position_sigma=0.0,
+    exposure_early_s=0.0,
+    turn_slip=0.0,
+    wheel_noise=2e-5,
+    frame_loss=0.05,
+    described=PRINTED_SENSOR,
+)
+"""The printed sigmas as white noise and nothing else."""
+
+W2 = ErrorModel(
+    forward_sigma=0.008,
+    left_sigma=0.006,
+    heading_sigma=0.10,
+    flip_probability=0.12,
+    gross_probability=0.005,
+    camera_yaw_sigma=math.radians(1.8),
+    scale_sigma=0.024,
+    map_position_sigma=0.016,
+    map_heading_sigma=0.03,
+    face_position_sigma=0.003,
+    exposure_early_s=0.133,
+    turn_slip=0.05,
+    wheel_noise=2e-5,
+    frame_loss=0.05,
+    described=PRINTED_SENSOR,
+)
+"""Small white noise and systematic errors that together look like the paper's experiment."""
+
+W2_FAST = replace(W2, turn_slip=0.20)
+"""At 0.08 m/s the wheels slip more in the curves."""
+
+WORLDS = {"w0": W0, "w2": W2, "w2fast": W2_FAST}
+
+
+@dataclass(frozen=True)
+class HiddenGeometry:
+    """Where cameras and markers truly are.
+
+    Attributes:
+        mounts: (N, 3) camera poses in base_link.
+        scales: (N,) reported distance per true distance.
+        landmarks: (L, 3) in map.
+        faces: (K, 3) in their robot's base_link.
+        face_owner: (K,) robot index.
+        ids: (L + K,) marker ids.
+    """
+
+    mounts: FloatArray
+    scales: FloatArray
+    landmarks: FloatArray
+    faces: FloatArray
+    face_owner: NDArray[np.int64]
+    ids: NDArray[np.uint32]
+
+
+def hidden_geometry(rng: np.random.Generator, swarm: Swarm, errors: ErrorModel) -> HiddenGeometry:
+    """Draw a world's systematic errors; every robot of the swarm must have a camera."""
+    mounts = np.array([[r.camera.x, r.camera.y, r.camera.yaw] for r in swarm.robots if r.camera is not None])
+    mounts[:, 2] += errors.camera_yaw_sigma * rng.standard_normal(len(mounts))
+    scales = 1.0 + errors.scale_sigma * rng.standard_normal(len(mounts))
+    landmarks = np.array([[m.x, m.y, m.yaw] for m in swarm.landmarks], dtype=float)
+    spread = np.array([errors.map_position_sigma, errors.map_position_sigma, errors.map_heading_sigma])
+    landmarks += spread * rng.standard_normal(landmarks.shape)
+    all_faces = [(index, face) for index, robot in enumerate(swarm.robots) for face in robot.faces]
+    faces = np.array([[face.x, face.y, face.yaw] for _, face in all_faces], dtype=float)
+    faces[:, :2] += errors.face_position_sigma * rng.standard_normal((len(faces), 2))
+    owner = np.array([index for index, _ in all_faces], dtype=np.int64)
+    ids = [mark.id for mark in swarm.landmarks] + [face.id for _, face in all_faces]
+    return HiddenGeometry(mounts, scales, landmarks, faces, owner, np.array(ids, dtype=np.uint32))
+
+
+class WorldError(UserError):
+    """A swarm that cannot be simulated; the message is one sentence."""
+
+
+def start_of(robot: Robot) -> Pose2:
+    """Where a robot begins.
+
+    Raises:
+        WorldError: Nobody says.
+    """
+    if robot.start is None:
+        raise WorldError(
+            f"robot '{robot.name}' has no start pose, and a simulated robot has to be somewhere."
+        )
+    return robot.start
