@@ -1,0 +1,114 @@
+"""The rules of the layout, see CONTRIBUTING.md: sizes, imports, names, words and documentation."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import house
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+LIMITS = {
+    "product_lines": 61_000,
+    "files_under_40": 120,
+    "files_over_400": 0,
+    "import_circles": 13,
+    "duplicate_class_names": 14,
+    "tuple_parameters": 30,
+    "private_words": 450,
+}
+MIN_DOCUMENTED = 0.96
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+@pytest.mark.parametrize("figure", LIMITS)
+def test_a_figure_keeps_its_limit(figure: str) -> None:
+    if figure == "product_lines":
+        assert sum(module.line_count for module in house.product_modules()) <= LIMITS[figure]
+        return
+    places = house.places()[figure]
+    assert len(places) <= LIMITS[figure], "\n".join(places)
+
+
+def product_and_tools() -> list[house.Module]:
+    others = [*(ROOT / "bench").rglob("*.py"), *(ROOT / "tools").rglob("*.py")]
+    others = [path for path in others if "test" not in path.relative_to(ROOT).parts]
+    names = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in others]
+    return house.product_modules() + [house.Module(*one) for one in zip(names, others, strict=True)]
+
+
+def public_functions(module: house.Module) -> Iterator[tuple[str, Function]]:
+    """Public functions and methods, by name, with the class that a method belongs to."""
+    classes = [n for n in module.tree.body if isinstance(n, ast.ClassDef) and not n.name.startswith("_")]
+    for prefix, body in (("", module.tree.body), *((f"{one.name}.", one.body) for one in classes)):
+        for node in body:
+            if isinstance(node, Function) and not node.name.startswith("_"):
+                yield f"{module.name}.{prefix}{node.name}", node
+
+
+def test_what_is_public_is_documented_and_annotated() -> None:
+    modules = product_and_tools()
+    public = [found for module in modules for found in public_functions(module)]
+    assert len(public) > 1000
+    bare = [name for name, function in public if function.returns is None]
+    assert not bare, f"public functions without annotations: {bare}"
+    undocumented = [name for name, function in public if ast.get_docstring(function) is None]
+    assert len(undocumented) <= (1.0 - MIN_DOCUMENTED) * len(public), undocumented
+    assert [module.name for module in modules if not ast.get_docstring(module.tree)] == []
+
+
+def test_benchmarks_and_tools_have_short_files_too() -> None:
+    assert {m.name: m.line_count for m in product_and_tools() if m.line_count > house.LONG} == {}
+
+
+def module(tmp_path: Path, name: str, text: str) -> house.Module:
+    path = tmp_path / f"{name}.py"
+    path.write_text(text, encoding="utf-8")
+    return house.Module(name, path)
+
+
+def test_circles_are_found_among_modules_and_among_folders(tmp_path: Path) -> None:
+    one = module(tmp_path, "p.a.x", "from p.b import y")
+    other = module(tmp_path, "p.b.y", "import p.c.z")
+    last = module(tmp_path, "p.c.z", "from p.b import y")
+    assert house.circles(house.import_graph([one, other])) == []
+    found = house.circles(house.import_graph([one, other, last]))
+    assert [circle.split(":")[0] for circle in found] == ["modules", "folders"]
+    late = module(tmp_path, "p.a.w", "from p.c import z")
+    folders_only = module(tmp_path, "p.c.v", "from p.a import w")
+    found = house.circles(house.import_graph([late, folders_only, module(tmp_path, "p.c.z", "")]))
+    assert [circle.split(":")[0] for circle in found] == ["folders"]
+
+
+def test_classes_of_one_name_are_found_within_a_package(tmp_path: Path) -> None:
+    one, other = module(tmp_path, "p.a", "class Stop: ..."), module(tmp_path, "p.b", "class Stop: ...")
+    assert house.duplicate_classes([one, module(tmp_path, "q.a", "class Stop: ...")]) == []
+    assert house.duplicate_classes([one, other]) == ["Stop: p.a, p.b"]
+
+
+@pytest.mark.parametrize(
+    ("annotation", "counts"),
+    [
+        ("tuple[float, float]", False),
+        ("tuple[int, ...]", False),
+        ("tuple[str, ...] | None", False),
+        ("list[int]", False),
+        ("tuple[float, int]", True),
+        ("tuple[FloatArray, FloatArray]", True),
+        ("Sequence[tuple[int, bytes]]", True),
+        ("tuple[float, tuple[float, float], int] | None", True),
+    ],
+)
+def test_tuples_of_unlike_things_are_found(tmp_path: Path, annotation: str, counts: bool) -> None:
+    one = module(tmp_path, "p.a", f"def f(look: {annotation}): ...")
+    assert bool(house.tuple_parameters([one])) == counts
+
+
+def test_private_words_are_found_as_words(tmp_path: Path) -> None:
+    (tmp_path / "README.md").write_text("Of late the robot is Told anew;\nhe retold it.", encoding="utf-8")
+    (tmp_path / "CONTRIBUTING.md").touch()
+    found = [place.partition(" ")[2] for place in house.private_words(tmp_path)]
+    assert found == ["Of late", "Told", "anew"]
