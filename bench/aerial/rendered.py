@@ -27,8 +27,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launching.graph import NodeSpec
 from swarm_loc_estimator.common.trajectory import interpolate
-from swarm_loc_estimator.offline.live.graph import LiveGraph
-from swarm_loc_estimator.offline.live.recorder import read_history
+from swarm_loc_estimator.offline.live.graph import LiveGraph, read_history
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status

@@ -42,12 +42,11 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launching.graph import NodeSpec, ParameterValue
 from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_infrared
 from swarm_loc_estimator.offline.calibration.recording import read_recording
-from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveGraph
-from swarm_loc_estimator.offline.live.recorder import read_history, read_poses
+from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveGraph, read_history, read_poses
 from swarm_loc_estimator.offline.metrics import pool, summarise
+from swarm_loc_estimator.offline.recorded_bag import read_truth
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.offline.truth import read_truth
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm

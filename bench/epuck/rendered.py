@@ -21,8 +21,7 @@ from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import DetectionArrayMessage, decode_detections
 from swarm_loc_estimator.common.messages.encoders import UNKNOWN_COVARIANCE, encode_detections
-from swarm_loc_estimator.offline.live.graph import LiveGraph, cpu_seconds
-from swarm_loc_estimator.offline.live.recorder import read_history
+from swarm_loc_estimator.offline.live.graph import LiveGraph, cpu_seconds, read_history
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm

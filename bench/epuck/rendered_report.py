@@ -19,7 +19,7 @@ from bench.epuck.seen import Seen, count_seen
 from bench.shared.common import OUT, Cell, ProgressLine, new_plot, save_plot, table
 from swarm_loc_estimator.offline.metrics import ErrorSummary, pool, summarise
 from swarm_loc_estimator.offline.replay import replay
-from swarm_loc_estimator.offline.report.overview import plot_overview
+from swarm_loc_estimator.offline.report.plots import plot_overview
 from swarm_loc_estimator.offline.report.style import INK, colour_of
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Swarm

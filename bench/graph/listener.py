@@ -18,7 +18,7 @@ from swarm_loc_estimator.common.messages.cdr import decode_pose_stamped
 from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveError, LiveGraph
-from swarm_loc_estimator.offline.truth import read_truth
+from swarm_loc_estimator.offline.recorded_bag import read_truth
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_msgs.msg import MarkerDetectionArray
 

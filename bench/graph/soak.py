@@ -22,8 +22,14 @@ import numpy as np
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launching.graph import GraphOptions, graph_nodes
-from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveGraph, cpu_seconds, resident_mb
-from swarm_loc_estimator.offline.live.recorder import Recorder, read_poses
+from swarm_loc_estimator.offline.live.graph import (
+    START_PATIENCE_S,
+    LiveGraph,
+    Recorder,
+    cpu_seconds,
+    read_poses,
+    resident_mb,
+)
 from swarm_loc_estimator.offline.live.run import ESTIMATOR, PLAYER
 
 BAG = OUT.parent / "bags" / "eight_five_robots"

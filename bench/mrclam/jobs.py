@@ -20,9 +20,8 @@ from bench.mrclam.sets import (
     without_sightings,
 )
 from bench.shared.common import OUT
-from swarm_loc_estimator.offline.calibration.motion_and_camera.fit import Options, calibrate
-from swarm_loc_estimator.offline.calibration.recording import Recording
-from swarm_loc_estimator.offline.calibration.rerun import rerun
+from swarm_loc_estimator.offline.calibration.fit import Options, calibrate
+from swarm_loc_estimator.offline.calibration.recording import Recording, rerun
 from swarm_loc_estimator.offline.metrics import Errors, pool
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.swarm.swarm import Swarm

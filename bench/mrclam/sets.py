@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.errors import UserError
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
-from swarm_loc_estimator.offline.datasets.mrclam.bag import Delay, convert
-from swarm_loc_estimator.offline.datasets.mrclam.dataset import read_dataset
+from swarm_loc_estimator.offline.datasets.mrclam import read_dataset
+from swarm_loc_estimator.offline.datasets.mrclam_bag import Delay, convert
 from swarm_loc_estimator.swarm.swarm import CameraMount, OdometryModel, Robot, SensorModel, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 

@@ -12,7 +12,7 @@ from swarm_loc_drivers.sim.run import in_order_of_arrival
 from swarm_loc_drivers.sim.scenarios.bags import as_detections
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.offline.metrics import nees
-from swarm_loc_estimator.offline.runner import ListedSchedule, Runner
+from swarm_loc_estimator.offline.replay import ListedSchedule, Runner
 from swarm_loc_estimator.sensors.messages import DetectionRows, OdometryRows, RawInputs, chosen
 from swarm_loc_estimator.timeline.estimator import Estimator
 

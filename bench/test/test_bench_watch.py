@@ -16,7 +16,7 @@ from playwright.sync_api import Browser
 from bench.watch.browser import WatchedPage
 from bench.watch.watched_swarm import PLACES, SWARM, WatchedSwarm
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.offline.report.recording import recorded
+from swarm_loc_estimator.offline.report.report import recorded
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.watch.page import page as page_of
 

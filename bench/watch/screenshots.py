@@ -23,7 +23,7 @@ from swarm_loc_drivers.sim.scenarios.bags import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.common.arguments import swarm_beside
 from swarm_loc_estimator.offline.replay import replay
-from swarm_loc_estimator.offline.report.recording import recorded
+from swarm_loc_estimator.offline.report.report import recorded
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.watch.page import page
 

@@ -10,8 +10,7 @@ from geometry_msgs.msg import PoseStamped
 
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_drivers.sim.simulation import SimulationOptions, simulation_nodes
-from swarm_loc_estimator.offline.live.graph import LiveGraph
-from swarm_loc_estimator.offline.live.recorder import Poses
+from swarm_loc_estimator.offline.live.graph import LiveGraph, Poses
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
 

@@ -16,8 +16,8 @@ from collections.abc import Sequence
 from swarm_loc_estimator.common.arguments import add_bag, number_in, swarm_beside, yaml_to_write
 from swarm_loc_estimator.common.command_errors import exit_with_message
 from swarm_loc_estimator.common.progress import ProgressLine
-from swarm_loc_estimator.offline.calibration.motion_and_camera.fit import EVALUATIONS, Options, calibrate
-from swarm_loc_estimator.offline.calibration.motion_and_camera.plots import draw, text_of
+from swarm_loc_estimator.offline.calibration.fit import EVALUATIONS, Options, calibrate
+from swarm_loc_estimator.offline.calibration.plots import draw, text_of
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm

@@ -25,9 +25,14 @@ from swarm_loc_estimator.common.command_errors import exit_with_message
 from swarm_loc_estimator.common.launching.graph import GraphOptions
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.nodes.player.playback import clock_step_ns
-from swarm_loc_estimator.offline.live.agreement import Agreement, compare_with_replay
-from swarm_loc_estimator.offline.live.recorder import Recorder, read_poses
-from swarm_loc_estimator.offline.live.run import BagContent, LiveRun, play_live
+from swarm_loc_estimator.offline.live.graph import Recorder, read_poses
+from swarm_loc_estimator.offline.live.run import (
+    Agreement,
+    BagContent,
+    LiveRun,
+    compare_with_replay,
+    play_live,
+)
 from swarm_loc_estimator.offline.metrics import pool, summarise
 from swarm_loc_estimator.offline.report.report import write_report
 from swarm_loc_estimator.swarm.swarm import Swarm

@@ -18,7 +18,7 @@ from pathlib import Path
 from swarm_loc_estimator.common.arguments import number_in
 from swarm_loc_estimator.common.command_errors import exit_with_message
 from swarm_loc_estimator.common.progress import ProgressLine
-from swarm_loc_estimator.offline.datasets.droplets.bag import (
+from swarm_loc_estimator.offline.datasets.droplets_bag import (
     METRES_PER_PIXEL,
     ImportSettings,
     import_recording,

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 from swarm_loc_estimator.common.command_errors import exit_with_message
 from swarm_loc_estimator.common.progress import ProgressLine
-from swarm_loc_estimator.offline.datasets.mrclam.bag import Delay, convert
-from swarm_loc_estimator.offline.datasets.mrclam.dataset import read_dataset
+from swarm_loc_estimator.offline.datasets.mrclam import read_dataset
+from swarm_loc_estimator.offline.datasets.mrclam_bag import Delay, convert
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -6,7 +6,6 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,10 +18,8 @@ from swarm_loc_estimator.common.messages.outputs import SwarmPosesEncoder, Trans
 from swarm_loc_estimator.common.messages.typestore import MARKERS, POSE_STAMPED, SWARM_POSES, TRANSFORMS
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.grid_messages import OCCUPANCY_GRID
+from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.timeline.estimate import Status
-
-if TYPE_CHECKING:
-    from swarm_loc_estimator.offline.result import ReplayResult
 
 _MAP = "map"
 

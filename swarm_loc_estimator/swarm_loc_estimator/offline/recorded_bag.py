@@ -1,16 +1,22 @@
-"""Read a bag of a swarm once: raw inputs in order of arrival, and ground truth apart from them."""
+"""Read a bag of a swarm once: inputs in order of arrival; ground truth, maps and goals beside them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.reader import BagReader, BagTopic
+from swarm_loc_estimator.common.messages.cdr import CdrError, decode_pose_stamped
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.streams import PoseReader
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.offline.surroundings import MapReader, RecordedMap
-from swarm_loc_estimator.offline.truth import TruthReader
+from swarm_loc_estimator.mapping.grid_messages import decode_occupancy_grid
+from swarm_loc_estimator.offline.result import RecordedMap
+from swarm_loc_estimator.offline.spool import Spool
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.messages import RawInputs
 from swarm_loc_estimator.sensors.topics import InputKind
@@ -96,3 +102,140 @@ def _strangers(topics: Iterable[BagTopic], ingest: Ingest) -> list[str]:
     names = [t.name for t in topics if kinds.get(t.name.rpartition("/")[2]) == t.type]
     strange = sorted(set(names) - set(ingest.handle_of))
     return [f"No robot of the swarm description has the topics {', '.join(strange)}."] if strange else []
+
+
+def read_truth(swarm: Swarm, messages: Mapping[str, Sequence[bytes]]) -> dict[str, Trajectory]:
+    """Ground truth that did not come from a bag.
+
+    Args:
+        swarm: Whose.
+        messages: Robot name -> its serialized PoseStamped.
+    """
+    reader = TruthReader(swarm)
+    topics = ((swarm.index_of[name], data) for name, all_of in messages.items() for data in all_of)
+    reader.add(MessageBatch.of([(topic, data, 0) for topic, data in topics]))
+    return reader.tracks()
+
+
+class TruthReader:
+    """Collects ground truth; nothing of it reaches the estimator.
+
+    Args:
+        swarm: Whose.
+
+    Attributes:
+        topics: Topics; their place here is the topic's number in a batch.
+    """
+
+    def __init__(self, swarm: Swarm) -> None:
+        self.topics = [f"{robot.name}/ground_truth" for robot in swarm.robots]
+        self._names = [robot.name for robot in swarm.robots]
+        self._reader = PoseReader(len(self.topics), decode_pose_stamped, names=1)
+        self._spool = Spool()
+        self._malformed = 0
+
+    def add(self, batch: MessageBatch) -> None:
+        """Take messages in."""
+        if not batch.size:
+            return
+        columns = self._reader.read(batch)
+        self._malformed += int(np.sum(~columns.valid))
+        usable = np.flatnonzero(columns.valid & np.isfinite(columns.pose).all(axis=1))
+        robot = batch.topic[usable]
+        order = usable[np.lexsort([columns.stamp_ns[usable], robot])]
+        ends = np.searchsorted(batch.topic[order], np.arange(len(self.topics) + 1))
+        for index in np.flatnonzero(np.diff(ends)).tolist():
+            rows = order[ends[index] : ends[index + 1]]
+            self._spool.append((index, "stamp_ns"), columns.stamp_ns[rows])
+            self._spool.append((index, "pose"), columns.pose[rows])
+
+    def tracks(self) -> dict[str, Trajectory]:
+        """Per robot that has ground truth; may be called once."""
+        return {name: track for index, name in enumerate(self._names) if (track := self._track(index))}
+
+    def remarks(self) -> tuple[str, ...]:
+        """What else must be said."""
+        return (f"{self._malformed} messages of ground truth are malformed.",) if self._malformed else ()
+
+    def _track(self, index: int) -> Trajectory | None:
+        stamp_ns: IntArray = self._spool.array((index, "stamp_ns"), np.int64)
+        pose = self._spool.array((index, "pose"), np.float64, 3)
+        if np.any(stamp_ns[1:] < stamp_ns[:-1]):
+            order = np.argsort(stamp_ns, kind="stable")
+            stamp_ns, pose = stamp_ns[order], pose[order]
+        return Trajectory(stamp_ns, pose) if stamp_ns.size else None
+
+
+MAX_MAP_BYTES = 48_000_000
+"""More maps are thinned out, evenly over time."""
+MAX_GOALS = 20_000
+"""Of one robot; those after them are not kept."""
+
+
+class MapReader:
+    """Collects the maps and goals of a bag; nothing of them reaches the estimator.
+
+    Args:
+        swarm: Whose goals.
+        max_bytes: How much maps may hold.
+
+    Attributes:
+        topics: Topics; their place here is the topic's number in a batch.
+    """
+
+    def __init__(self, swarm: Swarm, max_bytes: int = MAX_MAP_BYTES) -> None:
+        self._names = [robot.name for robot in swarm.robots]
+        self.topics = ["map", *(f"{name}/goal" for name in self._names)]
+        self._max_bytes = max_bytes
+        self._maps: list[RecordedMap] = []
+        self._newest: RecordedMap | None = None
+        self._spacing_ns = 0
+        self._goals: dict[str, list[tuple[int, tuple[float, float, float]]]] = {}
+        self._malformed = 0
+
+    def add(self, batch: MessageBatch) -> None:
+        """Take messages in."""
+        for topic, log_ns, data in batch.messages():
+            try:
+                if topic:
+                    self._add_goal(self._names[topic - 1], data)
+                else:
+                    decode_occupancy_grid(data)
+                    self._add_map(RecordedMap(log_ns, data))
+            except CdrError:
+                self._malformed += 1
+
+    def maps(self) -> tuple[RecordedMap, ...]:
+        """In the order of time, the newest among them."""
+        newest = [self._newest] if self._newest and self._newest not in self._maps[-1:] else []
+        return (*self._maps, *newest)
+
+    def goals(self) -> dict[str, Trajectory]:
+        """Per robot that has had any."""
+        found = {}
+        for name, goals in self._goals.items():
+            stamps, poses = zip(*sorted(goals), strict=True)
+            found[name] = Trajectory(np.array(stamps, dtype=np.int64), np.array(poses))
+        return found
+
+    def remarks(self) -> tuple[str, ...]:
+        """What else must be said."""
+        return (f"{self._malformed} messages of maps or goals are malformed.",) if self._malformed else ()
+
+    def _add_goal(self, name: str, data: bytes) -> None:
+        goal = decode_pose_stamped(data)
+        if not np.isfinite(goal.pose).all():
+            raise CdrError("a goal is not finite.")
+        goals = self._goals.setdefault(name, [])
+        if len(goals) < MAX_GOALS:
+            goals.append((goal.stamp_ns, goal.pose))
+
+    def _add_map(self, recorded: RecordedMap) -> None:
+        self._newest = recorded
+        if self._maps and recorded.log_ns < self._maps[-1].log_ns + self._spacing_ns:
+            return
+        self._maps.append(recorded)
+        while len(self._maps) > 1 and sum(len(one.data) for one in self._maps) > self._max_bytes:
+            self._maps = self._maps[::2]
+            span_ns = recorded.log_ns - self._maps[0].log_ns
+            self._spacing_ns = max(2 * self._spacing_ns, span_ns // len(self._maps))

@@ -1,19 +1,32 @@
-"""Replay a bag: messages in order of arrival, and poses by the very code that runs live."""
+"""Replay a bag: inputs reach the estimator when they arrived, and poses are taken on a schedule.
+
+Replay, calibration and benchmarks step the estimator as the live node does: late inputs are late again, and
+the same inputs give the same poses, byte for byte.
+"""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.offline.recorded_bag import Progress, read_bag, unwatched
-from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.offline.runner import ListedSchedule, PeriodicSchedule, Runner
+from swarm_loc_estimator.offline.result import AerialImage, ReplayResult
+from swarm_loc_estimator.offline.spool import Spool
+from swarm_loc_estimator.sensors.ingest import MAX_PAUSE_NS
+from swarm_loc_estimator.sensors.messages import AerialRows, RawInputs
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.sightings import Sightings, newest_sightings
 
 TICK_S = 0.1
 """Default time between two outputs [s]."""
@@ -54,3 +67,227 @@ def replay(
         remarks.append(f"{jumps}; no poses are given meanwhile.")
     result = runner.result(bag.name, summary.range_ns, summary.truth, summary.received, tuple(remarks))
     return replace(result, maps=summary.maps, goals=summary.goals)
+
+
+MAX_DETECTIONS = 200_000
+"""In all aerial images that are kept; of a very long run only the beginning."""
+_TICKS_AT_ONCE = 256
+_SIGHTINGS_PERIOD_NS = 500_000_000
+_MAX_SIGHTINGS = 500_000
+"""Kept for people who watch a run; of a very long one only the beginning."""
+
+
+class Schedule(Protocol):
+    """When to give poses."""
+
+    def begin(self, now_ns: int) -> None:
+        """A stretch of inputs without long pauses begins."""
+
+    def due(self, now_ns: int) -> list[int]:
+        """The instants until now that were not due before."""
+
+    def rest(self, last_ns: int) -> list[int]:
+        """The instants that are due after the last inputs of a recording that ends at `last_ns`."""
+
+
+class PeriodicSchedule:
+    """At every whole multiple of a period, but where the clock was set ahead.
+
+    Attributes:
+        jumps: How often it was.
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        self.jumps = 0
+        self._period_ns = period_ns
+        self._next_ns: int | None = None
+
+    def begin(self, now_ns: int) -> None:
+        """A stretch of inputs begins; nothing is due in a long pause before it."""
+        jumps = self._next_ns is not None and now_ns - self._next_ns > MAX_PAUSE_NS
+        if self._next_ns is None or jumps:
+            self._next_ns = (now_ns // self._period_ns + 1) * self._period_ns
+            self.jumps += jumps
+
+    def due(self, now_ns: int) -> list[int]:
+        """The instants until now that were not due before."""
+        if self._next_ns is None:
+            return []
+        stamps_ns = list(range(self._next_ns, now_ns + 1, self._period_ns))
+        self._next_ns += len(stamps_ns) * self._period_ns
+        return stamps_ns
+
+    def rest(self, last_ns: int) -> list[int]:
+        """The instants until one after the end; none without inputs."""
+        if self._next_ns is not None:
+            self.begin(last_ns)
+        return self.due(last_ns + self._period_ns)
+
+
+class ListedSchedule:
+    """At given instants (T,) [ns], increasing."""
+
+    def __init__(self, stamp_ns: npt.NDArray[np.int64]) -> None:
+        self._stamp_ns = stamp_ns
+        self._done = 0
+
+    def begin(self, now_ns: int) -> None:
+        """A stretch of inputs begins."""
+
+    def due(self, now_ns: int) -> list[int]:
+        """The instants until now that were not due before."""
+        first, self._done = self._done, int(self._stamp_ns.searchsorted(now_ns, side="right"))
+        stamps_ns: list[int] = self._stamp_ns[first : self._done].tolist()
+        return stamps_ns
+
+    def rest(self, last_ns: int) -> list[int]:
+        """All others, whenever the recording ends."""
+        return self.due(max(last_ns, int(self._stamp_ns.max(initial=0))))
+
+
+class Runner:
+    """Feeds an estimator, ticks it, and keeps its estimates in a temporary file: memory does not grow.
+
+    Args:
+        estimator: To run, which nobody else feeds.
+        schedule: When it ticks.
+        keep_sightings: Whether what the robots and cameras above them see is kept, too.
+    """
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        schedule: Schedule,
+        *,
+        keep_sightings: bool = False,
+    ) -> None:
+        self._estimator = estimator
+        self._schedule = schedule
+        self._began_s = time.perf_counter()
+        self._spool = Spool()
+        robots = len(estimator.swarm.robots)
+        self._stamp_ns = np.zeros(_TICKS_AT_ONCE, dtype=np.int64)
+        self._pose = np.zeros((_TICKS_AT_ONCE, robots, 3))
+        self._covariance = np.zeros((_TICKS_AT_ONCE, robots, 3, 3))
+        self._status = np.zeros((_TICKS_AT_ONCE, robots), dtype=np.uint8)
+        self._sightings_left = _MAX_SIGHTINGS if keep_sightings else 0
+        self._sightings: list[tuple[int, Sightings]] = []
+        self._images = AerialImages() if keep_sightings else None
+        self._filled = 0
+
+    def take(self, inputs: RawInputs) -> None:
+        """Hand in the inputs of a stretch of time, and do all ticks that are due until its end."""
+        self._schedule.begin(inputs.begin_ns)
+        if self._images is not None:
+            self._images.add(inputs.aerial)
+        stamps_ns = self._schedule.due(inputs.end_ns)
+        parts = self._estimator.validate(inputs).until_each(np.array(stamps_ns, dtype=np.int64))
+        for now_ns in stamps_ns:
+            self._estimator.add(next(parts))
+            self._tick(now_ns)
+        self._estimator.add(next(parts))
+
+    def finish(self, last_ns: int) -> None:
+        """Do the ticks that are due after the last inputs of a recording that ends at `last_ns`."""
+        for now_ns in self._schedule.rest(last_ns):
+            self._tick(now_ns)
+
+    def result(
+        self,
+        title: str,
+        range_ns: tuple[int, int],
+        truth: Mapping[str, Trajectory],
+        received: Mapping[str, int],
+        remarks: tuple[str, ...] = (),
+    ) -> ReplayResult:
+        """The poses of all ticks, with what there is to compare them with; to be called once.
+
+        Args:
+            title: What was run.
+            range_ns: First and last arrival.
+            truth: Robot name -> ground truth.
+            received: Messages by topic.
+            remarks: What else must be said.
+        """
+        self._flush()
+        estimator, robots = self._estimator, len(self._estimator.swarm.robots)
+        return ReplayResult(
+            title=title,
+            swarm=estimator.swarm,
+            stamp_ns=self._spool.array("stamp_ns", np.int64),
+            pose=self._spool.array("pose", np.float64, robots, 3),
+            covariance=self._spool.array("covariance", np.float64, robots, 3, 3),
+            status=self._spool.array("status", np.uint8, robots),
+            sightings=tuple(self._sightings),
+            images=self._images.images() if self._images is not None else (),
+            self_calibrated=estimator.learned() if estimator.is_self_calibrated else None,
+            truth=truth,
+            counters={
+                **{f"messages on {topic}": count for topic, count in received.items()},
+                **estimator.counters,
+                **estimator.drops,
+            },
+            remarks=remarks,
+            data_s=(range_ns[1] - range_ns[0]) * 1e-9,
+            wall_s=time.perf_counter() - self._began_s,
+        )
+
+    def _tick(self, now_ns: int) -> None:
+        estimate = self._estimator.tick(now_ns)
+        k, self._filled = self._filled, self._filled + 1
+        self._stamp_ns[k], self._pose[k], self._covariance[k] = now_ns, estimate.poses, estimate.covariances
+        self._status[k] = estimate.status
+        if self._images is not None:
+            self._images.note(self._estimator.identities)
+        if self._sightings_left > 0 and now_ns % _SIGHTINGS_PERIOD_NS == 0:
+            seen = newest_sightings(self._estimator.recent(), now_ns)
+            self._sightings.append((now_ns, seen))
+            self._sightings_left -= len(seen.observer)
+        if self._filled == _TICKS_AT_ONCE:
+            self._flush()
+
+    def _flush(self) -> None:
+        """Write what is kept to the spool."""
+        filled, self._filled = slice(self._filled), 0
+        for name in ("stamp_ns", "pose", "covariance", "status"):
+            self._spool.append(name, getattr(self, f"_{name}")[filled])
+
+
+class AerialImages:
+    """Collects aerial images, and who is who in them as it becomes known."""
+
+    def __init__(self) -> None:
+        self._positions: dict[int, FloatArray] = {}
+        self._identities: dict[int, Identities] = {}
+        self._left = MAX_DETECTIONS
+
+    def add(self, rows: AerialRows) -> None:
+        """Take the detections of images in."""
+        for stamp_ns in np.unique(rows.stamp_ns).tolist():
+            if self._left <= 0:
+                return
+            chosen = rows.stamp_ns == stamp_ns
+            position = np.full((int(rows.number[chosen].max()) + 1, 2), np.nan)
+            position[rows.number[chosen]] = rows.pose[chosen, :2]
+            self._positions[stamp_ns] = position
+            self._left -= len(position)
+
+    def note(self, identities: Identities | None) -> None:
+        """Take in who is who in an image; late data may change it."""
+        if identities is not None and identities.stamp_ns in self._positions:
+            self._identities[identities.stamp_ns] = identities
+
+    def images(self) -> tuple[AerialImage, ...]:
+        """In the order of their stamps."""
+        return tuple(
+            AerialImage(stamp_ns, position, _known(self._identities.get(stamp_ns)))
+            for stamp_ns, position in sorted(self._positions.items())
+        )
+
+
+def _known(identities: Identities | None) -> dict[int, tuple[int, float]]:
+    """Detection -> robot and probability."""
+    if identities is None:
+        return {}
+    found = np.flatnonzero(identities.place >= 0)
+    return {int(identities.place[k]): (int(k), float(identities.probability[k])) for k in found}

@@ -2,22 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.mapping.grid_messages import GridMessage, decode_occupancy_grid
 from swarm_loc_estimator.offline.metrics import Errors, compare
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline.sightings import Sightings
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
-    from swarm_loc_estimator.offline.surroundings import AerialImage, RecordedMap
-    from swarm_loc_estimator.swarm.swarm import Swarm
-    from swarm_loc_estimator.timeline.sightings import Sightings
+class RecordedMap(NamedTuple):
+    """A message of `map`, and when it was recorded."""
+
+    log_ns: int
+    data: bytes
+
+    @property
+    def grid(self) -> GridMessage:
+        """What it says."""
+        return decode_occupancy_grid(self.data)
+
+
+class AerialImage(NamedTuple):
+    """What an image from above shows.
+
+    Attributes:
+        stamp_ns: Of the image.
+        position: (n, 2) of its detections in map [m].
+        known: Detection -> index of the robot that it is believed to be, and the probability of that.
+    """
+
+    stamp_ns: int
+    position: FloatArray
+    known: Mapping[int, tuple[int, float]]
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,14 @@ from swarm_loc_estimator.cli.demo import main
 from swarm_loc_estimator.common.bags.cut import copy_beginning
 from swarm_loc_estimator.common.launching.graph import GraphOptions, graph_nodes
 from swarm_loc_estimator.common.trajectory import interpolate
-from swarm_loc_estimator.offline.live.agreement import _settled, compare_with_replay
-from swarm_loc_estimator.offline.live.graph import LiveError, LiveGraph
-from swarm_loc_estimator.offline.live.recorder import Recorder
-from swarm_loc_estimator.offline.live.run import ESTIMATOR, play_live, read_bag
+from swarm_loc_estimator.offline.live.graph import LiveError, LiveGraph, Recorder
+from swarm_loc_estimator.offline.live.run import (
+    ESTIMATOR,
+    _settled,
+    compare_with_replay,
+    play_live,
+    read_content,
+)
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Status
 from swarm_loc_estimator.timeline.settings import Settings
@@ -84,7 +88,7 @@ def test_the_recorder_counts_inputs_by_the_estimators_diagnostics_alone(ros: Ros
 
 def test_poses_come_back_after_the_estimator_was_killed(tmp_path: Path) -> None:
     swarm = load_swarm(SWARM_FILE)
-    content = read_bag(DEMO, swarm)
+    content = read_content(DEMO, swarm)
     options = GraphOptions(str(SWARM_FILE), bag=str(DEMO), rate=0.5)
     with LiveGraph(graph_nodes(options), tmp_path / "nodes.log") as graph:
         recorder = graph.recorder

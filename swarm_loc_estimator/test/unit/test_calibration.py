@@ -16,28 +16,29 @@ from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.typestore import typestore
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.offline.calibration.motion_and_camera.fit import Options, calibrate, fit_models
-from swarm_loc_estimator.offline.calibration.motion_and_camera.noise import (
+from swarm_loc_estimator.offline.calibration.fit import Options, calibrate, fit_models
+from swarm_loc_estimator.offline.calibration.motion import (
+    Drive,
+    Lateness,
+    fit_response,
+    nodes_of,
+    steps_of,
+    true_motion,
+)
+from swarm_loc_estimator.offline.calibration.noise import (
     TICK_S,
     Score,
     score,
     thinned,
     with_noise,
 )
-from swarm_loc_estimator.offline.calibration.motion_and_camera.response import (
-    Drive,
-    Lateness,
-    fit_response,
-    nodes_of,
-)
-from swarm_loc_estimator.offline.calibration.motion_and_camera.robust import population, ridge, softened
-from swarm_loc_estimator.offline.calibration.motion_and_camera.windows import steps_of, true_motion
 from swarm_loc_estimator.offline.calibration.recording import (
     CalibrationError,
     read_recording,
+    rerun,
     started_at_truth,
 )
-from swarm_loc_estimator.offline.calibration.rerun import rerun
+from swarm_loc_estimator.offline.calibration.robust import population, ridge, softened
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
 from swarm_loc_estimator.swarm.swarm import CameraMount, OdometryModel, Robot, SensorModel

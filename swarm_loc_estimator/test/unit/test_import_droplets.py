@@ -13,17 +13,17 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.infrared.brightness import expected
 from swarm_loc_estimator.offline.calibration.infrared.board_recording import read_board
 from swarm_loc_estimator.offline.calibration.recording import read_recording
-from swarm_loc_estimator.offline.datasets.droplets.bag import (
-    METRES_PER_PIXEL,
-    ImportSettings,
-    import_recording,
-)
-from swarm_loc_estimator.offline.datasets.droplets.places import clean
-from swarm_loc_estimator.offline.datasets.droplets.text import (
+from swarm_loc_estimator.offline.datasets.droplets import (
     DropletRecordingError,
     Exchange,
     Sighting,
+    clean,
     parse_line,
+)
+from swarm_loc_estimator.offline.datasets.droplets_bag import (
+    METRES_PER_PIXEL,
+    ImportSettings,
+    import_recording,
 )
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.swarm_file import load_swarm

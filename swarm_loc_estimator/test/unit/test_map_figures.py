@@ -11,8 +11,7 @@ import pytest
 from swarm_loc_estimator.cli.replay_map import main, read_walls
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.settings import MapperSettings
-from swarm_loc_estimator.offline.map_figures import MapFigures, map_figures
-from swarm_loc_estimator.offline.map_replay import replay_map, truth_of
+from swarm_loc_estimator.offline.map_replay import MapFigures, map_figures, replay_map, truth_of
 from swarm_loc_estimator.offline.metrics import pool, summarise
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.swarm.swarm_file import load_swarm

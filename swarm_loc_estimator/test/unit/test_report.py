@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.offline.report.overview import plot_overview
+from swarm_loc_estimator.offline.report.plots import plot_overview
 from swarm_loc_estimator.offline.report.report import write_report
 from swarm_loc_estimator.offline.report.table import text_report
 from swarm_loc_estimator.offline.result import ReplayResult

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from swarm_loc_estimator.offline.runner import ListedSchedule, PeriodicSchedule, Runner
+from swarm_loc_estimator.offline.replay import ListedSchedule, PeriodicSchedule, Runner
 from swarm_loc_estimator.sensors.messages import OdometryRows, RawInputs
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator

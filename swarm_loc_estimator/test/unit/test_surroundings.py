@@ -27,9 +27,9 @@ from swarm_loc_estimator.common.messages.typestore import ODOMETRY, POSE_STAMPED
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.mapping.grid_messages import MAX_CELLS, OCCUPANCY_GRID, decode_occupancy_grid
 from swarm_loc_estimator.offline.export import write_mcap
-from swarm_loc_estimator.offline.replay import replay
-from swarm_loc_estimator.offline.report.recording import recorded
-from swarm_loc_estimator.offline.surroundings import AerialImages, MapReader
+from swarm_loc_estimator.offline.recorded_bag import MapReader
+from swarm_loc_estimator.offline.replay import AerialImages, replay
+from swarm_loc_estimator.offline.report.report import recorded
 from swarm_loc_estimator.sensors.messages import AerialRows
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.watch.frames import unpack

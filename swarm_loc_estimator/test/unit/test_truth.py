@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from swarm_loc_estimator.common.messages.encoders import encode_pose_stamped
-from swarm_loc_estimator.offline.truth import read_truth
+from swarm_loc_estimator.offline.recorded_bag import read_truth
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 SWARM = Swarm((Robot("a"), Robot("b"), Robot("silent")))

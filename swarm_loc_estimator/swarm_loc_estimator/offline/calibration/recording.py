@@ -20,6 +20,8 @@ from swarm_loc_estimator.common.errors import UserError
 from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.offline.recorded_bag import Progress, read_bag, unwatched
+from swarm_loc_estimator.offline.replay import PeriodicSchedule, Runner
+from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.sensors.messages import (
     NO_BRIGHTNESS,
     NO_FIXES,
@@ -33,6 +35,7 @@ from swarm_loc_estimator.sensors.messages import (
 )
 from swarm_loc_estimator.sensors.validation import InputValidator
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 
 _NONE = np.zeros(0, dtype=np.int64)
@@ -230,3 +233,13 @@ def _joined(parts: list[Rows]) -> Rows:
     columns = (np.concatenate([_NONE, *(getattr(part, name) for part in parts)]) for name in names)
     robot, stamp_ns, arrival_ns = columns
     return Rows(robot, stamp_ns, arrival_ns, tuple(message for part in parts for message in part.data))
+
+
+def rerun(
+    recording: Recording, swarm: Swarm, tick_s: float, settings: Settings | None = None
+) -> ReplayResult:
+    """Poses at every whole multiple of `tick_s`, each from what had arrived by then."""
+    runner = Runner(Estimator(swarm, settings), PeriodicSchedule(round(tick_s * 1e9)))
+    runner.take(recording.messages)
+    runner.finish(recording.range_ns[1])
+    return runner.result(recording.name, recording.range_ns, recording.truth, {})

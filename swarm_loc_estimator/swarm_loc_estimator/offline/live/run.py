@@ -1,4 +1,4 @@
-"""Play a bag into the live graph over DDS, and record the poses that it publishes."""
+"""Play a bag into the live graph over DDS, record its poses, and compare them with those of a replay."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.launching.graph import GraphOptions, NodeSpec, ParameterValue, graph_nodes
@@ -19,15 +20,19 @@ from swarm_loc_estimator.offline.live.graph import (
     START_PATIENCE_S,
     LiveError,
     LiveGraph,
+    Recorder,
     cpu_seconds,
+    read_history,
+    read_poses,
     resident_mb,
 )
-from swarm_loc_estimator.offline.live.recorder import Recorder, read_history, read_poses
+from swarm_loc_estimator.offline.recorded_bag import TruthReader
+from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.offline.truth import TruthReader
 from swarm_loc_estimator.sensors.topics import input_topics
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.timeline.settings import Settings
 
 ESTIMATOR, PLAYER = "estimator", "player"
 _SILENCE_PATIENCE_S = 30.0
@@ -98,7 +103,7 @@ class BagContent:
 Watch = Callable[[Recorder, BagContent], None]
 
 
-def read_bag(bag: Path, swarm: Swarm) -> BagContent:
+def read_content(bag: Path, swarm: Swarm) -> BagContent:
     """Read what evaluation needs of a bag.
 
     Raises:
@@ -144,7 +149,7 @@ def play_live(
     if options.bag is None:
         raise ValueError("there is no bag to play")
     bag, swarm = Path(options.bag), load_swarm(Path(options.swarm_file))
-    content = read_bag(bag, swarm)
+    content = read_content(bag, swarm)
     nodes = [
         _player_of(node, [*content.arrival_ns], inputs_only=inputs_only) if node.name == PLAYER else node
         for node in graph_nodes(options)
@@ -232,3 +237,75 @@ def _wait_for_the_rest(graph: LiveGraph, content: BagContent) -> None:
         _END_PATIENCE_S,
         needed=[ESTIMATOR],
     )
+
+
+_EQUAL_M = 1e-6
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Live poses beside those of a replay at the same stamps.
+
+    A live estimator cannot know what is still on its way when it gives a pose: up to a step of the player's
+    clock and the transport, which takes the longer the busier the machine is. Only at settled stamps is it
+    known that both know the same, and the poses must be equal.
+
+    Attributes:
+        replayed: The replay.
+        distance_m: (T, N) between the positions; NaN where neither is located, infinite where one is not.
+        turn_rad: (T, N) between the headings, likewise, without sign.
+        settled: (T,) whether the estimator has said that it knew just what had arrived by then in the bag.
+    """
+
+    replayed: ReplayResult
+    distance_m: FloatArray
+    turn_rad: FloatArray
+    settled: NDArray[np.bool_]
+
+    @property
+    def equal_share(self) -> float:
+        """Share of the poses that are the same to a micrometre."""
+        return float(np.mean(self.distance_m[~np.isnan(self.distance_m)] < _EQUAL_M))
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square distance of all robots that both had located [m]."""
+        return float(np.sqrt(np.mean(self.distance_m[np.isfinite(self.distance_m)] ** 2)))
+
+    @property
+    def settled_max_m(self) -> float:
+        """Largest distance at settled stamps [m]; NaN when there are none."""
+        chosen = self.distance_m[self.settled]
+        return float(np.nanmax(chosen)) if chosen.size else float("nan")
+
+
+def compare_with_replay(live: LiveRun, bag: Path, settings: Settings | None = None) -> Agreement:
+    """Replay a bag at the very stamps of live poses.
+
+    Args:
+        live: What came out of the live graph.
+        bag: What was played into it.
+        settings: Those of the live estimator.
+    """
+    replayed = replay(bag, live.result.swarm, settings, stamp_ns=live.result.stamp_ns)
+    difference = live.result.pose - replayed.pose
+    located = np.isfinite(live.result.pose).all(axis=2)
+    one_only = located != np.isfinite(replayed.pose).all(axis=2)
+    turn = np.where(one_only, np.inf, np.abs(se2.wrap_angle(difference[..., 2])))
+    distance = np.where(one_only, np.inf, np.hypot(difference[..., 0], difference[..., 1]))
+    return Agreement(replayed, distance, turn, _settled(live))
+
+
+def _settled(live: LiveRun) -> NDArray[np.bool_]:
+    """(T,) whether the poses are known to be of all that had arrived by their stamp, and of nothing else."""
+    stamp_ns = live.result.stamp_ns
+    told_ns = np.array(sorted(live.taken), dtype=np.int64)
+    before = np.searchsorted(told_ns, stamp_ns, side="right")
+    behind = np.searchsorted(told_ns, stamp_ns, side="left") + 1
+    settled = np.ones(stamp_ns.size, dtype=bool)
+    for topic, arrival_ns in live.arrival_ns.items():
+        # the messages of a topic come in order: as many are the same ones
+        taken = np.array([0, *(live.taken[at].get(topic, 0) for at in told_ns.tolist()), arrival_ns.size])
+        arrived = np.searchsorted(arrival_ns, stamp_ns, side="right")
+        settled &= (taken[before] == arrived) & (taken[behind] == arrived)
+    return settled

@@ -1,19 +1,44 @@
-"""The report of a replay: a table, pictures, and one page with all of it."""
+"""The report of a replay: text, plots and one self-contained HTML page with a recording to play."""
 
 from __future__ import annotations
 
+import base64
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from html import escape
+from pathlib import Path
+from typing import TypeVar
 
-from swarm_loc_estimator.offline.report.html import html_report
-from swarm_loc_estimator.offline.report.overview import plot_overview
-from swarm_loc_estimator.offline.report.plots import plot_errors, plot_paths
-from swarm_loc_estimator.offline.report.table import text_report
+import numpy as np
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.trajectory import interpolate
+from swarm_loc_estimator.offline.export import estimates
+from swarm_loc_estimator.offline.report.plots import plot_errors, plot_overview, plot_paths
+from swarm_loc_estimator.offline.report.table import (
+    GROUPS,
+    HEADER,
+    POOLED,
+    SELF_CALIBRATED,
+    cells,
+    facts,
+    self_calibrated_landmarks,
+    self_calibrated_robots,
+    summaries,
+    text_report,
+)
+from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.watch.about import about
+from swarm_loc_estimator.watch.frames import (
+    Frame,
+    aerial_frame,
+    map_frame,
+    places_frame,
+    poses_frame,
+    sightings_frame,
+)
+from swarm_loc_estimator.watch.page import page
+from swarm_loc_estimator.watch.recording import recording
 
 
 @dataclass(frozen=True)
@@ -54,3 +79,218 @@ def write_report(result: ReplayResult, folder: Path) -> ReportFiles:
             pictures[heading] = path
     page.write_text(html_report(result, pictures), encoding="utf-8")
     return ReportFiles(text, page, overview, pictures.get("Paths"), pictures.get("Errors over time"))
+
+
+_STYLE = """
+:root { color-scheme: light dark; --ink: #22303c; --soft: #66757f; --line: #dfe4e8; --paper: #fff;
+  --card: #f6f8fa; --accent: #0072b2; }
+@media (prefers-color-scheme: dark) { :root { --ink: #e6edf3; --soft: #9aa7b2; --line: #30363d;
+  --paper: #0d1117; --card: #161b22; --accent: #56b4e9; } }
+* { box-sizing: border-box; }
+body { margin: 0 auto; padding: 2rem clamp(1rem, 4vw, 2.5rem) 4rem; max-width: 1120px;
+  background: var(--paper); color: var(--ink); font: 15px/1.5 system-ui, sans-serif; }
+h1 { font-size: 1.6rem; margin: 0 0 1rem; }
+h2 { font-size: 1.1rem; margin: 2.2rem 0 .7rem; }
+.facts { display: flex; flex-wrap: wrap; gap: .7rem; padding: 0; margin: 0; }
+.facts div { background: var(--card); border: 1px solid var(--line); border-radius: 8px;
+  padding: .55rem .9rem; }
+.facts dt { color: var(--soft); font-size: .8rem; }
+.facts dd { margin: 0; font-weight: 600; }
+.facts .headline dd { color: var(--accent); font-size: 1.25rem; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
+th, td { padding: .3rem .5rem; text-align: right; white-space: nowrap;
+  border-bottom: 1px solid var(--line); }
+th { color: var(--soft); font-weight: 500; font-size: .85rem; line-height: 1.25; }
+th:first-child, td:first-child { text-align: left; padding-left: 0; padding-right: 1rem;
+  position: sticky; left: 0; background: var(--paper); }
+th.group { text-align: center; color: var(--ink); }
+tr.pooled td { font-weight: 650; border-top: 2px solid var(--soft); }
+img { display: block; width: 100%; min-width: 42rem; background: #fff;
+  border: 1px solid var(--line); border-radius: 8px; }
+.player { width: 100%; height: min(75vh, 46rem); border: 1px solid var(--line); border-radius: 8px; }
+ul { padding-left: 1.2rem; }
+small { display: block; color: var(--soft); }
+"""
+
+
+def html_report(result: ReplayResult, pictures: dict[str, Path]) -> str:
+    """The page.
+
+    Args:
+        result: What to show.
+        pictures: Heading -> PNG file to put below it.
+    """
+    parts = [
+        f"<h1>{escape(result.title)}</h1>",
+        _facts(result),
+        _remarks(result),
+        _errors(result),
+        _player(result),
+        *(_picture(heading, path) for heading, path in pictures.items()),
+        _self_calibration(result),
+        _counters(result),
+    ]
+    head = (
+        '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(result.title)}</title><style>{_STYLE}</style>"
+    )
+    body = "\n".join(part for part in parts if part)
+    return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
+
+
+def _facts(result: ReplayResult) -> str:
+    """Size, duration and speed, with the pooled errors first."""
+    rows = summaries(result)
+    headline = []
+    if rows:
+        figures = cells(*rows[-1])
+        headline = [
+            ("position RMSE", f"{figures[2]} m"),
+            ("heading RMSE", f"{figures[7]}°"),
+            ("NEES", figures[12]),
+        ]
+    first = "".join(_card(name, text, "headline") for name, text in headline)
+    others = "".join(_card(name, text) for name, text in facts(result))
+    return f'<dl class="facts">{first}{others}</dl>'
+
+
+def _card(name: str, text: str, kind: str = "") -> str:
+    """One fact."""
+    return f'<div class="{kind}"><dt>{escape(name)}</dt><dd>{escape(text)}</dd></div>'
+
+
+def _remarks(result: ReplayResult) -> str:
+    """What else must be said."""
+    items = "".join(f"<li>{escape(remark)}</li>" for remark in result.remarks)
+    return f"<h2>Remarks</h2><ul>{items}</ul>" if items else ""
+
+
+def _errors(result: ReplayResult) -> str:
+    """The error table."""
+    title = "<h2>Errors against ground truth</h2>"
+    rows = summaries(result)
+    if not rows:
+        return f"{title}<p>No ground truth to compare with.</p>"
+    groups = "".join(f'<th class="group" colspan="{count}">{escape(name)}</th>' for name, count in GROUPS)
+    titles = "".join(
+        f"<th>{escape(name)}{f'<small>[{escape(unit)}]</small>' if unit else ''}</th>"
+        for name, unit in HEADER
+    )
+    body = "".join(
+        f"<tr{' class=pooled' if name == POOLED and row is rows[-1][1] else ''}>"
+        + "".join(f"<td>{escape(text)}</td>" for text in cells(name, row))
+        + "</tr>"
+        for name, row in rows
+    )
+    head = f"<thead><tr>{groups}</tr><tr>{titles}</tr></thead>"
+    return f'{title}<div class="wide"><table>{head}<tbody>{body}</tbody></table></div>'
+
+
+def _player(result: ReplayResult) -> str:
+    """The page on which people watch a swarm, with this run inside."""
+    recording = recorded(result)
+    if not recording:
+        return ""
+    inside = escape(page(recording))
+    return f'<h2>Run</h2><iframe class="player" title="The run" srcdoc="{inside}"></iframe>'
+
+
+def _self_calibration(result: ReplayResult) -> str:
+    """What was estimated of robots and landmarks beside the poses."""
+    rows, sentence = self_calibrated_robots(result), self_calibrated_landmarks(result)
+    if not rows and not sentence:
+        return ""
+    head = "".join(f"<th>{escape(name)}</th>" for name in SELF_CALIBRATED)
+    body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in rows)
+    table = f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    title = "<h2>Self-calibration, with one standard deviation</h2>"
+    return f"{title}{table if rows else ''}<p>{escape(sentence)}</p>"
+
+
+def _picture(heading: str, path: Path) -> str:
+    """A picture inside the page."""
+    data = base64.b64encode(path.read_bytes()).decode("ascii")
+    name = escape(heading)
+    return f'<h2>{name}</h2><div class="wide"><img alt="{name}" src="data:image/png;base64,{data}"></div>'
+
+
+def _counters(result: ReplayResult) -> str:
+    """What was counted."""
+    rows = "".join(
+        f"<tr><td>{escape(name)}</td><td>{count}</td></tr>" for name, count in result.counters.items()
+    )
+    return f'<h2>Counted</h2><div class="wide"><table><tbody>{rows}</tbody></table></div>' if rows else ""
+
+
+_Thing = TypeVar("_Thing")
+MAX_BYTES = 12_000_000
+"""Of poses and sightings before they are packed; maps, goals and aerial images have limits of their own."""
+_MAP_BYTES, _GOAL_BYTES, _IMAGE_BYTES = 6_000_000, 1_000_000, 2_000_000
+_BYTES_PER_FRAME, _BYTES_PER_ROBOT, _BYTES_PER_SIGHTING = 800, 64, 17
+_GAP_NS = 500_000_000
+
+
+def recorded(result: ReplayResult) -> str:
+    """The run as a text for the page; "" where there is nothing to show."""
+    if not len(result.stamp_ns) or not result.swarm.robots:
+        return ""
+    seen = sum(len(one.observer) for _, one in result.sightings) * _BYTES_PER_SIGHTING
+    each = _BYTES_PER_FRAME + _BYTES_PER_ROBOT * len(result.swarm.robots)
+    stride = -(-(each * len(result.stamp_ns)) // (MAX_BYTES // 2))
+    seen_stride = max(1, -(-seen // (MAX_BYTES // 2)))
+    frames = [*map(poses_frame, estimates(result, stride)), *_truth(result, stride)]
+    frames += [sightings_frame(stamp_ns, one) for stamp_ns, one in result.sightings[::seen_stride]]
+    frames += [*_maps(result), *_goals(result), *_images(result)]
+    told = about(result.swarm, result.title, commands=False)
+    return recording(told, sorted(frames, key=lambda frame: frame.stamp_ns))
+
+
+def _truth(result: ReplayResult, stride: int) -> Iterator[Frame]:
+    """The ground truth at the stamps of the poses."""
+    stamps_ns = np.asarray(result.stamp_ns[::stride])
+    robots = [index for index, one in enumerate(result.swarm.robots) if one.name in result.truth]
+    if not robots:
+        return
+    names = [result.swarm.robots[index].name for index in robots]
+    found = [interpolate(result.truth[name], stamps_ns, _GAP_NS) for name in names]
+    pose, known = (np.stack([one[part] for one in found], axis=1) for part in (0, 1))
+    for k, stamp_ns in enumerate(stamps_ns.tolist()):
+        there = np.flatnonzero(known[k])
+        yield places_frame("truth", stamp_ns, [robots[i] for i in there], pose[k, there])
+
+
+def _maps(result: ReplayResult) -> Iterator[Frame]:
+    """The map as it grew, the last one among them."""
+    size = max((len(one.data) for one in result.maps), default=1)
+    for one in _thinned(result.maps, _MAP_BYTES // size):
+        yield map_frame(one.log_ns, one.grid)
+
+
+def _goals(result: ReplayResult) -> Iterator[Frame]:
+    """The goals of all robots at each instant at which one has got another."""
+    index_of, newest = result.swarm.index_of, dict[int, FloatArray]()
+    rows = [
+        (int(track.stamp_ns[k]), index_of[name], track.pose[k])
+        for name, track in result.goals.items()
+        for k in range(len(track.stamp_ns))
+    ]
+    frames = []
+    for stamp_ns, robot, pose in sorted(rows, key=lambda row: row[:2]):
+        newest[robot] = pose
+        frames.append(places_frame("goals", stamp_ns, [*newest], np.array([*newest.values()])))
+    size = max((len(one.data) for one in frames), default=1)
+    yield from _thinned(frames, _GOAL_BYTES // size)
+
+
+def _images(result: ReplayResult) -> Iterator[Frame]:
+    """What cameras above the swarm saw."""
+    frames = [aerial_frame(*one) for one in result.images]
+    size = max((len(one.data) for one in frames), default=1)
+    yield from _thinned(frames, _IMAGE_BYTES // size)
+
+
+def _thinned(things: Sequence[_Thing], most: int) -> list[_Thing]:
+    """So many of them at most, but one at least, evenly, the last among them."""
+    stride = max(1, -(-len(things) // max(1, most)))
+    return [*things[::-1][::stride]][::-1]

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from swarm_loc_estimator.offline.metrics import ErrorSummary, pool, summarise
-
-if TYPE_CHECKING:
-    from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.offline.result import ReplayResult
 
 HEADER = (
     ("robot", ""),

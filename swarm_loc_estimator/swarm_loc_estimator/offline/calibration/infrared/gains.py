@@ -12,6 +12,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.infrared.solvers.gains import Exchanges, GainsError, GainsFit, estimate_gains
+from swarm_loc_estimator.offline.calibration.camera import DENSE_GAP_NS
 from swarm_loc_estimator.offline.calibration.infrared.dead_elements import ElementVerdicts, find_dead_elements
 from swarm_loc_estimator.offline.calibration.infrared.gain_validation import helpful_gains
 from swarm_loc_estimator.offline.calibration.infrared.reading_limits import (
@@ -20,7 +21,6 @@ from swarm_loc_estimator.offline.calibration.infrared.reading_limits import (
     find_reading_limits,
 )
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
-from swarm_loc_estimator.offline.calibration.sightings import DENSE_GAP_NS
 from swarm_loc_estimator.offline.recorded_bag import Progress
 from swarm_loc_estimator.sensors.exchanges import ExchangeKey, MatrixScreening, Readings
 from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform

@@ -10,11 +10,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.offline.calibration.motion_and_camera.camera import CameraFit
-from swarm_loc_estimator.offline.calibration.motion_and_camera.fit import Calibration
-from swarm_loc_estimator.offline.calibration.motion_and_camera.noise import Score
-from swarm_loc_estimator.offline.calibration.motion_and_camera.response import spread_of
-from swarm_loc_estimator.offline.calibration.motion_and_camera.robust import spread
+from swarm_loc_estimator.offline.calibration.camera import CameraFit
+from swarm_loc_estimator.offline.calibration.fit import Calibration
+from swarm_loc_estimator.offline.calibration.motion import spread_of
+from swarm_loc_estimator.offline.calibration.noise import Score
+from swarm_loc_estimator.offline.calibration.robust import spread
 from swarm_loc_estimator.offline.report.style import INK, SOFT, TRUTH, colour_of, save, style
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
 

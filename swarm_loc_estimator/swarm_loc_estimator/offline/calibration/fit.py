@@ -12,27 +12,33 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.offline.calibration.motion_and_camera.camera import CameraFit, fit_cameras
-from swarm_loc_estimator.offline.calibration.motion_and_camera.noise import (
-    Fold,
-    Score,
-    fit_noise,
-    score,
-    with_noise,
-)
-from swarm_loc_estimator.offline.calibration.motion_and_camera.offsets import fit_offsets
-from swarm_loc_estimator.offline.calibration.motion_and_camera.response import (
+from swarm_loc_estimator.offline.calibration.camera import CameraFit, fit_cameras
+from swarm_loc_estimator.offline.calibration.motion import (
     WINDOW_S,
     Drive,
     Lateness,
     explained,
     fit_lateness,
     fit_response,
+    steps_of,
+    true_motion,
+    windows,
 )
-from swarm_loc_estimator.offline.calibration.motion_and_camera.robust import spread
-from swarm_loc_estimator.offline.calibration.motion_and_camera.windows import steps_of, true_motion, windows
-from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording, started_at_truth
-from swarm_loc_estimator.offline.calibration.rerun import rerun
+from swarm_loc_estimator.offline.calibration.noise import (
+    Fold,
+    Score,
+    fit_noise,
+    score,
+    with_noise,
+)
+from swarm_loc_estimator.offline.calibration.offsets import fit_offsets
+from swarm_loc_estimator.offline.calibration.recording import (
+    CalibrationError,
+    Recording,
+    rerun,
+    started_at_truth,
+)
+from swarm_loc_estimator.offline.calibration.robust import spread
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.sensors.ingest import MAX_PAUSE_NS
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
@@ -86,7 +92,7 @@ class DriveFit:
 
 
 @dataclass(frozen=True)
-class Models:
+class FittedModels:
     """Calibrated models, without noise.
 
     Attributes:
@@ -115,7 +121,7 @@ class Calibration:
     """
 
     swarm: Swarm
-    models: Models
+    models: FittedModels
     noise: dict[str, float] = field(default_factory=dict)
     before: Score | None = None
     after: Score | None = None
@@ -158,7 +164,7 @@ def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Pr
     return Calibration(calibrated, whole, noise, *scores)
 
 
-def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: Progress) -> Models:
+def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: Progress) -> FittedModels:
     """Fit sensors and motion type by type; with `plain` only look at the errors.
 
     Raises:
@@ -192,7 +198,7 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
             f"recording '{recording.name}' holds too little ground truth together with odometry or sightings;"
             " a minute of a moving robot that sees markers is the least."
         )
-    return Models(replace(swarm, robots=tuple(robots)), tuple(cameras), tuple(motion), tuple(remarks))
+    return FittedModels(replace(swarm, robots=tuple(robots)), tuple(cameras), tuple(motion), tuple(remarks))
 
 
 def _fit_drive(
@@ -235,7 +241,7 @@ def _with_motion(robot: Robot, drive: DriveFit) -> Robot:
     return replace(robot, odometry=replace(robot.odometry, **numbers), response=response)
 
 
-def _folds(recording: Recording, swarm: Swarm, whole: Models, options: Options) -> list[Fold]:
+def _folds(recording: Recording, swarm: Swarm, whole: FittedModels, options: Options) -> list[Fold]:
     """Each half of the recording with the models of the other; where one gives none, of the whole."""
     if options.plain:
         return [Fold(recording, started_at_truth(whole.swarm, recording))]
@@ -252,7 +258,7 @@ def _folds(recording: Recording, swarm: Swarm, whole: Models, options: Options) 
     return folds
 
 
-def _first_noise(models: Models, *, plain: bool) -> dict[str, float]:
+def _first_noise(models: FittedModels, *, plain: bool) -> dict[str, float]:
     """Where the fit of noise begins: the scatter of sightings, half the errors of windows for each cause."""
     polar = np.concatenate([fit.sightings.polar for fit in models.cameras] or [np.zeros(0, dtype=bool)])
     errors = [fit.before if plain else fit.after for fit in models.cameras]

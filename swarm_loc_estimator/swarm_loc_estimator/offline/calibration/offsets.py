@@ -11,13 +11,13 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.offline.calibration.motion_and_camera.robust import (
+from swarm_loc_estimator.offline.calibration.camera import DENSE_GAP_NS
+from swarm_loc_estimator.offline.calibration.recording import Recording
+from swarm_loc_estimator.offline.calibration.robust import (
     fit_with_prior,
     population,
     spread,
 )
-from swarm_loc_estimator.offline.calibration.recording import Recording
-from swarm_loc_estimator.offline.calibration.sightings import DENSE_GAP_NS
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 _WIDE = np.array([0.05, 0.05])

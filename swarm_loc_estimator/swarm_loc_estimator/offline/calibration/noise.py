@@ -19,8 +19,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.number_spec import number_specs
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
-from swarm_loc_estimator.offline.calibration.recording import Recording, Rows
-from swarm_loc_estimator.offline.calibration.rerun import rerun
+from swarm_loc_estimator.offline.calibration.recording import Recording, Rows, rerun
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, SensorModel, Swarm

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +20,7 @@ from swarm_loc_estimator.common.messages.encoders import (
 )
 from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
-from swarm_loc_estimator.offline.datasets.mrclam.dataset import MAX_TRUTH_GAP_NS, Dataset, RobotLog, integrate
+from swarm_loc_estimator.offline.datasets.mrclam import MAX_TRUTH_GAP_NS, Dataset, RobotLog, integrate
 from swarm_loc_estimator.sensors.camera import CONTENT_POSITION
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
@@ -31,10 +32,6 @@ from swarm_loc_estimator.swarm.swarm import (
     Swarm,
 )
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 ROBOT_TYPE = "create"
 WHEEL_SEPARATION = 0.258
@@ -67,7 +64,7 @@ class Delay:
 
 
 @dataclass(frozen=True)
-class Conversion:
+class MrclamImport:
     """What was written.
 
     Attributes:
@@ -91,7 +88,7 @@ class _Stream:
 
 def convert(
     dataset: Dataset, folder: Path, delay: Delay, progress: Callable[[float, str], None]
-) -> Conversion:
+) -> MrclamImport:
     """Write `folder` as a bag with its `swarm.yaml` inside.
 
     Args:
@@ -121,7 +118,7 @@ def convert(
     remarks = [*dataset.remarks, *(remark for whole, used in pairs for remark in _start_remarks(whole, used))]
     save_swarm(describe(dataset, robots), folder / "swarm.yaml", "\n".join(remarks))
     progress(1.0, "done")
-    return Conversion(count, tuple(remarks))
+    return MrclamImport(count, tuple(remarks))
 
 
 def _start_remarks(whole: RobotLog, used: RobotLog) -> list[str]:

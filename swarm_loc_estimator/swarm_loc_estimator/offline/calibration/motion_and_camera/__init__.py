@@ -1,1 +1,0 @@
-"""The fit of odometry, cameras and noise to ground truth."""

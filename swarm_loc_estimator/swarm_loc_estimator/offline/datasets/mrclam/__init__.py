@@ -1,1 +1,0 @@
-"""The UTIAS multi-robot cooperative localization and mapping dataset."""
