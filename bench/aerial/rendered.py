@@ -21,7 +21,7 @@ from sensor_msgs.msg import Image
 from bench.graph.listener import Listener
 from bench.shared.common import OUT, Cell, ProgressLine, table
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
-from swarm_loc_drivers.sim.simulation import SimulationOptions, seen_from_above, simulation_nodes
+from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, seen_from_above
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -170,7 +170,7 @@ def run_aerial(
     save_swarm(swarm, folder / "swarm.yaml")
     names = [robot.name for robot in swarm.robots]
     options = SimulationOptions(str(folder / "swarm.yaml"), world=WORLD, seed=seed, aerial=True)
-    nodes = simulation_nodes(options, names, str(links))
+    nodes = graph_of(options, swarm, str(links))
     if known_start:
         nodes = _told_the_starts(nodes, swarm, folder / "known_starts.yaml")
     with LiveGraph(nodes, folder / "nodes.log") as graph:

@@ -16,7 +16,7 @@ from sensor_msgs.msg import Image
 
 from bench.graph.listener import TYPE_OF, Listener, Say
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
-from swarm_loc_drivers.sim.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import DetectionArrayMessage, decode_detections
@@ -125,7 +125,7 @@ def run_rendered(swarm: Swarm, seed: int, duration_s: float, folder: Path, say: 
     swarm_file, names = folder / "swarm.yaml", [robot.name for robot in swarm.robots]
     save_swarm(swarm, swarm_file)
     options = SimulationOptions(str(swarm_file), world=WORLD, seed=seed)
-    nodes = simulation_nodes(options, names, str(links))
+    nodes = graph_of(options, swarm, str(links))
     with LiveGraph(nodes, folder / "nodes.log") as graph:
         listener = Listener(graph, names)
         begin_ns = listener.wait_until_they_drive(say)

@@ -14,7 +14,7 @@ import numpy as np
 from bench.graph.listener import Listener, Say
 from bench.integrity.scoring import Estimated, Score, scored
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
-from swarm_loc_drivers.sim.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
 from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -110,7 +110,7 @@ def run_live(name: str, seed: int, folder: Path, say: Say) -> Score:
     save_swarm(swarm, folder / "swarm.yaml")
     names = [robot.name for robot in swarm.robots]
     options = SimulationOptions(str(folder / "swarm.yaml"), world="w0", seed=seed)
-    nodes = simulation_nodes(options, names, str(links))
+    nodes = graph_of(options, swarm, str(links))
     away_s = float(np.random.default_rng([seed, 5]).uniform(1.2, 6.0))
     with LiveGraph(nodes, folder / "nodes.log") as graph:
         listener = Listener(graph, names)

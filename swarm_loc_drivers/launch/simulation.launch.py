@@ -8,8 +8,7 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
 from swarm_loc_drivers.link_folder import link_folder
-from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
-from swarm_loc_drivers.sim.worlds import WORLDS
+from swarm_loc_drivers.sim.simulation import ROBOT_TYPES, SimulationOptions, graph_of, simulated_swarm
 from swarm_loc_estimator.common.launching.options import options_from
 from swarm_loc_estimator.common.launching.ros_launch import argument_texts, node_action
 
@@ -19,7 +18,11 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             DeclareLaunchArgument("swarm_file", description="path of the swarm description"),
-            DeclareLaunchArgument("world", default_value="w2", choices=sorted(WORLDS)),
+            DeclareLaunchArgument(
+                "world",
+                default_value="",
+                choices=["", *(world for kind in ROBOT_TYPES.values() for world in kind.worlds)],
+            ),
             DeclareLaunchArgument("seed", default_value="1", description="fixes the world's errors"),
             DeclareLaunchArgument("speed", default_value="0.06", description="along the eight [m/s]"),
             DeclareLaunchArgument("rate", default_value="1.0", description="simulated seconds per second"),

@@ -1,11 +1,12 @@
-"""Start simulated robots: e-pucks and all that locates them, or PushBots that map a hall.
+"""Start simulated robots: e-pucks or Droplets and all that locates them, or PushBots that map a hall.
 
     simulate bags/eight_five_robots/swarm.yaml --world w2 --seed 1
 
 One world with rendered cameras, robots that answer their drivers' bytes on serial ports, a driver and a
 marker detector for each robot, the steering along the eight, and the estimator; all on simulated time. Robots
-whose type is `pushbot` get a hall instead, each a driver and an event tracker with its laser calibrated, and
-together a mapper and a node that drives them to its goals.
+whose type is `droplet` get a table with infrared, a tracker above it and one process of drivers. Robots whose
+type is `pushbot` get a hall, each a driver and an event tracker with its laser calibrated, and together a
+mapper and a node that drives them to its goals.
 `ros2 launch swarm_loc_drivers simulation.launch.py` starts the same.
 """
 
@@ -17,9 +18,13 @@ from collections.abc import Sequence
 
 from swarm_loc_drivers.link_folder import link_folder
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
-from swarm_loc_drivers.sim.pushbot_simulation import has_pushbots
-from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
-from swarm_loc_drivers.sim.worlds import WORLDS
+from swarm_loc_drivers.sim.simulation import (
+    ROBOT_TYPES,
+    SimulationOptions,
+    graph_of,
+    robot_type_of,
+    simulated_swarm,
+)
 from swarm_loc_estimator.cli.graph import say
 from swarm_loc_estimator.common.arguments import number_in
 from swarm_loc_estimator.common.command_errors import exit_with_message
@@ -38,9 +43,9 @@ def parse(arguments: Sequence[str] | None) -> SimulationOptions:
     defaults = SimulationOptions("")
     parser.add_argument(
         "--world",
-        choices=sorted(WORLDS),
+        choices=[world for kind in ROBOT_TYPES.values() for world in kind.worlds],
         default=defaults.world,
-        help=f"which errors robots and cameras have (default: {defaults.world})",
+        help="which errors robots and sensors have (default: w2 of e-pucks, d1 of Droplets)",
     )
     for name, spec in number_specs(SimulationOptions).items():
         default = getattr(defaults, name)
@@ -71,9 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run until a node ends or Ctrl-C."""
     options = parse(arguments)
     swarm = simulated_swarm(options)
-    if (
-        not has_pushbots(swarm) and not options.aerial and not is_precompiled(precompile)
-    ):  # once, not in every robot's detector at a time
+    detects = robot_type_of(swarm).has_markers and not options.aerial
+    if detects and not is_precompiled(precompile):  # once, not in every robot's detector at a time
         say("compiling the marker detector for this machine: about half a minute")
         precompile()
     with link_folder() as links:

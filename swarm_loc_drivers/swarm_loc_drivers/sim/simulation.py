@@ -1,22 +1,24 @@
-"""The whole graph of simulated robots as data: of e-pucks world, drivers, steering, detectors, estimator.
+"""The whole graph of simulated robots as data: world, drivers, steering, sensing nodes, estimator.
 
-`ros2 launch swarm_loc_drivers simulation.launch.py` and the `simulate` command start the same list.
+`ROBOT_TYPES` has one entry per kind of robot. `ros2 launch swarm_loc_drivers simulation.launch.py` and the
+`simulate` command start the same list of nodes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from swarm_loc_drivers.sim.droplet.droplet_world_parameters import check_droplets
 from swarm_loc_drivers.sim.epuck.world import check_swarm
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
+from swarm_loc_drivers.sim.pushbot.optics import MAX_ROBOTS, laser_hz, led_hz
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
-from swarm_loc_drivers.sim.pushbot_simulation import has_pushbots, pushbot_nodes
 from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
 from swarm_loc_drivers.sim.scenarios.eight import ARENA
 from swarm_loc_drivers.sim.scenarios.eight_images import eight_floor
-from swarm_loc_drivers.sim.worlds import WORLDS
+from swarm_loc_drivers.sim.worlds import WorldError, start_of
 from swarm_loc_estimator.common.launching.graph import NodeSpec, ParameterValue
 from swarm_loc_estimator.common.launching.options import check_parameter_file
 from swarm_loc_estimator.common.number_spec import number
@@ -28,6 +30,8 @@ from swarm_loc_vision.aerial.ground_file import save_ground
 
 Parameters = dict[str, ParameterValue]
 
+_ESTIMATOR, _VISION, _DRIVERS = "swarm_loc_estimator", "swarm_loc_vision", "swarm_loc_drivers"
+_TIME: Parameters = {"use_sim_time": True}
 _ANSWER_WITHIN_S = 0.15
 """Images of real robots take so long to become detections, too."""
 _AERIAL_RATE_HZ = 3.0
@@ -39,7 +43,7 @@ _AERIAL_CAMERA: Parameters = {
     "y_min": -0.5 * ARENA[1],
     "y_max": 0.5 * ARENA[1],
 }
-"""What the node is told of the robots and of the arena."""
+"""The robots and the arena as the aerial camera's node knows them."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,7 @@ class SimulationOptions:
 
     Attributes:
         swarm_file: Path of the swarm description.
-        world: Which errors robots and cameras have.
+        world: Which errors robots and sensors have; "": the default of the robots' type.
         seed: Fixes them.
         speed: Along the eight [m/s].
         rate: Simulated seconds per second, as far as the machine keeps up.
@@ -58,7 +62,7 @@ class SimulationOptions:
     """
 
     swarm_file: str
-    world: str = "w2"
+    world: str = ""
     seed: int = number(1, "1", 0, 2**31 - 1, "fixes them")
     speed: float = number(0.06, "m/s", 0.001, 0.12, "along the eight")
     rate: float = number(
@@ -69,20 +73,55 @@ class SimulationOptions:
     parameter_file: str | None = None
 
 
+@dataclass(frozen=True)
+class RobotType:
+    """How one kind of robot is simulated.
+
+    Attributes:
+        name: The type of the robots in a swarm description.
+        check: Raises a `UserError` for a swarm that its world cannot hold.
+        nodes: Options, swarm, folder for serial ports and files -> nodes in the order in which they start.
+        worlds: Its error models, the default one first.
+        has_markers: Whether marker detectors run, whose compiled code is to be prepared once for all.
+    """
+
+    name: str
+    check: Callable[[Swarm], None]
+    nodes: Callable[[SimulationOptions, Swarm, str], list[NodeSpec]]
+    worlds: tuple[str, ...] = ()
+    has_markers: bool = False
+
+
+def robot_type_of(swarm: Swarm) -> RobotType:
+    """The kind of a swarm's robots; e-pucks may have a type of any other name.
+
+    Raises:
+        WorldError: The robots are of several kinds.
+    """
+    kinds = {robot.name: ROBOT_TYPES.get(robot.type, EPUCK) for robot in swarm.robots}
+    first = next((kind for kind in kinds.values() if kind is not EPUCK), EPUCK)
+    for robot, kind in kinds.items():
+        if kind is not first:
+            raise WorldError(
+                f"robot '{robot}' is no {first.name}, and others are: one world has one kind of robots."
+            )
+    return first
+
+
 def simulated_swarm(options: SimulationOptions) -> Swarm:
-    """The swarm of a simulation; looked at here, and not by the world when a score of processes have started.
+    """The swarm of a simulation, checked before any process starts.
 
     Raises:
         UserError: A file cannot be used, or the swarm cannot be simulated.
     """
-    if options.world not in WORLDS:
-        raise ParameterError(f"argument world = '{options.world}' must be one of {', '.join(WORLDS)}.")
     if options.plan not in FLOOR_PLANS:
         raise ParameterError(f"argument plan = '{options.plan}' must be one of {', '.join(FLOOR_PLANS)}.")
     check_parameter_file(options.parameter_file)
     swarm = load_swarm(Path(options.swarm_file))
-    if not has_pushbots(swarm):
-        check_swarm(swarm)
+    kind = robot_type_of(swarm)
+    if options.world and kind.worlds and options.world not in kind.worlds:
+        raise ParameterError(f"argument world = '{options.world}' must be one of {', '.join(kind.worlds)}.")
+    kind.check(swarm)
     return swarm
 
 
@@ -94,68 +133,51 @@ def graph_of(options: SimulationOptions, swarm: Swarm, links: str) -> list[NodeS
         swarm: As `simulated_swarm` has it.
         links: Folder for serial ports and files of the simulation; exists.
     """
-    robots = [robot.name for robot in swarm.robots]
-    if not has_pushbots(swarm):
-        return simulation_nodes(options, robots, links)
-    calibrate_lasers(robots, options.seed, Path(links))
-    world: Parameters = {
-        "swarm_file": options.swarm_file,
-        "plan": options.plan,
-        "seed": options.seed,
-        "rate": options.rate,
-    }
-    return pushbot_nodes(world, robots, links, options.parameter_file)
+    kind = robot_type_of(swarm)
+    chosen = replace(options, world=options.world or next(iter(kind.worlds), ""))
+    return kind.nodes(chosen, swarm, links)
 
 
 def seen_from_above(swarm: Swarm) -> Swarm:
-    """A swarm as the estimator is given it when an overhead camera is all that there is.
-
-    Robots have odometry alone, and where they start is not known.
-    """
+    """The estimator's description of a swarm that an overhead camera alone locates: odometry, no starts."""
     robots = (replace(robot, start=None, camera=None, faces=()) for robot in swarm.robots)
     return Swarm(tuple(robots))
 
 
-def simulation_nodes(options: SimulationOptions, robots: Sequence[str], links: str) -> list[NodeSpec]:
-    """The nodes of a simulation of e-pucks, in the order in which they start.
+def _world(options: SimulationOptions, links: str, **own: ParameterValue) -> Parameters:
+    """Parameters of a world's node."""
+    shared: Parameters = {"swarm_file": options.swarm_file, "seed": options.seed, "rate": options.rate}
+    return {**shared, "link_folder": links, **own}
 
-    Args:
-        options: What the user chose.
-        robots: The names of the swarm's robots.
-        links: Folder where their serial ports appear; exists. An overhead camera's files are written there.
-    """
-    drivers, vision, estimator = "swarm_loc_drivers", "swarm_loc_vision", "swarm_loc_estimator"
-    swarm: Parameters = {"swarm_file": options.swarm_file}
-    time: Parameters = {"use_sim_time": True}
-    world: Parameters = {
-        **swarm,
-        "world": options.world,
-        "seed": options.seed,
-        "rate": options.rate,
-        "link_folder": links,
-        "answer_within": _ANSWER_WITHIN_S,
-    }
-    steering: Parameters = {**swarm, "speed": options.speed, "wait_for_poses": True, "aerial": options.aerial}
-    described: Parameters = dict(swarm)
+
+def _epuck_nodes(options: SimulationOptions, swarm: Swarm, links: str) -> list[NodeSpec]:
     file = options.parameter_file
-    cameras: list[NodeSpec] = []
+    described: Parameters = {"swarm_file": options.swarm_file}
+    world = _world(options, links, world=options.world, answer_within=_ANSWER_WITHIN_S)
+    steering: Parameters = {
+        **described,
+        "speed": options.speed,
+        "wait_for_poses": True,
+        "aerial": options.aerial,
+    }
+    estimator, cameras = described, []
     if options.aerial:
-        described, ground = _aerial_files(options, Path(links))
+        estimator, ground = _aerial_files(options, Path(links))
         world |= {**ground, "aerial_rate": _AERIAL_RATE_HZ}
-        seeing: Parameters = {**ground, **_AERIAL_CAMERA, **_reliable("aerial"), **time}
-        cameras = [NodeSpec(vision, "aerial_camera_node", "aerial_camera", "aerial", seeing, file)]
+        seeing: Parameters = {**ground, **_AERIAL_CAMERA, **_reliable("aerial"), **_TIME}
+        cameras = [NodeSpec(_VISION, "aerial_camera_node", "aerial_camera", "aerial", seeing, file)]
     nodes = [
-        NodeSpec(estimator, "estimator_node", "estimator", "", {**described, **time}, file),
-        NodeSpec(drivers, "epuck_world_node", "epuck_world", "", world, file),
-        NodeSpec(drivers, "eight_steering_node", "eight_steering", "", {**steering, **time}, file),
+        NodeSpec(_ESTIMATOR, "estimator_node", "estimator", "", {**estimator, **_TIME}, file),
+        NodeSpec(_DRIVERS, "epuck_world_node", "epuck_world", "", world, file),
+        NodeSpec(_DRIVERS, "eight_steering_node", "eight_steering", "", {**steering, **_TIME}, file),
         *cameras,
     ]
-    for robot in robots:
-        address: Parameters = {"address": f"{links}/{robot}"}
-        nodes.append(NodeSpec(drivers, "epuck_driver_node", "epuck_driver", robot, {**address, **time}, file))
+    for robot in (one.name for one in swarm.robots):
+        driver: Parameters = {"address": f"{links}/{robot}", **_TIME}
+        nodes.append(NodeSpec(_DRIVERS, "epuck_driver_node", "epuck_driver", robot, driver, file))
         if not options.aerial:
-            camera: Parameters = {**swarm, "robot": robot, **_reliable(robot), **time}
-            nodes.append(NodeSpec(vision, "marker_detector_node", "marker_detector", robot, camera, file))
+            camera: Parameters = {**described, "robot": robot, **_reliable(robot), **_TIME}
+            nodes.append(NodeSpec(_VISION, "marker_detector_node", "marker_detector", robot, camera, file))
     return nodes
 
 
@@ -173,3 +195,75 @@ def _aerial_files(options: SimulationOptions, folder: Path) -> tuple[Parameters,
     save_swarm(seen_from_above(load_swarm(Path(options.swarm_file))), swarm_file)
     save_ground(eight_floor(), floor_file)
     return {"swarm_file": str(swarm_file)}, {"control_points_file": str(floor_file)}
+
+
+def _droplet_nodes(options: SimulationOptions, swarm: Swarm, links: str) -> list[NodeSpec]:
+    """Half of the Droplets wander; a tracker sees the first and the last one."""
+    described: Parameters = {"swarm_file": options.swarm_file}
+    tracked = list(dict.fromkeys((swarm.robots[0].name, swarm.robots[-1].name)))
+    world = _world(options, links, world=options.world, fixed=tracked)
+    steering: Parameters = {**described, "seed": options.seed, **_TIME}
+    fleet: Parameters = {**described, "link_folder": links, **_TIME}
+    file = options.parameter_file
+    return [
+        NodeSpec(_ESTIMATOR, "estimator_node", "estimator", "", {**described, **_TIME}, file),
+        NodeSpec(_DRIVERS, "droplet_world_node", "droplet_world", "", world, file),
+        NodeSpec(_DRIVERS, "droplet_steering_node", "droplet_steering", "", steering, file),
+        NodeSpec(_DRIVERS, "droplet_fleet_node", "droplet_fleet", "", fleet, file),
+    ]
+
+
+def _pushbot_nodes(options: SimulationOptions, swarm: Swarm, links: str) -> list[NodeSpec]:
+    """Writes the laser calibrations of the trackers, too."""
+    robots = [robot.name for robot in swarm.robots]
+    calibrate_lasers(robots, options.seed, Path(links))
+    described: Parameters = {"swarm_file": options.swarm_file}
+    leds = [f"{robot}={led_hz(index)}" for index, robot in enumerate(robots)] if len(robots) > 1 else []
+    mapper: Parameters = {**described, **({"led_frequencies": leds} if leds else {}), **_TIME}
+    world = _world(options, links, plan=options.plan)
+    exploration: Parameters = {**described, "wait_for_poses": True, **_TIME}
+    file = options.parameter_file
+    nodes = [
+        NodeSpec(_ESTIMATOR, "estimator_node", "estimator", "", {**described, **_TIME}, file),
+        NodeSpec(_ESTIMATOR, "mapper_node", "mapper", "", mapper, file),
+        NodeSpec(_DRIVERS, "pushbot_world_node", "pushbot_world", "", world, file),
+        NodeSpec(_DRIVERS, "exploration_node", "exploration", "", exploration, file),
+    ]
+    for index, robot in enumerate(robots):
+        laser: Parameters = {"laser_frequency": laser_hz(index), **_TIME}
+        driver: Parameters = {"address": f"{links}/{robot}", "led_frequency": led_hz(index), **laser}
+        others = [str(led_hz(other)) for other in range(len(robots)) if other != index]
+        tracker: Parameters = {"calibration": f"{links}/{robot}.yaml", **laser}
+        tracker |= {"light_frequencies": others} if others else {}
+        nodes += [
+            NodeSpec(_DRIVERS, "pushbot_driver_node", "pushbot_driver", robot, driver, file),
+            NodeSpec(_VISION, "event_tracker_node", "event_tracker", robot, tracker, file),
+        ]
+    return nodes
+
+
+def _check_pushbots(swarm: Swarm) -> None:
+    """Make sure that all robots have a start, and lights of their own.
+
+    Raises:
+        WorldError: A start is missing, or there are too many robots.
+    """
+    for robot in swarm.robots:
+        start_of(robot)
+    if len(swarm.robots) > MAX_ROBOTS:
+        raise WorldError(
+            f"{len(swarm.robots)} robots are more than the {MAX_ROBOTS} whose lights trackers can tell"
+            " from each other."
+        )
+
+
+EPUCK = RobotType("epuck", check_swarm, _epuck_nodes, ("w2", "w0", "w2fast"), has_markers=True)
+ROBOT_TYPES = {
+    one.name: one
+    for one in (
+        EPUCK,
+        RobotType("droplet", check_droplets, _droplet_nodes, ("d1", "d0")),
+        RobotType("pushbot", _check_pushbots, _pushbot_nodes),
+    )
+}
+"""The kinds of robots that can be simulated, by the type in a swarm description."""

@@ -9,7 +9,7 @@ import pytest
 from geometry_msgs.msg import PoseStamped
 
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
-from swarm_loc_drivers.sim.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
 from swarm_loc_estimator.offline.live.graph import LiveGraph, Poses
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
@@ -34,7 +34,7 @@ def test_robots_are_located_by_a_camera_that_cannot_tell_them_apart(tmp_path: Pa
         parameter_file=str(tmp_path / "parameters.yaml"),
     )
     names = [robot.name for robot in swarm.robots]
-    nodes = simulation_nodes(options, names, str(tmp_path / "links"))
+    nodes = graph_of(options, swarm, str(tmp_path / "links"))
     truth: dict[str, dict[int, tuple[float, float]]] = {name: {} for name in names}
 
     with LiveGraph(nodes, tmp_path / "nodes.log") as graph:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_drivers.sim.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
 
 pytest.importorskip("launch_ros.actions")
 from launch_world import end_of, nodes_of
@@ -40,7 +40,8 @@ def test_launch_arguments_become_the_simulations_nodes(
     chosen = {"world": "w0", "seed": "3", "speed": "0.06", "rate": "1.0", "params_file": ""}
     started = nodes_of(LAUNCH_FILE, swarm_file=SWARM_FILE, **chosen)
     (folder,) = links.iterdir()
-    specs = simulation_nodes(SimulationOptions(SWARM_FILE), ["epuck1"], str(folder))
+    options = SimulationOptions(SWARM_FILE)
+    specs = graph_of(options, simulated_swarm(options), str(folder))
     assert started == [spec.executable for spec in specs]
     (clean_up,) = at_exit
     clean_up()

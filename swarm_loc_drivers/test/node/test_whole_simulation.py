@@ -9,7 +9,7 @@ import pytest
 from geometry_msgs.msg import PoseStamped
 
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
-from swarm_loc_drivers.sim.simulation import SimulationOptions, simulation_nodes
+from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
 from swarm_loc_estimator.offline.live.graph import LiveGraph, Poses
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
@@ -32,7 +32,7 @@ def test_robots_are_located_by_what_their_cameras_see(tmp_path: Path) -> None:
         world="w0",
         parameter_file=str(tmp_path / "parameters.yaml"),
     )
-    nodes = simulation_nodes(options, [robot.name for robot in swarm.robots], str(tmp_path / "links"))
+    nodes = graph_of(options, swarm, str(tmp_path / "links"))
     truth: dict[int, np.ndarray[tuple[int], np.dtype[np.float64]]] = {}
     seen: list[MarkerDetectionArray] = []
 

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from swarm_loc_drivers.cli import simulate
 from swarm_loc_drivers.epuck.pending_images import Unanswered
-from swarm_loc_drivers.sim.simulation import SimulationOptions, simulation_nodes
-from swarm_loc_estimator.common.parameters import parameter_specs
+from swarm_loc_drivers.sim.droplet.world import DROPLET_WORLDS
+from swarm_loc_drivers.sim.simulation import ROBOT_TYPES, SimulationOptions, graph_of, simulated_swarm
+from swarm_loc_drivers.sim.worlds import WORLDS
+from swarm_loc_estimator.common.parameters import ParameterError, parameter_specs
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_vision.aerial.aerial_parameters import AerialParameters
 
 BAGS = Path(__file__).parents[3] / "bags"
 SECOND = 1_000_000_000
+TWO = Swarm((Robot("a"), Robot("b")))
 
 
 def test_every_robot_has_a_driver_on_its_link_and_a_detector_for_its_camera() -> None:
     options = SimulationOptions("swarm.yaml", world="w0", seed=3, rate=0.5, parameter_file="all.yaml")
-    nodes = {node.full_name: node for node in simulation_nodes(options, ["a", "b"], "/links")}
+    nodes = {node.full_name: node for node in graph_of(options, TWO, "/links")}
 
     assert list(nodes) == [
         *("estimator", "epuck_world", "eight_steering"),
@@ -38,7 +44,7 @@ def test_every_robot_has_a_driver_on_its_link_and_a_detector_for_its_camera() ->
 def test_from_above_an_overhead_camera_is_all_that_locates(tmp_path: Path) -> None:
     swarm_file = str(BAGS / "eight_five_robots" / "swarm.yaml")
     options = SimulationOptions(swarm_file, world="w0", aerial=True, parameter_file="all.yaml")
-    nodes = {node.full_name: node for node in simulation_nodes(options, ["a", "b"], str(tmp_path))}
+    nodes = {node.full_name: node for node in graph_of(options, TWO, str(tmp_path))}
 
     assert list(nodes) == [
         *("estimator", "epuck_world", "eight_steering", "aerial/aerial_camera"),
@@ -55,6 +61,29 @@ def test_from_above_an_overhead_camera_is_all_that_locates(tmp_path: Path) -> No
     known = {spec.name for spec in parameter_specs(AerialParameters)}
     assert {name for name in camera.parameters if not name.startswith("qos")} - {"use_sim_time"} <= known
     assert camera.parameter_file == "all.yaml"
+
+
+def test_droplets_get_a_table_one_fleet_of_drivers_and_a_tracker(tmp_path: Path) -> None:
+    robots = load_swarm(BAGS / "droplets_twenty" / "swarm.yaml").robots
+    swarm_file = tmp_path / "swarm.yaml"
+    save_swarm(Swarm(tuple(replace(robot, start=(0.0, 0.0, 0.0)) for robot in robots)), swarm_file)
+    options = SimulationOptions(str(swarm_file), seed=5)
+    nodes = {node.full_name: node for node in graph_of(options, simulated_swarm(options), "/links")}
+
+    assert list(nodes) == ["estimator", "droplet_world", "droplet_steering", "droplet_fleet"]
+    world = nodes["droplet_world"].parameters
+    assert (world["world"], world["seed"], world["fixed"]) == ("d1", 5, ["droplet1", "droplet20"])
+    assert nodes["droplet_fleet"].parameters["link_folder"] == world["link_folder"] == "/links"
+    for name, node in nodes.items():
+        assert node.parameters.get("use_sim_time", False) is (name != "droplet_world")
+
+
+def test_every_error_model_belongs_to_a_robot_type_and_no_other_is_accepted() -> None:
+    worlds = {world for kind in ROBOT_TYPES.values() for world in kind.worlds}
+    assert worlds == {*WORLDS, *DROPLET_WORLDS}
+    swarm_file = str(BAGS / "eight_one_robot_slow" / "swarm.yaml")
+    with pytest.raises(ParameterError, match="argument world = 'd1' must be one of w2, w0, w2fast"):
+        simulated_swarm(SimulationOptions(swarm_file, world="d1"))
 
 
 def test_the_command_line_becomes_options() -> None:

@@ -62,6 +62,16 @@ def make_droplet_world(parameters: DropletWorldParameters) -> tuple[Swarm, Dropl
         raise ParameterError(f"parameter swarm_file = '{parameters.swarm_file}': {error}") from error
 
 
+def check_droplets(swarm: Swarm) -> None:
+    """Make sure that every robot has a start and an infrared board.
+
+    Raises:
+        WorldError: One has none.
+    """
+    for robot in swarm.robots:
+        _needed(robot)
+
+
 def _needed(robot: Robot) -> tuple[RobotIr, Pose2]:
     """The board and the start of a robot.
 
