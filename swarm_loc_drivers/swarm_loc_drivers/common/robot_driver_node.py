@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from swarm_loc_drivers.common.robot_driver import RobotDriver
-from swarm_loc_estimator.common.ros.declare import Parameters
-from swarm_loc_estimator.common.ros.running import ConfiguredNode, Stop
+from swarm_loc_estimator.common.node import ConfiguredNode, Parameters, Stop
 
 
 class RobotDriverNode(ConfiguredNode[Parameters]):

@@ -26,7 +26,7 @@ from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
 from swarm_loc_drivers.droplet.driver import OWN, DropletDriver, DropletListeners
 from swarm_loc_drivers.droplet.droplet_parameters import DropletParameters, droplet_settings
 from swarm_loc_drivers.droplet.exchange import Brightness
-from swarm_loc_estimator.common.ros.running import run_node
+from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import BrightnessMatrix
 
 _COMMAND_QOS = QoSProfile(depth=1)
@@ -52,10 +52,10 @@ class DropletDriverNode(RobotDriverNode[DropletParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("droplet_driver", DropletParameters, **node_arguments)
-        settings = droplet_settings(self.chosen)
+        settings = droplet_settings(self.params)
         robot = self.get_namespace().strip("/")
-        self._base_frame = f"{self._prefix}{self.chosen.base_frame}"
-        self._transforms = transform_publisher(self) if self.chosen.publish_tf else None
+        self._base_frame = f"{self._prefix}{self.params.base_frame}"
+        self._transforms = transform_publisher(self) if self.params.publish_tf else None
         self._brightness = self.create_publisher(BrightnessMatrix, "brightness", _BRIGHTNESS_QOS)
         self._odometry = {OWN: self._odometry_output("odom", self._prefix)}
         for name in settings.relayed:
@@ -71,21 +71,21 @@ class DropletDriverNode(RobotDriverNode[DropletParameters]):
         self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
 
     def _odometry_output(self, topic: str, prefix: str) -> OdometryOutput:
-        odom_frame, base_frame = f"{prefix}{self.chosen.odom_frame}", f"{prefix}{self.chosen.base_frame}"
+        odom_frame, base_frame = f"{prefix}{self.params.odom_frame}", f"{prefix}{self.params.base_frame}"
         return OdometryOutput(self, topic, odom_frame, base_frame, self._transforms)
 
     def _on_cmd_vel(self, name: str, message: Twist) -> None:
         self._driver.set_velocity(name, (message.linear.x, message.linear.y, message.angular.z))
 
     def _on_measure(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self.chosen.turns or not self.chosen.partners:
+        if self.params.turns or not self.params.partners:
             response.message = "Nobody is asked: there are no partners, or Droplets take turns."
         elif self._driver.trouble:
             response.message = f"Nobody is asked: {self._driver.trouble}"
         else:
             self._driver.request_exchanges()
             response.success = True
-            response.message = f"{len(self.chosen.partners)} partners are asked to emit."
+            response.message = f"{len(self.params.partners)} partners are asked to emit."
         return response
 
     def _publish_odometry(self, name: str, state: OdometryState) -> None:
@@ -98,7 +98,7 @@ class DropletDriverNode(RobotDriverNode[DropletParameters]):
             transmitter=one.transmitter,
             n=len(one.readings),
             power=int(one.power),
-            saturation=self.chosen.saturation,
+            saturation=self.params.saturation,
         )
         message.readings = array("i", one.readings.ravel().tolist())
         self._brightness.publish(message)

@@ -17,8 +17,8 @@ from rclpy.parameter import Parameter
 
 from swarm_loc_drivers.droplet.droplet_driver_node import DropletDriverNode
 from swarm_loc_drivers.droplet.droplet_parameters import DropletFleetParameters
+from swarm_loc_estimator.common.node import ConfiguredNode, Stop, run_node, spin
 from swarm_loc_estimator.common.parameters import ParameterError
-from swarm_loc_estimator.common.ros.running import ConfiguredNode, Stop, run_node, spin
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 
@@ -27,7 +27,7 @@ class DropletFleetNode(ConfiguredNode[DropletFleetParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("droplet_fleet", DropletFleetParameters, **node_arguments)
-        parameters = self.chosen
+        parameters = self.params
         robots = load_swarm(Path(parameters.swarm_file)).robots
         names = [robot.name for robot in robots if robot.ir is not None]
         part, parts = parameters.part, parameters.parts

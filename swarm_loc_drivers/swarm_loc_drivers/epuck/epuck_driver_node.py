@@ -26,7 +26,7 @@ from swarm_loc_drivers.epuck import epuck_messages
 from swarm_loc_drivers.epuck.driver import EpuckDriver, Listeners
 from swarm_loc_drivers.epuck.epuck_parameters import EpuckParameters, camera_calibration, epuck_settings
 from swarm_loc_drivers.epuck.session import CameraImage
-from swarm_loc_estimator.common.ros.running import run_node
+from swarm_loc_estimator.common.node import run_node
 
 _COMMAND_QOS = QoSProfile(depth=1)
 _TF_STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -49,7 +49,7 @@ class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("epuck_driver", EpuckParameters, **node_arguments)
-        parameters = self.chosen
+        parameters = self.params
         settings = epuck_settings(parameters)
         self._base_frame = f"{self._prefix}{parameters.base_frame}"
         self._camera_frame = f"{self._prefix}camera_optical_frame"

@@ -28,7 +28,7 @@ from swarm_loc_drivers.pushbot.exploration_parameters import ExplorationParamete
 from swarm_loc_drivers.pushbot.stop_and_go import MapGoal, StopAndGo, StopAndGoSettings
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.planar import yaw_of
-from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node
+from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_msgs.msg import LaserDistance
 
@@ -53,7 +53,7 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("exploration", ExplorationParameters, **node_arguments)
-        chosen = self.chosen
+        chosen = self.params
         self._names = driven_robots(chosen, load_swarm(Path(chosen.swarm_file)))
         self._robots = [_Robot(chosen.settings) for _ in self._names]
         self._drops: Counter[str] = Counter()
@@ -90,7 +90,7 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
     def _can_begin(self, name: str) -> bool:
         """Whether all that make and use a robot's distances are there: nothing it sees is to get lost."""
         awaited = [f"{name}/laser", f"{name}/goal", f"{name}/fix"]
-        awaited += ["swarm/poses"] if self.chosen.wait_for_poses else []
+        awaited += ["swarm/poses"] if self.params.wait_for_poses else []
         heard = self.count_subscribers(f"{name}/laser") > 1 and self.count_subscribers(f"{name}/odom") > 1
         return heard and all(self.count_publishers(topic) for topic in awaited)
 

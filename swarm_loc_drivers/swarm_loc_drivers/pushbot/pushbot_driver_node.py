@@ -22,7 +22,7 @@ from swarm_loc_drivers.pushbot.event_output import event_message
 from swarm_loc_drivers.pushbot.event_packets import EventPacket
 from swarm_loc_drivers.pushbot.precompile import precompile
 from swarm_loc_drivers.pushbot.pushbot_parameters import PushbotParameters, pushbot_settings
-from swarm_loc_estimator.common.ros.running import run_node
+from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import EventPacket as EventPacketMessage
 
 EVENT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -48,7 +48,7 @@ class PushbotDriverNode(RobotDriverNode[PushbotParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("pushbot_driver", PushbotParameters, **node_arguments)
-        parameters = self.chosen
+        parameters = self.params
         settings = pushbot_settings(parameters)
         precompile()
         transforms = transform_publisher(self) if parameters.publish_tf else None

@@ -16,9 +16,8 @@ from swarm_loc_drivers.common.odometry_output import stamp_message
 from swarm_loc_drivers.sim.link_host import FirmwareHost
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.encoders import encode_pose_stamped
+from swarm_loc_estimator.common.node import ConfiguredNode, Parameters, Stop
 from swarm_loc_estimator.common.parameters import ParameterError
-from swarm_loc_estimator.common.ros.declare import Parameters
-from swarm_loc_estimator.common.ros.running import ConfiguredNode, Stop
 
 _CLOCK_QOS = QoSProfile(depth=10)
 _TRUTH_QOS = QoSProfile(depth=10)

@@ -97,13 +97,13 @@ def add_identities(reports: Sequence[Report], identities: Identities | None) -> 
 
 
 class Graph(Protocol):
-    """What the ROS graph knows of publishers, see `common/ros/topic_graph.py`."""
+    """What the ROS graph knows of publishers, see `ConfiguredNode`."""
 
-    def rivals(self, topic: str) -> list[str]:
-        """The nodes that publish a topic, if there is more than one."""
+    def duplicate_publishers(self, topic: str) -> list[str]:
+        """The nodes that publish a topic, if there are several."""
 
     def why_missing(self, topic: str, message_type: str) -> str:
-        """Why nothing comes on a topic, such as " (no publisher)"."""
+        """Why a topic has no messages, such as " (no publisher)"."""
 
 
 class Diagnostics:
@@ -117,13 +117,13 @@ class Diagnostics:
         sole: Further topics that should have one publisher.
 
     Attributes:
-        rivals: One sentence for each topic that has more publishers, at the newest reports.
+        duplicate_publishers: One sentence for each topic that has more publishers, at the newest reports.
     """
 
     def __init__(
         self, swarm: Swarm, ingest: Ingest, odom_frame: str, graph: Graph, sole: Sequence[str]
     ) -> None:
-        self.rivals: list[str] = []
+        self.duplicate_publishers: list[str] = []
         self._swarm = swarm
         self._ingest = ingest
         self._odom_frame = odom_frame
@@ -165,8 +165,8 @@ class Diagnostics:
         self._reported_ns = now_ns
         used, nis = _used_per_robot(recent, len(self._swarm.robots))
         of_one = [topic.name for _, topic in self._of_swarm if not topic.kind.stands_for]
-        common = self._rivals_on([*self._sole, *of_one])
-        self.rivals = common.copy()
+        common = self._duplicates_on([*self._sole, *of_one])
+        self.duplicate_publishers = common.copy()
         reports = []
         for index, robot in enumerate(self._swarm.robots):
             report = self._robot_report(index, robot, estimate, now_ns, elapsed_s)
@@ -188,9 +188,9 @@ class Diagnostics:
     def _why_missing(self, topic: InputTopic) -> str:
         return self._graph.why_missing(topic.name, topic.kind.message_type)
 
-    def _rivals_on(self, topics: Sequence[str]) -> list[str]:
+    def _duplicates_on(self, topics: Sequence[str]) -> list[str]:
         """One sentence for each of the topics that several nodes publish."""
-        found = {topic: self._graph.rivals(topic) for topic in topics}
+        found = {topic: self._graph.duplicate_publishers(topic) for topic in topics}
         some = {topic: names for topic, names in found.items() if names}
         return [f"{topic} has {len(names)} publishers: {listed(names)}" for topic, names in some.items()]
 
@@ -198,8 +198,8 @@ class Diagnostics:
         self, index: int, robot: Robot, estimate: Estimate, now_ns: int, elapsed_s: float
     ) -> Report:
         """State and inputs of one robot."""
-        troubles = self._rivals_on([topic.name for _, topic in self._inputs_of[index]])
-        self.rivals += troubles
+        troubles = self._duplicates_on([topic.name for _, topic in self._inputs_of[index]])
+        self.duplicate_publishers += troubles
         values: dict[str, str] = {}
         for handle, topic in self._inputs_of[index]:
             troubles += self._input_troubles(handle, topic, robot, now_ns)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
+from rosgraph_msgs.msg import Clock
+from tf2_msgs.msg import TFMessage
 
 from swarm_loc_estimator.sensors.topics import InputKind, InputTopic
 from swarm_loc_msgs.msg import (
@@ -44,6 +46,9 @@ _MESSAGE_CLASSES = {
 }
 _LOST = {ReliabilityPolicy.RELIABLE: "overload", ReliabilityPolicy.BEST_EFFORT: "lost"}
 """Why messages are missing between two others of a publisher."""
+_TF_STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_MAX_FRAME_LENGTH = 64
+"""Longer names of foreign frames are cut."""
 
 
 class EstimatorInputs:
@@ -120,3 +125,52 @@ class EstimatorInputs:
         self._node.get_logger().info(
             f"{self._topics[handle].name} is published best effort: what is lost on the way is not sent again"
         )
+
+
+def newest_time_ns(node: Node) -> int:
+    """Time of a node [ns]; in simulated time that of the newest /clock received, handled or not.
+
+    On a busy machine a node may take data that are newer than the /clock that its executor handled last; they
+    would seem to come from the future. A clock that jumped back is left to the executor.
+    """
+    now_ns = int(node.get_clock().now().nanoseconds)
+    source = node._time_source  # noqa: SLF001 - rclpy has no public access to it
+    subscription = source._clock_sub  # noqa: SLF001
+    taken = subscription.handle.take_message(Clock, False) if subscription is not None else None
+    if taken is None:
+        return now_ns
+    newest = taken[0].clock
+    if newest.sec * 1_000_000_000 + newest.nanosec < now_ns:
+        node.executor.create_task(source.clock_callback, taken[0])
+        return now_ns
+    source.clock_callback(taken[0])
+    return int(node.get_clock().now().nanoseconds)
+
+
+class StaticTransforms:
+    """Listens to `/tf_static` for transforms into the estimator's own frames, which tf2 would accept.
+
+    Args:
+        node: Has the subscription.
+        owned: The frames whose parent only this node may publish.
+    """
+
+    def __init__(self, node: Node, owned: Collection[str]) -> None:
+        self._parents: dict[str, str] = {}
+        self._owned = frozenset(owned)
+        # tf2 uses this absolute name, whatever the namespace
+        node.create_subscription(TFMessage, "/tf_static", self._on_transforms, _TF_STATIC)
+
+    @property
+    def foreign(self) -> list[str]:
+        """One sentence for each owned frame to which another node has given a parent."""
+        return [
+            f"/tf_static has a transform from '{parent}' to '{child}', which only the estimator may publish"
+            for child, parent in self._parents.items()
+        ]
+
+    def _on_transforms(self, message: TFMessage) -> None:
+        for transform in message.transforms:
+            child = transform.child_frame_id.lstrip("/")
+            if child in self._owned:
+                self._parents[child] = transform.header.frame_id.lstrip("/")[:_MAX_FRAME_LENGTH]

@@ -20,9 +20,6 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.clock import Clock, JumpThreshold
-from rclpy.clock_type import ClockType
-from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.time import Time
@@ -30,11 +27,7 @@ from std_srvs.srv import Trigger
 
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.ros.newest_time import newest_time_ns
-from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node
-from swarm_loc_estimator.common.ros.static_transforms import StaticTransforms
-from swarm_loc_estimator.common.ros.ticks import Ticks
-from swarm_loc_estimator.common.ros.topic_graph import TopicGraph
+from swarm_loc_estimator.common.node import BACKWARDS, ConfiguredNode, Ticks, run_node
 from swarm_loc_estimator.nodes.estimator_diagnostics import (
     Diagnostics,
     Report,
@@ -46,7 +39,7 @@ from swarm_loc_estimator.nodes.estimator_diagnostics import (
     overload_report,
     shedding_report,
 )
-from swarm_loc_estimator.nodes.estimator_inputs import EstimatorInputs
+from swarm_loc_estimator.nodes.estimator_inputs import EstimatorInputs, StaticTransforms, newest_time_ns
 from swarm_loc_estimator.nodes.estimator_outputs import EstimateOutputs
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
 from swarm_loc_estimator.nodes.load.fusion_pace import FusionPace
@@ -62,7 +55,6 @@ from swarm_loc_estimator.timeline.contradictions import Contradiction, Kind
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 
-_BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
 _DIAGNOSTICS_PERIOD_S = 1.0
 _THROTTLE_S = 30.0
 _ORDINARY_DROPS = frozenset(
@@ -102,21 +94,21 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
 
     def __init__(self, create_estimator: CreateEstimator = Estimator, **node_arguments: Any) -> None:
         super().__init__("estimator", EstimatorParameters, **node_arguments)
-        self._swarm = load_swarm(Path(self.chosen.swarm_file))
+        self._swarm = load_swarm(Path(self.params.swarm_file))
         if not is_precompiled(precompile):
             self.get_logger().info("compiling the estimator for this machine: about three minutes")
         precompile()
-        self._estimator = create_estimator(self._swarm, self.chosen.settings)
-        shared = self.chosen.shared_topics
-        self._ingest = Ingest(self._swarm, self.chosen.map_frame, live_topics(self._swarm, shared=shared))
+        self._estimator = create_estimator(self._swarm, self.params.settings)
+        shared = self.params.shared_topics
+        self._ingest = Ingest(self._swarm, self.params.map_frame, live_topics(self._swarm, shared=shared))
         self._estimate: Estimate | None = None
         self._jumps = 0
-        self._pace = FusionPace(self.chosen.fusion_load, self.chosen.settings.horizon_s)
-        self._shedding = Shedding(self.chosen.fusion_load, self.chosen.settings.horizon_s)
+        self._pace = FusionPace(self.params.fusion_load, self.params.settings.horizon_s)
+        self._shedding = Shedding(self.params.fusion_load, self.params.settings.horizon_s)
         self._thinning = self._create_thinning()
         self._cost = TickCost()
         self._diagnostics = self._create_diagnostics()
-        self._outputs = EstimateOutputs(self, self._swarm, self.chosen)
+        self._outputs = EstimateOutputs(self, self._swarm, self.params)
         self._diagnostics_publisher = self.create_publisher(
             DiagnosticArray, "/diagnostics", QoSProfile(depth=10)
         )
@@ -126,12 +118,12 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         self._known_drops: dict[str, int] = {}
         self._told_drops_s = -math.inf
         self._overload = 0
-        self._known_rivals: list[str] = []
+        self._known_duplicates: list[str] = []
         self._static_transforms = StaticTransforms(self, self._owned_frames())
         self._known_contradictions: set[tuple[str, Kind]] = set()
         self._inputs = EstimatorInputs(self, self._ingest.topics, self._estimator.drop)
         self.create_service(Trigger, "~/reset", self._on_reset)
-        frame = self.chosen.map_frame
+        frame = self.params.map_frame
         PoseCommands(self, self._swarm, self._estimator, frame, by_topics=not shared)
         self._start_timers()
 
@@ -148,25 +140,23 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
 
     def _create_diagnostics(self) -> Diagnostics:
         sole = ["swarm/poses", *(["/clock"] if self.get_clock().ros_time_is_active else [])]
-        return Diagnostics(self._swarm, self._ingest, self.chosen.odom_frame, TopicGraph(self), sole)
+        return Diagnostics(self._swarm, self._ingest, self.params.odom_frame, self, sole)
 
     def _owned_frames(self) -> list[str]:
         """The frames whose parent this node alone tells; none where it publishes no transforms."""
-        robots = self._swarm.robots if self.chosen.publish_tf else ()
-        return [f"{robot.name}/{self.chosen.odom_frame}" for robot in robots]
+        robots = self._swarm.robots if self.params.publish_tf else ()
+        return [f"{robot.name}/{self.params.odom_frame}" for robot in robots]
 
     def _start_timers(self) -> None:
-        self._ticks = Ticks(self, self.chosen.tick_period_s, self._on_tick)
+        self._ticks = Ticks(self, self.params.tick_period_s, self._on_tick)
         # what came before time goes back must not seem to come after
         self._jumps_back = self.get_clock().create_jump_callback(
-            _BACKWARDS, pre_callback=partial(self._receive, self._time_ns)
+            BACKWARDS, pre_callback=partial(self._receive, self._time_ns)
         )
-        # by a clock that runs also while simulated time stands still
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_DIAGNOSTICS_PERIOD_S, self._on_diagnostics, clock=steady)
+        self.create_steady_timer(_DIAGNOSTICS_PERIOD_S, self._on_diagnostics)
         self.get_logger().info(
             f"ready: {len(self._swarm.robots)} robots and {len(self._swarm.landmarks)} landmarks"
-            f" of '{self.chosen.swarm_file}'"
+            f" of '{self.params.swarm_file}'"
         )
         if note := self._estimator.note:
             self.get_logger().warning(note)
@@ -198,7 +188,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
             self._pace.begin(begin_s, now_ns)
             self._shedding.begin_fusion()
         begin_cpu_s, begin_fusing_s = time.thread_time(), time.perf_counter()
-        fuse, end_cpu_s = is_due or self._estimator.is_fusing, begin_cpu_s + self.chosen.tick_period_s
+        fuse, end_cpu_s = is_due or self._estimator.is_fusing, begin_cpu_s + self.params.tick_period_s
         estimate = self._estimator.tick(now_ns, fuse=fuse, go_on=lambda: time.thread_time() < end_cpu_s)
         if not fuse:
             return estimate, 0.0
@@ -234,7 +224,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         if not self.get_clock().now().nanoseconds:
             reports = [Report("estimator", NO_CLOCK, warning=True)]
         else:
-            period_s, settings = self.chosen.tick_period_s, self._estimator.settings
+            period_s, settings = self.params.tick_period_s, self._estimator.settings
             load = load_report(cost, elapsed_s, period_s, settings.fusion_period_s)
             if load.warning:
                 self.get_logger().warning(load.message, throttle_duration_sec=_THROTTLE_S)
@@ -244,7 +234,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
             load = merged([load, shedding], "load")
             reports = self._estimate_reports(load)
             self._warn_of_drops(now_s)
-            self._warn_of_rivals()
+            self._warn_of_duplicates()
         self._say_what_is_missing(now_s)
         self._publish_diagnostics(reports)
 
@@ -277,12 +267,12 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
             words = ", ".join(f"{count} {reason}" for reason, count in wrong.items())
             self.get_logger().warning(f"dropped so far: {words}")
 
-    def _warn_of_rivals(self) -> None:
+    def _warn_of_duplicates(self) -> None:
         """Tell of topics with too many publishers, and of foreign transforms, once whenever these change."""
-        rivals = [*self._diagnostics.rivals, *self._static_transforms.foreign]
-        if rivals != self._known_rivals:
-            self._known_rivals = rivals
-            for sentence in self._known_rivals:
+        duplicates = [*self._diagnostics.duplicate_publishers, *self._static_transforms.foreign]
+        if duplicates != self._known_duplicates:
+            self._known_duplicates = duplicates
+            for sentence in self._known_duplicates:
                 self.get_logger().warning(sentence)
 
     def _warn_of_contradictions(self, contradictions: list[Contradiction]) -> None:

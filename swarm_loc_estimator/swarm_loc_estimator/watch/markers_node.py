@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from visualization_msgs.msg import MarkerArray
@@ -25,7 +23,7 @@ from swarm_loc_estimator.common.messages.encoders import UNKNOWN_COVARIANCE, enc
 from swarm_loc_estimator.common.messages.estimates import EstimateMessage, SwarmPosesReader, decode_sightings
 from swarm_loc_estimator.common.messages.markers import MarkersEncoder
 from swarm_loc_estimator.common.messages.planar import PLANE, planar_covariance
-from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node
+from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.sightings import Sightings
 from swarm_loc_estimator.watch.markers_parameters import MarkersParameters
@@ -48,11 +46,11 @@ class MarkersNode(ConfiguredNode[MarkersParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("markers", MarkersParameters, **node_arguments)
-        self._swarm = load_swarm(Path(self.chosen.swarm_file))
+        self._swarm = load_swarm(Path(self.params.swarm_file))
         self._names = tuple(robot.name for robot in self._swarm.robots)
         self._reader = SwarmPosesReader()
         self._encoder: MarkersEncoder | None = None
-        self._period_ns = round(1e9 / self.chosen.rate)
+        self._period_ns = round(1e9 / self.params.rate)
         self._told_ns = 0
         self._newest_ns = 0
         self._seen: tuple[int, Sightings] | None = None
@@ -62,8 +60,8 @@ class MarkersNode(ConfiguredNode[MarkersParameters]):
             self.create_publisher(Odometry, f"{name}/odometry/filtered", _RELIABLE) for name in self._names
         ]
         self._heard: dict[str, Subscription] = {}
-        self.create_timer(_LOOK_S, self._look_around, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self.get_logger().info(f"ready: {len(self._names)} robots of '{self.chosen.swarm_file}'")
+        self.create_steady_timer(_LOOK_S, self._look_around)
+        self.get_logger().info(f"ready: {len(self._names)} robots of '{self.params.swarm_file}'")
 
     def _look_around(self) -> None:
         """Listen to what is needed for those who listen here."""

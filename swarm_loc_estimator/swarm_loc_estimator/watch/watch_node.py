@@ -19,8 +19,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import OccupancyGrid
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
@@ -29,8 +27,7 @@ from rclpy.subscription import Subscription
 from swarm_loc_estimator.common.messages.cdr import CdrError
 from swarm_loc_estimator.common.messages.estimates import SwarmPosesReader, decode_sightings
 from swarm_loc_estimator.common.messages.typestore import SWARM_POSES
-from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node
-from swarm_loc_estimator.common.ros.topic_graph import TopicGraph
+from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_estimator.mapping.grid_messages import decode_occupancy_grid
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.watch.about import about
@@ -63,11 +60,10 @@ class WatchNode(ConfiguredNode[WatchParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("watch", WatchParameters, **node_arguments)
-        path = Path(self.chosen.swarm_file)
+        path = Path(self.params.swarm_file)
         self._swarm = load_swarm(path)
         self._names = tuple(robot.name for robot in self._swarm.robots)
         self._reader = SwarmPosesReader()
-        self._graph = TopicGraph(self)
         self._newest_ns = 0
         self._places_s = -1.0
         self._heard_s = time.monotonic()
@@ -76,18 +72,17 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         self._sightings: Subscription | None = None
         self._truth, self._truth_places = self._places("truth", "ground_truth", keeps=False)
         self._goals, self._goal_places = self._places("goals", "goal", keeps=True)
-        self._commands = RobotCommands(self, self._names, self.chosen, time.monotonic_ns)
-        title = self.chosen.title or path.resolve().parent.name
-        told = about(self._swarm, title, teleop=self.chosen.teleop, commands=self.chosen.commands)
-        access = Access(self.chosen.address, self.chosen.token)
-        self.server = WatchServer(told, access, self.chosen.port, self.chosen.rate, self._commands.order)
+        self._commands = RobotCommands(self, self._names, self.params, time.monotonic_ns)
+        title = self.params.title or path.resolve().parent.name
+        told = about(self._swarm, title, teleop=self.params.teleop, commands=self.params.commands)
+        access = Access(self.params.address, self.params.token)
+        self.server = WatchServer(told, access, self.params.port, self.params.rate, self._commands.order)
         self._subscribe()
         self._diagnostics = WatchDiagnostics(self.get_name())
         self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", _OUTPUT_QOS)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_WORK_S, self._commands.work, clock=steady)
-        self.create_timer(_LOOK_S, self._look_around, clock=steady)
-        self.create_timer(_DIAGNOSTICS_S, self._publish_diagnostics, clock=steady)
+        self.create_steady_timer(_WORK_S, self._commands.work)
+        self.create_steady_timer(_LOOK_S, self._look_around)
+        self.create_steady_timer(_DIAGNOSTICS_S, self._publish_diagnostics)
         self.get_logger().info(f"watch the swarm at {self.server.url}")
 
     @property
@@ -176,7 +171,7 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         chosen = self.server.selected
         if not chosen:
             return
-        wanted = {f"{self.chosen.estimator}: {self._names[robot]}": robot for robot in chosen}
+        wanted = {f"{self.params.estimator}: {self._names[robot]}": robot for robot in chosen}
         for status in deserialize_message(data, DiagnosticArray).status:
             robot = wanted.get(status.name)
             if robot is not None:
@@ -199,7 +194,7 @@ class WatchNode(ConfiguredNode[WatchParameters]):
             self._sightings = None
         if time.monotonic() > self._heard_s + _PATIENCE_S:
             self._heard_s = time.monotonic()
-            why = self._graph.why_missing("swarm/poses", SWARM_POSES)
+            why = self.why_missing("swarm/poses", SWARM_POSES)
             missing = f"nothing received on swarm/poses{why}"
             self.get_logger().warning(f"waiting: {missing}", throttle_duration_sec=_THROTTLE_S)
             self.server.tell({"kind": "said", "text": f"Waiting: {missing}.", "ok": False})

@@ -9,7 +9,7 @@ from rclpy.node import Node
 from rclpy.time_source import TimeSource
 from rosgraph_msgs.msg import Clock
 
-from swarm_loc_estimator.common.ros.clock_guard import drop_negative_clocks
+from swarm_loc_estimator.common.node import drop_negative_clocks
 
 
 def test_a_clock_before_zero_ends_nothing(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 _FAILING = """
 from rclpy.node import Node
-from swarm_loc_estimator.common.ros import running
+from swarm_loc_estimator.common import node as running
 
 class Failing(Node):
     def run(self, stop):

@@ -7,7 +7,7 @@ from node_world import SECOND, STEP_NS, T0_NS, TRUE_POSES, Robots, Ros, odometry
 from rclpy.duration import Duration
 from rosgraph_msgs.msg import Clock
 
-from swarm_loc_estimator.common.ros.ticks import _EACH_CHANGE
+from swarm_loc_estimator.common.node import _EACH_CHANGE
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 
 BACKLOG = 20

@@ -25,7 +25,7 @@ class Graph:
     def __init__(self) -> None:
         self.publishers: dict[str, list[str]] = {}
 
-    def rivals(self, topic: str) -> list[str]:
+    def duplicate_publishers(self, topic: str) -> list[str]:
         """Those of the topic."""
         return self.publishers.get(topic, [])
 
@@ -105,10 +105,10 @@ def test_topics_with_too_many_publishers_are_named_where_they_belong() -> None:
     assert "publishers" not in a.message
     assert (b.warning, b.message) == (True, "b/odom has 2 publishers: /player, /player")
     assert whole.message.startswith("swarm/poses has 2 publishers: /one, /two; nothing received")
-    assert world.diagnostics.rivals == [whole.message.partition(";")[0], b.message]
+    assert world.diagnostics.duplicate_publishers == [whole.message.partition(";")[0], b.message]
     world.graph.publishers = {}
     _, b, _ = world.reports(0, tracked, recent(), {})
-    assert (b.warning, world.diagnostics.rivals) == (False, [])
+    assert (b.warning, world.diagnostics.duplicate_publishers) == (False, [])
 
 
 def test_rates_and_lateness_are_those_of_the_interval() -> None:

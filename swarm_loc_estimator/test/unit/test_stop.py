@@ -11,7 +11,7 @@ import time
 import pytest
 from processor_wait import waited_s
 
-running = pytest.importorskip("swarm_loc_estimator.common.ros.running", exc_type=ImportError)
+running = pytest.importorskip("swarm_loc_estimator.common.node", exc_type=ImportError)
 
 
 def test_only_the_first_signal_interrupts() -> None:
@@ -30,7 +30,7 @@ def test_only_the_first_signal_interrupts() -> None:
 
 _BUSY = """
 import signal
-from swarm_loc_estimator.common.ros.running import Stop
+from swarm_loc_estimator.common.node import Stop
 stop = Stop()
 stop.defer()
 stop.leave_at_once()
@@ -54,7 +54,7 @@ def test_a_process_that_is_busy_ends_within_two_seconds_of_a_signal() -> None:
 
 _COMPILING = """
 import signal
-from swarm_loc_estimator.common.ros import running
+from swarm_loc_estimator.common import node as running
 
 def create():
     try:

@@ -13,7 +13,7 @@ from typing import Any
 
 from rclpy.qos import QoSProfile
 
-from swarm_loc_estimator.common.ros.running import run_node
+from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import AnonymousDetectionArray
 from swarm_loc_vision.aerial.aerial_parameters import AerialParameters, aerial_camera
 from swarm_loc_vision.aerial.ground.control_points import PoseFit
@@ -25,10 +25,10 @@ class AerialCameraNode(CameraNode[AerialParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("aerial_camera", AerialParameters, **node_arguments)
-        self._camera = aerial_camera(self.chosen)
+        self._camera = aerial_camera(self.params)
         self._said = ""
         publisher = self.create_publisher(AnonymousDetectionArray, "detections", QoSProfile(depth=10))
-        self.watch(self._camera, self.chosen.image_transport, publisher)
+        self.watch(self._camera, self.params.image_transport, publisher)
         self.trouble()
 
     def detect(self, message: Any) -> bytes:

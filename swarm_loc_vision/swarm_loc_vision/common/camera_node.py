@@ -13,8 +13,7 @@ from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy, qos_profile_
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from swarm_loc_estimator.common.ros.declare import Parameters
-from swarm_loc_estimator.common.ros.running import ConfiguredNode
+from swarm_loc_estimator.common.node import ConfiguredNode, Parameters
 from swarm_loc_vision.common.calibrated_camera import CalibratedCamera
 from swarm_loc_vision.common.camera import CameraError
 from swarm_loc_vision.common.gray import ImageError

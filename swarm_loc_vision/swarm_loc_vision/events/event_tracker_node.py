@@ -24,7 +24,7 @@ from rclpy.time import Time
 from std_msgs.msg import Header
 
 from swarm_loc_estimator.common.messages.event_encoding import EventError, decode_events
-from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node
+from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_msgs.msg import EventPacket, LaserDistance, LightBearing, LightBearingArray
 from swarm_loc_vision.events.bearing import direction, direction_jacobian
 from swarm_loc_vision.events.event_tracker_parameters import (
@@ -53,11 +53,11 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("event_tracker", EventTrackerParameters, **node_arguments)
-        self._sources = light_sources(self.chosen)
-        self._calibration = laser_calibration(self.chosen)
+        self._sources = light_sources(self.params)
+        self._calibration = laser_calibration(self.params)
         self._has_laser = not self._sources[0].is_above
         robot = self.get_namespace().strip("/")
-        self._base_frame = f"{robot}/{self.chosen.base_frame}" if robot else self.chosen.base_frame
+        self._base_frame = f"{robot}/{self.params.base_frame}" if robot else self.params.base_frame
         self._size = (0, 0)
         self._tracker: WindowedTracker | None = None
         self._counts: Counter[str] = Counter()
@@ -87,7 +87,7 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
             self._drop(str(error))
             return
         if self._tracker is None or size != self._size:
-            self._size, self._tracker = size, make_tracker(self.chosen, self._sources, size)
+            self._size, self._tracker = size, make_tracker(self.params, self._sources, size)
         stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
         self._counts["events"] += len(events.x)
         for report in self._tracker.track(events.x, events.y, events.is_on, stamp_ns + events.time_ns):
@@ -138,7 +138,7 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
         return self._calibration.distance(seen.v, float(seen.covariance[1, 1]), seen.locking)
 
     def _light_message(self, seen: Sighting) -> LightBearing:
-        lens = self.chosen.lens
+        lens = self.params.lens
         u, v = seen.u - lens.centre_column, seen.v - lens.centre_row
         bearing, elevation = direction(u, v, lens.focal_px)
         jacobian = direction_jacobian(u, v, lens.focal_px)

@@ -25,9 +25,9 @@ from rclpy.clock_type import ClockType
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.qos import QoSProfile
 
+from swarm_loc_estimator.common.node import ConfiguredNode, Stop, run_node
 from swarm_loc_estimator.common.number_spec import number
 from swarm_loc_estimator.common.parameters import ParameterError, text
-from swarm_loc_estimator.common.ros.running import ConfiguredNode, Stop, run_node
 from swarm_loc_msgs.msg import LaserDistance
 from swarm_loc_vision.laser.calibration import LaserCalibration
 from swarm_loc_vision.laser.fit import CalibrationError, fit_hyperbola
@@ -63,7 +63,7 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("calibrate_laser", CalibrateLaserParameters, **node_arguments)
-        chosen = self.chosen
+        chosen = self.params
         if chosen.stop_distance >= 0.5 * chosen.start_distance:
             raise ParameterError(
                 f"parameter stop_distance = {chosen.stop_distance} must be less than half of"
@@ -81,8 +81,8 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
 
     def run(self, stop: Stop) -> int:
         """Drive to the wall, or read of such a drive, then fit and write; the exit status."""
-        if self.chosen.bag:
-            drive = recorded_drive(Path(self.chosen.bag), self.get_namespace().strip("/"), self._drive)
+        if self.params.bag:
+            drive = recorded_drive(Path(self.params.bag), self.get_namespace().strip("/"), self._drive)
             return self._fit(drive)
         executor = EventsExecutor()
         executor.add_node(self)
@@ -93,7 +93,7 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
                 break
             if self._drive.is_done or self._is_silent():
                 done_s = min(done_s, time.monotonic())
-            self._speed = self.chosen.speed if math.isinf(done_s) and self._hears_all() else 0.0
+            self._speed = self.params.speed if math.isinf(done_s) and self._hears_all() else 0.0
         self._command.publish(Twist())
         executor.shutdown()
         if self._error is not None:
@@ -110,7 +110,7 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
         return self._fit(self._drive)
 
     def _fit(self, drive: WallDrive) -> int:
-        chosen = self.chosen
+        chosen = self.params
         calibration = fit_hyperbola(drive.drive(chosen.start_sigma, chosen.camera_x))
         save_laser(Path(chosen.output), calibration)
         print(summary(calibration, drive.count, chosen.output), file=sys.stdout)

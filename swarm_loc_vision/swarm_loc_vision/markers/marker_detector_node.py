@@ -15,7 +15,7 @@ from typing import Any
 from rclpy.qos import QoSProfile
 
 from swarm_loc_estimator.common.jit import is_precompiled
-from swarm_loc_estimator.common.ros.running import run_node
+from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import MarkerDetectionArray
 from swarm_loc_vision.common.camera_node import CameraNode
 from swarm_loc_vision.common.transports import TRANSPORTS
@@ -32,7 +32,7 @@ class MarkerDetectorNode(CameraNode[DetectorParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("marker_detector", DetectorParameters, **node_arguments)
-        parameters = self.chosen
+        parameters = self.params
         create_detector = detector_maker(parameters)
         if not is_precompiled(precompile):
             self.get_logger().info("compiling the detector for this machine: about half a minute")

@@ -25,7 +25,7 @@ from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
 from swarm_loc_drivers.sim.droplet.world import STEP_NS, Fix, SimulatedDroplet, Tracker
 from swarm_loc_drivers.sim.world_node import Pace, WorldNode
 from swarm_loc_estimator.common.messages.planar import planar_covariance
-from swarm_loc_estimator.common.ros.running import run_node
+from swarm_loc_estimator.common.node import run_node
 
 _FIX_QOS = QoSProfile(depth=10)
 _CLOCK_STEPS = 2
@@ -37,7 +37,7 @@ class DropletWorldNode(WorldNode[DropletWorldParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("droplet_world", DropletWorldParameters, **node_arguments)
-        chosen = self.chosen
+        chosen = self.params
         swarm, self._world = make_droplet_world(chosen)
         names = [robot.name for robot in swarm.robots]
         folder = chosen.link_folder

@@ -29,7 +29,7 @@ from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware
 from swarm_loc_drivers.sim.epuck.world import OVERHEAD, STEP_NS, SimulatedEpuck
 from swarm_loc_drivers.sim.render.rigs import overhead_model
 from swarm_loc_drivers.sim.world_node import Pace, WorldNode
-from swarm_loc_estimator.common.ros.running import run_node
+from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import AnonymousDetectionArray, MarkerDetectionArray
 
 _AERIAL = "aerial"
@@ -44,7 +44,7 @@ class EpuckWorldNode(WorldNode[WorldParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("epuck_world", WorldParameters, **node_arguments)
-        chosen = self.chosen
+        chosen = self.params
         swarm, self._world = make_world(chosen)
         self._names = [robot.name for robot in swarm.robots]
         serve = partial(self._serve_serial if chosen.link_folder else self._serve_wifi, chosen)

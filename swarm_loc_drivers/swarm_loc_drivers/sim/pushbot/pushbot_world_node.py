@@ -21,7 +21,7 @@ from swarm_loc_drivers.sim.pushbot.pushbot_world_parameters import (
 )
 from swarm_loc_drivers.sim.pushbot.world import STEP_NS, SimulatedPushbot
 from swarm_loc_drivers.sim.world_node import Pace, WorldNode
-from swarm_loc_estimator.common.ros.running import run_node
+from swarm_loc_estimator.common.node import run_node
 
 
 class PushbotWorldNode(WorldNode[PushbotWorldParameters]):
@@ -29,7 +29,7 @@ class PushbotWorldNode(WorldNode[PushbotWorldParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("pushbot_world", PushbotWorldParameters, **node_arguments)
-        chosen = self.chosen
+        chosen = self.params
         swarm, self._world = make_pushbot_world(chosen)
         self._names = [robot.name for robot in swarm.robots]
         link = (
@@ -41,7 +41,7 @@ class PushbotWorldNode(WorldNode[PushbotWorldParameters]):
 
     def _serve(self, robot: int) -> str:
         """Put a robot on its link; the address for its driver."""
-        chosen = self.chosen
+        chosen = self.params
         firmware = PushbotFirmware(SimulatedPushbot(self._world, robot), GENERATIONS[chosen.firmware])
         self._world.firmwares[robot] = firmware
         if chosen.link_folder:

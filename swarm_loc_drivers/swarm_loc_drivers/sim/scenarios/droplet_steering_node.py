@@ -16,9 +16,9 @@ import numpy as np
 
 from swarm_loc_drivers.sim.scenarios.droplets import Wander
 from swarm_loc_drivers.sim.truth_steering import TruthSteering
+from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_estimator.common.number_spec import number
 from swarm_loc_estimator.common.parameters import ParameterError, text
-from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 
@@ -36,7 +36,7 @@ class DropletSteeringNode(ConfiguredNode[DropletSteeringParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("droplet_steering", DropletSteeringParameters, **node_arguments)
-        parameters = self.chosen
+        parameters = self.params
         robots = load_swarm(Path(parameters.swarm_file)).robots
         homes = [robot.start for robot in robots if robot.start is not None]
         if len(homes) < len(robots):

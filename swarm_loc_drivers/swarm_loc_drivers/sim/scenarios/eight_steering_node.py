@@ -17,9 +17,9 @@ from typing import Any
 
 from swarm_loc_drivers.sim.scenarios.eight import EightSteering
 from swarm_loc_drivers.sim.truth_steering import TruthSteering
+from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_estimator.common.number_spec import number
 from swarm_loc_estimator.common.parameters import flag, text
-from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 
@@ -43,7 +43,7 @@ class EightSteeringNode(ConfiguredNode[SteeringParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("eight_steering", SteeringParameters, **node_arguments)
-        parameters = self.chosen
+        parameters = self.params
         names = [robot.name for robot in load_swarm(Path(parameters.swarm_file)).robots]
         seen = ["aerial/detections"] if parameters.aerial else [f"{name}/detections" for name in names]
         located = ["swarm/poses", *seen]

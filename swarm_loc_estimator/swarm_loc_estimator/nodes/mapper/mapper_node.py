@@ -17,16 +17,12 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Odometry
-from rclpy.clock import Clock, JumpThreshold
-from rclpy.clock_type import ClockType
-from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from swarm_loc_estimator.common.jit import is_precompiled
-from swarm_loc_estimator.common.ros.running import ConfiguredNode, run_node
-from swarm_loc_estimator.common.ros.topic_graph import TopicGraph
+from swarm_loc_estimator.common.node import BACKWARDS, ConfiguredNode, run_node
 from swarm_loc_estimator.mapping.fix_covariance import FixCovariances
 from swarm_loc_estimator.mapping.grid.occupancy import CELL, OccupancyMap
 from swarm_loc_estimator.mapping.led_frequencies import led_frequencies
@@ -55,7 +51,6 @@ _MESSAGE_CLASSES = {
     MapperInput.LASER: LaserDistance,
     MapperInput.LIGHTS: LightBearingArray,
 }
-_BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
 _DIAGNOSTICS_PERIOD_S = 1.0
 _PATIENCE_S = 5.0
 _THROTTLE_S = 30.0
@@ -73,16 +68,15 @@ class MapperNode(ConfiguredNode[MapperParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("mapper", MapperParameters, **node_arguments)
-        swarm = load_swarm(Path(self.chosen.swarm_file))
-        names = chosen_robots(self.chosen.robots, list(swarm.index_of))
+        swarm = load_swarm(Path(self.params.swarm_file))
+        names = chosen_robots(self.params.robots, list(swarm.index_of))
         self._robots = [swarm.robots[swarm.index_of[name]] for name in names]
-        self._frequencies = led_frequencies(self.chosen.led_frequencies, names)
-        path = self.chosen.load_map
+        self._frequencies = led_frequencies(self.params.led_frequencies, names)
+        path = self.params.load_map
         self._background: OccupancyMap | None = load_map(Path(path), CELL) if path else None
         if not is_precompiled(precompile):
             self.get_logger().info("compiling the mapper for this machine: about half a minute")
         precompile()
-        self._graph = TopicGraph(self)
         self._known_drops: dict[str, int] = {}
         self._since_s, self._has_said_missing = time.monotonic(), False
         self._begin_anew()
@@ -94,15 +88,14 @@ class MapperNode(ConfiguredNode[MapperParameters]):
                 self.create_subscription(_MESSAGE_CLASSES[kind], topic, take, _INPUT_QOS, raw=True)
         self.create_service(Trigger, "~/save_map", self._on_save)
         self.create_service(Trigger, "~/reset", self._on_reset)
-        self._jumps = self.get_clock().create_jump_callback(_BACKWARDS, post_callback=self._on_jump)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(self.chosen.map_period_s, self._publish_map, clock=steady)
-        self.create_timer(_DIAGNOSTICS_PERIOD_S, self._on_diagnostics, clock=steady)
-        self.get_logger().info(f"ready: {len(self._robots)} robots of '{self.chosen.swarm_file}'")
+        self._jumps = self.get_clock().create_jump_callback(BACKWARDS, post_callback=self._on_jump)
+        self.create_steady_timer(self.params.map_period_s, self._publish_map)
+        self.create_steady_timer(_DIAGNOSTICS_PERIOD_S, self._on_diagnostics)
+        self.get_logger().info(f"ready: {len(self._robots)} robots of '{self.params.swarm_file}'")
 
     def _begin_anew(self) -> None:
         """An empty map, and robots that have not joined yet."""
-        self._mapper = CooperativeMapper(self.chosen.settings)
+        self._mapper = CooperativeMapper(self.params.settings)
         self._mapper.background = self._background
         self.feed = MapperFeed(self._robots, self._mapper, self._frequencies)
         self._told: dict[int, int] = {}
@@ -126,7 +119,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         if number is None or goal is None or self._told.get(robot) == goal.stamp_ns:
             return
         self._told[robot] = goal.stamp_ns
-        frame = self.chosen.map_frame
+        frame = self.params.map_frame
         covariance = self._covariances[robot].told(goal, self._mapper.covariance(number))
         self._fixes[robot].publish(fix_message(goal, covariance, frame))
         self._goals[robot].publish(goal_message(goal, frame))
@@ -137,7 +130,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         if occupancy is self._published:
             return
         self._published = occupancy
-        header = Header(frame_id=self.chosen.map_frame, stamp=self.get_clock().now().to_msg())
+        header = Header(frame_id=self.params.map_frame, stamp=self.get_clock().now().to_msg())
         self._map.publish(occupancy_message(occupancy, header))
         self._visitation.publish(visitation_message(occupancy, self._mapper.visits.on(occupancy), header))
 
@@ -157,7 +150,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         """Solve everything anew and write the map."""
         self._mapper.finish()
         try:
-            path, image = save_map(self._mapper.occupancy(), Path(self.chosen.save_map))
+            path, image = save_map(self._mapper.occupancy(), Path(self.params.save_map))
             response.success, response.message = True, f"The map is in '{path}' and '{image}'."
         except MapFileError as error:
             response.success, response.message = False, str(error)
@@ -192,7 +185,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
 
     def _why(self, topic: str) -> str:
         kind = next(one for one in MapperInput if topic.endswith(f"/{one.topic}"))
-        return f"{topic}{self._graph.why_missing(topic, kind.message_type)}"
+        return f"{topic}{self.why_missing(topic, kind.message_type)}"
 
 
 main = partial(run_node, "mapper_node", MapperNode)

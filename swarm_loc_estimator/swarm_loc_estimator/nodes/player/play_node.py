@@ -22,8 +22,8 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from swarm_loc_estimator.common.bags.reader import BagReader, BagTopic, RawMessage
+from swarm_loc_estimator.common.node import ConfiguredNode, Stop, run_node
 from swarm_loc_estimator.common.parameters import ParameterError
-from swarm_loc_estimator.common.ros.running import ConfiguredNode, Stop, run_node
 from swarm_loc_estimator.nodes.player.playback import STEP_S, PlayedSoFar, play
 from swarm_loc_estimator.nodes.player.player_parameters import PlayerParameters
 from swarm_loc_estimator.nodes.player.playing_qos import RELIABLE, playing_qos
@@ -47,18 +47,18 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("player", PlayerParameters, **node_arguments)
-        self._reader = BagReader(Path(self.chosen.bag))
+        self._reader = BagReader(Path(self.params.bag))
         first_ns, last_ns = self._reader.time_range_ns
-        self._begin_ns = first_ns + round(self.chosen.start_offset_s * 1e9)
+        self._begin_ns = first_ns + round(self.params.start_offset_s * 1e9)
         if self._begin_ns > last_ns:
             raise ParameterError(
-                f"parameter start_offset_s = {self.chosen.start_offset_s:g} must lie within the bag,"
+                f"parameter start_offset_s = {self.params.start_offset_s:g} must lie within the bag,"
                 f" which lasts {1e-9 * (last_ns - first_ns):g} s."
             )
         self._publisher_of: dict[str, Publisher] = {}
         # first of all: others learn of publishers in this order, and of thousands the last one after long
         self._clock_publisher = (
-            self.create_publisher(ClockMessage, "/clock", RELIABLE) if self.chosen.clock else None
+            self.create_publisher(ClockMessage, "/clock", RELIABLE) if self.params.clock else None
         )
         for topic in self._chosen_topics():
             self._add_publisher(topic)
@@ -73,7 +73,7 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
         while not stop.requested:
             played_before = self.so_far.messages
             self._play_once(stop)
-            if not self.chosen.loop or self.so_far.messages == played_before:
+            if not self.params.loop or self.so_far.messages == played_before:
                 break
         self._wait_for_acknowledgements(stop)
         if not stop.requested:
@@ -92,11 +92,11 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
     def _chosen_topics(self) -> list[BagTopic]:
         """The topics to play; the bag's own /clock is not among them."""
         topics = {topic.name: topic for topic in self._reader.topics if topic.name != _CLOCK}
-        wanted = [name.lstrip("/") for name in self.chosen.topics]
+        wanted = [name.lstrip("/") for name in self.params.topics]
         for name in wanted:
             if name not in topics:
                 raise ParameterError(
-                    f"parameter topics names '{name}', but '{self.chosen.bag}' has: {listed([*topics])}."
+                    f"parameter topics names '{name}', but '{self.params.bag}' has: {listed([*topics])}."
                 )
         return [topics[name] for name in wanted or topics]
 
@@ -113,7 +113,7 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
 
     def _play_once(self, stop: Stop) -> None:
         messages = takewhile(lambda _: not stop.requested, self._reader.messages(self._publisher_of))
-        play(messages, self._begin_ns, self.chosen.rate, self, self.so_far)
+        play(messages, self._begin_ns, self.params.rate, self, self.so_far)
 
     def publish(self, message: RawMessage) -> None:
         """Send a message of the bag out."""
@@ -145,7 +145,7 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
 
     def _wait_for_subscribers(self, stop: Stop) -> None:
         """Return once topics are heard as the user asked for, and no more come; say what is waited for."""
-        wanted = self.chosen.wait_for_subscribers
+        wanted = self.params.wait_for_subscribers
         said_s = changed_s = time.monotonic()
         heard, clock_heard = 0, False
         while wanted and not stop.requested:

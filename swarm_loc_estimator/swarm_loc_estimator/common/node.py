@@ -1,0 +1,329 @@
+"""What all nodes share: start and stop, parameters, ticks and clocks, and who publishes a topic."""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Sequence
+from types import FrameType
+from typing import Any, Generic, TypeVar
+
+import rclpy
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.clock import Clock, JumpThreshold
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
+from rclpy.exceptions import ParameterException
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Task
+from rclpy.time_source import TimeSource
+from rosgraph_msgs.msg import Clock as ClockMessage
+
+from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import ParameterSpec, Value, from_values, parameter_specs
+
+Parameters = TypeVar("Parameters")
+
+BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
+"""A clock that jumps back, by however little."""
+_EACH_CHANGE = JumpThreshold(
+    min_forward=Duration(nanoseconds=1), min_backward=Duration(nanoseconds=-1), on_clock_change=False
+)
+_WAKE_S = 0.2
+"""How long a signal may go unnoticed while nothing happens."""
+_LEAVE_S = 0.7
+"""The process ends this long after a signal, even if it is busy. Destroying thousands of publishers takes DDS
+20 s, since for each of them it announces all remaining ones."""
+_CLOCK_THROTTLE_S = 10.0
+_UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
+"""Name of a node that the middleware has not discovered yet, though its publisher."""
+
+
+class RosArgumentsError(UserError):
+    """The command line has ROS arguments that rcl cannot parse; the message is one sentence."""
+
+
+class Stop:
+    """Whether SIGINT or SIGTERM has been received.
+
+    rclpy's own handlers invalidate the ROS context at once, so a callback that is publishing would fail.
+    Here a signal is only recorded while a node runs; before that it raises KeyboardInterrupt.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._is_deferred = False
+        self._leaves_at_once = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def defer(self) -> None:
+        """From now on only record signals."""
+        self._is_deferred = True
+
+    def leave_at_once(self) -> None:
+        """From now on end the process soon after a signal, with status 0, whatever it is doing.
+
+        Only for a node with nothing to finish: no robot to stop, no file to close.
+        """
+        self._leaves_at_once = True
+
+    def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
+        if self._leaves_at_once and not self._is_deferred:
+            os._exit(0)  # an exception might be swallowed where a compiler or ROS has called back
+        if self._leaves_at_once and not self.requested:
+            timer = threading.Timer(_LEAVE_S, os._exit, (0,))
+            timer.daemon = True
+            timer.start()
+        self.requested = True
+        if not self._is_deferred:
+            self._is_deferred = True  # a launch sends the signal twice: to the group and to each process
+            raise KeyboardInterrupt
+
+
+class ConfiguredNode(Node, Generic[Parameters]):
+    """A node whose parameters are those of a dataclass.
+
+    Args:
+        name: Default name of the node.
+        parameters: The dataclass, see `declare_parameters`.
+        node_arguments: Further arguments of `rclpy.node.Node`.
+
+    Attributes:
+        params: Values of the parameters.
+
+    Raises:
+        UserError: A parameter, or a file that it names, cannot be used.
+    """
+
+    def __init__(self, name: str, parameters: type[Parameters], **node_arguments: Any) -> None:
+        super().__init__(name, **node_arguments)
+        self.params = declare_parameters(self, parameters)
+
+    def create_steady_timer(self, period_s: float, callback: Callable[[], None]) -> None:
+        """Call back once per period of a clock that runs also while simulated time stands still."""
+        self.create_timer(period_s, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def duplicate_publishers(self, topic: str) -> list[str]:
+        """Full names of the nodes that publish a topic, one per publisher, if there are several."""
+        if self.count_publishers(topic) < 2:  # asking for the names takes four times as long
+            return []
+        found = self.get_publishers_info_by_topic(topic)
+        names = sorted(f"{one.node_namespace.rstrip('/')}/{one.node_name}" for one in found)
+        known = not any(name.endswith(_UNKNOWN_NODE) for name in names)
+        return names if len(names) > 1 and known else []
+
+    def why_missing(self, topic: str, message_type: str) -> str:
+        """Why a topic has no messages, such as " (no publisher)"; "" if it has publishers of its type."""
+        types = {one.topic_type for one in self.get_publishers_info_by_topic(topic)}
+        if not types:
+            return " (no publisher)"
+        return "" if message_type in types else f" (published as {', '.join(sorted(types))})"
+
+    def run(self, stop: Stop) -> int:
+        """Spin until asked to stop; returns the exit status."""
+        return spin(self, stop)
+
+
+def run_node(name: str, create: Callable[[], ConfiguredNode[Any]], *, leaves_at_once: bool = False) -> int:
+    """Create a node, run it until SIGINT or SIGTERM, and destroy it.
+
+    Args:
+        name: Name of the executable, for errors.
+        create: Creates the node once ROS is initialized.
+        leaves_at_once: Whether the process ends soon after a signal whatever it is doing, see `Stop`.
+
+    Returns:
+        The exit status: that of the node's `run`, 0 when stopped before, 1 after a mistake of the user.
+    """
+    node: ConfiguredNode[Any] | None = None
+    stop = Stop()
+    if leaves_at_once:
+        stop.leave_at_once()
+    try:
+        _start_ros()
+        node = create()
+        stop.defer()
+        return node.run(stop)
+    except (UserError, ParameterException) as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        stop.defer()
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _start_ros() -> None:
+    """Initialize rclpy from the command line, without its signal handlers; see `Stop`."""
+    try:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        drop_negative_clocks()
+        end_at_task_errors()
+    except rclpy_implementation.UnknownROSArgsError as error:
+        raise RosArgumentsError(f"ROS does not know the arguments {error}.") from error
+    except rclpy_implementation.RCLError as error:
+        raise RosArgumentsError(str(error).splitlines()[0]) from error
+
+
+def spin(node: Node, stop: Stop, *companions: Node) -> int:
+    """Handle the events of a node, and of others in its process, until it is asked to stop; returns 0.
+
+    The default executors rebuild their wait set at every wake, which costs 18 us per subscription and
+    saturates a core at 50 robots. The EventsExecutor's own `spin()` never returns in Jazzy and delivers
+    nothing, and waiting for a future returns only when nothing is left to do, under overload never.
+    """
+    executor = EventsExecutor()
+    nodes = (node, *companions)
+    for one in nodes:
+        executor.add_node(one)
+    gc.freeze()  # what exists now stays: the collector need not scan it again and again
+    while not stop.requested:
+        executor.spin_once(timeout_sec=_WAKE_S)
+    for one in nodes:
+        executor.remove_node(one)
+    executor.shutdown()
+    return 0
+
+
+def declare_parameters(node: Node, cls: type[Parameters]) -> Parameters:
+    """Declare the parameters of a dataclass (see `common/parameters.py`), read-only, and return their values.
+
+    Raises:
+        ParameterError: A value has the wrong type or is out of range.
+    """
+    node.add_on_set_parameters_callback(_refuse_clock_change)
+    specs = parameter_specs(cls)
+    return from_values(cls, {spec.name: _declare(node, spec) for spec in specs})
+
+
+def _refuse_clock_change(parameters: Sequence[Parameter]) -> SetParametersResult:
+    """Refuse a change of use_sim_time: stamps of one clock mean nothing to the other."""
+    changed = any(parameter.name == "use_sim_time" for parameter in parameters)
+    reason = "use_sim_time is read at the start only: restart the node." if changed else ""
+    return SetParametersResult(successful=not changed, reason=reason)
+
+
+def _declare(node: Node, spec: ParameterSpec) -> Value:
+    """Declare one parameter and return its value.
+
+    rclpy would refuse a value with a traceback that lacks the unit. So the value is checked here, while the
+    parameter still has a dynamic type; then it gets its descriptor.
+    """
+    given = node.declare_parameter(spec.name, spec.default, ParameterDescriptor(dynamic_typing=True))
+    value = spec.checked(given.value)
+    node.set_parameters([Parameter(spec.name, _TYPES[type(spec.default)], value)])
+    node.set_descriptor(spec.name, _descriptor(spec))
+    return value
+
+
+_TYPES = {
+    bool: Parameter.Type.BOOL,
+    int: Parameter.Type.INTEGER,
+    float: Parameter.Type.DOUBLE,
+    str: Parameter.Type.STRING,
+    tuple: Parameter.Type.STRING_ARRAY,
+}
+
+
+def _descriptor(spec: ParameterSpec) -> ParameterDescriptor:
+    """What `ros2 param describe` prints."""
+    kind = _TYPES[type(spec.default)].value
+    descriptor = ParameterDescriptor(type=kind, description=spec.doc, read_only=True)
+    descriptor.additional_constraints = spec.range_text
+    number = spec.number
+    if number is None:
+        return descriptor
+    if isinstance(spec.default, int):
+        descriptor.integer_range = [IntegerRange(from_value=int(number.low), to_value=int(number.high))]
+    else:
+        descriptor.floating_point_range = [FloatingPointRange(from_value=number.low, to_value=number.high)]
+    return descriptor
+
+
+class Ticks:
+    """Calls back once per period of a node's clock; missed periods are skipped, never queued.
+
+    In simulated time, ticks are at the multiples of the period. rclpy's timers fail there on a busy machine:
+    for each /clock that finds a timer due, the EventsExecutor queues the timer without bound, each entry
+    advances the timer by a period, and each reset that brings it back queues two more.
+
+    Args:
+        node: Has the clock; its executor calls back.
+        period_s: Period [s].
+        on_tick: The callback.
+    """
+
+    def __init__(self, node: Node, period_s: float, on_tick: Callable[[], None]) -> None:
+        self._node = node
+        self._on_tick = on_tick
+        self._period_ns = round(period_s * 1e9)
+        self._ticked = 0
+        self._is_due = False
+        if node.get_clock().ros_time_is_active:
+            self._jumps = node.get_clock().create_jump_callback(_EACH_CHANGE, post_callback=self._on_time)
+        else:  # a timer by a clock that nobody sets
+            node.create_timer(period_s, on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    @property
+    def _number(self) -> int:
+        """Number of the current period."""
+        return int(self._node.get_clock().now().nanoseconds) // self._period_ns
+
+    def _on_time(self, _jump: object) -> None:
+        """Let the executor tick once, soon; this callback itself runs inside the setting of the clock."""
+        if self._number != self._ticked and not self._is_due and self._node.executor is not None:
+            self._is_due = True
+            self._node.executor.create_task(self._tick)
+
+    def _tick(self) -> None:
+        self._is_due = False
+        if self._number == self._ticked:
+            return
+        self._on_tick()
+        self._ticked = self._number  # the callback may have read a newer time
+
+
+def drop_negative_clocks() -> None:
+    """Make all nodes of this process drop a /clock before zero, with a warning.
+
+    rclpy's own callback raises an error for such a message, which ends the node.
+    """
+    take = TimeSource.clock_callback
+
+    def checked(source: TimeSource, message: ClockMessage) -> None:
+        node = source._get_node()  # noqa: SLF001 - the node of a time source is not public
+        if message.clock.sec >= 0:
+            take(source, message)
+        elif node is not None:
+            node.get_logger().warning(
+                f"dropped a /clock of {message.clock.sec} s, before zero",
+                throttle_duration_sec=_CLOCK_THROTTLE_S,
+            )
+
+    TimeSource.clock_callback = checked
+
+
+def end_at_task_errors() -> None:
+    """Make an error in a task of an executor print its traceback and end the process with status 1.
+
+    Ticks in simulated time and QoS events are tasks. The EventsExecutor of Jazzy crashes while it reports
+    such an error, and the error is lost (ros2/rclpy#1641).
+    """
+    Task.set_exception = _end
+
+
+def _end(_task: Task, error: Exception) -> None:
+    traceback.print_exception(error)
+    raise SystemExit(1) from error

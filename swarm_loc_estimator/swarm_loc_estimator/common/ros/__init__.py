@@ -1,1 +1,0 @@
-"""What all nodes share: parameters, start and end."""
