@@ -11,7 +11,7 @@ IMPORT_ALL_WITHOUT_ROS = """
 import importlib, pathlib, re, sys
 
 WITH_ROS = re.compile(
-    r"\\.(nodes|ros|launching|live|watch)\\.|_node$|_(output|messages|diagnostics)$"
+    r"common\\.(node|health|launch)$|\\.(nodes|launching|live|watch)\\.|_node$|_(output|messages|diagnostics)$"
     r"|cli\\.(demo|graph|watch|simulate)$|truth_steering$"
 )
 
