@@ -25,7 +25,7 @@ from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, seen_f
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.launching.graph import NodeSpec
+from swarm_loc_estimator.common.launch import NodeSpec
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.offline.live.graph import LiveGraph, read_history
 from swarm_loc_estimator.swarm.swarm import Swarm

@@ -22,7 +22,7 @@ from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
 from swarm_loc_drivers.sim.run import SimulatedRun
 from swarm_loc_drivers.sim.scenarios.bags import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
-from swarm_loc_estimator.common.launching.graph import GraphOptions
+from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.offline.live.run import play_live
 from swarm_loc_estimator.offline.metrics import pool, summarise
 from swarm_loc_estimator.timeline.thinning import SHED_REASONS

@@ -21,7 +21,7 @@ import numpy as np
 
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.launching.graph import GraphOptions, graph_nodes
+from swarm_loc_estimator.common.launch import GraphOptions, graph_nodes
 from swarm_loc_estimator.offline.live.graph import (
     START_PATIENCE_S,
     LiveGraph,

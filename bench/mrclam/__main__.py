@@ -37,7 +37,7 @@ from bench.mrclam.jobs import (
 from bench.mrclam.report import report
 from bench.mrclam.sets import NoSetsError, find_sets
 from bench.shared.common import OUT
-from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.common.command_line import exit_with_message
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 DEFAULT_FOLDER = OUT.parent.parent / "shared" / "data" / "mrclam"

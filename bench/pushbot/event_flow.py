@@ -19,7 +19,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.qos import QoSProfile
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.launching.processes import executable_path
+from swarm_loc_estimator.common.launch import executable_path
 from swarm_loc_estimator.offline.live.graph import cpu_seconds
 
 RATE = 300_000

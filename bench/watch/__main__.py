@@ -31,8 +31,16 @@ from bench.watch.browser import WatchedPage, chromium, running_browser
 from bench.watch.publisher import homes
 from swarm_loc_drivers.sim.scenarios.bags import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
-from swarm_loc_estimator.common.launching.graph import GraphOptions, NodeSpec, ParameterValue, graph_nodes
-from swarm_loc_estimator.common.launching.processes import Child, node_command, start, stop
+from swarm_loc_estimator.common.launch import (
+    Child,
+    GraphOptions,
+    NodeSpec,
+    ParameterValue,
+    graph_nodes,
+    node_command,
+    start,
+    stop,
+)
 from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveGraph, cpu_seconds
 from swarm_loc_estimator.offline.live.run import ESTIMATOR, PLAYER
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm

@@ -21,7 +21,7 @@ from bench.watch.browser import WatchedPage, chromium, running_browser
 from bench.watch.mapping_run import mapping_run
 from swarm_loc_drivers.sim.scenarios.bags import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
-from swarm_loc_estimator.common.arguments import swarm_beside
+from swarm_loc_estimator.common.command_line import swarm_beside
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.report.report import recorded
 from swarm_loc_estimator.swarm.swarm_file import load_swarm

@@ -9,8 +9,7 @@ from launch_ros.actions import Node
 
 from swarm_loc_drivers.link_folder import link_folder
 from swarm_loc_drivers.sim.simulation import ROBOT_TYPES, SimulationOptions, graph_of, simulated_swarm
-from swarm_loc_estimator.common.launching.options import options_from
-from swarm_loc_estimator.common.launching.ros_launch import argument_texts, node_action
+from swarm_loc_estimator.common.launch import argument_texts, node_action, options_from
 
 
 def generate_launch_description() -> LaunchDescription:

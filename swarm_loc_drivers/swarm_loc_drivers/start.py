@@ -1,8 +1,8 @@
-"""The executables of this package; see the estimator's `start.py`."""
+"""The executables of this package, each imported only when it is started."""
 
 from __future__ import annotations
 
-from swarm_loc_estimator.start import program
+from swarm_loc_estimator.common.command_line import program
 
 droplet_driver_node = program("swarm_loc_drivers.droplet.droplet_driver_node")
 droplet_fleet_node = program("swarm_loc_drivers.droplet.droplet_fleet_node")

@@ -4,9 +4,14 @@ from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
-from swarm_loc_estimator.common.launching.graph import GraphOptions, graph_nodes
-from swarm_loc_estimator.common.launching.options import check_graph, options_from
-from swarm_loc_estimator.common.launching.ros_launch import argument_texts, node_action
+from swarm_loc_estimator.cli.graph import check_graph
+from swarm_loc_estimator.common.launch import (
+    GraphOptions,
+    argument_texts,
+    graph_nodes,
+    node_action,
+    options_from,
+)
 
 
 def generate_launch_description() -> LaunchDescription:

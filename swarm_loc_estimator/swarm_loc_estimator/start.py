@@ -1,34 +1,8 @@
-"""Start executables: signals end them without a traceback while they still import what they need."""
+"""The executables of this package, each imported only when it is started."""
 
 from __future__ import annotations
 
-import os
-import signal
-from collections.abc import Callable
-from importlib import import_module
-
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-
-def program(module: str) -> Callable[[], int]:
-    """The `main` of a module, which is imported when it is called.
-
-    Args:
-        module: Its whole name.
-
-    Returns:
-        A function that ends the process by 128 + n at signal n, as shells tell it, until `main` begins.
-    """
-
-    def start() -> int:
-        handlers = {number: signal.signal(number, lambda n, _: os._exit(128 + n)) for number in _SIGNALS}
-        main: Callable[[], int] = import_module(module).main
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        return main()
-
-    return start
-
+from swarm_loc_estimator.common.command_line import program
 
 calibrate = program("swarm_loc_estimator.cli.calibrate")
 calibrate_ir = program("swarm_loc_estimator.cli.calibrate_ir")

@@ -1,8 +1,8 @@
-"""The executables of this package; see the estimator's `start.py`."""
+"""The executables of this package, each imported only when it is started."""
 
 from __future__ import annotations
 
-from swarm_loc_estimator.start import program
+from swarm_loc_estimator.common.command_line import program
 
 calibrate_laser = program("swarm_loc_vision.laser.calibrate_laser_node")
 aerial_camera_node = program("swarm_loc_vision.aerial.aerial_camera_node")

@@ -25,7 +25,7 @@ from bench.droplet.real import firmware, graph
 from bench.droplet.real.recordings import Recorded, read_folder
 from bench.shared.common import OUT, Cell, ProgressLine, table, write_figures
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.common.command_line import exit_with_message
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.infrared.solution import IrEstimator
 from swarm_loc_estimator.infrared.solvers.closed_form import ClosedForm

@@ -18,7 +18,7 @@ from bench.droplet.real.recordings import Recorded
 from bench.integrity.scoring import Estimated, Score, scored
 from bench.shared.common import OUT, Cell, ProgressLine, new_plot, save_plot, table
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.common.launching.graph import GraphOptions
+from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.offline.calibration.infrared.board import GAIN_SIGMA, BoardCalibration, without_dead

@@ -39,8 +39,7 @@ from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.scenarios.pushbot_bag import PushbotBagSettings, write_pushbot_bag
 from swarm_loc_drivers.sim.scenarios.wandering import WanderingSettings, simulate_wandering
 from swarm_loc_drivers.sim.worlds import WORLDS
-from swarm_loc_estimator.common.arguments import number_in
-from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -112,9 +111,7 @@ def _pushbots(options: argparse.Namespace, comment: str) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="generate_bag", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("generate_bag", __doc__)
     swarms = parser.add_subparsers(dest="swarm", required=True, metavar="SWARM")
     eight = _swarm(swarms, "eight", "e-pucks driving the paper's eight among wall markers", 5, 9, 54.0)
     eight.set_defaults(write=_eight)

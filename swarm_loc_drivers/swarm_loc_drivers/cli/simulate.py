@@ -12,7 +12,6 @@ mapper and a node that drives them to its goals.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 
@@ -25,20 +24,16 @@ from swarm_loc_drivers.sim.simulation import (
     robot_type_of,
     simulated_swarm,
 )
-from swarm_loc_estimator.cli.graph import say
-from swarm_loc_estimator.common.arguments import number_in
-from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
 from swarm_loc_estimator.common.jit import is_precompiled
-from swarm_loc_estimator.common.launching.processes import run_graph
+from swarm_loc_estimator.common.launch import print_line, run_graph
 from swarm_loc_estimator.common.number_spec import number_specs
 from swarm_loc_vision.markers.precompile import precompile
 
 
 def parse(arguments: Sequence[str] | None) -> SimulationOptions:
     """Read the command line."""
-    parser = argparse.ArgumentParser(
-        prog="simulate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("simulate", __doc__)
     parser.add_argument("swarm_file", metavar="SWARM_FILE", help="the swarm description")
     defaults = SimulationOptions("")
     parser.add_argument(
@@ -78,10 +73,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     swarm = simulated_swarm(options)
     detects = robot_type_of(swarm).has_markers and not options.aerial
     if detects and not is_precompiled(precompile):  # once, not in every robot's detector at a time
-        say("compiling the marker detector for this machine: about half a minute")
+        print_line("compiling the marker detector for this machine: about half a minute")
         precompile()
     with link_folder() as links:
-        return run_graph(graph_of(options, swarm, links), say)
+        return run_graph(graph_of(options, swarm, links))
 
 
 if __name__ == "__main__":

@@ -19,8 +19,7 @@ from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
 from swarm_loc_drivers.sim.scenarios.eight import ARENA
 from swarm_loc_drivers.sim.scenarios.eight_images import eight_floor
 from swarm_loc_drivers.sim.worlds import WorldError, start_of
-from swarm_loc_estimator.common.launching.graph import NodeSpec, ParameterValue
-from swarm_loc_estimator.common.launching.options import check_parameter_file
+from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue, check_parameter_file
 from swarm_loc_estimator.common.number_spec import number
 from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_estimator.swarm.swarm import Swarm

@@ -13,9 +13,15 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from swarm_loc_estimator.common.arguments import add_bag, number_in, swarm_beside, yaml_to_write
-from swarm_loc_estimator.common.command_errors import exit_with_message
-from swarm_loc_estimator.common.progress import ProgressLine
+from swarm_loc_estimator.common.command_line import (
+    ProgressLine,
+    add_bag,
+    command_parser,
+    exit_with_message,
+    number_in,
+    swarm_beside,
+    yaml_to_write,
+)
 from swarm_loc_estimator.offline.calibration.fit import EVALUATIONS, Options, calibrate
 from swarm_loc_estimator.offline.calibration.plots import draw, text_of
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
@@ -47,9 +53,7 @@ def _unused(recording: Recording) -> list[str]:
 
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="calibrate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("calibrate", __doc__)
     add_bag(parser, " with <robot>/ground_truth")
     parser.add_argument("--out", type=yaml_to_write, required=True, help="swarm description to write")
     parser.add_argument("--plain", action="store_true", help="fit only noise, calibrate nothing")

@@ -16,9 +16,14 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from swarm_loc_estimator.common.arguments import add_bag, swarm_beside, yaml_to_write
-from swarm_loc_estimator.common.command_errors import exit_with_message
-from swarm_loc_estimator.common.progress import ProgressLine
+from swarm_loc_estimator.common.command_line import (
+    ProgressLine,
+    add_bag,
+    command_parser,
+    exit_with_message,
+    swarm_beside,
+    yaml_to_write,
+)
 from swarm_loc_estimator.offline.calibration.infrared.board_plots import board_text, draw_board
 from swarm_loc_estimator.offline.calibration.infrared.board_recording import calibrate_from, with_board
 from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_infrared
@@ -62,9 +67,7 @@ def _board(options: argparse.Namespace, swarm: Swarm) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="calibrate_ir", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("calibrate_ir", __doc__)
     add_bag(parser, " with <robot>/brightness")
     parser.add_argument(
         "--out",

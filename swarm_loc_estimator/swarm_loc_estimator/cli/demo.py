@@ -20,9 +20,14 @@ from pathlib import Path
 import numpy as np
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arguments import folder_to_write, number_in, swarm_beside
-from swarm_loc_estimator.common.command_errors import exit_with_message
-from swarm_loc_estimator.common.launching.graph import GraphOptions
+from swarm_loc_estimator.common.command_line import (
+    command_parser,
+    exit_with_message,
+    folder_to_write,
+    number_in,
+    swarm_beside,
+)
+from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.nodes.player.playback import clock_step_ns
 from swarm_loc_estimator.offline.live.graph import Recorder, read_poses
@@ -175,9 +180,7 @@ class _Progress:
 
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="demo", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("demo", __doc__)
     parser.add_argument("bag", nargs="?", type=Path, default=BAG, help=f"what to play (default: {BAG})")
     parser.add_argument(
         "--rate", type=number_in(0.1, 100.0), default=RATE, help=f"speed of the bag (default: {RATE:g})"

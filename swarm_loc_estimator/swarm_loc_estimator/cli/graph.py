@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
-from swarm_loc_estimator.common.arguments import number_in
-from swarm_loc_estimator.common.command_errors import exit_with_message
-from swarm_loc_estimator.common.launching.graph import GraphOptions, graph_nodes
-from swarm_loc_estimator.common.launching.options import check_graph
-from swarm_loc_estimator.common.launching.processes import run_graph
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.command_line import exit_with_message, number_in
+from swarm_loc_estimator.common.launch import GraphOptions, check_parameter_file, graph_nodes, run_graph
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 
 def parse(arguments: Sequence[str]) -> GraphOptions:
@@ -30,9 +30,17 @@ def parse(arguments: Sequence[str]) -> GraphOptions:
     return GraphOptions(**vars(parser.parse_args(arguments)))
 
 
-def say(line: str) -> None:
-    """Print a line in one piece, since the nodes print to the same terminal."""
-    print(f"[graph] {line}\n", end="", flush=True)
+def check_graph(options: GraphOptions) -> None:
+    """Make sure that the files of a graph can be used.
+
+    Raises:
+        UserError: A file cannot be used; the message says why.
+    """
+    load_swarm(Path(options.swarm_file))
+    if options.bag is not None:
+        with BagReader(Path(options.bag)):
+            pass
+    check_parameter_file(options.parameter_file)
 
 
 @exit_with_message
@@ -40,4 +48,4 @@ def main() -> int:
     """Run until a node ends or Ctrl-C."""
     options = parse(sys.argv[1:])
     check_graph(options)
-    return run_graph(graph_nodes(options), say)
+    return run_graph(graph_nodes(options))

@@ -15,9 +15,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from swarm_loc_estimator.common.arguments import number_in
-from swarm_loc_estimator.common.command_errors import exit_with_message
-from swarm_loc_estimator.common.progress import ProgressLine
+from swarm_loc_estimator.common.command_line import ProgressLine, command_parser, exit_with_message, number_in
 from swarm_loc_estimator.offline.datasets.droplets_bag import (
     METRES_PER_PIXEL,
     ImportSettings,
@@ -46,9 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="import_droplets", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("import_droplets", __doc__)
     parser.add_argument("recording", type=Path, help="text file, one exchange a line")
     parser.add_argument("bag", type=Path, help="bag folder to create")
     parser.add_argument(

@@ -14,8 +14,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from swarm_loc_estimator.common.command_errors import exit_with_message
-from swarm_loc_estimator.common.progress import ProgressLine
+from swarm_loc_estimator.common.command_line import ProgressLine, command_parser, exit_with_message
 from swarm_loc_estimator.offline.datasets.mrclam import read_dataset
 from swarm_loc_estimator.offline.datasets.mrclam_bag import Delay, convert
 
@@ -47,9 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="import_mrclam", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("import_mrclam", __doc__)
     parser.add_argument("folder", type=Path, help="folder with Robot*_Odometry.dat and the other files")
     parser.add_argument("bag", type=Path, help="bag folder to create")
     parser.add_argument(

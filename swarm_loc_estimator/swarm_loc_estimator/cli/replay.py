@@ -21,9 +21,12 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.common.arguments import (
+from swarm_loc_estimator.common.command_line import (
+    ProgressLine,
     add_bag,
     add_set,
+    command_parser,
+    exit_with_message,
     folder_to_write,
     mcap_to_write,
     number_in,
@@ -31,8 +34,6 @@ from swarm_loc_estimator.common.arguments import (
     swarm_beside,
     yaml_to_write,
 )
-from swarm_loc_estimator.common.command_errors import exit_with_message
-from swarm_loc_estimator.common.progress import ProgressLine
 from swarm_loc_estimator.offline.export import write_mcap
 from swarm_loc_estimator.offline.replay import TICK_S, replay
 from swarm_loc_estimator.offline.report.report import write_report
@@ -90,9 +91,7 @@ def write_poses(result: ReplayResult, path: Path) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="replay", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("replay", __doc__)
     add_bag(parser)
     parser.add_argument("--out", type=folder_to_write, default="out/replay", help="folder for the report")
     parser.add_argument(

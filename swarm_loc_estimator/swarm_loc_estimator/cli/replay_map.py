@@ -19,17 +19,18 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.common.arguments import (
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.command_line import (
+    ProgressLine,
     add_bag,
     add_set,
+    command_parser,
+    exit_with_message,
     folder_to_write,
     parameters_of,
     swarm_beside,
 )
-from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.command_errors import exit_with_message
 from swarm_loc_estimator.common.errors import UserError
-from swarm_loc_estimator.common.progress import ProgressLine
 from swarm_loc_estimator.mapping.led_frequencies import led_frequencies
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
@@ -104,9 +105,7 @@ def write_stops(mapper: CooperativeMapper, name_of: Mapping[int, str], path: Pat
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="replay_map", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("replay_map", __doc__)
     add_bag(parser)
     parser.add_argument("--out", type=folder_to_write, default="out/map", help="folder for map and picture")
     parser.add_argument("--walls", type=Path, help="floor plan to draw below the map: x0,y0,x1,y1 a line")

@@ -13,12 +13,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from swarm_loc_estimator.cli.graph import say
-from swarm_loc_estimator.common.arguments import number_in, swarm_beside
-from swarm_loc_estimator.common.command_errors import exit_with_message
-from swarm_loc_estimator.common.launching.graph import GraphOptions, NodeSpec, ParameterValue, graph_nodes
-from swarm_loc_estimator.common.launching.options import check_graph
-from swarm_loc_estimator.common.launching.processes import run_graph
+from swarm_loc_estimator.cli.graph import check_graph
+from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in, swarm_beside
+from swarm_loc_estimator.common.launch import GraphOptions, NodeSpec, ParameterValue, graph_nodes, run_graph
 from swarm_loc_estimator.watch.access import Access
 from swarm_loc_estimator.watch.watch_parameters import WatchParameters
 
@@ -31,8 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run until Ctrl-C, or until the bag has ended."""
     options = parser().parse_args(arguments)
     Access(options.address, options.token)  # a wrong address is told before anything starts
-    nodes = watch_nodes(options)
-    return run_graph(nodes, say)
+    return run_graph(watch_nodes(options))
 
 
 def watch_nodes(options: argparse.Namespace) -> list[NodeSpec]:
@@ -70,9 +66,7 @@ def watch_nodes(options: argparse.Namespace) -> list[NodeSpec]:
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="watch", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("watch", __doc__)
     parser.add_argument("source", metavar="SWARM_FILE|BAG", type=Path, help="swarm description, or a bag")
     parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
     parser.add_argument("--address", default=_DEFAULT.address, help="what to listen on (default: 127.0.0.1)")

@@ -30,7 +30,7 @@ from rosgraph_msgs.msg import Clock
 from typing_extensions import Self
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.launching.processes import executable_path
+from swarm_loc_estimator.common.launch import executable_path
 from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
 from swarm_loc_estimator.common.messages.encoders import encode_detections, encode_odometry
 from swarm_loc_estimator.common.node import end_at_task_errors

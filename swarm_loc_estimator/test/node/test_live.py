@@ -14,7 +14,7 @@ from rclpy.time import Time
 
 from swarm_loc_estimator.cli.demo import main
 from swarm_loc_estimator.common.bags.cut import copy_beginning
-from swarm_loc_estimator.common.launching.graph import GraphOptions, graph_nodes
+from swarm_loc_estimator.common.launch import GraphOptions, graph_nodes
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.offline.live.graph import LiveError, LiveGraph, Recorder
 from swarm_loc_estimator.offline.live.run import (

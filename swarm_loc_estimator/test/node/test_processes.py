@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.common.launching import processes
-from swarm_loc_estimator.common.launching.graph import NodeSpec
+from swarm_loc_estimator.common import launch as processes
+from swarm_loc_estimator.common.launch import NodeSpec
 
 PROGRAMS = {
     "forever": "trap 'echo asked; exit 0' INT\necho up\nwhile :; do sleep 0.2 & wait; done\n",
@@ -27,8 +27,8 @@ PROGRAMS = {
 
 RUN_GRAPH = """
 import sys
-from swarm_loc_estimator.common.launching.graph import NodeSpec
-from swarm_loc_estimator.common.launching.processes import run_graph
+from swarm_loc_estimator.common.launch import NodeSpec
+from swarm_loc_estimator.common.launch import run_graph
 nodes = [NodeSpec("fake", name, name, required=name != "short") for name in sys.argv[1:]]
 sys.exit(run_graph(nodes, lambda line: print(f"{line}\\n", end="", flush=True)))
 """

@@ -18,8 +18,7 @@ import pytest
 from machines import PORT, Machines, Radio
 
 from swarm_loc_estimator.common.bags.cut import copy_beginning
-from swarm_loc_estimator.common.launching.graph import NodeSpec, ParameterValue
-from swarm_loc_estimator.common.launching.processes import node_command
+from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue, node_command
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_five_robots"
 INPUTS = 10

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.common.launching.graph import GraphOptions, graph_nodes
+from swarm_loc_estimator.common.launch import GraphOptions, graph_nodes
 
 pytest.importorskip("launch_ros.actions")
 from launch_world import end_of, nodes_of

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from swarm_loc_estimator.cli import calibrate, calibrate_ir, replay
-from swarm_loc_estimator.common.arguments import folder_to_write
-from swarm_loc_estimator.common.command_errors import exit_with_message
+from swarm_loc_estimator.common.command_line import exit_with_message, folder_to_write
 from swarm_loc_estimator.common.errors import UserError
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from swarm_loc_estimator.cli import graph as command
-from swarm_loc_estimator.common.launching.graph import GraphOptions, NodeSpec, graph_nodes
+from swarm_loc_estimator.common.launch import GraphOptions, NodeSpec, graph_nodes
 
 
 def test_a_live_graph_is_the_estimator_on_the_wall_clock() -> None:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from swarm_loc_estimator.cli.graph import check_graph
 from swarm_loc_estimator.common.errors import UserError
-from swarm_loc_estimator.common.launching.graph import GraphOptions
-from swarm_loc_estimator.common.launching.options import check_graph, options_from
+from swarm_loc_estimator.common.launch import GraphOptions, options_from
 from swarm_loc_estimator.common.parameters import ParameterError
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_one_robot_slow"

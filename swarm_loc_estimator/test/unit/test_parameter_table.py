@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.common.arguments import parameters_of
+from swarm_loc_estimator.common.command_line import parameters_of
 from swarm_loc_estimator.common.parameters import (
     ParameterError,
     ParameterSpec,

@@ -11,8 +11,8 @@ IMPORT_ALL_WITHOUT_ROS = """
 import importlib, pathlib, re, sys
 
 WITH_ROS = re.compile(
-    r"common\\.(node|health|launch)$|\\.(nodes|launching|live|watch)\\.|_node$|_(output|messages|diagnostics)$"
-    r"|cli\\.(demo|graph|watch|simulate)$|truth_steering$"
+    r"common\\.(node|health)$|\\.(nodes|live|watch)\\.|_node$|_(output|messages|diagnostics)$"
+    r"|cli\\.(demo|watch)$|truth_steering$"
 )
 
 class NoRos:

@@ -18,9 +18,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from swarm_loc_estimator.common.arguments import add_bag, add_set, parameters_of, swarm_beside
-from swarm_loc_estimator.common.command_errors import exit_with_message
-from swarm_loc_estimator.common.progress import ProgressLine
+from swarm_loc_estimator.common.command_line import (
+    ProgressLine,
+    add_bag,
+    add_set,
+    command_parser,
+    exit_with_message,
+    parameters_of,
+    swarm_beside,
+)
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.common.transports import Transport
 from swarm_loc_vision.markers.camera_detector import CameraDetector
@@ -72,9 +78,7 @@ def _summary(name: str, camera: CameraDetector) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="detect", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("detect", __doc__)
     add_bag(parser)
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="the new bag")
     add_set(parser, "parameter of marker_detector_node")

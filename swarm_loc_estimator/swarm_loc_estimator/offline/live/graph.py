@@ -30,8 +30,7 @@ from typing_extensions import Self
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.errors import UserError
-from swarm_loc_estimator.common.launching.graph import NodeSpec
-from swarm_loc_estimator.common.launching.processes import Child, node_command, start, stop
+from swarm_loc_estimator.common.launch import Child, NodeSpec, node_command, start, stop
 from swarm_loc_estimator.sensors.topics import InputKind
 from swarm_loc_msgs.msg import SwarmPoses
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.launching.graph import GraphOptions, NodeSpec, ParameterValue, graph_nodes
+from swarm_loc_estimator.common.launch import GraphOptions, NodeSpec, ParameterValue, graph_nodes
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
 from swarm_loc_estimator.offline.live.graph import (

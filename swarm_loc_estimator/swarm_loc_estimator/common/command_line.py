@@ -1,0 +1,205 @@
+"""What all commands share: their start, how they end, their arguments, and a progress bar."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from importlib import import_module
+from pathlib import Path
+from types import MappingProxyType
+from typing import ParamSpec, TextIO, TypeVar
+
+from typing_extensions import Self
+
+from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import ParameterError, Value, from_values, parameter_specs
+
+Arguments = ParamSpec("Arguments")
+Parameters = TypeVar("Parameters")
+Number = TypeVar("Number", int, float)
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_INTERRUPTED = 130
+"""Exit status of a program that SIGINT has ended, as shells count."""
+_REDRAW_S = 0.1
+_WIDTH = 30
+
+
+def program(module: str) -> Callable[[], int]:
+    """An entry point that imports a module only when it is called, and then runs its `main`.
+
+    A signal during the import ends the process with status 128 + n and without a traceback.
+
+    Args:
+        module: Full name of the module.
+    """
+
+    def start() -> int:
+        handlers = {number: signal.signal(number, lambda n, _: os._exit(128 + n)) for number in _SIGNALS}
+        main: Callable[[], int] = import_module(module).main
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        return main()
+
+    return start
+
+
+def exit_with_message(main: Callable[Arguments, int]) -> Callable[Arguments, int]:
+    """Decorate the `main` of a command: mistakes of the user end it with one sentence and status 1."""
+
+    @wraps(main)
+    def wrapped(*args: Arguments.args, **kwargs: Arguments.kwargs) -> int:
+        try:
+            return main(*args, **kwargs)
+        except UserError as error:
+            message = str(error)
+        except OSError as error:
+            message = f"{error.filename or 'A file'} cannot be used: {error.strerror or error}."
+        except KeyboardInterrupt:
+            return _INTERRUPTED
+        print(message, file=sys.stderr)
+        return 1
+
+    return wrapped
+
+
+def command_parser(name: str, description: str | None) -> argparse.ArgumentParser:
+    """The parser of a command, whose description keeps its line breaks."""
+    formatter = argparse.RawDescriptionHelpFormatter
+    return argparse.ArgumentParser(prog=name, description=description, formatter_class=formatter)
+
+
+def number_in(low: Number, high: Number, unit: str = "") -> Callable[[str], Number]:
+    """A type for argparse: a number within limits, of the type of these limits."""
+
+    def read(text: str) -> Number:
+        try:
+            value = type(low)(text)
+        except ValueError:
+            value = None
+        if value is None or not low <= value <= high:
+            raise argparse.ArgumentTypeError(
+                f"{text} must be a number in [{low:g}, {high:g}]{unit and ' '}{unit}"
+            )
+        return value
+
+    return read
+
+
+def folder_to_write(text: str) -> Path:
+    """A type for argparse: a folder that exists or can be created. It is not created yet."""
+    path = Path(text)
+    nearest = next(one for one in (path, *path.absolute().parents) if one.exists())
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
+        raise argparse.ArgumentTypeError(f"{path} cannot be written: {nearest} is no folder that is writable")
+    return path
+
+
+def yaml_to_write(text: str) -> Path:
+    """A type for argparse: a YAML file that can be written, with a picture of the same name beside it."""
+    path = Path(text)
+    if path.suffix not in (".yaml", ".yml"):
+        raise argparse.ArgumentTypeError(f"'{text}' must end in .yaml")
+    if path.is_dir():
+        raise argparse.ArgumentTypeError(f"{path} cannot be written: it is a folder")
+    folder_to_write(str(path.parent))
+    return path
+
+
+def mcap_to_write(text: str) -> Path:
+    """A type for argparse: an MCAP file that can be written; its folder is created."""
+    path = Path(text)
+    if path.suffix != ".mcap":
+        raise argparse.ArgumentTypeError(f"'{text}' must end in .mcap")
+    folder_to_write(str(path.parent)).mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def add_bag(parser: argparse.ArgumentParser, content: str = "") -> None:
+    """Add the arguments of a command that reads a bag: the bag itself, and its swarm description."""
+    parser.add_argument("bag", type=Path, help=f"rosbag2 folder, .mcap or .db3 file{content}")
+    parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
+
+
+def swarm_beside(bag: Path) -> Path:
+    """The swarm description that belongs to a bag; raises UserError where there is no bag."""
+    if not bag.exists():
+        raise UserError(f"There is no bag '{bag}'.")
+    return (bag if bag.is_dir() else bag.parent) / "swarm.yaml"
+
+
+def add_set(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add `--set NAME=VALUE`, which may be given several times; see `parameters_of`."""
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=what)
+
+
+def parameters_of(
+    cls: type[Parameters], pairs: Sequence[str], given: Mapping[str, Value] = MappingProxyType({})
+) -> Parameters:
+    """A dataclass of parameters from texts such as `horizon_s=1.0`, with defaults for the others.
+
+    Args:
+        cls: The dataclass, see `common/parameters.py`.
+        pairs: The texts.
+        given: Values, by name, that a user cannot set.
+
+    Raises:
+        ParameterError: There is no such parameter, or a value cannot be used.
+    """
+    specs = {spec.name: spec for spec in parameter_specs(cls)}
+    values = {name: spec.default for name, spec in specs.items()} | {**given}
+    for pair in pairs:
+        name, _, text = pair.partition("=")
+        if name not in specs or name in given:
+            known = ", ".join(name for name in specs if name not in given)
+            raise ParameterError(f"--set {pair}: '{name}' is no parameter; there are {known}.")
+        values[name] = specs[name].checked(_value(text, specs[name].default))
+    return from_values(cls, values)
+
+
+def _value(text: str, default: Value) -> object:
+    """A text converted to the type of the default; unchanged, and refused later, if that is impossible."""
+    if isinstance(default, tuple):
+        return [part for part in text.split(",") if part]
+    if isinstance(default, bool):
+        return {"true": True, "false": False}.get(text, text)
+    try:
+        return type(default)(text)
+    except ValueError:
+        return text
+
+
+class ProgressLine:
+    """A progress bar in one line of a terminal, cleared at the end; silent where the stream is no terminal.
+
+    Args:
+        stream: Where it is drawn; None: standard error.
+    """
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self._stream = sys.stderr if stream is None else stream
+        self._shown = self._stream.isatty()
+        self._last = 0.0
+
+    def __call__(self, share: float, what: str) -> None:
+        """Show the share done, 0 to 1, and what is being done."""
+        now = time.monotonic()
+        if not self._shown or (share < 1.0 and now - self._last < _REDRAW_S):
+            return
+        self._last = now
+        bar = "#" * round(_WIDTH * share)
+        self._stream.write(f"\r[{bar:<{_WIDTH}}] {share:4.0%} {what}\x1b[K")
+        self._stream.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._shown:
+            self._stream.write("\r\x1b[K")
+            self._stream.flush()

@@ -1,0 +1,323 @@
+"""Graphs of nodes: as data, as child processes that live and die together, and as actions of `ros2 launch`.
+
+`ros2 launch swarm_loc_estimator swarm.launch.py` and the `graph` command start the same nodes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, Field, dataclass, field, fields
+from math import nan
+from pathlib import Path
+from typing import IO, Any, TypeVar
+
+from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_estimator.common.parameters import ParameterError
+from swarm_loc_estimator.common.yaml_tree import read_tree
+
+Options = TypeVar("Options")
+ParameterValue = bool | int | float | str | list[str]
+
+GRACE_S = 5.0
+"""Time that processes get to end after SIGINT, and again after SIGTERM."""
+STOP_SIGNALS = {signal.SIGINT, signal.SIGTERM}
+AWAITED_SIGNALS = STOP_SIGNALS | {signal.SIGCHLD}
+_ARGUMENTS = {"parameter_file": "params_file"}
+_TIED_TO_PARENT = """
+import ctypes, os, signal, sys
+signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGCHLD})
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # shells start background jobs with it ignored
+PR_SET_PDEATHSIG = 1
+ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+"""Runs in a process before its program; between fork and exec only C code would be safe."""
+
+
+class GraphError(UserError):
+    """A graph that cannot start; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class GraphOptions:
+    """Options of a swarm's graph.
+
+    Attributes:
+        swarm_file: Path of the swarm description.
+        bag: Path of a bag to play into the graph, which then runs on the bag's clock; None: live robots.
+        rate: Speed of that bag, 1 for real time.
+        use_sim_time: Whether the nodes take their time from /clock though no bag is played here.
+        parameter_file: Path of a ROS parameter file for all nodes, None for none.
+        watch: Whether a page shows the swarm to browsers of this machine.
+        watch_port: Port of that page, 0 for any free one.
+    """
+
+    swarm_file: str
+    bag: str | None = None
+    rate: float = number(1.0, "1", 0.01, 1000.0, "speed of the bag")
+    use_sim_time: bool = False
+    parameter_file: str | None = None
+    watch: bool = False
+    watch_port: int = number(8420, "1", 0, 65535, "port of the page")
+
+
+@dataclass(frozen=True)
+class NodeSpec:
+    """One node of a graph.
+
+    Attributes:
+        package: Package of the executable.
+        executable: Name of the executable.
+        name: Name of the node.
+        namespace: Namespace of the node, "" for none.
+        parameters: Parameter -> value; they override the parameter file.
+        parameter_file: Path of a ROS parameter file, None for none.
+        remappings: Pairs of names, from and to.
+        required: Whether the graph ends when this node ends.
+    """
+
+    package: str
+    executable: str
+    name: str
+    namespace: str = ""
+    parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
+    parameter_file: str | None = None
+    remappings: tuple[tuple[str, str], ...] = ()
+    required: bool = True
+
+    @property
+    def full_name(self) -> str:
+        """Name with the namespace before it, unique in a graph."""
+        return f"{self.namespace}/{self.name}" if self.namespace else self.name
+
+    def ros_arguments(self) -> list[str]:
+        """The command-line arguments that configure the executable as this node."""
+        arguments = ["--ros-args", "-r", f"__node:={self.name}"]
+        if self.namespace:
+            arguments += ["-r", f"__ns:=/{self.namespace}"]
+        if self.parameter_file is not None:
+            arguments += ["--params-file", self.parameter_file]
+        for name, value in self.parameters.items():
+            arguments += ["-p", f"{name}:={json.dumps(value)}"]
+        for source, target in self.remappings:
+            arguments += ["-r", f"{source}:={target}"]
+        return arguments
+
+
+@dataclass(frozen=True)
+class Child:
+    """A process of a graph."""
+
+    spec: NodeSpec
+    process: subprocess.Popen[bytes]
+
+
+def graph_nodes(options: GraphOptions) -> list[NodeSpec]:
+    """The nodes of a swarm's graph in the order of their start: estimator, player and page, where wanted."""
+
+    def node(executable: str, name: str, parameters: dict[str, ParameterValue]) -> NodeSpec:
+        file, required = options.parameter_file, name != "watch"
+        return NodeSpec("swarm_loc_estimator", executable, name, "", parameters, file, required=required)
+
+    on_sim_time = options.use_sim_time or options.bag is not None
+    common: dict[str, ParameterValue] = {"swarm_file": options.swarm_file, "use_sim_time": on_sim_time}
+    nodes = [node("estimator_node", "estimator", common)]
+    if options.bag is not None:
+        # the estimator starts more slowly than the player, which therefore waits for a subscriber
+        play: dict[str, ParameterValue] = {"bag": options.bag, "rate": options.rate}
+        nodes.append(node("play", "player", {**play, "wait_for_subscribers": 1}))
+    if options.watch:
+        nodes.append(node("watch_node", "watch", {**common, "port": options.watch_port}))
+    return nodes
+
+
+def options_from(kind: type[Options], texts: Mapping[str, str]) -> Options:
+    """A dataclass of options from texts by field name; an empty text means the default.
+
+    Raises:
+        ParameterError: An option is missing, or is not a number in its range.
+    """
+    return kind(**{one.name: _value(one, texts.get(one.name, "")) for one in fields(kind)})  # type: ignore[arg-type]
+
+
+def _value(option: Field[Any], text: str) -> object:
+    """The text of an option, converted to the type of its default."""
+    default: Any = option.default
+    if not text:
+        if default is MISSING:
+            raise ParameterError(f"argument {option.name} is not set.")
+        return default
+    if "spec" not in option.metadata:
+        return text == "true" if isinstance(default, bool) else text
+    try:
+        value = type(default)(text)
+    except ValueError:
+        value = nan
+    spec = option.metadata["spec"]
+    if not spec.allows(value):
+        kind = "whole number" if isinstance(default, int) else "number"
+        raise ParameterError(f"argument {option.name} = '{text}' must be a {kind} in {spec.range_text}.")
+    return value
+
+
+def check_parameter_file(path: str | None) -> None:
+    """Make sure that a file, if one is given, has ROS parameters.
+
+    Raises:
+        UserError: It cannot be read, or has none.
+    """
+    if path is not None and not _has_parameters(read_tree(Path(path))):
+        raise ParameterError(f"argument params_file = '{path}' has no ros__parameters.")
+
+
+def _has_parameters(tree: object) -> bool:
+    """Whether some node gets parameters, in whatever namespace."""
+    return isinstance(tree, dict) and ("ros__parameters" in tree or any(map(_has_parameters, tree.values())))
+
+
+def argument_texts(context: Any, kind: type) -> dict[str, str]:
+    """The arguments of a `launch.LaunchContext` by option; `params_file` is the option `parameter_file`."""
+    arguments = context.launch_configurations
+    return {one.name: arguments[_ARGUMENTS.get(one.name, one.name)] for one in fields(kind)}
+
+
+def node_action(spec: NodeSpec) -> Any:
+    """The `launch_ros.actions.Node` of a node; needs launch_ros, which a full ROS 2 installation has."""
+    from launch.actions import Shutdown  # noqa: PLC0415 - `graph` works without launch_ros
+    from launch_ros.actions import Node  # noqa: PLC0415 - see above
+
+    files = [] if spec.parameter_file is None else [spec.parameter_file]
+    return Node(
+        package=spec.package,
+        executable=spec.executable,
+        name=spec.name,
+        namespace=spec.namespace,
+        parameters=[*files, dict(spec.parameters)],
+        remappings=list(spec.remappings),
+        output="screen",
+        on_exit=[Shutdown(reason=f"{spec.full_name} ended")] if spec.required else [],
+    )
+
+
+def executable_path(package: str, executable: str) -> Path:
+    """Where a package's executable is installed.
+
+    Raises:
+        GraphError: The package or the executable is missing.
+    """
+    from ament_index_python.packages import (  # noqa: PLC0415 - graphs can be described without ROS
+        PackageNotFoundError,
+        get_package_prefix,
+    )
+
+    try:
+        path = Path(get_package_prefix(package), "lib", package, executable)
+    except PackageNotFoundError as error:
+        raise GraphError(f"There is no package '{package}' in this environment.") from error
+    if not os.access(path, os.X_OK):
+        raise GraphError(f"There is no executable '{executable}' in package '{package}'.")
+    return path
+
+
+def node_command(node: NodeSpec) -> list[str]:
+    """Program and arguments of a node.
+
+    Raises:
+        GraphError: The executable is missing.
+    """
+    return [str(executable_path(node.package, node.executable)), *node.ros_arguments()]
+
+
+def print_line(line: str) -> None:
+    """Print a line in one piece, since the nodes print to the same terminal."""
+    print(f"[graph] {line}\n", end="", flush=True)
+
+
+def run_graph(nodes: Sequence[NodeSpec], say: Callable[[str], None] = print_line) -> int:
+    """Run nodes until a required one ends or this process gets SIGINT or SIGTERM; then end all of them.
+
+    Args:
+        nodes: The nodes, in the order in which they start.
+        say: Gets each line for the user.
+
+    Returns:
+        0 after a signal, else the exit status of the required node that ended (128 + n after signal n).
+
+    Raises:
+        GraphError: An executable is missing; nothing was started.
+    """
+    commands = [node_command(node) for node in nodes]
+    previous = signal.pthread_sigmask(signal.SIG_BLOCK, AWAITED_SIGNALS)
+    children: list[Child] = []
+    try:
+        for node, command in zip(nodes, commands, strict=True):
+            children.append(Child(node, start(command)))
+            say(f"{node.full_name}: started as process {children[-1].process.pid}")
+        return _watch(children, say)
+    finally:
+        stop(children, say)
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous)
+
+
+def start(command: Sequence[str], output: IO[bytes] | None = None) -> subprocess.Popen[bytes]:
+    """Start a process that a terminal's Ctrl-C does not reach directly and that dies with this one.
+
+    Args:
+        command: Program and arguments.
+        output: Its standard output and error; None: those of this process.
+    """
+    return subprocess.Popen(
+        [sys.executable, "-S", "-c", _TIED_TO_PARENT, *command],
+        stdout=output,
+        stderr=output,
+        start_new_session=True,
+    )
+
+
+def _watch(children: Sequence[Child], say: Callable[[str], None]) -> int:
+    """Wait until a required process ends or a signal asks to stop."""
+    running = list(children)
+    while True:
+        for child in [c for c in running if c.process.poll() is not None]:
+            running.remove(child)
+            code = child.process.returncode
+            status = 128 - code if code < 0 else code  # as shells count
+            say(f"{child.spec.full_name}: ended with status {status}")
+            if child.spec.required or not running:
+                return status
+        received = signal.sigwait(AWAITED_SIGNALS)
+        if received in STOP_SIGNALS:
+            say(f"stopping on {signal.Signals(received).name}")
+            return 0
+
+
+def stop(children: Sequence[Child], say: Callable[[str], None]) -> None:
+    """End the processes that still run: by SIGINT, then SIGTERM, then SIGKILL."""
+    for stop_signal, patience_s in (
+        (signal.SIGINT, GRACE_S),
+        (signal.SIGTERM, GRACE_S),
+        (signal.SIGKILL, None),
+    ):
+        running = [child for child in children if child.process.poll() is None]
+        for child in running:
+            if stop_signal != signal.SIGINT:
+                say(f"{child.spec.full_name}: does not end, {stop_signal.name}")
+            child.process.send_signal(stop_signal)
+        _wait_for_all(running, patience_s)
+
+
+def _wait_for_all(children: Sequence[Child], patience_s: float | None) -> None:
+    """Wait until all have ended, at most so long."""
+    deadline = None if patience_s is None else time.monotonic() + patience_s
+    for child in children:
+        try:
+            child.process.wait(None if deadline is None else max(0.0, deadline - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            return

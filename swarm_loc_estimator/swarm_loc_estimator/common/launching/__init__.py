@@ -1,1 +1,0 @@
-"""Graphs of nodes as data, as processes and as launch actions."""
