@@ -27,7 +27,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launch import NodeSpec
 from swarm_loc_estimator.common.trajectory import interpolate
-from swarm_loc_estimator.offline.live.graph import LiveGraph, read_history
+from swarm_loc_estimator.offline.live.graph import LiveGraph
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
@@ -202,16 +202,16 @@ def _told_the_starts(nodes: Sequence[NodeSpec], swarm: Swarm, path: Path) -> lis
 
 def _score(listener: Listener, swarm: Swarm, begin_ns: int) -> tuple[FloatArray, FloatArray]:
     """When robots were located, and their errors from a little later on."""
-    history = read_history(listener.graph.recorder.raw)
+    live = listener.graph.recorder.result("live", swarm, listener.truth(swarm))
     located = np.full(len(listener.names), np.inf)
     errors: list[FloatArray] = []
-    for robot, path in enumerate(listener.truth(swarm).values()):
-        true, is_known = interpolate(path, history.stamp_ns, _MAX_GAP_NS)
-        when_s = (history.stamp_ns - begin_ns) * 1e-9
-        tracked = history.status[:, robot] == Status.TRACKED
+    for robot, path in enumerate(live.truth.values()):
+        true, is_known = interpolate(path, live.stamp_ns, _MAX_GAP_NS)
+        when_s = (live.stamp_ns - begin_ns) * 1e-9
+        tracked = live.status[:, robot] == Status.TRACKED
         located[robot] = when_s[tracked].min(initial=np.inf)
         counts = tracked & is_known & (when_s >= max(located[robot], 0.0) + _SETTLED_S)
-        error = history.pose[counts, robot] - true[counts]
+        error = live.poses[counts, robot] - true[counts]
         error[:, 2] = se2.wrap_angle(error[:, 2])
         errors.append(error)
     return located, np.concatenate(errors)

@@ -25,7 +25,7 @@ from bench.droplet import swarm as droplet_swarm
 from bench.shared.common import Cell, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.cramer_rao import information
 from swarm_loc_estimator.infrared.solution import IrEstimator, IrSolutions, Outcome
 from swarm_loc_estimator.infrared.solvers.closed_form import ClosedForm
@@ -93,7 +93,7 @@ def readings_of(
     platform: IrPlatform, poses: FloatArray, rng: np.random.Generator, gains: PairGains | None = None
 ) -> FloatArray:
     """Readings (k, modes, n, n) with noise, cut at saturation."""
-    bright = expected(platform, poses, gains)
+    bright = expected_brightness(platform, poses, gains)
     noisy = bright + platform.noise * rng.standard_normal(bright.shape)
     return np.asarray(np.minimum(noisy, platform.saturation))
 

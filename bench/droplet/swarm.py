@@ -42,8 +42,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue
 from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_infrared
 from swarm_loc_estimator.offline.calibration.recording import read_recording
-from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveGraph, read_history, read_poses
-from swarm_loc_estimator.offline.metrics import pool, summarise
+from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveGraph, read_poses
 from swarm_loc_estimator.offline.recorded_bag import read_truth
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.result import ReplayResult
@@ -88,11 +87,11 @@ class Outcome:
 def outcome_of(result: ReplayResult) -> Outcome:
     """Mean errors from when the swarm should have settled."""
     begin_ns = int(result.stamp_ns[0])
-    known: NDArray[np.bool_] = np.asarray(np.isfinite(result.pose).all(axis=-1))
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(result.poses).all(axis=-1))
     since_s = (result.stamp_ns - begin_ns) * 1e-9
     first_s = [float(since_s[known[:, robot]].min(initial=np.inf)) for robot in range(known.shape[1])]
     settled = result.stamp_ns >= begin_ns + SETTLED_S * 1e9
-    whole = summarise(pool(list(result.chosen(settled).errors.values())))
+    whole = result.chosen(settled).overall
     return Outcome(
         result.title,
         100.0 * whole.position_mean,
@@ -150,9 +149,8 @@ def lived(seed: int, folder: Path, log: Path) -> ReplayResult:
 
         graph.wait_for(is_over, "go on publishing poses", _SILENCE_PATIENCE_S)
         print()
-        drops = dict(recorder.drops)
     tracks = read_truth(known_swarm, truth)
-    return ReplayResult(f"live {seed}", known_swarm, *read_history(recorder.raw)[:3], tracks, drops)
+    return recorder.result(f"live {seed}", known_swarm, tracks)
 
 
 def _write_swarms(seed: int, folder: Path) -> Swarm:
@@ -255,13 +253,13 @@ def draw(result: ReplayResult) -> Path:
     """Where the robots ended and were believed to be, and errors over time."""
     figure, (place, course) = new_plot(2, width=5.4, height=4.4)
     for index, (name, track) in enumerate(result.truth.items()):
-        true, believed = track.pose[-1], result.pose[-1, index]
+        true, believed = track.pose[-1], result.poses[-1, index]
         place.plot(*(100.0 * track.pose[:, :2].T), color="0.8", linewidth=1.0)
         x, y = (100.0 * true[:2]).tolist()
         place.add_patch(Ellipse((x, y), 4.4, 4.4, fill=False, color="0.5"))
         place.annotate(name.removeprefix("droplet"), (x, y), fontsize=7, ha="center", va="center")
         if np.isfinite(believed).all():
-            _draw_pose(place, believed, result.covariance[-1, index])
+            _draw_pose(place, believed, result.covariances[-1, index])
         errors = result.errors[name]
         since_s = (errors.stamp_ns - result.stamp_ns[0]) * 1e-9
         course.plot(since_s, 100.0 * errors.position, color="C0", linewidth=0.8, alpha=0.6)

@@ -21,7 +21,7 @@ from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import DetectionArrayMessage, decode_detections
 from swarm_loc_estimator.common.messages.encoders import UNKNOWN_COVARIANCE, encode_detections
-from swarm_loc_estimator.offline.live.graph import LiveGraph, cpu_seconds, read_history
+from swarm_loc_estimator.offline.live.graph import LiveGraph, cpu_seconds
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
@@ -161,13 +161,10 @@ def run_rendered(swarm: Swarm, seed: int, duration_s: float, folder: Path, say: 
 def _lived(listener: Listener, swarm: Swarm, begin_ns: int) -> tuple[ReplayResult, NDArray[np.float64]]:
     """The poses as they came out, and the truth; and how old they were then (A,) [s]."""
     recorder = listener.graph.recorder
-    history = read_history(recorder.raw)
-    driving = history.stamp_ns >= begin_ns
-    live = ReplayResult(
-        "rendered, live", swarm, *history[:3], listener.truth(swarm), dict(recorder.drops)
-    ).chosen(driving)
-    age_ns = np.array(recorder.received_ns, dtype=np.int64) - history.stamp_ns
-    return live, age_ns[driving].astype(np.float64) * 1e-9
+    live = recorder.result("rendered, live", swarm, listener.truth(swarm))
+    driving = live.stamp_ns >= begin_ns
+    age_ns = np.array(recorder.received_ns, dtype=np.int64) - live.stamp_ns
+    return live.chosen(driving), age_ns[driving].astype(np.float64) * 1e-9
 
 
 def _seen(listener: Listener, name: str, begin_ns: int) -> list[DetectionArrayMessage]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bench.epuck.rendered import RenderedRun, run_rendered, starting_swarm
 from bench.epuck.seen import Seen, count_seen
 from bench.shared.common import OUT, Cell, ProgressLine, new_plot, save_plot, table
-from swarm_loc_estimator.offline.metrics import ErrorSummary, pool, summarise
+from swarm_loc_estimator.offline.metrics import ErrorSummary
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.report.plots import plot_overview
 from swarm_loc_estimator.offline.report.style import INK, colour_of
@@ -84,7 +84,7 @@ def rendered_worlds(
 def errors_within(result: ReplayResult, begin_ns: int, end_ns: int) -> ErrorSummary:
     """The errors ten times a second in a stretch of time, of all robots."""
     chosen = (result.stamp_ns >= begin_ns) & (result.stamp_ns <= end_ns) & (result.stamp_ns % OUTPUT_NS == 0)
-    return summarise(pool(list(result.chosen(chosen).errors.values())))
+    return result.chosen(chosen).overall
 
 
 def figures_of(one: Rendered, settling_s: float) -> dict[str, float]:

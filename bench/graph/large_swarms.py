@@ -24,8 +24,7 @@ from swarm_loc_drivers.sim.scenarios.bags import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.offline.live.run import play_live
-from swarm_loc_estimator.offline.metrics import pool, summarise
-from swarm_loc_estimator.timeline.thinning import SHED_REASONS
+from swarm_loc_estimator.sensors.thinning import SHED_REASONS
 
 SIZES = (100, 300, 1000)
 DURATION_S = 30.0
@@ -90,7 +89,7 @@ def run(recording: SimulatedRun, *, shared: bool) -> dict[str, float]:
         options = GraphOptions(str(bag / "swarm.yaml"), bag=str(bag), parameter_file=str(parameters))
         live = play_live(options, log=log, inputs_only=True)
     settled = live.result.stamp_ns >= recording.start_ns + SETTLING_S * 1e9
-    errors = summarise(pool(list(live.result.chosen(settled).errors.values())))
+    errors = live.result.chosen(settled).overall
     figures = (
         live.start_up_s,
         live.sent,

@@ -23,8 +23,6 @@ from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.offline.datasets.mrclam import read_dataset
 from swarm_loc_estimator.offline.datasets.mrclam_bag import Delay, convert
 from swarm_loc_estimator.offline.live.run import Agreement, LiveRun, compare_with_replay, play_live
-from swarm_loc_estimator.offline.metrics import pool, summarise
-from swarm_loc_estimator.offline.result import ReplayResult
 
 ROOT = OUT.parent
 DEMO_BAG = ROOT / "bags" / "eight_five_robots"
@@ -56,18 +54,14 @@ def figures_of(outcome: Outcome) -> dict[str, float]:
         "lost_messages": float(live.lost),
         "estimator_core": live.estimator_core,
         "pose_age_ms": 1e3 * float(np.percentile(live.age_s, 95.0)),
-        "position_rmse_m": _rmse(live.result),
-        "replay_position_rmse_m": _rmse(compared.replayed),
+        "position_rmse_m": live.result.overall.position_rmse,
+        "replay_position_rmse_m": compared.replayed.overall.position_rmse,
         "difference_rms_m": compared.rms_m,
         "equal_share": compared.equal_share,
         "settled_difference_max_m": compared.settled_max_m,
         "settled_stamps": float(compared.settled.sum()),
     }
     return {name: value for name, value in figures.items() if np.isfinite(value)}
-
-
-def _rmse(result: ReplayResult) -> float:
-    return summarise(pool(list(result.errors.values()))).position_rmse
 
 
 def draw(outcomes: dict[str, Outcome]) -> None:

@@ -20,7 +20,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import decode_detections, decode_odometry
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
-from swarm_loc_estimator.offline.live.graph import LiveGraph, read_history, read_poses
+from swarm_loc_estimator.offline.live.graph import LiveGraph, read_poses
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
@@ -133,12 +133,12 @@ def _swarm() -> Swarm:
 
 def _estimated(listener: Listener, swarm: Swarm, begin_ns: int) -> Estimated:
     """The poses as they came out while the robots drove, held against the truth."""
-    history, truth = read_history(listener.graph.recorder.raw), listener.truth(swarm)
+    live = listener.graph.recorder.result("live", swarm, listener.truth(swarm))
     places = np.stack(
-        [interpolate(truth[name], history.stamp_ns, DEFAULT_GAP_NS)[0] for name in listener.names], axis=1
+        [interpolate(live.truth[name], live.stamp_ns, DEFAULT_GAP_NS)[0] for name in listener.names], axis=1
     )
-    known = (history.stamp_ns >= begin_ns) & np.isfinite(places).all(axis=(1, 2))
-    error = (history.pose - places)[known]
+    known = (live.stamp_ns >= begin_ns) & np.isfinite(places).all(axis=(1, 2))
+    error = (live.poses - places)[known]
     error[..., 2] = se2.wrap_angle(error[..., 2])
-    time_s: FloatArray = (history.stamp_ns[known] - begin_ns).astype(np.float64) * 1e-9
-    return Estimated(time_s, error, history.covariance[known], history.status[known] == Status.TRACKED)
+    time_s: FloatArray = (live.stamp_ns[known] - begin_ns).astype(np.float64) * 1e-9
+    return Estimated(time_s, error, live.covariances[known], live.status[known] == Status.TRACKED)

@@ -51,7 +51,7 @@ def run_core(run: SimulatedRun, tick_ns: NDArray[np.int64], settings: Settings) 
         runner.take(inputs)
     cpu_s = time.process_time() - begun
     result = runner.result("run", (run.start_ns, run.end_ns), {}, {})
-    return CoreResult(cpu_s, result.pose, result.covariance)
+    return CoreResult(cpu_s, result.poses, result.covariances)
 
 
 def inputs_between(run: SimulatedRun, tick_ns: NDArray[np.int64]) -> list[RawInputs]:

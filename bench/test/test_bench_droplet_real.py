@@ -27,7 +27,7 @@ def run(error_m: float) -> ReplayResult:
     covariance[:, 0] = np.diag([1e-6, 1e-6, 1e-2])
     told = np.tile(np.array([Status.TRACKED, Status.WAITING], dtype=np.uint8), (70, 1))
     swarm = Swarm((Robot("seen"), Robot("unseen")))
-    return ReplayResult("", swarm, stamp_ns, pose, covariance, {"seen": TRUTH}, status=told)
+    return ReplayResult("", swarm, stamp_ns, pose, covariance, told, {"seen": TRUTH})
 
 
 def test_a_robot_stands_where_two_sightings_agree_that_follow_each_other_soon() -> None:

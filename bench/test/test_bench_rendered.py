@@ -98,7 +98,13 @@ def test_errors_are_those_of_ten_poses_a_second_in_a_stretch_of_time() -> None:
     pose[1::2] = 9.0
     truth = Trajectory(stamps, np.zeros((len(stamps), 3)))
     result = ReplayResult(
-        "x", Swarm((Robot("r"),)), stamps, pose, np.tile(np.eye(3), (len(stamps), 1, 1, 1)), {"r": truth}
+        "x",
+        Swarm((Robot("r"),)),
+        stamps,
+        pose,
+        np.tile(np.eye(3), (len(stamps), 1, 1, 1)),
+        np.ones((len(stamps), 1), dtype=np.uint8),
+        {"r": truth},
     )
     summary = report.errors_within(result, 2 * SECOND, 3 * SECOND)
     assert (summary.count, summary.position_mean) == (11, pytest.approx(0.25))

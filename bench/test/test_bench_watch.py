@@ -169,7 +169,9 @@ def test_a_report_plays_its_run_without_a_server(browser: Browser, tmp_path: Pat
     pose[:, 0, 0] += np.arange(40) * 0.01
     covariance = np.tile(np.diag([1e-4, 1e-4, 1e-3]), (40, 3, 1, 1))
     truth = {"alpha": Trajectory(stamp_ns, pose[:, 0] + [0.003, 0.004, 0.0])}
-    result = ReplayResult("a run", SWARM, stamp_ns, pose, covariance, truth)
+    result = ReplayResult(
+        "a run", SWARM, stamp_ns, pose, covariance, np.isfinite(pose[..., 0]).view(np.uint8), truth
+    )
     file = tmp_path / "run.html"
     file.write_text(page_of(recorded(result)), encoding="utf-8")
     opened = WatchedPage(browser, file.as_uri())

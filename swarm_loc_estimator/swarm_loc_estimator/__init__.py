@@ -1,7 +1,88 @@
-"""The central estimator of a robot swarm, its replay, its player and its reports."""
+"""Cooperative localization of a robot swarm; this module is its public Python API, see doc/python_api.md.
+
+Names are loaded when they are first used: importing one of them loads only the modules that it needs.
+"""
 
 import os
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 # The matrices are too small to share: where other programs run, BLAS threads wait for each other a hundred
-# times longer than they reckon. Must be set before numpy loads.
+# times longer than they compute. Must be set before numpy loads.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+if TYPE_CHECKING:
+    from swarm_loc_estimator.infrared.brightness import expected_brightness as expected_brightness
+    from swarm_loc_estimator.mapping.exploration.goal import Goal as Goal
+    from swarm_loc_estimator.mapping.fix_covariance import FixCovariances as FixCovariances
+    from swarm_loc_estimator.mapping.grid.occupancy import OccupancyMap as OccupancyMap
+    from swarm_loc_estimator.mapping.grid_messages import OCCUPANCY_GRID as OCCUPANCY_GRID
+    from swarm_loc_estimator.mapping.laser_messages import LASER as LASER
+    from swarm_loc_estimator.mapping.laser_messages import LIGHTS as LIGHTS
+    from swarm_loc_estimator.mapping.laser_messages import BadMessageError as BadMessageError
+    from swarm_loc_estimator.mapping.laser_messages import decode_laser as decode_laser
+    from swarm_loc_estimator.mapping.mapper import SCAN_TURN as SCAN_TURN
+    from swarm_loc_estimator.mapping.mapper import START_TURN as START_TURN
+    from swarm_loc_estimator.mapping.mapper import CooperativeMapper as CooperativeMapper
+    from swarm_loc_estimator.mapping.readings import UNSEEN as UNSEEN
+    from swarm_loc_estimator.mapping.readings import LightSightings as LightSightings
+    from swarm_loc_estimator.mapping.readings import Readings as Readings
+    from swarm_loc_estimator.offline.metrics import Errors as Errors
+    from swarm_loc_estimator.offline.metrics import ErrorSummary as ErrorSummary
+    from swarm_loc_estimator.offline.replay import replay as replay
+    from swarm_loc_estimator.offline.report.report import write_report as write_report
+    from swarm_loc_estimator.offline.result import ReplayResult as ReplayResult
+    from swarm_loc_estimator.sensors.camera import CONTENT_POSE as CONTENT_POSE
+    from swarm_loc_estimator.sensors.camera import CONTENT_POSE_TWO as CONTENT_POSE_TWO
+    from swarm_loc_estimator.sensors.messages import DetectionRows as DetectionRows
+    from swarm_loc_estimator.sensors.messages import FixRows as FixRows
+    from swarm_loc_estimator.sensors.messages import OdometryRows as OdometryRows
+    from swarm_loc_estimator.sensors.messages import RawInputs as RawInputs
+    from swarm_loc_estimator.swarm.swarm import Landmark as Landmark
+    from swarm_loc_estimator.swarm.swarm import Robot as Robot
+    from swarm_loc_estimator.swarm.swarm import Swarm as Swarm
+    from swarm_loc_estimator.swarm.swarm_file import load_swarm as load_swarm
+    from swarm_loc_estimator.swarm.swarm_writer import save_swarm as save_swarm
+    from swarm_loc_estimator.timeline.estimate import Estimate as Estimate
+    from swarm_loc_estimator.timeline.estimate import Status as Status
+    from swarm_loc_estimator.timeline.estimator import Estimator as Estimator
+    from swarm_loc_estimator.timeline.settings import Settings as Settings
+
+_MODULES = {
+    "infrared.brightness": ("expected_brightness",),
+    "mapping.exploration.goal": ("Goal",),
+    "mapping.fix_covariance": ("FixCovariances",),
+    "mapping.grid.occupancy": ("OccupancyMap",),
+    "mapping.grid_messages": ("OCCUPANCY_GRID",),
+    "mapping.laser_messages": ("LASER", "LIGHTS", "BadMessageError", "decode_laser"),
+    "mapping.mapper": ("SCAN_TURN", "START_TURN", "CooperativeMapper"),
+    "mapping.readings": ("UNSEEN", "LightSightings", "Readings"),
+    "offline.metrics": ("Errors", "ErrorSummary"),
+    "offline.replay": ("replay",),
+    "offline.report.report": ("write_report",),
+    "offline.result": ("ReplayResult",),
+    "sensors.camera": ("CONTENT_POSE", "CONTENT_POSE_TWO"),
+    "sensors.messages": ("DetectionRows", "FixRows", "OdometryRows", "RawInputs"),
+    "swarm.swarm": ("Landmark", "Robot", "Swarm"),
+    "swarm.swarm_file": ("load_swarm",),
+    "swarm.swarm_writer": ("save_swarm",),
+    "timeline.estimate": ("Estimate", "Status"),
+    "timeline.estimator": ("Estimator",),
+    "timeline.settings": ("Settings",),
+}
+"""Module -> the names that it gives to the API; the same as are imported above for type checkers."""
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a name of the API, see PEP 562."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """The names of the API."""
+    return [*_MODULE_OF, *globals()]

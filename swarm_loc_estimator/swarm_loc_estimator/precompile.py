@@ -20,7 +20,7 @@ from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS, record_pair
 from swarm_loc_estimator.filter.integrity.fault_detection import is_elsewhere
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns
 from swarm_loc_estimator.filter.state import SwarmState
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE_TWO, CONTENT_POSITION
 from swarm_loc_estimator.sensors.ingest import Ingest
@@ -34,7 +34,7 @@ _SECOND = 1_000_000_000
 _FIRST_LANDMARK = 10
 _LANDMARKS = 30  # three robots see more than are fused one by one where many may be fused together
 _DROPLET = load_ir_platform("droplet")
-_LIGHT = expected(_DROPLET, (0.1, 0.3, 1.0))[0]
+_LIGHT = expected_brightness(_DROPLET, (0.1, 0.3, 1.0))[0]
 _FACING = (0.0, 1.0, 0.0, 0.0)  # x y z w: a marker that looks at the camera
 _AWAY = (0.0, 0.7, 0.0, 0.7)
 

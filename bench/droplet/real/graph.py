@@ -151,22 +151,21 @@ def can_be_seen(recorded: Recorded, names: list[str]) -> set[str]:
 
 def outcome_of(result: ReplayResult, yaw: dict[str, float], seen: set[str]) -> Outcome:
     """Hold poses against the truth of robots whose headings are ahead of it by `yaw` [rad]."""
-    error = np.full(result.pose.shape, np.nan)
+    error = np.full(result.poses.shape, np.nan)
     tracked = np.zeros(error.shape[:2], dtype=np.bool_)
     robots = result.swarm.robots
     for index, robot in enumerate(robots):
         if robot.name in result.truth:
             there, known = standing(result.truth[robot.name], result.stamp_ns)
-            error[known, index] = result.pose[known, index] - there[known]
+            error[known, index] = result.poses[known, index] - there[known]
             error[known, index, 2] -= yaw.get(robot.name, 0.0)
             tracked[:, index] = known
     error[..., 2] = wrap_angle(error[..., 2])
-    if result.status is not None:
-        tracked &= result.status == Status.TRACKED
+    tracked &= result.status == Status.TRACKED
     time_s: FloatArray = (result.stamp_ns - result.stamp_ns[0]).astype(np.float64) * 1e-9
-    estimated = Estimated(time_s, error, result.covariance, tracked)
+    estimated = Estimated(time_s, error, result.covariances, tracked)
     located = [
-        np.isfinite(result.pose[:, k]).all(axis=1).any() for k, r in enumerate(robots) if r.name in seen
+        np.isfinite(result.poses[:, k]).all(axis=1).any() for k, r in enumerate(robots) if r.name in seen
     ]
     told = error[tracked]
     return Outcome(

@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_drivers.common.velocity_command import STILL, Velocity
+from swarm_loc_estimator import SCAN_TURN, START_TURN
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.number_spec import number
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.mapping.mapper import SCAN_TURN, START_TURN
 
 _SLOW_TURN = 0.5 * math.pi
 """The begin of a first scan, which holds the heading of the whole map [rad]."""

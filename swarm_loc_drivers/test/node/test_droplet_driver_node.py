@@ -24,7 +24,7 @@ from tf2_msgs.msg import TFMessage
 from swarm_loc_drivers.droplet.droplet_driver_node import DropletDriverNode
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_msgs.msg import BrightnessMatrix
 
@@ -121,7 +121,7 @@ def test_a_droplet_walks_measures_and_stands_at_the_end(ros: Ros, robots: Robots
             assert (one.receiver, one.n, one.saturation) == (IDS[0], 6, 240)
             seen = se2.between(TRIANGLE[0], TRIANGLE[IDS.index(one.transmitter)])
             pose = [np.hypot(seen[0], seen[1]), np.arctan2(seen[1], seen[0]), seen[2]]
-            exact = np.clip(expected(platform, pose)[0, one.power], 0.0, 255.0)
+            exact = np.clip(expected_brightness(platform, pose)[0, one.power], 0.0, 255.0)
             assert np.abs(np.reshape(one.readings, (6, 6)) - exact).max() < 0.51
     assert {one.transmitter for one in matrices} == set(IDS[1:])
     status = diagnostics[-1].status[0]

@@ -11,7 +11,6 @@ import pytest
 from swarm_loc_drivers.sim.scenarios.bags import write_droplet_bag
 from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, simulate_droplets
 from swarm_loc_estimator.cli import calibrate_ir
-from swarm_loc_estimator.offline.metrics import pool, summarise
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -29,7 +28,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def position_rmse(bag: Path, swarm: Swarm) -> float:
-    return summarise(pool([*replay(bag, swarm).errors.values()])).position_rmse
+    return replay(bag, swarm).overall.position_rmse
 
 
 @pytest.fixture(scope="module")

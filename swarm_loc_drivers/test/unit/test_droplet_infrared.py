@@ -14,7 +14,7 @@ from swarm_loc_drivers.sim.droplet.infrared import ExchangeReadings, InfraredCom
 from swarm_loc_drivers.sim.droplet.world import NEAR_POWER, STEP_NS, DropletErrors, DropletWorld
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 
 
 def with_link(**changes: float) -> DropletErrors:
@@ -43,7 +43,7 @@ def model(world: DropletWorld, receiver: int, emitter: int) -> FloatArray:
     """What a board reads (modes, n, n) without noise, sensors by emitters."""
     seen = se2.between(world.poses[receiver], world.poses[emitter])
     pose = [np.hypot(seen[0], seen[1]), np.arctan2(seen[1], seen[0]), seen[2]]
-    readings: FloatArray = expected(QUIET, pose)[0]
+    readings: FloatArray = expected_brightness(QUIET, pose)[0]
     return readings
 
 

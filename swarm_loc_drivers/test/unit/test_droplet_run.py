@@ -19,7 +19,7 @@ from swarm_loc_drivers.sim.scenarios.droplets import (
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.messages.cdr import decode_brightness, decode_fix
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.swarm.ir_board import PairGains
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
@@ -78,7 +78,7 @@ def test_matrices_show_the_robots_where_they_were(run: DropletRun) -> None:
         gains = PairGains.of(*([board.gains] for board in known if board and board.gains))
         platform = known[0].platform if known[0] else None
         assert platform is not None
-        exact = expected(platform, pose, gains)[0, one.brightness.power]
+        exact = expected_brightness(platform, pose, gains)[0, one.brightness.power]
         misfits.append(np.median(np.abs(one.brightness.readings - np.minimum(exact, 250.0))))
     assert len(misfits) > 60
     assert np.median(misfits) < 2.0

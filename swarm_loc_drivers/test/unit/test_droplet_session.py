@@ -30,7 +30,7 @@ from swarm_loc_drivers.sim.droplet.world import NEAR_POWER, DropletErrors
 from swarm_loc_drivers.sim.link_host import ConsoleFirmware
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 
 PLATFORM = load_ir_platform("droplet")
@@ -40,7 +40,7 @@ def model(lab: Lab, receiver: int, transmitter: int) -> FloatArray:
     """What a robot reads of another one (modes, n, n), sensors by emitters."""
     seen = se2.between(lab.world.poses[receiver], lab.world.poses[transmitter])
     pose = [np.hypot(seen[0], seen[1]), np.arctan2(seen[1], seen[0]), seen[2]]
-    readings: FloatArray = np.clip(expected(PLATFORM, pose)[0], 0.0, 255.0)
+    readings: FloatArray = np.clip(expected_brightness(PLATFORM, pose)[0], 0.0, 255.0)
     return readings
 
 

@@ -38,7 +38,6 @@ from swarm_loc_estimator.offline.live.run import (
     compare_with_replay,
     play_live,
 )
-from swarm_loc_estimator.offline.metrics import pool, summarise
 from swarm_loc_estimator.offline.report.report import write_report
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -89,8 +88,8 @@ def live_facts(live: LiveRun, compared: Agreement) -> list[str]:
     # the time of reception is known to a step of /clock
     age_s = float(np.percentile(live.age_s, 95)) + 1e-9 * clock_step_ns(live.rate)
     live_line = (
-        f"Live:    {live.received} of {live.sent} messages received; {len(live.status)} poses of all robots,"
-        f" 95 % of them less than {1e3 * age_s:.0f} ms old;"
+        f"Live:    {live.received} of {live.sent} messages received;"
+        f" {len(live.result.stamp_ns)} poses of all robots, 95 % of them less than {1e3 * age_s:.0f} ms old;"
         f" {live.estimator_core:.2f} of a core"
     )
     replay_line = (
@@ -103,11 +102,11 @@ def live_facts(live: LiveRun, compared: Agreement) -> list[str]:
 def failed_bars(live: LiveRun) -> list[str]:
     """One sentence for each bar that the poses fail; none when they are right."""
     result = live.result
-    row = summarise(pool(list(result.errors.values())))
+    row = result.overall
     heading_deg = math.degrees(row.heading_rmse)
     waiting = [
         robot.name
-        for robot, status in zip(result.swarm.robots, live.status[-1], strict=True)
+        for robot, status in zip(result.swarm.robots, result.status[-1], strict=True)
         if status != Status.TRACKED
     ]
     share = coverage(live)

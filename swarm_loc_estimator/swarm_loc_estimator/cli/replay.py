@@ -82,7 +82,7 @@ def write_poses(result: ReplayResult, path: Path) -> None:
         writer = csv.writer(file)
         writer.writerow(_COLUMNS)
         for stamp_ns, poses, covariances in zip(
-            result.stamp_ns.tolist(), result.pose, result.covariance, strict=True
+            result.stamp_ns.tolist(), result.poses, result.covariances, strict=True
         ):
             for robot, pose, covariance in zip(result.swarm.robots, poses, covariances, strict=True):
                 if np.isfinite(pose).all():

@@ -23,7 +23,7 @@ from swarm_loc_estimator.infrared.curves import amplitudes_at, curves_at
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 
 
-def expected(platform: IrPlatform, poses: ArrayLike, gains: PairGains | None = None) -> FloatArray:
+def expected_brightness(platform: IrPlatform, poses: ArrayLike, gains: PairGains | None = None) -> FloatArray:
     """Readings (k, modes, n, n) [count] without noise, not cut at saturation; [mode, sensor, emitter].
 
     Args:

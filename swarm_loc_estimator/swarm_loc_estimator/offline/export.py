@@ -19,7 +19,6 @@ from swarm_loc_estimator.common.messages.typestore import MARKERS, POSE_STAMPED,
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.grid_messages import OCCUPANCY_GRID
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.timeline.estimate import Status
 
 _MAP = "map"
 
@@ -82,10 +81,6 @@ def estimates(result: ReplayResult, stride: int = 1) -> Iterator[EstimateMessage
     names = tuple(robot.name for robot in result.swarm.robots)
     not_kept = np.full(len(names), np.nan)
     for k in range(0, len(result.stamp_ns), stride):
-        pose = result.pose[k]
-        located = np.isfinite(pose).all(axis=1)
-        status = (
-            np.where(located, Status.TRACKED, Status.WAITING) if result.status is None else result.status[k]
-        )
-        stamp_ns, covariance = int(result.stamp_ns[k]), result.covariance[k]
-        yield EstimateMessage(stamp_ns, _MAP, names, pose, covariance, not_kept, status.astype(np.uint8))
+        pose = result.poses[k]
+        stamp_ns, covariance = int(result.stamp_ns[k]), result.covariances[k]
+        yield EstimateMessage(stamp_ns, _MAP, names, pose, covariance, not_kept, result.status[k])

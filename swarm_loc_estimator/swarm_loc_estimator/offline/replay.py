@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.command_line import swarm_beside
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.offline.recorded_bag import Progress, read_bag, unwatched
@@ -24,6 +25,7 @@ from swarm_loc_estimator.offline.spool import Spool
 from swarm_loc_estimator.sensors.ingest import MAX_PAUSE_NS
 from swarm_loc_estimator.sensors.messages import AerialRows, RawInputs
 from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.sightings import Sightings, newest_sightings
@@ -33,8 +35,8 @@ TICK_S = 0.1
 
 
 def replay(
-    bag: Path,
-    swarm: Swarm,
+    bag: Path | str,
+    swarm: Swarm | None = None,
     settings: Settings | None = None,
     *,
     tick_s: float = TICK_S,
@@ -46,16 +48,19 @@ def replay(
 
     Args:
         bag: rosbag2 folder, .mcap or .db3 file.
-        swarm: Who is in it.
+        swarm: Robots and landmarks; None: those of the `swarm.yaml` beside the bag.
         settings: Of the estimator.
         tick_s: Time between two outputs [s].
-        stamp_ns: (T,) increasing, when to give poses instead, such as when a live estimator gave them.
-        keep_sightings: Whether what the robots see is kept, too, for people who watch the run.
+        stamp_ns: (T,) increasing; outputs at these instants instead, such as those of a live run.
+        keep_sightings: Whether sightings and aerial images are kept for display, too.
         progress: Called now and then.
 
     Raises:
         BagError: Nothing in the bag can be read.
+        SwarmFileError: The swarm description cannot be used.
     """
+    bag = Path(bag)
+    swarm = load_swarm(swarm_beside(bag)) if swarm is None else swarm
     periodic = PeriodicSchedule(round(tick_s * 1e9))
     schedule = periodic if stamp_ns is None else ListedSchedule(stamp_ns)
     runner = Runner(Estimator(swarm, settings), schedule, keep_sightings=keep_sightings)
@@ -215,8 +220,8 @@ class Runner:
             title=title,
             swarm=estimator.swarm,
             stamp_ns=self._spool.array("stamp_ns", np.int64),
-            pose=self._spool.array("pose", np.float64, robots, 3),
-            covariance=self._spool.array("covariance", np.float64, robots, 3, 3),
+            poses=self._spool.array("pose", np.float64, robots, 3),
+            covariances=self._spool.array("covariance", np.float64, robots, 3, 3),
             status=self._spool.array("status", np.uint8, robots),
             sightings=tuple(self._sightings),
             images=self._images.images() if self._images is not None else (),

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.grid_messages import GridMessage, decode_occupancy_grid
-from swarm_loc_estimator.offline.metrics import Errors, compare
+from swarm_loc_estimator.offline.metrics import Errors, ErrorSummary, compare, pool, summarise
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.sightings import Sightings
 
@@ -52,14 +52,14 @@ class ReplayResult:
         title: What was replayed, such as the bag's name.
         swarm: Whom it is about.
         stamp_ns: (T,) when the poses hold.
-        pose: (T, N, 3) x [m], y [m], theta [rad] in map; NaN while a robot waits for a fix.
-        covariance: (T, N, 3, 3) of x, y, theta.
+        poses: (T, N, 3) x [m], y [m], theta [rad] in map; NaN while a robot is not located.
+        covariances: (T, N, 3, 3) of x, y, theta.
+        status: (T, N) of `Status`.
         truth: Robot name -> ground truth; robots without are missing.
         counters: Counted things by name, such as drops by reason.
         remarks: What else must be said, one sentence each, such as what could not be read of the bag.
         data_s: Duration of the data [s].
         wall_s: Duration of the replay [s].
-        status: (T, N) of `Status`; None: not known.
         sightings: What the robots saw every half second, with its instant [ns]; empty: not kept.
         images: Aerial images with who is who in them; empty: none, or not kept.
         maps: What the mapper told, as it was recorded.
@@ -70,15 +70,15 @@ class ReplayResult:
     title: str
     swarm: Swarm
     stamp_ns: npt.NDArray[np.int64]
-    pose: npt.NDArray[np.float64]
-    covariance: npt.NDArray[np.float64]
+    poses: npt.NDArray[np.float64]
+    covariances: npt.NDArray[np.float64]
+    status: npt.NDArray[np.uint8]
     truth: Mapping[str, Trajectory] = field(default_factory=dict)
     counters: Mapping[str, int] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     data_s: float = 0.0
     wall_s: float = 0.0
     self_calibrated: Swarm | None = None
-    status: npt.NDArray[np.uint8] | None = None
     sightings: tuple[tuple[int, Sightings], ...] = ()
     images: tuple[AerialImage, ...] = ()
     maps: tuple[RecordedMap, ...] = ()
@@ -94,15 +94,15 @@ class ReplayResult:
         return replace(
             self,
             stamp_ns=self.stamp_ns[rows],
-            pose=self.pose[rows],
-            covariance=self.covariance[rows],
-            status=None if self.status is None else self.status[rows],
+            poses=self.poses[rows],
+            covariances=self.covariances[rows],
+            status=self.status[rows],
         )
 
     def track(self, index: int) -> Trajectory:
         """The estimated poses of a robot where it has one."""
-        known = np.isfinite(self.pose[:, index]).all(axis=1)
-        return Trajectory(self.stamp_ns[known], self.pose[known, index])
+        known = np.isfinite(self.poses[:, index]).all(axis=1)
+        return Trajectory(self.stamp_ns[known], self.poses[known, index])
 
     @cached_property
     def errors(self) -> Mapping[str, Errors]:
@@ -110,7 +110,17 @@ class ReplayResult:
         found = {}
         for index, robot in enumerate(self.swarm.robots):
             if robot.name in self.truth:
-                known = np.isfinite(self.pose[:, index]).all(axis=1)
-                covariance = self.covariance[known, index]
+                known = np.isfinite(self.poses[:, index]).all(axis=1)
+                covariance = self.covariances[known, index]
                 found[robot.name] = compare(self.track(index), covariance, self.truth[robot.name])
         return found
+
+    @cached_property
+    def summaries(self) -> Mapping[str, ErrorSummary]:
+        """Robot name -> RMSE, median, NEES and others of its errors, for robots with ground truth."""
+        return {name: summarise(errors) for name, errors in self.errors.items()}
+
+    @cached_property
+    def overall(self) -> ErrorSummary:
+        """The same of all robots together; NaN without ground truth."""
+        return summarise(pool([*self.errors.values()]))

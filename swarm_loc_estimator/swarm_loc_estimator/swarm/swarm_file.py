@@ -43,6 +43,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from swarm_loc_estimator.common.errors import UserError
@@ -68,7 +69,6 @@ from swarm_loc_estimator.swarm.tree_checks import Numbers, TreeChecks, nearest
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping
-    from pathlib import Path
 
 FILE_VERSION = 1
 
@@ -105,7 +105,7 @@ class SwarmFileError(UserError):
     """A swarm description that cannot be used; the message is one sentence with file, key and value."""
 
 
-def load_swarm(path: Path) -> Swarm:
+def load_swarm(path: Path | str) -> Swarm:
     """Read and check a swarm description.
 
     Args:
@@ -114,6 +114,7 @@ def load_swarm(path: Path) -> Swarm:
     Raises:
         SwarmFileError: One sentence with file, dotted key, value and what is allowed.
     """
+    path = Path(path)
     try:
         tree = read_tree(path)
     except YamlTreeError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from swarm_loc_estimator.common.number_spec import number_specs
@@ -20,13 +21,12 @@ from swarm_loc_estimator.swarm.swarm_file import FILE_VERSION, LANDMARK_DEFAULTS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from pathlib import Path
 
 _WHOLE = frozenset({"camera", "faces", "response"})
 Mapping = dict[Any, Any]
 
 
-def save_swarm(swarm: Swarm, path: Path, comment: str = "") -> None:
+def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
     """Write a swarm description that `load_swarm` reads back equal.
 
     Args:
@@ -34,6 +34,7 @@ def save_swarm(swarm: Swarm, path: Path, comment: str = "") -> None:
         path: The file; replaced when it exists, its folder created when missing.
         comment: Lines that say where the numbers come from.
     """
+    path = Path(path)
     text = "".join(f"# {line}\n" for line in [*comment.splitlines(), *_units()])
     text += tree_text(_tree(swarm, path.parent))
     path.parent.mkdir(parents=True, exist_ok=True)

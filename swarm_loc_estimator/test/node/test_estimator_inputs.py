@@ -17,7 +17,7 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
 from swarm_loc_estimator.common.messages.encoders import encode_brightness, encode_fix
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_msgs.msg import BrightnessMatrix, SwarmPose, SwarmPoses
@@ -48,7 +48,7 @@ class Droplets:
             for topic in ("alpha/odom", "alpha/brightness", "gamma/fix")
         }
         self.poses: list[SwarmPoses] = ros.listen(SwarmPoses, "swarm/poses")
-        self._bright = np.minimum(np.rint(expected(load_ir_platform("droplet"), BETA)[0]), 255)
+        self._bright = np.minimum(np.rint(expected_brightness(load_ir_platform("droplet"), BETA)[0]), 255)
 
     def wait_for_estimator(self) -> None:
         """Return once it hears all topics and is heard."""

@@ -13,7 +13,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.encoders import encode_brightness, encode_fix, encode_odometry
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.sensors.messages import BrightnessRows, FixRows, OdometryRows, RawInputs
 from swarm_loc_estimator.sensors.topics import InputKind
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
@@ -194,7 +194,7 @@ def exchange(
     if gains is not None:
         emitters = np.broadcast_to(gains[1, transmitter], (len(near), platform.n))
         pairs = PairGains(gains[0, near], emitters, np.zeros((len(near), 4)))
-    bright = platform.dark_level + expected(platform, relative[near], pairs)
+    bright = platform.dark_level + expected_brightness(platform, relative[near], pairs)
     read = np.rint(bright + noise * platform.noise * rng.standard_normal(bright.shape))
     read = np.minimum(read, platform.saturation)
     return [

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.solvers.cost import Pair, new_costs, write_costs
 from swarm_loc_estimator.infrared.solvers.readings import classify
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
@@ -75,7 +75,7 @@ def readings_of(
     platform: IrPlatform, poses: FloatArray, seed: int, gains: PairGains | None = None
 ) -> FloatArray:
     """Readings (k, modes, n, n) of poses with the platform's noise, cut at saturation."""
-    bright = expected(platform, poses, gains)
+    bright = expected_brightness(platform, poses, gains)
     spread = np.hypot(platform.noise, platform.relative_noise * bright)
     noise = spread * np.random.default_rng(seed).standard_normal(bright.shape)
     return np.minimum(bright + noise, platform.saturation)

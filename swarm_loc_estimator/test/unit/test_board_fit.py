@@ -9,7 +9,7 @@ import pytest
 from ir_world import random_poses
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.curves import curve_at
 from swarm_loc_estimator.offline.calibration.infrared.board import errors_of, without_dead
 from swarm_loc_estimator.offline.calibration.infrared.board_fit import (
@@ -35,7 +35,7 @@ def recorded(count: int, seed: int) -> BoardReadings:
     told = random_poses(count, seed, low=0.05, high=0.2)
     true = turned(told, YAW[receiver], YAW[transmitter])
     gains = PairGains(np.tile(FACTORS, (count, 1)), np.ones((count, 6)), np.zeros((count, 4)))
-    light = expected(PLATFORM, true, gains)[:, 0]
+    light = expected_brightness(PLATFORM, true, gains)[:, 0]
     light = np.where(rng.uniform(size=light.shape) < 0.05, 0.0, light)
     light = light * np.exp(0.1 * rng.standard_normal(light.shape)) + 15.0 * rng.standard_normal(light.shape)
     readings = np.minimum(light, PLATFORM.saturation)

@@ -173,9 +173,9 @@ def test_a_message_that_the_estimator_drops_spoils_no_run() -> None:
         odometry=replace(odometry, data=((np.nan,) * 3, *odometry.data[1:])),
         detections=replace(detections, data=(*detections.data[:5], bad, *detections.data[6:])),
     )
-    poses = rerun(spoilt, swarm, 0.5).pose
+    poses = rerun(spoilt, swarm, 0.5).poses
     assert np.isfinite(poses).all()
-    apart = np.abs(poses - rerun(recording, swarm, 0.5).pose)
+    apart = np.abs(poses - rerun(recording, swarm, 0.5).poses)
     assert np.max(apart) < 0.05
 
 
@@ -275,11 +275,11 @@ def test_how_often_poses_are_wanted_changes_nothing_in_the_filter_of_a_dense_swa
     often, seldom = (rerun(recording, swarm, tick_s) for tick_s in (0.1, TICK_S))
     rows = np.isin(often.stamp_ns, seldom.stamp_ns)
     assert rows.sum() == seldom.stamp_ns.size - 1  # the last tick is the first after the end
-    np.testing.assert_allclose(often.pose[rows], seldom.pose[:-1], atol=1e-9)
-    np.testing.assert_allclose(often.covariance[rows], seldom.covariance[:-1], atol=1e-9)
+    np.testing.assert_allclose(often.poses[rows], seldom.poses[:-1], atol=1e-9)
+    np.testing.assert_allclose(often.covariances[rows], seldom.covariances[:-1], atol=1e-9)
     for period_s in (0.0, TICK_S):  # one measurement after the other, and more of them together
         other = rerun(recording, swarm, TICK_S, Settings(fusion_period_s=period_s))
-        assert np.nanmax(np.abs(other.pose - seldom.pose)) > 1e-6
+        assert np.nanmax(np.abs(other.poses - seldom.poses)) > 1e-6
 
 
 @pytest.mark.parametrize("seed", [16, 17, 18])

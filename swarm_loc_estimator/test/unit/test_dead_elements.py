@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from ir_world import random_poses
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.solvers.gains import Exchanges
 from swarm_loc_estimator.offline.calibration.infrared.dead_elements import find_dead_elements
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
@@ -34,7 +34,7 @@ def exchanged(count: int, seed: int, faults: Faults, poses: FloatArray | None = 
     for place, share in faults.items():
         factors[place] *= share
     gains = PairGains(factors[0, receiver], factors[1, transmitter], np.zeros((count, 4)))
-    light = expected(PLATFORM, poses, gains)[:, 0]
+    light = expected_brightness(PLATFORM, poses, gains)[:, 0]
     light[rng.uniform(size=light.shape) < PLATFORM.blocked_share] = 0.0
     light[np.flatnonzero(rng.uniform(size=count) < 0.1), rng.integers(0, N)] = 0.0
     light *= np.exp(PLATFORM.curve_sigma * rng.standard_normal(light.shape))

@@ -158,7 +158,14 @@ def test_a_run_is_written_as_mcap(tmp_path: Path) -> None:
     stamp_ns = np.arange(1, 4) * SECOND
     pose, covariance = np.zeros((3, 2, 3)), np.tile(np.eye(3), (3, 2, 1, 1))
     pose[0, 1] = np.nan
-    result = ReplayResult("run", Swarm(robots=(Robot("a"), Robot("b"))), stamp_ns, pose, covariance)
+    result = ReplayResult(
+        "run",
+        Swarm(robots=(Robot("a"), Robot("b"))),
+        stamp_ns,
+        pose,
+        covariance,
+        np.isfinite(pose[..., 0]).view(np.uint8),
+    )
     file = tmp_path / "run.mcap"
     file.write_bytes(b"an older one")
     write_mcap(result, file)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from ir_world import droplet, random_poses
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.solvers.gains import Exchanges
 from swarm_loc_estimator.offline.calibration.infrared.gain_validation import helpful_gains
 from swarm_loc_estimator.offline.calibration.infrared.held_out import (
@@ -38,7 +38,7 @@ def exchanged(
     transmitter = (receiver + rng.integers(1, ROBOTS, count)) % ROBOTS
     poses = random_poses(count, seed, 0.06, 0.2)
     gains = PairGains(factors[0, receiver], factors[1, transmitter], np.zeros((count, 4)))
-    light = expected(truly, poses, gains)
+    light = expected_brightness(truly, poses, gains)
     light[rng.uniform(size=light.shape) < truly.blocked_share] = 0.0
     light *= np.exp(truly.curve_sigma * rng.standard_normal(light.shape))
     light += truly.noise * rng.standard_normal(light.shape)

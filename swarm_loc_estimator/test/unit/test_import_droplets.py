@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.offline.calibration.infrared.board_recording import read_board
 from swarm_loc_estimator.offline.calibration.recording import read_recording
 from swarm_loc_estimator.offline.datasets.droplets import (
@@ -62,7 +62,7 @@ def exchanges(seed: int = 0, count: int = 60) -> list[Exchange]:
             for robot, (x, y, o) in PLACES.items()
         }
         x, y, heading = se2.between(poses[ROOT][None], poses[transmitter][None])[0]
-        light = expected(platform, [[math.hypot(x, y), math.atan2(y, x), heading]])[0, 0]
+        light = expected_brightness(platform, [[math.hypot(x, y), math.atan2(y, x), heading]])[0, 0]
         readings = np.rint(np.minimum(light + 15.0 * rng.standard_normal(light.shape), 2400.0))
         seen = tuple(Sighting(robot, *place) for robot, place in PLACES.items())
         done.append(Exchange(transmitter, ROOT, readings, 100.0 + k, seen))

@@ -14,7 +14,7 @@ from scipy.integrate import quad
 from scipy.optimize import minimize
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.cramer_rao import information
 from swarm_loc_estimator.infrared.solution import IrEstimator, Outcome, ReadingsError
 from swarm_loc_estimator.infrared.solvers.closed_form import ClosedForm
@@ -44,7 +44,9 @@ def limits(readings: FloatArray, limit: float = LIMIT) -> FloatArray:
 def surprise(pose: FloatArray, readings: FloatArray) -> float:
     """Minus the logarithm of the readings' likelihood, tails of the normal distribution integrated."""
     total = 0.0
-    for one, bright in zip(readings.ravel(), expected(NEVER_BLOCKED, pose[None]).ravel(), strict=True):
+    for one, bright in zip(
+        readings.ravel(), expected_brightness(NEVER_BLOCKED, pose[None]).ravel(), strict=True
+    ):
         if one < LIMIT:
             total += 0.5 * (one - bright) ** 2
         else:

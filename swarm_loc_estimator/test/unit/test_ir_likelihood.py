@@ -24,7 +24,7 @@ from ir_world import (
 )
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.cramer_rao import information
 from swarm_loc_estimator.infrared.curves import TabulatedCurve
 from swarm_loc_estimator.infrared.solution import IrEstimator, Outcome, ReadingsError
@@ -134,7 +134,7 @@ def test_noise_relative_to_readings_is_weighed() -> None:
 
 def test_readings_that_fit_badly_widen_the_covariance() -> None:
     poses = random_poses(300, 8, low=0.2, high=0.2)
-    readings = expected(droplet(), poses)
+    readings = expected_brightness(droplet(), poses)
     noise = np.random.default_rng(8).standard_normal(readings.shape)
     one, three = (ALIKE.solve(np.minimum(readings + factor * noise, 255.0)) for factor in (1.0, 3.0))
     assert np.median(three.misfits / one.misfits) == pytest.approx(9.0, rel=0.1)
@@ -162,7 +162,7 @@ def test_the_share_that_lasts_is_what_exchanges_with_other_noise_have_in_common(
 def with_a_robot_between(poses: FloatArray, seed: int) -> tuple[FloatArray, FloatArray]:
     """Readings (k, modes, n, n) with a third robot between, and the share of light that it blocks (k,)."""
     rng = np.random.default_rng(seed)
-    clear = expected(droplet(), poses, differing_gains(len(poses), 6, 0.1, seed))
+    clear = expected_brightness(droplet(), poses, differing_gains(len(poses), 6, 0.1, seed))
     ahead = units(poses[:, 1])
     along = rng.uniform(0.048, poses[:, 0] - 0.048)
     aside = rng.uniform(-0.06, 0.06, len(poses))

@@ -121,16 +121,16 @@ def test_a_bag_gives_the_same_poses_byte_for_byte_and_those_of_the_estimator_fed
     swarm = load_swarm(bag / "swarm.yaml")
     assert swarm == run.swarm
     first, second = (replay(bag, swarm, SLOW, tick_s=0.5) for _ in range(2))
-    assert first.pose.tobytes() == second.pose.tobytes()
-    assert first.covariance.tobytes() == second.covariance.tobytes()
+    assert first.poses.tobytes() == second.poses.tobytes()
+    assert first.covariances.tobytes() == second.covariances.tobytes()
     assert first.counters == second.counters
     _, estimates = play(run, late, SLOW, 0.5)
     by_hand = {estimate.stamp_ns: estimate.poses for estimate in estimates}
     both = [k for k, stamp_ns in enumerate(first.stamp_ns.tolist()) if stamp_ns in by_hand]
     assert len(both) > 15
     expected = np.array([by_hand[int(first.stamp_ns[k])] for k in both])
-    np.testing.assert_allclose(first.pose[both], expected, atol=1e-9)
-    assert np.isfinite(first.pose[-1]).all()
+    np.testing.assert_allclose(first.poses[both], expected, atol=1e-9)
+    assert np.isfinite(first.poses[-1]).all()
     lights = sum(isinstance(event, Light) for event in run.events)
     assert first.counters["messages on <robot>/brightness"] == lights
     assert first.counters["messages on <robot>/fix"] == 20

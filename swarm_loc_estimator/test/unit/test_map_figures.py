@@ -12,7 +12,6 @@ from swarm_loc_estimator.cli.replay_map import main, read_walls
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.settings import MapperSettings
 from swarm_loc_estimator.offline.map_replay import MapFigures, map_figures, replay_map, truth_of
-from swarm_loc_estimator.offline.metrics import pool, summarise
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
@@ -65,8 +64,8 @@ def test_two_pushbots_map_more_of_the_hall_in_less_time() -> None:
 def test_the_estimator_follows_the_mappers_fixes_and_finds_the_slip() -> None:
     """10 cm on the way, as the fixes were when they were told, and no surer than that."""
     result = replay(BAGS / "pushbots_two", load_swarm(BAGS / "pushbots_two" / "swarm.yaml"))
-    errors = summarise(pool([*result.errors.values()]))
-    assert np.isfinite(result.pose[-1]).all()
+    errors = result.overall
+    assert np.isfinite(result.poses[-1]).all()
     assert errors.position_rmse < 0.14
     assert 1.0 < errors.nees < 3.5
     assert result.counters["measurements used"] == 48

@@ -9,7 +9,7 @@ import pytest
 from ir_world import random_poses
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.solvers.gains import Exchanges
 from swarm_loc_estimator.offline.calibration.infrared.reading_limits import (
     ReadingLimits,
@@ -74,7 +74,7 @@ def exchanged(
     gains = PairGains(factors[0, receiver], factors[1, transmitter], np.zeros((course.count, 4)))
     lasting = np.exp(platform.curve_sigma * rng.standard_normal((stretches, N, N)))
     lasting *= rng.uniform(size=lasting.shape) > platform.blocked_share
-    light = expected(platform, moved, gains)[:, 0] * lasting[stretch]
+    light = expected_brightness(platform, moved, gains)[:, 0] * lasting[stretch]
     light *= 1.0 + platform.relative_noise * rng.standard_normal(light.shape)
     light += platform.noise * rng.standard_normal(light.shape)
     limit = np.broadcast_to(platform.saturation if saturation is None else saturation, (ROBOTS, N))

@@ -42,6 +42,7 @@ def result_of(robots: int, ticks: int = 200, truths: int | None = None, title: s
         stamp_ns,
         pose,
         covariance,
+        np.ones((ticks, robots), dtype=np.uint8),
         truth,
         {"gated": 3, "too_old": 14},
         ("A remark.",),
@@ -102,8 +103,8 @@ def test_table_has_the_figures() -> None:
 
 def test_robots_that_wait_and_robots_without_truth(tmp_path: Path) -> None:
     result = result_of(3, truths=2)
-    result.pose[:150, 0] = np.nan
-    result.pose[:, 1] = np.nan
+    result.poses[:150, 0] = np.nan
+    result.poses[:, 1] = np.nan
     text = text_report(result)
     assert re.search(r"^r0 +50 ", text, re.MULTILINE)
     assert re.search(r"^r1 +0 +-", text, re.MULTILINE)
@@ -135,7 +136,7 @@ def test_equal_results_give_equal_files(tmp_path: Path) -> None:
 
 def test_the_overview_ends_with_the_truth(tmp_path: Path) -> None:
     whole, longer = result_of(2, ticks=100), result_of(2, ticks=140)
-    longer.covariance[100:] *= 100.0
+    longer.covariances[100:] *= 100.0
     for name, result in (("whole", whole), ("longer", replace(longer, truth=whole.truth))):
         plot_overview(result, tmp_path / name)
     assert (tmp_path / "whole").read_bytes() == (tmp_path / "longer").read_bytes()
@@ -162,7 +163,12 @@ def test_without_truth_there_is_no_error_picture_and_that_is_said(old_report: Pa
 
 def test_nothing_at_all_is_still_a_report(tmp_path: Path) -> None:
     empty = ReplayResult(
-        "empty", Swarm((Robot("a"),)), np.empty(0, np.int64), np.empty((0, 1, 3)), np.empty((0, 1, 3, 3))
+        "empty",
+        Swarm((Robot("a"),)),
+        np.empty(0, np.int64),
+        np.empty((0, 1, 3)),
+        np.empty((0, 1, 3, 3)),
+        np.empty((0, 1), np.uint8),
     )
     files = write_report(empty, tmp_path)
     assert "No ground truth" in files.text.read_text()

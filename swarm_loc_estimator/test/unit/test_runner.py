@@ -48,11 +48,11 @@ def test_what_arrives_at_a_tick_counts_at_the_next_one() -> None:
     runner.finish(int(stamps_ns[1]))
     result = runner.result("two", (0, SECOND), {}, {})
     assert result.stamp_ns.tolist() == [SECOND, 2 * SECOND]
-    assert result.pose[0, 0, 0] == 0.0
-    assert result.pose[1, 0, 0] >= 0.01  # and on, at the speed that it has by then
+    assert result.poses[0, 0, 0] == 0.0
+    assert result.poses[1, 0, 0] >= 0.01  # and on, at the speed that it has by then
 
 
 def test_without_inputs_there_are_no_poses() -> None:
     runner = Runner(Estimator(Swarm((Robot("a"),))), PeriodicSchedule(SECOND))
     runner.finish(HOUR)
-    assert runner.result("nothing", (0, HOUR), {}, {}).pose.shape == (0, 1, 3)
+    assert runner.result("nothing", (0, HOUR), {}, {}).poses.shape == (0, 1, 3)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+from swarm_loc_estimator import LASER, BadMessageError, decode_laser
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.messages.cdr import CdrError, decode_odometry
 from swarm_loc_estimator.common.messages.typestore import ODOMETRY
-from swarm_loc_estimator.mapping.laser_messages import LASER, BadMessageError, decode_laser
 from swarm_loc_vision.laser.fit import CalibrationError
 from swarm_loc_vision.laser.wall_drive import WallDrive
 

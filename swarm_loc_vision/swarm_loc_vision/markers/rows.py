@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from swarm_loc_estimator import CONTENT_POSE, CONTENT_POSE_TWO
 from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
-from swarm_loc_estimator.sensors.camera import CONTENT_POSE, CONTENT_POSE_TWO
 from swarm_loc_vision.markers.detector import Detections
 
 _MIN_CHI2 = 1e-6

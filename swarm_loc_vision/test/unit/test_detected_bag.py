@@ -16,7 +16,6 @@ from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import decode_detections
 from swarm_loc_estimator.common.trajectory import interpolate
-from swarm_loc_estimator.offline.metrics import pool, summarise
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -97,11 +96,11 @@ def test_markers_in_view_are_found_and_no_others(detected: Path, replayed: Repla
 
 def test_the_detections_locate_the_robots(replayed: ReplayResult) -> None:
     """To 4.9 mm and 1.1 degrees, NEES 1.4."""
-    errors = summarise(pool([*replayed.errors.values()]))
+    errors = replayed.overall
     assert errors.position_rmse < 0.0065
     assert np.degrees(errors.heading_rmse) < 1.6
     assert 0.5 < errors.nees < 3.5
-    assert np.isfinite(replayed.pose[-1]).all()
+    assert np.isfinite(replayed.poses[-1]).all()
 
 
 def test_the_same_images_give_the_same_bytes(detected: Path, tmp_path: Path) -> None:

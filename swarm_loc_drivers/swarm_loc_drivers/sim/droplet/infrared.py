@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.droplet import infrared_timing as timing
 from swarm_loc_drivers.droplet.hardware import ELEMENTS, FULL_POWER
+from swarm_loc_estimator import expected_brightness
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.infrared.brightness import expected
 from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
 
 
@@ -149,7 +149,7 @@ class DropletLight:
             np.repeat(self._gains[1, [transmitter]], count, axis=0),
             np.zeros((count, 4)),
         )
-        far_near = expected(self._platform, relative, gains)[..., emitter]  # (k, modes, n)
+        far_near = expected_brightness(self._platform, relative, gains)[..., emitter]  # (k, modes, n)
         levels = np.stack([np.zeros_like(far_near[:, 0]), far_near[:, -1], far_near[:, 0]])
         share = np.array([np.interp(power, self._powers, corner) for corner in np.eye(3)])
         light: FloatArray = np.einsum("l,lkn->kn", share, levels)

@@ -15,12 +15,10 @@ from typing import Protocol
 import numpy as np
 
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, clearance, is_visible, ray_distance
+from swarm_loc_estimator import SCAN_TURN, UNSEEN, Goal, LightSightings, Readings
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.mapping.exploration.goal import Goal
-from swarm_loc_estimator.mapping.mapper import SCAN_TURN
-from swarm_loc_estimator.mapping.readings import UNSEEN, LightSightings, Readings
 
 PERIOD_S = 0.02
 """Between two reports of the event tracker."""

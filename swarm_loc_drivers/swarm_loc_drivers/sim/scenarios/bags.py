@@ -16,6 +16,7 @@ from swarm_loc_drivers.sim.run import CAMERA_LATENESS, LivedRun, Records, Simula
 from swarm_loc_drivers.sim.scenarios.droplets import FIX_SIGMAS, DropletRun
 from swarm_loc_drivers.sim.scenarios.eight_images import ImageRun
 from swarm_loc_drivers.sim.scenarios.wandering import AerialRun
+from swarm_loc_estimator import CONTENT_POSE
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
@@ -38,7 +39,6 @@ from swarm_loc_estimator.common.messages.typestore import (
     encode,
     typestore,
 )
-from swarm_loc_estimator.sensors.camera import CONTENT_POSE
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 

@@ -33,6 +33,17 @@ from swarm_loc_drivers.sim.pushbot.optics import (
 )
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.scenarios.bags import Stream, write_streams
+from swarm_loc_estimator import (
+    LASER,
+    LIGHTS,
+    OCCUPANCY_GRID,
+    CooperativeMapper,
+    FixCovariances,
+    Goal,
+    LightSightings,
+    OccupancyMap,
+    Readings,
+)
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.encoders import (
@@ -50,13 +61,6 @@ from swarm_loc_estimator.common.messages.typestore import (
     encode,
     typestore,
 )
-from swarm_loc_estimator.mapping.exploration.goal import Goal
-from swarm_loc_estimator.mapping.fix_covariance import FixCovariances
-from swarm_loc_estimator.mapping.grid.occupancy import OccupancyMap
-from swarm_loc_estimator.mapping.grid_messages import OCCUPANCY_GRID
-from swarm_loc_estimator.mapping.laser_messages import LASER, LIGHTS
-from swarm_loc_estimator.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.mapping.readings import LightSightings, Readings
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, StartSigma, Swarm
 
 EVENTS = f"{MESSAGE_PACKAGE}/msg/EventPacket"

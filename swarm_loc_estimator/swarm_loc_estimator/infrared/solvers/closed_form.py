@@ -20,7 +20,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.se2_scalar import wrap
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.curves import curve_at, distance_at
 from swarm_loc_estimator.infrared.solution import DARKEST, IrSolutions, Outcome, checked
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
@@ -90,7 +90,7 @@ class ClosedForm:
         poses[:, 0] = np.repeat(self._ranges, _SAMPLES)
         factors = np.exp(sigma * rng.standard_normal((2, count, platform.n)))
         differing = PairGains(factors[0], factors[1], np.zeros((count, 4)))
-        readings = expected(platform, poses, differing)
+        readings = expected_brightness(platform, poses, differing)
         spread = np.hypot(platform.noise, platform.relative * readings)
         readings = np.minimum(readings + spread * rng.standard_normal(readings.shape), platform.saturation)
         found, outcomes = np.zeros_like(poses), np.zeros(count, np.int64)

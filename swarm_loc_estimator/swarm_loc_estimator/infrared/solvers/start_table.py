@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit, reassociated_njit
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.curves import AngleCurve, TabulatedCurve, curve_at, distance_at
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform
 
@@ -120,7 +120,7 @@ def start_table(platform: IrPlatform) -> StartTable:
     angles: FloatArray = np.linspace(-np.pi, np.pi, directions, endpoint=False)
     bearing, heading, distance = np.meshgrid(angles, angles, ranges, indexing="ij")
     poses = np.stack([distance, bearing, heading], axis=-1).reshape(-1, 3)
-    readings = np.minimum(expected(platform, poses), model.saturation)
+    readings = np.minimum(expected_brightness(platform, poses), model.saturation)
     patterns = np.arcsinh(readings / (_KNEE * model.noise)).astype(np.float32)
     patterns = patterns.reshape(directions**2, _LEVELS, -1)
     totals: Float32Array = np.sum(patterns, axis=-1)

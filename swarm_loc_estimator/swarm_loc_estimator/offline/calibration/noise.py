@@ -92,9 +92,9 @@ def score(results: Sequence[ReplayResult]) -> Score:
                 continue
             true, known = interpolate(truth, result.stamp_ns, DEFAULT_GAP_NS)
             known_poses += int(known.sum())
-            known &= np.isfinite(result.pose[:, index]).all(axis=1)
-            errors.append(result.pose[known, index] - true[known])
-            covariances.append(result.covariance[known, index])
+            known &= np.isfinite(result.poses[:, index]).all(axis=1)
+            errors.append(result.poses[known, index] - true[known])
+            covariances.append(result.covariances[known, index])
     error, covariance = np.concatenate(errors), np.concatenate(covariances)
     if not error.size:
         return Score(math.nan, math.nan, math.nan, 0.0)

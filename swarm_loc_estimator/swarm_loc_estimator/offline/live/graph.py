@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import subprocess
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,7 +31,10 @@ from typing_extensions import Self
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.errors import UserError
 from swarm_loc_estimator.common.launch import Child, NodeSpec, node_command, start, stop
+from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.sensors.topics import InputKind
+from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_msgs.msg import SwarmPoses
 
 START_PATIENCE_S = 600.0
@@ -214,22 +217,6 @@ class Poses(NamedTuple):
     status: NDArray[np.uint8]
 
 
-class PoseHistory(NamedTuple):
-    """Many messages of swarm/poses; begins like the columns of a `ReplayResult`.
-
-    Attributes:
-        stamp_ns: (T,) when the poses hold.
-        pose: (T, N, 3) x [m], y [m], theta [rad] in map.
-        covariance: (T, N, 3, 3).
-        status: (T, N) of `SwarmPose.status`.
-    """
-
-    stamp_ns: NDArray[np.int64]
-    pose: FloatArray
-    covariance: FloatArray
-    status: NDArray[np.uint8]
-
-
 class Recorder(Node):
     """Keeps every message of swarm/poses with its time of reception, and the newest /diagnostics.
 
@@ -263,6 +250,12 @@ class Recorder(Node):
         """The numbers of all messages so far, in order of reception; each is read once."""
         self._poses.extend(map(read_poses, self.raw[len(self._poses) :]))
         return self._poses
+
+    def result(self, title: str, swarm: Swarm, truth: Mapping[str, Trajectory]) -> ReplayResult:
+        """All poses so far, of which there is at least one, and what was dropped, beside ground truth."""
+        stamps_ns, poses, covariances, status = zip(*self.poses(), strict=True)
+        stamp_ns, columns = np.array(stamps_ns, dtype=np.int64), (np.array(poses), np.array(covariances))
+        return ReplayResult(title, swarm, stamp_ns, *columns, np.array(status), truth, dict(self.drops))
 
     def _on_poses(self, data: bytes) -> None:
         self.raw.append(data)
@@ -305,9 +298,3 @@ def read_poses(data: bytes) -> Poses:
         np.array([one.covariance for one in robots]).reshape(-1, 3, 3),
         np.array([one.status for one in robots], dtype=np.uint8),
     )
-
-
-def read_history(raw: Sequence[bytes]) -> PoseHistory:
-    """The numbers of serialized SwarmPoses, of which there is at least one."""
-    stamps_ns, *columns = zip(*map(read_poses, raw), strict=True)
-    return PoseHistory(np.array(stamps_ns, dtype=np.int64), *map(np.array, columns))

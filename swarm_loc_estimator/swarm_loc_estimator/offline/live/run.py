@@ -22,7 +22,6 @@ from swarm_loc_estimator.offline.live.graph import (
     LiveGraph,
     Recorder,
     cpu_seconds,
-    read_history,
     read_poses,
     resident_mb,
 )
@@ -49,7 +48,6 @@ class LiveRun:
             player has published all of them.
         taken: Stamp of poses -> topic -> messages that the estimator had taken in for them; of some poses.
         rate: Speed at which the bag was played.
-        status: (T, N) of `SwarmPose.status`.
         received: Those that the estimator took in.
         estimator_core: CPU time of the estimator's process per second while the bag played.
         age_s: (A,) time of reception minus stamp of poses, in the bag's time, of those that came when it was
@@ -63,7 +61,6 @@ class LiveRun:
     arrival_ns: Mapping[str, NDArray[np.int64]]
     taken: Mapping[int, Mapping[str, int]]
     rate: float
-    status: NDArray[np.uint8]
     received: int
     estimator_core: float
     age_s: FloatArray
@@ -172,14 +169,8 @@ def play_live(
             raise LiveError(f"The player ended with status {player.returncode}; see {log}.")
         _wait_for_the_rest(graph, content)
         memory_mb = resident_mb(estimator.pid)
-    history = read_history(recorder.raw)
-    result = ReplayResult(
-        f"{bag.name}, live at {options.rate:g} x",
-        swarm,
-        *history[:3],
-        status=history.status,
-        truth=content.truth,
-        counters=dict(recorder.drops),
+    result = replace(
+        recorder.result(f"{bag.name}, live at {options.rate:g} x", swarm, content.truth),
         remarks=content.remarks,
         data_s=(content.end_ns - content.begin_ns) * 1e-9,
         wall_s=played_s,
@@ -190,7 +181,6 @@ def play_live(
         content.arrival_ns,
         recorder.taken,
         options.rate,
-        history.status,
         recorder.inputs,
         core,
         age_s,
@@ -288,9 +278,9 @@ def compare_with_replay(live: LiveRun, bag: Path, settings: Settings | None = No
         settings: Those of the live estimator.
     """
     replayed = replay(bag, live.result.swarm, settings, stamp_ns=live.result.stamp_ns)
-    difference = live.result.pose - replayed.pose
-    located = np.isfinite(live.result.pose).all(axis=2)
-    one_only = located != np.isfinite(replayed.pose).all(axis=2)
+    difference = live.result.poses - replayed.poses
+    located = np.isfinite(live.result.poses).all(axis=2)
+    one_only = located != np.isfinite(replayed.poses).all(axis=2)
     turn = np.where(one_only, np.inf, np.abs(se2.wrap_angle(difference[..., 2])))
     distance = np.where(one_only, np.inf, np.hypot(difference[..., 0], difference[..., 1]))
     return Agreement(replayed, distance, turn, _settled(live))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.offline.metrics import Errors, pool, summarise
+from swarm_loc_estimator.offline.metrics import Errors, pool
 from swarm_loc_estimator.offline.report.style import (
     INK,
     SOFT,
@@ -81,9 +80,7 @@ def _until_truth_ends(result: ReplayResult) -> ReplayResult:
     ends = [int(track.stamp_ns[-1]) for track in result.truth.values() if len(track.stamp_ns)]
     if not ends:
         return result
-    kept = result.stamp_ns <= max(ends)
-    stamp_ns, pose, covariance = result.stamp_ns[kept], result.pose[kept], result.covariance[kept]
-    return replace(result, stamp_ns=stamp_ns, pose=pose, covariance=covariance)
+    return result.chosen(result.stamp_ns <= max(ends))
 
 
 def _title(result: ReplayResult) -> str:
@@ -91,7 +88,7 @@ def _title(result: ReplayResult) -> str:
     robots = f"{_counted(result.swarm.robots, 'robot')}, {_counted(result.swarm.landmarks, 'landmark')}"
     if not result.errors:
         return robots
-    row = summarise(pool(list(result.errors.values())))
+    row = result.overall
     position, heading = length_text(row.position_rmse), f"{math.degrees(row.heading_rmse):.1f}°"
     return f"{robots}: RMS error {position} and {heading}, NEES {row.nees:.1f} (ideal 3)"
 
@@ -124,7 +121,7 @@ def _draw_swarm(axis: Axes, result: ReplayResult, world: WorldMap) -> float:
 def _draw_tail(axis: Axes, result: ReplayResult, index: int) -> None:
     """The last stretch of a path, bold."""
     late = result.stamp_ns >= result.stamp_ns.max(initial=0) - _TAIL_NS
-    x, y, _ = result.pose[late, index].T
+    x, y, _ = result.poses[late, index].T
     axis.plot(x, y, color=colour_of(index), linewidth=2.4, zorder=3)
 
 

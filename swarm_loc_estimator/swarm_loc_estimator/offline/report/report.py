@@ -60,13 +60,14 @@ class ReportFiles:
     errors: Path | None
 
 
-def write_report(result: ReplayResult, folder: Path) -> ReportFiles:
+def write_report(result: ReplayResult, folder: Path | str) -> ReportFiles:
     """Write report.txt, report.html and overview.png; paths.png and errors.png where they say more.
 
     Args:
         result: What to report.
         folder: Where to; created when missing, files of an earlier report are replaced.
     """
+    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     text, page, overview = (folder / name for name in ("report.txt", "report.html", "overview.png"))
     text.write_text(text_report(result), encoding="utf-8")

@@ -100,7 +100,7 @@ class WorldMap:
         points = [track.pose[:, :2] for track in result.truth.values()]
         points += [np.array([[mark.x, mark.y] for mark in result.swarm.landmarks]).reshape(-1, 2)]
         if not result.truth:
-            points.append(result.pose[..., :2].reshape(-1, 2))
+            points.append(result.poses[..., :2].reshape(-1, 2))
         every = np.concatenate(points)
         every = every[np.isfinite(every).all(axis=1)]
         low, high = (every.min(axis=0), every.max(axis=0)) if len(every) else (np.zeros(2), np.zeros(2))
@@ -141,7 +141,7 @@ class WorldMap:
             track = result.truth[name]
             truth = broken(track.stamp_ns, track.pose)[:: max(1, len(track.pose) // _MAX_POINTS)]
             axis.plot(truth[:, 0], truth[:, 1], color=TRUTH, linewidth=3.6, alpha=0.4, zorder=1)
-        pose = result.pose[:, index][:: max(1, len(result.pose) // _MAX_POINTS)]
+        pose = result.poses[:, index][:: max(1, len(result.poses) // _MAX_POINTS)]
         axis.plot(pose[:, 0], pose[:, 1], color=colour, linewidth=0.9, alpha=alpha, zorder=2)
 
     def draw_robot(self, axis: Axes, index: int, pose: FloatArray) -> None:
@@ -168,8 +168,8 @@ class WorldMap:
 
 def last_pose(result: ReplayResult, index: int) -> tuple[FloatArray, FloatArray] | None:
     """A robot's last pose (3,) with its covariance (3, 3); None where it never had one."""
-    known = np.flatnonzero(np.isfinite(result.pose[:, index]).all(axis=1))
-    return (result.pose[known[-1], index], result.covariance[known[-1], index]) if len(known) else None
+    known = np.flatnonzero(np.isfinite(result.poses[:, index]).all(axis=1))
+    return (result.poses[known[-1], index], result.covariances[known[-1], index]) if len(known) else None
 
 
 def label_map(axis: Axes) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from swarm_loc_estimator.offline.metrics import ErrorSummary, pool, summarise
+from swarm_loc_estimator.offline.metrics import ErrorSummary
 from swarm_loc_estimator.offline.result import ReplayResult
 
 HEADER = (
@@ -32,10 +32,7 @@ POOLED = "all"
 
 def summaries(result: ReplayResult) -> list[tuple[str, ErrorSummary]]:
     """Name and errors of each robot with ground truth, and of all together."""
-    rows = [(name, summarise(errors)) for name, errors in result.errors.items()]
-    if rows:
-        rows.append((POOLED, summarise(pool(list(result.errors.values())))))
-    return rows
+    return [*result.summaries.items(), (POOLED, result.overall)] if result.errors else []
 
 
 def cells(name: str, row: ErrorSummary) -> list[str]:

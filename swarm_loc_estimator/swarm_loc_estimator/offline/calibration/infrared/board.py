@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.solution import Outcome
 from swarm_loc_estimator.infrared.solvers.gains import Exchanges
 from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
@@ -162,7 +162,7 @@ def errors_of(model: BoardModel, data: BoardReadings, *, known: bool = True) -> 
 
 def stock_residual(platform: IrPlatform, data: BoardReadings) -> float:
     """RMS of what readings differ from expectation at the true poses [sigma], without saturated ones."""
-    bright = expected(replace(platform, amplitudes=platform.amplitudes[:1]), data.poses)[:, 0]
+    bright = expected_brightness(replace(platform, amplitudes=platform.amplitudes[:1]), data.poses)[:, 0]
     usable = (
         np.isfinite(data.readings) & (data.readings < platform.saturation) & (bright < platform.saturation)
     )

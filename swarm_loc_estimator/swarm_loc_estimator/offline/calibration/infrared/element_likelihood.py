@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.solution import DARKEST
 from swarm_loc_estimator.infrared.solvers.start_table import start_table
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
@@ -108,7 +108,7 @@ def _grid(platform: IrPlatform) -> tuple[FloatArray, FloatArray, FloatArray]:
     ranges = start_table(full).ranges
     angles = np.arange(-math.pi, math.pi - 1e-9, direction_step(platform))
     poses = np.stack(np.meshgrid(ranges, angles, angles, indexing="ij"), axis=-1).reshape(-1, 3)
-    return poses, expected(full, poses)[:, 0], 2.0 * np.log(poses[:, 0] / ranges[-1])
+    return poses, expected_brightness(full, poses)[:, 0], 2.0 * np.log(poses[:, 0] / ranges[-1])
 
 
 def _grid_variance(platform: IrPlatform, light: FloatArray) -> float:

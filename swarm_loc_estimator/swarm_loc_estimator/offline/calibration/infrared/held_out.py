@@ -15,7 +15,7 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.infrared.brightness import expected
+from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.solution import DARKEST, IrSolutions
 from swarm_loc_estimator.infrared.solvers.gains import POSE_SIGMA, Exchanges
 from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
@@ -59,7 +59,7 @@ def held_out_likelihoods(
         one, other = exchanges.receiver[k], exchanges.transmitter[k]
         logs = np.empty((HYPOTHESES, HYPOTHESES, len(poses)))
         _write_likelihoods(
-            expected(platform, poses),
+            expected_brightness(platform, poses),
             exchanges.readings[k],
             exchanges.saturation[k],
             (factors[0, one], factors[1, other], sigmas[one], sigmas[other]),

@@ -1,0 +1,88 @@
+"""The public Python API: its names, what importing one of them loads, its page, its example."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import swarm_loc_estimator
+from swarm_loc_estimator import ReplayResult, replay
+from swarm_loc_estimator.offline.report.table import text_report
+
+ROOT = Path(__file__).parents[3]
+PAGE = ROOT / "swarm_loc_estimator" / "doc" / "python_api.md"
+EXAMPLE = ROOT / "swarm_loc_estimator" / "examples" / "replay_errors.py"
+BAG = ROOT / "bags" / "eight_five_robots"
+NAMES = set(swarm_loc_estimator._MODULE_OF)
+
+
+def run(*arguments: str) -> str:
+    """What a Python process at the root of the workspace prints."""
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        cwd=ROOT,
+        env={**os.environ},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def result() -> ReplayResult:
+    return replay(BAG)
+
+
+def test_type_checkers_see_the_same_names_in_the_same_modules() -> None:
+    tree = ast.parse(Path(swarm_loc_estimator.__file__).read_text(encoding="utf-8"))
+    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
+    seen = {
+        one.asname: (node.module or "").removeprefix("swarm_loc_estimator.")
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for one in node.names
+    }
+    assert seen == swarm_loc_estimator._MODULE_OF
+
+
+def test_all_names_load_and_no_others() -> None:
+    assert all(hasattr(swarm_loc_estimator, name) for name in NAMES)
+    assert set(dir(swarm_loc_estimator)) >= NAMES
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        _ = swarm_loc_estimator.nothing
+
+
+@pytest.mark.parametrize("name", ["Swarm", "Goal", "Settings"])
+def test_one_name_loads_neither_the_filter_nor_plots_nor_a_server(name: str) -> None:
+    loaded = run("-c", f"import sys; from swarm_loc_estimator import {name}; print(*sys.modules)").split()
+    assert f"swarm_loc_estimator.{swarm_loc_estimator._MODULE_OF[name]}" in loaded
+    assert not {"matplotlib", "aiohttp", "rclpy", "swarm_loc_estimator.filter.state"} & set(loaded)
+
+
+def test_the_page_names_what_there_is_and_its_code_runs() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert len(blocks) == 3
+    printed = [run("-c", block).split("\n") for block in blocks]
+    assert float(printed[0][0]) == pytest.approx(0.0027, abs=1e-4)
+    assert [line.split()[0] for line in printed[1][:-1]] == [f"epuck{k}" for k in range(1, 6)]
+    assert printed[2][0] == "[[0.02 0.   0.  ]]"
+    assert printed[2][1] == "{}"
+
+
+def test_the_example_prints_the_errors_of_the_report(result: ReplayResult) -> None:
+    _, *lines = run(str(EXAMPLE), str(BAG)).splitlines()
+    report = text_report(result).splitlines()
+    assert [line.split()[0] for line in lines] == [*result.errors, "all"]
+    for line in lines:
+        name, position, heading, nees = line.split()
+        (row,) = [one.split() for one in report if one.startswith(f"{name} ")]
+        assert (position, heading, nees) == (row[2], row[7], row[12])
