@@ -33,7 +33,6 @@ from swarm_loc_drivers.sim.scenarios.droplets import (
     FIXED,
     TURN_S,
     DropletRunSettings,
-    DropletSwarmSettings,
     describe_droplets,
     simulate_droplets,
     starts,
@@ -46,7 +45,6 @@ from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveGraph, 
 from swarm_loc_estimator.offline.recorded_bag import read_truth
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
@@ -155,10 +153,9 @@ def lived(seed: int, folder: Path, log: Path) -> ReplayResult:
 
 def _write_swarms(seed: int, folder: Path) -> Swarm:
     """Write the swarm as the world knows it, and as the estimator does, which is returned: without starts."""
-    platform = load_ir_platform("droplet")
     for known, name in ((True, "world.yaml"), (False, "swarm.yaml")):
-        settings = DropletSwarmSettings(seed, ROBOTS, start_known=known)
-        swarm = describe_droplets(settings, starts(settings), platform, (None,) * ROBOTS)
+        settings = DropletRunSettings(seed, robots=ROBOTS, start_known=known)
+        swarm = describe_droplets(settings, starts(settings))
         save_swarm(swarm, folder / name)
     return swarm
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.epuck.rendered import WORLD, RenderedRun
+from bench.epuck.views import Views, views_of
 from swarm_loc_drivers.sim.epuck.epuck_world_parameters import WorldParameters, make_world
 from swarm_loc_drivers.sim.epuck.world import EpuckWorld
-from swarm_loc_drivers.sim.render.views import Views
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 
 _PENDING_NS = 300_000_000
@@ -68,7 +68,7 @@ def _of_robot(run: RenderedRun, world: EpuckWorld, robot: int, name: str) -> NDA
         detections += len(message.detections)
         if not np.isfinite(there).all():
             continue
-        views = world.views(robot, there)
+        views = views_of(world.rig, robot, there)
         clear = is_visible(views)
         matched = _matched(views, message.detections)
         visible += int(clear.sum())

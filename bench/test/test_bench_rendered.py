@@ -7,10 +7,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from bench.epuck.views import Views
 from swarm_loc_drivers.sim.epuck.world import Exposure
-from swarm_loc_drivers.sim.render.views import Views
 from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE, DetectionArrayMessage, decode_detections
 from swarm_loc_estimator.common.messages.encoders import encode_detections
 from swarm_loc_estimator.common.trajectory import Trajectory
@@ -53,19 +52,18 @@ class Camera:
     """Stands for a world whose cameras take ten pictures a second and see one marker."""
 
     PERIOD_NS = SECOND // 10
+    rig = None
 
     def exposure_of(self, robot: int, stamp_ns: int) -> Exposure:
         """See `EpuckWorld`."""
         number = round(stamp_ns / self.PERIOD_NS)
         return Exposure(robot, number, number * self.PERIOD_NS, number * self.PERIOD_NS)
 
-    def views(self, _robot: int, _poses: NDArray[np.float64]) -> Views:
-        """See `EpuckWorld`."""
-        return views(1)
-
 
 @pytest.mark.parametrize(("last", "lost"), [(600, 0), (598, 0), (596, 1), (12, 585), (0, 597)])
-def test_pictures_of_which_nothing_is_heard_are_lost_however_long_it_lasts(last: int, lost: int) -> None:
+def test_pictures_of_which_nothing_is_heard_are_lost_however_long_it_lasts(
+    monkeypatch: pytest.MonkeyPatch, last: int, lost: int
+) -> None:
     """The robots drive for a minute, and detections come until the last one."""
     stamps = np.arange(0, 60 * SECOND + 1, SECOND // 20)
     track = Trajectory(stamps + SECOND // 20, np.zeros((len(stamps), 3)))
@@ -77,6 +75,7 @@ def test_pictures_of_which_nothing_is_heard_are_lost_however_long_it_lasts(last:
     run = SimpleNamespace(
         seen={"r": messages}, live=live, begin_ns=SECOND // 20, end_ns=60 * SECOND + SECOND // 20
     )
+    monkeypatch.setattr(seen, "views_of", lambda *_: views(1))
     frames, missing, *others = seen._of_robot(run, Camera(), 0, "r").tolist()
     assert (frames, missing, others) == (597, lost, [0, 597 - lost, 0, 0])
 

@@ -37,7 +37,7 @@ from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_drivers.sim.scenarios.eight_images import simulate_eight_images
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.scenarios.pushbot_bag import PushbotBagSettings, write_pushbot_bag
-from swarm_loc_drivers.sim.scenarios.wandering import WanderingSettings, simulate_wandering
+from swarm_loc_drivers.sim.scenarios.wandering import simulate_wandering
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
 
@@ -98,7 +98,7 @@ def _droplets(options: argparse.Namespace, comment: str) -> int:
 
 
 def _aerial(options: argparse.Namespace, comment: str) -> int:
-    settings = WanderingSettings(options.seed, options.duration, options.robots, options.start_known)
+    settings = EightSettings(options.seed, options.duration, options.robots, start_known=options.start_known)
     return write_aerial_bag(simulate_wandering(settings), options.bag, comment)
 
 

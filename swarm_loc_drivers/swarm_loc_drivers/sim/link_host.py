@@ -40,31 +40,31 @@ class ConsoleFirmware(Protocol):
     """A firmware behind a serial port."""
 
     def receive(self, data: bytes) -> bytes:
-        """Take bytes; what the robot answers."""
+        """Take bytes; what the robot answers at once."""
 
     def stream(self) -> bytes:
-        """What the robot sends by itself."""
+        """What the robot sends by itself; behind flow control called when all before is on its way."""
 
 
-class StreamFirmware(Protocol):
-    """A firmware behind a TCP port."""
-
-    def receive(self, data: bytes) -> None:
-        """Take bytes."""
-
-    def stream(self) -> bytes:
-        """What the robot sends by itself; called when all before is on its way."""
+class StreamFirmware(ConsoleFirmware, Protocol):
+    """A firmware behind a TCP port, which answers as it streams."""
 
     def disconnect(self) -> None:
         """The client has gone."""
 
 
 class _PtyPort:
-    """A pseudo-terminal; it stays open while clients come and go, as a robot's Bluetooth module does."""
+    """A pseudo-terminal; it stays open while clients come and go, as a robot's Bluetooth module does.
 
-    def __init__(self, firmware: ConsoleFirmware, link: Path | None) -> None:
-        self._firmware = firmware
-        self._link = link
+    Args:
+        firmware: Who answers.
+        link: A name for the terminal that stays the same; None for none.
+        waits: Whether the firmware waits for the client (RTS/CTS); else what it does not take is lost.
+    """
+
+    def __init__(self, firmware: ConsoleFirmware, link: Path | None, *, waits: bool) -> None:
+        self._firmware, self._link, self._waits = firmware, link, waits
+        self._unsent = b""
         self._master, self._slave = pty.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -78,50 +78,23 @@ class _PtyPort:
 
     def on_readable(self) -> None:
         with contextlib.suppress(BlockingIOError):
-            self._send(self._firmware.receive(os.read(self._master, _CHUNK)))
+            if answer := self._firmware.receive(os.read(self._master, _CHUNK)):
+                self._send(answer)
 
     def on_cycle(self) -> None:
-        self._send(self._firmware.stream())
+        self._send(self._unsent or self._firmware.stream())
 
     def _send(self, data: bytes) -> None:
-        """What the client does not take is lost, as on a wire."""
-        if data:
-            with contextlib.suppress(BlockingIOError):
-                os.write(self._master, data)
+        with contextlib.suppress(BlockingIOError):
+            while data:
+                data = data[os.write(self._master, data) :]
+        self._unsent = data if self._waits else b""
 
     def close(self) -> None:
         if self._link is not None:
             self._link.unlink(missing_ok=True)
         os.close(self._master)
         os.close(self._slave)
-
-
-class _FlowControlledPort(_PtyPort):
-    """A pseudo-terminal with RTS/CTS: what the client does not take waits, and the firmware waits with it."""
-
-    def __init__(self, firmware: StreamFirmware, link: Path | None) -> None:
-        super().__init__(_Quiet(firmware), link)
-        self._unsent = b""
-
-    def on_cycle(self) -> None:
-        self._unsent = self._unsent or self._firmware.stream()
-        with contextlib.suppress(BlockingIOError):
-            while self._unsent:
-                self._unsent = self._unsent[os.write(self._master, self._unsent) :]
-
-
-class _Quiet:
-    """A firmware that answers as it streams."""
-
-    def __init__(self, firmware: StreamFirmware) -> None:
-        self._firmware = firmware
-
-    def receive(self, data: bytes) -> bytes:
-        self._firmware.receive(data)
-        return b""
-
-    def stream(self) -> bytes:
-        return self._firmware.stream()
 
 
 class _TcpPort:
@@ -198,23 +171,18 @@ class FirmwareHost:
         self._selector = selectors.DefaultSelector()
         self._ports: list[_Port] = []
 
-    def serve_pty(self, firmware: ConsoleFirmware, link: Path | None = None) -> Path:
+    def serve_pty(self, firmware: ConsoleFirmware, link: Path | None = None, *, waits: bool = False) -> Path:
         """Put a firmware behind a pseudo-terminal.
 
         Args:
             firmware: Who answers.
             link: A name for the terminal that stays the same; None for none.
+            waits: Whether the firmware waits for the client (RTS/CTS); else what it does not take is lost.
 
         Returns:
             The path for a driver.
         """
-        port = _PtyPort(firmware, link)
-        self._add(port)
-        return link or port.path
-
-    def serve_flow_controlled(self, firmware: StreamFirmware, link: Path | None = None) -> Path:
-        """The same with RTS/CTS: nothing is lost when the client takes its time, the firmware waits."""
-        port = _FlowControlledPort(firmware, link)
+        port = _PtyPort(firmware, link, waits=waits)
         self._add(port)
         return link or port.path
 

@@ -7,7 +7,6 @@ order of arrival. Ground truth stands apart and is for evaluation only.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -134,13 +133,6 @@ class SimulatedRun(LivedRun):
         frames["count"] = np.bincount(frame[kept], minlength=len(frames))
         frames["first"] = np.cumsum(frames["count"]) - frames["count"]
         return replace(self, frames=frames, sightings=self.sightings[kept])
-
-    def arrivals(self) -> Iterator[tuple[str, int]]:
-        """All data in order of arrival: ("odometry" or "frame", index into that array)."""
-        count = len(self.odometry)
-        arrival_ns = np.concatenate([self.odometry["arrival_ns"], self.frames["arrival_ns"]])
-        for index in np.argsort(arrival_ns, kind="stable").tolist():
-            yield ("odometry", index) if index < count else ("frame", index - count)
 
 
 def in_order_of_arrival(records: Records, end_ns: int) -> Records:

@@ -12,6 +12,9 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.errors import UserError
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, SensorModel, Swarm
 
+PRINTED_SENSOR = SensorModel(forward_sigma=0.026, left_sigma=0.029, heading_sigma=0.508)
+"""The sigmas that the e-puck paper prints below its figure 5."""
+
 
 @dataclass(frozen=True)
 class ErrorModel:
@@ -38,40 +41,21 @@ class ErrorModel:
     forward_sigma: float
     left_sigma: float
     heading_sigma: float
-    flip_probability: float
-    gross_probability: float
-    camera_yaw_sigma: float
-    scale_sigma: float
-    map_position_sigma: float
-    map_heading_sigma: float
-    face_position_sigma: float
-    exposure_early_s: float
-    turn_slip: float
-    wheel_noise: float
-    frame_loss: float
-    described: SensorModel
+    flip_probability: float = 0.0
+    gross_probability: float = 0.0
+    camera_yaw_sigma: float = 0.0
+    scale_sigma: float = 0.0
+    map_position_sigma: float = 0.0
+    map_heading_sigma: float = 0.0
+    face_position_sigma: float = 0.0
+    exposure_early_s: float = 0.0
+    turn_slip: float = 0.0
+    wheel_noise: float = 2e-5
+    frame_loss: float = 0.05
+    described: SensorModel = PRINTED_SENSOR
 
 
-PRINTED_SENSOR = SensorModel(forward_sigma=0.026, left_sigma=0.029, heading_sigma=0.508)
-"""The sigmas that the e-puck paper prints below its figure 5."""
-
-W0 = ErrorModel(
-    forward_sigma=PRINTED_SENSOR.forward_sigma,
-    left_sigma=PRINTED_SENSOR.left_sigma,
-    heading_sigma=PRINTED_SENSOR.heading_sigma,
-    flip_probability=0.0,
-    gross_probability=0.0,
-    camera_yaw_sigma=0.0,
-    scale_sigma=0.0,
-    map_position_sigma=0.0,
-    map_heading_sigma=0.0,
-    face_position_sigma=0.0,
-    exposure_early_s=0.0,
-    turn_slip=0.0,
-    wheel_noise=2e-5,
-    frame_loss=0.05,
-    described=PRINTED_SENSOR,
-)
+W0 = ErrorModel(PRINTED_SENSOR.forward_sigma, PRINTED_SENSOR.left_sigma, PRINTED_SENSOR.heading_sigma)
 """The printed sigmas as white noise and nothing else."""
 
 W2 = ErrorModel(
@@ -87,9 +71,6 @@ W2 = ErrorModel(
     face_position_sigma=0.003,
     exposure_early_s=0.133,
     turn_slip=0.05,
-    wheel_noise=2e-5,
-    frame_loss=0.05,
-    described=PRINTED_SENSOR,
 )
 """Small white noise and systematic errors that together look like the paper's experiment."""
 

@@ -15,22 +15,20 @@ from node_world import Program, Ros, overrides, stamp_ns
 from rosgraph_msgs.msg import Clock
 
 from swarm_loc_drivers.droplet.droplet_fleet_node import DropletFleetNode
-from swarm_loc_drivers.sim.scenarios.droplets import DropletSwarmSettings, describe_droplets, starts
+from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, describe_droplets, starts
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_msgs.msg import BrightnessMatrix
 
 ROBOTS = 3
 POWERS = {BrightnessMatrix.POWER_FAR, BrightnessMatrix.POWER_NEAR}
-SETTINGS = DropletSwarmSettings(robots=ROBOTS, start_known=True)
+SETTINGS = DropletRunSettings(robots=ROBOTS, start_known=True)
 
 
 @pytest.fixture
 def swarm_file(tmp_path: Path) -> Path:
     path = tmp_path / "swarm.yaml"
-    gains = (None,) * ROBOTS
-    swarm = describe_droplets(SETTINGS, starts(SETTINGS), load_ir_platform("droplet"), gains)
+    swarm = describe_droplets(SETTINGS, starts(SETTINGS))
     save_swarm(swarm, path)
     return path
 

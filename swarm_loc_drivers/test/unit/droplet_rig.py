@@ -12,14 +12,16 @@ from swarm_loc_drivers.droplet.exchange import Brightness, PollingSettings
 from swarm_loc_drivers.droplet.hardware import DROPLET, ELEMENTS, FULL_POWER
 from swarm_loc_drivers.droplet.session import SessionSettings
 from swarm_loc_drivers.droplet.tdma import TdmaSettings
+from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
 from swarm_loc_drivers.sim.droplet.infrared import InfraredSettings
-from swarm_loc_drivers.sim.droplet.lockstep import Cable, Loose, run
+from swarm_loc_drivers.sim.droplet.lockstep import Cable, run
 from swarm_loc_drivers.sim.droplet.world import (
     NEAR_POWER,
     STEP_NS,
     DropletErrors,
     DropletWorld,
     DropletWorldSettings,
+    SimulatedDroplet,
 )
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
@@ -83,8 +85,10 @@ class Lab:
             Cable(world, robot, session_settings(one), NOISE, self.found[robot].append)
             for robot, one in enumerate(exchanges)
         ]
-        loose = [Loose(world, robot) for robot in range(len(exchanges), len(world.ids))]
-        self._robots: list[Cable | Loose] = [*self.cables, *loose]
+        loose = [
+            DropletFirmware(SimulatedDroplet(world, robot)) for robot in range(len(exchanges), len(world.ids))
+        ]
+        self._robots = [*(cable.step for cable in self.cables), *(one.stream for one in loose)]
         self.control: Callable[[], None] = lambda: None
 
     def run(self, seconds: float) -> None:

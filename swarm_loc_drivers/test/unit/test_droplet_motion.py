@@ -227,7 +227,7 @@ def test_a_robot_follows_its_velocities() -> None:
 def test_a_move_that_somebody_else_commands_is_believed_too() -> None:
     lab = Lab(world_of(), asking(), asking()).connected()
     me, other = lab.cables
-    other.enter(f"tgt_cmd {IDS[0]:04X} move_steps 0 20")
+    other.firmware.receive(f"tgt_cmd {IDS[0]:04X} move_steps 0 20\r".encode())
     lab.run(5.0)
     assert me.counts["foreign_moves"] == 1
     assert me.odometry().pose == pytest.approx([20 * AHEAD.forward, 0.0, 0.0], abs=1e-6)

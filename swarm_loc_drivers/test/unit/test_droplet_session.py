@@ -26,7 +26,7 @@ from swarm_loc_drivers.common.robot_driver import SessionError
 from swarm_loc_drivers.droplet.exchange import Brightness, Power
 from swarm_loc_drivers.droplet.hardware import FULL_POWER
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, Print, print_2014, print_2016
-from swarm_loc_drivers.sim.droplet.world import NEAR_POWER, DropletErrors
+from swarm_loc_drivers.sim.droplet.world import NEAR_POWER, DropletErrors, SimulatedDroplet
 from swarm_loc_drivers.sim.link_host import ConsoleFirmware
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -105,7 +105,7 @@ def test_with_one_power_only_it_is_left_as_it_is() -> None:
 @pytest.mark.parametrize("layout", [print_2014, print_2016])
 def test_formats_without_ids_show_whom_was_asked(layout: Print) -> None:
     lab = Lab(world_of(), asking(IDS[1])).connected()
-    lab.cables[0].print_with(layout)
+    lab.cables[0].firmware = DropletFirmware(SimulatedDroplet(lab.world, 0), layout)
     lab.cables[0].session.request_exchanges()
     lab.until(lambda: lab.found[0])
     for one in lab.found[0]:
@@ -162,7 +162,7 @@ def test_impossible_matrices_are_counted(emitter: int, receiver: int, reason: st
         rows = ",".join("{" + ",".join(map(str, row)) + "}" for row in readings.tolist())
         return f'{{"{emitter:04X}", "{receiver:04X}", {{{rows}}}}},\r\n'
 
-    lab.cables[0].print_with(lying)
+    lab.cables[0].firmware = DropletFirmware(SimulatedDroplet(lab.world, 0), lying)
     lab.cables[0].session.request_exchanges()
     lab.until(lambda: lab.cables[0].counts["failed_exchanges"])
     assert lab.cables[0].counts[reason] == 1
@@ -246,7 +246,8 @@ class Wire:
 def test_over_a_bad_wire_no_other_command_arrives_than_was_meant(seed: int) -> None:
     lab = Lab(world_of(), asking(IDS[1], period_s=1.0))
     (cable,) = lab.cables
-    firmware = cable.wire(lambda one: Wire(one, 0.002, seed))
+    firmware = cable.firmware
+    cable.firmware = Wire(firmware, 0.002, seed)
     assert isinstance(firmware, DropletFirmware)
     executed: list[str] = []
     execute = firmware._execute
@@ -272,7 +273,7 @@ def test_what_a_deaf_robot_kept_of_a_line_is_not_executed_with_the_next_one() ->
     lab = Lab(world_of(), asking()).connected()
     (cable,) = lab.cables
     executed: list[str] = []
-    firmware = cable.wire(lambda one: one)
+    firmware = cable.firmware
     assert isinstance(firmware, DropletFirmware)
 
     def noting(line: str) -> None:
@@ -280,7 +281,7 @@ def test_what_a_deaf_robot_kept_of_a_line_is_not_executed_with_the_next_one() ->
 
     firmware._execute = noting  # type: ignore[method-assign]
     deaf_until_ns = lab.world.now_ns + SECOND // 2
-    cable._body.deaf_until_ns = lambda: deaf_until_ns  # type: ignore[method-assign]
+    firmware._body.deaf_until_ns = lambda: deaf_until_ns  # type: ignore[method-assign]
     cable.set_velocity((0.01, 0.0, 0.0))
     lab.run(0.52)
     cable.session.step(b"\r\n\t(RNB) ID: 6B6F | R: 173 B: -90 H: 45\r\n", lab.world.now_ns)
@@ -305,7 +306,7 @@ def test_who_does_not_speak_the_language_is_told(answer: Callable[[bytes], bytes
             return b""
 
     lab = Lab(world_of(), asking())
-    lab.cables[0].wire(lambda _: Stranger())
+    lab.cables[0].firmware = Stranger()
     with pytest.raises(SessionError, match=sentence):
         lab.run(60.0)
 
@@ -325,7 +326,7 @@ def test_a_clock_that_jumps_back_keeps_nobody_waiting() -> None:
 def test_without_a_clock_nothing_is_stamped() -> None:
     lab = Lab(world_of(), asking(IDS[1], period_s=1.0))
     session = lab.cables[0].session
-    firmware = lab.cables[0].wire(lambda one: one)
+    firmware = lab.cables[0].firmware
     data = b""
     for _ in range(20):
         data = firmware.receive(session.step(data, 0))

@@ -202,14 +202,6 @@ def test_the_same_seed_gives_the_same_run_and_another_does_not() -> None:
     assert grids[0].swarm == grids[1].swarm
 
 
-def test_arrivals_merge_both_kinds_in_order(white: SimulatedRun) -> None:
-    stamps = [
-        getattr(white, "frames" if kind == "frame" else kind)["arrival_ns"][i] for kind, i in white.arrivals()
-    ]
-    assert len(stamps) == len(white.odometry) + len(white.frames)
-    assert (np.diff(stamps) >= 0).all()
-
-
 def test_a_grid_sees_about_three_neighbours_with_its_noise() -> None:
     run = simulate_grid(GridSettings(robots=100, duration_s=6.0))
     exact, robot, own = exact_values(run)

@@ -50,7 +50,7 @@ class DropletWorldNode(WorldNode[DropletWorldParameters]):
         self.begin(names, pace, serve, f"link_folder = {folder}")
         fixed = tuple(swarm.index_of[name] for name in chosen.fixed)
         self._tracker = Tracker(
-            fixed, chosen.fix_rate, (chosen.fix_sigma, chosen.fix_heading_sigma), chosen.seed
+            fixed, chosen.fix_rate, chosen.fix_sigma, chosen.fix_heading_sigma, chosen.seed
         )
         self._fixes = {
             robot: self.create_publisher(PoseWithCovarianceStamped, f"{names[robot]}/fix", _FIX_QOS)
@@ -68,7 +68,7 @@ class DropletWorldNode(WorldNode[DropletWorldParameters]):
         message = PoseWithCovarianceStamped()
         message.header.stamp = stamp_message(fix.stamp_ns)
         message.header.frame_id = "map"
-        pose, (sigma, heading_sigma) = message.pose.pose, self._tracker.sigmas
+        pose, sigma, heading_sigma = message.pose.pose, self.chosen.fix_sigma, self.chosen.fix_heading_sigma
         pose.position.x, pose.position.y = float(fix.pose[0]), float(fix.pose[1])
         pose.orientation = yaw_quaternion(float(fix.pose[2]))
         covariance = planar_covariance(sigma**2, sigma**2, heading_sigma**2)

@@ -12,11 +12,10 @@ from collections.abc import Callable, Sequence
 from swarm_loc_drivers.common.odometry_state import OdometryState
 from swarm_loc_drivers.common.velocity_command import Velocity, VelocityCommand
 from swarm_loc_drivers.droplet.commanded_motion import CommandedMotion, MotionNoise
-from swarm_loc_drivers.droplet.console import TERMINATOR
 from swarm_loc_drivers.droplet.exchange import Brightness
 from swarm_loc_drivers.droplet.mover import DropletMover
 from swarm_loc_drivers.droplet.session import DropletSession, SessionSettings
-from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, Print
+from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
 from swarm_loc_drivers.sim.droplet.world import DropletWorld, SimulatedDroplet
 from swarm_loc_drivers.sim.link_host import ConsoleFirmware
 
@@ -35,6 +34,7 @@ class Cable:
         publish: Gets the matrices of exchanges.
 
     Attributes:
+        firmware: Who answers at the console.
         session: The conversation.
         counts: What happened in it.
     """
@@ -49,8 +49,7 @@ class Cable:
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._world = world
-        self._body = SimulatedDroplet(world, robot)
-        self._firmware: ConsoleFirmware = DropletFirmware(self._body)
+        self.firmware: ConsoleFirmware = DropletFirmware(SimulatedDroplet(world, robot))
         self._command = VelocityCommand(
             _TIMEOUT_S, lambda: world.now_ns, self.counts, lambda: 1e-9 * world.now_ns
         )
@@ -62,65 +61,35 @@ class Cable:
         """Have the robot move so for a while."""
         self._command.set(velocity)
 
-    def print_with(self, print_matrix: Print) -> None:
-        """Have the robot begin anew with another program of its user, who prints matrices so."""
-        self._firmware = DropletFirmware(self._body, print_matrix)
-
-    def wire(self, between: Callable[[ConsoleFirmware], ConsoleFirmware]) -> ConsoleFirmware:
-        """Put something between firmware and session; what the firmware was before."""
-        firmware = self._firmware
-        self._firmware = between(firmware)
-        return firmware
-
-    def enter(self, line: str) -> None:
-        """Type a line at the console, past the session."""
-        self._firmware.receive(line.encode() + TERMINATOR)
-
     def odometry(self) -> OdometryState:
         """Where the robot is believed to be."""
         return self._motion.state(self._world.now_ns)
 
     def step(self) -> None:
         """Hand bytes to and fro until both ends are silent."""
-        data = self._firmware.stream()
+        data = self.firmware.stream()
         while not self.session.ended:
             output = self.session.step(data, self._world.now_ns)
             if not output:
                 return
-            data = self._firmware.receive(output)
+            data = self.firmware.receive(output)
             if not data:
                 return
 
 
-class Loose:
-    """A robot without a cable, which is reached by infrared only.
-
-    Args:
-        world: Where the robot lives.
-        robot: Its index.
-    """
-
-    def __init__(self, world: DropletWorld, robot: int) -> None:
-        self._firmware = DropletFirmware(SimulatedDroplet(world, robot))
-
-    def step(self) -> None:
-        """Let it work; nobody reads what it prints."""
-        self._firmware.stream()
-
-
 def run(
-    world: DropletWorld, robots: Sequence[Cable | Loose], steps: int, control: Callable[[], None]
+    world: DropletWorld, robots: Sequence[Callable[[], object]], steps: int, control: Callable[[], None]
 ) -> None:
     """Let time pass.
 
     Args:
         world: The world.
-        robots: All of its robots.
+        robots: Let each of its robots work, such as `Cable.step`.
         steps: How many steps of the world.
         control: Called after every step; sets velocities, keeps records.
     """
     for _ in range(steps):
         world.step()
         for robot in robots:
-            robot.step()
+            robot()
         control()

@@ -45,14 +45,15 @@ class Tracker:
     Args:
         robots: Their indices.
         rate_hz: Of each [1/s].
-        sigmas: Of its position [m] and of its heading [rad], one standard deviation.
+        sigma: Noise of a position along each axis, one standard deviation [m].
+        heading_sigma: Noise of a heading [rad].
         seed: Fixes the noise.
     """
 
     def __init__(
-        self, robots: tuple[int, ...], rate_hz: float, sigmas: tuple[float, float], seed: int
+        self, robots: tuple[int, ...], rate_hz: float, sigma: float, heading_sigma: float, seed: int
     ) -> None:
-        self.sigmas = sigmas
+        self._scale = np.array([sigma, sigma, heading_sigma])
         self._robots = robots
         self._period_ns = round(1e9 / rate_hz)
         self._rng = np.random.default_rng([seed, *robots])
@@ -65,11 +66,8 @@ class Tracker:
         if now_ns < self._due_ns:
             return []
         self._due_ns += self._period_ns
-        position, heading = self.sigmas
-        scale = np.array([position, position, heading])
-        return [
-            Fix(robot, now_ns, poses[robot] + scale * self._rng.standard_normal(3)) for robot in self._robots
-        ]
+        noisy = ((robot, poses[robot] + self._scale * self._rng.standard_normal(3)) for robot in self._robots)
+        return [Fix(robot, now_ns, pose) for robot, pose in noisy]
 
 
 STEP_NS = 5_000_000

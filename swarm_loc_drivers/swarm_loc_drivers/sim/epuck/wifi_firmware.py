@@ -58,9 +58,10 @@ class WifiFirmware:
         self._due_ns = self._body.now_ns
         self._program = self._run()
 
-    def receive(self, data: bytes) -> None:
-        """Take what the client sends; it is looked at when the program comes round to it."""
+    def receive(self, data: bytes) -> bytes:
+        """Take what the client sends; the program reads it later, so nothing is answered at once."""
         self._queue += data
+        return b""
 
     def stream(self) -> bytes:
         """What is to be sent now; called when all before has been sent."""

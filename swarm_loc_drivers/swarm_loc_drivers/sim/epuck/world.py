@@ -19,7 +19,6 @@ from swarm_loc_drivers.epuck.wheels import WheelGeometry
 from swarm_loc_drivers.sim.differential_drive import Drive, LastingNoise, roll
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena, CameraRig, OverheadRig, OverheadSettings
-from swarm_loc_drivers.sim.render.views import Views
 from swarm_loc_drivers.sim.run import Trajectories
 from swarm_loc_drivers.sim.worlds import ErrorModel, WorldError, hidden_geometry, start_of
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -152,10 +151,11 @@ class EpuckWorld:
         )
         rng = np.random.default_rng(settings.seed)
         truth = hidden_geometry(rng, swarm, settings.errors)
-        self._rig = CameraRig(swarm, truth, settings.arena, settings.camera, settings.seed)
+        self.rig = CameraRig(swarm, truth, settings.arena, settings.camera, settings.seed)
+        """The robots' cameras."""
         overhead = settings.overhead
         self._overhead = (
-            OverheadRig(self._rig.scene, overhead, settings.floor_markers, settings.arena.family)
+            OverheadRig(self.rig.scene, overhead, settings.floor_markers, settings.arena.family)
             if overhead.is_there
             else None
         )
@@ -206,11 +206,7 @@ class EpuckWorld:
             rng = self._random(_OVERHEAD_SENSOR, exposure.number)
             return self._overhead.take(exposure.middle_ns, track, rng)
         rng = self._random(_SENSOR, exposure.robot, exposure.number)
-        return self._rig.take(exposure.robot, exposure.middle_ns, track, rng)
-
-    def views(self, robot: int, poses: FloatArray) -> Views:
-        """Where markers lie in a robot's images when all robots stand at `poses` (N, 3); for evaluation."""
-        return self._rig.views(robot, poses)
+        return self.rig.take(exposure.robot, exposure.middle_ns, track, rng)
 
     def proximity(self, robot: int) -> NDArray[np.int64]:
         """Raw values (8,) of a robot's proximity sensors now."""

@@ -28,6 +28,8 @@ BODY_RADIUS = 0.06
 FOCAL_BASELINE = 90.0 * 0.07
 """Focal length times distance of laser and lens [px m]."""
 _MAX_PX = 40.0
+_NEAREST, _FARTHEST = 0.10, 2.5
+"""Between these distances a reflection is seen [m]."""
 _LED_RADIUS = 0.045
 _LED_RANGE = 3.0
 _HALF_FIELD = math.radians(35.0)
@@ -58,14 +60,6 @@ class PushBotNoise:
     bearing: float = math.radians(1.0)
 
 
-@dataclass(frozen=True)
-class LaserLimits:
-    """Between which distances a reflection is seen [m]."""
-
-    low: float = 0.10
-    high: float = 2.5
-
-
 class KinematicPushBot:
     """One robot.
 
@@ -74,7 +68,6 @@ class KinematicPushBot:
         pose: (3,) at the start.
         noise: What it is like.
         rng: Source of the noise.
-        limits: Of its laser.
 
     Attributes:
         time_s: Until now.
@@ -88,12 +81,10 @@ class KinematicPushBot:
         pose: FloatArray,
         noise: PushBotNoise,
         rng: np.random.Generator,
-        limits: LaserLimits | None = None,
     ) -> None:
         self._plan = plan
         self._noise = noise
         self._rng = rng
-        self._limits = limits or LaserLimits()
         self._traces = [np.asarray(pose, dtype=float)[None]]
         self._odometry = np.zeros(3)
         self._steps = 0
@@ -203,10 +194,10 @@ class KinematicPushBot:
         """Inverse distances (n,) that the tracker reports of true distances (n,)."""
         count, rng, noise = len(distances), self._rng, self._noise
         pixels = FOCAL_BASELINE / distances + noise.pixel * rng.standard_normal(count)
-        lowest = FOCAL_BASELINE / self._limits.high
+        lowest = FOCAL_BASELINE / _FARTHEST
         nonsense = rng.random(count) < noise.outlier
         pixels = np.where(nonsense, rng.uniform(lowest, _MAX_PX, count), pixels)
-        seen: BoolArray = (distances > self._limits.low) & (distances < self._limits.high) & (pixels > lowest)
+        seen: BoolArray = (distances > _NEAREST) & (distances < _FARTHEST) & (pixels > lowest)
         seen &= rng.random(count) >= noise.dropout
         return np.where(seen, pixels / FOCAL_BASELINE, UNSEEN)
 

@@ -200,10 +200,11 @@ class PushbotFirmware:
         """The camera has seen events `0yyyyyyy pxxxxxxx` (N,) at times of the world (N,) [us]."""
         self.board.see(words, times_us, self._budget() // 2)
 
-    def receive(self, data: bytes) -> None:
-        """Take bytes."""
+    def receive(self, data: bytes) -> bytes:
+        """Take bytes; answers come with `stream`."""
         self._received += data
         self._work()
+        return b""
 
     def _work(self) -> None:
         """The main loop, as far as it does not wait for room to say something."""

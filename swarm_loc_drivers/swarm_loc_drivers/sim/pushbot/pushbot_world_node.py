@@ -46,7 +46,7 @@ class PushbotWorldNode(WorldNode[PushbotWorldParameters]):
         self._world.firmwares[robot] = firmware
         if chosen.link_folder:
             link = Path(chosen.link_folder) / self._names[robot]
-            return str(self.host.serve_flow_controlled(firmware, link))
+            return str(self.host.serve_pty(firmware, link, waits=True))
         port = self.host.serve_tcp(firmware, port=chosen.first_port and chosen.first_port + robot)
         return f"tcp://localhost:{port}"
 

@@ -13,7 +13,6 @@ from swarm_loc_drivers.sim.render import scene as scenery
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.raster import Patches
 from swarm_loc_drivers.sim.render.renderer import Renderer, RobotCamera, Scene
-from swarm_loc_drivers.sim.render.views import Views, views_of
 from swarm_loc_drivers.sim.run import Trajectories
 from swarm_loc_drivers.sim.worlds import HiddenGeometry
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -45,15 +44,21 @@ class CameraRig:
         arena: What is around.
         model: Of all cameras, as calibrated.
         seed: Draws what the walls and the floor look like.
+
+    Attributes:
+        scene: What there is to be seen.
+        faces: Of each robot the markers on it, in its base_link.
+        ids: (M,) of all landmarks, and then of the faces of robot after robot.
+        cameras: Of the robots.
     """
 
     def __init__(
         self, swarm: Swarm, truth: HiddenGeometry, arena: Arena, model: CameraModel, seed: int
     ) -> None:
-        self._faces, self._ids = _faces(swarm, truth, arena.family), truth.ids
-        self._scene = _scene(swarm, truth, arena, self._faces, np.random.default_rng(seed))
-        self._renderer = Renderer(self._scene, model)
-        self._cameras = [
+        self.faces, self.ids = _faces(swarm, truth, arena.family), truth.ids
+        self.scene = _scene(swarm, truth, arena, self.faces, np.random.default_rng(seed))
+        self._renderer = Renderer(self.scene, model)
+        self.cameras = [
             RobotCamera(index, model, _true_mount(robot.camera, mount), focal_scale=1.0 / scale)
             for index, (robot, mount, scale) in enumerate(
                 zip(swarm.robots, truth.mounts.tolist(), truth.scales.tolist(), strict=True)
@@ -71,16 +76,7 @@ class CameraRig:
             track: True paths, from half an exposure before to half an exposure behind.
             rng: Source of the sensor's noise.
         """
-        return self._renderer.take(self._cameras[robot], middle_ns, track.all_at, rng)
-
-    @property
-    def scene(self) -> Scene:
-        """What there is to be seen."""
-        return self._scene
-
-    def views(self, robot: int, poses: FloatArray) -> Views:
-        """Where markers lie in an image of a robot's camera when all robots stand at `poses` (N, 3)."""
-        return views_of(self._scene, self._faces, self._ids, self._cameras[robot], poses)
+        return self._renderer.take(self.cameras[robot], middle_ns, track.all_at, rng)
 
 
 def _true_mount(camera: CameraMount | None, true: list[float]) -> CameraMount:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,11 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from swarm_loc_drivers.common.calibration_file import CameraCalibration
 from swarm_loc_drivers.sim.run import CAMERA_LATENESS, LivedRun, Records, SimulatedRun, arrival_ns, survivors
-from swarm_loc_drivers.sim.scenarios.droplets import FIX_SIGMAS, DropletRun
+from swarm_loc_drivers.sim.scenarios.droplets import FIX_HEADING_SIGMA, FIX_SIGMA, DropletRun
 from swarm_loc_drivers.sim.scenarios.eight_images import ImageRun
 from swarm_loc_drivers.sim.scenarios.wandering import AerialRun
 from swarm_loc_estimator import CONTENT_POSE
 from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
 from swarm_loc_estimator.common.messages.encoders import (
@@ -44,45 +45,14 @@ from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 FAMILY = 0
 """MarkerDetection.FAMILY_ARTOOLKIT_BCH."""
-
-
-def as_detections(run: SimulatedRun) -> Records:
-    """All sightings (S,) of a run, of DETECTION_DTYPE; markers stand upright at their described heights."""
-    markers = run.swarm.owner_of
-    camera_height = np.array([0.0 if r.camera is None else r.camera.z for r in run.swarm.robots])
-    observer = np.repeat(run.frames["robot"], run.frames["count"])
-    height = np.array([markers[int(marker)].marker.z for marker in run.sightings["marker_id"]])
-    forward, left, heading = run.sightings["value"].T
-    detections = np.zeros(len(run.sightings), DETECTION_DTYPE)
-    detections["id"] = run.sightings["marker_id"]
-    detections["family"], detections["content"] = FAMILY, CONTENT_POSE
-    detections["id_margin"] = np.nan
-    detections["corners_px"] = np.nan
-    detections["position"] = np.column_stack([-left, camera_height[observer] - height, forward])
-    detections["orientation"] = marker_orientation(heading)
-    detections["covariance"][:, 0, 0] = -1.0
-    detections["alternative_orientation"][:, 3] = 1.0
-    detections["alternative_ratio"] = np.nan
-    return detections
-
-
-def marker_orientation(heading: np.typing.NDArray[np.float64]) -> np.typing.NDArray[np.float64]:
-    """Quaternions (S, 4) x y z w, in the optical frame, of upright markers.
-
-    Args:
-        heading: (S,) direction out of the face [rad], 0 along the optical axis, positive to the left.
-    """
-    sin, cos, zero = np.sin(heading), np.cos(heading), np.zeros_like(heading)
-    right = np.stack([-cos, zero, -sin], axis=-1)
-    up = np.stack([zero, zero - 1.0, zero], axis=-1)
-    out = np.stack([-sin, zero, cos], axis=-1)
-    quaternions: np.typing.NDArray[np.float64] = Rotation.from_matrix(
-        np.stack([right, up, out], axis=-1)
-    ).as_quat()
-    return quaternions
-
-
 TRUTH_PERIOD_NS = 100_000_000
+SATURATION = 240
+"""As the drivers report it: full scale less the largest ambient light [count]."""
+LOSS = 0.05
+"""Share of brightness matrices and fixes that never arrive."""
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+JPEG_QUALITY = 85
 
 
 class Stream(NamedTuple):
@@ -90,7 +60,7 @@ class Stream(NamedTuple):
 
     topic: str
     type: str
-    arrival_ns: NDArray[np.int64]
+    arrival_ns: IntArray
     data: list[bytes]
 
 
@@ -106,16 +76,67 @@ def write_bag(run: SimulatedRun, folder: Path, comment: str) -> int:
         Number of messages.
 
     Raises:
-        BagError: The folder is there already, or cannot be created.
+        BagError: The folder exists already, or cannot be created.
     """
     detections = as_detections(run)
-    streams: list[Stream] = []
-    for index in range(len(run.swarm.robots)):
-        streams += [
-            odometry_stream(run, index),
-            _detection_stream(run, index, detections),
-            truth_stream(run, index),
+    return _write_run(run, folder, comment, lambda robot: [_detection_stream(run, robot, detections)])
+
+
+def write_aerial_bag(run: AerialRun, folder: Path, comment: str) -> int:
+    """Write `aerial/detections`, and per robot `odom` and `ground_truth`; see `write_bag`."""
+    data = [
+        encode_anonymous("map", stamp_ns, image)
+        for stamp_ns, image in zip(run.stamp_ns.tolist(), run.images, strict=True)
+    ]
+    aerial = Stream("aerial/detections", ANONYMOUS_DETECTIONS, run.arrival_ns, data)
+    return _write_run(run, folder, comment, lambda _: [], aerial)
+
+
+def write_droplet_bag(run: DropletRun, folder: Path, comment: str, seed: int) -> int:
+    """Write per robot `odom`, `brightness`, `fix` and `ground_truth`; see `write_bag`.
+
+    The seed fixes what is late and what is lost.
+    """
+
+    def sensors(robot: int) -> list[Stream]:
+        rng = np.random.default_rng([seed, robot])
+        published = [_brightness(run, robot), _fixes(run, robot)]
+        return [_arriving(rng, run, one) for one in published if one.data or one.type == BRIGHTNESS]
+
+    return _write_run(run, folder, comment, sensors)
+
+
+def write_image_bag(recorded: ImageRun, folder: Path, comment: str) -> int:
+    """Write per robot `image_raw/compressed` (as image_transport), `camera_info`, `odom` and `ground_truth`.
+
+    See `write_bag`.
+    """
+    run, frames = recorded.run, recorded.run.frames
+    headers = [
+        message_header(stamp_ns, f"{run.swarm.robots[robot].name}/camera_optical_frame")
+        for robot, stamp_ns in zip(frames["robot"].tolist(), frames["stamp_ns"].tolist(), strict=True)
+    ]
+    images = [_image(header, image) for header, image in zip(headers, recorded.images(), strict=True)]
+    infos = [_info(header, recorded.camera.calibration) for header in headers]
+
+    def sensors(robot: int) -> list[Stream]:
+        name, own = run.swarm.robots[robot].name, np.flatnonzero(frames["robot"] == robot)
+        arrival_ns = frames["arrival_ns"][own]
+        return [
+            Stream(f"{name}/camera_info", CAMERA_INFO, arrival_ns, [infos[k] for k in own]),
+            Stream(f"{name}/image_raw/compressed", COMPRESSED_IMAGE, arrival_ns, [images[k] for k in own]),
         ]
+
+    return _write_run(run, folder, comment, sensors)
+
+
+def _write_run(
+    run: LivedRun, folder: Path, comment: str, sensors: Callable[[int], Sequence[Stream]], *shared: Stream
+) -> int:
+    """Write topics of the swarm, and per robot odometry, `sensors(robot)` and ground truth."""
+    streams = list(shared)
+    for robot in range(len(run.swarm.robots)):
+        streams += [odometry_stream(run, robot), *sensors(robot), truth_stream(run, robot)]
     return write_streams(streams, run.swarm, folder, comment)
 
 
@@ -158,6 +179,13 @@ def odometry_stream(run: LivedRun, robot: int) -> Stream:
     return Stream(f"{name}/odom", ODOMETRY, rows["arrival_ns"], data)
 
 
+def truth_stream(run: LivedRun, robot: int) -> Stream:
+    """Where the robot really was, ten times a second."""
+    stamp_ns = np.arange(run.start_ns, run.end_ns + 1, TRUTH_PERIOD_NS)
+    data = encode_pose_stamped("map", stamp_ns, run.truth.at(robot, stamp_ns))
+    return Stream(f"{run.swarm.robots[robot].name}/ground_truth", POSE_STAMPED, stamp_ns, data)
+
+
 def _detection_stream(run: SimulatedRun, robot: int, detections: Records) -> Stream:
     """The robot's images, also those that show nothing: they tell that the camera is alive."""
     name = run.swarm.robots[robot].name
@@ -170,68 +198,40 @@ def _detection_stream(run: SimulatedRun, robot: int, detections: Records) -> Str
     return Stream(f"{name}/detections", DETECTIONS, frames["arrival_ns"], data)
 
 
-def truth_stream(run: LivedRun, robot: int) -> Stream:
-    """Where the robot really was, ten times a second."""
-    stamp_ns = np.arange(run.start_ns, run.end_ns + 1, TRUTH_PERIOD_NS)
-    data = encode_pose_stamped("map", stamp_ns, run.truth.at(robot, stamp_ns))
-    return Stream(f"{run.swarm.robots[robot].name}/ground_truth", POSE_STAMPED, stamp_ns, data)
+def as_detections(run: SimulatedRun) -> Records:
+    """All sightings (S,) of a run, of DETECTION_DTYPE; markers stand upright at their described heights."""
+    markers = run.swarm.owner_of
+    camera_height = np.array([0.0 if r.camera is None else r.camera.z for r in run.swarm.robots])
+    observer = np.repeat(run.frames["robot"], run.frames["count"])
+    height = np.array([markers[int(marker)].marker.z for marker in run.sightings["marker_id"]])
+    forward, left, heading = run.sightings["value"].T
+    detections = np.zeros(len(run.sightings), DETECTION_DTYPE)
+    detections["id"] = run.sightings["marker_id"]
+    detections["family"], detections["content"] = FAMILY, CONTENT_POSE
+    detections["id_margin"] = np.nan
+    detections["corners_px"] = np.nan
+    detections["position"] = np.column_stack([-left, camera_height[observer] - height, forward])
+    detections["orientation"] = marker_orientation(heading)
+    detections["covariance"][:, 0, 0] = -1.0
+    detections["alternative_orientation"][:, 3] = 1.0
+    detections["alternative_ratio"] = np.nan
+    return detections
 
 
-def write_aerial_bag(run: AerialRun, folder: Path, comment: str) -> int:
-    """Write `aerial/detections`, and `<robot>/odom` and `<robot>/ground_truth` of all robots.
-
-    Args:
-        run: What to write; log times are times of arrival.
-        folder: The bag, created; must not exist.
-        comment: First lines of `swarm.yaml`, where the run comes from.
-
-    Returns:
-        Number of messages.
-
-    Raises:
-        BagError: The folder is there already, or cannot be created.
-    """
-    data = [
-        encode_anonymous("map", stamp_ns, image)
-        for stamp_ns, image in zip(run.stamp_ns.tolist(), run.images, strict=True)
-    ]
-    streams = [Stream("aerial/detections", ANONYMOUS_DETECTIONS, run.arrival_ns, data)]
-    for index in range(len(run.swarm.robots)):
-        streams += [odometry_stream(run, index), truth_stream(run, index)]
-    return write_streams(streams, run.swarm, folder, comment)
-
-
-SATURATION = 240
-"""As the drivers say it: full scale less the largest ambient light [count]."""
-LOSS = 0.05
-"""Share of matrices and fixes that never arrive."""
-
-
-def write_droplet_bag(run: DropletRun, folder: Path, comment: str, seed: int) -> int:
-    """Write `<robot>/odom`, `brightness`, `fix` and `ground_truth` of all robots.
+def marker_orientation(heading: np.typing.NDArray[np.float64]) -> np.typing.NDArray[np.float64]:
+    """Quaternions (S, 4) x y z w, in the optical frame, of upright markers.
 
     Args:
-        run: What to write; log times are times of arrival.
-        folder: The bag, created; must not exist.
-        comment: First lines of `swarm.yaml`, where the run comes from.
-        seed: Fixes what is late and what is lost.
-
-    Returns:
-        Number of messages.
-
-    Raises:
-        BagError: The folder is there already, or cannot be created.
+        heading: (S,) direction out of the face [rad], 0 along the optical axis, positive to the left.
     """
-    streams: list[Stream] = []
-    for index in range(len(run.swarm.robots)):
-        rng = np.random.default_rng([seed, index])
-        streams.append(odometry_stream(run, index))
-        streams.append(_arriving(rng, run, _brightness(run, index)))
-        fixes = _fixes(run, index)
-        if fixes.data:
-            streams.append(_arriving(rng, run, fixes))
-        streams.append(truth_stream(run, index))
-    return write_streams(streams, run.swarm, folder, comment)
+    sin, cos, zero = np.sin(heading), np.cos(heading), np.zeros_like(heading)
+    right = np.stack([-cos, zero, -sin], axis=-1)
+    up = np.stack([zero, zero - 1.0, zero], axis=-1)
+    out = np.stack([-sin, zero, cos], axis=-1)
+    quaternions: np.typing.NDArray[np.float64] = Rotation.from_matrix(
+        np.stack([right, up, out], axis=-1)
+    ).as_quat()
+    return quaternions
 
 
 def _arriving(rng: np.random.Generator, run: DropletRun, stream: Stream) -> Stream:
@@ -264,52 +264,17 @@ def _brightness(run: DropletRun, robot: int) -> Stream:
 def _fixes(run: DropletRun, robot: int) -> Stream:
     """Where a tracker has seen the robot."""
     own = [fix for fix in run.fixes if fix.robot == robot]
-    position, heading = FIX_SIGMAS
-    covariance = np.diag([position**2, position**2, heading**2])
+    covariance = np.diag([FIX_SIGMA**2, FIX_SIGMA**2, FIX_HEADING_SIGMA**2])
     data = [encode_fix("map", fix.stamp_ns, fix.pose, covariance) for fix in own]
     stamps_ns = np.array([fix.stamp_ns for fix in own], dtype=np.int64)
     return Stream(f"{run.swarm.robots[robot].name}/fix", POSE_WITH_COVARIANCE, stamps_ns, data)
 
 
-COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-JPEG_QUALITY = 85
-_SECOND = 1_000_000_000
-
-
-def write_image_bag(recorded: ImageRun, folder: Path, comment: str) -> int:
-    """Write `<robot>/image_raw/compressed`, `camera_info`, `odom` and `ground_truth` of all robots.
-
-    The folder, the comment, the result and the errors are those of `bag.write_bag`.
-    """
-    run = recorded.run
-    frames = run.frames
-    headers = [
-        _header(run.swarm.robots[robot].name, stamp_ns)
-        for robot, stamp_ns in zip(frames["robot"].tolist(), frames["stamp_ns"].tolist(), strict=True)
-    ]
-    images = [_image(header, image) for header, image in zip(headers, recorded.images(), strict=True)]
-    infos = [_info(header, recorded.camera.calibration) for header in headers]
-    streams: list[Stream] = []
-    for index, robot in enumerate(run.swarm.robots):
-        own = np.flatnonzero(frames["robot"] == index)
-        arrival_ns = frames["arrival_ns"][own]
-        streams += [
-            odometry_stream(run, index),
-            Stream(f"{robot.name}/camera_info", CAMERA_INFO, arrival_ns, [infos[k] for k in own]),
-            Stream(
-                f"{robot.name}/image_raw/compressed", COMPRESSED_IMAGE, arrival_ns, [images[k] for k in own]
-            ),
-            truth_stream(run, index),
-        ]
-    return write_streams(streams, run.swarm, folder, comment)
-
-
-def _header(robot: str, stamp_ns: int) -> Any:
-    """The header of an image and of its calibration."""
+def message_header(stamp_ns: int, frame: str) -> Any:
+    """A std_msgs/Header."""
     types = typestore().types
-    stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, _SECOND))
-    return types["std_msgs/msg/Header"](stamp, f"{robot}/camera_optical_frame")
+    stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 1_000_000_000))
+    return types["std_msgs/msg/Header"](stamp, frame)
 
 
 def _image(header: Any, image: NDArray[np.uint8]) -> bytes:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -39,7 +40,7 @@ from swarm_loc_drivers.sim.scenarios.eight import START_NS, rounded
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform
+from swarm_loc_estimator.swarm.ir_board import IrGains
 from swarm_loc_estimator.swarm.robot_ir import RobotIr
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
 
@@ -71,21 +72,29 @@ Their steps are 8 % too long or short and lead aside, in every direction differe
 
 
 @dataclass(frozen=True)
-class DropletSwarmSettings:
-    """Which swarm.
+class DropletRunSettings:
+    """What to simulate.
 
     Attributes:
-        seed: Two swarms with the same settings are identical.
+        seed: Two runs with the same settings are identical.
+        duration_s: [s].
         robots: How many, on a grid of which no row is much longer than a column.
-        start_known: Whether the description tells where each robot begins.
+        world: How they err, of `DROPLET_WORLDS`.
+        calibrated: Whether the description tells the gains of the elements, to 2 %.
+        start_known: Whether it tells where robots begin.
+        boards: Runs with the same one have the same elements; None: as the seed says.
     """
 
     seed: int = 1
+    duration_s: float = 90.0
     robots: int = 20
+    world: str = "d1"
+    calibrated: bool = False
     start_known: bool = False
+    boards: int | None = None
 
 
-def starts(settings: DropletSwarmSettings) -> FloatArray:
+def starts(settings: DropletRunSettings) -> FloatArray:
     """(N, 3) where the robots begin: near the places of a grid, looking anywhere."""
     rng = np.random.default_rng([settings.seed, settings.robots])
     columns = math.ceil(math.sqrt(1.25 * settings.robots))
@@ -96,19 +105,18 @@ def starts(settings: DropletSwarmSettings) -> FloatArray:
 
 
 def describe_droplets(
-    settings: DropletSwarmSettings,
+    settings: DropletRunSettings,
     start: FloatArray,
-    platform: IrPlatform,
-    gains: tuple[IrGains | None, ...],
+    gains: Sequence[IrGains] = (),
 ) -> Swarm:
     """The swarm as its owner would describe it.
 
     Args:
         settings: Which swarm.
         start: (N, 3) in map.
-        platform: The board of all robots, the packaged one of the Droplet.
-        gains: What is known of each robot's elements.
+        gains: What is known of each robot's elements; empty: nothing.
     """
+    platform = load_ir_platform("droplet")
     return Swarm(
         tuple(
             Robot(
@@ -117,7 +125,7 @@ def describe_droplets(
                 odometry=MOTION,
                 camera=None,
                 start=rounded(pose) if settings.start_known else None,
-                ir=RobotIr(_FIRST_ID + index, platform, "droplet", gains=gains[index]),
+                ir=RobotIr(_FIRST_ID + index, platform, "droplet", gains=gains[index] if gains else None),
             )
             for index, pose in enumerate(start)
         )
@@ -178,35 +186,12 @@ class Wander:
 TURN_S = 0.9
 FIXED = (0, -1)
 """The robots in two opposite corners."""
-FIX_SIGMAS = (0.003, 0.02)
+FIX_SIGMA, FIX_HEADING_SIGMA = 0.003, 0.02
 FIX_RATE_HZ = 1.0
 ODOMETRY_NS, CONTROL_NS = 200_000_000, 100_000_000
 NOISE = MotionNoise(walk_noise=5e-4, veer_noise=0.05, turn_noise=0.01)
 _GAINS_SIGMA = 0.02
 _GAINS, _LATENESS = range(2)
-
-
-@dataclass(frozen=True)
-class DropletRunSettings:
-    """What to simulate.
-
-    Attributes:
-        seed: Two runs with the same settings are identical.
-        duration_s: [s].
-        robots: How many.
-        world: How they err, of `DROPLET_WORLDS`.
-        calibrated: Whether the description tells the gains of the elements, to 2 %.
-        start_known: Whether it tells where robots begin.
-        boards: Runs with the same one have the same elements; None: as the seed says.
-    """
-
-    seed: int = 1
-    duration_s: float = 90.0
-    robots: int = 20
-    world: str = "d1"
-    calibrated: bool = False
-    start_known: bool = False
-    boards: int | None = None
 
 
 @dataclass(frozen=True)
@@ -252,12 +237,12 @@ class _Recorder:
 
 def simulate_droplets(settings: DropletRunSettings) -> DropletRun:
     """Let the swarm live and record it."""
-    platform = load_ir_platform("droplet")
-    layout = DropletSwarmSettings(settings.seed, settings.robots, settings.start_known)
-    start = starts(layout)
+    start = starts(settings)
     errors = DROPLET_WORLDS[settings.world]
-    world_settings = DropletWorldSettings(settings.seed, errors, platform, START_NS, settings.boards)
-    plain = describe_droplets(layout, start, platform, (None,) * settings.robots)
+    world_settings = DropletWorldSettings(
+        settings.seed, errors, load_ir_platform("droplet"), START_NS, settings.boards
+    )
+    plain = describe_droplets(settings, start)
     ids = [robot.ir.id for robot in plain.robots if robot.ir is not None]
     world = DropletWorld(ids, start, world_settings)
     recorder = _Recorder()
@@ -267,7 +252,7 @@ def simulate_droplets(settings: DropletRunSettings) -> DropletRun:
     rng = np.random.default_rng([settings.seed, _LATENESS])
     odometry["arrival_ns"] = arrival_ns(rng, odometry["stamp_ns"], ODOMETRY_LATENESS)
     return DropletRun(
-        describe_droplets(layout, start, platform, _gains(world, settings)),
+        describe_droplets(settings, start, _gains(world, settings)),
         Trajectories(np.array(recorder.stamps, dtype=np.int64), np.array(recorder.poses)),
         in_order_of_arrival(odometry, recorder.stamps[-1]),
         tuple(recorder.matrices),
@@ -294,7 +279,7 @@ def _live(
     robots = len(cables)
     wander = Wander(world.poses.copy(), np.arange(robots) % 2 == 1, settings.seed)
     fixed = tuple(sorted({robot % robots for robot in FIXED}))
-    tracker = Tracker(fixed, FIX_RATE_HZ, FIX_SIGMAS, settings.seed)
+    tracker = Tracker(fixed, FIX_RATE_HZ, FIX_SIGMA, FIX_HEADING_SIGMA, settings.seed)
 
     def control() -> None:
         now_ns = world.now_ns
@@ -310,13 +295,13 @@ def _live(
                 recorder.odometry.append((robot, state.stamp_ns, 0, state.pose))
 
     control()
-    run(world, cables, round(settings.duration_s * 1e9) // STEP_NS, control)
+    run(world, [cable.step for cable in cables], round(settings.duration_s * 1e9) // STEP_NS, control)
 
 
-def _gains(world: DropletWorld, settings: DropletRunSettings) -> tuple[IrGains | None, ...]:
+def _gains(world: DropletWorld, settings: DropletRunSettings) -> tuple[IrGains, ...]:
     """What a calibration has found, if there was one."""
     if not settings.calibrated:
-        return (None,) * settings.robots
+        return ()
     rng = np.random.default_rng([settings.seed, _GAINS])
     found = world.gains * np.exp(_GAINS_SIGMA * rng.standard_normal(world.gains.shape))
     rounded = np.round(found, 4)

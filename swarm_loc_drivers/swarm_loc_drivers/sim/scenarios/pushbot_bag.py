@@ -7,7 +7,6 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -32,7 +31,7 @@ from swarm_loc_drivers.sim.pushbot.optics import (
     lights_of,
 )
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
-from swarm_loc_drivers.sim.scenarios.bags import Stream, write_streams
+from swarm_loc_drivers.sim.scenarios.bags import Stream, message_header, write_streams
 from swarm_loc_estimator import (
     LASER,
     LIGHTS,
@@ -104,18 +103,9 @@ def event_streams(
     return streams
 
 
-def header_at(stamp_ns: int, frame: str) -> Any:
-    """The header of a message."""
-    types = typestore().types
-    stamp = types["builtin_interfaces/msg/Time"](
-        sec=stamp_ns // 1_000_000_000, nanosec=stamp_ns % 1_000_000_000
-    )
-    return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
-
-
 def _packet(name: str, stamp_ns: int, number: int, events: Events) -> bytes:
     message = typestore().types[EVENTS](
-        header=header_at(stamp_ns, f"{name}/event_camera_optical_frame"),
+        header=message_header(stamp_ns, f"{name}/event_camera_optical_frame"),
         height=SENSOR_PX,
         width=SENSOR_PX,
         seq=number,
@@ -178,7 +168,7 @@ def encode_map(stamp_ns: int, occupancy: OccupancyMap) -> bytes:
     types = typestore().types
     cells = np.ascontiguousarray(np.round(occupancy.percent).astype(np.int8).T)
     point, turn = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Quaternion"]
-    header = header_at(stamp_ns, "map")
+    header = message_header(stamp_ns, "map")
     x, y = map(float, occupancy.corner)
     origin = types["geometry_msgs/msg/Pose"](position=point(x, y, 0.0), orientation=turn(0.0, 0.0, 0.0, 1.0))
     about = types["nav_msgs/msg/MapMetaData"](
@@ -349,7 +339,7 @@ def _laser(name: str, readings: list[Readings], built: LaserOptics) -> Stream:
         data.append(
             encode(
                 message(
-                    header=header_at(at_ns, f"{name}/base_link"),
+                    header=message_header(at_ns, f"{name}/base_link"),
                     distance=distance,
                     sigma=sigma * distance**2,
                     u_px=column,
@@ -382,7 +372,7 @@ def _lights(name: str, sightings: list[LightSightings]) -> list[Stream]:
                 for k in np.flatnonzero(part.stamp_ns == at_ns)
             ]
             stamps.append(BEGIN_NS + at_ns)
-            header = header_at(BEGIN_NS + at_ns, f"{name}/base_link")
+            header = message_header(BEGIN_NS + at_ns, f"{name}/base_link")
             data.append(encode(array(header=header, lights=lights), LIGHTS))
     return [Stream(f"{name}/lights", LIGHTS, np.array(stamps, dtype=np.int64), data)] if data else []
 

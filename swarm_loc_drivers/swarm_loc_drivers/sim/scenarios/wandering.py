@@ -38,23 +38,6 @@ _HOMING_GAIN = 3.0
 
 
 @dataclass(frozen=True)
-class WanderingSettings:
-    """What to simulate.
-
-    Attributes:
-        seed: Two runs with the same settings are identical.
-        duration_s: [s].
-        robots: How many.
-        start_known: Whether the description tells where each robot starts.
-    """
-
-    seed: int = 1
-    duration_s: float = 60.0
-    robots: int = 5
-    start_known: bool = False
-
-
-@dataclass(frozen=True)
 class AerialRun(LivedRun):
     """A simulated swarm that is seen from above.
 
@@ -69,14 +52,11 @@ class AerialRun(LivedRun):
     images: tuple[np.typing.NDArray[np.void], ...]
 
 
-def simulate_wandering(settings: WanderingSettings) -> AerialRun:
-    """Drive robots about, and look at them from above."""
+def simulate_wandering(settings: EightSettings) -> AerialRun:
+    """Drive robots about at random and look at them from above; each robot has a speed of its own."""
     rng = np.random.default_rng(settings.seed)
-    eight = EightSettings(
-        settings.seed, settings.duration_s, settings.robots, start_known=settings.start_known
-    )
     start = _places(rng, settings.robots)
-    swarm, truth, odometry = drive_robots(rng, eight, start, _wander(rng, settings.robots))
+    swarm, truth, odometry = drive_robots(rng, settings, start, _wander(rng, settings.robots))
     blind = Swarm(tuple(replace(robot, camera=None, faces=()) for robot in swarm.robots))
     stamp_ns = np.arange(START_NS + PERIOD_NS, int(truth.stamp_ns[-1]), PERIOD_NS)
     poses = truth.all_at(stamp_ns)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench.epuck.views import views_of
 from swarm_loc_drivers.epuck.wheels import WheelGeometry
 from swarm_loc_drivers.sim.epuck.world import EpuckWorld, EpuckWorldSettings
 from swarm_loc_drivers.sim.render.lens import CameraModel
@@ -36,7 +37,7 @@ def test_markers_lie_where_the_detector_finds_them() -> None:
         pass
     camera = CAMERA.camera
     found = MarkerDetector(DetectorSettings(), [(FAMILY, None)], camera).detect(world.image(taken[0]))
-    views = world.views(0, BESIDE)
+    views = views_of(world.rig, 0, BESIDE)
     clear = (views.margin > 4.0) & ~views.hidden & (views.incidence < 1.2) & (views.side_px > 12.0)
     assert clear.sum() >= 6
     assert set(views.id[clear].tolist()) <= set(found.id.tolist())
@@ -49,7 +50,7 @@ def test_markers_lie_where_the_detector_finds_them() -> None:
 def test_a_lens_does_not_bring_into_the_picture_what_is_far_beside_it(heading: float) -> None:
     poses = np.array([[0.1, -0.2, heading], [-1.0, 0.6, 0.0]])
     bent, wide = (
-        world_at(poses, camera).views(0, poses)
+        views_of(world_at(poses, camera).rig, 0, poses)
         for camera in (CameraModel(k1=-0.3), CameraModel(field_of_view=math.radians(100.0)))
     )
     seen = set(bent.id[bent.margin > 0.0].tolist())
@@ -64,7 +65,8 @@ def test_a_robot_hides_what_is_behind_it_but_not_its_own_faces() -> None:
     target = min(landmarks, key=lambda mark: math.hypot(mark.x - 1.2, mark.y - 0.2))
     between = 0.6 * np.array([target.x, target.y])
     before = np.array([start[0], [*between, 0.5]])
-    views, free = world.views(0, before), world.views(0, start + np.array([[0.0] * 3, [0.0, 0.5, 0.0]]))
+    views = views_of(world.rig, 0, before)
+    free = views_of(world.rig, 0, start + np.array([[0.0] * 3, [0.0, 0.5, 0.0]]))
     assert views.hidden[views.id == target.id].tolist() == [True]
     assert free.hidden[free.id == target.id].tolist() == [False]
     faces = (views.id >= 20) & (views.id < 25)
@@ -82,7 +84,7 @@ def test_size_and_incidence_are_those_of_the_plane_geometry() -> None:
     settings = EpuckWorldSettings(
         3, exact, Arena(ARENA, FAMILY), CameraModel(), WheelGeometry(0.041, 0.053), 7.5, 10**12
     )
-    views = EpuckWorld(swarm, settings).views(0, start)
+    views = views_of(EpuckWorld(swarm, settings).rig, 0, start)
     back = views.id == 22
     assert views.incidence[back] == pytest.approx(0.0, abs=1e-6)
     distance = 0.5 - FACE_DISTANCE - 0.03

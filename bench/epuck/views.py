@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.sim.render.raster import Motion, Patches, project
-from swarm_loc_drivers.sim.render.renderer import RobotCamera, Scene
+from swarm_loc_drivers.sim.render.renderer import RobotCamera
+from swarm_loc_drivers.sim.render.rigs import CameraRig
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 
@@ -54,26 +55,19 @@ class _Seen(NamedTuple):
     corners: FloatArray
 
 
-def views_of(
-    scene: Scene,
-    faces: Sequence[Sequence[Patches]],
-    ids: NDArray[np.uint32],
-    camera: RobotCamera,
-    poses: FloatArray,
-) -> Views:
-    """The markers that look at a camera, of whatever size, in view or outside.
+def views_of(rig: CameraRig, robot: int, poses: FloatArray) -> Views:
+    """The markers that look at a robot's camera, of whatever size, in view or outside.
 
     Args:
-        scene: Its boards are markers.
-        faces: Of each robot the markers on it, in its base_link.
-        ids: Of all boards, and then of the faces of robot after robot.
-        camera: The camera.
+        rig: Cameras and scene, whose boards are markers.
+        robot: Index of the robot.
         poses: (N, 3) of all robots in map.
     """
+    scene, camera = rig.scene, rig.cameras[robot]
     own = poses[camera.robot]
     of_robots = [camera.view(se2.between(own, pose)) for pose in poses]
     markers = _in_optical_frame(
-        scene.boards, faces, ids, [camera.view(se2.inverse(own)), *of_robots], camera.robot
+        scene.boards, rig.faces, rig.ids, [camera.view(se2.inverse(own)), *of_robots], camera.robot
     )
     centre = markers.corners[:, _SQUARE].mean(axis=1)
     right, down = (markers.corners[:, _SQUARE, k] - markers.corners[:, _SQUARE, 0] for k in (1, 3))
