@@ -68,7 +68,7 @@ class DropletWorldNode(WorldNode[DropletWorldParameters]):
         message = PoseWithCovarianceStamped()
         message.header.stamp = stamp_message(fix.stamp_ns)
         message.header.frame_id = "map"
-        pose, sigma, heading_sigma = message.pose.pose, self.chosen.fix_sigma, self.chosen.fix_heading_sigma
+        pose, sigma, heading_sigma = message.pose.pose, self.params.fix_sigma, self.params.fix_heading_sigma
         pose.position.x, pose.position.y = float(fix.pose[0]), float(fix.pose[1])
         pose.orientation = yaw_quaternion(float(fix.pose[2]))
         covariance = planar_covariance(sigma**2, sigma**2, heading_sigma**2)
