@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -11,10 +12,22 @@ from swarm_loc_drivers.sim.pushbot.optics import assembled
 from swarm_loc_drivers.sim.pushbot.wall_drive import WallDriveSettings, drive_at_wall
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.laser.calibration import LaserCalibration
-from swarm_loc_vision.laser.fit import Drive, fit_hyperbola, fit_logarithm, logarithm_depth
+from swarm_loc_vision.laser.fit import Drive, fit_hyperbola
 
 DEPTHS_M = np.linspace(0.1, 2.5, 241)
 _MAX_ROW = 125.0
+
+
+def fit_logarithm(drive: Drive) -> tuple[float, float]:
+    """Fit a and b of p = a + b ln d, the relation that the PushBot paper names; for comparison."""
+    design = np.column_stack([np.ones_like(drive.depths), np.log(drive.depths)])
+    a, b = np.linalg.lstsq(design, drive.rows, rcond=None)[0].tolist()
+    return float(a), float(b)
+
+
+def logarithm_depth(a: float, b: float, row: float) -> float:
+    """Depth [m] at a row by the paper's relation."""
+    return math.exp((row - a) / b)
 
 
 class Calibrated(NamedTuple):

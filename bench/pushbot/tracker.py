@@ -8,14 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.pushbot.paper_tracker import PaperSettings, PaperTracker
 from bench.shared.common import Cell, new_plot, save_plot, table
 from swarm_loc_drivers.sim.pushbot.event_camera import Blinking, CameraEvents, CameraNoise, EventCamera, Spot
 from swarm_loc_drivers.sim.pushbot.optics import spot_brightness
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.events.centroid_tracker import CentroidTracker
-from swarm_loc_vision.events.paper_tracker import PaperSettings, PaperTracker
-from swarm_loc_vision.events.settings import LightSource, TrackerSettings
-from swarm_loc_vision.events.windows import WindowedTracker
+from swarm_loc_estimator.common.messages.event_encoding import Events
+from swarm_loc_vision.events.parameters import LightSource, TrackerSettings
+from swarm_loc_vision.events.tracker import LightTracker
 
 NOISES = (0.0, 1.0, 5.0, 15.0, 30.0)
 """Noise events of a pixel [1/s]; the bar is at 15."""
@@ -28,14 +28,14 @@ SOURCES = (LightSource(450.0, is_above=False), LightSource(1000.0, is_above=True
 _SKIPPED = 5
 """Windows in which a light is found at first."""
 
-MakeTracker = Callable[[], WindowedTracker]
+MakeTracker = Callable[[], LightTracker]
 TRACKERS: dict[str, MakeTracker] = {
     "printed": lambda: PaperTracker(SOURCES, SIZE, TrackerSettings(), PaperSettings()),
     "product": lambda: PaperTracker(SOURCES, SIZE, TrackerSettings(), PaperSettings(is_product=True)),
     "product, eta .02": lambda: PaperTracker(
         SOURCES, SIZE, TrackerSettings(), PaperSettings(eta=0.02, is_product=True)
     ),
-    "centroid": lambda: CentroidTracker(SOURCES, SIZE, TrackerSettings()),
+    "centroid": lambda: LightTracker(SOURCES, SIZE, TrackerSettings()),
 }
 
 
@@ -74,6 +74,11 @@ def scene(noise_rate: float, depth: float, seed: int) -> Scene:
     return Scene(events, np.array(stamps), np.array(places))
 
 
+def packet(seen: CameraEvents) -> Events:
+    """Emulated events as the tracker takes them."""
+    return Events(seen.x.astype(np.uint16), seen.y.astype(np.uint16), seen.polarity == 0, 1000 * seen.time_us)
+
+
 class Score(NamedTuple):
     """How a tracker did on a scene: rms per axis [px], NEES (ideal 2), share of windows with the spot."""
 
@@ -82,12 +87,11 @@ class Score(NamedTuple):
     seen: float
 
 
-def score(tracker: WindowedTracker, seen: Scene) -> Score:
+def score(tracker: LightTracker, seen: Scene) -> Score:
     """Track a scene and hold the laser's places against the truth at their stamps."""
     errors, nees, windows = [], [], 0
     for one in seen.events:
-        columns = (one.x.astype(np.uint16), one.y.astype(np.uint16), one.polarity == 0, 1000 * one.time_us)
-        for report in tracker.track(*columns):
+        for report in tracker.track(packet(one)):
             windows += 1
             for sighting in report.sightings:
                 if windows <= _SKIPPED or sighting.source != 0:
@@ -106,17 +110,14 @@ def throughput(seed: int, sources: int) -> float:
     """Events that the default tracker takes in a second of one core, in packets of 5 ms [1/s]."""
     seen = scene(BAR_NOISE, 0.7, seed)
     lights = [SOURCES[0], *(LightSource(700.0 + 30.0 * k, is_above=True) for k in range(sources - 1))]
-    packets = [
-        (one.x.astype(np.uint16), one.y.astype(np.uint16), one.polarity == 0, 1000 * one.time_us)
-        for one in seen.events
-    ]
+    packets = [packet(one) for one in seen.events]
     rates = []
     for _ in range(3):
-        tracker = CentroidTracker(lights, SIZE, TrackerSettings())
+        tracker = LightTracker(lights, SIZE, TrackerSettings())
         begin_s = time.process_time()
-        for packet in packets:
-            tracker.track(*packet)
-        rates.append(sum(len(packet[0]) for packet in packets) / (time.process_time() - begin_s))
+        for one in packets:
+            tracker.track(one)
+        rates.append(sum(len(one.x) for one in packets) / (time.process_time() - begin_s))
     return max(rates)
 
 

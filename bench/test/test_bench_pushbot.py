@@ -7,11 +7,14 @@ import math
 import numpy as np
 import pytest
 
+from bench.pushbot.calibration import calibrate
 from bench.pushbot.driver import robots_on_two_cores
 from bench.pushbot.event_flow import RATE, Measured
 from bench.pushbot.mapping import MappingEffort, figures_of, planned
 from bench.pushbot.runs import RunResult, RunSettings, coverage, rigid_fit, run, wall_distance_cm
+from bench.pushbot.tracker import BAR_NOISE, TRACKERS, packet, scene, score
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
+from swarm_loc_estimator.common.messages.event_encoding import Events
 
 
 def test_a_rigid_fit_undoes_a_motion() -> None:
@@ -76,3 +79,30 @@ def test_a_short_run_is_scored_and_comes_out_the_same_twice() -> None:
     assert 0.05 < first.coverage < 0.9
     assert first.wall_aligned_cm < 4.0
     assert np.array_equal(first.cells, second.cells)
+
+
+def test_the_printed_tracker_is_moved_by_noise_and_the_product_of_weights_is_not() -> None:
+    """The paper's equation (1) sums its weights: at 15 noise events/s/pixel it is pixels off."""
+    scenes = [scene(BAR_NOISE, 0.77, seed) for seed in (1, 2, 3)]
+    rms = {
+        name: np.sqrt(np.mean([score(TRACKERS[name](), one).rms ** 2 for one in scenes]))
+        for name in ("printed", "product")
+    }
+    assert rms["printed"] > 1.0
+    assert rms["product"] < 0.8
+
+
+def test_the_printed_tracker_gives_the_same_reports_for_packets_of_any_size() -> None:
+    parts = [packet(one) for one in scene(BAR_NOISE, 0.77, 1).events[:40]]
+    together = Events._make(np.concatenate(column) for column in zip(*parts, strict=True))
+    whole, cut = TRACKERS["printed"]().track(together), TRACKERS["printed"]()
+    found = [report for part in parts for report in cut.track(part)]
+    assert [(one.stamp_ns, [s[:4] for s in one.sightings]) for one in found] == [
+        (one.stamp_ns, [s[:4] for s in one.sightings]) for one in whole
+    ]
+
+
+def test_the_logarithm_of_the_paper_is_tens_of_centimetres_off() -> None:
+    one = calibrate(1)
+    assert np.sqrt(np.mean(one.hyperbola_cm**2)) < 1.0
+    assert np.sqrt(np.mean(one.logarithm_cm**2)) > 20.0

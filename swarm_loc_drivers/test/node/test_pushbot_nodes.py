@@ -26,8 +26,7 @@ from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simula
 from swarm_loc_estimator.common.parameters import markdown_table
 from swarm_loc_msgs.msg import EventPacket, LaserDistance, LightBearingArray, SwarmPose, SwarmPoses
 from swarm_loc_vision.laser.calibrate_laser_node import CalibrateLaserParameters
-from swarm_loc_vision.laser.calibration import LaserCalibration
-from swarm_loc_vision.laser.laser_file import load_laser, save_laser
+from swarm_loc_vision.laser.calibration import LaserCalibration, load_laser, save_laser
 
 SEED = 3
 STARTS = {"pushbot1": (2.6, 1.5, math.pi), "pushbot2": (1.6, 1.2, 0.3)}

@@ -30,9 +30,9 @@ from swarm_loc_estimator.common.messages.event_encoding import decode_events
 from swarm_loc_estimator.common.messages.typestore import typestore
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
-from swarm_loc_vision.events.centroid_tracker import CentroidTracker
-from swarm_loc_vision.events.settings import LightSource, TrackerSettings
-from swarm_loc_vision.laser.laser_file import load_laser
+from swarm_loc_vision.events.parameters import LightSource, TrackerSettings
+from swarm_loc_vision.events.tracker import LightTracker
+from swarm_loc_vision.laser.calibration import load_laser
 
 ROOM = FloorPlan("room", outline([(0, 0, 4, 3)], [(2, 1, 2.5, 2)]), np.array([[1.0, 1.5], [3.5, 1.5]]))
 EXACT = PushBotNoise(turn=0.0, distance=0.0, heading=0.0, pixel=1e-9, dropout=0.0, outlier=0.0, bearing=1e-9)
@@ -167,7 +167,7 @@ def test_the_events_of_a_bag_show_the_distances_of_the_bag(tmp_path: Path) -> No
     bag = tmp_path / "bag"
     write_pushbot_bag(PushbotBagSettings(3, 50.0, 2, "corridor", 0.02, events_s=2.0), bag, "Of a test.")
     calibration = load_laser(bag / "pushbot1.yaml")
-    tracker = CentroidTracker([LightSource(laser_hz(0), is_above=False)], (128, 128), TrackerSettings())
+    tracker = LightTracker([LightSource(laser_hz(0), is_above=False)], (128, 128), TrackerSettings())
     told: dict[int, float] = {}
     read: list[tuple[int, float, float]] = []
     with BagReader(bag) as reader:
@@ -180,7 +180,7 @@ def test_the_events_of_a_bag_show_the_distances_of_the_bag(tmp_path: Path) -> No
             events = decode_events(
                 message.events.tobytes(), message.encoding, (message.width, message.height)
             )
-            for report in tracker.track(events.x, events.y, events.is_on, stamp_ns + events.time_ns):
+            for report in tracker.track(events._replace(time_ns=stamp_ns + events.time_ns)):
                 for seen in report.sightings:
                     found = calibration.distance(seen.v, float(seen.covariance[1, 1]), seen.locking)
                     read.append((seen.stamp_ns, *found))

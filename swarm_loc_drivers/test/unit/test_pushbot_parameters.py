@@ -19,7 +19,7 @@ from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
 from swarm_loc_drivers.sim.worlds import WorldError
 from swarm_loc_estimator.common.parameters import ParameterError, markdown_table
-from swarm_loc_vision.laser.laser_file import load_laser
+from swarm_loc_vision.laser.calibration import load_laser
 
 DOC = Path(__file__).parents[2] / "doc"
 SWARM = """

@@ -2,8 +2,8 @@
 
     ./run swarm_loc_vision event_tracker_node --ros-args -r __ns:=/pushbot1 -p calibration:=pushbot1.yaml
 
-It takes `events` and publishes `laser` (the spot of the own laser and the distance that follows), `lights`
-(bearings of other robots' LEDs) and `/diagnostics`, every 20 ms of the events' time. Parameters: see
+The node subscribes to `events` and publishes `laser` (spot of the robot's own laser, and the distance),
+`lights` (bearings of other robots' LEDs) every 20 ms of the events' time, and `/diagnostics`. Parameters: see
 `doc/event_tracker_node.md`.
 """
 
@@ -26,15 +26,14 @@ from std_msgs.msg import Header
 from swarm_loc_estimator.common.messages.event_encoding import EventError, decode_events
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_msgs.msg import EventPacket, LaserDistance, LightBearing, LightBearingArray
-from swarm_loc_vision.events.bearing import direction, direction_jacobian
-from swarm_loc_vision.events.event_tracker_parameters import (
-    EventTrackerParameters,
-    laser_calibration,
-    light_sources,
-    make_tracker,
+from swarm_loc_vision.events.parameters import EventTrackerParameters, laser_calibration, light_sources
+from swarm_loc_vision.events.tracker import (
+    LightTracker,
+    Sighting,
+    WindowReport,
+    direction,
+    direction_jacobian,
 )
-from swarm_loc_vision.events.settings import Sighting, WindowReport
-from swarm_loc_vision.events.windows import WindowedTracker
 from swarm_loc_vision.laser.calibration import UNKNOWN, Distance
 
 EVENT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -42,14 +41,14 @@ _OUTPUT_QOS = QoSProfile(depth=50)
 _PERIOD_S = 1.0
 _PATIENCE_S = 5.0
 _LASER_PATIENCE_S, _SEEN_PATIENCE_S = 15.0, 60.0
-"""For the laser, before it was seen and afterwards: robots in large halls often have nothing within range."""
+"""For the laser, before it was first seen and afterwards: in large halls often nothing is within range."""
 _THROTTLE_S = 30.0
 _MAX_PIXELS = 1 << 21
-"""Of a sensor; the tracker remembers the last bursts of each."""
+"""Bound on the pixels of a sensor: the tracker stores the last bursts of each."""
 
 
 class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
-    """Decodes packets, lets the core track, publishes."""
+    """Decodes packets, tracks lights, publishes."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("event_tracker", EventTrackerParameters, **node_arguments)
@@ -59,7 +58,7 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
         robot = self.get_namespace().strip("/")
         self._base_frame = f"{robot}/{self.params.base_frame}" if robot else self.params.base_frame
         self._size = (0, 0)
-        self._tracker: WindowedTracker | None = None
+        self._tracker: LightTracker | None = None
         self._counts: Counter[str] = Counter()
         self._next_seq: int | None = None
         self._packet_s = self._laser_s = time.monotonic()
@@ -87,10 +86,10 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
             self._drop(str(error))
             return
         if self._tracker is None or size != self._size:
-            self._size, self._tracker = size, make_tracker(self.params, self._sources, size)
+            self._size, self._tracker = size, LightTracker(self._sources, size, self.params.settings)
         stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
         self._counts["events"] += len(events.x)
-        for report in self._tracker.track(events.x, events.y, events.is_on, stamp_ns + events.time_ns):
+        for report in self._tracker.track(events._replace(time_ns=stamp_ns + events.time_ns)):
             self._publish(report)
 
     def _drop(self, reason: str) -> None:
@@ -117,7 +116,7 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
         return Header(stamp=Time(nanoseconds=stamp_ns).to_msg(), frame_id=self._base_frame)
 
     def _laser_message(self, stamp_ns: int, seen: Sighting | None) -> LaserDistance:
-        """The spot and the distance that follows; NaN where there is none."""
+        """The spot and its distance; NaN where there is none."""
         message = LaserDistance(header=self._header(seen.stamp_ns if seen else stamp_ns))
         message.distance = message.sigma = message.u_px = message.v_px = math.nan
         message.covariance = np.array([-1.0, 0.0, 0.0, 0.0])
@@ -190,7 +189,7 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
 
 
 def _check(size: tuple[int, int]) -> None:
-    """Refuse a sensor that cannot be.
+    """Refuse an impossible sensor.
 
     Raises:
         EventError: It has no pixels, or too many.

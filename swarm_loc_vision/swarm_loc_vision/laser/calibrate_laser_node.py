@@ -2,10 +2,10 @@
 
     ./run swarm_loc_vision calibrate_laser --ros-args -r __ns:=/pushbot1 -p output:=pushbot1.yaml
 
-With `bag:=FOLDER` the drive is one that was recorded. Otherwise the
-robot's driver and its `event_tracker_node` must run. Put the robot square to a wall, measure from the
-middle between its wheels to the wall, and start. It takes `odom` and `laser` and publishes `cmd_vel`.
-Parameters: see `doc/calibrate_laser.md`.
+With `bag:=FOLDER` the drive comes from a bag. Otherwise the robot's driver and its `event_tracker_node` must
+run: put the robot square to a wall, measure the distance from the middle between its wheels to the wall, and
+start. The node subscribes to `odom` and `laser` and publishes `cmd_vel`. Parameters: see
+`doc/calibrate_laser.md`.
 """
 
 from __future__ import annotations
@@ -29,18 +29,16 @@ from swarm_loc_estimator.common.node import ConfiguredNode, Stop, run_node
 from swarm_loc_estimator.common.number_spec import number
 from swarm_loc_estimator.common.parameters import ParameterError, text
 from swarm_loc_msgs.msg import LaserDistance
-from swarm_loc_vision.laser.calibration import LaserCalibration
+from swarm_loc_vision.laser.calibration import LaserCalibration, save_laser
+from swarm_loc_vision.laser.drive import WallDrive, recorded_drive
 from swarm_loc_vision.laser.fit import CalibrationError, fit_hyperbola
-from swarm_loc_vision.laser.laser_file import save_laser
-from swarm_loc_vision.laser.recorded_drive import recorded_drive
-from swarm_loc_vision.laser.wall_drive import WallDrive
 
 _QOS = QoSProfile(depth=10)
 _COMMAND_S = 0.05
 _WAKE_S = 0.1
 _PATIENCE_S = 10.0
 _SETTLE_S = 0.5
-"""Odometry and rows that were under way when it stopped."""
+"""Time for messages that are under way when the robot stops [s]."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +46,14 @@ class CalibrateLaserParameters:
     """Parameters of `calibrate_laser`."""
 
     start_distance: float = number(
-        2.5, "m", 0.2, 100.0, "from base_link to the wall at the begin, measured by hand"
+        2.5, "m", 0.2, 100.0, "from base_link to the wall at the start, measured by hand"
     )
     start_sigma: float = number(0.005, "m", 1e-5, 1.0, "its standard deviation")
     stop_distance: float = number(0.16, "m", 0.05, 10.0, "from base_link to the wall where the robot stops")
-    speed: float = number(0.1, "m/s", 0.01, 1.0, "at which it drives")
-    camera_x: float = number(0.04, "m", -1.0, 1.0, "the camera before base_link")
-    output: str = text("", "path of the file that is written", required=True)
-    bag: str = text("", "path of a recorded drive, with the robot's odom and laser; empty: drive now")
+    speed: float = number(0.1, "m/s", 0.01, 1.0, "of the drive")
+    camera_x: float = number(0.04, "m", -1.0, 1.0, "position of the camera ahead of base_link")
+    output: str = text("", "path of the calibration file to write", required=True)
+    bag: str = text("", "path of a bag with the robot's odom and laser; empty: drive now")
 
 
 class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
@@ -80,7 +78,7 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
         self._error: CalibrationError | None = None
 
     def run(self, stop: Stop) -> int:
-        """Drive to the wall, or read of such a drive, then fit and write; the exit status."""
+        """Drive to the wall or read the bag, then fit and write; returns the exit status."""
         if self.params.bag:
             drive = recorded_drive(Path(self.params.bag), self.get_namespace().strip("/"), self._drive)
             return self._fit(drive)
@@ -104,8 +102,8 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
         if not self._drive.is_done:
             missing = min(self._heard_s, key=lambda name: self._heard_s[name])
             raise CalibrationError(
-                f"nothing has come on {self.resolve_topic_name(missing)} for {_PATIENCE_S:g} s, and the robot"
-                f" has driven {self._drive.driven:.2f} m."
+                f"no messages received on {self.resolve_topic_name(missing)} for {_PATIENCE_S:g} s;"
+                f" the robot has driven {self._drive.driven:.2f} m."
             )
         return self._fit(self._drive)
 
@@ -148,7 +146,7 @@ def _nanoseconds(message: Odometry | LaserDistance) -> int:
 
 
 def summary(calibration: LaserCalibration, count: int, path: str) -> str:
-    """What was found, for people."""
+    """The result as text."""
     near, far = calibration.min_depth, calibration.max_depth
     _, sigma = calibration.distance(calibration.row(1.0), 0.0)
     return (

@@ -2,23 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.event_encoding import Events
 
 SIZE = (128, 128)
-
-
-class EventColumns(NamedTuple):
-    """Events in the order of their time (N,)."""
-
-    x: NDArray[np.uint16]
-    y: NDArray[np.uint16]
-    is_on: BoolArray
-    time_ns: IntArray
 
 
 def light(
@@ -48,9 +37,9 @@ def noise(rng: np.random.Generator, rate: float, seconds: float) -> FloatArray:
     return np.stack([*places, rng.integers(0, 2, count), rng.uniform(0.0, seconds * 1e9, count)])
 
 
-def together(*parts: FloatArray) -> EventColumns:
+def together(*parts: FloatArray) -> Events:
     """All of them in the order of time."""
     rows = np.concatenate(parts, axis=1)
     rows = rows[:, np.argsort(rows[3], kind="stable")]
     x, y = rows[:2].astype(np.uint16)
-    return EventColumns(x, y, rows[2].astype(bool), rows[3].astype(np.int64))
+    return Events(x, y, rows[2].astype(bool), rows[3].astype(np.int64))

@@ -7,15 +7,12 @@ from pathlib import Path
 import pytest
 
 from swarm_loc_estimator.common.parameters import ParameterError, markdown_table
-from swarm_loc_vision.events.event_tracker_parameters import (
+from swarm_loc_vision.events.parameters import (
     EventTrackerParameters,
     laser_calibration,
     light_sources,
-    make_tracker,
 )
-from swarm_loc_vision.events.paper_tracker import PaperTracker
-from swarm_loc_vision.laser.calibration import LaserCalibration
-from swarm_loc_vision.laser.laser_file import save_laser
+from swarm_loc_vision.laser.calibration import LaserCalibration, save_laser
 
 DOC = Path(__file__).parents[2] / "doc"
 
@@ -52,9 +49,8 @@ def test_frequencies_that_cannot_be_are_named(changed: dict[str, object], senten
         light_sources(EventTrackerParameters(**changed))  # type: ignore[arg-type]
 
 
-def test_method_and_calibration_are_those_chosen(tmp_path: Path) -> None:
+def test_the_calibration_is_the_one_named(tmp_path: Path) -> None:
     save_laser(tmp_path / "laser.yaml", LaserCalibration())
-    parameters = EventTrackerParameters(method="paper", calibration=str(tmp_path / "laser.yaml"))
-    assert isinstance(make_tracker(parameters, light_sources(parameters), (128, 128)), PaperTracker)
+    parameters = EventTrackerParameters(calibration=str(tmp_path / "laser.yaml"))
     assert laser_calibration(parameters) == LaserCalibration()
     assert laser_calibration(EventTrackerParameters()) is None

@@ -8,11 +8,9 @@ from blinking_lights import SIZE, light, noise, together
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swarm_loc_vision.events.bearing import direction, direction_jacobian
-from swarm_loc_vision.events.bursts import BurstMatcher
-from swarm_loc_vision.events.centroid_tracker import CentroidTracker
-from swarm_loc_vision.events.paper_tracker import PaperSettings, PaperTracker
-from swarm_loc_vision.events.settings import MAX_SOURCES, LightSource, TrackerSettings, WindowReport
+from swarm_loc_estimator.common.messages.event_encoding import Events
+from swarm_loc_vision.events.parameters import MAX_SOURCES, LightSource, TrackerSettings
+from swarm_loc_vision.events.tracker import LightTracker, WindowReport, direction, direction_jacobian
 
 LASER, LED = LightSource(450.0, is_above=False), LightSource(1000.0, is_above=True)
 SETTINGS = TrackerSettings()
@@ -32,7 +30,7 @@ def test_laser_and_led_are_found_among_noise(seed: int) -> None:
     laser = (40.0 + 40.0 * rng.random(), 80.0 + 30.0 * rng.random())
     led = (40.0 + 40.0 * rng.random(), 20.0 + 30.0 * rng.random())
     events = together(light(rng, laser, 450.0, 0.5), light(rng, led, 1000.0, 0.5), noise(rng, 15.0, 0.5))
-    reports = CentroidTracker([LASER, LED], SIZE, SETTINGS).track(*events)
+    reports = LightTracker([LASER, LED], SIZE, SETTINGS).track(events)
     assert len(reports) == 24
     for source, place in enumerate((laser, led)):
         wrong = errors(reports, source, place)
@@ -47,7 +45,7 @@ def test_covariances_are_about_right() -> None:
         rng = np.random.default_rng(seed)
         place = (60.0 + rng.random(), 90.0 + rng.random())
         events = together(light(rng, place, 450.0, 0.2), noise(rng, 5.0, 0.2))
-        for report in CentroidTracker([LASER], SIZE, SETTINGS).track(*events)[1:]:
+        for report in LightTracker([LASER], SIZE, SETTINGS).track(events)[1:]:
             (one,) = report.sightings
             wrong = np.array([one.u - place[0], one.v - place[1]])
             values.append(wrong @ np.linalg.solve(one.covariance, wrong))
@@ -56,7 +54,7 @@ def test_covariances_are_about_right() -> None:
 
 def test_noise_alone_is_no_light() -> None:
     rng = np.random.default_rng(4)
-    reports = CentroidTracker([LASER, LED], SIZE, SETTINGS).track(*together(noise(rng, 30.0, 1.0)))
+    reports = LightTracker([LASER, LED], SIZE, SETTINGS).track(together(noise(rng, 30.0, 1.0)))
     assert len(reports) == 49
     assert not any(report.sightings for report in reports)
 
@@ -65,7 +63,7 @@ def test_halves_are_kept_apart() -> None:
     """A light of the laser's frequency in the upper half is somebody else's."""
     rng = np.random.default_rng(5)
     events = together(light(rng, (60.0, 30.0), 450.0, 0.2), noise(rng, 1.0, 0.2))
-    reports = CentroidTracker([LASER], SIZE, SETTINGS).track(*events)
+    reports = LightTracker([LASER], SIZE, SETTINGS).track(events)
     assert not any(report.sightings for report in reports)
 
 
@@ -75,7 +73,7 @@ def test_neighbouring_frequencies_are_told_apart(apart: float) -> None:
     sources = [LightSource(490.0, is_above=True), LightSource(490.0 + apart, is_above=True)]
     places = [(30.0, 40.0), (90.0, 30.0)]
     parts = [light(rng, place, one.frequency, 0.4) for place, one in zip(places, sources, strict=True)]
-    reports = CentroidTracker(sources, SIZE, SETTINGS).track(*together(*parts, noise(rng, 2.0, 0.4)))
+    reports = LightTracker(sources, SIZE, SETTINGS).track(together(*parts, noise(rng, 2.0, 0.4)))
     for source, place in enumerate(places):
         assert np.abs(errors(reports, source, place)).max() < 0.6
 
@@ -86,7 +84,7 @@ def test_many_frequencies_at_once() -> None:
     sources = [LightSource(one, is_above=True) for one in frequencies]
     places = [(12.0 + 11.0 * k, 20.0 + 3.0 * k) for k in range(10)]
     parts = [light(rng, place, one, 0.2) for place, one in zip(places, frequencies, strict=True)]
-    reports = CentroidTracker(sources, SIZE, SETTINGS).track(*together(*parts, noise(rng, 2.0, 0.2)))
+    reports = LightTracker(sources, SIZE, SETTINGS).track(together(*parts, noise(rng, 2.0, 0.2)))
     for source, place in enumerate(places):
         wrong = errors(reports, source, place)
         assert len(wrong) == 8
@@ -100,14 +98,14 @@ def test_a_light_is_no_echo_of_half_its_frequency() -> None:
     cycle = (rows[3] // 1e6).astype(int)
     rows = rows[:, rng.random(cycle.max() + 1)[cycle] > 0.15]
     sources = [LightSource(1000.0, is_above=True), LightSource(500.0, is_above=True)]
-    reports = CentroidTracker(sources, SIZE, SETTINGS).track(*together(rows))
+    reports = LightTracker(sources, SIZE, SETTINGS).track(together(rows))
     assert all([one.source for one in report.sightings] == [0] for report in reports[1:])
 
 
 def test_the_spot_of_a_moving_robot_is_where_it_was_at_its_stamp() -> None:
     rng = np.random.default_rng(9)
     events = together(light(rng, (30.0, 90.0), 450.0, 0.5, drift=60.0), noise(rng, 2.0, 0.5))
-    reports = CentroidTracker([LASER], SIZE, SETTINGS).track(*events)
+    reports = LightTracker([LASER], SIZE, SETTINGS).track(events)
     wrong = [
         one.u - (30.0 + 60.0 * one.stamp_ns * 1e-9) for report in reports[1:] for one in report.sightings
     ]
@@ -116,23 +114,17 @@ def test_the_spot_of_a_moving_robot_is_where_it_was_at_its_stamp() -> None:
 
 
 @settings(max_examples=20, deadline=None)
-@given(cuts=st.lists(st.integers(0, 4000), max_size=20), method=st.sampled_from(["centroid", "paper"]))
-def test_packets_of_any_size_give_the_same_reports(cuts: list[int], method: str) -> None:
+@given(cuts=st.lists(st.integers(0, 4000), max_size=20))
+def test_packets_of_any_size_give_the_same_reports(cuts: list[int]) -> None:
     rng = np.random.default_rng(10)
     events = together(light(rng, (60.3, 90.2), 450.0, 0.1), noise(rng, 2.0, 0.1))
     places = sorted(one for one in cuts if one < len(events.x))
 
-    def tracker() -> CentroidTracker | PaperTracker:
-        if method == "paper":
-            return PaperTracker([LASER], SIZE, SETTINGS, PaperSettings())
-        return CentroidTracker([LASER], SIZE, SETTINGS)
-
-    whole, cut = tracker().track(*events), tracker()
-    x, y, is_on, time_ns = events
+    whole, cut = LightTracker([LASER], SIZE, SETTINGS).track(events), LightTracker([LASER], SIZE, SETTINGS)
     parts = [
         report
-        for begin, end in zip([0, *places], [*places, len(x)], strict=True)
-        for report in cut.track(x[begin:end], y[begin:end], is_on[begin:end], time_ns[begin:end])
+        for begin, end in zip([0, *places], [*places, len(events.x)], strict=True)
+        for report in cut.track(Events._make(column[begin:end] for column in events))
     ]
     assert [(one.stamp_ns, [s[:4] for s in one.sightings]) for one in parts] == [
         (one.stamp_ns, [s[:4] for s in one.sightings]) for one in whole
@@ -142,39 +134,24 @@ def test_packets_of_any_size_give_the_same_reports(cuts: list[int], method: str)
 def test_time_that_steps_back_begins_anew() -> None:
     rng = np.random.default_rng(11)
     events = together(light(rng, (60.3, 90.2), 450.0, 0.2))
-    tracker = CentroidTracker([LASER], SIZE, SETTINGS)
+    tracker = LightTracker([LASER], SIZE, SETTINGS)
     later = events._replace(time_ns=events.time_ns + 10**12)
-    tracker.track(*later)
-    assert len(tracker.track(*events)) == 9
+    tracker.track(later)
+    assert len(tracker.track(events)) == 9
     assert tracker.time_jumps == 1
 
 
 def test_an_hour_without_events_makes_no_reports() -> None:
     rng = np.random.default_rng(12)
     events = together(light(rng, (60.3, 90.2), 450.0, 0.05))
-    tracker = CentroidTracker([LASER], SIZE, SETTINGS)
-    tracker.track(*events)
-    assert len(tracker.track(*events._replace(time_ns=events.time_ns + 3600 * 10**9))) == 3
+    tracker = LightTracker([LASER], SIZE, SETTINGS)
+    tracker.track(events)
+    assert len(tracker.track(events._replace(time_ns=events.time_ns + 3600 * 10**9))) == 3
 
 
 def test_more_lights_than_bits_are_refused() -> None:
     with pytest.raises(ValueError, match="33 lights"):
-        BurstMatcher([LASER] * (MAX_SOURCES + 1), SIZE, SETTINGS)
-
-
-def test_the_printed_tracker_is_moved_by_noise_and_the_product_of_weights_is_not() -> None:
-    """The paper's equation (1) sums its weights: at 15 noise events/s/pixel it is pixels off."""
-    rms = {}
-    for is_product in (False, True):
-        squares = []
-        for seed in (1, 2, 3):
-            rng = np.random.default_rng(seed)
-            events = together(light(rng, (60.3, 90.2), 450.0, 0.4), noise(rng, 15.0, 0.4))
-            paper = PaperTracker([LASER], SIZE, SETTINGS, PaperSettings(is_product=is_product))
-            squares.append((errors(paper.track(*events), 0, (60.3, 90.2), skipped=4) ** 2).mean())
-        rms[is_product] = np.sqrt(np.mean(squares))
-    assert rms[False] > 1.0
-    assert rms[True] < 0.8
+        LightTracker([LASER] * (MAX_SOURCES + 1), SIZE, SETTINGS)
 
 
 @given(u=st.floats(-60, 60), v=st.floats(-60, 60))

@@ -16,10 +16,11 @@ from swarm_loc_drivers.sim.pushbot.optics import (
     spot_brightness,
 )
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.events.centroid_tracker import CentroidTracker
-from swarm_loc_vision.events.settings import LightSource, TrackerSettings
+from swarm_loc_estimator.common.messages.event_encoding import Events
+from swarm_loc_vision.events.parameters import LightSource, TrackerSettings
+from swarm_loc_vision.events.tracker import LightTracker
+from swarm_loc_vision.laser.calibration import save_laser
 from swarm_loc_vision.laser.fit import Drive, fit_hyperbola
-from swarm_loc_vision.laser.laser_file import save_laser
 
 _STEP_US = 5_000
 _BLINKING, _LASER = Blinking(2222, 1111), LightSource(450.0, is_above=False)
@@ -52,7 +53,7 @@ def drive_at_wall(
 ) -> tuple[Drive, FloatArray]:
     """What odometry and tracker tell of a drive, and the true depths (N,) [m] at the same instants."""
     camera = EventCamera(CameraNoise(noise_rate=settings.noise_rate), rng, built.sensor)
-    tracker = CentroidTracker([_LASER], (128, 128), TrackerSettings())
+    tracker = LightTracker([_LASER], (128, 128), TrackerSettings())
     step_m = settings.speed * _STEP_US * 1e-6
     depth = settings.start - CAMERA_X_M + settings.start_sigma * rng.standard_normal()
     steps = round((settings.start - settings.stop) / step_m)
@@ -63,9 +64,9 @@ def drive_at_wall(
     for step in range(steps):
         begin, end = depths[step : step + 2].tolist()
         spot = Spot(built.spot(begin), built.spot(end), spot_brightness(end), _BLINKING)
-        events = camera.look(int(stamps_us[step]), int(stamps_us[step + 1]), [spot], np.zeros((0, 3)))
-        columns = (events.x.astype(np.uint16), events.y.astype(np.uint16), events.polarity == 0)
-        seen += tracker.track(*columns, 1000 * events.time_us)
+        one = camera.look(int(stamps_us[step]), int(stamps_us[step + 1]), [spot], np.zeros((0, 3)))
+        columns = one.x.astype(np.uint16), one.y.astype(np.uint16), one.polarity == 0, 1000 * one.time_us
+        seen += tracker.track(Events(*columns))
     rows = np.array([(1e-3 * one.stamp_ns, one.v) for report in seen for one in report.sightings])
     driven = np.interp(rows[:, 0], stamps_us, step_m * np.arange(steps + 1))
     told = Drive(settings.start, _TOLD_SIGMA, driven, rows[:, 1], CAMERA_X_M)

@@ -1,21 +1,52 @@
-"""Parameters of `event_tracker_node`, and the tracker that they describe. No ROS here."""
+"""Parameters of `event_tracker_node`: the lights that are looked for, and how they are tracked."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import ParameterError, choice, text, texts
-from swarm_loc_vision.events.centroid_tracker import CentroidTracker
-from swarm_loc_vision.events.paper_tracker import PaperSettings, PaperTracker
-from swarm_loc_vision.events.settings import MAX_SOURCES, LightSource, TrackerSettings
-from swarm_loc_vision.events.windows import WindowedTracker
-from swarm_loc_vision.laser.calibration import LaserCalibration
-from swarm_loc_vision.laser.laser_file import load_laser
+from swarm_loc_estimator.common.parameters import ParameterError, text, texts
+from swarm_loc_vision.laser.calibration import LaserCalibration, load_laser
 
+MAX_SOURCES = 32
+"""Bound on the lights that are looked for at once."""
 _MIN_HZ, _MAX_HZ = 10.0, 5000.0
+
+
+@dataclass(frozen=True)
+class LightSource:
+    """A light that blinks.
+
+    Attributes:
+        frequency: [Hz].
+        is_above: Whether it is in the upper half of the image, as LEDs of other robots, or in the lower half,
+            as the spot of the robot's own laser.
+    """
+
+    frequency: float
+    is_above: bool
+
+    @property
+    def period_ns(self) -> int:
+        """[ns]."""
+        return round(1e9 / self.frequency)
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """How blinking lights are tracked."""
+
+    window: float = number(0.02, "s", 0.002, 1.0, "length of the windows, each of which makes one report")
+    burst_gap: float = number(2.5e-4, "s", 1e-5, 0.01, "pause of a pixel before the first event of a burst")
+    period_gate: float = number(
+        6e-5, "s", 1e-6, 1e-3, "largest difference of the time between two bursts and the light's period"
+    )
+    radius: float = number(3.5, "px", 1.0, 20.0, "of the circle whose events determine a light's place")
+    min_events: int = number(8, "1", 2, 1000, "events of a light within 3 x 3 pixels, at least")
+    sigma_floor: float = number(
+        0.02, "px", 0.0, 2.0, "standard deviation of a place that more events do not reduce, per axis"
+    )
 
 
 @dataclass(frozen=True)
@@ -30,21 +61,16 @@ class LensSettings:
 
 @dataclass(frozen=True)
 class EventTrackerParameters:
-    """Parameters of `event_tracker_node`; those of the tracker itself are its settings."""
+    """Parameters of `event_tracker_node`."""
 
-    method: str = choice(
-        "centroid",
-        ("centroid", "paper"),
-        "centre of all events in time, or equation (1) of the PushBot paper",
-    )
     laser_frequency: float = number(
-        450.0, "Hz", 0.0, _MAX_HZ, "of the own laser, looked for in the lower half; 0: none"
+        450.0, "Hz", 0.0, _MAX_HZ, "of the robot's own laser, in the lower half of the image; 0: none"
     )
     light_frequencies: tuple[str, ...] = texts(
-        "of other robots' LEDs, looked for in the upper half, such as 1000 [Hz]; empty: none"
+        "of other robots' LEDs, in the upper half of the image, such as 1000 [Hz]; empty: none"
     )
-    calibration: str = text("", "path of the laser's calibration; empty: no distances, only the spot")
-    base_frame: str = text("base_link", "distances and bearings are in <robot>/base_frame", required=True)
+    calibration: str = text("", "path of the laser's calibration; empty: the spot without distances")
+    base_frame: str = text("base_link", "frame of distances and bearings: <robot>/base_frame", required=True)
     lens: LensSettings = field(default_factory=LensSettings, metadata={"numbers_of": LensSettings})
     settings: TrackerSettings = field(
         default_factory=TrackerSettings, metadata={"numbers_of": TrackerSettings}
@@ -80,15 +106,6 @@ def _in_range(name: str, value: float | str) -> float:
     if not _MIN_HZ <= frequency <= _MAX_HZ:
         raise ParameterError(f"parameter {name} = {value!r} must lie in [{_MIN_HZ:g}, {_MAX_HZ:g}] Hz.")
     return frequency
-
-
-def make_tracker(
-    parameters: EventTrackerParameters, sources: Sequence[LightSource], size: tuple[int, int]
-) -> WindowedTracker:
-    """The tracker for a sensor of a size [px]."""
-    if parameters.method == "paper":
-        return PaperTracker(sources, size, parameters.settings, PaperSettings())
-    return CentroidTracker(sources, size, parameters.settings)
 
 
 def laser_calibration(parameters: EventTrackerParameters) -> LaserCalibration | None:

@@ -12,15 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_vision.events.centroid_tracker import CentroidTracker
-from swarm_loc_vision.events.settings import LightSource, Sighting, TrackerSettings
-from swarm_loc_vision.events.windows import WindowedTracker
+from swarm_loc_estimator.common.messages.event_encoding import Events
+from swarm_loc_vision.events.parameters import LightSource, TrackerSettings
+from swarm_loc_vision.events.tracker import LightTracker, Sighting
 
 _LONG_AGO_NS = -(1 << 62)
 
@@ -44,8 +44,15 @@ class PaperSettings:
     sigma: float = 0.83
 
 
-class PaperTracker(WindowedTracker):
-    """Follows each light once it was found; until then it looks for it as the `CentroidTracker` does.
+class _Lights(NamedTuple):
+    """Periods (S,) of the lights, and whether each is in the upper half of the image."""
+
+    period_ns: IntArray
+    is_above: BoolArray
+
+
+class PaperTracker(LightTracker):
+    """Follows each light once it was found; until then it looks for it as the `LightTracker` does.
 
     Args:
         sources: The lights.
@@ -61,43 +68,31 @@ class PaperTracker(WindowedTracker):
         settings: TrackerSettings,
         paper: PaperSettings,
     ) -> None:
-        super().__init__(settings.window)
-        self._finder = CentroidTracker(sources, size, settings)
+        self._finder = LightTracker(sources, size, settings)
         self._paper = paper
-        self._size = size
-        self._periods = np.array([source.period_ns for source in sources], np.int64)
-        self._is_above = np.array([source.is_above for source in sources], bool)
-        self._numbers = np.array(
-            [
-                paper.eta,
-                1e9 * paper.time_sigma,
-                paper.distance_sigma,
-                paper.is_product,
-                1e9 * settings.burst_gap,
-                *size,
-            ],
-            dtype=float,
+        self._lights = _Lights(
+            np.array([source.period_ns for source in sources], np.int64),
+            np.array([source.is_above for source in sources], bool),
         )
+        weights = [paper.eta, 1e9 * paper.time_sigma, paper.distance_sigma, paper.is_product]
+        self._numbers = np.array([*weights, 1e9 * settings.burst_gap, *size], dtype=float)
         self._times = np.empty((2, 2 * size[0] * size[1]), np.int64)
-        self._reset()
+        super().__init__(sources, size, settings)
 
     def _reset(self) -> None:
         self._times[:] = _LONG_AGO_NS
-        self._places = np.full((len(self._periods), 2), np.nan)
-        self._events = np.zeros(len(self._periods), np.int64)
+        count = len(self._lights.period_ns)
+        self._places, self._events = np.full((count, 2), np.nan), np.zeros(count, np.int64)
         self._last_ns = 0
 
-    def _take(
-        self, x: NDArray[np.uint16], y: NDArray[np.uint16], is_on: BoolArray, time_ns: IntArray
-    ) -> None:
+    def _take(self, events: Events) -> None:
         if np.isnan(self._places).any():
-            for report in self._finder.track(x, y, is_on, time_ns):
+            for report in self._finder.track(events):
                 for one in report.sightings:
                     if np.isnan(self._places[one.source, 0]):
                         self._places[one.source] = one.u, one.v
-        lights = self._periods, self._is_above, self._numbers
-        _pull((x, y, is_on, time_ns), lights, self._times, self._places, self._events)
-        self._last_ns = int(time_ns[-1])
+        _pull(events, self._lights, self._numbers, self._times, self._places, self._events)
+        self._last_ns = int(events.time_ns[-1])
 
     def _report(self) -> list[Sighting]:
         found = [
@@ -119,22 +114,18 @@ class PaperTracker(WindowedTracker):
 
 @cached_njit
 def _pull(
-    events: tuple[NDArray[np.uint16], NDArray[np.uint16], BoolArray, IntArray],
-    lights: tuple[IntArray, BoolArray, FloatArray],
+    events: Events,
+    lights: _Lights,
+    numbers: FloatArray,
     times: IntArray,
     places: FloatArray,
     counts: IntArray,
 ) -> None:
     """Move places (S, 2) by events, and count those that were in time and near."""
     x, y, is_on, time_ns = events
-    periods, is_above, numbers = lights
-    eta, time_sigma, distance_sigma, is_product, gap = (
-        numbers[0],
-        numbers[1],
-        numbers[2],
-        numbers[3],
-        numbers[4],
-    )
+    periods, is_above = lights
+    eta, time_sigma, distance_sigma = numbers[0], numbers[1], numbers[2]
+    is_product, gap = numbers[3], numbers[4]
     width, height = int(numbers[5]), int(numbers[6])
     for k in range(len(x)):
         pixel = (int(is_on[k]) * height + y[k]) * width + x[k]

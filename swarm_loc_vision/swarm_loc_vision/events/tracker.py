@@ -1,0 +1,336 @@
+"""Track blinking lights in the events of an event camera.
+
+A switched light makes each pixel of its image send a burst of events of one polarity. A burst belongs to the
+light whose period is nearest to the time since the previous burst of the same pixel and polarity; noise and
+moving edges hardly ever keep a period. (G. R. Mueller and J. Conradt, "A miniature low-power sensor system
+for real time 2D visual tracking of LED markers", ROBIO 2011, match single events in this way.) In each window
+a light is at the centre of its events around the place where they are densest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_estimator.common.messages.event_encoding import Events
+from swarm_loc_vision.events.parameters import MAX_SOURCES, LightSource, TrackerSettings
+
+_LONG_AGO_NS = -(1 << 62)
+_ITERATIONS = 8
+_MAX_SHIFT_PX, _SETTLED_PX = 3.0, 1e-3
+_PIXEL_VARIANCE = 1.0 / 12.0
+"""Variance of a place within its pixel [px^2]."""
+_MOMENTS = 8
+_COUNT, _BURSTS, _U, _V, _UU, _UV, _VV, _TIME = range(_MOMENTS)
+
+
+class Sighting(NamedTuple):
+    """A light in one window.
+
+    Attributes:
+        source: Index of the light.
+        stamp_ns: Mean time of its events [ns].
+        u: Column of its centre [px].
+        v: Row [px].
+        covariance: (2, 2) over u, v [px^2].
+        locking: Part of each variance that is the bias within pixels, the same at each return [px^2].
+        events: Number of events that the place was computed from.
+    """
+
+    source: int
+    stamp_ns: int
+    u: float
+    v: float
+    covariance: FloatArray
+    locking: float
+    events: int
+
+
+class WindowReport(NamedTuple):
+    """The lights in one window.
+
+    Attributes:
+        stamp_ns: Middle of the window [ns].
+        sightings: At most one for each light, by source.
+    """
+
+    stamp_ns: int
+    sightings: tuple[Sighting, ...]
+
+
+class _Hits(NamedTuple):
+    """Events in time with a light, in order of time, one row each.
+
+    Attributes:
+        source: (H,) index of the light.
+        x: (H,) column [px].
+        y: (H,) row [px].
+        time_ns: (H,) [ns].
+        begins: (H,) whether the event is the first of its burst.
+    """
+
+    source: NDArray[np.int32]
+    x: NDArray[np.int32]
+    y: NDArray[np.int32]
+    time_ns: IntArray
+    begins: BoolArray
+
+
+class _Bursts(NamedTuple):
+    """The last burst of each pixel and polarity.
+
+    Attributes:
+        event_ns: (P,) time of its last event [ns].
+        begin_ns: (P,) time of its first event [ns].
+        source: (P,) the light that it belongs to; -1: none.
+    """
+
+    event_ns: IntArray
+    begin_ns: IntArray
+    source: NDArray[np.int32]
+
+
+class LightTracker:
+    """Reports the lights of each window of events; windows begin at whole multiples of their length.
+
+    Args:
+        sources: The lights, at most `MAX_SOURCES`.
+        size: Width and height of the sensor [px].
+        settings: Numbers of the tracker.
+
+    Attributes:
+        time_jumps: How often time stepped back by more than a window, which resets the tracker.
+    """
+
+    def __init__(
+        self, sources: Sequence[LightSource], size: tuple[int, int], settings: TrackerSettings
+    ) -> None:
+        if len(sources) > MAX_SOURCES:
+            raise ValueError(f"{len(sources)} lights are more than {MAX_SOURCES}")
+        self.time_jumps = 0
+        self._settings, (self._width, self._height) = settings, size
+        self._window_ns = round(1e9 * settings.window)
+        self._begin_ns: int | None = None
+        self._period_ns = np.array([source.period_ns for source in sources], np.int64)
+        self._is_above = np.array([source.is_above for source in sources], bool)
+        self._switches = [max(1.0, 2.0 * settings.window * source.frequency) for source in sources]
+        self._density = np.zeros((len(sources), self._height + 2, self._width + 2), np.int32)
+        pixels = 2 * self._width * self._height
+        self._bursts = _Bursts(
+            np.empty(pixels, np.int64), np.empty(pixels, np.int64), np.empty(pixels, np.int32)
+        )
+        self._hits: list[_Hits] = []
+        self._reset()
+
+    def track(self, events: Events) -> list[WindowReport]:
+        """Take events in order of time, given since the epoch; returns the windows that have ended."""
+        reports: list[WindowReport] = []
+        count, time_ns = len(events.x), events.time_ns
+        if not count:
+            return reports
+        if self._begin_ns is not None and time_ns[0] < self._begin_ns - self._window_ns:
+            self.time_jumps += 1
+            self._begin_ns = None
+            self._reset()
+        first = 0
+        while first < count:
+            if self._begin_ns is None:
+                self._begin_ns = int(time_ns[first]) // self._window_ns * self._window_ns
+            end_ns = self._begin_ns + self._window_ns
+            last = first + int(np.searchsorted(time_ns[first:], end_ns))
+            if last > first:
+                self._take(Events._make(column[first:last] for column in events))
+            if last < count:
+                reports.append(WindowReport(end_ns - self._window_ns // 2, tuple(self._report())))
+                self._begin_ns = int(time_ns[last]) // self._window_ns * self._window_ns
+            first = last
+        return reports
+
+    def _reset(self) -> None:
+        """Forget all events."""
+        self._bursts.event_ns[:] = self._bursts.begin_ns[:] = _LONG_AGO_NS
+        self._bursts.source[:] = -1
+        self._hits.clear()
+
+    def _take(self, events: Events) -> None:
+        """Keep the events of the open window that are in time with a light: the one of the nearest period."""
+        count = len(events.x)
+        source, x, y = np.empty((3, count), np.int32)
+        hits = _Hits(source, x, y, np.empty(count, np.int64), np.empty(count, bool))
+        gap_ns, gate_ns = round(1e9 * self._settings.burst_gap), round(1e9 * self._settings.period_gate)
+        found = _match(
+            events,
+            self._period_ns,
+            self._is_above,
+            gap_ns,
+            gate_ns,
+            self._width,
+            self._height,
+            self._bursts,
+            hits,
+        )
+        self._hits.append(_Hits._make(column[:found] for column in hits))
+
+    def _report(self) -> list[Sighting]:
+        """The lights of the open window, which is cleared.
+
+        Where bursts of a strong light are lost it also shows up at multiples of its period; such echoes are
+        left out.
+        """
+        hits = _Hits._make(np.concatenate(column) for column in zip(*self._hits, strict=True))
+        self._hits.clear()
+        moments, radius = np.zeros((len(self._density), _MOMENTS)), self._settings.radius
+        _locate(hits, self._density, radius, self._settings.min_events, moments)
+        found = [self._sighting(source, row) for source, row in enumerate(moments) if row[_COUNT]]
+        return [
+            one
+            for one in found
+            if not any(
+                other.events > 2 * one.events and np.hypot(one.u - other.u, one.v - other.v) < radius
+                for other in found
+            )
+        ]
+
+    def _sighting(self, source: int, row: FloatArray) -> Sighting:
+        """The light of a row of moments.
+
+        Noise averages out over bursts. The error within a pixel averages out only over the events of one
+        switch, because the same pixels answer every switch.
+        """
+        scatter = np.array([[row[_UU], row[_UV]], [row[_UV], row[_VV]]]) / row[_COUNT]
+        at_a_switch = max(1.0, row[_COUNT] / self._switches[source])
+        locking = float(_PIXEL_VARIANCE / at_a_switch)
+        systematic = locking + self._settings.sigma_floor**2
+        covariance = scatter / max(row[_BURSTS], 1.0) + systematic * np.eye(2)
+        place = float(row[_U]), float(row[_V])
+        return Sighting(source, int(row[_TIME]), *place, covariance, locking, int(row[_COUNT]))
+
+
+@cached_njit
+def _match(
+    events: Events,
+    period_ns: IntArray,
+    is_above: BoolArray,
+    gap_ns: int,
+    gate_ns: int,
+    width: int,
+    height: int,
+    bursts: _Bursts,
+    hits: _Hits,
+) -> int:
+    """Fill hits; returns their number."""
+    count = 0
+    for k in range(len(events.x)):
+        x, y, now = events.x[k], events.y[k], events.time_ns[k]
+        pixel = (int(events.is_on[k]) * height + y) * width + x
+        is_new = now - bursts.event_ns[pixel] > gap_ns
+        if is_new:
+            elapsed = now - bursts.begin_ns[pixel]
+            bursts.source[pixel] = _nearest_period(elapsed, 2 * y < height, period_ns, is_above, gate_ns)
+            bursts.begin_ns[pixel] = now
+        bursts.event_ns[pixel] = now
+        if bursts.source[pixel] >= 0:
+            hits.source[count], hits.x[count], hits.y[count] = bursts.source[pixel], x, y
+            hits.time_ns[count], hits.begins[count] = now, is_new
+            count += 1
+    return count
+
+
+@cached_njit
+def _nearest_period(elapsed: int, above: bool, period_ns: IntArray, is_above: BoolArray, gate_ns: int) -> int:
+    """The light of a half of the image whose period is nearest to a time between bursts; -1: none."""
+    nearest, found = gate_ns, -1
+    for k in range(len(period_ns)):
+        if is_above[k] == above and abs(elapsed - period_ns[k]) < nearest:
+            nearest, found = abs(elapsed - period_ns[k]), k
+    return found
+
+
+@cached_njit
+def _locate(
+    hits: _Hits, density: NDArray[np.int32], radius: float, min_events: int, moments: FloatArray
+) -> None:
+    """Fill the moments (S, 8) of each light: events, bursts, centre, sums of scatter about it, time [ns]."""
+    peak = np.zeros((len(density), 3), np.int64)
+    for k in range(len(hits.x)):
+        source, x, y = hits.source[k], hits.x[k], hits.y[k]
+        for row in range(y, y + 3):
+            for column in range(x, x + 3):
+                density[source, row, column] += 1
+                if density[source, row, column] > peak[source, 0]:
+                    peak[source, 0] = density[source, row, column]
+                    peak[source, 1], peak[source, 2] = column - 1, row - 1
+    for k in range(len(hits.x)):
+        for row in range(hits.y[k], hits.y[k] + 3):
+            for column in range(hits.x[k], hits.x[k] + 3):
+                density[hits.source[k], row, column] = 0
+    near = np.empty(len(hits.x), np.int64)
+    for source in range(len(density)):
+        if peak[source, 0] >= min_events:
+            count = _near(hits, source, peak[source], radius + _MAX_SHIFT_PX, near)
+            _centre(hits, near[:count], peak[source], radius, moments[source])
+
+
+@cached_njit
+def _near(hits: _Hits, source: int, peak: IntArray, reach: float, near: IntArray) -> int:
+    """Fill the indices of the events of a light around its peak; how many they are."""
+    count = 0
+    for k in range(len(hits.x)):
+        if hits.source[k] == source:
+            du, dv = float(hits.x[k] - peak[1]), float(hits.y[k] - peak[2])
+            if du * du + dv * dv <= reach * reach:
+                near[count] = k
+                count += 1
+    return count
+
+
+@cached_njit
+def _centre(hits: _Hits, near: IntArray, peak: IntArray, radius: float, row: FloatArray) -> None:
+    """Centre of the events within a radius of itself."""
+    u, v = float(peak[1]), float(peak[2])
+    step_u, step_v = 0.0, 0.0
+    for _ in range(_ITERATIONS):
+        row[:] = 0.0
+        for k in near:
+            du, dv = hits.x[k] - u, hits.y[k] - v
+            if du * du + dv * dv <= radius * radius:
+                row[_COUNT] += 1.0
+                row[_BURSTS] += hits.begins[k]
+                row[_U] += du
+                row[_V] += dv
+                row[_UU] += du * du
+                row[_UV] += du * dv
+                row[_VV] += dv * dv
+                row[_TIME] += hits.time_ns[k] - hits.time_ns[0]
+        step_u, step_v = row[_U] / row[_COUNT], row[_V] / row[_COUNT]
+        u, v = u + step_u, v + step_v
+        if abs(step_u) + abs(step_v) < _SETTLED_PX:
+            break
+    row[_UU] -= row[_COUNT] * step_u * step_u
+    row[_UV] -= row[_COUNT] * step_u * step_v
+    row[_VV] -= row[_COUNT] * step_v * step_v
+    row[_U], row[_V] = u, v
+    row[_TIME] = hits.time_ns[0] + row[_TIME] / row[_COUNT]
+
+
+def direction(u: float, v: float, focal_px: float) -> tuple[float, float]:
+    """Bearing to the left and elevation [rad] of a place (u, v) [px] beside a level camera's optical axis."""
+    x, y = -u / focal_px, -v / focal_px
+    return math.atan(x), math.atan2(y, math.hypot(1.0, x))
+
+
+def direction_jacobian(u: float, v: float, focal_px: float) -> FloatArray:
+    """(2, 2) derivatives of bearing and elevation by u and v [rad/px]."""
+    x, y = -u / focal_px, -v / focal_px
+    ground = 1.0 + x * x
+    length = ground + y * y
+    root = math.sqrt(ground)
+    by_xy = np.array([[1.0 / ground, 0.0], [-x * y / (root * length), root / length]])
+    jacobian: FloatArray = -by_xy / focal_px
+    return jacobian
