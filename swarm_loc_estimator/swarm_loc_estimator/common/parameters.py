@@ -1,7 +1,8 @@
 """Tables of a node's parameters: frozen dataclasses with names, types, defaults, units and ranges.
 
 The dataclass is filled from ROS parameters (`nodes.declare`), and the tables under doc/ are made from it. A
-field with the metadata `numbers_of` holds a dataclass of numbers, each of which is a parameter.
+field with the metadata `numbers_of` holds a dataclass of numbers, each of which is a parameter; one with
+`is_internal` is none.
 """
 
 from __future__ import annotations
@@ -101,6 +102,8 @@ def parameter_specs(cls: type) -> tuple[ParameterSpec, ...]:
         about = one.metadata
         number: NumberSpec | None = about.get("spec")
         default: Any = one.default
+        if about.get("is_internal"):
+            continue
         if "numbers_of" in about:
             specs += parameter_specs(about["numbers_of"])
         elif number is not None:
@@ -116,6 +119,8 @@ def from_values(cls: type[Parameters], values: Mapping[str, Value]) -> Parameter
     arguments: dict[str, Any] = {}
     for one in fields(cls):  # type: ignore[arg-type]  # any dataclass
         inner = one.metadata.get("numbers_of")
+        if one.metadata.get("is_internal"):
+            continue
         arguments[one.name] = from_values(inner, values) if inner else values[one.name]
     return cls(**arguments)
 

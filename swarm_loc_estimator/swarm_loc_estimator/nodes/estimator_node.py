@@ -47,13 +47,13 @@ from swarm_loc_estimator.nodes.load.shedding import Shedding
 from swarm_loc_estimator.nodes.set_pose import NO_CLOCK, PoseCommands
 from swarm_loc_estimator.precompile import precompile
 from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.thinning import SHED_REASONS, Thinning
 from swarm_loc_estimator.sensors.topics import live_topics
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.contradictions import Contradiction, Kind
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.thinning import SHED_REASONS, Thinning
 
 _DIAGNOSTICS_PERIOD_S = 1.0
 _THROTTLE_S = 30.0

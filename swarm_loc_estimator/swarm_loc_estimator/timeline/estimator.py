@@ -44,7 +44,7 @@ class Estimator:
 
     def __init__(self, swarm: Swarm, settings: Settings | None = None) -> None:
         self.swarm = swarm
-        self.settings = (settings or Settings()).chosen_for(swarm)
+        self.settings = (settings or Settings()).resolved_for(swarm)
         self._timeout_s = np.array([robot.odometry.timeout_s for robot in swarm.robots])
         self._tracks = OdometryTracks(swarm.robots)
         self._validator = InputValidator(swarm, self.settings)

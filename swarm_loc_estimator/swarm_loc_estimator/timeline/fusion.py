@@ -37,7 +37,7 @@ from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.aerial import PictureFusion, as_fixes, relieve_seen
 from swarm_loc_estimator.sensors.messages import chosen
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.timeline.fusion_period import middle_of_period
+from swarm_loc_estimator.timeline.scheduling import middle_of_period
 from swarm_loc_estimator.timeline.settings import Settings
 
 _SURER_AT_FIRST = 1.5
@@ -47,10 +47,6 @@ _PAIRS_PER_ROBOT = 32
 """A robot remembers what so many others have told it by infrared."""
 _CONTRADICTED_DESCRIPTION, _CONTRADICTED_WITHIN_NS = 2, 60_000_000_000
 """When so many robots and landmarks are contradicted within that time, so is all that was concluded."""
-_MAX_ROBOTS_OPENED = 30
-"""With more robots only those are estimated anew that are contradicted: all would cost too much."""
-_MANY = 64
-"""From so many measurements on, one update with all of them costs less than one each, at any swarm size."""
 
 
 class Verdict(IntEnum):
@@ -79,6 +75,7 @@ class Fusion:
 
     def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks) -> None:
         self._tracks = tracks
+        self._policy = settings.policy
         self._limits = LossLimits(
             settings.lost_sigma, settings.lost_heading_sigma, settings.lost_after, settings.max_doubt
         )
@@ -175,7 +172,7 @@ class Fusion:
         """Fuse measurements that name their robots."""
         measured = measurements["kind"] < Kind.SET_POSE
         if state.filter.sequential:
-            if self._period_ns and measurements.size >= _MANY and measured.all():
+            if self._period_ns and measurements.size >= self._policy.batch_from and measured.all():
                 self._fuse_together(state, measurements, verdicts, nis)
             else:
                 self._fuse_in_order(state, measurements, verdicts, nis)
@@ -349,7 +346,7 @@ class Fusion:
         poses = self._poses(state, stamp_ns)
         state.contradicted_ns[source] = stamp_ns
         lately = np.sum(state.contradicted_ns > stamp_ns - _CONTRADICTED_WITHIN_NS)
-        if lately < _CONTRADICTED_DESCRIPTION or state.all_opened or robots > _MAX_ROBOTS_OPENED:
+        if lately < _CONTRADICTED_DESCRIPTION or state.all_opened or robots > self._policy.reopen_all_up_to:
             state.open(source, poses[min(source, robots - 1)])
         else:
             state.open_all(poses)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from swarm_loc_estimator.common.errors import UserError
 from swarm_loc_estimator.common.number_spec import number, number_specs
+from swarm_loc_estimator.timeline.scheduling import Policy
 
 if TYPE_CHECKING:
     from swarm_loc_estimator.swarm.swarm import Swarm
-
-_USUAL_PERIODS_S = ((600, 0.5), (250, 0.4), (0, 0.2))
-"""The usual fusion period where odometry of so many robots and more is calibrated."""
 
 
 class SettingsError(UserError):
@@ -21,7 +19,9 @@ class SettingsError(UserError):
 
 @dataclass(frozen=True)
 class Settings:
-    """How measurements are buffered, judged and given up on; each number with its range beside it.
+    """How measurements are buffered, gated and fused; each number with its range beside it.
+
+    `policy` holds the sizes from which on swarms are fused differently; it is no ROS parameter.
 
     Raises:
         SettingsError: A value is out of range.
@@ -98,7 +98,9 @@ class Settings:
     aerial_position_sigma: float = number(
         0.02, "m", 1e-4, 10.0, "noise of aerial detections that tell no covariance, along x and y"
     )
-    aerial_heading_sigma: float = number(0.1, "rad", 1e-4, 10.0, "likewise of their headings")
+    aerial_heading_sigma: float = number(0.1, "rad", 1e-4, 10.0, "noise of the headings of such detections")
+
+    policy: Policy = field(default_factory=Policy, metadata={"is_internal": True})
 
     def __post_init__(self) -> None:
         for name, spec in number_specs(type(self)).items():
@@ -106,10 +108,9 @@ class Settings:
             if not spec.allows(value):
                 raise SettingsError(f"parameter {name} = {value} must lie in {spec.range_text}.")
 
-    def chosen_for(self, swarm: Swarm) -> Settings:
-        """The same with the fusion period that is usual for a swarm, where none is given."""
+    def resolved_for(self, swarm: Swarm) -> Settings:
+        """The settings with the default fusion period for a swarm where none is given."""
         if self.fusion_period_s >= 0.0:
             return self
         calibrated = sum(robot.odometry.is_calibrated for robot in swarm.robots)
-        period_s = next(period_s for count, period_s in _USUAL_PERIODS_S if calibrated >= count)
-        return replace(self, fusion_period_s=period_s)
+        return replace(self, fusion_period_s=self.policy.fusion_period_s(calibrated))

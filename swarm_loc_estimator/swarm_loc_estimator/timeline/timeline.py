@@ -19,7 +19,7 @@ from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.timeline.buffer import MeasurementBuffer
 from swarm_loc_estimator.timeline.fusion import Verdict
-from swarm_loc_estimator.timeline.fusion_period import end_of_period, middle_of_period
+from swarm_loc_estimator.timeline.scheduling import end_of_period, middle_of_period
 from swarm_loc_estimator.timeline.settings import Settings
 
 Step = Callable[[SwarmState, MeasurementArray, NDArray[np.uint8], FloatArray], None]
@@ -28,8 +28,6 @@ GoOn = Callable[[], bool]
 
 _CHECKPOINTS = 40
 _FORGOTTEN_AT_ONCE = 4
-_LARGE = 64
-"""Robots of a swarm whose periods are worth waiting for: fusing a smaller one anew takes little."""
 _BEFORE_ALL, _AFTER_ALL = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 
@@ -61,7 +59,7 @@ class Timeline:
         self._horizon_ns = round(settings.horizon_s * 1e9)
         self._state_period_ns = round(settings.state_period_s * 1e9)
         self._fusion_period_ns = round(settings.fusion_period_s * 1e9)
-        waits = self._fusion_period_ns and state.tracked.size >= _LARGE
+        waits = self._fusion_period_ns and state.tracked.size >= settings.policy.delay_from
         self._fusion_delay_ns = round(settings.fusion_delay_s * 1e9) if waits else None
         self._kept_ns = self._horizon_ns + reach_ns
         self._spacing_ns = self._kept_ns // _CHECKPOINTS

@@ -14,8 +14,9 @@ from numba.core.runtime.nrt import rtsys
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import inlined_njit, norefcount_njit
 from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
-from swarm_loc_estimator.timeline import fusion
 from swarm_loc_estimator.timeline.estimator import Estimator
+from swarm_loc_estimator.timeline.scheduling import Policy
+from swarm_loc_estimator.timeline.settings import Settings
 
 
 @pytest.fixture
@@ -35,13 +36,12 @@ def held() -> int:
 
 @pytest.mark.usefixtures("counted")
 @pytest.mark.parametrize("many", [3, 1000])
-def test_a_run_leaves_no_array_behind(many: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_leaves_no_array_behind(many: int) -> None:
     """Of measurements used together, and one by one."""
-    monkeypatch.setattr(fusion, "_MANY", many)
     world = simulate(Plan(3, 4.0), 1)
     counts = []
     for _ in range(3):
-        estimator = Estimator(world.swarm)
+        estimator = Estimator(world.swarm, Settings(policy=Policy(batch_from=many)))
         play(estimator, on_time(world), ticks(T0, int(world.stamp_ns[-1])))
         assert settled(estimator)["USED"] > 20
         del estimator

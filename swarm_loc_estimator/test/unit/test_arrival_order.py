@@ -14,8 +14,8 @@ from core_world import MOUNT, ODOMETRY, Plan, World, simulate
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.timeline import fusion, timeline
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
+from swarm_loc_estimator.timeline.scheduling import Policy
 from swarm_loc_estimator.timeline.settings import Settings
 
 Arrival = tuple[int, Event]
@@ -120,6 +120,8 @@ def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
         sparse_from=2 if sparse else 250,
         state_period_s=state_period_s,
         lost_after=lost_after,
+        # so that a small swarm's measurements are fused together, too, and wait
+        policy=Policy(batch_from=5) if delay_s is None else Policy(batch_from=5, delay_from=1),
     )
     events = [event for event in world.events if rng.uniform() < 0.9]
     silent = rng.integers(robots)  # for longer than its motion counts as known
@@ -132,14 +134,10 @@ def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
     arrivals += [arrivals[k] for k in rng.integers(0, len(arrivals), 5)]
     resting = {int(t) for t in rng.integers(T0, end_ns, 40)}
     wild = sorted({*ticks(T0, end_ns, 0.09), *resting})
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fusion, "_MANY", 5)  # so that a small swarm's measurements are fused together, too
-        if delay_s is not None:
-            patch.setattr(timeline, "_LARGE", 1)  # and wait
-        assert_same(
-            outcome(world, orderly, ticks(T0, end_ns, 0.25), chosen),
-            outcome(world, arrivals, wild, chosen, resting),
-        )
+    assert_same(
+        outcome(world, orderly, ticks(T0, end_ns, 0.25), chosen),
+        outcome(world, arrivals, wild, chosen, resting),
+    )
 
 
 @settings(max_examples=15)
@@ -158,19 +156,21 @@ def test_fusing_a_few_steps_at_each_tick_gives_the_same(
     world = simulate(Plan(4, 3.5, 0.2, start_known=start_known, outliers=0.1, flips=0.1), seed)
     # so long a horizon that nothing is too old, however long it waits
     chosen = Settings(
-        fusion_period_s=fusion_period_s, sparse_from=2 if sparse else 250, horizon_s=20.0, lost_after=2
+        fusion_period_s=fusion_period_s,
+        sparse_from=2 if sparse else 250,
+        horizon_s=20.0,
+        lost_after=2,
+        policy=Policy(batch_from=5),
     )
     arrivals = [(event.stamp_ns + int(rng.uniform(0, late_s) * SECOND), event) for event in world.events]
     at_ns = ticks(T0, T0 + 6 * SECOND, 0.09)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fusion, "_MANY", 5)
-        in_parts = Estimator(world.swarm, chosen)
-        estimates = play(in_parts, arrivals, at_ns, go_on=lambda: bool(rng.uniform() < part))
-        assert all(np.isfinite(one.poses[one.status != Status.WAITING]).all() for one in estimates)
-        for _ in range(2):  # what was begun, then what has come since
-            last = in_parts.tick(at_ns[-1])
-        assert not in_parts.is_fusing
-        assert_same(outcome(world, arrivals, at_ns, chosen), Outcome(in_parts, last))
+    in_parts = Estimator(world.swarm, chosen)
+    estimates = play(in_parts, arrivals, at_ns, go_on=lambda: bool(rng.uniform() < part))
+    assert all(np.isfinite(one.poses[one.status != Status.WAITING]).all() for one in estimates)
+    for _ in range(2):  # what was begun, then what has come since
+        last = in_parts.tick(at_ns[-1])
+    assert not in_parts.is_fusing
+    assert_same(outcome(world, arrivals, at_ns, chosen), Outcome(in_parts, last))
 
 
 def test_poses_are_given_while_fusing_takes_several_ticks() -> None:

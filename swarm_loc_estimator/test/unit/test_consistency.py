@@ -14,8 +14,8 @@ from scipy.stats import chi2
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.timeline import fusion
 from swarm_loc_estimator.timeline.estimator import Estimator
+from swarm_loc_estimator.timeline.scheduling import Policy
 from swarm_loc_estimator.timeline.settings import Settings
 
 SEEDS = range(6)
@@ -30,6 +30,11 @@ def errors(world: World, settings: Settings, period_s: float) -> tuple[FloatArra
     estimates = play(Estimator(world.swarm, settings), on_time(world), ticks(T0, end_ns, period_s))
     error = np.array([estimate.poses - world.at(estimate.stamp_ns) for estimate in estimates])
     return wrapped(error), np.array([estimate.covariances for estimate in estimates])
+
+
+def batched(batch_from: int) -> Settings:
+    """Settings that fuse so many measurements of a period and more together."""
+    return Settings(policy=Policy(batch_from=batch_from))
 
 
 def assert_chi_square(squared: Sequence[FloatArray]) -> None:
@@ -53,14 +58,14 @@ def test_the_normalised_error_is_chi_square_distributed(content: int, flips: flo
     assert_chi_square(squared)
 
 
-def assert_estimated(worlds: Sequence[World], trusting: Callable[[World], Swarm]) -> None:
+def assert_estimated(worlds: Sequence[World], trusting: Callable[[World], Swarm], settings: Settings) -> None:
     """What is wrong with worlds is estimated: errors are as the filter says, and less than of who trusts."""
     squared, own, others = [], [], []
     for world in worlds:
-        error, covariance = errors(world, Settings(), 1.0)
+        error, covariance = errors(world, settings, 1.0)
         squared.append(nees(error, covariance)[5:].mean(axis=0))
         own.append(np.square(error[5:, :, :2]).mean())
-        error, _ = errors(replace(world, swarm=trusting(world)), Settings(), 1.0)
+        error, _ = errors(replace(world, swarm=trusting(world)), settings, 1.0)
         others.append(np.square(error[5:, :, :2]).mean())
     assert_chi_square(squared)
     assert np.mean(own) < 0.7 * np.nanmean(others)  # not a number where it got lost
@@ -69,31 +74,29 @@ def assert_estimated(worlds: Sequence[World], trusting: Callable[[World], Swarm]
 @pytest.mark.parametrize("many", [5, 1000])
 @pytest.mark.parametrize(("content", "robots"), [(POSE, 1), (POSITION, 3)])
 def test_errors_that_last_are_estimated_and_the_error_stays_chi_square_distributed(
-    content: int, robots: int, many: int, monkeypatch: pytest.MonkeyPatch
+    content: int, robots: int, many: int
 ) -> None:
-    monkeypatch.setattr(fusion, "_MANY", many)
     plan = Plan(robots, 20.0, content=content, lasting=1.0, speed=0.15)
 
     def trusting(world: World) -> Swarm:
         trusted = (replace(robot, odometry=ODOMETRY, camera=MOUNT) for robot in world.swarm.robots)
         return replace(world.swarm, robots=tuple(trusted))
 
-    assert_estimated([world_of(plan, 200 + seed) for seed in SEEDS], trusting)
+    assert_estimated([world_of(plan, 200 + seed) for seed in SEEDS], trusting, batched(many))
 
 
 @pytest.mark.parametrize("many", [5, 1000])
 @pytest.mark.parametrize("content", [POSE, POSITION])
 def test_landmarks_badly_surveyed_are_estimated_and_the_error_stays_chi_square_distributed(
-    content: int, many: int, monkeypatch: pytest.MonkeyPatch
+    content: int, many: int
 ) -> None:
-    monkeypatch.setattr(fusion, "_MANY", many)
     plan = Plan(1, 30.0, content=content, survey=1.0, speed=0.15)
 
     def trusting(world: World) -> Swarm:
         trusted = (replace(mark, position_sigma=0.0, yaw_sigma=0.0) for mark in world.swarm.landmarks)
         return replace(world.swarm, landmarks=tuple(trusted))
 
-    assert_estimated([world_of(plan, 300 + seed) for seed in SEEDS], trusting)
+    assert_estimated([world_of(plan, 300 + seed) for seed in SEEDS], trusting, batched(many))
 
 
 @pytest.mark.parametrize("fusion_period_s", [0.0, 0.2])
@@ -106,10 +109,7 @@ def test_without_noise_the_error_vanishes(content: int, fusion_period_s: float) 
         if robot.start
     ]
     world = replace(world, swarm=replace(world.swarm, robots=tuple(wrong)))
-    settings = Settings(fusion_period_s=fusion_period_s)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fusion, "_MANY", 3)
-        error, _ = errors(world, settings, 0.5)
+    error, _ = errors(world, replace(batched(3), fusion_period_s=fusion_period_s), 0.5)
     assert np.abs(error[0]).max() > 0.02
     assert np.abs(error[-1]).max() < 0.006
 
@@ -140,10 +140,8 @@ def test_the_closest_stored_state_is_as_good_for_robots_that_stand_and_worse_for
 
 
 def test_fusing_together_costs_little_accuracy() -> None:
-    together, exact = Settings(fusion_period_s=0.2), Settings(fusion_period_s=0.0)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fusion, "_MANY", 3)
-        assert rmse(0.1, together) < 1.1 * rmse(0.1, exact)
+    together, exact = replace(batched(3), fusion_period_s=0.2), Settings(fusion_period_s=0.0)
+    assert rmse(0.1, together) < 1.1 * rmse(0.1, exact)
 
 
 def test_neighbours_help_where_landmarks_are_few() -> None:

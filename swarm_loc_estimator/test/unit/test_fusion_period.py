@@ -18,14 +18,13 @@ from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.sensors.validation import about_robots
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
-from swarm_loc_estimator.timeline import timeline
 from swarm_loc_estimator.timeline.estimator import Estimator
-from swarm_loc_estimator.timeline.fusion_period import end_of_period, middle_of_period
+from swarm_loc_estimator.timeline.scheduling import Policy, end_of_period, middle_of_period
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.timeline import Timeline
 
 PERIOD_NS = SECOND // 5
-SMALLEST_LARGE = timeline._LARGE
+SMALLEST_LARGE = Policy().delay_from
 
 
 @given(st.integers(0, 2**62), st.integers(1, 10**10))
@@ -116,10 +115,8 @@ def test_odometry_is_kept_for_what_waits_beyond_the_horizon() -> None:
     at_ns = ticks(T0, T0 + 20 * SECOND)
     at_once = Estimator(world.swarm, chosen)
     expected = play(at_once, on_time(world), at_ns)[-1]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(timeline, "_LARGE", 4)
-        waiting = Estimator(world.swarm, chosen)
-        found = play(waiting, on_time(world), at_ns)[-1]
+    waiting = Estimator(world.swarm, replace(chosen, policy=Policy(delay_from=4)))
+    found = play(waiting, on_time(world), at_ns)[-1]
     assert waiting.used == at_once.used > 100
     np.testing.assert_allclose(found.poses, expected.poses, atol=1e-9)
     np.testing.assert_allclose(found.covariances, expected.covariances, atol=1e-9)

@@ -18,8 +18,9 @@ from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.validation import about_robots
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.timeline import fusion
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
+from swarm_loc_estimator.timeline.fusion import Fusion
+from swarm_loc_estimator.timeline.scheduling import Policy
 from swarm_loc_estimator.timeline.settings import Settings
 
 
@@ -136,11 +137,12 @@ def test_a_start_that_sightings_contradict_gives_way_to_them() -> None:
     [(1e3, 10.0, False), (0.05, 10.0, True), (1e3, 0.2, True)],
 )
 def test_a_robot_too_unsure_after_a_silence_waits_and_is_found_again(
-    lost_sigma: float, lost_heading_sigma: float, is_lost: bool, many: int, monkeypatch: pytest.MonkeyPatch
+    lost_sigma: float, lost_heading_sigma: float, is_lost: bool, many: int
 ) -> None:
-    monkeypatch.setattr(fusion, "_MANY", many)
     world, silent_ns, heard_ns = simulate(Plan(1, 8.0), 1), T0 + 2 * SECOND, T0 + 7 * SECOND // 2
-    limits = Settings(lost_sigma=lost_sigma, lost_heading_sigma=lost_heading_sigma)
+    limits = Settings(
+        lost_sigma=lost_sigma, lost_heading_sigma=lost_heading_sigma, policy=Policy(batch_from=many)
+    )
     arrivals = [(t, e) for t, e in on_time(world) if not silent_ns < t < heard_ns]
     estimates = play(Estimator(world.swarm, limits), arrivals, ticks(T0, T0 + 8 * SECOND))
     before = [e.status[0] for e in estimates if e.stamp_ns < heard_ns]
@@ -161,7 +163,7 @@ def test_a_robot_unsure_at_one_of_many_measurements_is_lost_in_whatever_order_th
     stamps_ns = T0 + np.array([0, SECOND // 10])
     tracks.extend(np.zeros(2, dtype=np.int64), stamps_ns, np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]))
     limits = Settings(lost_sigma=0.05, lost_heading_sigma=10.0)
-    steps = fusion.Fusion(swarm, limits, tracks)
+    steps = Fusion(swarm, limits, tracks)
     state = steps.new_state()
     state.initialize(0, InitialPose(np.zeros(3), np.diag([1e-6, 1e-6, 1.0])), Preintegrated.begin(T0))
     fixes = about_robots(0, stamps_ns, np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), Kind.CARTESIAN)

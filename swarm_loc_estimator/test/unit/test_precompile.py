@@ -23,11 +23,11 @@ from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.precompile import precompile
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.messages import RawInputs
-from swarm_loc_estimator.sensors.thinning import Thinning
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.thinning import Thinning
 
 BAGS = Path(__file__).parents[3] / "bags"
 SECOND = 1_000_000_000

@@ -15,8 +15,8 @@ from scipy.stats import chi2
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
-from swarm_loc_estimator.timeline import fusion
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
+from swarm_loc_estimator.timeline.scheduling import Policy
 from swarm_loc_estimator.timeline.settings import Settings
 
 SPARSE = Settings(sparse_from=2, fusion_period_s=0.2)
@@ -138,13 +138,11 @@ def misled(world: World, liar: int, from_ns: int, by: tuple[float, float]) -> Wo
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_false_sightings_of_one_robot_are_gated_and_the_robot_is_named(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(fusion, "_MAX_ROBOTS_OPENED", 2)  # as in a large swarm, not all is estimated anew
+def test_false_sightings_of_one_robot_are_gated_and_the_robot_is_named(seed: int) -> None:
+    as_in_a_large_swarm = replace(SPARSE, policy=Policy(reopen_all_up_to=2))
     plan = Plan(5, 14.0, landmarks=6)
     world = misled(simulate(plan, 700 + seed), 2, T0 + 6 * SECOND, (0.5, 0.3))
-    estimator, estimates = run(world)
+    estimator, estimates = run(world, as_in_a_large_swarm)
     named = set()
     for estimate in estimates[-5:]:
         named |= {one.about for one in estimator.contradictions(estimate.stamp_ns)}

@@ -27,8 +27,9 @@ from swarm_loc_estimator.swarm.swarm import (
     Robot,
     Swarm,
 )
-from swarm_loc_estimator.timeline import fusion
 from swarm_loc_estimator.timeline.estimator import Estimator
+from swarm_loc_estimator.timeline.scheduling import Policy
+from swarm_loc_estimator.timeline.settings import Settings
 
 TIME_SIGMA_S = 0.04
 SEER = Robot("seer", camera=CameraMount(x=0.04))
@@ -128,20 +129,18 @@ def test_a_robot_whose_motion_is_unknown_gives_no_rate() -> None:
         np.testing.assert_allclose(motion, [expected, 0.0, 0.0], atol=1e-9)
 
 
-def mean_nees(world: World, swarm: Swarm) -> FloatArray:
+def mean_nees(world: World, swarm: Swarm, settings: Settings) -> FloatArray:
     """(N,) of each robot over time."""
     end_ns = int(world.stamp_ns[-1])
-    estimates = play(Estimator(swarm), on_time(world), ticks(T0, end_ns, 1.0))
+    estimates = play(Estimator(swarm, settings), on_time(world), ticks(T0, end_ns, 1.0))
     error = wrapped(np.array([one.poses - world.at(one.stamp_ns) for one in estimates]))
     mean: FloatArray = nees(error, np.array([one.covariances for one in estimates]))[2:].mean(axis=0)
     return mean
 
 
 @pytest.mark.parametrize("many", [5, 1000])
-def test_errors_are_admitted_where_stamps_err_and_are_not_by_who_trusts_them(
-    many: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(fusion, "_MANY", many)
+def test_errors_are_admitted_where_stamps_err_and_are_not_by_who_trusts_them(many: int) -> None:
+    settings = Settings(policy=Policy(batch_from=many))
     knowing, trusting = [], []
     for seed in range(12):
         rng = np.random.default_rng([seed, 7])
@@ -153,8 +152,8 @@ def test_errors_are_admitted_where_stamps_err_and_are_not_by_who_trusts_them(
             for one in world.events
         ]
         world = replace(world, events=tuple(events))
-        knowing.append(mean_nees(world, with_time_sigma(world.swarm, TIME_SIGMA_S)))
-        trusting.append(mean_nees(world, world.swarm))
+        knowing.append(mean_nees(world, with_time_sigma(world.swarm, TIME_SIGMA_S), settings))
+        trusting.append(mean_nees(world, world.swarm, settings))
     samples = np.size(knowing)
     most = chi2.ppf(1.0 - 1e-4, 3 * samples) / samples
     assert np.mean(knowing) < most < np.nanmean(trusting)  # not a number where it got lost

@@ -19,8 +19,8 @@ from swarm_loc_estimator.sensors.messages import (
     RawInputs,
     joined,
 )
-from swarm_loc_estimator.sensors.thinning import Thinning, water_level
-from swarm_loc_estimator.timeline.fusion_period import end_of_period
+from swarm_loc_estimator.timeline.scheduling import end_of_period
+from swarm_loc_estimator.timeline.thinning import Thinning, water_level
 
 ROBOTS = 20
 SEEN = 4

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.sensors.messages import AerialRows, BrightnessRows, RawInputs, chosen
-from swarm_loc_estimator.timeline.fusion_period import end_of_period
+from swarm_loc_estimator.timeline.scheduling import end_of_period
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 """The golden ratio's fractional part in units of 2^-64."""
