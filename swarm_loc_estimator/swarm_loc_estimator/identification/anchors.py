@@ -1,9 +1,8 @@
-"""Detections that may be a robot whose heading is not known yet: where chains begin.
+"""Anchors: detections at which chains without a known heading start.
 
-A robot that was at z and has moved by |W| since lies on a circle around z, in every direction alike. The
-density of a detection at the distance |D| is that of Rice's distribution over the circle, known in closed
-form also where the robot has hardly moved. Where it has, the direction gives the heading, and the chain
-becomes a track.
+A robot that was at z and has moved by |W| since lies on a circle around z, with equal density in every
+direction. The density of a detection at distance |D| follows Rice's distribution, in closed form also for
+small motions. For larger motions the direction gives the heading, and the chain becomes a track.
 """
 
 from __future__ import annotations
@@ -19,17 +18,17 @@ from swarm_loc_estimator.identification.picture import Picture, TrackPoint, gath
 from swarm_loc_estimator.identification.tracks import NO_TRACKS, Tracks, predicted, updated
 
 _CONCENTRATED = 8.0
-"""From this concentration on a heading (von Mises) is as good as Gaussian: 0.36 rad."""
+"""Concentration from which a von Mises heading is treated as Gaussian: 0.36 rad."""
 _ANY_DIRECTION = 3.0
-"""Standard deviation of c along the circle before its direction is known; wide, as it is only linear."""
+"""Standard deviation of c along the circle before its direction is known; wide for a linear model."""
 
 
 class Scale(NamedTuple):
-    """What is known of an image's scale.
+    """Scale of an image.
 
     Attributes:
-        mean: Units of the image per metre of the robot's own way.
-        sigma: How unsure that is, in the same unit.
+        mean: Units of the image per metre of the robot's own motion.
+        sigma: Standard deviation of the mean, in the same unit.
     """
 
     mean: float
@@ -37,7 +36,7 @@ class Scale(NamedTuple):
 
 
 class Anchors(NamedTuple):
-    """Detections (a,) of one image that may be the robot.
+    """Detections (a,) of one image that are candidates for the robot.
 
     Attributes:
         point: The robot's own track at that image.
@@ -55,8 +54,8 @@ class Anchors(NamedTuple):
     log_weight: FloatArray
     place: IntArray
 
-    def chosen(self, rows: IntArray) -> Anchors:
-        """Some of them."""
+    def select(self, rows: IntArray) -> Anchors:
+        """The anchors of the given rows."""
         return self._replace(
             position=self.position[rows],
             covariance=self.covariance[rows],
@@ -70,7 +69,7 @@ class Circles(NamedTuple):
 
     Attributes:
         log_density: (a, n) of the detection, if it is the robot that the anchor is [1/m^2].
-        log_alike: (a, n) likewise if both are another robot, which moves about as far.
+        log_alike: (a, n) the same if both are another robot, which moves about as far.
         concentration: (a, n) of the heading that the pair shows.
     """
 
@@ -80,20 +79,20 @@ class Circles(NamedTuple):
 
 
 def own_way(anchors: Anchors, point: TrackPoint) -> complex:
-    """The robot's way along its track since the anchors' image, in the track's frame [m]."""
+    """Displacement of the robot along its track since the image of the anchors, in the track's frame [m]."""
     x, y = point.pose[:2] - anchors.point.pose[:2]
     return complex(x, y)
 
 
 def circles(anchors: Anchors, picture: Picture, point: TrackPoint, scale: Scale, likeness: float) -> Circles:
-    """How well detections lie on the circles around anchors.
+    """Densities of detections on the circles around anchors.
 
     Args:
         anchors: (a,).
         picture: (n,).
         point: The robot's own track at the picture.
         scale: Of the picture.
-        likeness: By what share of its way another robot's is longer or shorter.
+        likeness: Relative standard deviation of the distance that another robot moves.
     """
     way = abs(own_way(anchors, point))
     gathered = scale.mean**2 * 0.5 * float(np.trace(gathered_between(anchors.point, point)[:2, :2]))
@@ -134,7 +133,7 @@ def tracks_of(
     start = anchors.position[rows]
     away = (picture.pose[places, :2] - start) @ [1.0, 1.0j]
     direction = np.exp(1j * (np.angle(away) - np.angle(way)))
-    tracks = _begun(start, anchors.covariance[rows], direction, scale, _ANY_DIRECTION)
+    tracks = _tracks_from(start, anchors.covariance[rows], direction, scale, _ANY_DIRECTION)
     tracks = tracks._replace(log_weight=anchors.log_weight[rows])
     moved = predicted(tracks, way, gathered_between(anchors.point, point), 0.0)
     return updated(moved, picture, places, float(point.pose[2]))
@@ -145,7 +144,7 @@ def shown_by_heading(picture: Picture, places: IntArray, point: TrackPoint, scal
     direction = np.exp(1j * (picture.pose[places, 2] - point.pose[2]))
     covariance = picture.covariance[places]
     sigma = np.sqrt(covariance[:, 2, 2])
-    tracks = _begun(picture.pose[places, :2], covariance[:, :2, :2], direction, scale, sigma)
+    tracks = _tracks_from(picture.pose[places, :2], covariance[:, :2, :2], direction, scale, sigma)
     return tracks._replace(place=places)
 
 
@@ -164,7 +163,7 @@ def merged(
     return Anchors(point, stamp_ns, picture.pose[places, :2], covariance, weight, places)
 
 
-def _begun(
+def _tracks_from(
     position: FloatArray,
     covariance: FloatArray,
     direction: np.typing.NDArray[np.complex128],

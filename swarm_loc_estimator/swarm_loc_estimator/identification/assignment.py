@@ -1,8 +1,7 @@
-"""Global assignment of anonymous detections to robots that know where they are.
+"""Global assignment of anonymous detections to localized robots.
 
-All robots together are assigned so that the whole is most likely: a detection where one is expected, or
-none. A robot whose detection might as well be another one's, or which might as well have another one, gets
-none.
+All robots are assigned jointly, each to one detection or to none, so that the total likelihood is largest. A
+robot gets none where two assignments are about equally likely.
 """
 
 from __future__ import annotations
@@ -16,14 +15,14 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.identification.picture import Picture
 
 UNSEEN = -1
-"""Of a robot: no detection is near enough; of a detection: no robot is."""
+"""No detection passes the gate of a robot, or no robot that of a detection."""
 AMBIGUOUS = -2
-"""Of a robot or a detection: there is one, or are several, but it is not clear which."""
+"""Candidates pass the gate, but none is clearly the right one."""
 _FORBIDDEN = 1e9
 
 
 class Assignment(NamedTuple):
-    """Who is what.
+    """Assignment of robots and detections.
 
     Attributes:
         place: (r,) the detection of each robot, or UNSEEN or AMBIGUOUS.
@@ -39,13 +38,13 @@ class Assignment(NamedTuple):
 def log_ratios(
     poses: FloatArray, covariances: FloatArray, picture: Picture, log_density: float, gate: float
 ) -> FloatArray:
-    """Log likelihoods (r, n) of detections as robots', over those as any others'; -inf beyond the gate.
+    """Log likelihood ratios (r, n), of this robot over another one; -inf beyond the gate.
 
     Args:
-        poses: (r, 3) where robots are believed to be at the stamp of the picture.
+        poses: (r, 3) estimated poses at the stamp of the picture.
         covariances: (r, 3, 3).
         picture: (n,) detections.
-        log_density: Of detections that are others' [1/m^2].
+        log_density: Log density of detections of other robots [1/m^2].
         gate: Largest squared Mahalanobis distance of a position.
     """
     away = picture.pose[None, :, :2] - poses[:, None, :2]
@@ -64,7 +63,7 @@ def assign(ratios: FloatArray, detection_probability: float, least_probability: 
     Args:
         ratios: (r, n) as of `log_ratios`.
         detection_probability: Of a robot in the picture.
-        least_probability: Of an assignment that others contest; less is ambiguous.
+        least_probability: Lowest probability of a contested assignment; below it the robot is AMBIGUOUS.
     """
     costs = -(ratios + np.log(detection_probability) - np.log1p(-detection_probability))
     near = np.isfinite(ratios)
@@ -90,7 +89,7 @@ def assign(ratios: FloatArray, detection_probability: float, least_probability: 
 
 
 def _solved(costs: FloatArray) -> tuple[IntArray, float]:
-    """The detection (r,) of each robot, UNSEEN for none, at the least cost together; none costs nothing."""
+    """The detection (r,) of each robot, or UNSEEN at zero cost, with the least total cost."""
     r, n = costs.shape
     whole = np.full((r, n + r), _FORBIDDEN)
     whole[:, :n] = np.where(np.isfinite(costs), costs, _FORBIDDEN)

@@ -1,11 +1,10 @@
-"""Which detection is me: the posterior over chains of anonymous detections, image after image.
+"""Identification of one robot: the posterior over chains of anonymous detections, image after image.
 
-A robot is in the picture or not; in it, it is detected with a probability, or missed; each other detection
-is another robot or a false one. So the likelihood of a chain is a product over images of P_D N(z; expected)
-/ beta for the detection that it has, and of 1 - P_D where it has none (the likelihood of one target in
-clutter). The density beta is that of others, anywhere, and of one that was where the chain was before and
-moves alike: robots of one kind do, so that a detection about as far away as the own way is long tells
-little. Robots that enter begin a chain later.
+A robot inside the picture is detected with probability P_D or missed; every other detection is another robot
+or clutter. So the likelihood of a chain is the product over images of P_D N(z; prediction) / beta where the
+chain has a detection and of 1 - P_D where it has none (one target in clutter). The density beta covers other
+robots anywhere in the picture, and a robot of the same kind that was at the chain's last detection and moved
+about as far. A robot that enters the picture later starts a chain there.
 """
 
 from __future__ import annotations
@@ -40,32 +39,32 @@ from swarm_loc_estimator.identification.tracks import (
 )
 
 _NEGLIGIBLE = 12.0
-"""By so much in its logarithm a chain's weight may lie below the largest one's."""
+"""Chains whose log weight lies this far below the largest one are dropped."""
 _MAX_TRACKS = 3000
 _MAX_ANCHORED_IMAGES = 6
-"""A chain whose last detection lies further back ends unless its heading is known."""
+"""Chains without heading end when their last detection is older than this number of images."""
 _LIKENESS = 0.5
-"""By what share of its own way, and turn, a robot expects that of another one to differ from it."""
+"""Relative standard deviation of distance and turn of another robot of the same kind."""
 _LEAST_TURN_SPREAD = 0.1
 _OUTSIDE = 0.5
-"""Share of the detection probability for robots that are outside of all that was seen."""
+"""Factor on the detection probability outside the area of all detections so far."""
 
 
 METRIC = Scale(1.0, 0.02)
-"""Of a calibrated camera: detections are in metres, and 2 % off at most about."""
+"""Scale of a calibrated camera: metres, with a standard deviation of 2 %."""
 
 
 @dataclass(frozen=True)
 class ChainModel:
-    """What is assumed of images and robots.
+    """Assumptions about images and robots.
 
     Attributes:
-        detection_probability: Of a robot in the picture.
+        detection_probability: Probability that a robot in the picture is detected.
         absent: Probability that a robot is not in the first image.
         entering: Probability that a robot not in the picture is in the next one.
-        false_detections: How many detections of an image are no robots, on average.
-        scale: The image's units per metre, and how unsure that is.
-        scale_drift: By what share it drifts, the standard deviation after a second [1/s^0.5].
+        false_detections: Mean number of false detections per image.
+        scale: Scale of the image and its standard deviation.
+        scale_drift: Relative random walk of the scale [1/s^0.5].
     """
 
     detection_probability: float = 0.95
@@ -77,11 +76,11 @@ class ChainModel:
 
 
 class Identity(NamedTuple):
-    """An answer.
+    """The most probable detection of a robot.
 
     Attributes:
-        place: Which detection of the newest image the robot is.
-        probability: That this is right.
+        place: Index of the detection in the newest image.
+        probability: Probability that it is the robot.
         pose: (3,) x [m], y [m], heading [rad] there.
         covariance: (3, 3) of it.
         scale: Of the image.
@@ -94,21 +93,29 @@ class Identity(NamedTuple):
     scale: float
 
 
+class _Starts(NamedTuple):
+    """Parts of the anchors of the newest image."""
+
+    place: list[IntArray]
+    log_weight: list[FloatArray]
+
+
 @dataclass(frozen=True)
 class Chains:
-    """All chains that may be one robot, after some images.
+    """All chains of one robot after some images.
 
     Attributes:
-        model: What is assumed.
+        model: Assumptions.
         point: The robot's own track at the newest image; None before the first.
         stamp_ns: Of that image.
-        images: How many there were.
-        detections: How many the newest one has.
+        images: Number of images so far.
+        detections: Number of detections in the newest image.
         tracks: Chains with a heading.
         anchors: Chains without, newest image last.
         log_absent: Log probability that the robot is not in the picture.
-        low: Least x and y of all detections so far [m]; likewise high, the greatest.
-        reach: The longest of the robot's own ways between images [m].
+        low: Smallest x and y of all detections so far [m].
+        high: Largest x and y [m].
+        reach: Longest displacement of the robot between images [m].
     """
 
     model: ChainModel = ChainModel()
@@ -149,7 +156,7 @@ class Chains:
 
     @property
     def probabilities(self) -> FloatArray:
-        """(n,) that each detection of the newest image is the robot; the rest is that none is."""
+        """(n,) probability of each detection of the newest image; the remainder is that of none."""
         out = np.zeros(self.detections)
         parts = [(self.tracks.place, self.tracks.log_weight)]
         parts += [(one.place, one.log_weight) for one in self.anchors]
@@ -159,7 +166,7 @@ class Chains:
         return out
 
     def answer(self) -> Identity | None:
-        """The detection that is the robot most probably, where chains with a heading end in one."""
+        """The most probable detection; None unless a chain with a heading ends there."""
         here = np.flatnonzero(self.tracks.place >= 0)
         if not here.size:
             return None
@@ -168,13 +175,13 @@ class Chains:
         if not rows.size:
             return None
         weight = np.exp(self.tracks.log_weight[rows])
-        pose, covariance, scale = self._mixed(self.tracks.chosen(rows), weight / weight.sum())
+        pose, covariance, scale = self._mixed(self.tracks.select(rows), weight / weight.sum())
         return Identity(place, float(weight.sum()), pose, covariance, scale)
 
     def _log_density(self, picture: Picture) -> float:
-        """Of detections that are other robots or false [1/m^2].
+        """Log density of other robots and false detections [1/m^2].
 
-        The area is that of all that was seen so far, and of what the robot may have come from.
+        The area is that of all detections so far, extended by the displacement of the robot.
         """
         others = max(len(picture.pose) - 1, 0) + self.model.false_detections
         extent = np.maximum(np.subtract(self.high, self.low), 0.0) + self.reach
@@ -182,20 +189,20 @@ class Chains:
         return math.log(others / float(np.prod(np.maximum(extent, 10.0 * sigma))))
 
     def _log_other_share(self, picture: Picture) -> float:
-        """How likely any detection is another robot or false, before all else."""
+        """Log prior probability that a detection is another robot or false."""
         others = max(len(picture.pose) - 1, 0) + self.model.false_detections
         return math.log(others / max(others, len(picture.pose)))
 
     def _continued(
         self, picture: Picture, point: TrackPoint, stamp_ns: int, log_density: float
     ) -> tuple[list[Tracks], list[Anchors]]:
-        """All chains with and without a detection in the newest image."""
+        """Every chain continued with each likely detection of the newest image, and without one."""
         probability = self.model.detection_probability
         log_hit = math.log(probability)
         tracks: list[Tracks] = [NO_TRACKS]
         if self.tracks.place.size and self.point is not None:
             tracks += self._tracks_continued(picture, point, stamp_ns, log_density)
-        standing = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
+        starts = _Starts([np.zeros(0, dtype=np.int64)], [np.zeros(0)])
         anchors: list[Anchors] = []
         for old in self.anchors:
             pairs = circles(old, picture, point, self._scale_since(old.stamp_ns, stamp_ns), _LIKENESS)
@@ -206,24 +213,23 @@ class Chains:
             rows, places = np.nonzero(likely & is_concentrated(pairs.concentration))
             scale = self._scale_since(old.stamp_ns, stamp_ns)
             some = old._replace(log_weight=np.zeros_like(old.log_weight))
-            begun = tracks_of(some, rows, picture, places, point, scale)
-            tracks.append(begun._replace(log_weight=begun.log_weight + weight[rows, places]))
+            headed = tracks_of(some, rows, picture, places, point, scale)
+            tracks.append(headed._replace(log_weight=headed.log_weight + weight[rows, places]))
             rows, places = np.nonzero(likely & ~is_concentrated(pairs.concentration))
-            standing[0].append(places)
-            standing[1].append(weight[rows, places])
+            starts.place.append(places)
+            starts.log_weight.append(weight[rows, places])
             missed = np.full(old.place.size, MISSED)
             anchors.append(old._replace(log_weight=old.log_weight + math.log1p(-probability), place=missed))
-        self._begin(picture, point, tracks, standing)
-        if sum(map(len, standing[0])):
-            anchors.append(
-                merged(np.concatenate(standing[0]), np.concatenate(standing[1]), picture, point, stamp_ns)
-            )
+        self._start_chains(picture, point, tracks, starts)
+        place, log_weight = np.concatenate(starts.place), np.concatenate(starts.log_weight)
+        if place.size:
+            anchors.append(merged(place, log_weight, picture, point, stamp_ns))
         return tracks, anchors[-_MAX_ANCHORED_IMAGES:]
 
     def _tracks_continued(
         self, picture: Picture, point: TrackPoint, stamp_ns: int, log_density: float
     ) -> list[Tracks]:
-        """The tracks with a detection of the newest image each, and without."""
+        """The tracks continued with each likely detection of the newest image, and without one."""
         before = self.point or point
         x, y = point.pose[:2] - before.pose[:2]
         drift = self.model.scale_drift**2 * (stamp_ns - self.stamp_ns) * 1e-9
@@ -233,10 +239,9 @@ class Chains:
         log_ratio = log_likelihoods(moved, picture) - np.logaddexp(log_density, alike)
         weight = moved.log_weight[:, None] + log_ratio + math.log(self.model.detection_probability)
         rows, places = np.nonzero(weight > self._threshold())
-        chosen = moved.chosen(rows)
-        chosen = chosen._replace(log_weight=weight[rows, places])
+        hits = moved.select(rows)._replace(log_weight=weight[rows, places])
         turn_spread = max(_LIKENESS * abs(point.pose[2] - before.pose[2]), _LEAST_TURN_SPREAD)
-        found = updated(chosen, picture, places, point.pose[2], turn_spread)
+        found = updated(hits, picture, places, point.pose[2], turn_spread)
         inside = np.all((moved.mean[:, :2] >= self.low) & (moved.mean[:, :2] <= self.high), axis=1)
         probability = self.model.detection_probability * np.where(inside, 1.0, _OUTSIDE)
         missed = moved._replace(
@@ -244,14 +249,10 @@ class Chains:
         )
         return [found, missed]
 
-    def _begin(
-        self,
-        picture: Picture,
-        point: TrackPoint,
-        tracks: list[Tracks],
-        standing: tuple[list[IntArray], list[FloatArray]],
+    def _start_chains(
+        self, picture: Picture, point: TrackPoint, tracks: list[Tracks], starts: _Starts
     ) -> None:
-        """Add chains that begin in the newest image: anywhere, as likely as the others' density there."""
+        """Add chains that start in the newest image, with equal weights."""
         count = len(picture.pose)
         if not count:
             return
@@ -260,20 +261,20 @@ class Chains:
         weight = self.log_absent + math.log(entering * self.model.detection_probability / others)
         shown = np.flatnonzero(picture.has_heading)
         if shown.size:
-            begun = shown_by_heading(picture, shown, point, self.model.scale)
-            tracks.append(begun._replace(log_weight=np.full(shown.size, weight)))
+            headed = shown_by_heading(picture, shown, point, self.model.scale)
+            tracks.append(headed._replace(log_weight=np.full(shown.size, weight)))
         hidden = np.flatnonzero(~picture.has_heading)
-        standing[0].append(hidden)
-        standing[1].append(np.full(hidden.size, weight))
+        starts.place.append(hidden)
+        starts.log_weight.append(np.full(hidden.size, weight))
 
     def _scale_since(self, begin_ns: int, end_ns: int) -> Scale:
-        """What is known of the scale, and of by how much it has drifted since an image."""
+        """The scale with its drift between two instants."""
         mean, sigma = self.model.scale
         drift = self.model.scale_drift * mean * math.sqrt(max(0, end_ns - begin_ns) * 1e-9)
         return Scale(mean, math.hypot(sigma, drift))
 
     def _threshold(self) -> float:
-        """Weights below this are negligible beside that of a chain that goes on without a detection."""
+        """Log weight below which a continuation is negligible."""
         return math.log1p(-self.model.detection_probability) - _NEGLIGIBLE
 
     def _normalised(
@@ -284,7 +285,7 @@ class Chains:
         tracks: list[Tracks],
         anchors: list[Anchors],
     ) -> Chains:
-        """The chains that are left, their probabilities summing up to one."""
+        """The chains that are kept, normalised to a total probability of one."""
         entering = self.model.entering if self.images else 1.0 - self.model.absent
         log_absent = self.log_absent + math.log1p(-entering * self.model.detection_probability)
         whole = joined(tracks)
@@ -294,8 +295,8 @@ class Chains:
         if kept.size > _MAX_TRACKS:
             order = np.argsort(whole.log_weight[kept], kind="stable")[-_MAX_TRACKS:]
             kept = kept[np.sort(order)]
-        tracks_kept = whole.chosen(kept)
-        some = [one.chosen(np.flatnonzero(one.log_weight > least)) for one in anchors]
+        tracks_kept = whole.select(kept)
+        some = [one.select(np.flatnonzero(one.log_weight > least)) for one in anchors]
         return replace(
             self,
             point=point,
@@ -308,7 +309,7 @@ class Chains:
         )
 
     def _mixed(self, tracks: Tracks, weight: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-        """Pose (3,), its covariance (3, 3) and the scale, of tracks (k,) together by weight."""
+        """Pose (3,), covariance (3, 3) and scale of a mixture of tracks (k,)."""
         real, imag = tracks.mean[:, 2], tracks.mean[:, 3]
         squared = real**2 + imag**2
         jacobian = np.zeros((weight.size, 3, 4))

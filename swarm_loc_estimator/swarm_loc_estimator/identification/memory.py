@@ -1,4 +1,4 @@
-"""What is remembered of aerial images: chains of robots that look for themselves, and the camera's view."""
+"""State of the identification between images: chains of unidentified robots, and the view of the camera."""
 
 from __future__ import annotations
 
@@ -6,33 +6,34 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.identification.chain import Chains
 
 _GENERATION_NS = 10_000_000_000
-"""What was seen longer ago than one to two such times says nothing of where the camera looks now."""
+"""Detections older than one to two of these times do not count for the view of the camera."""
 _NOWHERE: FloatArray = np.zeros((0, 2))
 
 
 class Outcome(IntEnum):
-    """What an image told a robot that looked for itself in it."""
+    """Result of the search for one robot in one image."""
 
     ANSWERED = 0
-    UNDECIDED = 1  # not yet sure enough
-    NOT_MOVED = 2  # the robot has not moved since the image before, so all detections are alike to it
-    CONFLICT = 3  # two robots took the same detection for themselves
-    CROWDED = 4  # more detections than can be looked through
-    NO_ODOMETRY = 5  # how the robot has moved is not known
+    UNDECIDED = 1  # the probability is too low
+    NOT_MOVED = 2  # the robot has not moved since the last image, so no detection stands out
+    CONFLICT = 3  # two robots claim the same detection
+    CROWDED = 4  # too many detections
+    NO_ODOMETRY = 5  # the motion of the robot is unknown
 
 
 class Identities(NamedTuple):
-    """Who is who in an image.
+    """Identities of the robots in an image.
 
     Attributes:
         stamp_ns: Of the image.
-        place: (N,) which detection each robot is, counted as in the message; -1: not known, or not there.
-        probability: (N,) of that; where it is not known, of the best guess.
+        place: (N,) index of each robot's detection in the message; -1: unknown, or not detected.
+        probability: (N,) of the identity; where it is unknown, of the best candidate.
     """
 
     stamp_ns: int
@@ -41,12 +42,12 @@ class Identities(NamedTuple):
 
 
 class IdentityMemory:
-    """What has come of aerial images so far; part of the filter's state.
+    """Memory of the identification; part of the filter's state.
 
     Attributes:
-        chains: Robots that look for themselves, with what they know; the chains are never written to.
-        newest: Who is who in the newest image; None before the first.
-        outcomes: (len(Outcome),) how many times a robot's look at an image ended so.
+        chains: Unidentified robots and their chains; chains are immutable.
+        newest: Identities in the newest image; None before the first.
+        outcomes: (len(Outcome),) number of searches with each outcome.
     """
 
     def __init__(self) -> None:
@@ -54,7 +55,7 @@ class IdentityMemory:
         self.newest: Identities | None = None
         self.outcomes: IntArray = np.zeros(len(Outcome), dtype=np.int64)
         self._hulls = (_NOWHERE, _NOWHERE)
-        self._begun_ns = 0
+        self._generation_ns = 0
 
     def copy(self) -> IdentityMemory:
         """An independent copy."""
@@ -64,16 +65,16 @@ class IdentityMemory:
         return other
 
     def see(self, positions: FloatArray, stamp_ns: int) -> None:
-        """Note where an image shows something (n, 2)."""
+        """Extend the view of the camera by positions (n, 2) detected in an image."""
         older, newer = self._hulls
-        if stamp_ns - self._begun_ns > _GENERATION_NS:
-            older, newer, self._begun_ns = newer, _NOWHERE, stamp_ns
+        if stamp_ns - self._generation_ns > _GENERATION_NS:
+            older, newer, self._generation_ns = newer, _NOWHERE, stamp_ns
         self._hulls = (older, convex_hull(np.concatenate([newer, positions])))
 
     def is_in_view(self, positions: FloatArray, margin: FloatArray) -> BoolArray:
-        """Whether places (k, 2) lie inside of what was seen of late, by a margin (k,) [m].
+        """Whether positions (k, 2) lie inside the recent view of the camera, by a margin (k,) [m].
 
-        What a camera sees of a plane is convex; so it sees all that lies between things that it has seen.
+        The view of a plane is convex, so it contains the convex hull of all detections.
         """
         inside = np.zeros(len(positions), dtype=bool)
         for hull in self._hulls:
@@ -87,21 +88,9 @@ class IdentityMemory:
 
 
 def convex_hull(points: FloatArray) -> FloatArray:
-    """The corners (h, 2) of the convex hull of points (n, 2), counter-clockwise (Andrew's monotone chain)."""
-    ordered = np.unique(points, axis=0)
-    if len(ordered) < 3:
-        return ordered
-    return np.array(_half(ordered.tolist())[:-1] + _half(ordered[::-1].tolist())[:-1])
-
-
-def _half(points: list[list[float]]) -> list[list[float]]:
-    """Half of a hull, along which points in order turn left."""
-    out: list[list[float]] = []
-    for x, y in points:
-        while len(out) > 1:
-            (ax, ay), (bx, by) = out[-2:]
-            if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0.0:
-                break
-            out.pop()
-        out.append([x, y])
-    return out
+    """Corners (h, 2) of the convex hull of points (n, 2), counter-clockwise; the two ends of a line."""
+    try:
+        return np.asarray(points[ConvexHull(points).vertices])
+    except (QhullError, ValueError):  # fewer than three points, or all in a line
+        ordered = np.unique(points, axis=0)
+        return ordered[[0, -1]] if len(ordered) > 1 else ordered

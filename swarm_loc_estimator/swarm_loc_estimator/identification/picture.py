@@ -1,4 +1,4 @@
-"""What an aerial image shows, and what a robot knows of its own way to there."""
+"""Detections of an aerial image, and points of a robot's odometry track."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Picture(NamedTuple):
 
     @property
     def variance(self) -> FloatArray:
-        """(n,) of a position along any direction, the mean of x and y [m^2]."""
+        """(n,) mean variance of x and y [m^2]."""
         return np.asarray(0.5 * (self.covariance[:, 0, 0] + self.covariance[:, 1, 1]))
 
 
@@ -33,7 +33,7 @@ class TrackPoint(NamedTuple):
 
     Attributes:
         pose: (3,) on the track, in the track's frame; the heading is not wrapped.
-        covariance: (3, 3) of the right-invariant error that the track has gathered since its beginning.
+        covariance: (3, 3) of the right-invariant error accumulated since the start of the track.
     """
 
     pose: FloatArray
@@ -41,9 +41,9 @@ class TrackPoint(NamedTuple):
 
 
 def gathered_between(before: TrackPoint, after: TrackPoint) -> FloatArray:
-    """Covariance (3, 3) that a track has gathered between two points, at the later one.
+    """Covariance (3, 3) accumulated between two points of a track, at the later one.
 
-    Of x, y (along the axes of the track's frame) and heading there.
+    Of x and y along the axes of the track's frame, and of the heading.
     """
     x, y = after.pose[0], after.pose[1]
     shear = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])

@@ -1,4 +1,4 @@
-"""Chains of detections that may be one robot, each with the Gaussian belief that it gives.
+"""Tracks: chains of detections that may be one robot, each with a Gaussian estimate.
 
 A chain's state is (p, c): the position p in `map`, and c = lambda exp(i theta), which turns the robot's own
 track into the map, with the image's scale lambda. In these four real numbers motion and measurement are
@@ -18,9 +18,9 @@ from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.identification.picture import Picture
 
 MISSED = -1
-"""The place of a chain of which the newest image shows nothing."""
+"""Place of a chain without a detection in the newest image."""
 _FALSE_HEADING = 0.02
-"""Share of headings that a pattern shows wrongly; they are anywhere."""
+"""Share of detected headings that are wrong and uniformly distributed."""
 _LOG_TURN = float(np.log(2.0 * np.pi))
 
 
@@ -30,9 +30,9 @@ class Tracks(NamedTuple):
     Attributes:
         mean: (h, 4) p [m], c [1], real and imaginary parts.
         covariance: (h, 4, 4).
-        log_weight: (h,) of their probabilities, up to a constant that all have in common.
-        place: (h,) which detection of the newest image each ends in, or MISSED.
-        length: (h,) how many detections each has.
+        log_weight: (h,) log probabilities, up to a common constant.
+        place: (h,) detection of the newest image at which each ends, or MISSED.
+        length: (h,) number of detections of each.
     """
 
     mean: FloatArray
@@ -41,8 +41,8 @@ class Tracks(NamedTuple):
     place: IntArray
     length: IntArray
 
-    def chosen(self, rows: IntArray) -> Tracks:
-        """Some of them."""
+    def select(self, rows: IntArray) -> Tracks:
+        """The tracks of the given rows."""
         return Tracks(*(column[rows] for column in self))  # type: ignore[arg-type] # each keeps its type
 
 
@@ -56,7 +56,7 @@ NO_TRACKS = Tracks(
 
 
 def joined(parts: list[Tracks]) -> Tracks:
-    """All tracks of some parts."""
+    """The tracks of all parts, in one container."""
     return Tracks(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
@@ -66,13 +66,13 @@ def turning(w: complex) -> FloatArray:
 
 
 def predicted(tracks: Tracks, way: complex, noise: FloatArray, scale_variance: float) -> Tracks:
-    """Tracks moved along the robot's own way.
+    """Tracks predicted by the robot's own motion.
 
     Args:
         tracks: (h,).
-        way: Along its track, in the track's frame [m].
-        noise: (3, 3) covariance that the way adds to x, y, heading in the track's frame, at its end.
-        scale_variance: By which the logarithm of the image's scale has changed meanwhile.
+        way: Displacement along the robot's track, in the track's frame [m].
+        noise: (3, 3) covariance that the motion adds to x, y, heading in the track's frame.
+        scale_variance: Variance of the change of the logarithm of the image's scale.
     """
     move = np.eye(4)
     move[:2, 2:] = turning(way)
@@ -88,12 +88,12 @@ def predicted(tracks: Tracks, way: complex, noise: FloatArray, scale_variance: f
 
 
 def log_likelihoods(tracks: Tracks, picture: Picture, spread: float = 0.0) -> FloatArray:
-    """Log densities (h, n) of the detections' positions [1/m^2] where the tracks expect theirs.
+    """Log densities (h, n) of detected positions under the predictions of the tracks [1/m^2].
 
     Args:
         tracks: (h,).
         picture: (n,).
-        spread: By how much less is known of where a robot moves, along x and y each [m].
+        spread: Additional standard deviation of x and y [m].
     """
     away = picture.pose[None, :, :2] - tracks.mean[:, None, :2]
     s = tracks.covariance[:, None, :2, :2] + picture.covariance[None, :, :2, :2] + spread**2 * np.eye(2)
@@ -107,14 +107,14 @@ def log_likelihoods(tracks: Tracks, picture: Picture, spread: float = 0.0) -> Fl
 def updated(
     tracks: Tracks, picture: Picture, places: IntArray, track_heading: float, turn_spread: float = math.inf
 ) -> Tracks:
-    """Tracks (h,) with a detection each, their weights by headings alone: those by positions are given.
+    """Tracks (h,) updated with one detection each; weights change by headings only.
 
     Args:
-        tracks: As they are predicted.
+        tracks: Predicted, with the weights of the positions.
         picture: The newest image.
-        places: (h,) which detection each has.
-        track_heading: Of the robot on its own track [rad].
-        turn_spread: By how much another robot, which was there before, would have turned otherwise [rad].
+        places: (h,) detection of each track.
+        track_heading: Heading of the robot on its own track [rad].
+        turn_spread: Standard deviation of the turn of another robot relative to this one [rad].
     """
     s = tracks.covariance[:, :2, :2] + picture.covariance[places][:, :2, :2]
     gain = np.linalg.solve(s, tracks.covariance[:, :2, :]).transpose(0, 2, 1)
@@ -129,34 +129,34 @@ def updated(
 def _with_headings(
     tracks: Tracks, picture: Picture, rows: IntArray, track_heading: float, turn_spread: float
 ) -> Tracks:
-    """Tracks (h,) of which some rows (r,) also use the heading of their detection."""
+    """Tracks (h,) after an update of some rows (r,) with the detected headings."""
     mean, covariance = tracks.mean[rows], tracks.covariance[rows]
     places = tracks.place[rows]
     real, imag = mean[:, 2], mean[:, 3]
     jacobian = np.zeros((rows.size, 4))
     jacobian[:, 2], jacobian[:, 3] = -imag / (real**2 + imag**2), real / (real**2 + imag**2)
-    expected = np.arctan2(imag, real) + track_heading
-    difference = wrap_angle(picture.pose[places, 2] - expected)
+    predicted_heading = np.arctan2(imag, real) + track_heading
+    innovation = wrap_angle(picture.pose[places, 2] - predicted_heading)
     projected = (covariance @ jacobian[..., None])[..., 0]
     variance = picture.covariance[places, 2, 2] + np.sum(projected * jacobian, axis=1)
-    right = (1.0 - _FALSE_HEADING) * _times_turn(difference, variance)
+    right = (1.0 - _FALSE_HEADING) * _times_turn(innovation, variance)
     others = np.ones(rows.size)
     if math.isfinite(turn_spread):
-        others = 0.5 + 0.5 * _times_turn(difference, variance + turn_spread**2)
+        others = 0.5 + 0.5 * _times_turn(innovation, variance + turn_spread**2)
     share = right / (right + _FALSE_HEADING)
     gain = projected / variance[:, None] * (share > 0.5)[:, None]
     changed = tracks._replace(
         mean=tracks.mean.copy(), covariance=tracks.covariance.copy(), log_weight=tracks.log_weight.copy()
     )
-    changed.mean[rows] += gain * difference[:, None]
+    changed.mean[rows] += gain * innovation[:, None]
     changed.covariance[rows] = _symmetric(covariance - gain[:, :, None] * projected[:, None, :])
     changed.log_weight[rows] += np.log((right + _FALSE_HEADING) / others)
     return changed
 
 
-def _times_turn(difference: FloatArray, variance: FloatArray) -> FloatArray:
-    """Normal densities (k,) of angles, over that of angles which are anywhere."""
-    return np.asarray(np.exp(-0.5 * difference**2 / variance) * np.sqrt(2.0 * np.pi / variance))
+def _times_turn(innovation: FloatArray, variance: FloatArray) -> FloatArray:
+    """Normal densities (k,) of angles relative to the uniform density."""
+    return np.asarray(np.exp(-0.5 * innovation**2 / variance) * np.sqrt(2.0 * np.pi / variance))
 
 
 def _symmetric(covariance: FloatArray) -> FloatArray:

@@ -17,7 +17,12 @@ from swarm_loc_estimator.filter.sparse.neighbours import adjacency
 from swarm_loc_estimator.filter.sparse.ordering import Situation, ordered
 from swarm_loc_estimator.filter.sparse.parameters import Groups, active_blocks
 from swarm_loc_estimator.filter.sparse.symbolic import Pattern, pattern_of, wanted_rows
-from swarm_loc_estimator.filter.sparse.translation_adjoint import Information, carried_pairs, levers, summed
+from swarm_loc_estimator.filter.sparse.translation_adjoint import (
+    Information,
+    carried_pairs,
+    summed,
+    translation_adjoints,
+)
 
 COUNT = 60
 
@@ -45,7 +50,7 @@ def test_the_next_order_does_not_depend_on_what_is_measured_then(
         one, other = ordered(now, before), ordered(situation(pairs + late), before)
         if before is not None and before.updates >= ordering._ORDERED_AGAIN:
             assert one.order is other.order
-            assert one.near is other.near
+            assert one.near.pairs is other.near.pairs
         for a, b in pairs + late:  # whatever the order is, all pairs lie in the pattern
             assert in_pattern(other, a, b)
         before = one
@@ -69,10 +74,10 @@ def test_who_is_near_whom_is_found_out_again_however_soon_orders_are_replaced(
         here.places[robot] = (3.6, 0.1 + 0.05 * min(update, ordering._NEAR_AGAIN))
         now = ordered(here, now)
     assert now is not None
-    for a, b in now.near:
+    for a, b in now.near.pairs:
         if robot in (a, b):
             assert np.linalg.norm(here.places[a] - here.places[b]) < 2.0
-    assert now.near_updates <= ordering._NEAR_AGAIN + ordering._ORDERED_AGAIN
+    assert now.near.updates <= ordering._NEAR_AGAIN + ordering._ORDERED_AGAIN
 
 
 @given(st.integers(0, 10**6), st.integers(0, 40))
@@ -97,7 +102,7 @@ def test_covariances_are_carried_by_the_levers_of_their_bodies(seed: int) -> Non
         rng.normal(0.0, 9.0, (5, 2)),
         rng.normal(0, 1, (5, 3, 3)),
     )
-    expected = levers(places) @ across @ levers(others).transpose(0, 2, 1)
+    expected = translation_adjoints(places) @ across @ translation_adjoints(others).transpose(0, 2, 1)
     np.testing.assert_allclose(carried_pairs(places, across, others), expected, atol=1e-9)
 
 
@@ -156,7 +161,7 @@ def test_a_factor_says_all_covariances_that_a_new_pattern_wants(seed: int) -> No
     beside = np.where(rng.random(COUNT) < 0.3, rng.integers(0, COUNT, COUNT), -1)
     covariance = np.full((COUNT, COUNT, 3, 3), np.nan)
     write_fronts(factor, covariance)
-    write_rows(factor, 0, wanted_rows(factor.pattern, new, place, 0, beside), covariance)
+    write_rows(factor, 0, *wanted_rows(factor.pattern, new, place, 0, beside), covariance)
     for f in range(new.fronts):
         pivots = new.pivot[new.pivot_begin[f] : new.pivot_begin[f + 1]]
         border = new.border[new.border_begin[f] : new.border_begin[f + 1]]

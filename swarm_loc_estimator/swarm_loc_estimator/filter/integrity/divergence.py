@@ -1,4 +1,4 @@
-"""Divergence: whether a pose has been confirmed, how sure it is told to be, and when a robot is given up."""
+"""Loss of track: confirmation of assumed poses, reported uncertainty, and when a robot is lost."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from swarm_loc_estimator.filter.integrity.fault_detection import source_of
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns
 
 CONFIRMED = 2
-"""So many sightings that agree make a pose that was assumed one that is known."""
+"""Number of agreeing sightings after which an assumed pose counts as known."""
 WELL_CONFIRMED = 12
 _DOUBTFUL = 2.0
 _HIDDEN_SIGMA = (0.03, 0.03, 0.06)
-"""What sensors may hide while a pose is doubtful, or few sightings have confirmed it [m], [m], [rad]."""
+"""Standard deviations added while a pose is suspect or little confirmed: x [m], y [m], heading [rad]."""
 _SEEN_RELIEF = 1.0
-"""A look from above rests on nothing else that is believed."""
+"""Decrease of the fault score by a detection from above, which depends on no other estimate."""
 _GATED_AGAIN_NS = 250_000_000
 _MAX_GATED_FIXES = 3
-"""A robot is where fixes put it, not where other robots that hang on it say: so many send it there."""
+"""Gated fixes after which a robot is re-initialized from its fixes, whatever other robots measure of it."""
 _CONFIRMED_AGAIN_NS = 150_000_000
-"""Sightings that follow each other faster confirm a pose once: they have much of their errors in common."""
+"""Sightings within this time count as one confirmation, because their errors are correlated."""
 
 
 class LossLimits(NamedTuple):
-    """Beyond which a robot is given up.
+    """Limits beyond which a robot is lost.
 
     Attributes:
         position_sigma: Standard deviation of its position [m].
         heading_sigma: Of its heading [rad].
         gated_in_a_row: Gated measurements since the last accepted one.
-        max_doubt: How much may speak against a robot or landmark before it is contradicted.
+        max_doubt: Fault score from which a robot or landmark is contradicted.
     """
 
     position_sigma: float
@@ -43,7 +43,7 @@ class LossLimits(NamedTuple):
 
 @inlined_njit
 def confirm(measurements: MeasurementColumns, k: int, belief: BeliefArrays, passed: bool) -> int:
-    """Hold measurement k against poses that were assumed; return a robot that is elsewhere, or -1."""
+    """Check measurement k against assumed poses; return a robot that is kidnapped, or -1."""
     observer, target = measurements.observer[k], measurements.target[k]
     known = belief.integrity.confirmations
     knows_observer = observer < 0 or known[observer] >= CONFIRMED
@@ -82,20 +82,20 @@ def is_uncertain(belief: BeliefArrays, robot: int, pose: FloatArray, limits: Los
 
 @inlined_njit
 def add_hidden_errors(state: IntegrityArrays, robot: int, covariance: FloatArray) -> None:
-    """Add to a pose's covariance (3, 3) what its sensors may hide."""
+    """Inflate the covariance (3, 3) of a pose that is suspect or little confirmed."""
     if state.doubt[robot] > _DOUBTFUL or state.confirmations[robot] < WELL_CONFIRMED:
         for i in range(3):
             covariance[i, i] += _HIDDEN_SIGMA[i] ** 2
 
 
 def note_missed(state: IntegrityArrays, robot: int, weight: float) -> float:
-    """Count that a robot was not seen where it should be; return how much speaks against it now."""
+    """Raise the fault score of a robot that was not detected where it was expected; return the score."""
     state.doubt[robot] += weight
     return float(state.doubt[robot])
 
 
 def note_seen(state: IntegrityArrays, robot: int) -> None:
-    """Count that a robot was seen from above where it is believed to be."""
+    """Lower the fault score of a robot that was detected from above where it was expected."""
     state.doubt[robot] = max(0.0, state.doubt[robot] - _SEEN_RELIEF)
 
 
@@ -103,9 +103,9 @@ def note_seen(state: IntegrityArrays, robot: int) -> None:
 def count_gated(
     measurements: MeasurementColumns, k: int, belief: BeliefArrays, passed: bool, limits: LossLimits
 ) -> int:
-    """Count fixes and gated measurements; return a robot that has had too many gated in a row, or -1.
+    """Count fixes and gated measurements; return a robot with too many gated in a row, or -1.
 
-    One source alone counts four times a second at most.
+    One source alone counts at most four times a second.
     """
     observer, target = measurements.observer[k], measurements.target[k]
     lost, state = -1, belief.integrity
@@ -131,9 +131,9 @@ def count_gated(
 
 @cached_njit
 def _is_off_its_fixes(state: IntegrityArrays, robot: int, stamp_ns: int) -> bool:
-    """Count a gated fix of a robot; whether there are too many since the last accepted sight of the map.
+    """Count a gated fix; return whether there are too many since the last absolute measurement.
 
-    Robots that were located by way of this one agree with it wherever it is, so what they say does not count.
+    Robots initialized from this one agree with it wherever it is, so their measurements do not count.
     """
     if stamp_ns - state.gated_fix_ns[robot] > _GATED_AGAIN_NS:
         state.gated_fixes[robot] += 1

@@ -1,12 +1,11 @@
-"""Integrity: what the newest measurements say of the belief, whom they contradict, and when a robot is lost.
+"""Fault detection and exclusion: outliers are attributed to an observer, to a source, or to their pair.
 
-A measurement is a surprise when the squared Mahalanobis distance of its position exceeds a threshold that one
-good measurement in twenty does, or when the whitened innovations of its last few have a trend. Every surprise
-counts against its pair of observer and source. It counts against one of the two, too, where the other one is
-in agreement: for each, the share of its pairs that are surprises, as observer and as source, is compared. A
-robot whose camera was turned disagrees with all that it sees, a landmark that was moved with all that see it;
-they are contradicted once enough speaks against them. A false sighting disagrees with nobody but itself: the
-pair is set aside. Every measurement that is no surprise counts for those whom it is about.
+A measurement is an outlier when the squared Mahalanobis distance of its position exceeds a threshold that one
+good measurement in twenty exceeds, or when the whitened innovations of its last few have a trend. An outlier
+raises the fault score of whichever of observer and source has the larger share of outliers among its pairs.
+A robot whose camera was turned disagrees with all that it sees; a landmark that was moved disagrees with all
+that see it. Either is contradicted once its fault score reaches a limit. If both agree with others, the
+outlier is evidence against the pair alone, and the pair is excluded. Inliers lower scores and evidence.
 """
 
 from __future__ import annotations
@@ -23,45 +22,45 @@ from swarm_loc_estimator.filter.integrity.noise_inflation import raise_hidden_no
 from swarm_loc_estimator.filter.measurement_model import POLAR, MeasurementColumns
 
 _ASIDE, _MAX_EVIDENCE = 10.0, 15.0
-"""Evidence from which on a pair is set aside, and the most that is counted."""
+"""Evidence from which a pair is excluded, and its maximum."""
 _DENIED = 7.5
-"""From here on a robot is not told as tracked."""
+"""Fault score from which a robot is not reported as tracked."""
 
 _SOURCES = 16
 _SURPRISE = 6.0
 _MAX_WEIGHT = 3.0
 _UNEXPLAINED_WEIGHT = 2.0
 NOISE, DESCRIPTION, ELSEWHERE = 0, 1, 2
-"""What may explain an innovation: noise, a wrong description, or that a robot is somewhere else."""
+"""Possible causes of an innovation: noise, a wrong description, or a robot at another place."""
 _NOISE_M = 0.05
 _EXPLAINED_M, _EXPLAINED_SHARE = 0.1, 0.35
-"""A wrong description explains errors of so much, and of that share of the distance."""
+"""Error that a wrong description can explain: a constant, and a share of the distance."""
 _SMALL_M, _SMALL_SHARE = 0.003, 0.005
-"""Errors of so much, and of that share of the distance, are no surprise whatever the noise is."""
+"""Errors up to this constant and share of the distance are inliers whatever the noise is."""
 _SINGLE_WEIGHT = 0.3
-"""A surprise of an observer with no other one."""
+"""Weight of an outlier whose observer has no other one."""
 _MAX_SINGLE_DOUBT = 5.0
-"""One source alone makes an observer doubtful, but does not contradict it."""
+"""A single source raises the fault score of an observer up to here, which does not contradict it."""
 _SHARED_WEIGHT = 0.2
-"""The source's part where it cannot be told who is wrong."""
+"""Weight for the source where observer and source are equally likely to be wrong."""
 _RELIEF = 0.25
 RECENT_NS = 400_000_000
 _ONE_IMAGE_NS = 20_000_000
 _TOLD_NS = 3_000_000_000
 _AGAIN_NS = 90_000_000
-"""What comes sooner after the last look of a pair is no new evidence."""
+"""A measurement sooner after the last one of its pair is no new evidence."""
 _INDEPENDENT_NS = 100_000_000
-"""The errors of looks that follow each other faster are the same."""
+"""Measurements of a pair that follow each other faster share their errors."""
 _TREND_LOOKS = 8
 _TREND = 3.0
-"""Squared sum of so many whitened innovations over the sum of their squares; 1 on average without a trend."""
+"""Limit of the squared sum of whitened innovations over their sum of squares; 1 without a trend."""
 _MIN_TREND = 0.6
-"""A mean of whitened innovations that matters: calibrated sensors have trends that their noise covers."""
+"""Smallest mean of whitened innovations that counts: trends of calibrated sensors lie below their noise."""
 _TREND_WEIGHT = 4.0
 
 
 def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
-    """Nothing is held against anybody."""
+    """All fault scores zero, no pair known."""
     return IntegrityArrays(
         source=np.full((robots, _SOURCES), -1),
         source_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
@@ -93,13 +92,13 @@ def assess(
     max_doubt: float,
     look: tuple[float, tuple[float, float], int],
 ) -> int:
-    """Hold measurement k against what its observer and its source have shown lately.
+    """Update fault scores and evidence by measurement k.
 
     Args:
         measurements: (m,).
         k: Which one.
         belief: Its integrity is changed.
-        max_doubt: How much may speak against a robot or landmark before it is contradicted.
+        max_doubt: Fault score from which a robot or landmark is contradicted.
         look: Squared Mahalanobis distance of the position, the innovation over its standard deviation (2,),
             and what may explain it, see `cause_of`.
 
@@ -139,7 +138,7 @@ def assess(
 
 @cached_njit
 def _is_estimated(belief: BeliefArrays, node: int) -> bool:
-    """Whether what describes a robot or landmark is estimated already."""
+    """Whether the parameters of a robot or the place of a landmark are states already."""
     robots, table = belief.tracked.size, belief.table
     column = table.column[node, CAMERA_YAW] if node < robots else table.survey_column[node - robots]
     estimated: bool = column >= 0
@@ -148,7 +147,7 @@ def _is_estimated(belief: BeliefArrays, node: int) -> bool:
 
 @cached_njit
 def _forgive(state: IntegrityArrays, node: int) -> None:
-    """Hold nothing against a robot or landmark any more, nor against its pairs."""
+    """Reset the fault score of a robot or landmark, and the evidence against its pairs."""
     state.doubt[node] = 0.0
     robots, places = state.source.shape
     for robot in range(robots):
@@ -158,14 +157,14 @@ def _forgive(state: IntegrityArrays, node: int) -> None:
 
 
 def pairs_set_aside(state: IntegrityArrays, now_ns: int) -> list[tuple[int, int]]:
-    """The pairs of observer and source that do not count, of those measured of late."""
+    """The excluded pairs of observer and source among those measured recently."""
     aside = (state.evidence >= _ASIDE) & (now_ns - state.source_ns < _TOLD_NS)
     return [(int(observer), int(state.source[observer, place])) for observer, place in np.argwhere(aside)]
 
 
 @inlined_njit
 def is_set_aside(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> bool:
-    """Whether the pair of measurement k has disagreed so often that it does not count."""
+    """Whether the pair of measurement k is excluded."""
     observer, place = measurements.observer[k], _find(measurements, k, belief)
     aside: bool = place >= 0 and belief.integrity.evidence[observer, place] >= _ASIDE
     return aside
@@ -173,7 +172,7 @@ def is_set_aside(measurements: MeasurementColumns, k: int, belief: BeliefArrays)
 
 @inlined_njit
 def cause_of(kind: int, innovation: FloatArray, predicted: FloatArray) -> int:
-    """What may explain an innovation (3,) of a prediction (3,): NOISE, DESCRIPTION or ELSEWHERE."""
+    """Smallest cause that explains an innovation (3,) of a prediction (3,), of the three above."""
     if kind == POLAR:
         distance, along, across = predicted[0], abs(innovation[0]), abs(innovation[1]) * predicted[0]
     else:
@@ -187,7 +186,7 @@ def cause_of(kind: int, innovation: FloatArray, predicted: FloatArray) -> int:
 
 @inlined_njit
 def small_variances(kind: int, predicted: FloatArray) -> tuple[float, float]:
-    """Variances of errors of a position, forward or range and left or bearing, too small to matter."""
+    """Variances of position errors too small to be outliers: forward or range, left or bearing."""
     distance = predicted[0] if kind == POLAR else math.hypot(predicted[0], predicted[1])
     small = (_SMALL_M + _SMALL_SHARE * abs(distance)) ** 2
     return small, (small / max(distance * distance, 1e-6) if kind == POLAR else small)
@@ -195,7 +194,7 @@ def small_variances(kind: int, predicted: FloatArray) -> tuple[float, float]:
 
 @inlined_njit
 def is_elsewhere(state: IntegrityArrays, robot: int, within_ns: int = RECENT_NS) -> bool:
-    """Whether most of what a robot has measured last can only mean that it is somewhere else."""
+    """Whether most recent measurements of a robot can only mean that it is at another place."""
     newest_ns, elsewhere, count = state.source_ns[robot, 0], 0, 0
     for place in range(state.source.shape[1]):
         newest_ns = max(newest_ns, state.source_ns[robot, place])
@@ -209,7 +208,7 @@ def is_elsewhere(state: IntegrityArrays, robot: int, within_ns: int = RECENT_NS)
 
 @inlined_njit
 def is_contradicted(state: IntegrityArrays, robot: int) -> bool:
-    """Whether the newest measurements speak against a robot's pose: it is not told as tracked."""
+    """Whether the newest measurements contradict the pose of a robot; it is not tracked then."""
     contradicted: bool = (
         state.doubt[robot] >= _DENIED
         or state.gated_fixes[robot] > 0
@@ -220,7 +219,7 @@ def is_contradicted(state: IntegrityArrays, robot: int) -> bool:
 
 @inlined_njit
 def _relieve(state: IntegrityArrays, observer: int, source: int, place: int) -> None:
-    """Count a look that is no surprise for those whom it is about."""
+    """Lower evidence and fault scores by an inlier."""
     state.evidence[observer, place] = max(0.0, state.evidence[observer, place] - _RELIEF)
     for node in (observer, source):
         state.doubt[node] = max(0.0, state.doubt[node] - _RELIEF)
@@ -230,7 +229,7 @@ def _relieve(state: IntegrityArrays, observer: int, source: int, place: int) -> 
 def _blame(
     state: IntegrityArrays, pair: tuple[int, int], weight: float, unexplained: bool, now_ns: int
 ) -> bool:
-    """Add a surprise to the doubt of whoever has more of them among its pairs; False: of neither."""
+    """Attribute an outlier to whichever of a pair has the larger share of them; False: to neither."""
     observer, source = pair
     bad_observer, share_observer = _surprises(state, observer, now_ns)
     _, share_source = _surprises(state, source, now_ns)
@@ -250,12 +249,12 @@ def _blame(
 
 @cached_njit
 def _surprises(state: IntegrityArrays, node: int, now_ns: int) -> tuple[int, float]:
-    """How many pairs of a robot or landmark are surprises, as observer and as source, and what share."""
+    """Number and share of outliers among the pairs of a robot or landmark, as observer and as source."""
     robots, places = state.source.shape
     bad, count = 0, 0
     for robot in range(robots):
         named = 0
-        for place in range(places):  # most robots have not looked at it, which is soon found out like this
+        for place in range(places):  # most robots have not measured it: a quick check first
             named += state.source[robot, place] == node
         for place in range(places if named or robot == node else 0):
             source = state.source[robot, place]
@@ -270,7 +269,7 @@ def _surprises(state: IntegrityArrays, node: int, now_ns: int) -> tuple[int, flo
 def _weight_of_trend(
     state: IntegrityArrays, observer: int, place: int, whitened: tuple[float, float]
 ) -> float:
-    """Take a whitened innovation (2,) into the pair's sum; what speaks against it when there are enough."""
+    """Add a whitened innovation (2,) to the sum of its pair; return the weight of a trend, 0 without one."""
     total = state.whitened[observer, place]
     for i in range(2):
         total[i] += whitened[i]
@@ -293,7 +292,7 @@ def _forget_trend(state: IntegrityArrays, observer: int, place: int) -> None:
 
 @inlined_njit
 def _find(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int:
-    """Where the pair of measurement k is remembered; -1: nowhere, or it is no pair."""
+    """The slot of the pair of measurement k; -1: it has none, or it is no pair."""
     observer, source = measurements.observer[k], source_of(measurements, k, belief)
     if observer >= 0 and source >= 0:
         sources = belief.integrity.source[observer]
@@ -305,7 +304,7 @@ def _find(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int
 
 @inlined_njit
 def _new_place(state: IntegrityArrays, observer: int, source: int) -> int:
-    """Remember a new pair in place of the one seen longest ago."""
+    """Give a new pair the slot of the one measured longest ago."""
     oldest = 0
     for place in range(state.source.shape[1]):
         if state.source_ns[observer, place] < state.source_ns[observer, oldest]:
@@ -320,7 +319,7 @@ def _new_place(state: IntegrityArrays, observer: int, source: int) -> int:
 
 @inlined_njit
 def source_of(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int:
-    """What measurement k is of: a robot, N + l for a landmark, or -1."""
+    """The source of measurement k: a robot, N + l for landmark l, or -1."""
     landmark: int = measurements.landmark[k] - 1
     target: int = measurements.target[k]
     return belief.tracked.size + landmark if landmark >= 0 else target
@@ -328,7 +327,7 @@ def source_of(measurements: MeasurementColumns, k: int, belief: BeliefArrays) ->
 
 @inlined_njit
 def noise_of_frequent_looks(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> float:
-    """By what factor the noise of measurement k counts more, so soon after another one of its pair."""
+    """Factor on the noise of measurement k that follows closely on another one of its pair."""
     observer, place = measurements.observer[k], _find(measurements, k, belief)
     if place < 0:
         return 1.0

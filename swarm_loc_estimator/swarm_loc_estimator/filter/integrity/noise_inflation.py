@@ -1,8 +1,8 @@
-"""Hidden noise: what measurements scatter beyond their description, found when they contradict the belief.
+"""Noise inflation: measurements that scatter more than described get more noise, in units per robot.
 
-A robot whose measurements go on to contradict what is believed although all that describes it is estimated
-has more noise than described: its markers sit a little off, its images are stamped a little wrong. Its
-measurements then count with one unit of noise more, each time.
+A robot whose measurements still contradict the estimate although all its parameters are states has more
+noise than described: its markers are mounted inexactly, its images are stamped inexactly. Each time its
+measurements are contradicted, their noise grows by one unit.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from swarm_loc_estimator.filter.measurement_model import POLAR, MeasurementColum
 from swarm_loc_estimator.swarm.swarm import SensorModel
 
 _POSITION_SIGMA, _BEARING_SIGMA, _HEADING_SIGMA, _STAMP_SIGMA = 0.004, 0.01, 0.03, 0.03
-"""One unit of it [m], [rad], [rad], [s]."""
+"""One unit of inflation [m], [rad], [rad], [s]."""
 _DOUBTED_UNITS, MAX_UNITS = 2.0, 5.0
 
 
 @inlined_njit
 def stamp_variance(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> float:
-    """How unsure the stamp of measurement k is, as described and as found out [s^2]."""
+    """Variance of the stamp of measurement k, as described and with inflation [s^2]."""
     variance: float = measurements.stamp_variance[k]
     observer = measurements.observer[k]
     if observer >= 0:
@@ -37,7 +37,7 @@ def stamp_variance(measurements: MeasurementColumns, k: int, belief: BeliefArray
 def add_hidden_noise(
     measurements: MeasurementColumns, k: int, belief: BeliefArrays, noise: FloatArray
 ) -> None:
-    """Add to the noise (3, 3) of measurement k what its observer's measurements scatter beyond it."""
+    """Add the noise inflation of its observer to the noise (3, 3) of measurement k."""
     observer = measurements.observer[k]
     units = belief.integrity.hidden_noise[observer] if observer >= 0 else 0.0
     if units > 0.0:
@@ -48,7 +48,7 @@ def add_hidden_noise(
 
 @cached_njit
 def raise_hidden_noise(belief: BeliefArrays, observer: int) -> bool:
-    """Count one more unit of an observer's noise; False: it cannot be noise any more."""
+    """Inflate the noise of an observer by one unit; False: it is at its maximum."""
     units = belief.integrity.hidden_noise[observer]
     belief.integrity.hidden_noise[observer] = min(units + 1.0, MAX_UNITS)
     raised: bool = units < MAX_UNITS
@@ -56,12 +56,12 @@ def raise_hidden_noise(belief: BeliefArrays, observer: int) -> bool:
 
 
 def doubt_noise(state: IntegrityArrays) -> None:
-    """Take no robot's noise for as small as described, where the description has proved wrong."""
+    """Inflate the noise of all robots, because their description has proved wrong."""
     np.maximum(state.hidden_noise, _DOUBTED_UNITS, out=state.hidden_noise)
 
 
 def with_hidden_noise(sensor: SensorModel, units: float) -> SensorModel:
-    """A sensor whose noise is described as it was found to be."""
+    """A sensor model with the noise inflation included."""
     unit_of = {
         "forward_sigma": _POSITION_SIGMA,
         "left_sigma": _POSITION_SIGMA,

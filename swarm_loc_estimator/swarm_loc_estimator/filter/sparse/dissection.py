@@ -1,8 +1,9 @@
 """Nested dissection: an order of elimination that keeps the fronts small.
 
-Bodies are parted by their places into two halves and a separator, which no pair bypasses; the halves likewise
-until few are left. A separator is eliminated after both of its halves. George, "Nested dissection of a
-regular finite element mesh", SIAM J. Numer. Anal. 10 (1973).
+Bodies are split by their positions into two halves and a separator, which no pair bypasses, and the halves
+again until few bodies are left. A separator is eliminated after both of its halves.
+
+George, "Nested dissection of a regular finite element mesh", SIAM J. Numer. Anal. 10 (1973).
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.filter.sparse.neighbours import Adjacency
 
 _LEAF = 24
-"""So many bodies are not parted any more."""
+"""Sets of at most this size are not split."""
 _CUTS = (0.5, 0.42, 0.58)
 _FEW = 60
-"""So many bodies are only halved."""
+"""Sets of at most this size are split in the middle only."""
 _UNEQUAL = 1.15
-"""Another separator must be so much smaller where the parts are less equal."""
+"""Factor by which the separator of an uneven split must be smaller."""
 _DIRECTIONS = 4
 _BELOW, _ABOVE, _SEPARATOR, _OUTSIDE = 0, 1, 2, -1
 
@@ -31,8 +32,8 @@ class Order(NamedTuple):
     """Groups of bodies in the order of their elimination.
 
     Attributes:
-        body: (n,) the bodies, group by group.
-        begin: (F + 1,) where each group begins.
+        body: (n,) bodies, group by group.
+        begin: (F + 1,) start of each group.
     """
 
     body: IntArray
@@ -41,7 +42,7 @@ class Order(NamedTuple):
 
 @cached_njit
 def dissect(bodies: IntArray, places: FloatArray, adjacency: Adjacency) -> Order:
-    """Part bodies, named by their indices (k,) into places (n, 2), until each group has few."""
+    """Split bodies (k,), indices into places (n, 2), until each group is small."""
     count = bodies.size
     members, groups = bodies.copy(), np.empty(count, dtype=np.int64)
     begin, left = np.zeros(count + 2, dtype=np.int64), np.empty((count + 2, 2), dtype=np.int64)
@@ -70,7 +71,7 @@ def dissect(bodies: IntArray, places: FloatArray, adjacency: Adjacency) -> Order
             left[waiting, 0], left[waiting, 1] = first, first + below
             left[waiting + 1, 0], left[waiting + 1, 1] = first + below, last - separators
             waiting += 2
-    # found from the top downwards, eliminated from the bottom upwards
+    # found from the root downwards, eliminated from the leaves upwards
     order = Order(np.empty(count, dtype=np.int64), np.zeros(number + 1, dtype=np.int64))
     written = 0
     for group in range(number - 1, -1, -1):
@@ -83,7 +84,7 @@ def dissect(bodies: IntArray, places: FloatArray, adjacency: Adjacency) -> Order
 
 @cached_njit
 def _part(part: IntArray, places: FloatArray, adjacency: Adjacency, side: IntArray, trial: IntArray) -> None:
-    """Write the side of each body of a part, by the cut with the smallest separator; `trial` is room."""
+    """Write the side of each body of a part, by the cut with the smallest separator; `trial` is workspace."""
     smallest, along = math.inf, np.empty(part.size)
     for direction in range(_DIRECTIONS):
         angle = direction * math.pi / _DIRECTIONS
@@ -105,7 +106,7 @@ def _part(part: IntArray, places: FloatArray, adjacency: Adjacency, side: IntArr
 
 @cached_njit
 def _separate(part: IntArray, adjacency: Adjacency, side: IntArray) -> int:
-    """Move bodies to the separator until no pair lies across, those of most pairs first; return how many."""
+    """Move bodies to the separator until no pair crosses, those of most pairs first; return their number."""
     degree, border, count = np.zeros(part.size, dtype=np.int64), np.empty(part.size, dtype=np.int64), 0
     for body in part:
         across = _across(body, adjacency, side)
@@ -133,7 +134,7 @@ def _separate(part: IntArray, adjacency: Adjacency, side: IntArray) -> int:
 
 @cached_njit
 def _across(body: int, adjacency: Adjacency, side: IntArray) -> int:
-    """With how many bodies of the other side a body is paired."""
+    """Number of neighbours of a body on the other side."""
     count = 0
     for k in range(adjacency.begin[body], adjacency.begin[body + 1]):
         other = side[adjacency.neighbour[k]]
@@ -143,7 +144,7 @@ def _across(body: int, adjacency: Adjacency, side: IntArray) -> int:
 
 @cached_njit
 def _sort(part: IntArray, side: IntArray) -> tuple[int, int]:
-    """Sort a part by its sides, in place, and forget them; return how many are below and separate."""
+    """Sort a part by its sides, in place, and reset them; return the sizes of lower half and separator."""
     old, counts, place = part.copy(), np.zeros(3, dtype=np.int64), 0
     for which in (_BELOW, _ABOVE, _SEPARATOR):
         for body in old:

@@ -1,7 +1,7 @@
-"""Elimination: a prior projected on a pattern, measurements added, and the factor of both.
+"""Elimination: the factor of a prior, projected on a pattern, and of measurements.
 
-Of each front the prior's p(x_J | x_B) is kept, which is the projection on the pattern that loses least in
-Kullback and Leibler's measure. As information it is V V^T with V the last columns of C^-T, where C is the
+Of each front the prior's p(x_J | x_B) is kept. This is the projection on the pattern with the smallest
+Kullback-Leibler divergence. As information it is V V^T with V the last columns of C^-T, where C is the
 Cholesky factor of the front's covariance, borders first.
 """
 
@@ -18,17 +18,17 @@ from swarm_loc_estimator.filter.sparse.symbolic import Pattern
 from swarm_loc_estimator.filter.sparse.translation_adjoint import Information
 
 _LOOSER = (0.0, 1e-10, 1e-8, 1e-6, 1e-4)
-"""By such shares variances are enlarged, one after the other, where rounding has left no covariance."""
+"""Relative increases of the variances, tried in turn where rounding has made a covariance indefinite."""
 _PANEL = 24
-"""Rows that are solved for at once."""
+"""Rows solved at once."""
 
 
 class Prior(NamedTuple):
-    """What is known before, on a pattern.
+    """Covariances before the measurements, on a pattern.
 
     Attributes:
         covariance: (s, s, 3, 3) by the bodies' numbers there.
-        place: (n,) the numbers of the pattern's bodies there.
+        place: (n,) numbers of the pattern's bodies in `covariance`.
     """
 
     covariance: FloatArray
@@ -39,7 +39,7 @@ def eliminate(pattern: Pattern, prior: Prior, measured: Information) -> Factor:
     """The factor of a prior and measurements.
 
     Raises:
-        LinAlgError: The prior is no covariance.
+        LinAlgError: The prior is not positive definite.
     """
     earlier = np.minimum(pattern.front[measured.first], pattern.front[measured.second])
     order = np.argsort(earlier, kind="stable")
@@ -47,7 +47,7 @@ def eliminate(pattern: Pattern, prior: Prior, measured: Information) -> Factor:
     factor = new_factor(pattern)
     for looser in _LOOSER:
         try:
-            _eliminate(factor, prior, measured, (order, begin), looser)
+            _eliminate(factor, prior, measured, order, begin, looser)
         except np.linalg.LinAlgError:
             continue
         return factor
@@ -59,10 +59,11 @@ def _eliminate(
     factor: Factor,
     prior: Prior,
     measured: Information,
-    blocks: tuple[IntArray, IntArray],
+    order: IntArray,
+    begin: IntArray,
     looser: float,
 ) -> None:
-    """Write a factor; `blocks` is the order of what was measured, front by front, and where each begins."""
+    """Write a factor; the measured blocks of front f are order[begin[f]:begin[f + 1]]."""
     pattern = factor.pattern
     fronts = pattern.pivot_begin.size - 1
     updates = [np.empty((0, 0)) for _ in range(fronts)]
@@ -76,7 +77,7 @@ def _eliminate(
             local[bodies[k]] = k
         places = prior.place[bodies]
         information = _conditional(gathered(prior.covariance, places, places), size, looser)
-        _add_blocks(information, local, measured, blocks[0][blocks[1][f] : blocks[1][f + 1]])
+        _add_blocks(information, local, measured, order[begin[f] : begin[f + 1]])
         below = child[f]
         while below >= 0:
             left = pattern.border[pattern.border_begin[below] : pattern.border_begin[below + 1]]
@@ -98,7 +99,7 @@ def _eliminate(
 
 @cached_njit
 def _conditional(covariance: FloatArray, size: int, looser: float) -> FloatArray:
-    """Information (d, d) of p(x_J | x_B) for a covariance (d, d), the pivots being the last `size` rows."""
+    """Information (d, d) of p(x_J | x_B) from a covariance (d, d) whose last `size` rows are the pivots."""
     for k in range(covariance.shape[0]):
         covariance[k, k] *= 1.0 + looser
     lower: FloatArray = np.linalg.cholesky(np.ascontiguousarray(covariance))
@@ -133,7 +134,7 @@ def _last_columns(lower: FloatArray, size: int) -> FloatArray:
 
 @cached_njit
 def _add_blocks(information: FloatArray, local: IntArray, measured: Information, which: IntArray) -> None:
-    """Add some blocks of what was measured to a front's information, those of two bodies either way."""
+    """Add measured blocks to the information of a front, symmetrically."""
     for k in which:
         row, column = 3 * local[measured.first[k]], 3 * local[measured.second[k]]
         for i in range(3):
@@ -145,7 +146,7 @@ def _add_blocks(information: FloatArray, local: IntArray, measured: Information,
 
 @cached_njit
 def _add_update(information: FloatArray, local: IntArray, bodies: IntArray, update: FloatArray) -> None:
-    """Add what a front before says of its border (b,)."""
+    """Add the update of an earlier front with this border (b,)."""
     for r in range(bodies.size):
         row = 3 * local[bodies[r]]
         for c in range(bodies.size):

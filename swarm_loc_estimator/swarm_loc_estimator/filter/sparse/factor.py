@@ -1,9 +1,8 @@
-"""The factor: how each front's pivots depend on its border, and the covariances that follow from it.
+"""The factor: the pivots of each front given its border, and the covariances that follow.
 
     x_J = A^T x_B + e,    cov e = D,
 
-for every front, in which all that is known of the bodies is said. A factor is never written to: what is
-derived from it, or comes after it, is another one.
+for every front, which determines the whole Gaussian. Factors are immutable.
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.filter.sparse.symbolic import Pattern
 
 _FEW = 2
-"""Products of so few pivots with many columns take less time as loops than as calls of BLAS."""
+"""Up to this number of pivots, products with many columns are faster as loops than by BLAS."""
 
 
 class Derived(NamedTuple):
-    """A body that has come since, whose error follows from those of others.
+    """A body appended to a factor, whose error is a function of those of others.
 
     Attributes:
-        others: (s,) bodies of the factor, or derived before; none: it is independent.
+        others: (s,) bodies of the factor, or appended before; empty: independent.
         gain: (3 s, 3) A.
         spread: (3, 3) D.
     """
@@ -39,9 +38,9 @@ class Factor(NamedTuple):
 
     Attributes:
         pattern: Its fronts.
-        gain: Of each front A (3 b, 3 j), one behind the other.
-        gain_begin: (F + 1,) where that of each front begins.
-        spread: Likewise of each front D (3 j, 3 j).
+        gain: A (3 b, 3 j) of all fronts, concatenated.
+        gain_begin: (F + 1,) start of each front's A.
+        spread: D (3 j, 3 j) of all fronts, concatenated.
         spread_begin: (F + 1,)
     """
 
@@ -55,18 +54,18 @@ class Factor(NamedTuple):
 _NONE: IntArray = np.zeros(0, dtype=np.int64)
 _FIRST: IntArray = np.zeros(1, dtype=np.int64)
 EMPTY = Factor(Pattern(_NONE, _FIRST, _NONE, _FIRST, _NONE), np.zeros(0), _FIRST, np.zeros(0), _FIRST)
-"""Of no bodies."""
+"""A factor without bodies."""
 
 
 def new_factor(pattern: Pattern) -> Factor:
-    """A factor to be written."""
+    """A factor with uninitialized values."""
     pivots, border = 3 * np.diff(pattern.pivot_begin), 3 * np.diff(pattern.border_begin)
     gain_begin, spread_begin = _begins(border * pivots), _begins(pivots * pivots)
     return Factor(pattern, np.empty(gain_begin[-1]), gain_begin, np.empty(spread_begin[-1]), spread_begin)
 
 
 def with_derived(factor: Factor, derived: tuple[Derived, ...]) -> Factor:
-    """The factor with more bodies, numbered behind those it has; each is eliminated before all others."""
+    """The factor with more bodies, numbered last and eliminated first."""
     if not derived:
         return factor
     old, count = factor.pattern, len(derived)
@@ -90,7 +89,7 @@ def with_derived(factor: Factor, derived: tuple[Derived, ...]) -> Factor:
 
 
 def _begins(sizes: IntArray) -> IntArray:
-    """Where each of some (k,) begins, and the last one ends (k + 1,)."""
+    """Starts of consecutive parts of these sizes (k,), and the end of the last one (k + 1,)."""
     return np.concatenate([[0], np.cumsum(sizes)])
 
 
@@ -102,8 +101,8 @@ def write_fronts(factor: Factor, covariance: FloatArray) -> None:
     (1973), for fronts.
 
     Args:
-        factor: Of n bodies, none of them derived.
-        covariance: (n, n, 3, 3) written; what is in no front stays as it is.
+        factor: Factor of n bodies, none of them appended.
+        covariance: (n, n, 3, 3) written; other entries do not change.
     """
     for f in range(factor.pattern.pivot_begin.size - 2, -1, -1):
         _write_front(factor, f, covariance)
@@ -111,7 +110,7 @@ def write_fronts(factor: Factor, covariance: FloatArray) -> None:
 
 @cached_njit
 def _write_front(factor: Factor, f: int, covariance: FloatArray) -> None:
-    """Write the covariances of the pivots of front f with it, where those of its border stand."""
+    """Write the covariances of the pivots of front f, from those of its border."""
     pattern = factor.pattern
     pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
     border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
@@ -126,20 +125,23 @@ def _write_front(factor: Factor, f: int, covariance: FloatArray) -> None:
 
 
 @cached_njit
-def write_rows(factor: Factor, derived: int, rows: tuple[IntArray, IntArray], covariance: FloatArray) -> None:
-    """Write the covariances of wanted rows, and of bodies derived, where those within other fronts stand.
+def write_rows(
+    factor: Factor, derived: int, rows: IntArray, rows_begin: IntArray, covariance: FloatArray
+) -> None:
+    """Write the covariances of wanted rows and of appended bodies, from those within other fronts.
 
     Args:
-        factor: Of n bodies.
-        derived: So many of the first fronts are of bodies derived: pairs of their borders may be in no front.
-        rows: As `symbolic.wanted_rows` gives them.
-        covariance: (n, n, 3, 3) written; what is not wanted stays as it is.
+        factor: Factor of n bodies.
+        derived: Number of first fronts of appended bodies; pairs of their borders may be in no front.
+        rows: From `symbolic.wanted_rows`.
+        rows_begin: (F + 1,) start of each front's rows.
+        covariance: (n, n, 3, 3) written; other entries do not change.
     """
     pattern = factor.pattern
     for f in range(pattern.pivot_begin.size - 2, -1, -1):
         if f < derived:
             _write_front(factor, f, covariance)
-        wanted = rows[0][rows[1][f] : rows[1][f + 1]]
+        wanted = rows[rows_begin[f] : rows_begin[f + 1]]
         if not wanted.size:
             continue
         pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
@@ -164,7 +166,7 @@ def solve(factor: Factor, right: FloatArray) -> None:
 
 @cached_njit
 def _substitute(factor: Factor, f: int, right: FloatArray) -> None:
-    """Add to the border of front f what its pivots' columns say of it."""
+    """Forward substitution of front f: add the contribution of its pivots to its border."""
     pattern, columns = factor.pattern, right.shape[1]
     pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
     border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
@@ -186,7 +188,7 @@ def _substitute(factor: Factor, f: int, right: FloatArray) -> None:
 
 @cached_njit
 def _substitute_back(factor: Factor, f: int, right: FloatArray) -> None:
-    """Make the columns of the pivots of front f the solution, where those of its border are."""
+    """Back substitution of front f: solve for its pivots, given its border."""
     pattern = factor.pattern
     pivots = pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]
     border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
@@ -229,9 +231,9 @@ def _rows_of(matrix: FloatArray, bodies: IntArray) -> FloatArray:
 
 @cached_njit
 def gathered(covariance: FloatArray, rows: IntArray, columns: IntArray) -> FloatArray:
-    """Covariances (3 r, 3 c) of bodies (r,) with bodies (c,), which stand there either way."""
+    """Covariances (3 r, 3 c) of bodies (r,) with bodies (c,)."""
     out = np.empty((3 * rows.size, 3 * columns.size))
-    for c in range(columns.size):  # rows are many: those of one column stand together
+    for c in range(columns.size):  # most are rows: those of one column are contiguous
         for r in range(rows.size):
             for i in range(3):
                 for j in range(3):
@@ -241,7 +243,7 @@ def gathered(covariance: FloatArray, rows: IntArray, columns: IntArray) -> Float
 
 @cached_njit
 def _scatter(covariance: FloatArray, rows: IntArray, columns: IntArray, values: FloatArray) -> None:
-    """Write covariances (3 r, 3 c) of bodies (r,) with bodies (c,), either way."""
+    """Write covariances (3 r, 3 c) of bodies (r,) with bodies (c,), and their transposes."""
     for c in range(columns.size):
         for r in range(rows.size):
             for i in range(3):

@@ -1,10 +1,10 @@
-"""Errors that far bodies share: those of copies of some bodies, which, unlike these, do not move on.
+"""Low-rank correction: errors that far bodies share, through copies of the errors of some bodies.
 
     x_i = G_i a + y_i,
 
-with combinations a of the errors of copies, independent and of variance 1, and with y, which is independent
-of a and what the factor is about. Measurements of x say with information T of y, with T G of both
-and with G^T T G of a: y is eliminated with T G on the right-hand side, and a is one dense part of the end.
+where a are independent combinations, of unit variance, of the errors of the copies, and y is independent of a
+and represented by the factor. Measurements of x have information T about y, T G about both, and G^T T G about
+a: y is eliminated with T G on the right-hand side, and a is one dense block at the end.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from swarm_loc_estimator.filter.sparse.symbolic import Pattern
 from swarm_loc_estimator.filter.sparse.translation_adjoint import Information
 
 _COPY_SPREAD = np.diag(np.square([3e-5, 3e-5, 3e-4]))
-"""What keeps a copy apart from the body [m^2], [m^2], [rad^2]."""
+"""Variance of a copy given its body [m^2], [m^2], [rad^2]."""
 _PANELS = 4
 
 
 def with_derived(shares: FloatArray, derived: tuple[Derived, ...]) -> FloatArray:
-    """G (n, 3, k) with the shares of more bodies behind."""
+    """G (n, 3, k) with the shares of more bodies appended."""
     if not derived:
         return shares
     out = np.concatenate([shares, np.zeros((len(derived), *shares.shape[1:]))])
@@ -36,9 +36,9 @@ def with_derived(shares: FloatArray, derived: tuple[Derived, ...]) -> FloatArray
 
 
 def renewed(factor: Factor, shares: FloatArray, copied: IntArray) -> FloatArray:
-    """G (n, 3, k) of copies of some bodies (m,) as they are, in place of those there were.
+    """G (n, 3, k) of new copies of bodies (m,), which replace the old copies.
 
-    k is 3 m: fewer combinations of the errors of copies make robots with a single landmark too sure.
+    k is 3 m: with fewer combinations, covariances of robots with a single landmark are too small.
     """
     count, size = factor.pattern.front.size, 3 * copied.size
     columns = (3 * copied[:, None] + np.arange(3)).reshape(-1)
@@ -53,12 +53,12 @@ def renewed(factor: Factor, shares: FloatArray, copied: IntArray) -> FloatArray:
 
 
 def updated(factor: Factor, shares: FloatArray, measured: Information) -> tuple[FloatArray, FloatArray]:
-    """G after measurements, and the correction (n, 3) that they make.
+    """G after measurements, and their correction (n, 3).
 
     Args:
-        factor: Of y, after them.
+        factor: Of y, after the measurements.
         shares: (n, 3, k) G before them.
-        measured: What they say.
+        measured: Information of the measurements.
     """
     count, _, size = shares.shape
     before, gradient = shares.reshape(3 * count, size), measured.gradient.reshape(-1)
@@ -75,7 +75,7 @@ def updated(factor: Factor, shares: FloatArray, measured: Information) -> tuple[
 
 
 def _lower_product(left: FloatArray, right: FloatArray) -> FloatArray:
-    """The lower triangle of left^T right for columns (n, k), in panels: some of the rest is not computed."""
+    """The lower triangle of left^T right for columns (n, k), in panels that skip part of the upper one."""
     size = left.shape[1]
     out = np.zeros((size, size))
     for panel in np.array_split(np.arange(size), min(_PANELS, size)):
@@ -87,7 +87,7 @@ def _lower_product(left: FloatArray, right: FloatArray) -> FloatArray:
 def _whiten(columns: FloatArray, matrix: FloatArray) -> None:
     """Multiply columns (n, k) by K^-T, in place, where K K^T is a matrix (k, k) by its lower triangle.
 
-    By the inverse of K: a product takes half of the time that solving with so many columns does.
+    Uses the inverse of K: the product takes half the time of solving with this many columns.
 
     Raises:
         LinAlgError: The matrix is not positive definite.
@@ -95,7 +95,7 @@ def _whiten(columns: FloatArray, matrix: FloatArray) -> None:
     if matrix.size:
         inverse = np.array(matrix, order="F")
         if not invert_factor(inverse.reshape(-1, order="F"), len(inverse)):
-            raise np.linalg.LinAlgError("what is told of copies is not positive definite")
+            raise np.linalg.LinAlgError("the covariance of the copies is not positive definite")
         blas.dtrmm(1.0, inverse, columns.T, lower=1, overwrite_b=1)
 
 
@@ -115,7 +115,7 @@ def _weigh(measured: Information, shares: FloatArray, out: FloatArray) -> None:
 
 @reassociated_njit
 def shared(shares: FloatArray, first: IntArray, second: IntArray) -> FloatArray:
-    """Covariances (m, 3, 3) that pairs of bodies (m,) have through the copies."""
+    """Covariances (m, 3, 3) of pairs of bodies (m,) through the copies."""
     out = np.zeros((first.size, 3, 3))
     for k in range(first.size):
         for i in range(3):
@@ -129,22 +129,23 @@ def shared(shares: FloatArray, first: IntArray, second: IntArray) -> FloatArray:
 
 @cached_njit
 def change_shared(
-    covariance: FloatArray, pattern: Pattern, place: IntArray, shares: tuple[FloatArray, FloatArray]
+    covariance: FloatArray, pattern: Pattern, place: IntArray, old: FloatArray, new: FloatArray
 ) -> None:
-    """Make the covariances of x into those of y by other copies, for all pairs of a pattern.
+    """Change the covariances of y from old to new copies, for all pairs of a pattern.
 
     Args:
-        covariance: (n, n, 3, 3) of y by G, changed.
-        pattern: Whose pairs are wanted.
-        place: Numbers of the pattern's bodies there.
-        shares: (n, 3, k) G before and from now on.
+        covariance: (n, n, 3, 3) of y, changed.
+        pattern: Pairs to change.
+        place: Numbers of the pattern's bodies in `covariance`.
+        old: (n, 3, k) G of the old copies.
+        new: (n, 3, k) G of the new copies.
     """
     for f in range(pattern.pivot_begin.size - 1):
         pivots = place[pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]]
         border = place[pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]]
         bodies = np.concatenate((border, pivots))
-        change = np.dot(_chosen(shares[0], bodies), _chosen(shares[0], pivots).T)
-        change -= np.dot(_chosen(shares[1], bodies), _chosen(shares[1], pivots).T)
+        change = np.dot(_rows(old, bodies), _rows(old, pivots).T)
+        change -= np.dot(_rows(new, bodies), _rows(new, pivots).T)
         for r in range(bodies.size):
             for c in range(pivots.size):
                 for i in range(3):
@@ -156,7 +157,7 @@ def change_shared(
 
 
 @cached_njit
-def _chosen(shares: FloatArray, bodies: IntArray) -> FloatArray:
+def _rows(shares: FloatArray, bodies: IntArray) -> FloatArray:
     """The shares (3 m, k) of some bodies (m,)."""
     out = np.empty((3 * bodies.size, shares.shape[2]))
     for r in range(bodies.size):

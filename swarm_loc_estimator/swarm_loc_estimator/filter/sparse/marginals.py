@@ -1,4 +1,4 @@
-"""Covariances of each body with its own parameters, and what has become of them since the newest factor."""
+"""Covariances of each body with its own parameters, and their changes since the newest factor."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.filter.calibration_states import BLOCKS, DRIVES
 from swarm_loc_estimator.filter.sparse.factor import Derived
 from swarm_loc_estimator.filter.sparse.parameters import Groups, Moves
-from swarm_loc_estimator.filter.sparse.translation_adjoint import levers
+from swarm_loc_estimator.filter.sparse.translation_adjoint import translation_adjoints
 
 _DRIVEN = slice(3, 3 + DRIVES)
 
 
 class Marginals:
-    """Each body's own covariance, as predictions change it.
+    """The marginal covariance of each body with its parameters, as predictions change it.
 
     Args:
         groups: Which bodies have blocks of parameters.
 
     Attributes:
-        groups: Likewise.
+        groups: Which bodies have blocks of parameters.
         current: (n, w, w) see `JointFilter.marginal`.
         driven: (robots, 4, DRIVES) see `JointFilter.driven`.
     """
@@ -44,7 +44,7 @@ class Marginals:
         return other
 
     def grow(self, groups: Groups) -> None:
-        """Have more bodies or blocks, without error."""
+        """Append bodies or blocks, without error."""
         self.groups, driven = groups, _undriven(groups)
         driven[: len(self.driven)] = self.driven
         self.current, self._settled, self.driven = (
@@ -54,7 +54,7 @@ class Marginals:
         )
 
     def place(self, bodies: IntArray, own: IntArray, covariances: FloatArray) -> None:
-        """Give columns (c,) of bodies (k,) covariances (k, c, c), independent of what else is theirs."""
+        """Give columns (c,) of bodies (k,) covariances (k, c, c), independent of their other columns."""
         for known in (self.current, self._settled):
             known[bodies[:, None], own], known[bodies[:, None], :, own] = 0.0, 0.0
             known[bodies[:, None, None], own[:, None], own] = covariances
@@ -62,16 +62,16 @@ class Marginals:
             self.driven[bodies[bodies < len(self.driven)], :3] = 0.0
 
     def settle(self, bodies: IntArray) -> None:
-        """Take them for bodies (k,) as those of the newest factor."""
+        """Take the present marginals of bodies (k,) as those of the newest factor."""
         self._settled[bodies] = self.current[bodies]
         robots = bodies[bodies < len(self.driven)]
         self.driven[robots, :3], self.driven[robots, 3] = 0.0, 1.0
 
     def within(self, bodies: IntArray) -> Iterator[tuple[tuple[slice, slice], IntArray, IntArray, IntArray]]:
-        """Pairs of a body's parts, itself or its blocks, for bodies (k,).
+        """Pairs of parts of bodies (k,); a part is the body or one of its blocks.
 
         Yields:
-            Rows and columns of both parts, whose of the bodies they are (m,), and the parts (m,) themselves.
+            Rows and columns of both parts, indices (m,) into `bodies`, and the two parts (m,).
         """
         parts = range(self.current.shape[1] // 3)
         first = np.arange(bodies.size)
@@ -85,12 +85,16 @@ class Marginals:
                 yield where, robots[there], member[there, row], member[there, column]
 
     def since(self, bodies: IntArray, places: FloatArray) -> tuple[FloatArray, Moves]:
-        """What has become of the errors of bodies (k,) since the newest factor, about places (n, 2).
+        """Changes of the errors of bodies (k,) since the newest factor, about reference points (n, 2).
 
         Returns:
-            The noise (k, w, w) in them and their parameters, and how else these have moved.
+            Process noise (k, w, w) of bodies and parameters, and the transition.
         """
-        count, before, lever = self.groups.owner.size, self._settled[bodies], levers(places[bodies])
+        count, before, adjoint = (
+            self.groups.owner.size,
+            self._settled[bodies],
+            translation_adjoints(places[bodies]),
+        )
         moves = Moves(np.full(count, -1), np.zeros((count, 3, 3)), np.ones((count, 3)))
         if len(self.driven):
             of_robots = np.flatnonzero(bodies < len(self.driven))
@@ -102,46 +106,46 @@ class Marginals:
             before = follow @ before @ follow.transpose(0, 2, 1)
             moved = driven[:, :3].any(axis=(1, 2))
             moves.beside[robots[moved]] = blocks[moved]
-            moves.gain[robots] = lever[of_robots] @ driven[:, :3]
+            moves.gain[robots] = adjoint[of_robots] @ driven[:, :3]
             moves.left[blocks[blocks >= 0]] = driven[blocks >= 0, 3]
         noise = self.current[bodies] - before
-        noise[:, :3] = lever @ noise[:, :3]
-        noise[:, :, :3] = noise[:, :, :3] @ lever.transpose(0, 2, 1)
+        noise[:, :3] = adjoint @ noise[:, :3]
+        noise[:, :, :3] = noise[:, :, :3] @ adjoint.transpose(0, 2, 1)
         return noise, moves
 
 
 def _width(groups: Groups) -> int:
-    """Columns of a body with its parameters: where there are none, those of the body."""
+    """Columns of a body with its parameters, or of the body alone where there are no parameters."""
     return 3 * (1 + BLOCKS) if (groups.member[:, 1:] >= 0).any() else 3
 
 
 def _enlarged(known: FloatArray, groups: Groups) -> FloatArray:
-    """The same (n, w, w) for more bodies and blocks, without error."""
+    """Covariances (n, w, w) with more bodies and blocks, without error."""
     out = np.zeros((groups.owner.size, _width(groups), _width(groups)))
     out[: len(known), : known.shape[1], : known.shape[1]] = known
     return out
 
 
 def _undriven(groups: Groups) -> FloatArray:
-    """No move; where there are no parameters, of no robot."""
+    """The identity transition; for no robot where there are no parameters."""
     robots = len(groups.member) if _width(groups) > 3 else 0
     return np.tile(np.vstack([np.zeros((3, DRIVES)), np.ones(DRIVES)]), (robots, 1, 1))
 
 
-def derived_by(moves: Moves, group: tuple[int, int], noise: FloatArray, numbers: IntArray) -> list[Derived]:
-    """The blocks and the pose of one robot after moves, each to be appended behind those before.
+def derived_by(moves: Moves, robot: int, block: int, noise: FloatArray, numbers: IntArray) -> list[Derived]:
+    """The blocks and the pose of one robot after a transition, to be appended.
 
     Args:
-        moves: What becomes of them.
-        group: The robot and the block that moves it; -1: none.
-        noise: (w, w) covariance of what the pose and the blocks have gained; of the block that moves the
-            pose each column has noise of its own.
-        numbers: (2 + BLOCKS,) of the pose and the blocks before, and of the next body to come; -1: none.
+        moves: The transition.
+        robot: The robot.
+        block: The block that changes its pose; -1: none.
+        noise: (w, w) process noise of the pose and the blocks; diagonal within `block`.
+        numbers: (2 + BLOCKS,) of the pose and the blocks before, and of the next body; -1: none.
 
     Returns:
         The new blocks in their order, then the pose.
     """
-    out, (robot, block) = [], group
+    out: list[Derived] = []
     gain, left = moves.gain[robot], moves.left[block]
     for k in range(1, 1 + BLOCKS):
         if numbers[k] >= 0:

@@ -1,4 +1,4 @@
-"""The graph of who shares errors with whom: who has measured whom of late, and who stands near whom."""
+"""The graph of bodies with correlated errors: pairs that measured each other recently, and near pairs."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Adjacency(NamedTuple):
     """Neighbours of each of n bodies.
 
     Attributes:
-        begin: (n + 1,) where those of each begin.
-        neighbour: Who they are.
+        begin: (n + 1,) start of the neighbours of each body.
+        neighbour: (k,) bodies.
     """
 
     begin: IntArray
@@ -26,13 +26,13 @@ class Adjacency(NamedTuple):
 
 
 def adjacency(count: int, pairs: IntArray) -> Adjacency:
-    """Who the neighbours of `count` bodies are by pairs (k, 2), each named once or more."""
+    """The neighbours of `count` bodies by pairs (k, 2), which may repeat."""
     return _adjacency(count, np.ascontiguousarray(pairs))
 
 
 @cached_njit
 def _adjacency(count: int, pairs: IntArray) -> Adjacency:
-    """The neighbours of each in order, without sorting them."""
+    """The neighbours of each body in ascending order, without sorting."""
     named = np.zeros(count + 1, dtype=np.int64)
     for k in range(len(pairs)):
         for body in pairs[k]:
@@ -44,7 +44,7 @@ def _adjacency(count: int, pairs: IntArray) -> Adjacency:
             naming[place[pairs[k, side]]] = pairs[k, 1 - side]
             place[pairs[k, side]] += 1
     neighbour, place, last = np.empty_like(naming), begin[:count].copy(), np.full(count, -1)
-    for body in range(count):  # in order, so that each is written behind smaller ones
+    for body in range(count):  # ascending, so that each is written after smaller ones
         for other in naming[begin[body] : begin[body + 1]]:
             if other != body and last[other] != body:
                 neighbour[place[other]] = last[other] = body
@@ -59,7 +59,7 @@ def _adjacency(count: int, pairs: IntArray) -> Adjacency:
 
 
 def near_pairs(places: FloatArray) -> IntArray:
-    """Pairs (k, 2) of places (n, 2): each with its nearest, and the Gabriel graph, which is connected."""
+    """Pairs (k, 2) of positions (n, 2): nearest neighbours, and the Gabriel graph, which is connected."""
     count = len(places)
     nearest = min(_NEAREST, count - 1)
     if nearest < 1:
@@ -70,7 +70,7 @@ def near_pairs(places: FloatArray) -> IntArray:
 
 
 def _gabriel(places: FloatArray) -> IntArray:
-    """Pairs (k, 2) in whose diametral circle no other place lies."""
+    """Pairs (k, 2) in whose diametral circle no other position lies."""
     try:
         begin, neighbour = Delaunay(places).vertex_neighbor_vertices
     except (QhullError, ValueError):  # fewer than four places, or all in a line
@@ -81,17 +81,17 @@ def _gabriel(places: FloatArray) -> IntArray:
     a, b = places[pairs[:, 0]], places[pairs[:, 1]]
     nearest, _ = cKDTree(places).query(0.5 * (a + b))
     empty = nearest**2 >= 0.25 * np.sum((a - b) ** 2, axis=1) * (1.0 - 1e-9)
-    chosen: IntArray = pairs[empty]
-    return chosen
+    gabriel: IntArray = pairs[empty]
+    return gabriel
 
 
 def spread(places: FloatArray, count: int) -> IntArray:
-    """So many of places (n, 2) that lie far from each other; the first is the one nearest to their middle."""
+    """A subset (count,) of positions (n, 2) that lie far apart; the first is nearest to the mean."""
     if not min(count, len(places)):
         return np.zeros(0, dtype=np.int64)
-    chosen = [int(np.argmin(np.sum((places - places.mean(axis=0)) ** 2, axis=1)))]
-    distance = np.sum((places - places[chosen[0]]) ** 2, axis=1)
-    while len(chosen) < min(count, len(places)):
-        chosen.append(int(np.argmax(distance)))
-        distance = np.minimum(distance, np.sum((places - places[chosen[-1]]) ** 2, axis=1))
-    return np.array(chosen, dtype=np.int64)
+    picked = [int(np.argmin(np.sum((places - places.mean(axis=0)) ** 2, axis=1)))]
+    distance = np.sum((places - places[picked[0]]) ** 2, axis=1)
+    while len(picked) < min(count, len(places)):
+        picked.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.sum((places - places[picked[-1]]) ** 2, axis=1))
+    return np.array(picked, dtype=np.int64)

@@ -1,7 +1,7 @@
-"""Which order of elimination is used for how many updates.
+"""Order of elimination of an update: reused for some updates, then replaced.
 
-The next order is found from what was known at the update before. So all that begins from there has the same
-one, whatever has come of the newest measurements as yet, and it is sought once.
+The next order is computed from the situation of the previous update. So every recomputation that starts there
+uses the same order, whatever measurements have arrived since, and the order is computed once.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from swarm_loc_estimator.filter.sparse.symbolic import Pattern, pattern_of
 
 _ORDERED_AGAIN = 3
 _GROWN = 1.2
-"""An order is replaced after so many updates, or when its largest front has grown so much."""
+"""An order is replaced after this number of updates, or when its largest front has grown by this factor."""
 _NEAR_AGAIN = 9
-"""After so many updates it is found out again who is near whom."""
+"""Number of updates after which near pairs are computed again."""
 
 
 class Situation(NamedTuple):
-    """What an order is sought for.
+    """The bodies and pairs of an update.
 
     Attributes:
-        bodies: Those that are there, ascending.
-        blocks: Of parameters, which are eliminated before all bodies.
+        bodies: Active bodies, ascending.
+        blocks: Blocks of parameters, which are eliminated before all bodies.
         places: (n, 2) of all bodies.
-        pairs: (k, 2) bodies of which one has measured the other of late, and those that follow from blocks.
+        pairs: (k, 2) bodies of which one has measured the other recently, and pairs that follow from blocks.
     """
 
     bodies: IntArray
@@ -40,16 +40,16 @@ class Situation(NamedTuple):
     pairs: IntArray
 
     def near(self) -> IntArray:
-        """Pairs (k, 2) of bodies that are near each other."""
+        """Pairs (k, 2) of near bodies."""
         pairs: IntArray = self.bodies[near_pairs(self.places[self.bodies])]
         return pairs
 
     def pattern(self, order: Order, near: IntArray) -> Pattern:
-        """The pattern in which all pairs lie."""
+        """The pattern that contains all pairs."""
         return pattern_of(order, adjacency(len(self.places), np.concatenate([self.pairs, near])))
 
     def order(self, near: IntArray) -> Order:
-        """An order of its own."""
+        """A new order, by nested dissection."""
         graph = adjacency(len(self.places), np.concatenate([self.pairs, near]))
         blocks, dissected = self.blocks, dissect(self.bodies, self.places, graph)
         return Order(
@@ -58,23 +58,33 @@ class Situation(NamedTuple):
         )
 
     def has_same(self, other: Situation) -> bool:
-        """Whether the same are there as in another one."""
+        """Whether bodies and blocks are the same as in another situation."""
         same = np.array_equal(self.bodies, other.bodies)
         return same and np.array_equal(self.blocks.body, other.blocks.body)
 
 
+class NearPairs(NamedTuple):
+    """Pairs (k, 2) of near bodies, and the number of updates that have used them."""
+
+    pairs: IntArray
+    updates: int
+
+    def used_again(self) -> NearPairs:
+        """The same pairs after one more update."""
+        return self._replace(updates=self.updates + 1)
+
+
 @dataclass(frozen=True, eq=False)
 class Ordering:
-    """An order of elimination, and the pattern that it gives one update.
+    """An order of elimination and the pattern of one update.
 
     Attributes:
-        situation: At the update.
-        pattern: In which all pairs of the situation lie.
+        situation: Bodies and pairs of the update.
+        pattern: Contains all pairs of the situation.
         order: Of all active bodies and blocks.
-        updates: For how many it has been used.
-        width: Of its largest front at first.
-        near: (k, 2) pairs of bodies that are near each other.
-        near_updates: For how many updates these have been used.
+        updates: Number of updates that have used the order.
+        width: Size of its largest front at first use.
+        near: Near pairs.
     """
 
     situation: Situation
@@ -82,37 +92,35 @@ class Ordering:
     order: Order
     updates: int
     width: int
-    near: IntArray
-    near_updates: int
+    near: NearPairs
 
     @cached_property
-    def next_near(self) -> tuple[IntArray, int]:
-        """Who is near whom from the next order on, and for how many updates that has been used by then."""
-        if self.near_updates < _NEAR_AGAIN:
-            return self.near, self.near_updates + 1
-        return self.situation.near(), 1
+    def next_near(self) -> NearPairs:
+        """The near pairs of the next order."""
+        if self.near.updates < _NEAR_AGAIN:
+            return self.near.used_again()
+        return NearPairs(self.situation.near(), 1)
 
     @cached_property
     def next_order(self) -> Order:
-        """What follows this order."""
-        return self.situation.order(self.next_near[0])
+        """The order after this one."""
+        return self.situation.order(self.next_near.pairs)
 
 
 def ordered(situation: Situation, before: Ordering | None) -> Ordering:
-    """The ordering of an update after another one; None: there was none."""
+    """The ordering of an update; `before` is that of the previous update, None at first."""
     if before is None or not situation.has_same(before.situation):
-        near = situation.near()
-        return _begun(situation, situation.order(near), (near, 1))
+        near = NearPairs(situation.near(), 1)
+        return _with_new_order(situation, situation.order(near.pairs), near)
     if before.updates >= _ORDERED_AGAIN:
-        return _begun(situation, before.next_order, before.next_near)
-    near, near_updates = before.near, before.near_updates + 1
-    pattern = situation.pattern(before.order, near)
+        return _with_new_order(situation, before.next_order, before.next_near)
+    pattern = situation.pattern(before.order, before.near.pairs)
     if pattern.width > _GROWN * before.width:
-        return _begun(situation, situation.order(before.next_near[0]), before.next_near)
-    return Ordering(situation, pattern, before.order, before.updates + 1, before.width, near, near_updates)
+        return _with_new_order(situation, situation.order(before.next_near.pairs), before.next_near)
+    near = before.near.used_again()
+    return Ordering(situation, pattern, before.order, before.updates + 1, before.width, near)
 
 
-def _begun(situation: Situation, order: Order, near: tuple[IntArray, int]) -> Ordering:
-    """An ordering with a new order."""
-    pattern = situation.pattern(order, near[0])
-    return Ordering(situation, pattern, order, 1, pattern.width, *near)
+def _with_new_order(situation: Situation, order: Order, near: NearPairs) -> Ordering:
+    pattern = situation.pattern(order, near.pairs)
+    return Ordering(situation, pattern, order, 1, pattern.width, near)

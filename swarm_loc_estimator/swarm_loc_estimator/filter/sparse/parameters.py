@@ -1,11 +1,11 @@
-"""Parameters of robots in the sparse filter: blocks of three columns, which move the pose beside them.
+"""Parameters of robots in the sparse filter: blocks of three columns that change the error of their pose.
 
 Between two updates the errors x of a robot's pose and z of the parameters of its motion become
 
     x + A z + w,    L z + v,    L diagonal,
 
-where the noises w and v may be correlated. Blocks are eliminated before all bodies, those of each robot in a
-front of their own whose border is the robot and what it has measured of late.
+where the noises w and v may be correlated. Blocks are eliminated before all bodies, those of each robot in
+one front, whose border is the robot and what it has measured recently.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from swarm_loc_estimator.filter.sparse.symbolic import Pattern
 
 
 class Groups(NamedTuple):
-    """What belongs to which of n bodies and blocks.
+    """The robots, bodies and blocks that belong together, for n bodies and blocks.
 
     Attributes:
-        member: (N, 1 + BLOCKS) of each robot itself and its blocks; -1: there is none.
-        owner: (n,) the robot of each block; of bodies themselves.
-        part: (n,) 0 of a body, which block of its robot otherwise.
+        member: (N, 1 + BLOCKS) each robot's body and its blocks; -1: none.
+        owner: (n,) the robot of each block; a body is its own owner.
+        part: (n,) 0 for a body, else the number of the block within its robot.
     """
 
     member: IntArray
@@ -36,7 +36,7 @@ class Groups(NamedTuple):
 
     @classmethod
     def of(cls, table: ParameterTable) -> Groups:
-        """Those of a table with blocks."""
+        """The groups of a parameter table."""
         robots = np.arange(table.column.shape[0])
         member = np.column_stack([robots, table.block_columns // DRIVES])
         owner = np.arange(table.filter_size // DRIVES)
@@ -47,16 +47,16 @@ class Groups(NamedTuple):
         return cls(member, owner, part)
 
     def columns(self, columns: IntArray) -> tuple[int, IntArray]:
-        """Whose these columns (k,) of one body or one robot's blocks are, and which of its own (k,)."""
+        """The owner of columns (k,) of one body or one robot's blocks, and their numbers (k,) within it."""
         blocks, slots = np.divmod(columns, DRIVES)
         return int(self.owner[blocks[0]]), DRIVES * self.part[blocks] + slots
 
 
 class Moves(NamedTuple):
-    """How errors of n bodies and blocks have become others.
+    """Transition of the errors of n bodies and blocks.
 
     Attributes:
-        beside: (n,) the block that moves each body; -1: none.
+        beside: (n,) the block whose error changes each body's; -1: none.
         gain: (n, 3, 3) A.
         left: (n, 3) L.
     """
@@ -66,12 +66,12 @@ class Moves(NamedTuple):
     left: FloatArray
 
     def any(self) -> bool:
-        """Whether anything has moved."""
+        """Whether the transition is not the identity."""
         return bool((self.beside >= 0).any() or (self.left != 1.0).any())
 
 
 def active_blocks(groups: Groups, active: BoolArray) -> Order:
-    """The blocks that are active, in the order of their elimination: those of a robot together."""
+    """The active blocks in the order of their elimination: those of a robot together."""
     blocks = groups.member[:, 1:]
     there = (blocks >= 0) & active[blocks]
     counts = there.sum(axis=1)
@@ -79,12 +79,12 @@ def active_blocks(groups: Groups, active: BoolArray) -> Order:
 
 
 def block_pairs(groups: Groups, active: BoolArray, measured: IntArray) -> IntArray:
-    """Pairs (k, 2) that follow from blocks: each robot's, itself and what it has measured are neighbours.
+    """Pairs (k, 2) that follow from blocks: among a robot, its blocks and what it has measured.
 
     Args:
-        groups: Of whom there are blocks.
-        active: (n,) who is there.
-        measured: (m, 2) observers and what they have measured, all of them active.
+        groups: Robots and their blocks.
+        active: (n,) active bodies and blocks.
+        measured: (m, 2) observers and what they have measured, all active.
     """
     robots = np.arange(len(groups.member))
     has_blocks = np.zeros(active.size, dtype=bool)
@@ -100,7 +100,7 @@ def block_pairs(groups: Groups, active: BoolArray, measured: IntArray) -> IntArr
 
 @cached_njit
 def _cliques(pairs: IntArray, bodies: int) -> IntArray:
-    """All pairs (k, 2) of what is paired with the same first one, of so many bodies."""
+    """All pairs (k, 2) among bodies that are paired with the same first body."""
     order = np.argsort(pairs[:, 0], kind="mergesort")
     seen, last = np.empty(order.size, dtype=np.int64), np.full(bodies, -1, dtype=np.int64)
     out, written, begin = np.empty((16 * order.size, 2), dtype=np.int64), 0, 0
@@ -126,16 +126,16 @@ def _cliques(pairs: IntArray, bodies: int) -> IntArray:
 
 @cached_njit
 def move(covariance: FloatArray, pattern: Pattern, place: IntArray, moves: Moves) -> None:
-    """Let errors become what they are by now, for all pairs of a pattern.
+    """Apply a transition to the covariances of all pairs of a pattern.
 
     Args:
-        covariance: (n, n, 3, 3) changed; of pairs of whoever is moved, those of what moves it are there, too.
-        pattern: Whose pairs are wanted.
-        place: Numbers of the pattern's bodies there.
-        moves: What becomes of these.
+        covariance: (n, n, 3, 3) changed; includes the pairs of the blocks that change a body.
+        pattern: Pairs to change.
+        place: Numbers of the pattern's bodies in `covariance`.
+        moves: The transition.
     """
     room = np.empty((2, 3, 3))
-    # what moves others changes after these: first pairs of two that are moved, then of one, then of none
+    # blocks change after the bodies that depend on them: pairs of two such bodies first, then of one, of none
     for moved in (2, 1, 0):
         for f in range(pattern.pivot_begin.size - 1):
             for k in range(pattern.pivot_begin[f], pattern.pivot_begin[f + 1]):
@@ -154,7 +154,7 @@ def move(covariance: FloatArray, pattern: Pattern, place: IntArray, moves: Moves
 def _move_pair(
     covariance: FloatArray, a: int, b: int, place: IntArray, moves: Moves, room: FloatArray
 ) -> None:
-    """Move the covariance of a pair, either way; `room` (2, 3, 3) is written."""
+    """Apply the transition to both blocks of a pair; `room` (2, 3, 3) is workspace."""
     row, column = place[a], place[b]
     by_a, by_b = moves.beside[a], moves.beside[b]
     for i in range(3):
@@ -181,7 +181,7 @@ def _move_pair(
 
 
 def moved_shares(shares: FloatArray, place: IntArray, moves: Moves) -> FloatArray:
-    """The shares (n, 3, k) of copies after moves; copies stay."""
+    """The shares (n, 3, k) of copies after a transition; copies do not change."""
     out: FloatArray = shares.copy()
     bodies = np.flatnonzero(moves.beside >= 0)
     out[place[bodies]] += moves.gain[bodies] @ shares[place[moves.beside[bodies]]]

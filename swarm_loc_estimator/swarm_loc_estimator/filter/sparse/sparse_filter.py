@@ -1,4 +1,4 @@
-"""The sparse filter: errors of bodies and of parameters on a chordal pattern, which follows who sees whom."""
+"""The sparse filter: errors of bodies and parameters, a Gaussian on the chordal pattern of recent pairs."""
 
 from __future__ import annotations
 
@@ -36,24 +36,24 @@ from swarm_loc_estimator.filter.sparse.translation_adjoint import (
     carried_pairs,
     centres,
     information_of,
-    levers,
     summed,
+    translation_adjoints,
 )
 
 _COPIES = 64
 _COPIED_SHARE = 4
-"""One of so many bodies is copied, at most."""
+"""At most one of this number of bodies is copied."""
 _COPIED_AGAIN = 100
-"""Updates after which other bodies are copied: copies grow old, but each new choice forgets something."""
+"""Updates after which other bodies are copied: copies become stale, but each change loses correlations."""
 _PAIRS_KEPT, _PAIRS_KEPT_WITH_BLOCKS = 3, 2
-"""Pairs of so many updates count as neighbours; with blocks all that a robot has measured are neighbours."""
+"""Updates whose pairs count as neighbours, without and with blocks of parameters."""
 _FAR_M = 20.0
-"""A body so far from where its error is held about is held about another place."""
+"""Distance from its reference point beyond which the error of a body gets a new reference point."""
 _NOBODY: IntArray = np.zeros(0, dtype=np.int64)
 
 
 class _Prepared(NamedTuple):
-    """What an update needs: the pattern, covariances and shares of copies before it, who is active."""
+    """The pattern of an update, covariances and shares of copies before it, and the active bodies."""
 
     pattern: Pattern
     prior: Prior
@@ -67,12 +67,12 @@ class _Prepared(NamedTuple):
 
 
 class SparseFilter:
-    """Errors of bodies, of which those of bodies that are not neighbours are known through others.
+    """Errors of bodies; those of bodies that are not neighbours are correlated through others.
 
-    Three columns each are those of a body, or of a block of a robot's parameters.
+    Each body, and each block of a robot's parameters, has three columns.
 
     Args:
-        table: Which columns there are, in blocks; each starts with unit variance, independent.
+        table: Columns in blocks; each starts independent, with unit variance.
     """
 
     sequential = False
@@ -90,7 +90,7 @@ class SparseFilter:
         self._ordering: Ordering | None = None
         self._updates = 0
         self._prepared: _Prepared | None = None
-        self._room = _Room(count)
+        self._workspace = _Workspace(count)
 
     def copy(self) -> SparseFilter:
         """An independent copy; factors are shared, since they are never written to."""
@@ -111,11 +111,11 @@ class SparseFilter:
 
     @property
     def _groups(self) -> Groups:
-        """Which bodies have blocks."""
+        """The blocks of each body."""
         return self._marginals.groups
 
     def place(self, columns: IntArray, covariance: FloatArray) -> None:
-        """Give columns (k,) this covariance (k, k), independent of the rest, whatever was known."""
+        """Give columns (k,) this covariance (k, k), independent of all others."""
         if columns.size and self._groups.part[columns[0] // 3]:
             blocks, variances = columns // 3, np.diag(covariance)
             for block in np.unique(blocks).tolist():
@@ -125,7 +125,7 @@ class SparseFilter:
             self.place_bodies(columns[:1] // 3, covariance[None])
 
     def _place_parameters(self, columns: IntArray, variances: FloatArray) -> None:
-        """Likewise parameters (k,) of one block; what else stands there stays as it is."""
+        """Give parameters (k,) of one block these variances; its other parameters do not change."""
         (robot, own), block = self._groups.columns(columns), columns[:1] // 3
         spread, kept = np.ones(3), np.ones(3)
         kept[columns % 3] = 0.0
@@ -139,30 +139,30 @@ class SparseFilter:
         self._marginals.place(np.array([robot]), own, np.diag(variances)[None])
 
     def place_bodies(self, bodies: IntArray, covariances: FloatArray) -> None:
-        """Likewise the columns of bodies (k,), each with a covariance (k, 3, 3) of its own."""
+        """Give bodies (k,) covariances (k, 3, 3), each independent of all others."""
         self._place[bodies] = centres(covariances)
         own = carried(self._place[bodies], covariances)
         self._append(bodies, [Derived(_NOBODY, np.zeros((0, 3)), one) for one in own])
         self._marginals.place(bodies, np.arange(3), covariances)
 
     def _append(self, bodies: IntArray, derived: Sequence[Derived]) -> None:
-        """Let bodies (k,) be new ones."""
+        """Append new bodies (k,)."""
         self._number[bodies] = self._next_number + np.arange(len(derived))
         self._new += tuple(derived)
 
     @property
     def _next_number(self) -> int:
-        """That of the next body to come."""
+        """The number of the next body to append."""
         return self._factor.pattern.front.size + len(self._new)
 
     def add(self, columns: IntArray, covariance: FloatArray) -> None:
-        """Add a covariance (k, k) to that of columns (k,): their errors are larger than was known."""
+        """Add a covariance (k, k) to that of columns (k,)."""
         if columns.size:
             body, own = self._groups.columns(columns)
             self.marginal[body, own[:, None], own] += covariance
 
     def grow(self, table: ParameterTable) -> None:
-        """Append the columns that a table has more, without error as yet: they are placed next."""
+        """Append the additional columns of a table, without error; their prior is set next."""
         more = table.filter_size // 3 - self._number.size
         self._marginals.grow(Groups.of(table))
         self._place = np.concatenate([self._place, np.zeros((more, 2))])
@@ -170,9 +170,9 @@ class SparseFilter:
         self._ordering = None
 
     def relate(self, columns: IntArray, others: IntArray, mapping: FloatArray) -> None:
-        """Add the errors of other bodies' columns (m,), mapped by (3, m), to those of a body just placed.
+        """Add the errors of other bodies' columns (m,), mapped by (3, m), to those of a body just appended.
 
-        Until the next update its marginal is that of others which err alike.
+        Until the next update its marginal assumes that the other bodies have the same error.
         """
         if others.size == 0:
             return
@@ -180,8 +180,11 @@ class SparseFilter:
         placed, self._new = self._new[-1], self._new[:-1]
         for other in np.unique(bodies).tolist():
             self._take_in(other)
-        lever, back = levers(self._place[[body]])[0], levers(-self._place[bodies])
-        shares = lever @ mapping.reshape(3, -1, 3).transpose(1, 0, 2) @ back
+        adjoint, back = (
+            translation_adjoints(self._place[[body]])[0],
+            translation_adjoints(-self._place[bodies]),
+        )
+        shares = adjoint @ mapping.reshape(3, -1, 3).transpose(1, 0, 2) @ back
         alike = np.linalg.cholesky(carried(self._place[bodies], self.marginal[bodies, :3, :3]))
         common = np.sum(shares @ alike, axis=0)
         gain = shares.transpose(0, 2, 1).reshape(-1, 3)
@@ -191,7 +194,7 @@ class SparseFilter:
         self._marginals.place(np.array([body]), np.arange(3), own)
 
     def _take_in(self, body: int) -> None:
-        """Take what a body's errors have become since the newest factor into them, so others share it."""
+        """Append a body with the changes of its error since the newest factor, for others to share."""
         noise, moves = self._marginals.since(np.array([body]), self._place)
         if not noise.any() and moves.beside[body] < 0:
             return
@@ -199,7 +202,7 @@ class SparseFilter:
         blocks = self._groups.member[body] if is_robot else np.array([body] + BLOCKS * [-1])
         numbers = np.where(blocks >= 0, self._number[blocks], -1)
         derived = derived_by(
-            moves, (int(body), int(blocks[1])), noise[0], np.append(numbers, self._next_number)
+            moves, int(body), int(blocks[1]), noise[0], np.append(numbers, self._next_number)
         )
         present = blocks[[*range(1, 1 + BLOCKS), 0]]
         self._append(present[(present >= 0) & (self._number[present] >= 0)], derived)
@@ -214,13 +217,13 @@ class SparseFilter:
         return covariance
 
     def relate_pairs(self, columns: IntArray, robots: Robots, across: FloatArray) -> None:
-        """Write covariances of what measurements (m,) depend on, before an update with them.
+        """Write the covariances between the bodies of measurements (m,), before an update with them.
 
         Args:
-            columns: (m, 3) the first columns of observers, targets and observers' cameras; -1: there is none.
-            robots: Where all are.
-            across: (m, 3, 5) written: of the observers' errors with the targets', and of these with those of
-                the cameras; those that there are none of do not matter.
+            columns: (m, 3) first columns of observers, targets and observers' cameras; -1: none.
+            robots: Positions of all robots.
+            across: (m, 3, 5) written: covariances of observers with targets, and of targets with cameras;
+                undefined where there is none.
         """
         tied = (columns[:, :2] >= 0).all(axis=1)
         bodies = columns // 3
@@ -230,9 +233,9 @@ class SparseFilter:
         across[seen, :, 3:] = self._about_map(prepared.covariance_of, *bodies[seen, 1:].T)[:, :, :2]
 
     def _prepare(self, pairs: IntArray, robots: Robots) -> _Prepared:
-        """Have the covariances of all pairs of a pattern that pairs (k, 2) fit into."""
+        """Compute the covariances of a pattern that contains pairs (k, 2)."""
         count = robots.active.size
-        # landmarks stand where they were placed
+        # landmarks stay at their reference points
         places = np.concatenate([robots.places, self._place[count:]])
         active = np.flatnonzero(np.concatenate([robots.active, self._number[count:] >= 0]))
         bodies = active[self._groups.part[active] == 0]
@@ -241,9 +244,9 @@ class SparseFilter:
         pattern = self._pattern(pairs, active, places)
         noise, moves = self._marginals.since(bodies, self._place)
         rows = wanted_rows(factor.pattern, pattern, self._number, len(self._new), moves.beside)
-        covariance = self._room.with_fronts(self._factor, len(self._new))
-        write_rows(factor, len(self._new), rows, covariance)
-        self._room.holds = None  # since noise is added to it
+        covariance = self._workspace.with_fronts(self._factor, len(self._new))
+        write_rows(factor, len(self._new), *rows, covariance)
+        self._workspace.holds = None  # since noise is added to it
         others = None
         if self._updates % _COPIED_AGAIN == 0:
             copied = bodies[spread(places[bodies], min(_COPIES, bodies.size // _COPIED_SHARE))]
@@ -253,7 +256,7 @@ class SparseFilter:
             shares = moved_shares(shares, self._number, moves)
             others = None if others is None else moved_shares(others, self._number, moves)
         if others is not None:
-            copies.change_shared(covariance, pattern, self._number, (shares, others))
+            copies.change_shared(covariance, pattern, self._number, shares, others)
             shares = others
         self._updates += 1
         self._add_noise(covariance, bodies, noise)
@@ -262,7 +265,7 @@ class SparseFilter:
         return self._prepared
 
     def _add_noise(self, covariance: FloatArray, bodies: IntArray, noise: FloatArray) -> None:
-        """Add what bodies (k,) have gained, with their blocks, to covariances by number."""
+        """Add the process noise of bodies (k,) and their blocks to covariances by number."""
         for (row, column), of, first, second in self._marginals.within(bodies):
             covariance[self._number[first], self._number[second]] += noise[of, row, column]
 
@@ -270,22 +273,22 @@ class SparseFilter:
         """Shares of copies (n, 3, r) of all bodies, from those by number."""
         numbers = self._number[active]
         if np.array_equal(numbers, np.arange(self._number.size)):
-            return shares  # all are there, as they were before
+            return shares  # all bodies are active, with unchanged numbers
         by_body = np.zeros((self._number.size, 3, shares.shape[2]))
         by_body[active] = shares[numbers]
         return by_body
 
     def _move_far(self, active: IntArray, places: FloatArray) -> None:
-        """Hold the errors of bodies that have gone far about where they are now."""
+        """Move the reference points of bodies that are far from them to their present positions."""
         moved = places[active] - self._place[active]
         far = active[np.hypot(moved[:, 0], moved[:, 1]) > _FAR_M]
-        turns = levers(places[far] - self._place[far])
+        turns = translation_adjoints(places[far] - self._place[far])
         for body, turn in zip(far[:, None], turns, strict=True):
             self._append(body, [Derived(self._number[body], turn.T.copy(), np.zeros((3, 3)))])
         self._place[far] = places[far]
 
     def _pattern(self, pairs: IntArray, active: IntArray, places: FloatArray) -> Pattern:
-        """A pattern in which all these pairs (k, 2) lie, in the order in use or a new one."""
+        """A pattern that contains all these pairs (k, 2), by the present order or a new one."""
         here = np.zeros(self._number.size, dtype=bool)
         here[active] = True
         kept = _PAIRS_KEPT_WITH_BLOCKS if self._groups.part.any() else _PAIRS_KEPT
@@ -301,7 +304,7 @@ class SparseFilter:
     def _about_map(
         self, covariance_of: Callable[[IntArray, IntArray], FloatArray], first: IntArray, second: IntArray
     ) -> FloatArray:
-        """Covariances (k, 3, 3) of pairs, of errors as the filter's columns are."""
+        """Covariances (k, 3, 3) of pairs, with errors about the origin of `map` as in the columns."""
         return carried_pairs(-self._place[first], covariance_of(first, second), -self._place[second])
 
     def update(
@@ -309,16 +312,16 @@ class SparseFilter:
     ) -> FloatArray:
         """Use many measurements with independent errors at once; return the correction (n,) of all columns.
 
-        Their pairs must have been among those of `relate_pairs`, which comes before each update.
+        Their pairs must have been passed to `relate_pairs` before.
 
         Args:
-            columns: (m, c) what each depends on, the two bodies' first.
-            jacobian: (m, 3, c) its Jacobian; a zero row is a component that was not measured.
+            columns: (m, c) columns that each depends on, those of the two bodies first.
+            jacobian: (m, 3, c) Jacobians; a zero row is a component that was not measured.
             innovation: (m, 3) measured minus predicted.
             noise: (m, 3, 3) covariance of the measurement.
         """
         if self._prepared is None:
-            raise RuntimeError("the pairs of an update are related first")
+            raise RuntimeError("call relate_pairs before update")
         (pattern, prior, shares, active), self._prepared = self._prepared, None
         measured = summed(information_of(columns, jacobian, innovation, noise, self._place))
         self._factor = eliminate(pattern, prior, measured)
@@ -328,14 +331,14 @@ class SparseFilter:
         self._number[active] = active
         self._new = ()
         self._settle(active)
-        moved = np.einsum("nij,nj->ni", levers(-self._place[active]), correction[active])
+        moved = np.einsum("nij,nj->ni", translation_adjoints(-self._place[active]), correction[active])
         out = np.zeros((count, 3))
         out[active] = moved
         return out.reshape(-1)
 
     def _settle(self, active: IntArray) -> None:
-        """Have the marginals of the newest factor and copies."""
-        covariance = self._room.with_fronts(self._factor)
+        """Compute the marginals of the newest factor and copies."""
+        covariance = self._workspace.with_fronts(self._factor)
         bodies = active[self._groups.part[active] == 0]
         for (row, column), of, first, second in self._marginals.within(bodies):
             own = covariance[first, second] + copies.shared(self._shares, first, second)
@@ -344,14 +347,14 @@ class SparseFilter:
         self._marginals.settle(bodies)
 
 
-class _Room:
-    """Where covariances are written between two factors, for a filter and all its copies.
+class _Workspace:
+    """Covariances between two updates, shared by a filter and all its copies.
 
     Args:
-        bodies: How many there are at first.
+        bodies: Initial number of bodies.
 
     Attributes:
-        holds: The factor of whose fronts all covariances stand there.
+        holds: The factor whose fronts are written there.
     """
 
     def __init__(self, bodies: int) -> None:
@@ -360,9 +363,9 @@ class _Room:
         self._make(bodies)
 
     def with_fronts(self, factor: Factor, more: int = 0) -> FloatArray:
-        """Room (n, n, 3, 3) with the covariances within all fronts of a factor; others do not matter.
+        """Array (n, n, 3, 3) with the covariances within all fronts of a factor; other entries are undefined.
 
-        There is room for `more` bodies than the factor has.
+        It has space for `more` bodies than the factor has.
         """
         bodies = factor.pattern.front.size + more
         if len(self._blocks) < bodies:
@@ -375,4 +378,4 @@ class _Room:
     def _make(self, bodies: int) -> None:
         size = bodies + bodies // 8
         self._blocks, self.holds = np.zeros((size, size, 3, 3)), None
-        self._blocks.fill(0.0)  # so that the system finds the memory now, and not when data are there
+        self._blocks.fill(0.0)  # touch the memory now rather than while data arrive

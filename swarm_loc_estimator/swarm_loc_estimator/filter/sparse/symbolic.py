@@ -1,7 +1,7 @@
-"""Symbolic elimination: which bodies each front holds, and what of the factor before it has to be known.
+"""Symbolic elimination: the bodies of each front, and the rows of an old factor that a new pattern needs.
 
-A front eliminates its pivots J, given its border B: all bodies eliminated later that are paired with one of
-them, or with what was eliminated before and led to them. The pairs within all J and B are the pattern.
+A front eliminates its pivots J given its border B: all bodies eliminated later that are paired with a pivot,
+or with a body eliminated earlier whose border contains a pivot. The pairs within all J and B are the pattern.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ class Pattern(NamedTuple):
     """Fronts in the order of their elimination.
 
     Attributes:
-        pivot: Bodies, front by front.
-        pivot_begin: (F + 1,) where those of each front begin.
-        border: Likewise the bodies of the borders.
-        border_begin: (F + 1,)
-        front: (n,) in which front each body is a pivot; -1: in none.
+        pivot: Pivots, front by front.
+        pivot_begin: (F + 1,) start of each front's pivots.
+        border: Borders, front by front.
+        border_begin: (F + 1,) start of each front's border.
+        front: (n,) the front of which each body is a pivot; -1: none.
     """
 
     pivot: IntArray
@@ -35,7 +35,7 @@ class Pattern(NamedTuple):
 
     @property
     def fronts(self) -> int:
-        """How many there are."""
+        """Number of fronts."""
         return self.pivot_begin.size - 1
 
     @property
@@ -54,7 +54,7 @@ def pattern_of(order: Order, adjacency: Adjacency) -> Pattern:
 
 @cached_njit
 def _borders(order: Order, front: IntArray, adjacency: Adjacency) -> tuple[IntArray, IntArray]:
-    """The bodies of all borders, front by front, and where each begins (F + 1,)."""
+    """The borders of all fronts, concatenated, and the start of each (F + 1,)."""
     pivot, begin = order.body, order.begin
     fronts, seen = begin.size - 1, np.full(front.size, -1, dtype=np.int64)
     borders, border_begin = np.empty(64 * front.size, dtype=np.int64), np.zeros(fronts + 1, dtype=np.int64)
@@ -80,7 +80,7 @@ def _borders(order: Order, front: IntArray, adjacency: Adjacency) -> tuple[IntAr
 
 @cached_njit
 def _take(bodies: IntArray, f: int, front: IntArray, seen: IntArray, borders: IntArray, end: int) -> int:
-    """Write those bodies behind the borders that are pivots later than front f; return the new end."""
+    """Append the bodies that are pivots after front f to the borders; return the new end."""
     for body in bodies:
         if front[body] > f and seen[body] != f:
             seen[body] = f
@@ -92,18 +92,18 @@ def _take(bodies: IntArray, f: int, front: IntArray, seen: IntArray, borders: In
 def wanted_rows(
     old: Pattern, new: Pattern, place: IntArray, derived: int, beside: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """What has to be known of an old factor besides its own pattern, for a new pattern to be.
+    """Covariances of an old factor, outside its pattern, that a new pattern needs.
 
     Args:
-        old: Its bodies have numbers of their own.
-        new: Whose pairs are wanted.
-        place: (n,) the numbers of the new pattern's bodies in the old one.
-        derived: So many of the first fronts have borders whose pairs may be in no front.
-        beside: (n,) a body that is wanted wherever another one is; -1: none.
+        old: Pattern of the old factor, with its own numbers of bodies.
+        new: The new pattern.
+        place: (n,) numbers of the new pattern's bodies in the old one.
+        derived: Number of first fronts with borders whose pairs may be in no front.
+        beside: (n,) body whose pairs are needed together with those of another one; -1: none.
 
     Returns:
-        Bodies, front by front of the old pattern, whose covariances with its pivots are wanted, and where
-        those of each front begin (F + 1,).
+        Bodies, front by front of the old pattern, whose covariances with its pivots are needed, and the start
+        of each front's bodies (F + 1,).
     """
     position = np.empty_like(old.front)
     position[old.pivot] = np.arange(old.pivot.size)
@@ -113,7 +113,7 @@ def wanted_rows(
 
 
 class _Sequence(NamedTuple):
-    """When each body is eliminated: in which front, and as which one."""
+    """Order of elimination: the front and the position of each body."""
 
     front: IntArray
     position: IntArray
@@ -121,7 +121,7 @@ class _Sequence(NamedTuple):
 
 @cached_njit
 def _want_pairs(old: _Sequence, new: Pattern, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
-    """Note all pairs of the new pattern, and of those beside, at the earlier one's front."""
+    """Mark all pairs of the new pattern, and of bodies beside, at the front of the earlier body."""
     for f in range(new.pivot_begin.size - 1):
         for k in range(new.pivot_begin[f], new.pivot_begin[f + 1]):
             a = new.pivot[k]
@@ -135,7 +135,7 @@ def _want_pairs(old: _Sequence, new: Pattern, place: IntArray, beside: IntArray,
 
 @cached_njit
 def _want_with(old: _Sequence, a: int, b: int, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
-    """Note a pair of bodies, with those beside them."""
+    """Mark a pair of bodies, and the pairs of the bodies beside them."""
     _want(old, place[a], place[b], wanted)
     if beside[a] >= 0:
         _want(old, place[beside[a]], place[b], wanted)
@@ -147,7 +147,7 @@ def _want_with(old: _Sequence, a: int, b: int, place: IntArray, beside: IntArray
 
 @cached_njit
 def _want(old: _Sequence, a: int, b: int, wanted: BoolArray) -> None:
-    """Note a pair of bodies; those of one front are known."""
+    """Mark a pair of bodies; pairs within a front are known."""
     if old.front[a] < old.front[b]:
         wanted[old.front[a], old.position[b]] = True
     elif old.front[b] < old.front[a]:
@@ -156,7 +156,7 @@ def _want(old: _Sequence, a: int, b: int, wanted: BoolArray) -> None:
 
 @cached_njit
 def _close(old: Pattern, position: IntArray, wanted: BoolArray, derived: int) -> tuple[IntArray, IntArray]:
-    """Add what the wanted ones follow from: a pair of a pivot follows from those of its border."""
+    """Mark the pairs that marked ones depend on: a pair of a pivot depends on those of its border."""
     sequence, fronts = _Sequence(old.front, position), old.pivot_begin.size - 1
     begin, end = np.zeros(fronts + 1, dtype=np.int64), 0
     for f in range(fronts):
@@ -178,9 +178,9 @@ def _close(old: Pattern, position: IntArray, wanted: BoolArray, derived: int) ->
 
 @cached_njit
 def _follow(old: Pattern, position: IntArray, wanted: BoolArray, f: int) -> int:
-    """Want the pairs of the border of front f with all that are wanted there; return how many these are."""
+    """Mark the pairs of the border of front f with all bodies marked there; return their number."""
     border = old.border[old.border_begin[f] : old.border_begin[f + 1]]
-    for body in border:  # those that are eliminated after it
+    for body in border:  # bodies eliminated after it
         front = old.front[body]
         for k in range(old.pivot_begin[front + 1], old.pivot.size):
             wanted[front, k] |= wanted[f, k]

@@ -1,8 +1,7 @@
-"""Errors about each body's own place, which are well-conditioned far from the origin of `map`, too.
+"""Errors about a reference point of each body, well-conditioned also far from the origin of `map`.
 
-The filter's columns are right-invariant errors xi, twists about the origin of `map`, in which a small error
-of a heading moves what is far away by much. Here they are eta = Lev(r) xi, twists about a place r near the
-body.
+The filter's columns are right-invariant errors xi, twists about the origin of `map`, in which a small heading
+error moves a far body by much. Here they are eta = Ad(r) xi, twists about a reference point r near the body.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from swarm_loc_estimator.common.small_matrix import cholesky3, solve3
 
 
 class Information(NamedTuple):
-    """What measurements say: H^T R^-1 H in blocks, and H^T R^-1 y.
+    """Information of measurements: H^T R^-1 H in blocks, and H^T R^-1 y.
 
     Attributes:
         first: (k,) bodies; a block of two bodies is given once.
@@ -32,21 +31,21 @@ class Information(NamedTuple):
     gradient: FloatArray
 
 
-def levers(places: FloatArray) -> FloatArray:
-    """Lev(r) (n, 3, 3) of places (n, 2); its inverse is that of -r."""
+def translation_adjoints(places: FloatArray) -> FloatArray:
+    """Ad(r) (n, 3, 3) of reference points (n, 2); the inverse is that of -r."""
     out = np.tile(np.eye(3), (len(places), 1, 1))
     out[:, 0, 2], out[:, 1, 2] = -places[:, 1], places[:, 0]
     return out
 
 
 def carried(places: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Covariances (n, 3, 3) of Lev(r) e for errors e of covariances (n, 3, 3)."""
+    """Covariances (n, 3, 3) of Ad(r) e for errors e of covariances (n, 3, 3)."""
     return carried_pairs(places, covariances, places)
 
 
 @cached_njit
 def carried_pairs(places: FloatArray, across: FloatArray, others: FloatArray) -> FloatArray:
-    """Lev(r) C Lev(s)^T (n, 3, 3) for places r (n, 2), matrices C (n, 3, 3) and other places s (n, 2)."""
+    """Ad(r) C Ad(s)^T (n, 3, 3) for points r (n, 2), matrices C (n, 3, 3) and points s (n, 2)."""
     out = np.empty((across.shape[0], 3, 3))
     for k in range(across.shape[0]):
         x, y = places[k, 0], places[k, 1]
@@ -62,7 +61,7 @@ def carried_pairs(places: FloatArray, across: FloatArray, others: FloatArray) ->
 
 
 def centres(covariances: FloatArray) -> FloatArray:
-    """The places (n, 2) about which errors of covariances (n, 3, 3) turn without moving, on average."""
+    """Points (n, 2) whose position errors are uncorrelated with the heading, for covariances (n, 3, 3)."""
     across = np.column_stack([-covariances[:, 1, 2], covariances[:, 0, 2]])
     places: FloatArray = across / covariances[:, 2, 2, None]
     return places
@@ -72,15 +71,15 @@ def centres(covariances: FloatArray) -> FloatArray:
 def information_of(
     columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray, places: FloatArray
 ) -> Information:
-    """What measurements say of bodies, each about its own place.
+    """Information of measurements about bodies, each about its reference point.
 
     Args:
-        columns: (m, c) filter columns that each depends on: those of two bodies first of all, then some of
-            one block of parameters.
-        jacobian: (m, 3, c), zero for a body that there is none of.
+        columns: (m, c) filter columns that each depends on: those of two bodies, then some of one block of
+            parameters.
+        jacobian: (m, 3, c), zero where there is no body.
         innovation: (m, 3) measured minus predicted.
         noise: (m, 3, 3) covariances.
-        places: (n, 2) of all bodies.
+        places: (n, 2) reference points.
     """
     measurements, count = columns.shape[0], 0
     first, second = np.empty(6 * measurements, dtype=np.int64), np.empty(6 * measurements, dtype=np.int64)
@@ -116,7 +115,7 @@ def information_of(
 
 @cached_njit
 def summed(measured: Information) -> Information:
-    """The same with one block for bodies that are named several times in this order, by the first of them."""
+    """The same information with repeated blocks summed into the first of them."""
     count, bodies = measured.first.size, len(measured.gradient)
     newest, before, kept = (
         np.full(bodies, -1),
@@ -151,7 +150,7 @@ def summed(measured: Information) -> Information:
 
 @cached_njit
 def _about_place(jacobian: FloatArray, place: FloatArray, out: FloatArray) -> None:
-    """Write the columns of a Jacobian by xi (3, 3) as rows by eta."""
+    """Write the columns of a Jacobian with respect to xi (3, 3) as rows with respect to eta."""
     for i in range(3):
         out[0, i], out[1, i] = jacobian[i, 0], jacobian[i, 1]
         out[2, i] = jacobian[i, 2] + place[1] * jacobian[i, 0] - place[0] * jacobian[i, 1]
@@ -159,7 +158,7 @@ def _about_place(jacobian: FloatArray, place: FloatArray, out: FloatArray) -> No
 
 @cached_njit
 def _by_parameters(columns: IntArray, jacobian: FloatArray, out: FloatArray) -> int:
-    """Write the columns of a Jacobian (3, c) by parameters as rows of their block; return it, -1: of none."""
+    """Write the parameter columns of a Jacobian (3, c) as rows of their block; return it, -1: none."""
     block = -1
     for c in range(6, columns.size):
         if jacobian[0, c] != 0.0 or jacobian[1, c] != 0.0 or jacobian[2, c] != 0.0:
