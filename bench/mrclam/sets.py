@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swarm_loc_estimator.common.arrays import BoolArray
 from swarm_loc_estimator.common.errors import UserError
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
 from swarm_loc_estimator.offline.datasets.mrclam import read_dataset
 from swarm_loc_estimator.offline.datasets.mrclam_bag import Delay, convert
+from swarm_loc_estimator.sensors.messages import NO_DETECTIONS, chosen
 from swarm_loc_estimator.swarm.swarm import CameraMount, OdometryModel, Robot, SensorModel, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
@@ -67,24 +68,28 @@ def transferred(fitted: Swarm, swarm: Swarm) -> Swarm:
 
 def without_robots(recording: Recording, swarm: Swarm) -> Recording:
     """The recording as if robots had not been seen."""
-    ids = np.array([landmark.id for landmark in swarm.landmarks])
-    return recording.masked(lambda _, found: np.isin(found["id"], ids))
+    return _masked(recording, _shows_landmark(recording, swarm))
 
 
 def without_sightings(recording: Recording) -> Recording:
     """The recording as if nothing had been seen."""
-    return recording.masked(lambda _, found: np.zeros(found.size, dtype=bool))
+    return replace(recording, detections=NO_DETECTIONS)
 
 
 def with_two_seeing(recording: Recording, swarm: Swarm, seeing: tuple[int, int]) -> Recording:
     """The recording as if only two robots could see landmarks; everybody sees robots."""
-    ids = np.array([landmark.id for landmark in swarm.landmarks])
+    kept = np.isin(recording.detections.robot, seeing) | ~_shows_landmark(recording, swarm)
+    return _masked(recording, kept)
 
-    def keep(robot: int, found: NDArray[np.void]) -> NDArray[np.bool_]:
-        kept: NDArray[np.bool_] = np.full(found.size, robot in seeing) | ~np.isin(found["id"], ids)
-        return kept
 
-    return recording.masked(keep)
+def _masked(recording: Recording, kept: BoolArray) -> Recording:
+    """The recording as if only some of the detections (d,) had been made."""
+    return replace(recording, detections=chosen(recording.detections, kept))
+
+
+def _shows_landmark(recording: Recording, swarm: Swarm) -> BoolArray:
+    """Which detections (d,) are of landmarks."""
+    return np.isin(recording.detections.detection["id"], [landmark.id for landmark in swarm.landmarks])
 
 
 def unknown_start(swarm: Swarm) -> Swarm:

@@ -23,7 +23,8 @@ from bench.mrclam.sets import (
 )
 from bench.shared.common import save_plot, write_figures
 from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
-from swarm_loc_estimator.offline.calibration.recording import Recording, Rows
+from swarm_loc_estimator.offline.calibration.recording import Recording
+from swarm_loc_estimator.sensors.messages import NO_ODOMETRY, DetectionRows
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, SensorModel, Swarm
 
 SWARM = Swarm(
@@ -34,20 +35,19 @@ SWARM = Swarm(
 
 def seen(*observations: tuple[int, list[int]]) -> Recording:
     """A recording in which robots (by index) see ids."""
-    found = []
-    for _, ids in observations:
-        rows = np.zeros(len(ids), DETECTION_DTYPE)
-        rows["id"] = ids
-        found.append(rows)
-    stamps = np.arange(len(found), dtype=np.int64)
-    robots = np.array([robot for robot, _ in observations], dtype=np.int64)
-    none = np.zeros(0, dtype=np.int64)
-    return Recording("r", Rows(none, none, none, ()), Rows(robots, stamps, stamps, tuple(found)), {})
+    found = [
+        (robot, stamp_ns, marker) for stamp_ns, (robot, ids) in enumerate(observations) for marker in ids
+    ]
+    robots, stamps_ns, ids = np.array(found, dtype=np.int64).T
+    rows = np.zeros(len(found), DETECTION_DTYPE)
+    rows["id"] = ids
+    return Recording("r", NO_ODOMETRY, DetectionRows(robots, stamps_ns, rows, stamps_ns), {})
 
 
 def ids_of(recording: Recording) -> list[list[int]]:
     """What is seen, picture by picture."""
-    return [found["id"].tolist() for found in recording.detections.data]
+    seen = recording.detections
+    return [seen.detection["id"][seen.stamp_ns == stamp_ns].tolist() for stamp_ns in range(3)]
 
 
 def test_masks_hide_what_they_say() -> None:

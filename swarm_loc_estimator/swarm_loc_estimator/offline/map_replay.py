@@ -15,14 +15,13 @@ from scipy.spatial import cKDTree
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.messages.typestore import POSE_STAMPED
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
 from swarm_loc_estimator.mapping.grid.occupancy import OccupancyMap
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
 from swarm_loc_estimator.mapping.settings import MapperSettings
-from swarm_loc_estimator.offline.recorded_bag import read_truth
+from swarm_loc_estimator.offline.recorded_bag import TruthReader
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 _TELL_EVERY = 1000
@@ -67,13 +66,11 @@ def replay_map(
 
 def truth_of(bag: Path, swarm: Swarm) -> dict[str, Trajectory]:
     """Ground truth of a bag by robot, for evaluation only; empty without any."""
-    found: dict[str, list[bytes]] = {}
-    names = {f"{robot.name}/ground_truth": robot.name for robot in swarm.robots}
+    truth = TruthReader(swarm)
     with BagReader(bag) as reader:
-        for topic, message_type, _, data in reader.messages(names):
-            if message_type == POSE_STAMPED:
-                found.setdefault(names[topic], []).append(data)
-    return read_truth(swarm, found) if found else {}
+        for batch in reader.batches(truth.topics):
+            truth.add(batch)
+    return truth.tracks()
 
 
 COVERED_M = 0.06

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,8 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.offline.calibration.recording import Recording, Rows
+from swarm_loc_estimator.offline.calibration.recording import Recording
+from swarm_loc_estimator.sensors.messages import DetectionRows, OdometryRows
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, Swarm
 
 SECOND = 1_000_000_000
@@ -72,24 +74,25 @@ def record(world: World) -> tuple[Recording, Swarm]:
     for index, true in enumerate(world.robots):
         raw = _raw(rng, world.duration_s)
         truth[true.name] = _truth(rng, true, raw, world)
-        odometry += [
-            (index, s, s, tuple(pose))
-            for s, pose in zip(raw.stamp_ns.tolist(), raw.pose.tolist(), strict=True)
-        ]
+        odometry += [(index, s, pose[None]) for s, pose in zip(raw.stamp_ns.tolist(), raw.pose, strict=True)]
     for index, true in enumerate(world.robots):
         stamps = np.arange(3 * SECOND, int((world.duration_s - _MARGIN_S) * SECOND), int(_PICTURE_S * SECOND))
         relative = _marks_seen_from(truth[true.name], true, stamps, marks)
         for stamp, places in zip(stamps.tolist(), relative, strict=True):
             found = _seen(rng, world, places, true)
             if found.size:
-                pictures.append((index, stamp, stamp, found))
-    return Recording("world", _rows(odometry), _rows(pictures), truth), swarm
+                pictures.append((index, stamp, found))
+    driven = OdometryRows(*_columns(odometry, [1] * len(odometry)))
+    seen = DetectionRows(*_columns(pictures, [len(found) for _, _, found in pictures]))
+    return Recording("world", driven, seen, truth), swarm
 
 
-def _rows(messages: Sequence[tuple[int, int, int, object]]) -> Rows:
-    ordered = sorted(messages, key=lambda message: message[2])
-    columns = [np.array([m[k] for m in ordered], dtype=np.int64) for k in range(3)]
-    return Rows(columns[0], columns[1], columns[2], tuple(m[3] for m in ordered))
+def _columns(messages: Sequence[tuple[int, int, Any]], counts: Sequence[int]) -> Any:
+    """Robots, stamps, rows and arrivals of messages, each with so many rows, in order of arrival."""
+    order = sorted(range(len(messages)), key=lambda k: messages[k][1])
+    repeats = [counts[k] for k in order]
+    robot, stamp_ns = (np.repeat([messages[k][part] for k in order], repeats) for part in (0, 1))
+    return robot, stamp_ns, np.concatenate([messages[k][2] for k in order]), stamp_ns
 
 
 def _raw(rng: np.random.Generator, duration_s: float) -> Trajectory:

@@ -166,12 +166,12 @@ def test_a_message_that_the_estimator_drops_spoils_no_run() -> None:
     recording, swarm = record(World((robot(1, HONEST),), 22, duration_s=30.0))
     swarm = started_at_truth(swarm, recording)
     odometry, detections = recording.odometry, recording.detections
-    bad = detections.data[5].copy()
-    bad["content"], bad["covariance"] = CONTENT_POSE, -np.eye(6) * [1, 1, 1, 1, 1, -1]
+    poses, bad = odometry.pose.copy(), detections.detection.copy()
+    poses[0] = np.nan
+    sixth = detections.stamp_ns == np.unique(detections.stamp_ns)[5]
+    bad["content"][sixth], bad["covariance"][sixth] = CONTENT_POSE, -np.eye(6) * [1, 1, 1, 1, 1, -1]
     spoilt = replace(
-        recording,
-        odometry=replace(odometry, data=((np.nan,) * 3, *odometry.data[1:])),
-        detections=replace(detections, data=(*detections.data[:5], bad, *detections.data[6:])),
+        recording, odometry=odometry._replace(pose=poses), detections=detections._replace(detection=bad)
     )
     poses = rerun(spoilt, swarm, 0.5).poses
     assert np.isfinite(poses).all()
@@ -193,7 +193,7 @@ def test_what_cannot_be_used_is_not_read_and_said(tmp_path: Path) -> None:
             writer.write(name, log_ns, bytes(typestore().serialize_cdr(message, kind)))
     recording = read_recording(tmp_path / "bag", swarm)
     assert recording.odometry.robot.size == 99
-    assert np.isfinite(recording.odometry.poses).all()
+    assert np.isfinite(recording.odometry.pose).all()
     assert "1 inputs are not used: odometry_non_finite." in recording.remarks
 
 
@@ -214,7 +214,7 @@ def test_a_clock_that_was_set_is_one_sentence() -> None:
     recording, swarm = record(World((robot(1, TRUE),), 12, duration_s=10.0))
     odometry = recording.odometry
     stamps_ns = np.where(np.arange(odometry.robot.size) < 50, odometry.stamp_ns - 10**18, odometry.stamp_ns)
-    recording = replace(recording, odometry=replace(odometry, stamp_ns=stamps_ns))
+    recording = replace(recording, odometry=odometry._replace(stamp_ns=stamps_ns))
     with pytest.raises(CalibrationError, match="jump of 277778 h"):
         calibrate(recording, swarm, Options(), quiet)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from swarm_loc_estimator.offline.calibration.robust import (
     spread,
 )
 from swarm_loc_estimator.sensors.camera import SightingConverter
+from swarm_loc_estimator.sensors.messages import chosen
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, SensorModel, Swarm
 
 DENSE_GAP_NS = 200_000_000
@@ -81,9 +81,8 @@ def sightings_of(recording: Recording, swarm: Swarm, observer: int) -> CameraSig
         other = recording.truth.get(swarm.robots[target].name)
         known[rows] &= other is not None and _dense_around(other, logged.stamp_ns[rows])
     known &= np.isnan(lone[:, 0]) | (logged.target < 0)  # a lone pose does not say when the picture was taken
-    chosen = np.flatnonzero(known)
-    chosen = chosen[:: max(1, -(-chosen.size // _MAX_SIGHTINGS))]
-    return replace(logged, lone=lone)[chosen]
+    rows = np.flatnonzero(known)
+    return replace(logged, lone=lone)[rows[:: max(1, -(-rows.size // _MAX_SIGHTINGS))]]
 
 
 def true_values(
@@ -128,17 +127,13 @@ def true_values(
 def _logged(recording: Recording, swarm: Swarm, observer: int) -> CameraSightings:
     """All of a robot's sightings of known markers."""
     ideal = replace(swarm, robots=tuple(_ideal(robot) for robot in swarm.robots))
-    rows = np.flatnonzero(recording.detections.robot == observer)
-    found: list[Any] = [recording.detections.data[row] for row in rows.tolist()]
-    counts = [len(one) for one in found]
-    if not sum(counts):
+    rows = chosen(recording.detections, recording.detections.robot == observer)
+    if not rows.robot.size:
         empty = np.zeros(0, dtype=np.int64)
         return CameraSightings(
             empty, empty == 0, np.zeros((0, 3)), empty, np.zeros((0, 3)), empty, np.zeros((0, 3))
         )
-    stamps = np.repeat(recording.detections.stamp_ns[rows], counts)
-    measured = SightingConverter(ideal).convert(np.full(stamps.size, observer), stamps, np.concatenate(found))
-    m = measured.measurements
+    m = SightingConverter(ideal).convert(rows.robot, rows.stamp_ns, rows.detection).measurements
     return CameraSightings(
         stamp_ns=m["stamp_ns"].copy(),
         polar=m["kind"] == Kind.POLAR,

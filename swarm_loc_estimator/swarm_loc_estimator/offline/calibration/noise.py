@@ -19,9 +19,10 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.number_spec import number_specs
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
-from swarm_loc_estimator.offline.calibration.recording import Recording, Rows, rerun
+from swarm_loc_estimator.offline.calibration.recording import Recording, rerun
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.sensors.messages import chosen
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, SensorModel, Swarm
 
 TICK_S = 1.0
@@ -114,13 +115,13 @@ def with_noise(swarm: Swarm, values: dict[str, float]) -> Swarm:
 
 def thinned(recording: Recording) -> Recording:
     """The recording with odometry no denser than the fit of noise needs."""
-    rows: Rows = recording.odometry
+    rows = recording.odometry
     keep = np.ones(rows.robot.size, dtype=bool)
     for robot in np.unique(rows.robot).tolist():
         own = np.flatnonzero(rows.robot == robot)
         slot = rows.stamp_ns[own] // _SPACING_NS
         keep[own] = np.concatenate([[True], np.diff(slot) != 0])
-    return replace(recording, odometry=rows.chosen(keep))
+    return replace(recording, odometry=chosen(rows, keep))
 
 
 def fit_noise(
