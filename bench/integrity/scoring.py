@@ -12,7 +12,7 @@ from bench.integrity.scenarios import Fault
 from bench.shared.simulated_run import errors_of, inputs_between
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.offline.metrics import nees
-from swarm_loc_estimator.timeline.contradictions import Kind
+from swarm_loc_estimator.timeline.contradictions import Contradicted
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
 
 TICK_NS = 100_000_000
@@ -63,7 +63,7 @@ class Score:
     time_s: FloatArray
     error_m: FloatArray
     misleading: BoolArray
-    told: frozenset[tuple[str, Kind]] = frozenset()
+    told: frozenset[tuple[str, Contradicted]] = frozenset()
 
 
 def score(fault: Fault) -> Score:
@@ -71,7 +71,7 @@ def score(fault: Fault) -> Score:
     run = fault.run
     tick_ns = np.arange(run.start_ns + TICK_NS, run.end_ns + 1, TICK_NS)
     estimator, estimates = Estimator(run.swarm), []
-    told: set[tuple[str, Kind]] = set()
+    told: set[tuple[str, Contradicted]] = set()
     for now_ns, inputs in zip(tick_ns.tolist(), inputs_between(run, tick_ns), strict=True):
         estimator.receive(inputs)
         estimates.append(estimator.tick(now_ns))

@@ -6,7 +6,7 @@ import pytest
 
 from bench.integrity.scenarios import SCENARIOS
 from bench.integrity.scoring import score
-from swarm_loc_estimator.timeline.contradictions import Kind
+from swarm_loc_estimator.timeline.contradictions import Contradicted
 
 SEED = 23
 
@@ -14,12 +14,12 @@ SEED = 23
 @pytest.mark.parametrize(
     ("scenario", "about", "kind"),
     [
-        ("false_sightings", "epuck1", Kind.SIGHTINGS),
-        ("turned_camera", "epuck1", Kind.DESCRIPTION),
-        ("two_odometry_sources", "epuck1", Kind.ODOMETRY),
+        ("false_sightings", "epuck1", Contradicted.SIGHTINGS),
+        ("turned_camera", "epuck1", Contradicted.DESCRIPTION),
+        ("two_odometry_sources", "epuck1", Contradicted.ODOMETRY),
     ],
 )
-def test_a_fault_is_named_and_misleads_nobody(scenario: str, about: str, kind: Kind) -> None:
+def test_a_fault_is_named_and_misleads_nobody(scenario: str, about: str, kind: Contradicted) -> None:
     found = score(SCENARIOS[scenario](SEED))
     assert found.misleading_share <= 0.001
     assert (about, kind) in found.told
@@ -30,14 +30,14 @@ def test_noise_that_the_description_hides_is_found_and_costs_no_robot() -> None:
     assert found.misleading_share <= 0.001
     assert found.tracked_share >= 0.99
     assert found.position_m <= 0.015
-    assert ("epuck1", Kind.NOISE) in found.told
+    assert ("epuck1", Contradicted.NOISE) in found.told
 
 
 def test_a_landmark_that_was_moved_is_named() -> None:
     fault = SCENARIOS["moved_landmark"](SEED)
     found = score(fault)
     assert found.misleading_share <= 0.001
-    assert (fault.about, Kind.DESCRIPTION) in found.told
+    assert (fault.about, Contradicted.DESCRIPTION) in found.told
 
 
 def test_starts_that_are_wrong_give_way_and_nothing_is_said_where_nothing_is_wrong() -> None:

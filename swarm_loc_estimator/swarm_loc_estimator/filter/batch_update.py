@@ -24,7 +24,7 @@ from swarm_loc_estimator.filter.integrity.divergence import (
     is_uncertain,
 )
 from swarm_loc_estimator.filter.integrity.fault_detection import assess, is_set_aside
-from swarm_loc_estimator.filter.measurement_model import MeasurementColumns
+from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, has_kernel
 from swarm_loc_estimator.odometry.look_up import look_up, look_up_pose, new_sample
 from swarm_loc_estimator.odometry.preintegration import Preintegrated, TrackArrays
 
@@ -114,10 +114,11 @@ def related_columns(measurements: MeasurementColumns, belief: BeliefArrays) -> I
 
 @cached_njit
 def evaluate_all(measurements: MeasurementColumns, belief: BeliefArrays, batch: InnovationBatch) -> None:
-    """Evaluate the innovations of all measurements (m,) against one belief, see `evaluate`."""
+    """Evaluate the innovations of all measurements (m,) that have a kernel against one belief."""
     scratch = new_scratch()
     for k in range(measurements.stamp_ns.size):
-        evaluate(measurements, k, belief, batch, k, scratch)
+        if has_kernel(measurements, k):
+            evaluate(measurements, k, belief, batch, k, scratch)
 
 
 @cached_njit
@@ -130,10 +131,13 @@ def assess_all(
 ) -> BoolArray:
     """Assess all measurements (m,); return which robots and landmarks (N + L,) are contradicted.
 
-    Those of pairs set aside do not pass.
+    Those of excluded pairs do not pass. Measurements of models without a kernel take no part: they neither
+    count as evidence nor are excluded.
     """
     contradicted = np.zeros(belief.integrity.doubt.size, dtype=np.bool_)
     for k in range(passed.size):
+        if not has_kernel(measurements, k):
+            continue
         look = (looks[0][k], (looks[1][k, 0], looks[1][k, 1]), looks[2][k])
         source = assess(measurements, k, belief, limits.max_doubt, look)
         if source >= 0:
@@ -144,12 +148,16 @@ def assess_all(
 
 @cached_njit
 def confirm_all(measurements: MeasurementColumns, belief: BeliefArrays, passed: BoolArray) -> BoolArray:
-    """Hold all measurements (m,) against poses that were assumed; return which robots (N,) are elsewhere."""
+    """Compare all measurements (m,) with assumed poses; return which robots (N,) they refute.
+
+    Measurements of models without a kernel confirm poses, but refute none.
+    """
     lost = np.zeros(belief.tracked.size, dtype=np.bool_)
     for k in range(passed.size):
-        robot = confirm(measurements, k, belief, passed[k])
-        if robot >= 0:
-            lost[robot] = True
+        if passed[k] or has_kernel(measurements, k):
+            robot = confirm(measurements, k, belief, passed[k])
+            if robot >= 0:
+                lost[robot] = True
     return lost
 
 

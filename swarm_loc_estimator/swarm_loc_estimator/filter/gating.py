@@ -13,9 +13,10 @@ from swarm_loc_estimator.common.small_matrix import factor_numbers
 _STUDENT_DOF = 4.0
 
 
-def gate_threshold(probability: ArrayLike) -> FloatArray:
-    """The squared distance of two components that good measurements exceed with 1 - probability."""
-    threshold: FloatArray = 2.0 * gammaincinv(1.0, np.asarray(probability, dtype=float))
+def gate_threshold(probability: ArrayLike, degrees_of_freedom: int = 2) -> FloatArray:
+    """The squared distance of so many components that good measurements exceed with 1 - probability."""
+    half = 0.5 * degrees_of_freedom
+    threshold: FloatArray = 2.0 * gammaincinv(half, np.asarray(probability, dtype=float))
     return threshold
 
 

@@ -1,6 +1,8 @@
-"""The measurement model: relative and absolute poses, predicted values and Jacobians.
+"""Measurements and their models: predicted values, Jacobians, innovations and gates.
 
-Every measurement observes the pose of a marker in a sensor's frame,
+A model is one record, see `MeasurementModel`; all of them stand in `MODELS`. Those of `Kind` are built in:
+they are compiled, and kernels switch on their numbers. Each of their measurements
+observes the pose of a marker in a sensor's frame,
 
     rel = (X_observer S)^-1 (X_target M),
 
@@ -17,32 +19,43 @@ scale, see CAMERA_YAW and CAMERA_SCALE of filter/calibration_states.py.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import inlined_njit
 from swarm_loc_estimator.common.se2_scalar import composed, wrap
+from swarm_loc_estimator.filter.gating import gate_threshold
 
 NOBODY = -1
 """Index in place of a robot: the observer of an absolute fix, the target of a landmark sighting."""
 
 
 class Kind(IntEnum):
-    """What a value is: its first two components, or an order about the target robot."""
+    """Numbers of the built-in models, by the first two components of a value."""
 
     CARTESIAN = 0  # forward [m], left [m]
     POLAR = 1  # range [m], bearing [rad], positive to the left
-    SET_POSE = 2  # the target is at `value` in map with `covariance`, whatever was believed
-    FORGET = 3  # the target is not where it was believed to be
-    ANONYMOUS = 4  # some robot, seen from above, was at `value` in map; marker_id: its number in the image
+    ANONYMOUS = 2  # some robot, seen from above, was at `value` in map; marker_id: its number in the image
 
 
-POLAR, SET_POSE = int(Kind.POLAR), int(Kind.SET_POSE)
-"""Kinds as plain numbers, for compiled code."""
+class Command(IntEnum):
+    """Orders about the target robot, which are kept in order of time among the measurements."""
+
+    NONE = 0  # a measurement
+    SET_POSE = 1  # the target is at `value` in map with `covariance`, whatever was believed
+    FORGET = 2  # the target is not where it was believed to be
+
+
+POLAR = int(Kind.POLAR)
+"""As a plain number, for compiled code."""
+NO_MODEL = -1
+"""The `kind` of a command."""
 
 MEASUREMENT_DTYPE = np.dtype(
     [
@@ -52,20 +65,25 @@ MEASUREMENT_DTYPE = np.dtype(
         ("target", np.int64),  # robot index or NOBODY
         ("landmark", np.int64),  # 1 + index of the landmark; 0: none
         ("marker_id", np.int64),
-        ("kind", np.int64),  # Kind
+        ("command", np.int64),  # Command; NONE for a measurement
+        ("kind", np.int64),  # number of its model in MODELS
         ("has_heading", np.int64),  # 1 when value[2] was measured, else 0
         ("has_alternative", np.int64),  # 1 when `alternative` is a second, mirrored solution, else 0
         ("stamp_variance", np.float64),  # of stamp_ns [s^2], times how many measurements share this error
-        ("gate", np.float64),  # largest squared distance of its first two components that is believed
+        ("gate", np.float64),  # largest squared distance of its gated components that is accepted
         ("sensor", np.float64, (3,)),  # S: x [m], y [m], yaw [rad] in the observer's base_link
         ("marker", np.float64, (3,)),  # M: in the target's base_link, or in map
-        ("value", np.float64, (3,)),  # two by kind, then the heading [rad] of the marker's face
+        (
+            "value",
+            np.float64,
+            (3,),
+        ),  # built-in models: two by kind, then the heading [rad] of the face
         ("alternative", np.float64, (3,)),
         (
             "covariance",
             np.float64,
             (3, 3),
-        ),  # of value; a heading not measured has no covariance and variance 1
+        ),  # of value; a component not measured has no covariance and variance 1
         (
             "systematic_share",
             np.float64,
@@ -107,8 +125,100 @@ class MeasurementColumns(NamedTuple):
 
     @classmethod
     def views(cls, measurements: MeasurementArray) -> MeasurementColumns:
-        """Likewise, to be written."""
+        """The columns as views, to be written."""
         return cls(*(measurements[name] for name in cls._fields))
+
+
+@inlined_njit
+def has_kernel(measurements: MeasurementColumns, k: int) -> bool:
+    """Whether compiled code can evaluate measurement k: no command, and a model that is built in."""
+    kind: int = measurements.kind[k]
+    return 0 <= kind <= POLAR
+
+
+class Prediction(NamedTuple):
+    """What a model expects of a measurement of n components, n up to 3.
+
+    Attributes:
+        value: (n,).
+        observer_jacobian: (n, 3) by the observer's right-invariant error X = exp(xi) X_hat.
+        target_jacobian: (n, 3) by the target's.
+    """
+
+    value: FloatArray
+    observer_jacobian: FloatArray
+    target_jacobian: FloatArray
+
+
+@dataclass(frozen=True)
+class MeasurementModel:
+    """How a kind of measurement depends on the poses of its observer and its target.
+
+    A model without a compiled kernel is evaluated by its record, see `filter/model_evaluation.py`.
+
+    Attributes:
+        name: For people.
+        number: What `kind` of its measurements holds.
+        degrees_of_freedom: So many components of a value, the first ones, decide whether it is accepted.
+        predict: From a measurement (1,) and the poses (3,) in `map` of observer and target. The pose of a
+            target that is a landmark is by what it is moved from its survey; one that is missing is not to be
+            used.
+        innovation: From a measurement (1,) and the predicted value (n,) the measured value minus it (n,),
+            angles wrapped.
+        constraint: From a measurement (1,) the same as one of `Kind.CARTESIAN` or `Kind.POLAR`, which can
+            locate a robot that waits; None: it locates nobody.
+    """
+
+    name: str
+    number: int
+    degrees_of_freedom: int
+    predict: Callable[[MeasurementArray, FloatArray, FloatArray], Prediction]
+    innovation: Callable[[MeasurementArray, FloatArray], FloatArray]
+    constraint: Callable[[MeasurementArray], MeasurementArray] | None = None
+
+    def gate(self, probability: ArrayLike) -> FloatArray:
+        """The squared distance that good measurements exceed with 1 - probability."""
+        return gate_threshold(probability, self.degrees_of_freedom)
+
+
+def _predict_built_in(one: MeasurementArray, observer: FloatArray, target: FloatArray) -> Prediction:
+    value, jacobian = predict(one, observer[None], target[None])
+    return Prediction(value[0], -jacobian[0, :, :3], jacobian[0, :, :3])
+
+
+def _innovation_built_in(one: MeasurementArray, predicted: FloatArray) -> FloatArray:
+    out = np.empty(3)
+    innovation(MeasurementColumns.of(one), 0, one["value"][0], predicted, out)
+    return out
+
+
+def _itself(one: MeasurementArray) -> MeasurementArray:
+    return one
+
+
+MODELS: dict[int, MeasurementModel] = {
+    int(kind): MeasurementModel(
+        kind.name.lower(),
+        int(kind),
+        2,  # the heading has no vote, see `gating.position_distance`
+        _predict_built_in,
+        _innovation_built_in,
+        None if kind == Kind.ANONYMOUS else _itself,
+    )
+    for kind in Kind
+}
+"""All models by their numbers."""
+
+
+def register(model: MeasurementModel) -> None:
+    """Add a model.
+
+    Raises:
+        ValueError: Its number is not free, or not positive.
+    """
+    if model.number <= 0 or model.number in MODELS:
+        raise ValueError(f"the number {model.number} of the measurement model {model.name!r} is not free")
+    MODELS[model.number] = model
 
 
 def predict(

@@ -20,16 +20,16 @@ from swarm_loc_estimator.filter.integrity.divergence import (
     is_uncertain,
 )
 from swarm_loc_estimator.filter.integrity.fault_detection import assess, is_set_aside
-from swarm_loc_estimator.filter.measurement_model import SET_POSE, MeasurementColumns
+from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, has_kernel
 from swarm_loc_estimator.odometry.look_up import look_up, new_sample
 from swarm_loc_estimator.odometry.preintegration import Preintegrated, TrackArrays
 
 OPEN, USED, GATED = 0, 1, 2
 """Verdicts, see `fusion.Verdict`."""
 
-FINISHED, NOT_LOCALIZED, LOST, CONTRADICTED = 0, 1, 2, 3
-"""Why `update_in_order` came back: all done, a measurement not between robots located, a robot given up, a
-robot or landmark contradicted."""
+FINISHED, LEFT_OUT, LOST, CONTRADICTED = 0, 1, 2, 3
+"""Why `update_in_order` returned: all done; a command, a model without a kernel or a measurement not between
+robots located; a robot is lost; a robot or landmark is contradicted."""
 
 
 @cached_njit
@@ -61,8 +61,8 @@ def update_in_order(
     for k in range(begin, measurements.stamp_ns.size):
         sides = (measurements.observer[k], measurements.target[k])
         for side in sides:
-            if measurements.kind[k] >= SET_POSE or (side >= 0 and not belief.tracked[side]):
-                return k, NOT_LOCALIZED, -1
+            if not has_kernel(measurements, k) or (side >= 0 and not belief.tracked[side]):
+                return k, LEFT_OUT, -1
         for i in range(2):
             if sides[i] >= 0:
                 look_up(tracks, sides[i], measurements.stamp_ns[k], sample, i)

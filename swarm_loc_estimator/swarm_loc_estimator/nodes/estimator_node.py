@@ -50,7 +50,7 @@ from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.topics import live_topics
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.timeline.contradictions import Contradiction, Kind
+from swarm_loc_estimator.timeline.contradictions import Contradicted, Contradiction
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.thinning import SHED_REASONS, Thinning
@@ -120,7 +120,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         self._overload = 0
         self._known_duplicates: list[str] = []
         self._static_transforms = StaticTransforms(self, self._owned_frames())
-        self._known_contradictions: set[tuple[str, Kind]] = set()
+        self._known_contradictions: set[tuple[str, Contradicted]] = set()
         self._inputs = EstimatorInputs(self, self._ingest.topics, self._estimator.drop)
         self.create_service(Trigger, "~/reset", self._on_reset)
         frame = self.params.map_frame

@@ -161,7 +161,7 @@ def about_robots(
     stamps_ns: IntArray | int,
     poses: FloatArray,
     covariances: FloatArray,
-    kind: Kind,
+    kind: int,
 ) -> MeasurementArray:
     """Measurements (m,) without observer of poses (m, 3) in `map` with covariances (m, 3, 3)."""
     measurements = np.zeros(len(poses), dtype=MEASUREMENT_DTYPE)

@@ -19,8 +19,18 @@ from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, Meas
 _WORDS = MEASUREMENT_DTYPE.itemsize // 8  # every field is made of 8-byte numbers, the stamp is the first
 
 
-_FIRST = ("stamp_ns", "observer", "target", "marker_id", "kind", "covariance", "alternative", "value")
-"""By what measurements are told apart before all else."""
+_FIRST = (
+    "stamp_ns",
+    "observer",
+    "target",
+    "marker_id",
+    "command",
+    "kind",
+    "covariance",
+    "alternative",
+    "value",
+)
+"""Fields that order measurements of one stamp before all others."""
 
 
 def _words_in_order() -> tuple[IntArray, NDArray[np.bool_]]:

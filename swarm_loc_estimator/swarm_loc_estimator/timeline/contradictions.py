@@ -1,4 +1,4 @@
-"""What contradicts the belief, in words: which robot or landmark, by which sensor."""
+"""Detected faults in words: which robot or landmark contradicts the estimate, and by which sensor."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 
-class Kind(Enum):
-    """What is contradicted."""
+class Contradicted(Enum):
+    """What of a robot or landmark is contradicted."""
 
     ODOMETRY = "odometry"
     POSE = "pose"
@@ -25,28 +25,28 @@ class Kind(Enum):
 
 
 class Contradiction(NamedTuple):
-    """Something that is not as it was believed or described.
+    """A fault of a robot or landmark.
 
     Attributes:
-        about: A robot's name, or a landmark as "landmark 7".
-        kind: What of it.
-        text: The same in words.
+        about: A robot's name, or a landmark such as "landmark 7".
+        kind: What is contradicted.
+        text: One sentence for people.
     """
 
     about: str
-    kind: Kind
+    kind: Contradicted
     text: str
 
 
 def contradictions(
     swarm: Swarm, state: SwarmState, tracks: OdometryTracks, now_ns: int
 ) -> list[Contradiction]:
-    """All that contradicts the belief at an instant.
+    """All faults that are known at an instant.
 
     Args:
-        swarm: Whose names are told.
-        state: The belief.
-        tracks: Odometry, which may contradict itself.
+        swarm: Gives the names.
+        state: The newest state.
+        tracks: Odometry; a robot whose odometry jumps may have two sources.
         now_ns: The instant.
     """
     names = [robot.name for robot in swarm.robots] + [f"landmark {mark.id}" for mark in swarm.landmarks]
@@ -65,29 +65,30 @@ def contradictions(
 
 
 def _odometry(name: str) -> Contradiction:
-    return Contradiction(name, Kind.ODOMETRY, f"the odometry of {name} jumps to and fro: has it two sources?")
+    text = f"the odometry of {name} jumps back and forth: it may have two sources"
+    return Contradiction(name, Contradicted.ODOMETRY, text)
 
 
 def _pose(name: str) -> Contradiction:
-    return Contradiction(name, Kind.POSE, f"the newest sightings contradict the pose of {name}")
+    return Contradiction(name, Contradicted.POSE, f"the newest measurements contradict the pose of {name}")
 
 
 def _sightings(observer: str, source: str) -> Contradiction:
-    text = f"what {observer} sees of {source} is set aside: it agrees with nothing else"
-    return Contradiction(observer, Kind.SIGHTINGS, text)
+    text = f"excluding {observer}'s measurements of {source}: inconsistent with all others"
+    return Contradiction(observer, Contradicted.SIGHTINGS, text)
 
 
 def _description(name: str, source: int, state: SwarmState) -> Contradiction:
-    """What is said of a robot or landmark that is estimated because it was contradicted."""
+    """The fault of a robot or landmark whose parameters are re-estimated."""
     robots = state.tracked.size
     if source < robots:
-        text = f"{name} does not see or move as described: its camera and odometry are calibrated anew"
+        text = f"{name} contradicts its calibration; re-estimating its camera and odometry parameters"
     else:
         moved = float(np.hypot(*state.landmark[source - robots, :2]))
-        text = f"{name} is not where it is described, but about {moved:.2f} m off: its place is estimated"
-    return Contradiction(name, Kind.DESCRIPTION, text)
+        text = f"{name} is about {moved:.2f} m from its surveyed place; re-estimating its place"
+    return Contradiction(name, Contradicted.DESCRIPTION, text)
 
 
 def _noise(name: str) -> Contradiction:
-    text = f"what {name} measures counts with more noise than described, which has been contradicted"
-    return Contradiction(name, Kind.NOISE, text)
+    text = f"the measurements of {name} are noisier than described; inflating their noise"
+    return Contradiction(name, Contradicted.NOISE, text)

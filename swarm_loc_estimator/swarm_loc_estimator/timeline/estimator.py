@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.belief import NEVER_NS
-from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
+from swarm_loc_estimator.filter.measurement_model import NO_MODEL, Command, MeasurementArray
 from swarm_loc_estimator.identification.memory import Identities, Outcome
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.infrared import BrightnessConverter
@@ -111,7 +111,8 @@ class Estimator:
         """
         if self._odometry:
             self._use_odometry()
-        command = about_robots(robot, stamp_ns, np.array([pose]), np.array([covariance]), Kind.SET_POSE)
+        command = about_robots(robot, stamp_ns, np.array([pose]), np.array([covariance]), NO_MODEL)
+        command["command"] = Command.SET_POSE
         fault = REJECT_REASONS[reject_reasons(command)[0]] or (
             "" if self._tracks.begun(robot, stamp_ns) else "not_localized"
         )
@@ -123,7 +124,9 @@ class Estimator:
 
     def forget(self, robot: int, stamp_ns: int) -> None:
         """Take a robot out of the estimate; it waits for a fix."""
-        self._timeline.add(about_robots(robot, stamp_ns, np.zeros((1, 3)), np.eye(3)[None], Kind.FORGET))
+        command = about_robots(robot, stamp_ns, np.zeros((1, 3)), np.eye(3)[None], NO_MODEL)
+        command["command"] = Command.FORGET
+        self._timeline.add(command)
 
     def drop(self, reason: str, count: int = 1) -> None:
         """Count data that could not even be handed in."""
@@ -224,5 +227,5 @@ class Estimator:
         }
 
     def _estimate(self, now_ns: int) -> Estimate:
-        state = self._fusion.with_starts(self._timeline.state, now_ns)
+        state = self._fusion.starts.with_starts(self._timeline.state, now_ns)
         return estimate_at(state, self._tracks.arrays, self._timeout_s, now_ns)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.filter import sequential_update
 from swarm_loc_estimator.filter.batch_update import (
     assess_all,
@@ -22,14 +22,22 @@ from swarm_loc_estimator.filter.batch_update import (
 from swarm_loc_estimator.filter.belief import correct
 from swarm_loc_estimator.filter.calibration_states import ParameterTable
 from swarm_loc_estimator.filter.correlated_noise import at_first, record_constraint, record_pair
+from swarm_loc_estimator.filter.dense_filter import update_one
 from swarm_loc_estimator.filter.innovation import InnovationBatch, new_batch
 from swarm_loc_estimator.filter.integrity.divergence import WELL_CONFIRMED, LossLimits
 from swarm_loc_estimator.filter.integrity.fault_detection import is_elsewhere
 from swarm_loc_estimator.filter.joint_filter import JointFilter, Robots
-from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray, MeasurementColumns
+from swarm_loc_estimator.filter.measurement_model import (
+    MODELS,
+    Command,
+    Kind,
+    MeasurementArray,
+    MeasurementColumns,
+)
+from swarm_loc_estimator.filter.model_evaluation import evaluate_by_records
 from swarm_loc_estimator.filter.sequential_update import update_in_order
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
-from swarm_loc_estimator.filter.state import InitialPose, Starts, SwarmState
+from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.identification.assignment import AMBIGUOUS
 from swarm_loc_estimator.initialization.initializer import Initializer
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
@@ -37,6 +45,7 @@ from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.aerial import PictureFusion, as_fixes, relieve_seen
 from swarm_loc_estimator.sensors.messages import chosen
 from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline.configured_starts import ConfiguredStarts
 from swarm_loc_estimator.timeline.scheduling import middle_of_period
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -71,6 +80,7 @@ class Fusion:
 
     Attributes:
         is_sparse: Whether only covariances of neighbours are kept: in a large swarm.
+        starts: Initializes robots at their configured starts.
     """
 
     def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks) -> None:
@@ -81,10 +91,7 @@ class Fusion:
         )
         self._period_ns = round(settings.fusion_period_s * 1e9)
         self.is_sparse = self._period_ns > 0 and len(swarm.robots) >= settings.sparse_from
-        self._has_start = np.array([r.start is not None for r in swarm.robots], dtype=bool)
-        self._start: FloatArray = np.array([r.start or (0.0, 0.0, 0.0) for r in swarm.robots]).reshape(-1, 3)
-        sigma = [(r.start_sigma.x, r.start_sigma.y, r.start_sigma.theta) for r in swarm.robots]
-        self._start_variance: FloatArray = np.square(sigma).reshape(-1, 3)
+        self.starts = ConfiguredStarts(swarm, tracks)
         surer = settings.lost_heading_sigma / _SURER_AT_FIRST
         self._initializer = Initializer(tracks, settings.fix_window_s, surer)
         self._pictures = PictureFusion(swarm, settings, tracks)
@@ -95,49 +102,6 @@ class Fusion:
         """Nothing is known yet."""
         joint: JointFilter | None = SparseFilter(self._table) if self.is_sparse else None
         return SwarmState(self._table, self._pairs, joint)
-
-    def with_starts(self, state: SwarmState, stamp_ns: int) -> SwarmState:
-        """The state, together with those robots at their starts about whom there was no measurement yet.
-
-        Not those that walk at random: nobody knows since when.
-        """
-        robots = np.flatnonzero(state.start_pending)
-        ready = robots[~self._tracks.walks(robots) & self._may_start(state, robots, stamp_ns)]
-        if ready.size:
-            state = state.copy()
-            self._initialize_at_start(state, ready, np.full(ready.size, stamp_ns))
-        return state
-
-    def _may_start(self, state: SwarmState, robots: IntArray, stamps_ns: IntArray | int) -> BoolArray:
-        """Whether robots (k,) may start at configured poses: their odometry has begun by instants (k,)."""
-        pending: BoolArray = state.start_pending[robots] & self._has_start[robots]
-        return pending & self._tracks.begun(robots, stamps_ns)
-
-    def _initialize_at_start(self, state: SwarmState, robots: IntArray, stamps_ns: IntArray) -> None:
-        """Where their tracks begin; or, if they walk at random, with the first measurements about them."""
-        tracks, start, walks = self._tracks.arrays, self._start[robots], self._tracks.walks(robots)
-        transform = se2.compose(start, se2.inverse(tracks.begin_pose[robots]))
-        error = se2.error_covariance(start, self._start_variance[robots][:, :, None] * np.eye(3))
-        begun_ns = np.where(walks, stamps_ns, tracks.begin_ns[robots])
-        covariance, jacobian = self._tracks.at(robots, stamps_ns)[2:4]
-        covariance[~walks], jacobian[~walks] = 0.0, 0.0  # where a track begins, nothing is preintegrated yet
-        state.start(robots, Starts(transform, error, begun_ns, covariance, jacobian))
-
-    def _initialize_measured(self, state: SwarmState, measurements: MeasurementArray) -> bool:
-        """Initialize robots at their starts with the first measurement (m,) about them; whether any was.
-
-        Not before: only a measurement about a robot is computed again when its first odometry arrives late.
-        """
-        initialized = False
-        for side in ("observer", "target"):
-            new = np.append(state.start_pending, False)[measurements[side]]  # NOBODY (-1) finds the last
-            robots, stamps_ns = measurements[side][new], measurements["stamp_ns"][new]
-            ready = self._may_start(state, robots, stamps_ns)
-            chosen_robots, first = np.unique(robots[ready], return_index=True)
-            if chosen_robots.size:
-                self._initialize_at_start(state, chosen_robots, stamps_ns[ready][first])
-                initialized = True
-        return initialized
 
     def step(
         self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
@@ -170,7 +134,7 @@ class Fusion:
         self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
     ) -> None:
         """Fuse measurements that name their robots."""
-        measured = measurements["kind"] < Kind.SET_POSE
+        measured = measurements["command"] == Command.NONE
         if state.filter.sequential:
             if self._period_ns and measurements.size >= self._policy.batch_from and measured.all():
                 self._fuse_together(state, measurements, verdicts, nis)
@@ -189,10 +153,7 @@ class Fusion:
         self, state: SwarmState, image: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
     ) -> None:
         """Fuse the anonymous detections of an aerial image."""
-        robots, stamp_ns = np.flatnonzero(state.start_pending), int(image["stamp_ns"][0])
-        ready = robots[self._may_start(state, robots, stamp_ns)]
-        if ready.size:
-            self._initialize_at_start(state, ready, np.full(ready.size, stamp_ns))
+        self.starts.initialize_pending(state, int(image["stamp_ns"][0]))
         assignment = self._pictures.assigned(state, image)
         known = assignment.robot >= 0
         if known.any():
@@ -225,13 +186,42 @@ class Fusion:
                 self._open(state, robot, int(measurements["stamp_ns"][k]))
                 continue
             one = measurements[k : k + 1]
-            if one["kind"][0] >= Kind.SET_POSE:
+            if one["command"][0] != Command.NONE:
                 verdicts[k] = self._apply_command(state, one)
-            elif self._initialize_measured(state, one):
+            elif self.starts.initialize_measured(state, one):
                 continue
+            elif state.is_known(one["observer"][0]) and state.is_known(one["target"][0]):
+                verdict = self._fuse_by_record(state, one, nis[k : k + 1])
+                if verdict == Verdict.OPEN:
+                    continue
+                verdicts[k] = verdict
             else:
                 verdicts[k] = self._note(state, one)
             k += 1
+
+    def _fuse_by_record(self, state: SwarmState, one: MeasurementArray, nis: FloatArray) -> Verdict:
+        """Fuse a measurement (1,) of a model without a kernel; OPEN: one of its robots was lost instead.
+
+        Args:
+            state: Changed in place; its filter is dense.
+            one: Between robots that are located.
+            nis: (1,) written.
+        """
+        fields = MeasurementColumns.of(one)
+        batch, lost = self._predict(state, fields, int(one["stamp_ns"][0]))
+        if lost.any():
+            return Verdict.OPEN
+        belief, passed = state.arrays(), batch.passed
+        evaluate_by_records(one, self._tracks.arrays, belief, state.filter, batch)
+        nis[:] = batch.nis
+        gone = confirm_all(fields, belief, passed)
+        if passed[0]:
+            evaluated = batch.columns[0], batch.jacobian[0], batch.innovation[0], batch.noise[0]
+            correct(belief, update_one(belief.covariance, *evaluated))
+        gone |= count_all_gated(fields, belief, passed, self._limits)
+        for robot in np.flatnonzero(gone).tolist():
+            state.lose(robot)
+        return Verdict.USED if passed[0] else Verdict.GATED
 
     def _fuse_together(
         self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
@@ -256,18 +246,20 @@ class Fusion:
         self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
     ) -> None:
         """Fuse measurements (m,) together, against one belief."""
-        self._initialize_measured(state, measurements)
+        self.starts.initialize_measured(state, measurements)
         known = np.append(state.tracked, True)  # NOBODY (-1) finds the last
         tied = known[measurements["observer"]] & known[measurements["target"]]
         if tied.any():
-            fields = MeasurementColumns.of(measurements if tied.all() else measurements[tied])
-            batch, lost = self._predict(state, fields)
+            rows = measurements if tied.all() else measurements[tied]
+            fields = MeasurementColumns.of(rows)
+            middle_ns = middle_of_period(int(fields.stamp_ns[0]), self._period_ns)
+            batch, lost = self._predict(state, fields, middle_ns)
             good = ~(lost[fields.observer] | lost[fields.target])
             if not good.all():
-                fields, batch = chosen(fields, good), chosen(batch, good)
+                rows, fields, batch = rows[good], chosen(fields, good), chosen(batch, good)
                 tied[tied] = good
             if good.any():
-                verdicts[tied], nis[tied] = self._update(state, fields, batch)
+                verdicts[tied], nis[tied] = self._update(state, rows, fields, batch)
         untied = np.flatnonzero(~tied)
         sides = zip(measurements["observer"][untied], measurements["target"][untied], strict=True)
         for k, (observer, target) in zip(untied.tolist(), sides, strict=True):
@@ -277,28 +269,37 @@ class Fusion:
             else:
                 verdicts[k] = self._note(state, measurements[k : k + 1])
 
-    def _predict(self, state: SwarmState, fields: MeasurementColumns) -> tuple[InnovationBatch, BoolArray]:
-        """Predict the robots involved to the middle of the period; those too uncertain leave.
+    def _predict(
+        self, state: SwarmState, fields: MeasurementColumns, stamp_ns: int
+    ) -> tuple[InnovationBatch, BoolArray]:
+        """Predict the robots involved to an instant; those too uncertain leave.
 
         Returns:
             A batch (m,) with poses and motion, and (N + 1,) whether each robot, and nobody, was lost.
         """
         batch, lost = new_batch(fields.stamp_ns.size), np.zeros(state.tracked.size + 1, dtype=bool)
-        stamp_ns = middle_of_period(int(fields.stamp_ns[0]), self._period_ns)
         predict_all(fields, stamp_ns, self._tracks.arrays, state.arrays(), self._limits, batch, lost[:-1])
         for robot in np.flatnonzero(lost):
             state.lose(int(robot))
         return batch, lost
 
     def _update(
-        self, state: SwarmState, fields: MeasurementColumns, batch: InnovationBatch
+        self, state: SwarmState, rows: MeasurementArray, fields: MeasurementColumns, batch: InnovationBatch
     ) -> tuple[NDArray[np.uint8], FloatArray]:
-        """Hold measurements (m,) against one belief, use those that pass; return verdicts and their NIS."""
+        """Gate measurements (m,), use those accepted together; return verdicts and NIS (m,).
+
+        Args:
+            state: Changed in place, with the robots involved predicted.
+            rows: (m,) between robots that are located.
+            fields: (m,) the same as columns.
+            batch: (m,) with poses and motion.
+        """
         belief, passed, newest_ns = state.arrays(), batch.passed, int(fields.stamp_ns[-1])
         state.filter.relate_pairs(
             related_columns(fields, belief), self._robots(state, newest_ns), batch.across
         )
         evaluate_all(fields, belief, batch)
+        evaluate_by_records(rows, self._tracks.arrays, belief, state.filter, batch)
         looks = (batch.distance, batch.whitened, batch.cause)
         contradicted = assess_all(fields, belief, self._limits, looks, passed)
         lost = confirm_all(fields, belief, passed)
@@ -329,7 +330,8 @@ class Fusion:
 
     def _note(self, state: SwarmState, one: MeasurementArray) -> Verdict:
         """Keep a measurement (1,) as a constraint if it ties a waiting robot to something located."""
-        if not self._initializer.note(state, at_first(one)):
+        constraint = MODELS[int(one["kind"][0])].constraint
+        if constraint is None or not self._initializer.note(state, at_first(constraint(one))):
             return Verdict.NOT_LOCALIZED
         sides = np.array([one["observer"][0], one["target"][0]])
         if self._pairs and (sides >= 0).all():
@@ -354,7 +356,7 @@ class Fusion:
     def _apply_command(self, state: SwarmState, command: MeasurementArray) -> Verdict:
         """Set the pose of a robot or forget it, as the command (1,) says."""
         robot, stamp_ns = int(command["target"][0]), int(command["stamp_ns"][0])
-        if command["kind"][0] == Kind.FORGET:
+        if command["command"][0] == Command.FORGET:
             state.lose(robot)
             return Verdict.USED
         if not self._tracks.begun(robot, stamp_ns):

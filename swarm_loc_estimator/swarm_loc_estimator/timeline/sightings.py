@@ -7,12 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
+from swarm_loc_estimator.filter.measurement_model import Command, MeasurementArray
 from swarm_loc_estimator.timeline.fusion import Verdict
 
 RECENT_NS = 2_000_000_000
 """Older measurements do not tell what a robot sees now."""
-_SHOWN = (int(Kind.CARTESIAN), int(Kind.POLAR))
 
 
 class Sightings(NamedTuple):
@@ -48,7 +47,7 @@ def newest_sightings(
     robot, landmark = rows["target"], rows["landmark"]
     target = np.where(landmark > 0, -landmark, robot)
     observer = rows["observer"]
-    chosen = np.flatnonzero(np.isin(rows["kind"], _SHOWN) & ((landmark > 0) | (robot >= 0)))[::-1]
+    chosen = np.flatnonzero((rows["command"] == Command.NONE) & ((landmark > 0) | (robot >= 0)))[::-1]
     # np.unique keeps the first of equal keys: by the reversed order the newest
     _, places = np.unique((observer[chosen] << 32) + target[chosen], return_index=True)
     kept = chosen[places]

@@ -32,7 +32,7 @@ from tf2_msgs.msg import TFMessage
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 from swarm_loc_estimator.sensors.messages import RawInputs
-from swarm_loc_estimator.timeline.contradictions import Contradiction, Kind
+from swarm_loc_estimator.timeline.contradictions import Contradicted, Contradiction
 from swarm_loc_estimator.timeline.estimator import Estimate
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.timeline import GoOn
@@ -233,9 +233,9 @@ def test_eight_new_contradictions_are_told_one_by_one_and_more_in_a_sentence(
     node = ros.add(EstimatorNode(lambda *_: told, parameter_overrides=overrides(swarm_file=str(swarm_file))))
     lines: list[str] = []
     monkeypatch.setattr(node, "get_logger", lambda: SimpleNamespace(warning=lines.append))
-    all_of = [Contradiction(f"robot{k}", Kind.POSE, f"robot{k} is elsewhere") for k in range(19)]
+    all_of = [Contradiction(f"robot{k}", Contradicted.POSE, f"robot{k} is elsewhere") for k in range(19)]
     texts = [one.text for one in all_of]
-    other = Contradiction("robot0", Kind.NOISE, "robot0 is noisy")
+    other = Contradiction("robot0", Contradicted.NOISE, "robot0 is noisy")
     for now, expected in (
         (all_of[:8], texts[:8]),
         (all_of[:9], texts[8:9]),

@@ -11,7 +11,7 @@ from swarm_loc_estimator.filter.integrity.fault_detection import is_contradicted
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, NOBODY, MeasurementColumns
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.swarm.swarm import RandomWalk, Robot, Swarm
-from swarm_loc_estimator.timeline.contradictions import Kind as Contradicted
+from swarm_loc_estimator.timeline.contradictions import Contradicted
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
 from swarm_loc_estimator.timeline.settings import Settings
 

@@ -167,7 +167,7 @@ def test_a_robot_unsure_at_one_of_many_measurements_is_lost_in_whatever_order_th
     state = steps.new_state()
     state.initialize(0, InitialPose(np.zeros(3), np.diag([1e-6, 1e-6, 1.0])), Preintegrated.begin(T0))
     fixes = about_robots(0, stamps_ns, np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), Kind.CARTESIAN)
-    _, lost = steps._predict(state, MeasurementColumns.of(fixes[list(order)]))
+    _, lost = steps._predict(state, MeasurementColumns.of(fixes[list(order)]), T0)
     assert lost.tolist() == [True, False]
     assert not state.tracked[0]
 

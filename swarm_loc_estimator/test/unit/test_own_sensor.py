@@ -1,0 +1,174 @@
+"""A range-only sensor added from outside the product, and the Jacobians of all registered models."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from core_geometry import nees, wrapped
+from core_messages import SECOND, T0
+from core_run import play, settled, ticks
+from core_world import Plan, World, simulate
+from scipy.stats import chi2
+
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.filter import measurement_model
+from swarm_loc_estimator.filter.measurement_model import (
+    MEASUREMENT_DTYPE,
+    MODELS,
+    NOBODY,
+    MeasurementArray,
+    MeasurementModel,
+    Prediction,
+)
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
+from swarm_loc_estimator.timeline.scheduling import Policy
+from swarm_loc_estimator.timeline.settings import Settings
+
+SIGMA_M = 0.03
+
+
+def predict_range(one: MeasurementArray, observer: FloatArray, target: FloatArray) -> Prediction:
+    (sx, sy, _), (mx, my, _) = se2.compose(observer, one["sensor"][0]), se2.compose(target, one["marker"][0])
+    distance = np.hypot(mx - sx, my - sy)
+    toward = np.array([[mx - sx, my - sy]]) / distance
+    moved_observer, moved_target = ([[1.0, 0.0, -y], [0.0, 1.0, x]] for x, y in ((sx, sy), (mx, my)))
+    return Prediction(np.array([distance]), -toward @ moved_observer, toward @ moved_target)
+
+
+RANGE = MeasurementModel("range", 100, 1, predict_range, lambda one, value: one["value"][0, :1] - value)
+
+
+def ranges(world: World, seed: int, outliers: float = 0.0) -> MeasurementArray:
+    """Ranges (m,) of all robots to two anchors and to the next robot, five times a second."""
+    rng, rows = np.random.default_rng([seed, 9]), []
+    robots = len(world.swarm.robots)
+    for k in range(4, world.stamp_ns.size, 4):
+        for robot in range(robots):
+            for anchor in (0, 3, None):
+                one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
+                one["stamp_ns"], one["kind"], one["gate"] = world.stamp_ns[k], RANGE.number, RANGE.gate(0.999)
+                one["observer"] = one["received_from"] = robot
+                one["target"], one["covariance"] = NOBODY, np.diag([SIGMA_M**2, 1.0, 1.0])
+                other = world.truth[k, (robot + 1) % robots]
+                if anchor is None:
+                    one["target"] = (robot + 1) % robots
+                else:
+                    mark = world.swarm.landmarks[anchor]
+                    one["landmark"], one["marker"] = anchor + 1, (mark.x, mark.y, 0.0)
+                    other = one["marker"][0]
+                distance = np.hypot(*(other - world.truth[k, robot])[:2]) + rng.normal(0.0, SIGMA_M)
+                one["value"][0, 0] = distance + (1.0 if rng.uniform() < outliers else 0.0)
+                rows.append(one)
+    return np.concatenate(rows)
+
+
+IN_ORDER = Settings(fusion_period_s=0.0)
+TOGETHER = Settings(fusion_period_s=0.2, policy=Policy(batch_from=2))
+SPARSE = Settings(fusion_period_s=0.2, sparse_from=2)
+ALL = pytest.mark.parametrize("settings", [IN_ORDER, TOGETHER, SPARSE], ids=["order", "batch", "sparse"])
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measurement_model, "MODELS", MODELS)
+    monkeypatch.setitem(MODELS, RANGE.number, RANGE)
+
+
+def world_of(seed: int) -> World:
+    """Robots that see nothing."""
+    return simulate(Plan(4, 16.0, reach=0.0), seed)
+
+
+def run(
+    world: World, measured: MeasurementArray, settings: Settings, late_s: float = 0.0
+) -> tuple[Estimator, list[Estimate]]:
+    """A world with ranges that come late by up to so much, in any order."""
+    rng, estimator = np.random.default_rng(0), Estimator(world.swarm, settings)
+    arrivals_ns = measured["stamp_ns"] + (rng.uniform(0.0, late_s, measured.size) * SECOND).astype(np.int64)
+    order = np.argsort(arrivals_ns, kind="stable")
+    measured, arrivals_ns = measured[order], arrivals_ns[order]
+    events = [(e.stamp_ns + int(rng.uniform(0.0, late_s) * SECOND), e) for e in world.events]
+    estimates, begin_ns = [], T0
+    for now_ns in ticks(T0, int(world.stamp_ns[-1]) + 2 * SECOND, 0.25):
+        estimator._timeline.add(measured[(arrivals_ns > begin_ns) & (arrivals_ns <= now_ns)])
+        here = [(t, e) for t, e in events if begin_ns < t <= now_ns or t == now_ns == T0]
+        estimates += play(estimator, here, [now_ns])
+        begin_ns = now_ns
+    return estimator, estimates
+
+
+def errors(world: World, estimates: list[Estimate]) -> tuple[FloatArray, FloatArray]:
+    """Errors (T, N, 3) and covariances (T, N, 3, 3) at whole seconds of the world."""
+    whole = [e for e in estimates if e.stamp_ns % SECOND == 0 and e.stamp_ns <= world.stamp_ns[-1]][4:]
+    error = wrapped(np.array([e.poses - world.at(e.stamp_ns) for e in whole]))
+    return error, np.array([e.covariances for e in whole])
+
+
+@ALL
+def test_ranges_make_poses_better_and_the_errors_stay_as_large_as_the_covariances_say(
+    settings: Settings,
+) -> None:
+    squared, with_ranges, without = [], [], []
+    for seed in range(4):
+        world = world_of(900 + seed)
+        estimator, estimates = run(world, ranges(world, seed), settings)
+        error, covariance = errors(world, estimates)
+        assert settled(estimator)["USED"] > 900
+        squared.append(nees(error, covariance).mean(axis=0))
+        with_ranges.append(np.square(error[..., :2]).mean())
+        error, _ = errors(world, run(world, ranges(world, seed)[:0], settings)[1])
+        without.append(np.square(error[..., :2]).mean())
+    assert np.sqrt(np.mean(with_ranges)) < 0.4 * np.sqrt(np.mean(without))
+    samples = np.size(squared)
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 3 * samples) / samples
+    assert low < np.mean(squared) < high
+
+
+@ALL
+def test_late_and_shuffled_ranges_give_the_same(settings: Settings) -> None:
+    world = world_of(910)
+    measured = ranges(world, 1)
+    expected = run(world, measured, settings)[1][-1]
+    found = run(world, np.random.default_rng(3).permutation(measured), settings, late_s=1.5)[1][-1]
+    np.testing.assert_allclose(found.poses, expected.poses, atol=1e-9)
+    np.testing.assert_allclose(found.covariances, expected.covariances, atol=1e-9)
+
+
+@ALL
+def test_outliers_are_gated_with_the_one_degree_of_freedom_of_the_sensor(settings: Settings) -> None:
+    np.testing.assert_allclose(RANGE.gate([0.95, 0.999]), chi2.ppf([0.95, 0.999], 1))
+    world = world_of(920)
+    measured = ranges(world, 2, outliers=0.1)
+    estimator, estimates = run(world, measured, replace(settings, horizon_s=60.0))
+    rows, verdicts, nis = estimator.recent()
+    gated = verdicts == 2
+    assert gated.sum() == pytest.approx(0.1 * rows.size, rel=0.3)
+    assert nis[gated].min() > chi2.ppf(0.999, 1) >= nis[~gated].max()
+    error, _ = errors(world, estimates)
+    assert np.sqrt(np.square(error[..., :2]).mean()) < 0.05
+
+
+@pytest.mark.parametrize("number", [*MODELS, RANGE.number])
+@pytest.mark.parametrize("seed", range(3))
+def test_jacobians_of_all_models_agree_with_finite_differences(number: int, seed: int) -> None:
+    model, rng, step = MODELS[number], np.random.default_rng(seed), 1e-6
+    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
+    one["kind"], one["observer"], one["target"], one["has_heading"] = number, 0, 1, 1
+    one["sensor"], one["marker"], poses = *rng.normal(size=(2, 1, 3)), rng.normal(size=(2, 3))
+    predicted = model.predict(one, *poses)
+    assert 1 <= model.degrees_of_freedom <= predicted.value.size <= 3
+    for side, jacobian in enumerate((predicted.observer_jacobian, predicted.target_jacobian)):
+        for j in range(3):
+            moved = poses.copy()
+            moved[side] = se2.compose(se2.exp(step * np.eye(3)[j]), moved[side])
+            one["value"][0, : predicted.value.size] = model.predict(one, *moved).value
+            slope = model.innovation(one, predicted.value) / step
+            np.testing.assert_allclose(jacobian[:, j], slope, atol=2e-5)
+
+
+def test_a_number_stands_for_one_model() -> None:
+    with pytest.raises(ValueError, match="the number 100 of the measurement model 'range' is not free"):
+        measurement_model.register(RANGE)
