@@ -1,4 +1,4 @@
-"""Write a run as one MCAP file that any viewer shows: poses, /tf, markers, ground truth, map and goals."""
+"""Write a run as one MCAP file for viewers: poses, /tf, markers, ground truth, map and goals."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _MAP = "map"
 
 
 def write_mcap(result: ReplayResult, path: Path) -> None:
-    """Write the file; one that is there is replaced.
+    """Write the file, replacing an existing one.
 
-    Transforms go from map straight to `<robot>/base_link`, since nobody else says where that is.
+    Transforms lead from map directly to `<robot>/base_link`; the file holds no odom frames.
 
     Args:
         result: The run.
-        path: Where to, such as run.mcap.
+        path: Such as run.mcap.
 
     Raises:
         BagError: It cannot be written.
@@ -39,8 +39,8 @@ def write_mcap(result: ReplayResult, path: Path) -> None:
         bag = Path(folder) / "run"
         with BagWriter(bag, compress=True) as writer:
             _add_estimates(result, writer)
-            _add_places("ground_truth", result.truth, writer)
-            _add_places("goal", result.goals, writer)
+            _add_tracks("ground_truth", result.truth, writer)
+            _add_tracks("goal", result.goals, writer)
             if result.maps:
                 writer.add_topic("map", OCCUPANCY_GRID, is_latched=True)
             for one in result.maps:
@@ -48,9 +48,9 @@ def write_mcap(result: ReplayResult, path: Path) -> None:
         shutil.move(bag / "run.mcap", path)
 
 
-def _add_places(topic: str, places: Mapping[str, Trajectory], writer: BagWriter) -> None:
-    """A PoseStamped for each place of each robot."""
-    for name, track in places.items():
+def _add_tracks(topic: str, tracks: Mapping[str, Trajectory], writer: BagWriter) -> None:
+    """Write trajectories as PoseStamped on `<robot>/<topic>`."""
+    for name, track in tracks.items():
         writer.add_topic(f"{name}/{topic}", POSE_STAMPED)
         messages = encode_pose_stamped(_MAP, track.stamp_ns, track.pose)
         for stamp_ns, message in zip(track.stamp_ns.tolist(), messages, strict=True):
@@ -58,7 +58,7 @@ def _add_places(topic: str, places: Mapping[str, Trajectory], writer: BagWriter)
 
 
 def _add_estimates(result: ReplayResult, writer: BagWriter) -> None:
-    """Poses, transforms and markers of each instant."""
+    """Write poses, transforms and markers at each stamp."""
     for topic, kind in (("swarm/poses", SWARM_POSES), ("tf", TRANSFORMS), ("swarm/markers", MARKERS)):
         writer.add_topic(topic, kind)
     names = [robot.name for robot in result.swarm.robots]
@@ -77,7 +77,7 @@ def _add_estimates(result: ReplayResult, writer: BagWriter) -> None:
 
 
 def estimates(result: ReplayResult, stride: int = 1) -> Iterator[EstimateMessage]:
-    """The poses of a run as messages hold them, every so many; ages of fixes are not known."""
+    """Every `stride`-th output of a run as a message; ages of fixes are not known."""
     names = tuple(robot.name for robot in result.swarm.robots)
     not_kept = np.full(len(names), np.nan)
     for k in range(0, len(result.stamp_ns), stride):

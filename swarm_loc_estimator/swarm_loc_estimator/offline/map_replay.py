@@ -24,7 +24,7 @@ from swarm_loc_estimator.mapping.settings import MapperSettings
 from swarm_loc_estimator.offline.recorded_bag import TruthReader
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
-_TELL_EVERY = 1000
+_REPORT_EVERY = 1000
 
 
 def replay_map(
@@ -34,14 +34,14 @@ def replay_map(
     frequencies: Mapping[str, float],
     progress: Callable[[float, str], None],
 ) -> tuple[CooperativeMapper, MapperFeed]:
-    """Make the map of a bag; returns the mapper, all solved anew at the end, and what was used and what not.
+    """Map a bag; returns the mapper after a last optimization, and its feed with the counts of used inputs.
 
     Args:
         bag: With `<robot>/odom`, `<robot>/laser` and, if frequencies are given, `<robot>/lights`.
-        robots: Those that map.
+        robots: The robots that map.
         settings: Of the mapper.
         frequencies: Robot -> frequency of its LEDs [Hz].
-        progress: Is told the share that is done, and what is going on.
+        progress: Called now and then with the share done and what is being done.
 
     Raises:
         UserError: The bag cannot be read, or the robots cannot start.
@@ -58,7 +58,7 @@ def replay_map(
                 feed.add(robot, kind, data)
             else:
                 feed.drops["other_type"] += 1
-            if number % _TELL_EVERY == 0:
+            if number % _REPORT_EVERY == 0:
                 progress(reader.progress, "mapping")
     mapper.finish()
     return mapper, feed
@@ -84,7 +84,7 @@ class MapFigures(NamedTuple):
     Attributes:
         stops: How many stops have ground truth.
         position_m: RMS error of these.
-        heading_rad: Likewise of their headings.
+        heading_rad: RMS error of their headings.
         wall_m: Mean distance of occupied cells from the nearest wall.
         coverage: Share of the walls with an occupied cell nearby.
     """
@@ -96,7 +96,7 @@ class MapFigures(NamedTuple):
     coverage: float
 
     def sentence(self) -> str:
-        """For people."""
+        """The figures as a sentence."""
         parts = []
         if self.stops:
             parts.append(
@@ -109,7 +109,7 @@ class MapFigures(NamedTuple):
 
 
 def map_figures(mapper: CooperativeMapper, truth: Mapping[int, Trajectory], walls: FloatArray) -> MapFigures:
-    """Figures of the map that a mapper has now.
+    """Compare the map of a mapper with ground truth and floor plan.
 
     Args:
         mapper: Holds the map and the stops.

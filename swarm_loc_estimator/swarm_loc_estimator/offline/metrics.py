@@ -14,7 +14,7 @@ from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, in
 
 
 class MetricsError(ValueError):
-    """Arrays that do not belong together; the message is one sentence."""
+    """Arrays whose sizes do not match; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,12 @@ class Errors:
 
 @dataclass(frozen=True)
 class ErrorSummary:
-    """A row of an error table; NaN throughout when there was nothing to compare.
+    """Statistics of errors; NaN when there was nothing to compare.
 
     Attributes:
         count: Number of compared poses.
-        position_rmse: [m]; likewise mean, median, p95 (95 %) and max.
-        heading_rmse: [rad]; likewise of the absolute heading error.
+        position_rmse: [m]; mean, median, p95 (95 %) and max follow.
+        heading_rmse: [rad], of the absolute heading error; mean, median, p95 and max follow.
         nees: Mean normalised squared error, ideally 3.
     """
 
@@ -68,10 +68,10 @@ class ErrorSummary:
 def compare(
     estimate: Trajectory, covariance: FloatArray | None, truth: Trajectory, max_gap_ns: int = DEFAULT_GAP_NS
 ) -> Errors:
-    """Errors at every time where estimate and truth are known.
+    """Errors wherever estimate and truth are known.
 
-    Dense truth is interpolated at the estimate's stamps. A truth that stands alone, further than the gap from
-    its neighbours, would never meet an estimate's stamp; there the estimate is interpolated instead.
+    Dense truth is interpolated at the estimate's stamps. At an isolated true pose, further than `max_gap_ns`
+    from its neighbours, the estimate is interpolated at the stamp of the truth instead.
 
     Args:
         estimate: Poses from the estimator; rows that are not finite are not compared.
@@ -128,7 +128,7 @@ def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def summarise(errors: Errors) -> ErrorSummary:
-    """One row of an error table."""
+    """Statistics of the errors of one robot, or of several pooled ones."""
     position, heading = errors.position, np.abs(errors.error[:, 2])
     if len(position) == 0:
         return ErrorSummary(0, *[float("nan")] * 11)

@@ -23,24 +23,24 @@ from swarm_loc_estimator.sensors.topics import InputKind
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 Progress = Callable[[float, str], None]
-"""Takes the share done, 0 to 1, and what is being done."""
+"""Is called with the share done, 0 to 1, and what is being done."""
 
 
 def unwatched(_share: float, _what: str) -> None:
-    """Progress that nobody watches."""
+    """Ignore the progress."""
 
 
 @dataclass(frozen=True)
 class BagSummary:
-    """What is known of a bag beside its inputs.
+    """Contents of a bag beside the inputs of the estimator.
 
     Attributes:
         range_ns: First and last log time.
         truth: Robot name -> ground truth; robots without are missing.
         received: Messages for the estimator by kind of topic.
         remarks: What could not be read or used, one sentence each.
-        maps: What was recorded of `map`, thinned out where it is very much.
-        goals: Robot name -> where it was to go, by the instants at which that was decided.
+        maps: Messages of `map`, thinned out to `MAX_MAP_BYTES`.
+        goals: Robot name -> its goals by their stamps.
     """
 
     range_ns: tuple[int, int]
@@ -56,8 +56,8 @@ def read_bag(bag: Path, swarm: Swarm, take: Callable[[RawInputs], None], progres
 
     Args:
         bag: rosbag2 folder, .mcap or .db3 file.
-        swarm: Whose messages are wanted.
-        take: Is handed the inputs, one stretch of time after the other.
+        swarm: Robots whose messages are read.
+        take: Called with the inputs, in order of arrival.
         progress: Called now and then.
 
     Raises:
@@ -80,13 +80,13 @@ def read_bag(bag: Path, swarm: Swarm, take: Callable[[RawInputs], None], progres
 
 
 def _from(batch: MessageBatch, first: int) -> MessageBatch:
-    """The messages whose topics have such a number or a higher one, with numbers that begin at 0."""
+    """The messages of topics from number `first` on, renumbered from 0."""
     others = batch.chosen(batch.topic >= first)
     return others._replace(topic=others.topic - first)
 
 
 def _missing(ingest: Ingest) -> list[str]:
-    """One sentence for every input that the bag does not have, nor one of all robots in its place."""
+    """One sentence for every expected topic without messages, unless a topic that robots share has some."""
     pairs = [*zip(ingest.topics, ingest.statistics, strict=True)]
     shared = {topic.kind.stands_for for topic, statistics in pairs if statistics.received}
     return [
@@ -97,7 +97,7 @@ def _missing(ingest: Ingest) -> list[str]:
 
 
 def _strangers(topics: Iterable[BagTopic], ingest: Ingest) -> list[str]:
-    """A sentence when there are inputs of robots that the swarm does not have."""
+    """One sentence if the bag holds inputs of robots that the swarm does not have."""
     kinds = {kind.topic: kind.message_type for kind in InputKind}
     names = [t.name for t in topics if kinds.get(t.name.rpartition("/")[2]) == t.type]
     strange = sorted(set(names) - set(ingest.handle_of))
@@ -105,10 +105,10 @@ def _strangers(topics: Iterable[BagTopic], ingest: Ingest) -> list[str]:
 
 
 def read_truth(swarm: Swarm, messages: Mapping[str, Sequence[bytes]]) -> dict[str, Trajectory]:
-    """Ground truth that did not come from a bag.
+    """Decode serialized ground truth.
 
     Args:
-        swarm: Whose.
+        swarm: The robots.
         messages: Robot name -> its serialized PoseStamped.
     """
     reader = TruthReader(swarm)
@@ -118,13 +118,13 @@ def read_truth(swarm: Swarm, messages: Mapping[str, Sequence[bytes]]) -> dict[st
 
 
 class TruthReader:
-    """Collects ground truth; nothing of it reaches the estimator.
+    """Collects ground truth for evaluation; the estimator does not see it.
 
     Args:
-        swarm: Whose.
+        swarm: The robots.
 
     Attributes:
-        topics: Topics; their place here is the topic's number in a batch.
+        topics: The index of a topic is its number in a batch.
     """
 
     def __init__(self, swarm: Swarm) -> None:
@@ -135,7 +135,7 @@ class TruthReader:
         self._malformed = 0
 
     def add(self, batch: MessageBatch) -> None:
-        """Take messages in."""
+        """Add messages."""
         if not batch.size:
             return
         columns = self._reader.read(batch)
@@ -150,11 +150,11 @@ class TruthReader:
             self._spool.append((index, "pose"), columns.pose[rows])
 
     def tracks(self) -> dict[str, Trajectory]:
-        """Per robot that has ground truth; may be called once."""
+        """Robot name -> ground truth, for robots that have any; may be called once."""
         return {name: track for index, name in enumerate(self._names) if (track := self._track(index))}
 
     def remarks(self) -> tuple[str, ...]:
-        """What else must be said."""
+        """Sentences for the user."""
         return (f"{self._malformed} messages of ground truth are malformed.",) if self._malformed else ()
 
     def _track(self, index: int) -> Trajectory | None:
@@ -167,20 +167,20 @@ class TruthReader:
 
 
 MAX_MAP_BYTES = 48_000_000
-"""More maps are thinned out, evenly over time."""
+"""Beyond this, maps are thinned out evenly over time."""
 MAX_GOALS = 20_000
-"""Of one robot; those after them are not kept."""
+"""Goals kept of one robot."""
 
 
 class MapReader:
-    """Collects the maps and goals of a bag; nothing of them reaches the estimator.
+    """Collects the maps and goals of a bag for display; the estimator does not see them.
 
     Args:
-        swarm: Whose goals.
-        max_bytes: How much maps may hold.
+        swarm: The robots.
+        max_bytes: Limit of all maps together.
 
     Attributes:
-        topics: Topics; their place here is the topic's number in a batch.
+        topics: The index of a topic is its number in a batch.
     """
 
     def __init__(self, swarm: Swarm, max_bytes: int = MAX_MAP_BYTES) -> None:
@@ -194,7 +194,7 @@ class MapReader:
         self._malformed = 0
 
     def add(self, batch: MessageBatch) -> None:
-        """Take messages in."""
+        """Add messages."""
         for topic, log_ns, data in batch.messages():
             try:
                 if topic:
@@ -206,12 +206,12 @@ class MapReader:
                 self._malformed += 1
 
     def maps(self) -> tuple[RecordedMap, ...]:
-        """In the order of time, the newest among them."""
+        """In the order of time, with the newest."""
         newest = [self._newest] if self._newest and self._newest not in self._maps[-1:] else []
         return (*self._maps, *newest)
 
     def goals(self) -> dict[str, Trajectory]:
-        """Per robot that has had any."""
+        """Robot name -> its goals, for robots that have any."""
         found = {}
         for name, goals in self._goals.items():
             stamps, poses = zip(*sorted(goals), strict=True)
@@ -219,7 +219,7 @@ class MapReader:
         return found
 
     def remarks(self) -> tuple[str, ...]:
-        """What else must be said."""
+        """Sentences for the user."""
         return (f"{self._malformed} messages of maps or goals are malformed.",) if self._malformed else ()
 
     def _add_goal(self, name: str, data: bytes) -> None:

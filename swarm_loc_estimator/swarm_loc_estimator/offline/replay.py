@@ -53,7 +53,7 @@ def replay(
         tick_s: Time between two outputs [s].
         stamp_ns: (T,) increasing; outputs at these instants instead, such as those of a live run.
         keep_sightings: Whether sightings and aerial images are kept for display, too.
-        progress: Called now and then.
+        progress: Called now and then with the share done and what is being done.
 
     Raises:
         BagError: Nothing in the bag can be read.
@@ -75,31 +75,31 @@ def replay(
 
 
 MAX_DETECTIONS = 200_000
-"""In all aerial images that are kept; of a very long run only the beginning."""
+"""Detections of aerial images kept for display; of a very long run only the beginning."""
 _TICKS_AT_ONCE = 256
 _SIGHTINGS_PERIOD_NS = 500_000_000
 _MAX_SIGHTINGS = 500_000
-"""Kept for people who watch a run; of a very long one only the beginning."""
+"""Sightings kept for display; of a very long run only the beginning."""
 
 
 class Schedule(Protocol):
-    """When to give poses."""
+    """When to output poses."""
 
     def begin(self, now_ns: int) -> None:
-        """A stretch of inputs without long pauses begins."""
+        """Inputs without a long pause between them begin to arrive."""
 
     def due(self, now_ns: int) -> list[int]:
-        """The instants until now that were not due before."""
+        """Output times until now that were not due before."""
 
     def rest(self, last_ns: int) -> list[int]:
-        """The instants that are due after the last inputs of a recording that ends at `last_ns`."""
+        """Output times after the last inputs of a recording that ends at `last_ns`."""
 
 
 class PeriodicSchedule:
-    """At every whole multiple of a period, but where the clock was set ahead.
+    """Outputs at every whole multiple of a period, except while the clock jumps ahead.
 
     Attributes:
-        jumps: How often it was.
+        jumps: How often the clock jumped ahead by more than `MAX_PAUSE_NS`.
     """
 
     def __init__(self, period_ns: int) -> None:
@@ -108,14 +108,14 @@ class PeriodicSchedule:
         self._next_ns: int | None = None
 
     def begin(self, now_ns: int) -> None:
-        """A stretch of inputs begins; nothing is due in a long pause before it."""
+        """Inputs begin to arrive; no output is due in a long pause before them."""
         jumps = self._next_ns is not None and now_ns - self._next_ns > MAX_PAUSE_NS
         if self._next_ns is None or jumps:
             self._next_ns = (now_ns // self._period_ns + 1) * self._period_ns
             self.jumps += jumps
 
     def due(self, now_ns: int) -> list[int]:
-        """The instants until now that were not due before."""
+        """Output times until now that were not due before."""
         if self._next_ns is None:
             return []
         stamps_ns = list(range(self._next_ns, now_ns + 1, self._period_ns))
@@ -123,30 +123,30 @@ class PeriodicSchedule:
         return stamps_ns
 
     def rest(self, last_ns: int) -> list[int]:
-        """The instants until one after the end; none without inputs."""
+        """Output times until one after the end; none without inputs."""
         if self._next_ns is not None:
             self.begin(last_ns)
         return self.due(last_ns + self._period_ns)
 
 
 class ListedSchedule:
-    """At given instants (T,) [ns], increasing."""
+    """Outputs at given times (T,) [ns], increasing."""
 
     def __init__(self, stamp_ns: npt.NDArray[np.int64]) -> None:
         self._stamp_ns = stamp_ns
         self._done = 0
 
     def begin(self, now_ns: int) -> None:
-        """A stretch of inputs begins."""
+        """Nothing changes."""
 
     def due(self, now_ns: int) -> list[int]:
-        """The instants until now that were not due before."""
+        """Output times until now that were not due before."""
         first, self._done = self._done, int(self._stamp_ns.searchsorted(now_ns, side="right"))
         stamps_ns: list[int] = self._stamp_ns[first : self._done].tolist()
         return stamps_ns
 
     def rest(self, last_ns: int) -> list[int]:
-        """All others, whenever the recording ends."""
+        """All remaining output times, whenever the recording ends."""
         return self.due(max(last_ns, int(self._stamp_ns.max(initial=0))))
 
 
@@ -154,18 +154,12 @@ class Runner:
     """Feeds an estimator, ticks it, and keeps its estimates in a temporary file: memory does not grow.
 
     Args:
-        estimator: To run, which nobody else feeds.
+        estimator: Fed by this runner only.
         schedule: When it ticks.
-        keep_sightings: Whether what the robots and cameras above them see is kept, too.
+        keep_sightings: Whether sightings and aerial images are kept for display, too.
     """
 
-    def __init__(
-        self,
-        estimator: Estimator,
-        schedule: Schedule,
-        *,
-        keep_sightings: bool = False,
-    ) -> None:
+    def __init__(self, estimator: Estimator, schedule: Schedule, *, keep_sightings: bool = False) -> None:
         self._estimator = estimator
         self._schedule = schedule
         self._began_s = time.perf_counter()
@@ -181,7 +175,7 @@ class Runner:
         self._filled = 0
 
     def take(self, inputs: RawInputs) -> None:
-        """Hand in the inputs of a stretch of time, and do all ticks that are due until its end."""
+        """Feed inputs, and do all ticks that are due until the last of them."""
         self._schedule.begin(inputs.begin_ns)
         if self._images is not None:
             self._images.add(inputs.aerial)
@@ -193,7 +187,7 @@ class Runner:
         self._estimator.add(next(parts))
 
     def finish(self, last_ns: int) -> None:
-        """Do the ticks that are due after the last inputs of a recording that ends at `last_ns`."""
+        """Do the ticks after the last inputs of a recording that ends at `last_ns`."""
         for now_ns in self._schedule.rest(last_ns):
             self._tick(now_ns)
 
@@ -205,14 +199,14 @@ class Runner:
         received: Mapping[str, int],
         remarks: tuple[str, ...] = (),
     ) -> ReplayResult:
-        """The poses of all ticks, with what there is to compare them with; to be called once.
+        """The poses of all ticks beside ground truth; may be called once.
 
         Args:
-            title: What was run.
+            title: Name of the recording.
             range_ns: First and last arrival.
             truth: Robot name -> ground truth.
             received: Messages by topic.
-            remarks: What else must be said.
+            remarks: Sentences for the user.
         """
         self._flush()
         estimator, robots = self._estimator, len(self._estimator.swarm.robots)
@@ -252,14 +246,14 @@ class Runner:
             self._flush()
 
     def _flush(self) -> None:
-        """Write what is kept to the spool."""
+        """Move the ticks in memory to the temporary file."""
         filled, self._filled = slice(self._filled), 0
         for name in ("stamp_ns", "pose", "covariance", "status"):
             self._spool.append(name, getattr(self, f"_{name}")[filled])
 
 
 class AerialImages:
-    """Collects aerial images, and who is who in them as it becomes known."""
+    """Collects aerial images and the identities of their detections."""
 
     def __init__(self) -> None:
         self._positions: dict[int, FloatArray] = {}
@@ -267,23 +261,23 @@ class AerialImages:
         self._left = MAX_DETECTIONS
 
     def add(self, rows: AerialRows) -> None:
-        """Take the detections of images in."""
+        """Add the detections of images."""
         for stamp_ns in np.unique(rows.stamp_ns).tolist():
             if self._left <= 0:
                 return
-            chosen = rows.stamp_ns == stamp_ns
-            position = np.full((int(rows.number[chosen].max()) + 1, 2), np.nan)
-            position[rows.number[chosen]] = rows.pose[chosen, :2]
+            here = rows.stamp_ns == stamp_ns
+            position = np.full((int(rows.number[here].max()) + 1, 2), np.nan)
+            position[rows.number[here]] = rows.pose[here, :2]
             self._positions[stamp_ns] = position
             self._left -= len(position)
 
     def note(self, identities: Identities | None) -> None:
-        """Take in who is who in an image; late data may change it."""
+        """Set the identities in an image; late data may change them."""
         if identities is not None and identities.stamp_ns in self._positions:
             self._identities[identities.stamp_ns] = identities
 
     def images(self) -> tuple[AerialImage, ...]:
-        """In the order of their stamps."""
+        """All images in the order of their stamps."""
         return tuple(
             AerialImage(stamp_ns, position, _known(self._identities.get(stamp_ns)))
             for stamp_ns, position in sorted(self._positions.items())
@@ -291,7 +285,7 @@ class AerialImages:
 
 
 def _known(identities: Identities | None) -> dict[int, tuple[int, float]]:
-    """Detection -> robot and probability."""
+    """Detection -> index of its robot and probability of that."""
     if identities is None:
         return {}
     found = np.flatnonzero(identities.place >= 0)

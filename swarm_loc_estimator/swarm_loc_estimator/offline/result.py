@@ -1,4 +1,4 @@
-"""Result of a run of the estimator: poses, covariances, ground truth, counters."""
+"""Result of a run of the estimator: poses, covariances, errors against ground truth, counters."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ class RecordedMap(NamedTuple):
 
     @property
     def grid(self) -> GridMessage:
-        """What it says."""
+        """The decoded message."""
         return decode_occupancy_grid(self.data)
 
 
 class AerialImage(NamedTuple):
-    """What an image from above shows.
+    """Detections of an aerial image.
 
     Attributes:
         stamp_ns: Of the image.
         position: (n, 2) of its detections in map [m].
-        known: Detection -> index of the robot that it is believed to be, and the probability of that.
+        known: Detection -> index of its most probable robot, and the probability of that.
     """
 
     stamp_ns: int
@@ -49,22 +49,22 @@ class ReplayResult:
     """Estimated poses of all robots over time, and what there is to compare them with.
 
     Attributes:
-        title: What was replayed, such as the bag's name.
-        swarm: Whom it is about.
-        stamp_ns: (T,) when the poses hold.
+        title: Such as the name of the bag.
+        swarm: Robots and landmarks.
+        stamp_ns: (T,) times of the poses.
         poses: (T, N, 3) x [m], y [m], theta [rad] in map; NaN while a robot is not located.
         covariances: (T, N, 3, 3) of x, y, theta.
         status: (T, N) of `Status`.
         truth: Robot name -> ground truth; robots without are missing.
-        counters: Counted things by name, such as drops by reason.
-        remarks: What else must be said, one sentence each, such as what could not be read of the bag.
+        counters: Such as dropped inputs by reason.
+        remarks: Sentences for the user, such as what of the bag could not be read.
         data_s: Duration of the data [s].
         wall_s: Duration of the replay [s].
-        sightings: What the robots saw every half second, with its instant [ns]; empty: not kept.
-        images: Aerial images with who is who in them; empty: none, or not kept.
-        maps: What the mapper told, as it was recorded.
-        goals: Robot name -> where the mapper sent it; robots without are missing.
-        self_calibrated: The swarm with what the filter has estimated beside the poses; None: nothing.
+        self_calibrated: The swarm with calibration parameters as estimated; None: none were estimated.
+        sightings: Time [ns] and sightings, every half second; empty: not kept.
+        images: Aerial images with the identities of their detections; empty: none, or not kept.
+        maps: Recorded messages of `map`.
+        goals: Robot name -> its recorded goals; robots without are missing.
     """
 
     title: str
@@ -86,11 +86,11 @@ class ReplayResult:
 
     @property
     def speed_factor(self) -> float:
-        """How much faster than the data's own time the replay ran."""
+        """Duration of the data divided by that of the replay."""
         return self.data_s / self.wall_s if self.wall_s > 0.0 else float("nan")
 
     def chosen(self, rows: npt.NDArray[np.bool_]) -> ReplayResult:
-        """The same with the poses at some of the stamps (T,) only."""
+        """The result with the poses at some of the stamps (T,) only."""
         return replace(
             self,
             stamp_ns=self.stamp_ns[rows],
@@ -100,13 +100,13 @@ class ReplayResult:
         )
 
     def track(self, index: int) -> Trajectory:
-        """The estimated poses of a robot where it has one."""
+        """The estimated poses of a robot (index) while it is located."""
         known = np.isfinite(self.poses[:, index]).all(axis=1)
         return Trajectory(self.stamp_ns[known], self.poses[known, index])
 
     @cached_property
     def errors(self) -> Mapping[str, Errors]:
-        """Robot name -> errors, for robots with ground truth."""
+        """Robot name -> estimate minus ground truth, for robots that have any."""
         found = {}
         for index, robot in enumerate(self.swarm.robots):
             if robot.name in self.truth:
@@ -117,10 +117,10 @@ class ReplayResult:
 
     @cached_property
     def summaries(self) -> Mapping[str, ErrorSummary]:
-        """Robot name -> RMSE, median, NEES and others of its errors, for robots with ground truth."""
+        """Robot name -> RMSE, median, NEES and others of its errors."""
         return {name: summarise(errors) for name, errors in self.errors.items()}
 
     @cached_property
     def overall(self) -> ErrorSummary:
-        """The same of all robots together; NaN without ground truth."""
+        """RMSE, median, NEES and others of the errors of all robots; NaN without ground truth."""
         return summarise(pool([*self.errors.values()]))

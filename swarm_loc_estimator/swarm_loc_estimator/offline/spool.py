@@ -1,4 +1,4 @@
-"""Arrays that are appended to on disk, and memory-mapped in the end."""
+"""Arrays that grow in a temporary file and are memory-mapped at the end."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _COPY_BYTES = 1 << 20
 
 
 class Spool:
-    """Rows by key in one temporary file, which vanishes with the last array that lies in it.
+    """Rows by key in one temporary file, which is deleted with the last array that maps it.
 
-    So what is collected costs pages of the file that the system may drop, and no memory of the process.
+    The rows take no memory of the process, only pages of the file that the system may drop.
     """
 
     def __init__(self) -> None:
@@ -27,7 +27,7 @@ class Spool:
         self._blocks: dict[Hashable, list[tuple[int, int]]] = {}
 
     def append(self, key: Hashable, rows: npt.NDArray[Any]) -> None:
-        """Write rows (k, ...) behind those of the same key."""
+        """Append rows (k, ...) to those of the same key."""
         data = np.ascontiguousarray(rows).tobytes()
         blocks = self._blocks.setdefault(key, [])
         blocks.append((self._end, len(data)))
@@ -35,7 +35,7 @@ class Spool:
         self._end += len(data)
 
     def array(self, key: Hashable, dtype: npt.DTypeLike, *shape: int) -> npt.NDArray[Any]:
-        """All rows of a key (k, *shape), which cannot be written to."""
+        """All rows of a key (k, *shape), read-only; the key is then empty."""
         blocks = self._blocks.pop(key, [])
         size = sum(length for _, length in blocks)
         begin = -(-self._end // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
@@ -50,7 +50,7 @@ class Spool:
         return np.frombuffer(mapped, dtype=dtype).reshape(-1, *shape)
 
     def _copy(self, offset: int, length: int) -> None:
-        """Write a block once more, at the end."""
+        """Copy a block to the end of the file."""
         for start in range(offset, offset + length, _COPY_BYTES):
             self._file.seek(start)
             data = self._file.read(min(_COPY_BYTES, offset + length - start))

@@ -1,4 +1,4 @@
-"""Read recordings of Droplets under an overhead camera: one exchange a line, camera poses beside each.
+"""Read recordings of Droplets under an overhead camera: one exchange per line, with camera poses.
 
     {"TX", "RX", {{6 counts}, ...}, camera time [s], {"id"->{x, y, orientation}, ...}},
 
@@ -33,7 +33,7 @@ _MAX_COUNT = 2**31 - 1
 
 
 class DropletRecordingError(UserError):
-    """A file that is no such recording; the message is one sentence."""
+    """A file that is not such a recording; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Sighting:
     """A fiducial in the camera's image.
 
     Attributes:
-        id: Whose it was read as.
+        id: As read by the camera.
         x: [px], to the right.
         y: [px], downwards.
         orientation: Counter-clockwise as seen in the image [rad].
@@ -55,7 +55,7 @@ class Sighting:
 
 @dataclass(frozen=True)
 class Exchange:
-    """What one robot read of another one's emitters, and where the camera saw all robots.
+    """What one robot measured of another's emitters, and what the camera saw at that time.
 
     Attributes:
         transmitter: Id of the robot that lit its emitters.
@@ -73,7 +73,7 @@ class Exchange:
 
 
 def read_exchanges(path: Path) -> tuple[list[Exchange], Counter[str]]:
-    """All exchanges of a file in the order of their times, and how many lines are of no use, by reason.
+    """All exchanges of a file in the order of their times, and the number of unusable lines by reason.
 
     Raises:
         DropletRecordingError: It cannot be read, or holds no exchange.
@@ -102,7 +102,7 @@ def read_exchanges(path: Path) -> tuple[list[Exchange], Counter[str]]:
 
 
 def parse_line(line: str) -> Exchange | str:
-    """The exchange of a line, or why it is none: `not_an_exchange`, `not_square`, `hears_itself`."""
+    """The exchange of a line, or why there is none: `not_an_exchange`, `not_square`, `hears_itself`."""
     match = _LINE.fullmatch(line.strip())
     if match is None:
         return "not_an_exchange"
@@ -125,21 +125,21 @@ def parse_line(line: str) -> Exchange | str:
 
 
 SAME_PLACE_PX = 3.5
-"""A robot that stands is seen within this of where it was."""
+"""A standing robot moves less than this between two sightings."""
 SAME_TURN = math.radians(8.0)
 MAX_GAP_S = 30.0
-"""A robot unseen for longer may have been elsewhere."""
+"""A robot unseen for longer may have moved."""
 _QUARTER = 0.5 * math.pi
 
 
 @dataclass
 class Place:
-    """A robot that stands, or goes very slowly.
+    """A robot that stands, or moves very slowly.
 
     Attributes:
-        moments: Numbers of the exchanges at which it was seen.
-        seen: What was seen, one per moment.
-        turned: One per moment: the orientation but for quarter turns, continuous [rad].
+        moments: Indices of the exchanges at which it was seen.
+        seen: Its sightings, one per moment.
+        turned: One per moment: the orientation up to quarter turns, continuous [rad].
     """
 
     moments: list[int] = field(default_factory=list)
@@ -148,17 +148,17 @@ class Place:
 
     @property
     def owner(self) -> int:
-        """The id that it was read as most often."""
+        """The most frequent id."""
         return Counter(one.id for one in self.seen).most_common(1)[0][0]
 
     @property
     def votes(self) -> int:
-        """How often it was read as its owner."""
+        """Number of sightings with the id of the owner."""
         return sum(one.id == self.owner for one in self.seen)
 
     @property
     def quarter(self) -> int:
-        """By how many quarter turns what most sightings of its owner say is off from `turned`."""
+        """Quarter turns from `turned` to the orientation of most sightings of the owner."""
         owner = self.owner
         votes = Counter(
             round((one.orientation - turned) / _QUARTER) % 4
@@ -168,13 +168,13 @@ class Place:
         return votes.most_common(1)[0][0]
 
     def distance_to(self, sighting: Sighting) -> float:
-        """How far from where it was last seen [px]; infinite where it has turned meanwhile."""
+        """Distance from its last sighting [px]; infinite if the orientations differ."""
         last = self.seen[-1]
         turn = abs(_within_quarter(sighting.orientation - self.turned[-1]))
         return math.hypot(sighting.x - last.x, sighting.y - last.y) if turn < SAME_TURN else math.inf
 
     def add(self, moment: int, sighting: Sighting) -> None:
-        """A sighting that belongs here."""
+        """Add a sighting."""
         self.moments.append(moment)
         self.seen.append(sighting)
         before = self.turned[-1] if self.turned else sighting.orientation
@@ -183,7 +183,7 @@ class Place:
 
 @dataclass(frozen=True)
 class CameraPose:
-    """Where the camera sees a robot that stands: x, y [px], orientation [rad], as in `Sighting`."""
+    """Pose of a standing robot in the image: x, y [px], orientation [rad], as in `Sighting`."""
 
     x: float
     y: float
@@ -192,11 +192,11 @@ class CameraPose:
 
 @dataclass
 class CleanTruth:
-    """Where all robots stood.
+    """Poses of all standing robots.
 
     Attributes:
-        poses: One per exchange: robot -> where it stands; those that are not known are missing.
-        remarks: What was put right or dropped -> how often.
+        poses: One mapping per exchange: robot -> its pose, if known.
+        remarks: What was corrected or dropped -> how often.
     """
 
     poses: list[dict[int, CameraPose]]
@@ -204,7 +204,7 @@ class CleanTruth:
 
 
 def clean(exchanges: Sequence[Exchange]) -> CleanTruth:
-    """Where all robots stood at each exchange."""
+    """Find the poses of all robots at each exchange."""
     remarks = Counter[str]()
     owned: dict[int, list[Place]] = {}
     for place in find_places(exchanges):
@@ -214,13 +214,13 @@ def clean(exchanges: Sequence[Exchange]) -> CleanTruth:
             owned.setdefault(place.owner, []).append(place)
     poses: list[dict[int, CameraPose]] = [{} for _ in exchanges]
     for owner, places in owned.items():
-        for place in _without_rivals(places, remarks):
+        for place in _without_overlaps(places, remarks):
             _write(place, owner, poses, remarks)
     return CleanTruth(poses, remarks)
 
 
 def find_places(exchanges: Sequence[Exchange]) -> list[Place]:
-    """All places, in the order in which robots came there."""
+    """All places in the order of their first sightings."""
     places, open_places = list[Place](), list[Place]()
     for moment, exchange in enumerate(exchanges):
         open_places = [
@@ -241,8 +241,8 @@ def find_places(exchanges: Sequence[Exchange]) -> list[Place]:
     return places
 
 
-def _without_rivals(places: list[Place], remarks: Counter[str]) -> list[Place]:
-    """The places of one robot of which no two are at one time: those that more sightings speak for."""
+def _without_overlaps(places: list[Place], remarks: Counter[str]) -> list[Place]:
+    """Places of one robot that do not overlap in time; of overlapping ones that with more sightings."""
     kept: list[Place] = []
     for place in sorted(places, key=lambda one: -one.votes):
         first, last = place.moments[0], place.moments[-1]
@@ -263,8 +263,8 @@ def _write(
     quarter = place.quarter
     for k, moment in enumerate(place.moments):
         seen, turned = place.seen[k], place.turned[k] + quarter * _QUARTER
-        remarks["ids misread, put right"] += seen.id != owner
-        remarks["orientations a quarter or half turn off, put right"] += (
+        remarks["ids misread, corrected"] += seen.id != owner
+        remarks["orientations a quarter or half turn off, corrected"] += (
             seen.id == owner and abs(float(wrap_angle(seen.orientation - turned))) > 0.5 * _QUARTER
         )
         until = place.moments[k + 1] if k + 1 < len(place.moments) else moment + 1
@@ -273,5 +273,5 @@ def _write(
 
 
 def _within_quarter(angle: float) -> float:
-    """An angle but for quarter turns, within half of one [rad]."""
+    """An angle modulo quarter turns, within +-pi/4 [rad]."""
     return angle - _QUARTER * round(angle / _QUARTER)

@@ -1,10 +1,10 @@
 """Write a recording of Droplets as a bag with its swarm description.
 
-How fiducials sit on robots is found from what the robots read of each other.
+The orientation of the fiducials on the robots is found from the brightness matrices.
 
 The sums of a brightness matrix over sensors and emitters point to the other robot whatever the board's curves
-are, eqs (5)-(10) of the Droplet paper. Each robot's median tells the quarter turn by which its fiducial sits,
-and all together whether the image is mirrored.
+are, eqs (5)-(10) of the Droplet paper. The mean of each robot gives the quarter turn of its fiducial, and all
+together whether the image is mirrored.
 """
 
 from __future__ import annotations
@@ -33,31 +33,39 @@ from swarm_loc_estimator.sensors.topics import InputKind
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
 from swarm_loc_estimator.swarm.robot_ir import RobotIr
-from swarm_loc_estimator.swarm.swarm import RandomWalk, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Pose2, RandomWalk, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+
+ROBOT_TYPE = "droplet"
+DIAMETER_M = 0.044
+METRES_PER_PIXEL = DIAMETER_M / 42.0
+"""Robots that touch are 42 pixels apart in the recordings of 2016."""
+FIX_SIGMA = (0.001, 0.001, 0.05)
+"""Standard deviations of fixes by the camera: x, y [m], heading [rad]."""
+WALK = RandomWalk(position=5e-6, heading=3e-2)
+"""The robots turn often and move some centimetres per minute."""
+_NS = 1_000_000_000
 
 _QUARTER = 0.5 * math.pi
 _CLEAR = 8.0
-"""Matrices whose brightest reading is not above the noise by so much are not asked [sigma]."""
+"""Matrices whose brightest reading is not this far above the noise are not used [sigma]."""
 _ONE_WAY = 0.5
-"""Directions whose mean vector is shorter contradict each other."""
+"""If the mean vector of all directions is shorter, matrices and camera contradict each other."""
 
 
 @dataclass(frozen=True)
 class Fiducials:
-    """How all fiducials sit.
+    """Orientation of all fiducials.
 
     Attributes:
-        handedness: 1 where the image's x and y are those of map, -1 where y points the other way.
-        turn_of: Robot -> from its fiducial's orientation to its own [rad], a multiple of a quarter turn.
-        told: By how many exchanges each robot's was told.
+        handedness: 1 if x and y of the image are those of map, -1 if y points the other way.
+        turn_of: Robot -> from the orientation of its fiducial to its own [rad], a multiple of a quarter turn.
     """
 
     handedness: int
     turn_of: Mapping[int, float]
-    told: Mapping[int, int]
 
-    def pose(self, robot: int, seen: CameraPose, metres_per_pixel: float) -> tuple[float, float, float]:
+    def pose(self, robot: int, seen: CameraPose, metres_per_pixel: float) -> Pose2:
         """The robot's pose x, y [m], heading [rad] in map."""
         turned = self.handedness * seen.orientation + self.turn_of[robot]
         x, y = metres_per_pixel * seen.x, self.handedness * metres_per_pixel * seen.y
@@ -67,11 +75,11 @@ class Fiducials:
 def find_fiducials(
     exchanges: Sequence[Exchange], poses: Sequence[Mapping[int, CameraPose]], angles: FloatArray
 ) -> Fiducials:
-    """Find how fiducials sit.
+    """Find the orientation of all fiducials.
 
     Args:
-        exchanges: All.
-        poses: One per exchange: where robots stood.
+        exchanges: All of a recording.
+        poses: One mapping per exchange: robot -> pose in the image.
         angles: (n,) directions of the elements in base_link [rad].
 
     Raises:
@@ -79,65 +87,54 @@ def find_fiducials(
     """
     floor = _CLEAR * _noise(exchanges)
     rows = [
-        (one, where)
-        for one, where in zip(exchanges, poses, strict=True)
+        k
+        for k, (one, where) in enumerate(zip(exchanges, poses, strict=True))
         if one.receiver in where and one.transmitter in where and one.readings.max() > floor
     ]
-    best, told = max(((_turns(rows, angles, sign), sign) for sign in (1, -1)), key=lambda pair: pair[0][0])
-    share, turns, counts = best
+    clear, there = [exchanges[k] for k in rows], [poses[k] for k in rows]
+    found = [(*_turns(clear, there, angles, sign), sign) for sign in (1, -1)]
+    share, turns, handedness = max(found, key=lambda one: one[0])
     if share < _ONE_WAY:
         raise DropletRecordingError(
-            f"what robots read and what the camera saw contradict each other: directions agree to {share:.2f}"
+            f"brightness matrices and camera contradict each other: directions agree to {share:.2f}"
             f" of 1 in {len(rows)} exchanges, at least {_ONE_WAY} is needed."
         )
     usual = float(np.median(list(turns.values())))
     everybody = {robot for where in poses for robot in where}
-    return Fiducials(told, {robot: turns.get(robot, usual) for robot in everybody}, counts)
+    return Fiducials(handedness, {robot: turns.get(robot, usual) for robot in everybody})
 
 
 def _turns(
-    rows: Sequence[tuple[Exchange, Mapping[int, CameraPose]]], angles: FloatArray, sign: int
-) -> tuple[float, dict[int, float], dict[int, int]]:
-    """How well directions agree, the turn of each robot that took part, and how often it did."""
-    said: dict[int, list[complex]] = {}
+    exchanges: Sequence[Exchange], poses: Sequence[Mapping[int, CameraPose]], angles: FloatArray, sign: int
+) -> tuple[float, dict[int, float]]:
+    """Length of the mean vector of all directions, at most 1, and the turn of each robot."""
+    found: dict[int, list[complex]] = {}
     units = np.exp(1j * angles)
-    for one, where in rows:
+    for one, where in zip(exchanges, poses, strict=True):
         light = np.clip(one.readings, 0.0, None)
         bearing = np.angle(units @ light.sum(axis=1))
         heading = np.angle(-(units @ light @ units.conj()))
         receiver, transmitter = where[one.receiver], where[one.transmitter]
         along = math.atan2(sign * (transmitter.y - receiver.y), transmitter.x - receiver.x)
         forward = along - bearing
-        said.setdefault(one.receiver, []).append(np.exp(1j * (forward - sign * receiver.orientation)))
+        found.setdefault(one.receiver, []).append(np.exp(1j * (forward - sign * receiver.orientation)))
         turned = forward + heading - sign * transmitter.orientation
-        said.setdefault(one.transmitter, []).append(np.exp(1j * turned))
-    sums = {robot: sum(values) for robot, values in said.items()}
+        found.setdefault(one.transmitter, []).append(np.exp(1j * turned))
+    sums = {robot: sum(values) for robot, values in found.items()}
     turns = {robot: _QUARTER * round(np.angle(total) / _QUARTER) for robot, total in sums.items()}
-    share = sum(abs(total) for total in sums.values()) / max(sum(map(len, said.values())), 1)
-    return share, turns, {robot: len(values) for robot, values in said.items()}
+    share = sum(abs(total) for total in sums.values()) / max(sum(map(len, found.values())), 1)
+    return share, turns
 
 
 def _noise(exchanges: Sequence[Exchange]) -> float:
-    """Robust scatter of what sensors read, most of which is no light [count]."""
+    """Robust standard deviation of all readings, most of which are dark [count]."""
     values = np.concatenate([one.readings.ravel() for one in exchanges])
     return max(1.4826 * float(np.median(np.abs(values - np.median(values)))), 1.0)
 
 
-ROBOT_TYPE = "droplet"
-DIAMETER_M = 0.044
-"""Of a Droplet."""
-METRES_PER_PIXEL = DIAMETER_M / 42.0
-"""Robots that touch are 42 pixels apart in the recordings of 2016."""
-FIX_SIGMA = (0.001, 0.001, 0.05)
-"""How well the camera knows the receiver: x, y [m], heading [rad]."""
-WALK = RandomWalk(position=5e-6, heading=3e-2)
-"""They turn often and go some centimetres a minute."""
-_NS = 1_000_000_000
-
-
 @dataclass(frozen=True)
 class ImportSettings:
-    """What the files do not say.
+    """What the files do not contain.
 
     Attributes:
         platform: Packaged name or path of the board of all robots.
@@ -150,13 +147,13 @@ class ImportSettings:
 
 @dataclass(frozen=True)
 class DropletImport:
-    """What was written.
+    """Result of an import.
 
     Attributes:
-        exchanges: How many.
-        with_truth: In how many of them both robots' poses are known.
-        fiducials: How they sit.
-        remarks: What was put right and what was dropped, one sentence each.
+        exchanges: Their number.
+        with_truth: Number of those with both robots' poses known.
+        fiducials: Their orientation.
+        remarks: What was corrected and what was dropped, one sentence each.
     """
 
     exchanges: int
@@ -173,9 +170,9 @@ def import_recording(
     The bag holds <robot>/brightness, <robot>/ground_truth at each exchange, and <robot>/fix of the receivers.
 
     Args:
-        path: The recording, see `text`.
+        path: The recording, see `datasets.droplets`.
         folder: The bag to create.
-        settings: What it does not say.
+        settings: What the recording does not contain.
         progress: Called with the share done and what is being done.
 
     Raises:
@@ -192,7 +189,11 @@ def import_recording(
     fiducials = find_fiducials(sized, truth.poses, np.array(platform.angles))
     swarm = _describe(sized, truth.poses, settings.platform, platform)
     progress(0.6, "writing")
-    _write(folder, sized, truth.poses, _Scene(swarm, fiducials, settings.metres_per_pixel))
+    places = [
+        {robot: fiducials.pose(robot, seen, settings.metres_per_pixel) for robot, seen in where.items()}
+        for where in truth.poses
+    ]
+    _write(folder, swarm, sized, places)
     known = sum(
         one.receiver in where and one.transmitter in where
         for one, where in zip(sized, truth.poses, strict=True)
@@ -202,31 +203,15 @@ def import_recording(
     return DropletImport(len(sized), known, fiducials, remarks)
 
 
-@dataclass(frozen=True)
-class _Scene:
-    """What turns exchanges into messages."""
-
-    swarm: Swarm
-    fiducials: Fiducials
-    metres_per_pixel: float
-
-    def pose(self, robot: int, seen: CameraPose) -> FloatArray:
-        """The pose (1, 3) of a robot in map."""
-        return np.array([self.fiducials.pose(robot, seen, self.metres_per_pixel)])
-
-
 def name_of(robot: int) -> str:
-    """What a robot is called."""
+    """The name of a robot."""
     return f"{ROBOT_TYPE}_{robot:04x}"
 
 
 def _describe(
-    exchanges: Sequence[Exchange],
-    poses: Sequence[dict[int, CameraPose]],
-    source: str,
-    platform: IrPlatform,
+    exchanges: Sequence[Exchange], poses: Sequence[dict[int, CameraPose]], source: str, platform: IrPlatform
 ) -> Swarm:
-    """The swarm: all robots that exchanged light or were seen standing; their starts are not known."""
+    """The swarm of all robots in exchanges or with poses, their starts unknown."""
     ids = {robot for where in poses for robot in where}
     ids |= {robot for one in exchanges for robot in (one.receiver, one.transmitter)}
     path = str(Path(source).resolve()) if source.endswith((".yaml", ".yml")) else source
@@ -246,25 +231,24 @@ def _describe(
 
 
 def _write(
-    folder: Path, exchanges: Sequence[Exchange], poses: Sequence[dict[int, CameraPose]], scene: _Scene
+    folder: Path, swarm: Swarm, exchanges: Sequence[Exchange], places: Sequence[Mapping[int, Pose2]]
 ) -> None:
-    """Write all messages; exchanges of one stamp follow each other by a microsecond."""
+    """Write all messages; exchanges with equal stamps are spaced by a microsecond."""
     covariance = np.diag(np.square(FIX_SIGMA))
     with BagWriter(folder, compress=True) as bag:
-        for robot in scene.swarm.robots:
+        for robot in swarm.robots:
             for kind in (InputKind.BRIGHTNESS, InputKind.FIXES):
                 bag.add_topic(f"{robot.name}/{kind.topic}", kind.message_type)
             bag.add_topic(f"{robot.name}/ground_truth", POSE_STAMPED)
         last_ns = 0
-        for one, where in zip(exchanges, poses, strict=True):
+        for one, where in zip(exchanges, places, strict=True):
             stamp_ns = max(round(one.time_s * _NS), last_ns + 1000)
             last_ns = stamp_ns
-            for robot_id, seen in where.items():
-                pose = scene.pose(robot_id, seen)
-                (message,) = encode_pose_stamped("map", np.array([stamp_ns]), pose)
+            for robot_id, pose in where.items():
+                (message,) = encode_pose_stamped("map", np.array([stamp_ns]), np.array([pose]))
                 bag.write(f"{name_of(robot_id)}/ground_truth", stamp_ns, message)
                 if robot_id == one.receiver:
-                    fix = encode_fix("map", stamp_ns, pose[0], covariance)
+                    fix = encode_fix("map", stamp_ns, pose, covariance)
                     bag.write(f"{name_of(robot_id)}/{InputKind.FIXES.topic}", stamp_ns, fix)
             receiver = name_of(one.receiver)
             matrix = encode_brightness(
@@ -274,5 +258,5 @@ def _write(
 
 
 def _counted(counts: Counter[str]) -> list[tuple[str, int]]:
-    """Reasons with their counts, none of zero."""
+    """Reasons with their counts, without those of zero."""
     return sorted((what.replace("_", " "), count) for what, count in counts.items() if count)

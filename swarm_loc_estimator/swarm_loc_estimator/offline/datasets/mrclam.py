@@ -32,7 +32,7 @@ _SIGHTINGS_TO_JUDGE = 10
 
 
 class MrclamError(UserError):
-    """A folder that is no such dataset; the message is one sentence."""
+    """A folder that is not such a dataset; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class RobotLog:
         twist: (N, 2) commanded forward speed [m/s] and turn rate [rad/s].
         sighting_ns: (M,) stamps, not decreasing.
         sighting: (M, 2) range [m] and bearing [rad, positive to the left].
-        barcode: (M,) what was seen.
+        barcode: (M,) of each sighting.
         truth: Ground truth in map; None when there is none.
     """
 
@@ -66,7 +66,7 @@ class Dataset:
         robots: In the order of their subjects.
         barcode_of: Subject -> barcode.
         landmarks: Subject -> x [m], y [m].
-        remarks: What was found and done, one sentence each.
+        remarks: Missing files and corrected barcodes, one sentence each.
     """
 
     robots: tuple[RobotLog, ...]
@@ -76,7 +76,7 @@ class Dataset:
 
 
 def read_dataset(folder: Path) -> Dataset:
-    """Read a folder, and put right barcodes that contradict the ground truth.
+    """Read a folder, and correct barcodes that contradict the ground truth.
 
     Raises:
         MrclamError: It holds no such dataset, or a damaged file.
@@ -103,7 +103,7 @@ def read_dataset(folder: Path) -> Dataset:
 
 
 def integrate(stamp_ns: IntArray, twist: FloatArray) -> Trajectory:
-    """Poses that the commands lead to, from the origin: exact arcs, each command until the next row's stamp.
+    """Integrate commands from the origin: exact arcs, each command until the stamp of the next row.
 
     Args:
         stamp_ns: (N,).
@@ -120,10 +120,10 @@ def integrate(stamp_ns: IntArray, twist: FloatArray) -> Trajectory:
 
 
 def correct_barcodes(dataset: Dataset) -> Dataset:
-    """Exchange barcodes of landmarks that were clearly noted wrongly.
+    """Correct barcodes of landmarks that were exchanged in the dataset's files.
 
-    Every sighting by a robot whose true pose is known says where the barcode hangs. A barcode that is far
-    from its own landmark and close to that of another wrong one was exchanged with it; each is remarked.
+    Sightings by robots with ground truth show where a barcode is. One that is far from its own landmark and
+    close to that of another wrong one was exchanged with it; each gets a remark.
     """
     places = _seen_places(dataset)
     subjects = [subject for subject in dataset.landmarks if subject in dataset.barcode_of]
@@ -145,7 +145,7 @@ def correct_barcodes(dataset: Dataset) -> Dataset:
 
 
 def _barcode_remark(subject: int, noted: Mapping[int, int], used: Mapping[int, int], misfit: float) -> str:
-    """What is wrong with a landmark's barcode, and what was done."""
+    """A sentence on a wrong barcode and its correction."""
     far = f"sightings of barcode {noted[subject]} lie {misfit:.2f} m from landmark {subject}"
     if used[subject] == noted[subject]:
         return f"{far}, and no exchange explains it; it was left as noted."
@@ -154,7 +154,7 @@ def _barcode_remark(subject: int, noted: Mapping[int, int], used: Mapping[int, i
 
 
 def _seen_places(dataset: Dataset) -> dict[int, FloatArray]:
-    """Barcode -> (K, 2) places in map where robots with a known pose saw it."""
+    """Barcode -> (K, 2) positions in map, from sightings by robots with a known pose."""
     found: list[FloatArray] = []
     names: list[npt.NDArray[np.int64]] = []
     for robot in dataset.robots:
@@ -172,14 +172,14 @@ def _seen_places(dataset: Dataset) -> dict[int, FloatArray]:
 
 
 def _misfit(places: FloatArray | None, landmark: tuple[float, float]) -> float:
-    """Median distance of sightings from a landmark; 0 (no objection) when there are too few to judge."""
+    """Median distance of sightings from a landmark [m]; 0 if there are too few."""
     if places is None or len(places) < _SIGHTINGS_TO_JUDGE:
         return 0.0
     return float(np.median(np.hypot(*(places - np.array(landmark)).T)))
 
 
 def _read_robot(folder: Path, subject: int, sparse: FloatArray, remarks: list[str]) -> RobotLog:
-    """One robot's files; what is missing becomes a remark."""
+    """Read one robot's files; missing ones become remarks."""
     odometry = _in_order(_table(folder / f"Robot{subject}_Odometry.dat", 3))
     if len(odometry) == 0:
         raise MrclamError(f"'{folder / f'Robot{subject}_Odometry.dat'}' holds no rows.")
@@ -200,7 +200,7 @@ def _read_robot(folder: Path, subject: int, sparse: FloatArray, remarks: list[st
 
 
 def _truth(folder: Path, subject: int, sparse: FloatArray, remarks: list[str]) -> Trajectory | None:
-    """Dense ground truth, else the sparse one, else none."""
+    """Dense ground truth if there is any, else the sparse one, else None."""
     path = folder / f"Robot{subject}_Groundtruth.dat"
     table = _table(path, 4) if path.exists() else sparse[sparse[:, 0] == subject][:, 1:5]
     if len(table) == 0:
@@ -215,12 +215,12 @@ def _truth(folder: Path, subject: int, sparse: FloatArray, remarks: list[str]) -
 
 
 def _sparse_truth(path: Path) -> FloatArray:
-    """(N, 5) subject, time, x, y, theta; empty when there is no such file."""
+    """(N, 5) subject, time, x, y, theta; empty without the file."""
     return _table(path, 5, delimiter=",") if path.exists() else np.empty((0, 5))
 
 
 def _table(path: Path, columns: int, delimiter: str | None = None) -> FloatArray:
-    """The first columns of a text file of numbers."""
+    """The first columns (N, `columns`) of a text file of numbers."""
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "loadtxt: input contained no data")
@@ -240,7 +240,7 @@ def _first_bad(table: FloatArray) -> int:
 
 
 def _in_order(table: FloatArray) -> FloatArray:
-    """Rows by time, equal ones as they stand."""
+    """Rows sorted by time, stable."""
     return table[np.argsort(table[:, 0], kind="stable")]
 
 

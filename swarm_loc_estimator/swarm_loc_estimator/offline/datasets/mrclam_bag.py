@@ -1,4 +1,4 @@
-"""A set of the MRCLAM dataset as a bag and its swarm description."""
+"""Write a set of the MRCLAM dataset as a bag with its swarm description."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 ROBOT_TYPE = "create"
 WHEEL_SEPARATION = 0.258
-"""Of an iRobot Create [m]."""
+"""Of the iRobot Create [m]."""
 TIMEOUT_S = 2.0
-"""Every two minutes or so the logs pause for just over a second; the robots drive on as commanded."""
+"""The logs pause for just over a second about every two minutes, while the robots keep driving."""
 
 _FAMILY_OTHER = 255
 _REPORT_EVERY = 5000
 _SERIALIZING = 0.3
-"""Share of the time that is not writing."""
+"""Share of the progress before writing."""
 
 _MAX_CUT_NS = 120_000_000_000
 _MARGIN_NS = 1_000_000_000
@@ -50,7 +50,7 @@ _MARGIN_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Delay:
-    """Detections arrive late, evenly between two times.
+    """Delay of detections, uniform between two limits.
 
     Attributes:
         low_ns: Least delay.
@@ -65,11 +65,11 @@ class Delay:
 
 @dataclass(frozen=True)
 class MrclamImport:
-    """What was written.
+    """Result of an import.
 
     Attributes:
-        message_count: Number of messages.
-        remarks: What was found and done, one sentence each.
+        message_count: Number of messages written.
+        remarks: Missing data, corrected barcodes and late starts, one sentence each.
     """
 
     message_count: int
@@ -89,16 +89,13 @@ class _Stream:
 def convert(
     dataset: Dataset, folder: Path, delay: Delay, progress: Callable[[float, str], None]
 ) -> MrclamImport:
-    """Write `folder` as a bag with its `swarm.yaml` inside.
+    """Write a set as a bag with its `swarm.yaml` inside.
 
     Args:
         dataset: The set; robots start where their ground truth begins.
-        folder: To create.
+        folder: The bag to create.
         delay: How late detections arrive.
         progress: Called with the share done, 0 to 1, and what is being done.
-
-    Returns:
-        How much was written, and what there is to say about it.
 
     Raises:
         BagError: The folder is there already, or cannot be created.
@@ -122,25 +119,21 @@ def convert(
 
 
 def _start_remarks(whole: RobotLog, used: RobotLog) -> list[str]:
-    """What became of a start that the ground truth does not tell."""
+    """A sentence if the ground truth does not cover the robot's first odometry."""
     cut_ns = int(used.odometry.stamp_ns[0] - whole.odometry.stamp_ns[0])
     if cut_ns:
-        return [
-            (
-                f"robot {used.subject} joins {cut_ns * 1e-9:.1f} s after its first odometry,"
-                " where its ground truth begins."
-            )
-        ]
+        late_s = f"{cut_ns * 1e-9:.1f} s after its first odometry"
+        return [f"robot {used.subject} joins {late_s}, where its ground truth begins."]
     if used.truth is not None and _start(used) is None:
-        return [f"robot {used.subject} starts unknown: its ground truth does not tell where it starts."]
+        return [f"robot {used.subject} starts unknown: its ground truth does not cover its start."]
     return []
 
 
 def from_truth_on(robot: RobotLog) -> RobotLog:
-    """The robot's log from its first known true pose on, so that it starts at a known place.
+    """The robot's log from its first true pose on, so that its start is known.
 
-    Where its ground truth begins after its odometry, the command of that moment opens the log. Where that
-    would cost more than two minutes, nothing is cut and the robot starts unknown.
+    The command of that moment becomes the first row. If more than two minutes would be lost, nothing is cut
+    and the start is unknown.
     """
     if robot.truth is None or _start(robot) is not None:
         return robot
@@ -163,7 +156,7 @@ def from_truth_on(robot: RobotLog) -> RobotLog:
 
 
 def describe(dataset: Dataset, robots: list[RobotLog]) -> Swarm:
-    """The swarm description; landmarks and robots are known by their barcodes."""
+    """The swarm description; barcodes are the marker ids."""
     return Swarm(
         tuple(_robot(robot, dataset.barcode_of.get(robot.subject)) for robot in robots),
         tuple(
@@ -175,7 +168,7 @@ def describe(dataset: Dataset, robots: list[RobotLog]) -> Swarm:
 
 
 def _robot(robot: RobotLog, barcode: int | None) -> Robot:
-    """A robot whose marker, a cylinder of barcodes about its middle, shows no heading."""
+    """A robot with one marker, a cylinder of barcodes around its centre that shows no heading."""
     return Robot(
         f"robot{robot.subject}",
         ROBOT_TYPE,
@@ -198,7 +191,7 @@ def _start(robot: RobotLog) -> Pose2 | None:
 
 
 def _odometry(robot: RobotLog) -> _Stream:
-    """The commands as odometry; they arrive when they are given."""
+    """Commands as odometry; arrival equals stamp."""
     name, stamp_ns = f"robot{robot.subject}", robot.odometry.stamp_ns
     twist = np.column_stack([robot.twist[:, 0], np.zeros(len(stamp_ns)), robot.twist[:, 1]])
     data = encode_odometry(
@@ -214,7 +207,7 @@ def _odometry(robot: RobotLog) -> _Stream:
 
 
 def _detections(robot: RobotLog, delay: Delay, rng: np.random.Generator) -> _Stream:
-    """Sightings of one picture as one array, late by the delay."""
+    """Sightings of one stamp as one message, late by the delay."""
     name = f"robot{robot.subject}"
     stamp_ns, first = np.unique(robot.sighting_ns, return_index=True)
     rows = _detection_rows(robot)
@@ -248,7 +241,7 @@ def _detection_rows(robot: RobotLog) -> npt.NDArray[np.void]:
 
 
 def _truth(subject: int, truth: Trajectory, begin_ns: int, end_ns: int) -> _Stream:
-    """Ground truth while anything else is there."""
+    """Ground truth between the first and the last odometry."""
     inside = (truth.stamp_ns >= begin_ns) & (truth.stamp_ns <= end_ns)
     stamp_ns = truth.stamp_ns[inside]
     data = encode_pose_stamped("map", stamp_ns, truth.pose[inside])

@@ -1,1 +1,1 @@
-"""The live graph as child processes, recorded and compared with replay."""
+"""Runs of the live graph, recorded and compared with replay."""

@@ -1,7 +1,7 @@
 """Run a graph as child processes in a ROS domain of its own, and record its poses and diagnostics.
 
-The graph is one that a command and a launch file start, too. It gets a ROS domain that no other has, and
-stays on this machine: nothing of it mixes with robots that are about.
+The graph is the one that commands and launch files start. Its ROS domain is used by nothing else and limited
+to this machine, so that it cannot mix with real robots.
 """
 
 from __future__ import annotations
@@ -38,24 +38,24 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_msgs.msg import SwarmPoses
 
 START_PATIENCE_S = 600.0
-"""An estimator that must be compiled first takes three minutes, and more where others are at work, too."""
+"""Compiling the estimator takes three minutes, more on a busy machine."""
 _ALONE = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": ""}
 _WAKE_S = 0.05
 
 
 class LiveError(UserError):
-    """The live graph did not do what it should; the text is one sentence."""
+    """The live graph has failed; the message is one sentence."""
 
 
 class LiveGraph:
     """A graph that runs as child processes while this process listens; use it as a context manager.
 
     Args:
-        nodes: The graph, the estimator first; the others start when its poses can be heard here.
-        log: File that the nodes' own output goes to.
+        nodes: The estimator first; the others start when this process has discovered its poses.
+        log: File for the output of the nodes.
 
     Attributes:
-        recorder: What came out so far.
+        recorder: Records poses and diagnostics.
 
     Raises:
         LiveError: The estimator does not start.
@@ -91,7 +91,7 @@ class LiveGraph:
         self._stack.close()
 
     def process(self, name: str) -> subprocess.Popen[bytes]:
-        """The process of a node, by its full name."""
+        """The process of a node by its full name."""
         return self._children[name].process
 
     def kill(self, name: str) -> None:
@@ -100,7 +100,7 @@ class LiveGraph:
         self.process(name).wait()
 
     def restart(self, name: str) -> None:
-        """Start a node anew; kill it first, if it still runs."""
+        """Kill a node if it runs, and start it."""
         self.kill(name)
         self._start(self._nodes[name])
 
@@ -111,16 +111,16 @@ class LiveGraph:
         patience_s: float,
         needed: Collection[str] | None = None,
     ) -> None:
-        """Listen until a condition holds.
+        """Process messages until a condition holds.
 
         Args:
-            condition: Of what was recorded; looked at after each event and now and then.
-            what: The condition in words, to follow "did not".
-            patience_s: How long nothing may come before that is an error.
-            needed: Nodes that must go on meanwhile; None: all that have started.
+            condition: Checked after each event and every 50 ms.
+            what: The condition in words, following "did not".
+            patience_s: Timeout since the last poses.
+            needed: Nodes that must keep running; None: all that have started.
 
         Raises:
-            LiveError: A node has ended, or patience has.
+            LiveError: A node has ended, or the timeout has passed.
         """
         heard, since_s = -1, time.monotonic()
         while not condition():
@@ -136,7 +136,7 @@ class LiveGraph:
             self._executor.spin_once(timeout_sec=_WAKE_S)
 
     def _start_all(self) -> None:
-        """Start the estimator, and the others when this process hears it: no pose is missed."""
+        """Start the estimator, and the others once this process has discovered it: no pose is missed."""
         estimator, *others = self._nodes.values()
         self._start(estimator)
         self.wait_for(
@@ -149,7 +149,7 @@ class LiveGraph:
 
     @property
     def _see(self) -> str:
-        """Where to look, with what stands there last."""
+        """The end of an error message: the log and its last line."""
         said = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         return f" its nodes' output is in {self._log}" + (f", at last: {said[-1]}" if said else ".")
 
@@ -164,14 +164,14 @@ class LiveGraph:
 
 
 def cpu_seconds(pid: int) -> float:
-    """CPU time that a process has used [s]."""
+    """CPU time of a process so far [s]."""
     fields = Path("/proc", str(pid), "stat").read_text(encoding="ascii").rpartition(")")[2].split()
     user_and_system = int(fields[11]) + int(fields[12])
     return user_and_system / os.sysconf("SC_CLK_TCK")
 
 
 def resident_mb(pid: int) -> float:
-    """Memory of a process [MB]."""
+    """Resident memory of a process [MB]."""
     lines = Path("/proc", str(pid), "status").read_text(encoding="ascii").splitlines()
     (kilobytes,) = [line.split()[1] for line in lines if line.startswith("VmRSS:")]
     return int(kilobytes) / 1e3
@@ -179,7 +179,7 @@ def resident_mb(pid: int) -> float:
 
 @contextmanager
 def _own_domain() -> Iterator[None]:
-    """Give this process and its children a ROS domain of their own on this machine."""
+    """Give this process and its children an unused ROS domain, limited to this machine."""
     reservation = domain_id()
     alone = {**_ALONE, "ROS_DOMAIN_ID": str(reservation.__enter__())}
     before = {name: os.environ.get(name) for name in alone}
@@ -192,7 +192,7 @@ def _own_domain() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-        reservation.__exit__(None, None, None)  # an error handed in would be taken for a domain in use
+        reservation.__exit__(None, None, None)  # it takes an exception for a domain in use
 
 
 _DEEP = QoSProfile(depth=1000)
@@ -205,7 +205,7 @@ class Poses(NamedTuple):
     """One message of swarm/poses.
 
     Attributes:
-        stamp_ns: When the poses hold.
+        stamp_ns: Time of the poses.
         pose: (N, 3) x [m], y [m], theta [rad] in map.
         covariance: (N, 3, 3).
         status: (N,) of `SwarmPose.status`.
@@ -218,19 +218,19 @@ class Poses(NamedTuple):
 
 
 class Recorder(Node):
-    """Keeps every message of swarm/poses with its time of reception, and the newest /diagnostics.
+    """Records all messages of swarm/poses with their times of reception, and counts from /diagnostics.
 
     Args:
         node_arguments: Further arguments of `rclpy.node.Node`.
 
     Attributes:
         raw: Serialized messages in order of reception.
-        received_ns: The graph's time at each reception; with /clock it advances in steps of that.
-        taken: Stamp of poses -> topic -> messages that the estimator had taken in for them; of those poses
-            of which /diagnostics told, about once a second.
-        inputs: Messages that it has taken in, of all topics.
-        drops: Data that it did not use, by reason.
-        diagnostics: How many messages of /diagnostics have come from it.
+        received_ns: Time of each reception by the graph's clock, which advances in steps of /clock.
+        taken: Stamp of poses -> topic -> messages that the estimator had received by then, from /diagnostics,
+            about once a second.
+        inputs: Messages that the estimator has received, of all topics.
+        drops: Inputs that it has not used, by reason.
+        diagnostics: Messages of /diagnostics that have come from it.
     """
 
     def __init__(self, **node_arguments: Any) -> None:
@@ -247,12 +247,12 @@ class Recorder(Node):
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, _DEEP)
 
     def poses(self) -> Sequence[Poses]:
-        """The numbers of all messages so far, in order of reception; each is read once."""
+        """All messages so far in order of reception; each is decoded once."""
         self._poses.extend(map(read_poses, self.raw[len(self._poses) :]))
         return self._poses
 
     def result(self, title: str, swarm: Swarm, truth: Mapping[str, Trajectory]) -> ReplayResult:
-        """All poses so far, of which there is at least one, and what was dropped, beside ground truth."""
+        """All poses so far, at least one, with ground truth and the counts of dropped inputs."""
         stamps_ns, poses, covariances, status = zip(*self.poses(), strict=True)
         stamp_ns, columns = np.array(stamps_ns, dtype=np.int64), (np.array(poses), np.array(covariances))
         return ReplayResult(title, swarm, stamp_ns, *columns, np.array(status), truth, dict(self.drops))
@@ -277,7 +277,7 @@ class Recorder(Node):
 
 
 def _taken(statuses: Sequence[DiagnosticStatus]) -> dict[str, int]:
-    """Topic -> messages that the estimator has taken in, by its statuses: one per robot, and its own."""
+    """Topic -> messages that the estimator has received, from its status and those of the robots."""
     taken = {}
     for status in statuses:
         robot = status.name.removeprefix(_ESTIMATOR).removeprefix(": ")
@@ -288,7 +288,7 @@ def _taken(statuses: Sequence[DiagnosticStatus]) -> dict[str, int]:
 
 
 def read_poses(data: bytes) -> Poses:
-    """The numbers of a serialized SwarmPoses."""
+    """Decode a serialized SwarmPoses."""
     message = deserialize_message(data, SwarmPoses)
     stamp = message.header.stamp
     robots = message.robots

@@ -40,21 +40,20 @@ _END_PATIENCE_S = 10.0
 
 @dataclass(frozen=True)
 class LiveRun:
-    """What came out of a live graph.
+    """Results of a run of the live graph.
 
     Attributes:
-        result: Poses as received, ground truth of the bag, what the estimator dropped.
-        arrival_ns: Topic for the estimator -> (M,) increasing, when its messages had arrived in the bag; the
-            player has published all of them.
-        taken: Stamp of poses -> topic -> messages that the estimator had taken in for them; of some poses.
-        rate: Speed at which the bag was played.
-        received: Those that the estimator took in.
-        estimator_core: CPU time of the estimator's process per second while the bag played.
-        age_s: (A,) time of reception minus stamp of poses, in the bag's time, of those that came when it was
-            known here.
-        start_up_s: From the start of the estimator's process to its first poses, which come when all topics
-            of the bag have been found and the player has begun.
-        memory_mb: Of the estimator's process at the end.
+        result: Poses as received, ground truth of the bag, counts of dropped inputs.
+        arrival_ns: Topic of the estimator's inputs -> (M,) increasing log times of its messages in the bag,
+            all of which were published.
+        taken: Stamp of poses -> topic -> messages that the estimator had received by then; of some poses.
+        rate: Speed of the player.
+        received: Messages that the estimator received.
+        estimator_core: CPU time of the estimator per second while the bag played.
+        age_s: (A,) time of reception minus stamp of poses in the bag's time, once /clock was received here.
+        start_up_s: From the start of the estimator to its first poses, which come when all topics of the bag
+            are discovered and the player has begun.
+        memory_mb: Of the estimator at the end.
     """
 
     result: ReplayResult
@@ -69,23 +68,23 @@ class LiveRun:
 
     @property
     def sent(self) -> int:
-        """Messages for the estimator that were published."""
+        """Inputs of the estimator that were published."""
         return sum(map(len, self.arrival_ns.values()))
 
     @property
     def lost(self) -> int:
-        """Messages that went missing on the way."""
+        """Inputs that were published but not received."""
         return self.sent - self.received
 
 
 @dataclass(frozen=True)
 class BagContent:
-    """What is known of a bag before it is played.
+    """Contents of a bag, read before it is played.
 
     Attributes:
         begin_ns: First log time.
         end_ns: Last one.
-        arrival_ns: Topic for the estimator -> (M,) increasing, log times of its messages.
+        arrival_ns: Topic of the estimator's inputs -> (M,) increasing log times of its messages.
         truth: Robot name -> ground truth.
         remarks: What could not be read, one sentence each.
     """
@@ -101,7 +100,7 @@ Watch = Callable[[Recorder, BagContent], None]
 
 
 def read_content(bag: Path, swarm: Swarm) -> BagContent:
-    """Read what evaluation needs of a bag.
+    """Read ground truth and arrival times of a bag.
 
     Raises:
         BagError: Nothing in the bag can be read.
@@ -128,13 +127,13 @@ def play_live(
     inputs_only: bool = False,
     watch: Watch = lambda _recorder, _content: None,
 ) -> LiveRun:
-    """Play a whole bag into a live graph and collect the poses that come out.
+    """Play a whole bag into a live graph and record its poses.
 
     Args:
-        options: The graph, with the bag.
-        log: File for the nodes' output.
-        inputs_only: Whether nothing but the estimator's inputs is played.
-        watch: Called about once per event while the bag plays, to show progress.
+        options: Of the graph, with the bag.
+        log: File for the output of the nodes.
+        inputs_only: Whether only inputs of the estimator are played.
+        watch: Called about once per event while the bag plays.
 
     Raises:
         ValueError: The options have no bag.
@@ -190,21 +189,21 @@ def play_live(
 
 
 def _player_of(player: NodeSpec, inputs: Sequence[str], *, inputs_only: bool) -> NodeSpec:
-    """A player that begins once all inputs are heard, however slowly they are discovered."""
-    chosen: dict[str, ParameterValue] = {"wait_for_subscribers": max(1, len(inputs))}
+    """The player that begins once the estimator has discovered all inputs."""
+    changes: dict[str, ParameterValue] = {"wait_for_subscribers": max(1, len(inputs))}
     if inputs_only:
-        chosen["topics"] = [*inputs]
-    return replace(player, parameters={**player.parameters, **chosen})
+        changes["topics"] = [*inputs]
+    return replace(player, parameters={**player.parameters, **changes})
 
 
 def _ages(received_ns: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> FloatArray:
-    """Ages of poses at reception [s], where that time is known; before the first /clock it is zero."""
+    """Ages of poses at reception [s]; the time of reception is 0 before the first /clock."""
     known = received_ns > 0
     return (received_ns - stamp_ns)[known].astype(np.float64) * 1e-9
 
 
 def _wait_for_the_rest(graph: LiveGraph, content: BagContent) -> None:
-    """Wait for poses of the bag's end, and for what the estimator then says of its inputs."""
+    """Wait for poses of the end of the bag, and for the diagnostics after it."""
     sent = sum(map(len, content.arrival_ns.values()))
     recorder, last_ns = graph.recorder, content.end_ns - round(EstimatorParameters().tick_period_s * 1e9)
     graph.wait_for(
@@ -213,20 +212,14 @@ def _wait_for_the_rest(graph: LiveGraph, content: BagContent) -> None:
         _END_PATIENCE_S,
         needed=[ESTIMATOR],
     )
-    told: dict[int, int] = {}  # how many inputs by the n-th diagnostics
+    inputs_at: dict[int, int] = {}  # number of diagnostics -> inputs received by then
 
     def has_all() -> bool:
-        """Whether everything has been taken in, or no more is."""
-        told[recorder.diagnostics] = recorder.inputs
-        before = told.get(recorder.diagnostics - 1)
-        return recorder.inputs in (sent, before)
+        """Whether all inputs are received, or none has come since the diagnostics before."""
+        inputs_at[recorder.diagnostics] = recorder.inputs
+        return recorder.inputs in (sent, inputs_at.get(recorder.diagnostics - 1))
 
-    graph.wait_for(
-        has_all,
-        "publish diagnostics",
-        _END_PATIENCE_S,
-        needed=[ESTIMATOR],
-    )
+    graph.wait_for(has_all, "publish diagnostics", _END_PATIENCE_S, needed=[ESTIMATOR])
 
 
 _EQUAL_M = 1e-6
@@ -234,17 +227,17 @@ _EQUAL_M = 1e-6
 
 @dataclass(frozen=True)
 class Agreement:
-    """Live poses beside those of a replay at the same stamps.
+    """Live poses compared with those of a replay at the same stamps.
 
-    A live estimator cannot know what is still on its way when it gives a pose: up to a step of the player's
-    clock and the transport, which takes the longer the busier the machine is. Only at settled stamps is it
-    known that both know the same, and the poses must be equal.
+    The live estimator lacks inputs that are still in transport when it gives a pose: those of up to a step of
+    the player's clock, and more on a busy machine. Only at settled stamps both have the same inputs; there
+    the poses must be equal.
 
     Attributes:
         replayed: The replay.
-        distance_m: (T, N) between the positions; NaN where neither is located, infinite where one is not.
-        turn_rad: (T, N) between the headings, likewise, without sign.
-        settled: (T,) whether the estimator has said that it knew just what had arrived by then in the bag.
+        distance_m: (T, N) between the positions; NaN if neither is located, infinite if one is not.
+        turn_rad: (T, N) absolute difference of the headings; NaN and infinite as above.
+        settled: (T,) whether the estimator had received exactly what had arrived by then in the bag.
     """
 
     replayed: ReplayResult
@@ -254,28 +247,28 @@ class Agreement:
 
     @property
     def equal_share(self) -> float:
-        """Share of the poses that are the same to a micrometre."""
+        """Share of the poses whose positions differ by less than a micrometre."""
         return float(np.mean(self.distance_m[~np.isnan(self.distance_m)] < _EQUAL_M))
 
     @property
     def rms_m(self) -> float:
-        """Root mean square distance of all robots that both had located [m]."""
+        """Root mean square distance where both are located [m]."""
         return float(np.sqrt(np.mean(self.distance_m[np.isfinite(self.distance_m)] ** 2)))
 
     @property
     def settled_max_m(self) -> float:
         """Largest distance at settled stamps [m]; NaN when there are none."""
-        chosen = self.distance_m[self.settled]
-        return float(np.nanmax(chosen)) if chosen.size else float("nan")
+        settled = self.distance_m[self.settled]
+        return float(np.nanmax(settled)) if settled.size else float("nan")
 
 
 def compare_with_replay(live: LiveRun, bag: Path, settings: Settings | None = None) -> Agreement:
-    """Replay a bag at the very stamps of live poses.
+    """Replay a bag at the stamps of live poses.
 
     Args:
-        live: What came out of the live graph.
-        bag: What was played into it.
-        settings: Those of the live estimator.
+        live: A run of the live graph.
+        bag: The bag that it was played.
+        settings: Of the live estimator.
     """
     replayed = replay(bag, live.result.swarm, settings, stamp_ns=live.result.stamp_ns)
     difference = live.result.poses - replayed.poses
@@ -287,15 +280,15 @@ def compare_with_replay(live: LiveRun, bag: Path, settings: Settings | None = No
 
 
 def _settled(live: LiveRun) -> NDArray[np.bool_]:
-    """(T,) whether the poses are known to be of all that had arrived by their stamp, and of nothing else."""
+    """(T,) whether the poses include exactly the inputs that had arrived by their stamp, as far as known."""
     stamp_ns = live.result.stamp_ns
-    told_ns = np.array(sorted(live.taken), dtype=np.int64)
-    before = np.searchsorted(told_ns, stamp_ns, side="right")
-    behind = np.searchsorted(told_ns, stamp_ns, side="left") + 1
+    counted_ns = np.array(sorted(live.taken), dtype=np.int64)
+    before = np.searchsorted(counted_ns, stamp_ns, side="right")
+    behind = np.searchsorted(counted_ns, stamp_ns, side="left") + 1
     settled = np.ones(stamp_ns.size, dtype=bool)
     for topic, arrival_ns in live.arrival_ns.items():
-        # the messages of a topic come in order: as many are the same ones
-        taken = np.array([0, *(live.taken[at].get(topic, 0) for at in told_ns.tolist()), arrival_ns.size])
+        # the messages of a topic come in order: equal counts mean equal messages
+        taken = np.array([0, *(live.taken[at].get(topic, 0) for at in counted_ns.tolist()), arrival_ns.size])
         arrived = np.searchsorted(arrival_ns, stamp_ns, side="right")
         settled &= (taken[before] == arrived) & (taken[behind] == arrived)
     return settled

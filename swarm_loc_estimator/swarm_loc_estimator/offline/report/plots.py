@@ -35,25 +35,24 @@ from swarm_loc_estimator.offline.result import ReplayResult
 
 _MAP_IN, _ERRORS_IN = 6.6, 4.4
 _ROOM_IN = 0.6
-"""Height that title, legend and axes take."""
+"""Height of title, legend and axes."""
 _TAIL_NS = 6_000_000_000
 _SIGMAS = 3.0
 _ENLARGED = 20.0
 _SEEN = 0.05
-"""An ellipse smaller than this share of the map's width is drawn enlarged."""
+"""Ellipses are enlarged if the largest is smaller than this share of the map's width."""
 _MAX_NAMES = 12
 _STRETCHES = 120
 _NAME_PT = np.array([42.0, 22.0])
-"""How far beside and above a robot its name stands."""
+"""Distance of a name from its robot, horizontally and vertically."""
 
 
 def plot_overview(result: ReplayResult, path: Path) -> None:
-    """Draw paths, landmarks and the robots at the end with their covariance; beside it, errors over time.
+    """Draw paths, landmarks and the last poses with their covariance; beside it, errors over time.
 
     Args:
-        result: What to draw. The picture ends with the ground truth: what it shows last can be judged.
-            Without ground truth there are no errors.
-        path: Picture to write.
+        result: The run, shown until its ground truth ends.
+        path: PNG file to write.
     """
     result = _until_truth_ends(result)
     world = WorldMap(result)
@@ -76,7 +75,7 @@ def plot_overview(result: ReplayResult, path: Path) -> None:
 
 
 def _until_truth_ends(result: ReplayResult) -> ReplayResult:
-    """The result without poses that are later than all ground truth, where sensors may have stopped, too."""
+    """The result without poses later than all ground truth, when sensors may have stopped, too."""
     ends = [int(track.stamp_ns[-1]) for track in result.truth.values() if len(track.stamp_ns)]
     if not ends:
         return result
@@ -84,7 +83,7 @@ def _until_truth_ends(result: ReplayResult) -> ReplayResult:
 
 
 def _title(result: ReplayResult) -> str:
-    """Who, and how well."""
+    """Sizes and pooled errors."""
     robots = f"{_counted(result.swarm.robots, 'robot')}, {_counted(result.swarm.landmarks, 'landmark')}"
     if not result.errors:
         return robots
@@ -94,12 +93,12 @@ def _title(result: ReplayResult) -> str:
 
 
 def _counted(things: tuple[object, ...], name: str) -> str:
-    """Things by number."""
+    """A number of things, such as "2 robots"."""
     return f"{len(things)} {name}{'' if len(things) == 1 else 's'}"
 
 
 def _draw_swarm(axis: Axes, result: ReplayResult, world: WorldMap) -> float:
-    """Landmarks below, then truth, paths and robots; returns how much larger than life the ellipses are."""
+    """Draw landmarks, truth, paths and robots; returns the factor by which ellipses are enlarged."""
     world.draw_world(axis)
     label_map(axis)
     ends = [last_pose(result, index) for index in range(len(result.swarm.robots))]
@@ -119,20 +118,20 @@ def _draw_swarm(axis: Axes, result: ReplayResult, world: WorldMap) -> float:
 
 
 def _draw_tail(axis: Axes, result: ReplayResult, index: int) -> None:
-    """The last stretch of a path, bold."""
+    """Draw the last seconds of a path bold."""
     late = result.stamp_ns >= result.stamp_ns.max(initial=0) - _TAIL_NS
     x, y, _ = result.poses[late, index].T
     axis.plot(x, y, color=colour_of(index), linewidth=2.4, zorder=3)
 
 
 def _enlargement(covariances: list[FloatArray], width: float) -> float:
-    """How much larger than life ellipses must be drawn to be seen."""
+    """The factor by which ellipses are enlarged to be visible."""
     sigmas = [math.sqrt(float(np.linalg.eigvalsh(one[:2, :2])[-1])) for one in covariances]
     return 1.0 if not sigmas or 2.0 * _SIGMAS * max(sigmas) > _SEEN * width else _ENLARGED
 
 
 def _draw_ellipse(axis: Axes, pose: FloatArray, covariance: FloatArray, enlarged: float, colour: str) -> None:
-    """Where a robot is believed to be, (2, 2) about its pose."""
+    """Draw the covariance (2, 2) of a position."""
     variances, directions = np.linalg.eigh(covariance)
     minor, major = 2.0 * _SIGMAS * enlarged * np.sqrt(variances.clip(min=0.0))
     turn = math.degrees(math.atan2(directions[1, 1], directions[0, 1]))
@@ -142,7 +141,7 @@ def _draw_ellipse(axis: Axes, pose: FloatArray, covariance: FloatArray, enlarged
 
 
 def _draw_name(axis: Axes, name: str, pose: FloatArray, middle: FloatArray, colour: str) -> None:
-    """A robot's name beside its path, on the side away from the swarm's middle."""
+    """Write a robot's name beside its path, on the side away from the middle of the swarm."""
     side = np.array([-math.sin(pose[2]), math.cos(pose[2])])
     away = math.copysign(1.0, float(side @ (pose[:2] - middle))) * side * _NAME_PT
     text = axis.annotate(
@@ -161,7 +160,7 @@ def _draw_name(axis: Axes, name: str, pose: FloatArray, middle: FloatArray, colo
 
 
 def _legend(figure: Figure, enlarged: float, *, judged: bool) -> None:
-    """What lines and shades mean."""
+    """Draw the legend."""
     larger = f", {enlarged:.0f} x enlarged" if enlarged != 1.0 else ""
     meanings = [
         Line2D([], [], color=INK, linewidth=3.5, label="landmark"),
@@ -175,7 +174,7 @@ def _legend(figure: Figure, enlarged: float, *, judged: bool) -> None:
 
 
 def _draw_errors(axis: Axes, title: str, of: Callable[[Errors], FloatArray], result: ReplayResult) -> None:
-    """An error over time: faint that of each robot, bold the RMS of the swarm."""
+    """Plot an error over time: thin for each robot, bold for the RMS of the swarm."""
     style(axis)
     begin_ns = int(result.stamp_ns[0])
     for name, errors in result.errors.items():
@@ -189,7 +188,7 @@ def _draw_errors(axis: Axes, title: str, of: Callable[[Errors], FloatArray], res
 
 
 def _rms(time_s: FloatArray, off: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Root mean squares of even stretches of time, and their middles; NaN where there is nothing."""
+    """Middles of equal intervals of time, and the RMS in each; NaN in empty ones."""
     edges = np.linspace(float(time_s.min()), np.nextafter(float(time_s.max()), math.inf), _STRETCHES + 1)
     counts, _ = np.histogram(time_s, edges)
     sums, _ = np.histogram(time_s, edges, weights=off**2)
@@ -202,18 +201,18 @@ _MAX_PANELS = 9
 _MAX_ROWS = 6
 _MAX_POINTS = 1500
 _NEES_95 = (0.216, 9.348)
-"""Bounds that hold 95 % of the normalised squared errors of three consistent dimensions."""
+"""95 % bounds of the normalized squared error of three dimensions."""
 
 
 def plot_paths(result: ReplayResult, path: Path) -> bool:
     """Draw each robot's true and estimated path in a panel of its own.
 
     Args:
-        result: What to draw.
-        path: Picture to write.
+        result: The run.
+        path: PNG file to write.
 
     Returns:
-        Whether there are as many robots as that is good for: one, or very many, need no such picture.
+        Whether the file was written: not for one robot nor for more than `_MAX_PANELS`.
     """
     robots = result.swarm.robots
     if not 1 < len(robots) <= _MAX_PANELS:
@@ -245,11 +244,11 @@ def plot_errors(result: ReplayResult, path: Path) -> bool:
     """Draw errors over time with their 3-sigma bands, and NEES; the robots with the largest errors when many.
 
     Args:
-        result: What to draw.
-        path: Picture to write.
+        result: The run.
+        path: PNG file to write.
 
     Returns:
-        Whether there was ground truth to draw anything against.
+        Whether the file was written: not without ground truth.
     """
     names = [name for name, errors in result.errors.items() if len(errors.stamp_ns)]
     if not names:
@@ -279,7 +278,7 @@ def plot_errors(result: ReplayResult, path: Path) -> bool:
 
 
 def _error_limits(errors: list[Errors]) -> tuple[float, float]:
-    """Limits of position [m] and heading [rad] that show all but the wildest errors of all robots."""
+    """Axis limits of position [m] and heading [rad] from the 99th percentiles of all robots."""
     position = np.concatenate([np.abs(one.error[:, :2]).max(axis=1) for one in errors])
     heading = np.concatenate([np.abs(one.error[:, 2]) for one in errors])
     return (
@@ -291,7 +290,7 @@ def _error_limits(errors: list[Errors]) -> tuple[float, float]:
 def _draw_errors_of(
     axes: npt.NDArray[np.object_], errors: Errors, colour: str, begin_ns: int, limits: tuple[float, float]
 ) -> None:
-    """One robot's errors in x, y and heading."""
+    """Plot one robot's errors in x, y and heading with 3-sigma bands."""
     rows = _thin(errors)
     time_s = seconds_since(begin_ns, errors.stamp_ns[rows])
     metre, _ = length_unit(limits[0])
@@ -301,7 +300,7 @@ def _draw_errors_of(
         value, sigma = (scale * part[rows, column] for part in (errors.error, errors.sigma))
         axis.fill_between(time_s, -3.0 * sigma, 3.0 * sigma, color=colour, alpha=0.16, linewidth=0)
         line = broken(errors.stamp_ns[rows], np.column_stack([time_s, value]))
-        lone = len(line) > len(rows)  # single points between gaps would be no line
+        lone = len(line) > len(rows)  # single points between gaps make no line
         axis.plot(*line.T, color=colour, linewidth=0.7, marker="." if lone else "", markersize=3)
         axis.axhline(0.0, color=SOFT, linewidth=0.5)
         limit = scale * limits[column == 2]
@@ -310,7 +309,7 @@ def _draw_errors_of(
 
 
 def _draw_nees(axis: Axes, errors: Errors, colour: str, begin_ns: int) -> None:
-    """One robot's normalised squared errors."""
+    """Plot one robot's normalized squared errors."""
     rows = _thin(errors)
     time_s = seconds_since(begin_ns, errors.stamp_ns[rows])
     style(axis)
@@ -323,7 +322,7 @@ def _draw_nees(axis: Axes, errors: Errors, colour: str, begin_ns: int) -> None:
 
 
 def _thin(errors: Errors) -> npt.NDArray[np.intp]:
-    """Indices to draw: of each stretch of time the largest error, so that no spike is lost."""
+    """Indices to draw: the largest error of each interval, so that no spike is lost."""
     count = len(errors.stamp_ns)
     if count <= _MAX_POINTS:
         return np.arange(count)

@@ -43,14 +43,14 @@ from swarm_loc_estimator.watch.recording import recording
 
 @dataclass(frozen=True)
 class ReportFiles:
-    """Where the report lies.
+    """Files of a report.
 
     Attributes:
         text: The table as text.
         page: The self-contained page.
-        overview: Picture of the swarm on its map, and of its errors over time.
-        paths: Picture of each robot's path; None for one robot or very many.
-        errors: Picture of each robot's errors over time; None without ground truth.
+        overview: Plot of the swarm on its map, and of its errors over time.
+        paths: Plot of each robot's path; None for one robot or more than nine.
+        errors: Plot of each robot's errors over time; None without ground truth.
     """
 
     text: Path
@@ -61,11 +61,11 @@ class ReportFiles:
 
 
 def write_report(result: ReplayResult, folder: Path | str) -> ReportFiles:
-    """Write report.txt, report.html and overview.png; paths.png and errors.png where they say more.
+    """Write report.txt, report.html and overview.png; paths.png and errors.png where they apply.
 
     Args:
-        result: What to report.
-        folder: Where to; created when missing, files of an earlier report are replaced.
+        result: The run.
+        folder: Created if missing; files of an earlier report are replaced.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -116,11 +116,11 @@ small { display: block; color: var(--soft); }
 
 
 def html_report(result: ReplayResult, pictures: dict[str, Path]) -> str:
-    """The page.
+    """One self-contained HTML page.
 
     Args:
-        result: What to show.
-        pictures: Heading -> PNG file to put below it.
+        result: The run.
+        pictures: Heading -> PNG file below it.
     """
     parts = [
         f"<h1>{escape(result.title)}</h1>",
@@ -141,7 +141,7 @@ def html_report(result: ReplayResult, pictures: dict[str, Path]) -> str:
 
 
 def _facts(result: ReplayResult) -> str:
-    """Size, duration and speed, with the pooled errors first."""
+    """Pooled errors, sizes, durations and speed."""
     rows = summaries(result)
     headline = []
     if rows:
@@ -152,17 +152,17 @@ def _facts(result: ReplayResult) -> str:
             ("NEES", figures[12]),
         ]
     first = "".join(_card(name, text, "headline") for name, text in headline)
-    others = "".join(_card(name, text) for name, text in facts(result))
+    others = "".join(_card(name, text) for name, text in facts(result).items())
     return f'<dl class="facts">{first}{others}</dl>'
 
 
 def _card(name: str, text: str, kind: str = "") -> str:
-    """One fact."""
+    """One name and value."""
     return f'<div class="{kind}"><dt>{escape(name)}</dt><dd>{escape(text)}</dd></div>'
 
 
 def _remarks(result: ReplayResult) -> str:
-    """What else must be said."""
+    """The remarks as a list."""
     items = "".join(f"<li>{escape(remark)}</li>" for remark in result.remarks)
     return f"<h2>Remarks</h2><ul>{items}</ul>" if items else ""
 
@@ -189,7 +189,7 @@ def _errors(result: ReplayResult) -> str:
 
 
 def _player(result: ReplayResult) -> str:
-    """The page on which people watch a swarm, with this run inside."""
+    """The page of `watch` with this run inside."""
     recording = recorded(result)
     if not recording:
         return ""
@@ -198,7 +198,7 @@ def _player(result: ReplayResult) -> str:
 
 
 def _self_calibration(result: ReplayResult) -> str:
-    """What was estimated of robots and landmarks beside the poses."""
+    """The table of estimated calibration parameters."""
     rows, sentence = self_calibrated_robots(result), self_calibrated_landmarks(result)
     if not rows and not sentence:
         return ""
@@ -210,14 +210,14 @@ def _self_calibration(result: ReplayResult) -> str:
 
 
 def _picture(heading: str, path: Path) -> str:
-    """A picture inside the page."""
+    """A plot embedded in the page."""
     data = base64.b64encode(path.read_bytes()).decode("ascii")
     name = escape(heading)
     return f'<h2>{name}</h2><div class="wide"><img alt="{name}" src="data:image/png;base64,{data}"></div>'
 
 
 def _counters(result: ReplayResult) -> str:
-    """What was counted."""
+    """The table of counters."""
     rows = "".join(
         f"<tr><td>{escape(name)}</td><td>{count}</td></tr>" for name, count in result.counters.items()
     )
@@ -226,14 +226,14 @@ def _counters(result: ReplayResult) -> str:
 
 _Thing = TypeVar("_Thing")
 MAX_BYTES = 12_000_000
-"""Of poses and sightings before they are packed; maps, goals and aerial images have limits of their own."""
+"""Of poses and sightings before compression; maps, goals and aerial images have limits of their own."""
 _MAP_BYTES, _GOAL_BYTES, _IMAGE_BYTES = 6_000_000, 1_000_000, 2_000_000
 _BYTES_PER_FRAME, _BYTES_PER_ROBOT, _BYTES_PER_SIGHTING = 800, 64, 17
 _GAP_NS = 500_000_000
 
 
 def recorded(result: ReplayResult) -> str:
-    """The run as a text for the page; "" where there is nothing to show."""
+    """The run as text for the page of `watch`, thinned out to `MAX_BYTES`; "" if there is nothing to show."""
     if not len(result.stamp_ns) or not result.swarm.robots:
         return ""
     seen = sum(len(one.observer) for _, one in result.sightings) * _BYTES_PER_SIGHTING
@@ -243,8 +243,8 @@ def recorded(result: ReplayResult) -> str:
     frames = [*map(poses_frame, estimates(result, stride)), *_truth(result, stride)]
     frames += [sightings_frame(stamp_ns, one) for stamp_ns, one in result.sightings[::seen_stride]]
     frames += [*_maps(result), *_goals(result), *_images(result)]
-    told = about(result.swarm, result.title, commands=False)
-    return recording(told, sorted(frames, key=lambda frame: frame.stamp_ns))
+    header = about(result.swarm, result.title, commands=False)
+    return recording(header, sorted(frames, key=lambda frame: frame.stamp_ns))
 
 
 def _truth(result: ReplayResult, stride: int) -> Iterator[Frame]:
@@ -262,14 +262,14 @@ def _truth(result: ReplayResult, stride: int) -> Iterator[Frame]:
 
 
 def _maps(result: ReplayResult) -> Iterator[Frame]:
-    """The map as it grew, the last one among them."""
+    """The maps over time, with the last."""
     size = max((len(one.data) for one in result.maps), default=1)
     for one in _thinned(result.maps, _MAP_BYTES // size):
         yield map_frame(one.log_ns, one.grid)
 
 
 def _goals(result: ReplayResult) -> Iterator[Frame]:
-    """The goals of all robots at each instant at which one has got another."""
+    """The goals of all robots whenever one of them changes."""
     index_of, newest = result.swarm.index_of, dict[int, FloatArray]()
     rows = [
         (int(track.stamp_ns[k]), index_of[name], track.pose[k])
@@ -285,13 +285,13 @@ def _goals(result: ReplayResult) -> Iterator[Frame]:
 
 
 def _images(result: ReplayResult) -> Iterator[Frame]:
-    """What cameras above the swarm saw."""
+    """Aerial images over time."""
     frames = [aerial_frame(*one) for one in result.images]
     size = max((len(one.data) for one in frames), default=1)
     yield from _thinned(frames, _IMAGE_BYTES // size)
 
 
 def _thinned(things: Sequence[_Thing], most: int) -> list[_Thing]:
-    """So many of them at most, but one at least, evenly, the last among them."""
+    """At most so many of them, evenly spaced, always with the last."""
     stride = max(1, -(-len(things) // max(1, most)))
     return [*things[::-1][::stride]][::-1]

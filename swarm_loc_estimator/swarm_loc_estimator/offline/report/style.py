@@ -18,39 +18,39 @@ from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Landmark
 
 INK, SOFT, TRUTH = "#22303c", "#6b7a86", "#9aa5b1"
-# Okabe and Ito: told apart by everyone
+# Okabe and Ito: distinguishable with any colour vision
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 _DPI = 120
 _PAD_IN = 0.08
 _PALETTE = 256
-"""So many colours make the file half as large as all of them."""
+"""Fewer colours halve the size of the file."""
 _MILLIMETRES_BELOW_M = 0.1
 _MIN_GAP_NS = 2_000_000_000
 
 
 def colour_of(index: int) -> str:
-    """The colour of a robot in all pictures."""
+    """The colour of a robot (index) in all plots."""
     return _COLOURS[index % len(_COLOURS)]
 
 
 def length_unit(length: float) -> tuple[float, str]:
-    """The unit that a length [m] is best told in: how many of it are a metre, and its name."""
+    """The readable unit of a length [m]: units per metre, and its name."""
     return (1e3, "mm") if abs(length) < _MILLIMETRES_BELOW_M else (1.0, "m")
 
 
 def length_text(length: float) -> str:
-    """A length [m] in the unit that it is best told in."""
+    """A length [m] in its readable unit."""
     metre, unit = length_unit(length)
     return f"{metre * length:.{1 if unit == 'mm' else 2}f} {unit}"
 
 
 def seconds_since(begin_ns: int, stamp_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
-    """The axis of time [s]."""
+    """Stamps as seconds since `begin_ns`."""
     return (stamp_ns - begin_ns).astype(np.float64) * 1e-9
 
 
 def style(axis: Axes) -> None:
-    """Quiet axes: the data speak."""
+    """Format axes: light grid, no frame."""
     axis.grid(visible=True, color="#e4e8ec", linewidth=0.6)
     axis.set_axisbelow(True)
     for side in ("top", "right"):
@@ -61,7 +61,7 @@ def style(axis: Axes) -> None:
 
 
 def broken(stamp_ns: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Rows with one of NaN in each gap of time, so that no line is drawn across what is not known."""
+    """Rows with a row of NaN inserted in each gap of time, so that lines are interrupted there."""
     step_ns = np.diff(stamp_ns)
     if len(step_ns) == 0:
         return rows
@@ -70,7 +70,7 @@ def broken(stamp_ns: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> np
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a picture with few colours and without a stamp of version or time: equal results, equal files."""
+    """Write a PNG with few colours and without version or time: equal results give equal files."""
     figure.set_layout_engine("constrained", w_pad=_PAD_IN, h_pad=_PAD_IN)
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=_DPI, format="png")
@@ -80,19 +80,19 @@ def save(figure: Figure, path: Path) -> None:
 _MAX_POINTS = 8000
 _MAX_IDS = 40
 _MARGIN = 0.05
-"""Free space around the world, as a share of its size."""
+"""Margin around the world, as a share of its size."""
 
 
 class WorldMap:
-    """The part of the plane that a result is about, and how it is drawn; all lengths in metres.
+    """Limits of a map that shows a result, and what is drawn on it; all lengths in metres.
 
     Args:
-        result: What to draw.
+        result: The run.
 
     Attributes:
-        x: Limits; from truth and landmarks before estimates, which may be anywhere.
-        y: Likewise.
-        radius: Of the disc that stands for a robot.
+        x: Limits from truth and landmarks; from estimates only without truth.
+        y: Limits in y.
+        radius: Of the disc of a robot.
     """
 
     def __init__(self, result: ReplayResult) -> None:
@@ -111,7 +111,7 @@ class WorldMap:
 
     @property
     def width(self) -> float:
-        """Along x."""
+        """Extent along x."""
         return self.x[1] - self.x[0]
 
     @property
@@ -120,21 +120,21 @@ class WorldMap:
         return (self.y[1] - self.y[0]) / self.width
 
     def draw_world(self, axis: Axes) -> None:
-        """Axes at equal scale, and the landmarks."""
+        """Draw axes at equal scale, and the landmarks."""
         style(axis)
         axis.set(aspect="equal", xlim=self.x, ylim=self.y)
         for mark in self._result.swarm.landmarks:
             self._draw_landmark(axis, mark)
 
     def draw_ids(self, axis: Axes) -> None:
-        """The landmarks' ids, where they are few enough to be read."""
+        """Draw the ids of the landmarks, unless there are too many to read."""
         landmarks = self._result.swarm.landmarks
         for mark in landmarks if len(landmarks) <= _MAX_IDS else ():
             place, shift = (mark.x, mark.y), (4, 4)
             axis.annotate(str(mark.id), place, shift, textcoords="offset points", fontsize=7, color=SOFT)
 
     def draw_paths(self, axis: Axes, index: int, alpha: float) -> None:
-        """A robot's true path broad, its estimated path thin above it."""
+        """Draw a robot's true path broad, its estimated path thin above it."""
         result, colour = self._result, colour_of(index)
         name = result.swarm.robots[index].name
         if name in result.truth:
@@ -145,7 +145,7 @@ class WorldMap:
         axis.plot(pose[:, 0], pose[:, 1], color=colour, linewidth=0.9, alpha=alpha, zorder=2)
 
     def draw_robot(self, axis: Axes, index: int, pose: FloatArray) -> None:
-        """A disc with a nose at a pose (3,)."""
+        """Draw a disc with a nose at a pose (3,)."""
         x, y, theta = (float(value) for value in pose)
         colour = colour_of(index)
         axis.add_patch(
@@ -155,7 +155,7 @@ class WorldMap:
         axis.plot([x, x + reach * math.cos(theta)], [y, y + reach * math.sin(theta)], color=INK, zorder=7)
 
     def _draw_landmark(self, axis: Axes, mark: Landmark) -> None:
-        """A bar that faces where the marker faces; a square where that is unknown."""
+        """Draw a bar with the direction of the marker; a square if that is unknown."""
         if mark.yaw is None:
             axis.plot(mark.x, mark.y, "s", color=INK, markersize=4, zorder=4)
             return
@@ -167,12 +167,12 @@ class WorldMap:
 
 
 def last_pose(result: ReplayResult, index: int) -> tuple[FloatArray, FloatArray] | None:
-    """A robot's last pose (3,) with its covariance (3, 3); None where it never had one."""
+    """A robot's last pose (3,) with its covariance (3, 3); None if it was never located."""
     known = np.flatnonzero(np.isfinite(result.poses[:, index]).all(axis=1))
     return (result.poses[known[-1], index], result.covariances[known[-1], index]) if len(known) else None
 
 
 def label_map(axis: Axes) -> None:
-    """Say what the axes are."""
+    """Label the axes."""
     axis.set_xlabel("x in map [m]", color=SOFT, fontsize=9)
     axis.set_ylabel("y in map [m]", color=SOFT, fontsize=9)

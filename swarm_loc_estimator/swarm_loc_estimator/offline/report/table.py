@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 from swarm_loc_estimator.offline.metrics import ErrorSummary
 from swarm_loc_estimator.offline.result import ReplayResult
@@ -25,7 +26,7 @@ HEADER = (
 """Column titles with their units; the first group is position, the second heading."""
 
 GROUPS = (("", 2), ("position", 5), ("heading", 5), ("", 1))
-"""What the columns are about, and how many there are of each."""
+"""Headings over the columns, with the number of columns below each."""
 
 POOLED = "all"
 
@@ -50,16 +51,16 @@ def cells(name: str, row: ErrorSummary) -> list[str]:
 
 SELF_CALIBRATED = (
     "robot",
-    "path, true per told",
-    "turn, true per told",
+    "path, true per reported",
+    "turn, true per reported",
     "camera yaw [deg]",
-    "distance, seen per true",
+    "distance, measured per true",
 )
 """Column titles of the self-calibration of robots."""
 
 
 def self_calibrated_robots(result: ReplayResult) -> list[list[str]]:
-    """The self-calibration of robots, a text per column of `SELF_CALIBRATED`; a dash where there is none."""
+    """The self-calibration of robots, one text per column of `SELF_CALIBRATED`; a dash if not estimated."""
     rows = []
     for robot in result.self_calibrated.robots if result.self_calibrated else ():
         odometry, camera, sensor = robot.odometry, robot.camera, robot.sensor
@@ -75,7 +76,7 @@ def self_calibrated_robots(result: ReplayResult) -> list[list[str]]:
 
 
 def self_calibrated_landmarks(result: ReplayResult) -> str:
-    """The self-calibration of the landmarks in a sentence; "" where their survey is exact."""
+    """The self-calibration of landmarks in a sentence; "" if their positions are exact."""
     before = {mark.id: mark for mark in result.swarm.landmarks}
     after = [mark for mark in (result.self_calibrated or result.swarm).landmarks if mark.is_estimated]
     if not result.self_calibrated or not after:
@@ -83,21 +84,21 @@ def self_calibrated_landmarks(result: ReplayResult) -> str:
     moved = [100.0 * math.hypot(mark.x - before[mark.id].x, mark.y - before[mark.id].y) for mark in after]
     sigma = 100.0 * sum(mark.position_sigma for mark in after) / len(after)
     return (
-        f"{len(after)} landmarks are {sum(moved) / len(moved):.1f} cm from where the survey has them"
-        f" (at most {max(moved):.1f} cm), sure to {sigma:.1f} cm."
+        f"{len(after)} landmarks are {sum(moved) / len(moved):.1f} cm from their surveyed positions"
+        f" (at most {max(moved):.1f} cm), with a standard deviation of {sigma:.1f} cm."
     )
 
 
-def facts(result: ReplayResult) -> list[tuple[str, str]]:
-    """Duration, speed and size in words."""
-    rows = [
-        ("robots", str(len(result.swarm.robots))),
-        ("landmarks", str(len(result.swarm.landmarks))),
-        ("poses", str(len(result.stamp_ns))),
-        ("duration of the data", f"{result.data_s:.1f} s"),
-    ]
+def facts(result: ReplayResult) -> dict[str, str]:
+    """Sizes, durations and speed by name."""
+    rows = {
+        "robots": str(len(result.swarm.robots)),
+        "landmarks": str(len(result.swarm.landmarks)),
+        "poses": str(len(result.stamp_ns)),
+        "duration of the data": f"{result.data_s:.1f} s",
+    }
     if math.isfinite(result.speed_factor):
-        rows.append(("duration of the run", f"{result.wall_s:.2f} s, {result.speed_factor:.0f} x real time"))
+        rows["duration of the run"] = f"{result.wall_s:.2f} s, {result.speed_factor:.0f} x real time"
     return rows
 
 
@@ -116,21 +117,21 @@ def text_report(result: ReplayResult) -> str:
         lines += ["", head, *_columns([list(SELF_CALIBRATED), *robots])]
     lines += ["", self_calibrated_landmarks(result)] if self_calibrated_landmarks(result) else []
     if result.counters:
-        lines += ["", "Counted", *_pairs([(name, str(count)) for name, count in result.counters.items()])]
+        lines += ["", "Counted", *_pairs(result.counters)]
     if result.remarks:
         lines += ["", *result.remarks]
     return "\n".join(lines) + "\n"
 
 
 def _number(value: float, digits: int) -> str:
-    """A figure, or a dash where there is none."""
+    """A number, or a dash for NaN."""
     if math.isnan(value):
         return "-"
     return f"{value:.{digits}f}"
 
 
 def _estimated(value: float, sigma: float, digits: int) -> str:
-    """A figure with its standard deviation, or a dash where it was not estimated."""
+    """A number with its standard deviation; a dash if it was not estimated."""
     return f"{value:.{digits}f} ± {sigma:.{digits}f}" if sigma else "-"
 
 
@@ -140,10 +141,10 @@ def _columns(rows: list[list[str]]) -> list[str]:
     return [_line(row, widths) for row in rows]
 
 
-def _pairs(rows: list[tuple[str, str]]) -> list[str]:
-    """Names and values below each other."""
-    width = max((len(name) for name, _ in rows), default=0)
-    return [f"  {name:<{width}}  {value}" for name, value in rows]
+def _pairs(rows: Mapping[str, object]) -> list[str]:
+    """One line per name and value."""
+    width = max(map(len, rows), default=0)
+    return [f"  {name:<{width}}  {value}" for name, value in rows.items()]
 
 
 def _table(rows: list[list[str]]) -> list[str]:
@@ -169,7 +170,7 @@ def _table(rows: list[list[str]]) -> list[str]:
 
 
 def _line(texts: list[str], widths: list[int]) -> str:
-    """Names to the left, figures to the right."""
+    """One line: names to the left, numbers to the right."""
     first = f"{texts[0]:<{widths[0]}}"
     return "  ".join(
         [first, *(f"{text:>{width}}" for text, width in zip(texts[1:], widths[1:], strict=True))]
