@@ -37,7 +37,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class Driven:
-    """What came of driving.
+    """True and reported tracks of a drive.
 
     Attributes:
         truth: (T + 1, N, 3) true poses in map.
@@ -49,10 +49,10 @@ class Driven:
 
 
 class LastingNoise:
-    """Unit noise that acts over a while instead of within one step.
+    """Unit noise that is correlated over several steps.
 
-    White noise would shake a wheel anew at every step, however short: a camera that looks for 8 ms would see
-    the robot jump. Real wheels slip over millimetres, and a robot is heavy. So each draw is spread evenly
+    White noise would shake a wheel at every step, however short: a camera that exposes for 8 ms would see
+    the robot jump. Real wheels slip over millimetres, and a robot has inertia. So each draw is spread evenly
     over the steps of `time_s`, of which every step takes the mean. Sums over longer times keep the variance
     of sums of white noise but for a third of `time_s`, so that `wheel_noise` means what it says.
 
@@ -60,7 +60,7 @@ class LastingNoise:
         rng: Source.
         shape: Of one step's noise.
         step_s: [s].
-        time_s: How long a draw acts [s].
+        time_s: Correlation time: how long a draw acts [s].
     """
 
     def __init__(
@@ -98,13 +98,13 @@ def roll(
     step_s: float,
     noise: FloatArray,
 ) -> FloatArray:
-    """Where robots at `poses` (N, 3) come in one step.
+    """The poses of robots after one step.
 
     Args:
-        poses: In map.
+        poses: (N, 3) before the step, in map.
         speed: Commanded (N,) [m/s].
         turn_rate: Commanded (N,) [rad/s].
-        model: How they err.
+        model: Their drive and its imperfections.
         step_s: [s].
         noise: (N, 2) of the right and left wheel, of variance `model.wheel_noise` [m^0.5].
     """
@@ -135,7 +135,7 @@ def drive(
 
 
 def integrate(twists: FloatArray) -> FloatArray:
-    """Odometry (T + 1, N, 3) from zero: each step is laid along its middle heading, e-puck paper eq. (1)."""
+    """Odometry (T + 1, N, 3) from zero: each step follows its middle heading, e-puck paper eq. (1)."""
     heading = np.concatenate([np.zeros((1, *twists.shape[1:-1])), np.cumsum(twists[..., 2], axis=0)])
     middle = heading[:-1] + 0.5 * twists[..., 2]
     steps = twists[..., :1] * np.stack([np.cos(middle), np.sin(middle)], axis=-1)

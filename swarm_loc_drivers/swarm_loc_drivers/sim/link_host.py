@@ -204,7 +204,7 @@ class FirmwareHost:
             port.on_cycle()
 
     def close(self) -> None:
-        """Take all robots off their links, as when they are switched off."""
+        """Close all links, as when the robots are switched off."""
         self._selector.close()
         for port in self._ports:
             port.close()

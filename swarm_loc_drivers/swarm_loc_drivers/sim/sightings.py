@@ -97,14 +97,14 @@ def deliver(
     end_ns: int,
     loss: float,
 ) -> tuple[Records, Records]:
-    """Send images on their way: late, in another order, and not all of them.
+    """Delay and reorder images, and lose some of them.
 
     Args:
         rng: Source of delays and losses.
-        exposures: Who looked when.
+        exposures: Robot and stamp of each image.
         frame: (S,) image of each sighting, ascending.
         sightings: (S,) of SIGHTING_DTYPE.
-        end_ns: What would arrive later is left out.
+        end_ns: What would arrive later is dropped.
         loss: Share of images that never arrive.
 
     Returns:
@@ -135,13 +135,13 @@ def observe_markers(
     view: View,
     errors: ErrorModel,
 ) -> tuple[Records, Records]:
-    """What the images show.
+    """Frames and sightings of the cameras' images.
 
     Args:
         rng: Source of every imperfection.
         swarm: Geometry as described.
         truth: Where the robots are.
-        exposures: Who looked when, by the stamps.
+        exposures: Robot and stamp of each image.
         view: What a camera can see.
         errors: The imperfections.
 

@@ -17,20 +17,20 @@ from swarm_loc_drivers.common.velocity_command import Velocity
 from swarm_loc_estimator.common.arrays import FloatArray
 
 Steer = Callable[[int, int, FloatArray], Velocity]
-"""Robot's index, stamp [ns], true pose (3,) in map -> what it should do."""
+"""Robot's index, stamp [ns], true pose (3,) in map -> its velocity."""
 _THROTTLE_S = 10.0
 
 
 class TruthSteering:
-    """Turns `<robot>/ground_truth` into `<robot>/cmd_vel`, from when all robots have told odometry.
+    """Turns `<robot>/ground_truth` into `<robot>/cmd_vel` once all robots have sent odometry.
 
-    A driver that listens may have no robot yet, and where that is to be would move on without it.
+    A driver may subscribe before its robot is connected; the target would then move on without that robot.
 
     Args:
-        node: Whose subscriptions.
+        node: Owner of the subscriptions.
         names: Of the robots.
-        steer: Tells what to do.
-        awaited: Topics that must have publishers, too, before the robots drive.
+        steer: Computes the commands.
+        awaited: Topics that must have publishers before the robots drive.
     """
 
     def __init__(self, node: Node, names: Sequence[str], steer: Steer, awaited: Sequence[str] = ()) -> None:
@@ -64,7 +64,7 @@ class TruthSteering:
         self._silent.discard(name)
 
     def _all_there(self) -> bool:
-        """Whether the robots can begin to drive."""
+        """Whether all robots are connected and all awaited topics have publishers."""
         drivers = all(one.get_subscription_count() for one in self._commands)
         return (
             not self._silent

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
@@ -23,69 +24,78 @@ _CLOCK_QOS = QoSProfile(depth=10)
 _TRUTH_QOS = QoSProfile(depth=10)
 _HELD_WAKE_S = 0.002
 _MAX_LAG_S = 0.1
-"""A world that cannot keep up goes on from now instead of hurrying after."""
-
-
-class Pace(NamedTuple):
-    """How a world's time passes and is told.
-
-    Attributes:
-        step_ns: Simulated time of a step.
-        rate: Simulated seconds per second, as far as the machine keeps up.
-        truth_rate: Published true poses of each robot [1/s].
-        clock_steps: The time is told every so many steps.
-    """
-
-    step_ns: int
-    rate: float
-    truth_rate: float
-    clock_steps: int = 1
+"""A world that cannot keep up continues from now and does not catch up."""
 
 
 class WorldNode(ConfiguredNode[Parameters]):
-    """Lets the time of a world pass; a kind of world says what a step does. See `ConfiguredNode`."""
+    """Steps a world in paced simulated time; a derived class implements `step`. See `ConfiguredNode`."""
 
     def __init__(self, name: str, parameters: type[Parameters], **node_arguments: Any) -> None:
         super().__init__(name, parameters, **node_arguments)
         self.host = FirmwareHost()
         self._steps = 0
 
-    def begin(self, names: Sequence[str], pace: Pace, serve: Callable[[int], str], place: str) -> None:
-        """Put all robots on their links, and publish from now on.
+    def begin(
+        self,
+        names: Sequence[str],
+        step_ns: int,
+        firmware_of: Callable[[int], Any],
+        *,
+        rate: float,
+        truth_rate: float,
+        link_folder: str,
+        first_port: int = 0,
+        waits: bool = False,
+        clock_steps: int = 1,
+    ) -> None:
+        """Put all robots on their links and start publishing.
 
         Args:
-            names: Of the robots.
-            pace: How time passes.
-            serve: Puts a robot on its link; returns the address for its driver.
-            place: The parameter that says where links are, and its value, for errors.
+            names: Names of the robots.
+            step_ns: Simulated time of a step.
+            firmware_of: Makes the firmware of a robot by its index: a `ConsoleFirmware` with a link folder,
+                else a `StreamFirmware`.
+            rate: Simulated seconds per second, as far as the machine keeps up.
+            truth_rate: Published true poses of each robot [1/s].
+            link_folder: Folder for serial ports named like the robots; "": TCP ports.
+            first_port: TCP port of the first robot, the others follow; 0: any.
+            waits: Whether serial ports have flow control.
+            clock_steps: The time is published after every so many steps.
 
         Raises:
-            ParameterError: A link cannot be there.
+            ParameterError: A link cannot be made.
         """
         for robot, name in enumerate(names):
+            firmware = firmware_of(robot)
             try:
-                self.get_logger().info(f"{name} answers at {serve(robot)}")
+                if link_folder:
+                    address = str(self.host.serve_pty(firmware, Path(link_folder) / name, waits=waits))
+                else:
+                    port = self.host.serve_tcp(firmware, port=first_port and first_port + robot)
+                    address = f"tcp://localhost:{port}"
             except OSError as error:
+                place = f"link_folder = {link_folder}" if link_folder else f"first_port = {first_port}"
                 raise ParameterError(
                     f"parameter {place} cannot be used for {name}: {error.strerror}."
                 ) from error
-        self._step_s, self._rate, self._clock_steps = pace.step_ns * 1e-9, pace.rate, pace.clock_steps
-        self._truth_steps = max(1, round(1.0 / (pace.truth_rate * self._step_s)))
+            self.get_logger().info(f"{name} answers at {address}")
+        self._step_s, self._rate, self._clock_steps = step_ns * 1e-9, rate, clock_steps
+        self._truth_steps = max(1, round(1.0 / (truth_rate * self._step_s)))
         self._clock_publisher = self.create_publisher(Clock, "/clock", _CLOCK_QOS)
         self._truths = [
             self.create_publisher(PoseStamped, f"{name}/ground_truth", _TRUTH_QOS) for name in names
         ]
 
     def step(self) -> None:
-        """Let the world do its next step, and `tell` it."""
+        """Let the world do its next step, and `publish_step`."""
         raise NotImplementedError
 
     def is_held(self) -> bool:
-        """Whether time stands still for now."""
+        """Whether simulated time is paused."""
         return False
 
-    def tell(self, now_ns: int, poses: FloatArray) -> None:
-        """A step was done: publish the time, and at times the true poses (N, 3)."""
+    def publish_step(self, now_ns: int, poses: FloatArray) -> None:
+        """Publish the time after a step, and at `truth_rate` the true poses (N, 3)."""
         if self._steps % self._clock_steps == 0:
             self._clock_publisher.publish(Clock(clock=stamp_message(now_ns)))
         if self._steps % self._truth_steps == 0:
@@ -95,7 +105,7 @@ class WorldNode(ConfiguredNode[Parameters]):
         self._steps += 1
 
     def run(self, stop: Stop) -> int:
-        """Step again and again, and answer drivers in between, until asked to stop; the exit status."""
+        """Step and answer drivers until asked to stop; returns the exit status."""
         executor = EventsExecutor()
         executor.add_node(self)
         due_s = time.monotonic()
@@ -113,6 +123,6 @@ class WorldNode(ConfiguredNode[Parameters]):
         return 0
 
     def destroy_node(self) -> None:
-        """Switch the robots off, too."""
+        """Close the robots' links, too."""
         self.host.close()
         super().destroy_node()

@@ -25,7 +25,7 @@ class ErrorModel:
         left_sigma: White noise across it [m].
         heading_sigma: White noise of a marker's heading [rad].
         flip_probability: Share of sightings whose heading is the mirror solution of the planar pose problem.
-        gross_probability: Share of sightings that are nonsense.
+        gross_probability: Share of sightings that are outliers.
         camera_yaw_sigma: Unknown turn of each camera on its robot [rad].
         scale_sigma: Unknown scale of each camera's distances [1].
         map_position_sigma: Error of every landmark's surveyed position, per axis [m].
@@ -118,17 +118,15 @@ def hidden_geometry(rng: np.random.Generator, swarm: Swarm, errors: ErrorModel) 
 
 
 class WorldError(UserError):
-    """A swarm that cannot be simulated; the message is one sentence."""
+    """A swarm that cannot be simulated."""
 
 
 def start_of(robot: Robot) -> Pose2:
-    """Where a robot begins.
+    """The start pose of a robot.
 
     Raises:
-        WorldError: Nobody says.
+        WorldError: The swarm description has none.
     """
     if robot.start is None:
-        raise WorldError(
-            f"robot '{robot.name}' has no start pose, and a simulated robot has to be somewhere."
-        )
+        raise WorldError(f"robot '{robot.name}' has no start pose, and a simulated robot needs one.")
     return robot.start

@@ -68,4 +68,4 @@ def test_robots_are_located_by_a_camera_that_cannot_tell_them_apart(tmp_path: Pa
             assert np.hypot(*(one.pose[robot, :2] - true)) < 0.02
     log = (tmp_path / "nodes.log").read_text(encoding="utf-8")
     assert "dropped" not in log
-    assert "time goes on without" not in log
+    assert "simulated time continues without" not in log

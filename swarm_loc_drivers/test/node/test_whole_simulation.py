@@ -71,4 +71,4 @@ def test_robots_are_located_by_what_their_cameras_see(tmp_path: Path) -> None:
     assert sum(len(array.detections) for array in seen) > len(seen)
     log = (tmp_path / "nodes.log").read_text(encoding="utf-8")
     assert "dropped" not in log
-    assert "time goes on without" not in log
+    assert "simulated time continues without" not in log

@@ -9,7 +9,6 @@ Drivers connect to serial ports named like the robots in `link_folder`. The node
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from swarm_loc_drivers.sim.droplet.droplet_world_parameters import (
 )
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
 from swarm_loc_drivers.sim.droplet.world import STEP_NS, Fix, SimulatedDroplet, Tracker
-from swarm_loc_drivers.sim.world_node import Pace, WorldNode
+from swarm_loc_drivers.sim.world_node import WorldNode
 from swarm_loc_estimator.common.messages.planar import planar_covariance
 from swarm_loc_estimator.common.node import run_node
 
@@ -33,24 +32,25 @@ _CLOCK_STEPS = 2
 
 
 class DropletWorldNode(WorldNode[DropletWorldParameters]):
-    """Steps the world, serves its robots' consoles, publishes what is to be seen of it."""
+    """Steps the world, serves its robots' consoles, publishes clock, true poses and fixes."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("droplet_world", DropletWorldParameters, **node_arguments)
-        chosen = self.params
-        swarm, self._world = make_droplet_world(chosen)
+        params = self.params
+        swarm, self._world = make_droplet_world(params)
         names = [robot.name for robot in swarm.robots]
-        folder = chosen.link_folder
-
-        def serve(robot: int) -> str:
-            firmware = DropletFirmware(SimulatedDroplet(self._world, robot))
-            return str(self.host.serve_pty(firmware, Path(folder) / names[robot]))
-
-        pace = Pace(STEP_NS, chosen.rate, chosen.truth_rate, _CLOCK_STEPS)
-        self.begin(names, pace, serve, f"link_folder = {folder}")
-        fixed = tuple(swarm.index_of[name] for name in chosen.fixed)
+        self.begin(
+            names,
+            STEP_NS,
+            lambda robot: DropletFirmware(SimulatedDroplet(self._world, robot)),
+            rate=params.rate,
+            truth_rate=params.truth_rate,
+            link_folder=params.link_folder,
+            clock_steps=_CLOCK_STEPS,
+        )
+        fixed = tuple(swarm.index_of[name] for name in params.fixed)
         self._tracker = Tracker(
-            fixed, chosen.fix_rate, chosen.fix_sigma, chosen.fix_heading_sigma, chosen.seed
+            fixed, params.fix_rate, params.fix_sigma, params.fix_heading_sigma, params.seed
         )
         self._fixes = {
             robot: self.create_publisher(PoseWithCovarianceStamped, f"{names[robot]}/fix", _FIX_QOS)
@@ -58,9 +58,9 @@ class DropletWorldNode(WorldNode[DropletWorldParameters]):
         }
 
     def step(self) -> None:
-        """Let the world do a step; tell the time, and then what a tracker has seen."""
+        """Step the world; publish the time and then the fixes of the tracker."""
         self._world.step()
-        self.tell(self._world.now_ns, self._world.poses)
+        self.publish_step(self._world.now_ns, self._world.poses)
         for fix in self._tracker.look(self._world.now_ns, self._world.poses):
             self._fixes[fix.robot].publish(self._fix_message(fix))
 

@@ -35,10 +35,12 @@ class DropletWorldParameters:
     )
     link_folder: str = text("", "where each robot's serial port appears under its name", required=True)
     truth_rate: float = number(10.0, "1/s", 0.1, 200.0, "published true poses of each robot")
-    fixed: tuple[str, ...] = texts("robots that a tracker above the table sees, which publishes <robot>/fix")
+    fixed: tuple[str, ...] = texts("robots that a tracker above the table sees; it publishes <robot>/fix")
     fix_rate: float = number(1.0, "1/s", 0.01, 100.0, "fixes of each of these robots")
-    fix_sigma: float = number(0.003, "m", 1e-6, 1.0, "their noise along each axis, one standard deviation")
-    fix_heading_sigma: float = number(0.02, "rad", 1e-6, 1.0, "likewise of the heading")
+    fix_sigma: float = number(0.003, "m", 1e-6, 1.0, "noise of a fix along each axis, one standard deviation")
+    fix_heading_sigma: float = number(
+        0.02, "rad", 1e-6, 1.0, "noise of the heading of a fix, one standard deviation"
+    )
 
 
 def make_droplet_world(parameters: DropletWorldParameters) -> tuple[Swarm, DropletWorld]:
@@ -80,5 +82,5 @@ def _needed(robot: Robot) -> tuple[RobotIr, Pose2]:
     """
     start = start_of(robot)
     if robot.ir is None:
-        raise WorldError(f"robot '{robot.name}' has no infrared board, and a Droplet has one.")
+        raise WorldError(f"robot '{robot.name}' has no infrared board, and a Droplet needs one.")
     return robot.ir, start

@@ -28,18 +28,18 @@ class DropletBody(Protocol):
 
     @property
     def robot_id(self) -> int:
-        """What its chip was made with, never 0."""
+        """The id in its chip, never 0."""
 
     @property
     def trims(self) -> Sequence[Sequence[int]]:
-        """Calibration in its memory: per direction the trims of the three motors, see `protocols.droplet`."""
+        """Calibration in its memory: the trims of the three motors per direction."""
 
     @property
     def lengths(self) -> Sequence[int]:
-        """Likewise path [mm] or turn [deg] per 1000 steps of each direction."""
+        """Calibration in its memory: path [mm] or turn [deg] per 1000 steps of each direction."""
 
     def move(self, direction: int | None) -> None:
-        """Run the motors of a direction until the next call; None: stand."""
+        """Run the motors of a direction until the next call; None stops them."""
 
     def infrared_status(self) -> int:
         """Bits: 1 a message is coming in, 2 one is going out, 4 and 8 an exchange is going on."""
@@ -48,13 +48,13 @@ class DropletBody(Protocol):
         """Send a command to another robot; target 0: to all."""
 
     def emit(self, power: int) -> None:
-        """Call all robots around, and light the emitters one after the other at a power of 0 to 256."""
+        """Announce an exchange, then light the emitters one after the other at a power of 0 to 256."""
 
     def heard(self) -> Sequence[InfraredCommand | ExchangeReadings]:
-        """What has come by infrared since the last call."""
+        """The commands and readings received by infrared since the last call."""
 
     def deaf_until_ns(self) -> int:
-        """The firmware does nothing else before this time: an exchange needs it whole [ns]."""
+        """End of the current exchange, during which the firmware does nothing else [ns]."""
 
     @property
     def now_ns(self) -> int:
@@ -74,7 +74,7 @@ Print = Callable[[int, int, NDArray[np.int64]], str]
 
 
 def print_named(emitter: int, receiver: int, readings: NDArray[np.int64]) -> str:
-    """The format that tells who is who."""
+    """The format with the ids of both robots."""
     return f'{{"{emitter:04X}", "{receiver:04X}", {_braces(readings)}}},\r\n'
 
 
@@ -127,7 +127,7 @@ class DropletFirmware:
         }
 
     def receive(self, data: bytes) -> bytes:
-        """Take bytes; what the robot sends. While it is deaf to its console, most are lost."""
+        """Take bytes; returns the answer. During an exchange most bytes are lost."""
         if self._is_deaf():
             self._queue += data[: _RECEIVE_QUEUE - len(self._queue)]
             return b""
@@ -136,7 +136,7 @@ class DropletFirmware:
         return self._taken()
 
     def stream(self) -> bytes:
-        """What the robot sends by itself."""
+        """The bytes that the robot sends without being asked."""
         if self._is_deaf():
             return b""
         if self._queue:
@@ -170,7 +170,7 @@ class DropletFirmware:
         self._at(self._body.now_ns + delay_ns, task)
 
     def _run_tasks(self) -> None:
-        """Do what is due, the oldest first; tasks may make others."""
+        """Run the tasks that are due, the oldest first; tasks may add others."""
         while self._tasks and not self._is_deaf():
             first = min(self._tasks, key=lambda one: one[0])
             due_ns, task = first
@@ -180,7 +180,7 @@ class DropletFirmware:
             task()
 
     def _character(self, byte: int) -> None:
-        """One that was typed."""
+        """Process a typed character."""
         if self._escape:
             self._escape = 2 if self._escape == 1 and byte == ord("[") else 0
         elif byte in b"\r\n":
@@ -200,7 +200,7 @@ class DropletFirmware:
             self._output += chr(byte)
 
     def _execute(self, line: str) -> None:
-        """A line, typed or sent by another robot."""
+        """Execute a line, typed or sent by another robot."""
         if not line:
             return
         word, *arguments = line.split(" ")
@@ -211,7 +211,7 @@ class DropletFirmware:
         try:
             command(arguments)
         except (IndexError, ValueError):
-            self._reset()  # a missing argument is fetched from nowhere
+            self._reset()  # a missing argument crashes the firmware
 
     def _move_steps(self, words: list[str]) -> None:
         direction, steps = ord(words[0][0]) - ord("0"), int(words[1])
@@ -289,7 +289,7 @@ class DropletFirmware:
             self._say(f"\t{direction}\t{self._body.lengths[direction]}")
 
     def _reset(self) -> None:
-        """Begin anew as after power-on."""
+        """Reset as after power-on."""
         self._stop()
         self._tasks.clear()
         self._line.clear()

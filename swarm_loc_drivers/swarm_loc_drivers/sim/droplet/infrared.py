@@ -18,11 +18,11 @@ from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
 
 
 class InfraredCommand(NamedTuple):
-    """A line that came by infrared.
+    """A command received by infrared.
 
     Attributes:
-        line: What to do.
-        end_ns: When its last byte came.
+        line: The command.
+        end_ns: When its last byte arrived.
     """
 
     line: str
@@ -35,7 +35,7 @@ class ExchangeReadings(NamedTuple):
     Attributes:
         emitter: Id of the robot that emitted.
         readings: (n, n) emitters by sensors, baseline taken off [count].
-        end_ns: When the exchange was over.
+        end_ns: End of the exchange.
     """
 
     emitter: int
@@ -50,15 +50,15 @@ def overlap(one: InfraredMessage | Exchange, other: InfraredMessage | Exchange) 
 
 @dataclass
 class InfraredMessage:
-    """A transmission.
+    """An infrared message in transit.
 
     Attributes:
         sender: Index of the robot.
         begin_ns: When.
-        end_ns: When it is through.
+        end_ns: End of the transmission.
         hearers: Indices of the robots in its reach at its begin.
         line: The command; "" for the call that begins an exchange.
-        target: Id of whom it is for; 0: all.
+        target: Id of the receiver; 0: all.
     """
 
     sender: int
@@ -85,7 +85,7 @@ class Exchange:
         receivers: (k,) indices of the robots that have heard the call.
         readings: (k, n, n) emitters by sensors, as far as measured.
         flashes: How many.
-        done: Whether it is over and its readings are told.
+        done: Whether it is over and its readings are delivered.
     """
 
     emitter: int
@@ -113,7 +113,7 @@ class Exchange:
 
 
 class DropletLight:
-    """The light of one emitter at a time.
+    """Light from one emitter on the sensors of other robots.
 
     Args:
         platform: The board of all robots.
@@ -180,7 +180,7 @@ def distance_to_segments(begins: FloatArray, end: FloatArray, points: FloatArray
 
 
 _REMEMBERED_NS = 1_000_000_000
-"""So long messages and exchanges that are over are kept: longer than any message takes."""
+"""Messages and exchanges are kept for this time after their end, longer than any message takes."""
 _BASELINE_PERIOD_NS = 5_407_000_000
 _DRIFT_NS = 100_000_000
 _RECEIVING, _TRANSMITTING, _TIMED, _BLOCKED = 1, 2, 4, 8
@@ -188,7 +188,7 @@ _RECEIVING, _TRANSMITTING, _TIMED, _BLOCKED = 1, 2, 4, 8
 
 @dataclass(frozen=True)
 class InfraredSettings:
-    """How infrared fails; messages make no light in measurements.
+    """Losses and ambient light of infrared; messages do not disturb measurements.
 
     Attributes:
         reach: How far messages reach [m].
@@ -215,9 +215,9 @@ class DropletInfrared:
         now_ns: First moment.
 
     Attributes:
-        heard: Per robot what has come and was not fetched.
+        heard: Per robot the commands and readings that were not fetched yet.
         deaf_until_ns: Per robot the end of its last exchange [ns].
-        counts: What happened how often.
+        counts: Events by name.
     """
 
     def __init__(
@@ -257,7 +257,7 @@ class DropletInfrared:
         self.deaf_until_ns[emitter] = self._exchanges[-1].end_ns
 
     def status(self, robot: int) -> int:
-        """What keeps a robot's infrared busy, see `DropletBody.infrared_status`."""
+        """Status bits of a robot's infrared, see `DropletBody.infrared_status`."""
         status = 0
         for message in self._messages:
             if message.end_ns > self._now_ns:
@@ -302,7 +302,7 @@ class DropletInfrared:
         return np.flatnonzero(near)
 
     def _deliver(self, message: InfraredMessage) -> None:
-        """A message is through: to those who could hear and understand it."""
+        """Deliver a message to the robots that received it without loss or collision."""
         understood = self._rng.random(len(message.hearers)) >= self._settings.loss
         clear = np.array([self._is_clear(robot, message) for robot in message.hearers.tolist()], dtype=bool)
         self.counts["lost"] += int(np.count_nonzero(~understood & clear))
@@ -316,7 +316,7 @@ class DropletInfrared:
                 self.heard[robot].append(InfraredCommand(message.line, message.end_ns))
 
     def _is_clear(self, robot: int, message: InfraredMessage) -> bool:
-        """Whether a robot listens all the time of a message, and hears nothing else."""
+        """Whether a robot was free during a whole message, and received no other one."""
         if any(
             one.has(robot) and overlap(one, message) and one.emitter != message.sender
             for one in self._exchanges
@@ -328,7 +328,7 @@ class DropletInfrared:
         )
 
     def _begin_to_measure(self, call: InfraredMessage, receivers: NDArray[np.int64]) -> None:
-        """Robots have heard a call."""
+        """Register the robots that heard a call as receivers of its exchange."""
         for exchange in self._exchanges:
             if exchange.emitter == call.sender and exchange.begin_ns == call.begin_ns:
                 exchange.receivers = receivers
@@ -352,14 +352,14 @@ class DropletInfrared:
         exchange.readings[:, emitter] = counts - self._baseline[receivers]
 
     def _finish(self, exchange: Exchange) -> None:
-        """The readings are there."""
+        """Deliver the readings of an exchange."""
         self.counts["exchanges"] += 1
         emitter = int(self._ids[exchange.emitter])
         for robot, readings in zip(exchange.receivers.tolist(), exchange.readings, strict=True):
             self.heard[robot].append(ExchangeReadings(emitter, readings, exchange.end_ns))
 
     def _drift(self) -> None:
-        """The ambient light changes; robots measure it now and then."""
+        """Let the ambient light drift; robots measure it from time to time."""
         self._drift_due_ns += _DRIFT_NS
         walk = self._settings.ambient_walk * np.sqrt(_DRIFT_NS * 1e-9)
         self._ambient = np.abs(self._ambient + walk * self._rng.standard_normal(self._ambient.shape))

@@ -1,6 +1,6 @@
 """A world of Droplets with the drivers' own sessions at their consoles, all in simulated time in one thread.
 
-The bytes are those that go over the cable, they just take no time. So runs are as they are live, and the same
+The bytes are those that go over the cable, without delay. So runs behave as live ones, and are reproducible.
 every time.
 """
 
@@ -24,19 +24,19 @@ STRIDE_S = 2.0
 
 
 class Cable:
-    """A robot, its console, and the session that talks to it.
+    """A robot at a cable: its console, and the driver's session.
 
     Args:
         world: Where the robot lives.
         robot: Its index.
         settings: Of the session.
-        noise: How the session believes that robots err.
+        noise: The session's model of motion errors.
         publish: Gets the matrices of exchanges.
 
     Attributes:
         firmware: Who answers at the console.
         session: The conversation.
-        counts: What happened in it.
+        counts: Events of the session by name.
     """
 
     def __init__(
@@ -58,15 +58,15 @@ class Cable:
         self.session = DropletSession(settings, mover, (), publish, self.counts)
 
     def set_velocity(self, velocity: Velocity) -> None:
-        """Have the robot move so for a while."""
+        """Command a velocity."""
         self._command.set(velocity)
 
     def odometry(self) -> OdometryState:
-        """Where the robot is believed to be."""
+        """The session's odometry."""
         return self._motion.state(self._world.now_ns)
 
     def step(self) -> None:
-        """Hand bytes to and fro until both ends are silent."""
+        """Exchange bytes until both ends are silent."""
         data = self.firmware.stream()
         while not self.session.ended:
             output = self.session.step(data, self._world.now_ns)

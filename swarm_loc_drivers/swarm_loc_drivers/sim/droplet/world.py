@@ -26,7 +26,7 @@ from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
 @dataclass(frozen=True)
 class Fix:
-    """Where a robot was seen.
+    """A pose measured by the tracker.
 
     Attributes:
         robot: Its index.
@@ -40,7 +40,7 @@ class Fix:
 
 
 class Tracker:
-    """Sees some robots.
+    """A tracker above the table: noisy absolute poses of some robots at a fixed rate.
 
     Args:
         robots: Their indices.
@@ -60,7 +60,7 @@ class Tracker:
         self._due_ns: int | None = None
 
     def look(self, now_ns: int, poses: FloatArray) -> list[Fix]:
-        """What it sees now, if it is time, of robots at poses (N, 3)."""
+        """The fixes that are due now, of robots at true poses (N, 3)."""
         if self._due_ns is None:
             self._due_ns = now_ns
         if now_ns < self._due_ns:
@@ -82,7 +82,7 @@ _MOTION, _GAINS, _INFRARED = range(3)
 
 @dataclass(frozen=True)
 class DropletErrors:
-    """How Droplets err; all sigmas are one standard deviation.
+    """Errors of Droplets; all sigmas are one standard deviation.
 
     Attributes:
         scale_sigma: Of each robot's and each direction's steps, relative.
@@ -113,7 +113,7 @@ DROPLET_WORLDS = {"d0": D0, "d1": D1}
 
 @dataclass(frozen=True)
 class DropletWorldSettings:
-    """How a world is.
+    """Settings of a world.
 
     Attributes:
         seed: Fixes its systematic errors and its noise.
@@ -167,14 +167,14 @@ class DropletWorld:
         )
 
     def step(self) -> None:
-        """Go on by STEP_NS."""
+        """Step by STEP_NS."""
         if self._twists.any():
             self._creep(STEP_NS * 1e-9)
         self.now_ns += STEP_NS
         self.infrared.step(self.now_ns, self.poses)
 
     def _creep(self, step_s: float) -> None:
-        """Those move whose motors run."""
+        """Move the robots whose motors run."""
         path = step_s * np.hypot(self._twists[:, 0], self._twists[:, 1])
         walk = self._errors.walk_noise * path
         heading = self._errors.veer_noise * path
@@ -184,15 +184,15 @@ class DropletWorld:
         self.poses = se2.compose(self.poses, se2.exp(self._twists * step_s + noise))
 
     def move(self, robot: int, direction: int | None) -> None:
-        """A robot's motors run."""
+        """Run a robot's motors in a direction, None: stop."""
         self._twists[robot] = 0.0 if direction is None else self._true[robot, direction]
 
     def _true_velocities(self, count: int) -> FloatArray:
-        """(N, directions, 3) what the robots really do when they are told a direction."""
+        """(N, directions, 3) true velocities of the robots for each commanded direction."""
         scale = 1.0 + self._errors.scale_sigma * self._rng.standard_normal((count, len(DIRECTIONS)))
         veer = self._errors.veer_sigma * self._rng.standard_normal((count, len(DIRECTIONS)))
-        told = np.array([nominal_gait(direction).velocity for direction in DIRECTIONS])
-        true: FloatArray = scale[..., None] * told
+        nominal = np.array([nominal_gait(direction).velocity for direction in DIRECTIONS])
+        true: FloatArray = scale[..., None] * nominal
         true[..., 2] += veer * np.hypot(true[..., 0], true[..., 1])
         return true
 
@@ -202,17 +202,17 @@ class DropletWorld:
 
 
 def trims(direction: int) -> tuple[int, int, int]:
-    """What the robots' memory holds: two motors walk, three turn."""
+    """The trims in the robots' memory: two motors walk, three turn."""
     return _WALK_TRIMS if direction in WALKS else _TURN_TRIMS
 
 
 def length(direction: int) -> int:
-    """Likewise per 1000 steps [mm or deg]."""
+    """The path or turn per 1000 steps in their memory [mm or deg]."""
     return _WALK_MM if direction in WALKS else _TURN_DEG
 
 
 def nominal_gait(direction: int) -> Gait:
-    """What a step does by the robot's own calibration."""
+    """The gait by the robot's own calibration."""
     one = gait(direction, trims(direction), length(direction))
     assert one is not None  # noqa: S101 - motors turn in every direction
     return one
@@ -268,7 +268,7 @@ class SimulatedDroplet:
 
 
 def _check(ids: Sequence[int], platform: IrPlatform) -> None:
-    """Raise what cannot be simulated."""
+    """Raise a WorldError for robots that cannot be simulated."""
     wrong = [robot for robot in ids if not 0 < robot <= 0xFFFF]
     if wrong:
         raise WorldError(f"id {wrong[0]} must lie in [1, 65535].")

@@ -37,7 +37,7 @@ class WorldParameters:
         "s",
         0.0,
         10.0,
-        "time stands still while an image that is older has not become <robot>/detections; 0: never",
+        "simulated time waits for <robot>/detections of images older than this; 0: never",
     )
     link_folder: str = text(
         "", "where each robot's serial port appears under its name; empty: robots on WiFi"
@@ -49,7 +49,7 @@ class WorldParameters:
         OdometryModel().wheel_separation, "m", 0.001, 10.0, "distance between the two wheels"
     )
     arena_x: float = number(ARENA[0], "m", 0.1, 1000.0, "size of the arena along x, around the origin")
-    arena_y: float = number(ARENA[1], "m", 0.1, 1000.0, "likewise along y")
+    arena_y: float = number(ARENA[1], "m", 0.1, 1000.0, "size of the arena along y")
     family: str = choice(FAMILY, tuple(families()), "kind of the markers")
     camera_rate: float = number(CAMERA_RATE_HZ, "1/s", 2.0, 60.0, "images of each camera")
     truth_rate: float = number(20.0, "1/s", 0.1, 200.0, "published true poses of each robot")
@@ -63,7 +63,7 @@ class WorldParameters:
 
 
 def _floor_markers(parameters: WorldParameters) -> tuple[FloorMarker, ...]:
-    """What lies on the floor."""
+    """The markers on the floor."""
     path = parameters.control_points_file
     if not path:
         return ()

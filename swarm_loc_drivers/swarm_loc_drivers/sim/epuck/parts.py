@@ -87,7 +87,7 @@ class Motors:
         return as_counter(left), as_counter(right)
 
     def preset(self, left: int, right: int) -> None:
-        """Make the counters what the host says."""
+        """Set the counters."""
         done_left, done_right = self._body.wheel_steps()
         self._origin = (done_left - left, done_right - right)
 
@@ -111,7 +111,7 @@ def camera_image(body: EpuckBody, width: int, height: int, zoom: int) -> Image:
 
 
 def sensor_values(body: EpuckBody, motors: Motors) -> NDArray[np.void]:
-    """What the sensors of a robot that stands level in a quiet room say, () of SENSORS_DTYPE."""
+    """The sensor values () of SENSORS_DTYPE of a robot that stands level in a quiet room."""
     values = np.zeros((), SENSORS_DTYPE)
     values["acceleration"] = (0, 0, GRAVITY_EPUCK2)
     values["acceleration_polar"] = (GRAVITY_EPUCK2, 0.0, 0.0)

@@ -57,7 +57,7 @@ class SerialRobot:
         return self.model is EPUCK1
 
     def reset(self) -> None:
-        """Begin anew as after power-on."""
+        """Reset as after power-on."""
         self.motors.set_speeds(0, 0)
         self.motors.preset(0, 0)
         self.camera = CameraSetting()
@@ -143,7 +143,7 @@ class AsciiCommands:
         }
 
     def execute(self, text: str) -> bytes:
-        """Do what a line says; the answer with its end of line."""
+        """Execute a line; returns the answer with its end of line."""
         letter = text[0] if text[0] in "bg" else text[0].upper()
         if letter == "R":
             return self._reset()
@@ -179,7 +179,7 @@ class AsciiCommands:
         return "j"
 
     def _reset(self) -> bytes:
-        """Only the first generation knows it."""
+        """Reset; only the first generation has this command."""
         self._robot.reset_wanted = self._robot.is_first
         return b"r\r\n" if self._robot.is_first else b""
 
@@ -222,7 +222,7 @@ class BinaryCommands:
         return command.arguments if command else 0
 
     def execute(self, byte: int, arguments: bytes) -> bytes:
-        """Do it; the payload."""
+        """Execute a command; returns the payload."""
         command = self._commands.get(byte)
         return command.execute(arguments) if command else b""
 
@@ -287,7 +287,7 @@ class BinaryCommands:
         return self._robot.values().tobytes()[: _ALL_SENSORS_SIZE - 1] + b"\x00"
 
     def _actuate(self, arguments: bytes) -> bytes:
-        """What the WiFi commands' bytes 2 to 20 do."""
+        """Act like bytes 2 to 20 of a WiFi command."""
         words = arguments[1 : 1 + _SPEEDS.size]
         return self._preset(words) if arguments[0] & _PRESET_COUNTERS else self._set_speeds(words)
 
@@ -298,7 +298,7 @@ _BANNER = b'\f\aWELCOME to the SerCom protocol on e-Puck\r\nthe EPFL education r
 
 
 class SerialFirmware:
-    """Answers bytes as the robot does, one after the other and without any timeout.
+    """Answers bytes one after the other as the robot does, without any timeout.
 
     Args:
         body: The robot.
@@ -317,7 +317,7 @@ class SerialFirmware:
         next(self._program)
 
     def receive(self, data: bytes) -> bytes:
-        """Take bytes; what the robot sends."""
+        """Take bytes; returns the answer."""
         replies = []
         for byte in data:
             reply = self._program.send(byte)

@@ -53,7 +53,7 @@ class WifiFirmware:
         self.disconnect()
 
     def disconnect(self) -> None:
-        """The client is gone; the motors keep running."""
+        """The client has disconnected; the motors keep running."""
         self._queue = b""
         self._due_ns = self._body.now_ns
         self._program = self._run()

@@ -83,19 +83,19 @@ OVERHEAD = -1
 _SLIP_S = 0.05
 """How long a slip of a wheel lasts: 3 mm of its way at 0.06 m/s."""
 _KEPT_NS = 400_000_000
-"""So long an image can still be drawn after its camera has taken the next one."""
+"""An image can be drawn for this time after its camera has taken the next one."""
 _PHASES, _EXPOSURES, _SENSOR, _PROXIMITY, _OVERHEAD_SENSOR = range(5)
 """Streams of random numbers, each a function of the seed, the stream, and what it is for."""
 
 
 @dataclass(frozen=True)
 class EpuckWorldSettings:
-    """How a world is.
+    """Settings of a world.
 
     Attributes:
         seed: Fixes its systematic errors and its noise.
         errors: Which errors there are; those of sightings themselves (noise, flips) are up to the images.
-        arena: What is built around the robots.
+        arena: Arena around the robots.
         camera: Of all robots, as calibrated.
         wheels: Of all robots.
         camera_rate_hz: [1/s].
@@ -181,7 +181,7 @@ class EpuckWorld:
         """The last image that each camera has taken."""
 
     def step(self) -> list[Exposure]:
-        """Go on by STEP_NS; the images that have been taken meanwhile, by stamp."""
+        """Step by STEP_NS; returns the images taken meanwhile, by stamp."""
         step_s = STEP_NS * 1e-9
         left, right = (self._settings.wheels.metres_per_step * self.rates).T
         noise = np.sqrt(self._drive.wheel_noise) * self._slip.next()
@@ -197,7 +197,7 @@ class EpuckWorld:
         """Draw what a camera took (height, width).
 
         Raises:
-            ValueError: It was taken too long ago.
+            ValueError: The image was taken too long ago.
         """
         track = Trajectories(
             np.array([stamp_ns for stamp_ns, _ in self._past]), np.array([poses for _, poses in self._past])
@@ -214,18 +214,18 @@ class EpuckWorld:
         return proximity_values(self.poses, robot, self._settings.arena.size, rng)
 
     def _take(self, robot: int) -> Exposure:
-        """Note the image that was due, and when the next one is."""
+        """Take the due image and schedule the next one."""
         exposure = self._next[robot]
         self.newest[robot] = exposure
         self._next[robot] = self._exposure(robot, exposure.number + 1)
         return exposure
 
     def exposure_of(self, robot: int, stamp_ns: int) -> Exposure:
-        """The image that a camera stamps so, at any time: which one it is, and when it is truly taken."""
+        """The exposure of a camera nearest to a stamp, at any time."""
         return self._exposure(robot, round((stamp_ns - self._first_ns[robot]) / self._period_ns))
 
     def _exposure(self, robot: int, number: int) -> Exposure:
-        """An image; it is taken before its stamp as the world has it."""
+        """The exposure of a number; it happens before its stamp, by the world's error."""
         stamp_ns = self._first_ns[robot] + number * self._period_ns
         early_s = self._settings.errors.exposure_early_s * self._random(_EXPOSURES, robot, number).random()
         return Exposure(robot, number, stamp_ns, stamp_ns - round(1e9 * early_s))
@@ -243,7 +243,7 @@ class EpuckWorld:
         return [Exposure(OVERHEAD, number, middle_ns, middle_ns)]
 
     def _is_due(self, exposure: Exposure) -> bool:
-        """Whether its shutter has closed and its camera has stamped it."""
+        """Whether the exposure has ended and its stamp has passed."""
         return self.now_ns >= max(exposure.stamp_ns, exposure.middle_ns + self._half_exposure_ns)
 
     def _random(self, *what: int) -> np.random.Generator:
@@ -296,15 +296,15 @@ class SimulatedEpuck:
 
 
 def check_swarm(swarm: Swarm) -> None:
-    """Make sure that nothing is lacking.
+    """Check that a swarm can be simulated.
 
     Raises:
-        WorldError: What a robot or a marker lacks.
+        WorldError: A robot or a marker lacks something.
     """
     for robot in swarm.robots:
         start_of(robot)
         if robot.camera is None:
-            raise WorldError(f"robot '{robot.name}' has no camera, and a simulated e-puck has one.")
+            raise WorldError(f"robot '{robot.name}' has no camera, and a simulated e-puck needs one.")
     for marker_id, owner in swarm.owner_of.items():
         if owner.marker.yaw is None:
-            raise WorldError(f"marker {marker_id} has no yaw, and a simulated marker looks somewhere.")
+            raise WorldError(f"marker {marker_id} has no yaw, and a simulated marker needs one.")

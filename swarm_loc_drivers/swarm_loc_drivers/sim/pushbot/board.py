@@ -17,7 +17,7 @@ class PushbotBody(Protocol):
     """Motors, wheel encoders, lights and clock of one PushBot; called by the thread that steps the world."""
 
     def set_duties(self, left: float, right: float) -> None:
-        """Drive the motors by shares of the battery's voltage in [-1, 1]; 0 brakes, and it lasts."""
+        """Drive the motors by shares of the battery's voltage in [-1, 1] until the next call; 0 brakes."""
 
     def wheel_ticks(self) -> tuple[int, int]:
         """Return the quadrature counts of the wheels since power-on, left and right."""
@@ -36,10 +36,10 @@ _DELTA_LIMITS = (0x7F, 0x3FFF, 0x1FFFFF)
 
 
 class EventRing:
-    """Events that wait to be sent.
+    """Ring buffer of events to be sent.
 
     Attributes:
-        dropped: Events that were overwritten; the board does not know it.
+        dropped: Events that were overwritten, unnoticed by the board.
     """
 
     def __init__(self) -> None:
@@ -70,7 +70,7 @@ class EventRing:
             self._words, self._times = self._words[extra:], self._times[extra:]
 
     def clear(self) -> None:
-        """Forget all, as when nothing is streamed."""
+        """Drop all events, as when nothing is streamed."""
         self._words, self._times = self._words[:0], self._times[:0]
 
     def take(self, until_us: int, max_bytes: int, stamp_bytes: int) -> bytes:
@@ -128,7 +128,7 @@ class _Mode(Enum):
 
 
 class Motor:
-    """One motor: what it was told, and the duty cycle that follows from it."""
+    """One motor: its command, and the resulting duty cycle."""
 
     def __init__(self) -> None:
         self._mode = _Mode.DIRECT
@@ -203,7 +203,7 @@ class Board:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew: all off, ticks and clock at zero."""
+        """Reset: all off, ticks and clock at zero."""
         self.ring = EventRing()
         self.texts: deque[tuple[int, bytes]] = deque()
         self.is_streaming = False
@@ -245,12 +245,12 @@ class Board:
         return sum(len(text) for _, text in self.texts) >= TX_BUFFER
 
     def say_version(self) -> None:
-        """Tell what it is."""
+        """Send the version."""
         banner = "EDVS-4337, RELEASE V0.7.1 PBOT" if self._generation.has_decay else "EDVS-4337, V0.1_MROB"
         self.say(f"\n{banner}\nSystem Clock: 192MHz; 1us event time resolution\n")
 
     def list_sensors(self) -> None:
-        """Tell the numbers of the sensors."""
+        """Send the numbers of the sensors."""
         rate, ticks = _EVENT_RATE_BITS[self._generation.name], self._generation.tick_bit
         gap = " " if self._generation.has_decay else "_"
         names = {_BATTERY_BIT: "BATTERY", rate: f"EVENTS{gap}RATE", ticks: f"MOTOR{gap}SENSORS"}
@@ -268,7 +268,7 @@ class Board:
         self._apply_duties()
 
     def drive(self, motor: int, value: int, kind: str, *, decays: bool) -> None:
-        """Tell a motor a velocity or a duty cycle."""
+        """Command a motor by a velocity or a duty cycle."""
         if kind == "velocity":
             self._motors[motor].set_velocity(value, self.ticks()[motor], decays=decays)
         else:

@@ -20,7 +20,7 @@ from swarm_loc_estimator.common.number_spec import number
 
 
 class Blinking(NamedTuple):
-    """A light that is lit in the first part of each period; a period of 0: it is dark.
+    """A light that is lit in the first part of each period; with a period of 0 it is dark.
 
     Attributes:
         period_us: [us].
@@ -57,15 +57,15 @@ class CameraNoise:
         0.05, "1", 0.0, 0.5, "standard deviation of the pixels' thresholds, of their mean"
     )
     jitter: float = number(15.0, "us", 0.0, 200.0, "standard deviation of the time of an event")
-    refractory: float = number(50.0, "us", 1.0, 1000.0, "time in which a pixel that has told stays silent")
+    refractory: float = number(50.0, "us", 1.0, 1000.0, "dead time of a pixel after an event")
 
 
 class Spot(NamedTuple):
     """The image of a light during a step.
 
     Attributes:
-        begin: Its column and row at the begin of the step [px].
-        end: Likewise at the end.
+        begin: Column and row at the begin of the step [px].
+        end: Column and row at the end of the step [px].
         amplitude: Its brightness in the middle over that of the surroundings [1].
         blinking: How it blinks; periods begin at whole multiples since the world's time zero.
     """
@@ -103,12 +103,12 @@ class EventCamera:
         self._rng = rng
         spread = np.random.default_rng(sensor).standard_normal((SENSOR_PX, SENSOR_PX)) * noise.mismatch
         self._threshold = noise.threshold * np.exp(spread)
-        self._told_us = np.full(2 * SENSOR_PX * SENSOR_PX, -1e9)
+        self._last_us = np.full(2 * SENSOR_PX * SENSOR_PX, -1e9)
         self._bus_us = 0
         self._later: _Raw = (np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), np.zeros(0))
 
     def look(self, begin_us: int, end_us: int, spots: Sequence[Spot], edges: FloatArray) -> CameraEvents:
-        """What it tells of a step.
+        """The events of a step.
 
         Args:
             begin_us: Begin of the step [us].
@@ -124,8 +124,8 @@ class EventCamera:
         x, y, polarity, time_us = _columns(columns, ~is_later)
         is_inside = (x >= 0) & (x < SENSOR_PX) & (y >= 0) & (y < SENSOR_PX)
         x, y, polarity, time_us = _columns((x, y, polarity, time_us), is_inside)
-        told = self._without_refractory(x, y, polarity, time_us)
-        x, y, polarity, time_us = _columns((x, y, polarity, time_us), told)
+        kept = self._without_refractory(x, y, polarity, time_us)
+        x, y, polarity, time_us = _columns((x, y, polarity, time_us), kept)
         return CameraEvents(x, y, polarity, self._on_the_bus(time_us))
 
     def _noise_events(self, begin_us: int, end_us: int) -> _Raw:
@@ -135,7 +135,7 @@ class EventCamera:
         return x, y, rng.integers(0, 2, count), rng.uniform(begin_us, end_us, count)
 
     def _edge_events(self, begin_us: int, end_us: int, edges: FloatArray) -> _Raw:
-        """Columns that edges sweep over; a pixel tells of an edge as often as its contrast allows."""
+        """Events of edges that sweep over columns; a pixel notices one with the contrast as probability."""
         rng = self._rng
         first, last = np.floor(edges[:, 0]).astype(int), np.floor(edges[:, 1]).astype(int)
         crossed = np.minimum(np.abs(last - first), SENSOR_PX)
@@ -174,7 +174,7 @@ class EventCamera:
     def _without_refractory(
         self, x: IntArray, y: IntArray, polarity: IntArray, time_us: FloatArray
     ) -> IntArray:
-        """Which events pixels tell, in the order of time: after one of a polarity they rest."""
+        """Indices of the events outside the dead times of pixels and polarities, by time."""
         pixel = (polarity * SENSOR_PX + y) * SENSOR_PX + x
         order = np.lexsort((time_us, pixel))
         sorted_pixel, sorted_us = pixel[order], time_us[order]
@@ -182,14 +182,14 @@ class EventCamera:
         before[1:] = sorted_us[:-1]
         begins = np.ones(len(order), bool)
         begins[1:] = sorted_pixel[1:] != sorted_pixel[:-1]
-        before[begins] = self._told_us[sorted_pixel[begins]]
-        tells = sorted_us - before >= self._noise.refractory
-        self._told_us[sorted_pixel[tells]] = sorted_us[tells]
-        told: IntArray = order[tells]
-        return told[np.argsort(time_us[told], kind="stable")]
+        before[begins] = self._last_us[sorted_pixel[begins]]
+        remains = sorted_us - before >= self._noise.refractory
+        self._last_us[sorted_pixel[remains]] = sorted_us[remains]
+        kept: IntArray = order[remains]
+        return kept[np.argsort(time_us[kept], kind="stable")]
 
     def _on_the_bus(self, time_us: FloatArray) -> IntArray:
-        """Times as the board takes them (N,): one event a microsecond, and never before the last."""
+        """Times at which the board takes the events (N,): one a microsecond, in order."""
         place = np.arange(len(time_us))
         wanted = np.floor(time_us).astype(np.int64) - place
         if len(wanted):

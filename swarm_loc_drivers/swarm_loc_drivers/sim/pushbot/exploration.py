@@ -46,7 +46,7 @@ class PushBotNoise:
         heading: While driving, per square root of a metre [rad].
         pixel: Of where the tracker sees the laser [px].
         dropout: Share of readings that see nothing.
-        outlier: Share of readings that are nonsense.
+        outlier: Share of readings that are outliers.
         bearing: Of where it sees a light [rad].
     """
 
@@ -66,13 +66,13 @@ class KinematicPushBot:
     Args:
         plan: Where it is.
         pose: (3,) at the start.
-        noise: What it is like.
+        noise: Its imperfections.
         rng: Source of the noise.
 
     Attributes:
         time_s: Until now.
         trace: (n, 3) true pose every `PERIOD_S` until now.
-        bumps: How often something stopped it.
+        bumps: How often an obstacle stopped it.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class KinematicPushBot:
         return positions
 
     def turn(self, angle: float, others: list[KinematicPushBot], rate: float = TURN_RATE) -> Readings:
-        """Turn on the spot by an angle of the odometry [rad] at a rate [rad/s]; what it reads meanwhile."""
+        """Turn on the spot by an angle of the odometry [rad] at a rate [rad/s]; returns the readings."""
         count = max(1, round(abs(angle) / (rate * PERIOD_S)))
         step = angle / count
         noise = self._noise.turn * math.sqrt(abs(step) / (2.0 * math.pi))
@@ -127,12 +127,12 @@ class KinematicPushBot:
         return self._moved(poses, reported, others)
 
     def rest(self, duration_s: float, others: list[KinematicPushBot]) -> Readings:
-        """Stand still for a while [s]."""
+        """Stand still for a time [s]; returns the readings."""
         count = round(duration_s / PERIOD_S)
         return self._moved(np.tile(self.pose, (count, 1)), np.tile(self._odometry, (count, 1)), others)
 
     def drive(self, length: float, others: list[KinematicPushBot]) -> Readings:
-        """Drive ahead by a length of the odometry [m], until something is in the way."""
+        """Drive ahead by a length of the odometry [m] or up to an obstacle; returns the readings."""
         count = max(1, round(length / (SPEED * PERIOD_S)))
         step = length / count
         scale = 1.0 + self._noise.distance * self._rng.standard_normal()
@@ -149,7 +149,7 @@ class KinematicPushBot:
         return self._moved(poses, reported, others)
 
     def lights(self, readings: Readings, others: dict[int, KinematicPushBot]) -> LightSightings:
-        """Lights of other robots, by their numbers, that it saw while it took the newest readings (n,)."""
+        """Sightings of the lights of other robots, by number, at the times of the newest readings (n,)."""
         steps = np.round(readings.stamp_ns / (1e9 * PERIOD_S)).astype(np.int64)
         own = self.positions_at(steps)
         rows: list[tuple[int, int, float]] = []
@@ -179,7 +179,7 @@ class KinematicPushBot:
         )
 
     def _moved(self, poses: FloatArray, odometry: FloatArray, others: list[KinematicPushBot]) -> Readings:
-        """Go on to poses (n, 3) with odometry (n, 3), and read at each."""
+        """Move through poses (n, 3) with odometry (n, 3); returns the readings."""
         count = len(poses)
         distances = _distances(self._plan.walls, self._discs(others, count), poses)
         self._traces.append(poses)
@@ -246,7 +246,7 @@ def _seen_lights(walls: FloatArray, own: FloatArray, there: FloatArray) -> tuple
 
 
 START_SIGMA = np.array([0.10, 0.10, math.radians(5.0)])
-"""How well the starts of all robots but the first are known; that one's is the origin of the map."""
+"""Of the starts of all robots but the first, whose start is the origin of the map."""
 FIRST_SIGMA = np.full(3, 1e-3)
 START_TURNS = ((0.25 * math.pi, 1.0 / 6.0), (0.25 * math.pi, 1.0 / 6.0), (4.0 * math.pi, 0.5))
 """Turns of a first scan [rad] and their rates [rad/s]."""
@@ -254,7 +254,7 @@ _REST_S = 1.2
 
 
 class Mapper(Protocol):
-    """What makes a map of readings and says where to go."""
+    """A mapper that makes a map of readings and chooses goals."""
 
     def join(self, pose: FloatArray, sigma: FloatArray) -> int:
         """Let a robot join; its number."""
@@ -278,10 +278,10 @@ class Arrival:
 
     Attributes:
         robot: Its number.
-        time_s: When it had looked around.
+        time_s: End of its scan [s].
         truth: (3,) true pose then.
-        online: (3,) what the mapper believed then.
-        count: How many arrivals came before, of all robots.
+        online: (3,) the mapper's estimate then.
+        count: Number of earlier arrivals of all robots.
     """
 
     robot: int
@@ -293,7 +293,7 @@ class Arrival:
 
 @dataclass
 class Exploration:
-    """Robots in a floor plan with one mapper.
+    """Robots that explore a floor plan with one mapper.
 
     Attributes:
         plan: The hall.
@@ -302,9 +302,9 @@ class Exploration:
         use_lights: Whether the mapper gets sightings of lights.
         robots: Those that have joined, by number.
         arrivals: All stops so far.
-        cpu_s: Time that the mapper needed.
-        starts: (3,) where the mapper was told that each robot starts.
-        on_readings: Is told of all that each robot reads.
+        cpu_s: CPU time of the mapper [s].
+        starts: By robot, the start pose (3,) that the mapper was given.
+        on_readings: Called with the number, readings and light sightings of a robot.
     """
 
     plan: FloorPlan
@@ -331,7 +331,7 @@ class Exploration:
         return robot
 
     def run(self, until_s: float, on_arrival: Callable[[Arrival], None] | None = None) -> None:
-        """Let all robots explore until a time [s]; the one whose time is least acts next."""
+        """Explore until a time [s]; the robot with the smallest time acts next."""
         while True:
             robot = min(self.robots, key=lambda one: self.robots[one].time_s)
             if self.robots[robot].time_s >= until_s:
@@ -341,7 +341,7 @@ class Exploration:
                 on_arrival(self.arrivals[-1])
 
     def _act(self, robot: int) -> None:
-        """Let a robot go to its goal, if it has looked around before, and look around."""
+        """Drive a robot to its goal, unless this is its first scan, and let it scan."""
         body = self.robots[robot]
         others = self._others(robot)
         if not body.time_s:
@@ -350,7 +350,7 @@ class Exploration:
         else:
             self._go(robot, body, others)
             self._feed(robot, body.turn(SCAN_TURN, others))
-        if self.mapper.goal(robot) is None:  # it has slipped a lot: a rest says that this is all
+        if self.mapper.goal(robot) is None:  # it has slipped a lot: a rest ends the scan
             self._feed(robot, body.rest(_REST_S, others))
         online = self.mapper.pose(robot)
         known = np.full(3, np.nan) if online is None else online

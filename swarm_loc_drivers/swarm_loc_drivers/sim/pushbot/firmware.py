@@ -1,4 +1,4 @@
-"""The firmware of a PushBot behind its link: its console, and what its wire carries of its answers."""
+"""The firmware of a PushBot: its console, and the limited rate of its wire."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Console:
         self.echo = 2
 
     def take(self, character: int) -> None:
-        """Take a character; what follows from it."""
+        """Process a character."""
         board = self._board
         echoes = self.echo > 0 and not board.is_streaming
         if character in b"\r\n":
@@ -169,7 +169,7 @@ def _number(text: str) -> int:
 
 _BITS_PER_BYTE = 10
 _MAX_GAP_S = 0.02
-"""While the other side takes nothing the wire stands; what it could have carried is not made up for."""
+"""A wire that was blocked for longer does not catch up."""
 
 
 class PushbotFirmware:
@@ -207,7 +207,7 @@ class PushbotFirmware:
         return b""
 
     def _work(self) -> None:
-        """The main loop, as far as it does not wait for room to say something."""
+        """Run the main loop until it has to wait for room in the text buffer."""
         used = 0
         for character in self._received:
             if self.board.is_blocked:
@@ -220,7 +220,7 @@ class PushbotFirmware:
         self._received = self._received[used:]
 
     def stream(self) -> bytes:
-        """What the wire has carried since the last call."""
+        """The bytes carried by the wire since the last call."""
         board, now_ns = self.board, self._body.now_ns
         budget, parts = self._budget(), []
         self._sent_ns = now_ns
@@ -238,9 +238,9 @@ class PushbotFirmware:
         return b"".join(parts)
 
     def disconnect(self) -> None:
-        """The host has gone; the board does not notice."""
+        """The host has disconnected, which the board does not notice."""
 
     def _budget(self) -> int:
-        """Bytes that the wire can carry since it last did."""
+        """Bytes that the wire can carry since the last call."""
         elapsed_s = min((self._body.now_ns - self._sent_ns) * 1e-9, _MAX_GAP_S)
         return min(round(elapsed_s * self._bytes_per_s), 2 * TX_BUFFER)

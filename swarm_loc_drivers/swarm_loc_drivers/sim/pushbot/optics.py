@@ -41,11 +41,11 @@ MAX_ROBOTS = len(_LED_PERIODS_US)
 
 @dataclass(frozen=True)
 class LaserOptics:
-    """How one robot was put together.
+    """The laser and camera of one robot as assembled.
 
     Attributes:
         row: p_inf [px] and f b [px m] of the spot's row.
-        column: Likewise of its column.
+        column: The same of its column.
         sensor: Seed of what the pixels of its event camera are like.
     """
 
@@ -59,7 +59,7 @@ class LaserOptics:
 
 
 def assembled(rng: np.random.Generator) -> LaserOptics:
-    """One robot as it came from assembly."""
+    """Draw the optics of one assembled robot."""
     shift_row, shift_column, turn_row, turn_column = rng.standard_normal(4)
     return LaserOptics(
         (CENTRE_PX + 0.5 + 1.5 * shift_row, FOCAL_PX * _BASE_ROW_M * (1.0 + 0.03 * turn_row)),
@@ -69,23 +69,23 @@ def assembled(rng: np.random.Generator) -> LaserOptics:
 
 
 def assembled_robots(seed: int, count: int) -> list[LaserOptics]:
-    """The robots of a world of a seed as they came from assembly."""
+    """The optics of all robots of a world, by its seed."""
     rng = np.random.default_rng(seed)
     return [assembled(rng) for _ in range(count)]
 
 
 def laser_hz(robot: int) -> float:
-    """At which the laser of a robot of a hall blinks, by its index [Hz]."""
+    """Frequency of the laser of a robot of a hall, by its index [Hz]."""
     return round(1e6 / _LASER_PERIODS_US[robot], 3)
 
 
 def led_hz(robot: int) -> float:
-    """Likewise its LEDs [Hz]."""
+    """Frequency of the LEDs of a robot of a hall, by its index [Hz]."""
     return round(1e6 / _LED_PERIODS_US[robot], 3)
 
 
 def lights_of(robot: int) -> tuple[Blinking, Blinking, Blinking]:
-    """Laser, rear and front LED of a robot of a hall, as it is told to let them blink."""
+    """Laser, rear and front LED of a robot of a hall."""
     laser, led = _LASER_PERIODS_US[robot], _LED_PERIODS_US[robot]
     return Blinking(laser, laser // 2), Blinking(led, led // 2), Blinking(led, led // 2)
 
@@ -96,7 +96,7 @@ def spot_brightness(distance: float) -> float:
 
 
 def led_brightness(distance: float) -> float:
-    """Likewise of an LED."""
+    """Brightness of an LED over its surroundings."""
     return min(_LED_BRIGHTNESS / distance**2, _MAX_BRIGHTNESS)
 
 
@@ -134,9 +134,9 @@ def led_pixel(observer: FloatArray, pose: FloatArray, *, front: bool) -> tuple[f
 
 BODY_RADIUS_M = 0.07
 _MAX_SPOT_M = 5.0
-"""Beyond it no pixel notices the laser."""
+"""The laser is invisible beyond this distance."""
 _BEFORE_WALL = 1e-3
-"""A corner is part of walls: what is to be seen of it lies this share of the way before it."""
+"""Corners are part of walls: visibility is tested at a point moved by this share towards the camera."""
 _CONTRAST = 0.6
 """Share of the pixels along an upright edge that notice it."""
 
@@ -149,7 +149,7 @@ class HallSight:
 
     Args:
         walls: (S, 4) of the hall [m].
-        built: How the robots were put together.
+        built: Optics of the robots.
         noise: Of their cameras.
         rng: Source of all that is random.
     """
@@ -176,12 +176,12 @@ class HallSight:
         span_us: tuple[int, int],
         lights: Sequence[Lights],
     ) -> CameraEvents:
-        """What a robot's camera sees while all go from poses (N, 3) to others.
+        """The events of a robot's camera during a step.
 
         Args:
             robot: Its index.
-            before: (N, 3) at the begin, in map.
-            after: (N, 3) at the end.
+            before: (N, 3) poses of all robots at the begin, in map.
+            after: (N, 3) poses at the end.
             span_us: Begin and end [us].
             lights: Of all robots.
         """

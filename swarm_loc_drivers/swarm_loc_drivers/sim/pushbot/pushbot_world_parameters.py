@@ -28,15 +28,17 @@ class PushbotWorldParameters:
 
     swarm_file: str = text("", "path of the swarm description; every robot needs a start", required=True)
     plan: str = choice("corridor", tuple(FLOOR_PLANS), "the hall")
-    seed: int = number(1, "1", 0, 2**31 - 1, "fixes how robots are put together, and all noise")
+    seed: int = number(1, "1", 0, 2**31 - 1, "fixes the assembly of the robots, and all noise")
     rate: float = number(
         1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
     )
-    turn_slip: float = number(0.02, "1", 0.0, 0.5, "share of turns that the wheels make in vain")
+    turn_slip: float = number(0.02, "1", 0.0, 0.5, "share of every turn that slips")
     wheel_noise: float = number(
         WHEEL_NOISE, "m", 0.0, 0.01, "variance of each wheel's path per metre it rolls [m^2/m]"
     )
-    turn_noise: float = number(TURN_NOISE, "rad", 0.0, 1.0, "error of a whole turn besides")
+    turn_noise: float = number(
+        TURN_NOISE, "rad", 0.0, 1.0, "further error of a whole turn, one standard deviation"
+    )
     link_folder: str = text("", "where each robot's serial port appears under its name; empty: TCP")
     first_port: int = number(0, "1", 0, 65000, "TCP port of the first robot, the others follow; 0: any")
     firmware: str = choice(SECOND_FIRMWARE.name, tuple(GENERATIONS), "generation of the robots' firmware")

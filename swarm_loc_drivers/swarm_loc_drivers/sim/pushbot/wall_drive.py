@@ -24,16 +24,16 @@ from swarm_loc_vision.laser.fit import Drive, fit_hyperbola
 
 _STEP_US = 5_000
 _BLINKING, _LASER = Blinking(2222, 1111), LightSource(450.0, is_above=False)
-_TOLD_SIGMA = 0.005
+_START_SIGMA = 0.005
 
 
 @dataclass(frozen=True)
 class WallDriveSettings:
-    """How a robot drives at a wall, and what errs.
+    """A drive towards a wall, and its errors.
 
     Attributes:
         start: From base_link to the wall at the begin [m].
-        stop: Likewise at the end [m].
+        stop: From base_link to the wall at the end [m].
         speed: [m/s].
         start_sigma: Of the tape at the start [m].
         wheel_noise: Variance of the path per metre [m^2/m].
@@ -51,7 +51,7 @@ class WallDriveSettings:
 def drive_at_wall(
     rng: np.random.Generator, built: LaserOptics, settings: WallDriveSettings
 ) -> tuple[Drive, FloatArray]:
-    """What odometry and tracker tell of a drive, and the true depths (N,) [m] at the same instants."""
+    """Odometry and tracked spots of a drive, and the true depths (N,) [m] at the same instants."""
     camera = EventCamera(CameraNoise(noise_rate=settings.noise_rate), rng, built.sensor)
     tracker = LightTracker([_LASER], (128, 128), TrackerSettings())
     step_m = settings.speed * _STEP_US * 1e-6
@@ -69,8 +69,8 @@ def drive_at_wall(
         seen += tracker.track(Events(*columns))
     rows = np.array([(1e-3 * one.stamp_ns, one.v) for report in seen for one in report.sightings])
     driven = np.interp(rows[:, 0], stamps_us, step_m * np.arange(steps + 1))
-    told = Drive(settings.start, _TOLD_SIGMA, driven, rows[:, 1], CAMERA_X_M)
-    return told, np.interp(rows[:, 0], stamps_us, depths)
+    measured = Drive(settings.start, _START_SIGMA, driven, rows[:, 1], CAMERA_X_M)
+    return measured, np.interp(rows[:, 0], stamps_us, depths)
 
 
 def calibrate_lasers(robots: Sequence[str], seed: int, folder: Path) -> None:

@@ -67,15 +67,15 @@ WHEEL_NOISE, TURN_NOISE = 1e-7, math.radians(0.64)
 
 @dataclass(frozen=True)
 class PushbotWorldSettings:
-    """How a world is.
+    """Settings of a world.
 
     Attributes:
-        seed: Fixes how the robots are put together, and all noise.
+        seed: Fixes the assembly of the robots and all noise.
         plan: The hall.
         wheels: Of all robots.
         wheel_noise: Variance of a wheel's path per metre it rolls [m^2/m].
-        turn_noise: Standard deviation of a whole turn besides [rad].
-        turn_slip: Share of every turn that the ticks tell and the floor does not [1].
+        turn_noise: Further standard deviation of a whole turn [rad].
+        turn_slip: Share of every turn that is lost by slip [1].
         camera: How far event cameras are from ideal ones.
         start_ns: First moment.
     """
@@ -91,7 +91,7 @@ class PushbotWorldSettings:
 
 
 class StepsAlong(Protocol):
-    """A firmware that lives in the world's time."""
+    """A firmware that is stepped with the world."""
 
     def millisecond(self) -> None:
         """A millisecond has passed."""
@@ -108,7 +108,7 @@ class PushbotWorld:
         settings: How the world is.
 
     Raises:
-        WorldError: A robot begins within a wall or another robot.
+        WorldError: A robot starts within a wall or another robot.
     """
 
     def __init__(self, starts: list[Pose2], settings: PushbotWorldSettings) -> None:
@@ -120,7 +120,7 @@ class PushbotWorld:
         """(N, 3) where the robots truly are, in map."""
         self.drivetrain = Drivetrain(count, 1e-3)
         self.optics = assembled_robots(settings.seed, count)
-        """How the robots were put together; for evaluation."""
+        """Optics of the robots, for evaluation."""
         self.lights: list[Lights] = [(Blinking(), Blinking(), Blinking()) for _ in range(count)]
         """Laser, rear and front LED of each robot."""
         self.firmwares: list[StepsAlong | None] = [None] * count
@@ -133,7 +133,7 @@ class PushbotWorld:
                 raise WorldError(f"robot {robot + 1} of the swarm begins within a wall or another robot.")
 
     def step(self) -> None:
-        """Go on by STEP_NS."""
+        """Step by STEP_NS."""
         done = np.zeros_like(self.drivetrain.ticks)
         for _ in range(_MS_PER_STEP):
             self.now_ns += STEP_NS // _MS_PER_STEP
@@ -147,7 +147,7 @@ class PushbotWorld:
             self._look(robot, before)
 
     def _rolled(self, ticks: FloatArray) -> FloatArray:
-        """Where the robots come; who would run into something turns its wheels in vain."""
+        """Poses after the wheels' ticks; a robot that would hit something only turns."""
         step_s = STEP_NS * 1e-9
         left, right = (self._settings.wheels.metres_per_tick * ticks / step_s).T
         slip = self._slip.next()
@@ -167,7 +167,7 @@ class PushbotWorld:
         return bool(clearance(self._settings.plan.walls, others, BODY_RADIUS_M, x, y) < BODY_RADIUS_M)
 
     def _look(self, robot: int, before: FloatArray) -> None:
-        """What a robot's camera has seen since all stood at `before` (N, 3)."""
+        """Pass the events of a robot's camera since poses `before` (N, 3) to its firmware."""
         firmware = self.firmwares[robot]
         if firmware is None:
             return

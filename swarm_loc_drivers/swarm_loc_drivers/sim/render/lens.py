@@ -31,10 +31,10 @@ class CameraModel:
     height: int = number(960, "px", 16, 8192, "rows")
     field_of_view: float = number(math.radians(60.0), "rad", 0.05, 2.6, "across, without distortion")
     k1: float = number(0.0, "1", -1.0, 1.0, "radial distortion, as OpenCV defines it")
-    k2: float = number(0.0, "1", -1.0, 1.0, "likewise")
-    p1: float = number(0.0, "1", -0.1, 0.1, "tangential distortion, likewise")
-    p2: float = number(0.0, "1", -0.1, 0.1, "likewise")
-    k3: float = number(0.0, "1", -1.0, 1.0, "radial distortion, likewise")
+    k2: float = number(0.0, "1", -1.0, 1.0, "radial distortion, as OpenCV defines it")
+    p1: float = number(0.0, "1", -0.1, 0.1, "tangential distortion, as OpenCV defines it")
+    p2: float = number(0.0, "1", -0.1, 0.1, "tangential distortion, as OpenCV defines it")
+    k3: float = number(0.0, "1", -1.0, 1.0, "radial distortion, as OpenCV defines it")
     focus_sigma_px: float = number(0.5, "px", 0.0, 10.0, "blur of the optics, one standard deviation")
     vignetting: float = number(
         0.5, "1", 0.0, 1.0, "share of the natural fall of light, cos^4, towards the edge"

@@ -251,7 +251,7 @@ def _add_boundary(
         changes: Where it is noted.
         lens: Constants of `project`.
         start: (3,) in the camera's optical frame [m].
-        end: Likewise.
+        end: (3,) in the same frame [m].
         change: [1].
         box: Left, top, right and bottom [px] of what was drawn, extended.
     """

@@ -50,13 +50,13 @@ PosesAt = Callable[[NDArray[np.int64]], FloatArray]
 
 @dataclass(frozen=True)
 class Scene:
-    """What cameras see.
+    """Everything that cameras see.
 
     Attributes:
         backdrop: Behind everything, in map.
-        boards: What stands alone, in map.
+        boards: Free-standing boards, in map.
         robots: Of each robot its parts in its base_link, such that no part hides a later one.
-        flat: So many of the first robots are flat on the floor, as shadows are: they hide nothing.
+        flat: Number of first robots that are flat on the floor, as shadows are, and hide nothing.
     """
 
     backdrop: Patches
@@ -70,7 +70,7 @@ class RobotCamera:
     """One robot's camera as it truly is.
 
     Attributes:
-        robot: Whose; its own body is not seen.
+        robot: Index of its robot, whose own body is not seen.
         model: As calibrated.
         mount: In base_link.
         focal_scale: True focal length per calibrated one.
@@ -190,7 +190,7 @@ class Renderer:
         Args:
             camera: The camera.
             begin: (N, 3) poses of all robots in map when the shutter opens.
-            end: Likewise when it closes.
+            end: (N, 3) poses when it closes.
         """
         poses = np.stack([begin, end])
         seen_from = poses[:, camera.robot]
@@ -207,7 +207,7 @@ class Renderer:
     def _far_to_near(
         self, own: int, poses: FloatArray, of_map: Motion, of_robots: Motion
     ) -> Iterator[tuple[Patches, Motion]]:
-        """Everything in front of the backdrop with its motion, by distance at the exposure's middle."""
+        """All parts in front of the backdrop with their motions, far ones first, at the exposure's middle."""
         middle = poses[len(poses) // 2]
         places = np.concatenate([self._board_centres[:, :2], middle[:, :2]])
         boards = len(self._board_centres)

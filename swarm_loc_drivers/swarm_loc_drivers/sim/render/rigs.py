@@ -24,7 +24,7 @@ from swarm_loc_vision.markers.families import Family
 
 @dataclass(frozen=True)
 class Arena:
-    """What is built around the robots.
+    """Arena around the robots.
 
     Attributes:
         size: Size along x and y, around map's origin [m].
@@ -41,9 +41,9 @@ class CameraRig:
     Args:
         swarm: As described; every robot has a camera, and every marker shows a heading.
         truth: Where cameras and markers truly are.
-        arena: What is around.
+        arena: Arena around the robots.
         model: Of all cameras, as calibrated.
-        seed: Draws what the walls and the floor look like.
+        seed: Draws the look of walls and floor.
 
     Attributes:
         scene: What there is to be seen.
@@ -128,7 +128,7 @@ class OverheadSettings:
     aerial_field_of_view: float = number(math.radians(75.0), "rad", 0.05, 2.6, "across, without distortion")
     aerial_k1: float = number(-0.1, "1", -1.0, 1.0, "radial distortion, as OpenCV defines it")
     aerial_x: float = number(0.0, "m", -100.0, 100.0, "where the camera hangs in map")
-    aerial_y: float = number(-0.35, "m", -100.0, 100.0, "likewise")
+    aerial_y: float = number(-0.35, "m", -100.0, 100.0, "where the camera hangs in map")
     aerial_z: float = number(2.1, "m", 0.2, 100.0, "height above the floor")
     aerial_tilt: float = number(math.radians(10.0), "rad", 0.0, 1.2, "away from straight down")
     aerial_yaw: float = number(0.5 * math.pi, "rad", -6.3, 6.3, "direction to which it is tilted")
@@ -140,7 +140,7 @@ class OverheadSettings:
 
     @property
     def is_there(self) -> bool:
-        """Whether there is such a camera."""
+        """Whether the overhead camera exists."""
         return self.aerial_rate > 0.0
 
 

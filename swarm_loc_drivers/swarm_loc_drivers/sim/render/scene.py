@@ -1,4 +1,4 @@
-"""What stands in an arena, as flat patches: floor, walls, markers, bodies.
+"""Contents of an arena as flat patches: floor, walls, markers, bodies.
 
 Brightness 0 is black, 1 is white in full light. A marker is a white sheet, on that a black square, on that
 white runs of cells; each patch knows only by how much it differs from what it lies on.
@@ -18,7 +18,7 @@ from swarm_loc_vision.aerial.pattern import MARK_RADIUS
 
 BLACK, WHITE = 0.05, 0.85
 ROOM = 0.30
-"""What is seen above the walls."""
+"""Brightness above the walls."""
 
 _FLOOR, _TILE, _TILE_SPREAD = 0.45, 0.2, 0.02
 _WALLS, _WALL_HEIGHT = (0.58, 0.66, 0.62, 0.70), 0.30
@@ -38,7 +38,7 @@ class Surface:
     Args:
         origin: (3,) [m].
         right: (3,) unit vector, as seen from the front.
-        down: (3,) likewise.
+        down: (3,) unit vector, as seen from the front.
     """
 
     def __init__(self, origin: FloatArray, right: FloatArray, down: FloatArray) -> None:

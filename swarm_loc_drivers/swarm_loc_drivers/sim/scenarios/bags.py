@@ -180,14 +180,14 @@ def odometry_stream(run: LivedRun, robot: int) -> Stream:
 
 
 def truth_stream(run: LivedRun, robot: int) -> Stream:
-    """Where the robot really was, ten times a second."""
+    """The robot's true poses, ten times a second."""
     stamp_ns = np.arange(run.start_ns, run.end_ns + 1, TRUTH_PERIOD_NS)
     data = encode_pose_stamped("map", stamp_ns, run.truth.at(robot, stamp_ns))
     return Stream(f"{run.swarm.robots[robot].name}/ground_truth", POSE_STAMPED, stamp_ns, data)
 
 
 def _detection_stream(run: SimulatedRun, robot: int, detections: Records) -> Stream:
-    """The robot's images, also those that show nothing: they tell that the camera is alive."""
+    """The robot's images, including empty ones, which show that the camera works."""
     name = run.swarm.robots[robot].name
     frames = run.frames[run.frames["robot"] == robot]
     optical_frame = f"{name}/camera_optical_frame"
@@ -235,14 +235,14 @@ def marker_orientation(heading: np.typing.NDArray[np.float64]) -> np.typing.NDAr
 
 
 def _arriving(rng: np.random.Generator, run: DropletRun, stream: Stream) -> Stream:
-    """What of a stream arrives, and when; its times are those of publication."""
+    """The part of a stream that arrives, with times of arrival in place of times of publication."""
     late_ns = arrival_ns(rng, stream.arrival_ns, CAMERA_LATENESS)
     kept = np.flatnonzero(survivors(rng, len(stream.data), LOSS) & (late_ns <= run.end_ns))
     return stream._replace(arrival_ns=late_ns[kept], data=[stream.data[k] for k in kept])
 
 
 def _brightness(run: DropletRun, robot: int) -> Stream:
-    """What the robot's sensors read, when it was published."""
+    """The robot's brightness matrices, by time of publication."""
     name, board = run.swarm.robots[robot].name, run.swarm.robots[robot].ir
     assert board is not None  # noqa: S101 - all Droplets have one
     own = [one for one in run.matrices if one.receiver == robot]
@@ -262,7 +262,7 @@ def _brightness(run: DropletRun, robot: int) -> Stream:
 
 
 def _fixes(run: DropletRun, robot: int) -> Stream:
-    """Where a tracker has seen the robot."""
+    """The robot's fixes."""
     own = [fix for fix in run.fixes if fix.robot == robot]
     covariance = np.diag([FIX_SIGMA**2, FIX_SIGMA**2, FIX_HEADING_SIGMA**2])
     data = [encode_fix("map", fix.stamp_ns, fix.pose, covariance) for fix in own]

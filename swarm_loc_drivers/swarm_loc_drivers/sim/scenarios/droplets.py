@@ -64,7 +64,7 @@ MOTION = OdometryModel(
     speed_change=0.003,
     turn_rate_change=0.15,
 )
-"""What is honest for commanded motion of robots that err as in `D1` of `droplet/world.py`.
+"""Noise that covers the commanded motion of robots that err as in `D1` of `droplet/world.py`.
 
 Their steps are 8 % too long or short and lead aside, in every direction differently: a stretch of 5 cm goes
 4 mm and 0.03 rad wrong.
@@ -73,16 +73,16 @@ Their steps are 8 % too long or short and lead aside, in every direction differe
 
 @dataclass(frozen=True)
 class DropletRunSettings:
-    """What to simulate.
+    """Settings of a run.
 
     Attributes:
         seed: Two runs with the same settings are identical.
         duration_s: [s].
         robots: How many, on a grid of which no row is much longer than a column.
-        world: How they err, of `DROPLET_WORLDS`.
-        calibrated: Whether the description tells the gains of the elements, to 2 %.
-        start_known: Whether it tells where robots begin.
-        boards: Runs with the same one have the same elements; None: as the seed says.
+        world: Their errors, of `DROPLET_WORLDS`.
+        calibrated: Whether the description has the gains of the elements, to 2 %.
+        start_known: Whether it has the start poses.
+        boards: Seed of the gains of the elements; None: that of the run.
     """
 
     seed: int = 1
@@ -109,7 +109,7 @@ def describe_droplets(
     start: FloatArray,
     gains: Sequence[IrGains] = (),
 ) -> Swarm:
-    """The swarm as its owner would describe it.
+    """The swarm description.
 
     Args:
         settings: Which swarm.
@@ -133,11 +133,11 @@ def describe_droplets(
 
 
 class Wander:
-    """Steers robots to places around their homes, one after the other, and in between lets them turn.
+    """Steers each robot to places around its home, one after the other, with turns in between.
 
     Args:
         homes: (N, 3) around which they wander, in map.
-        walking: (N,) which of them do; the others stand.
+        walking: (N,) which robots wander; the others stand.
         seed: Fixes the places.
     """
 
@@ -147,7 +147,7 @@ class Wander:
         self._since_ns = np.zeros(len(homes), dtype=np.int64)
 
     def command(self, robot: int, stamp_ns: int, pose: FloatArray) -> tuple[float, float, float]:
-        """What a robot should do now: forward [m/s], to the left [m/s], turning to the left [rad/s].
+        """The velocity of a robot: forward [m/s], to the left [m/s], turning to the left [rad/s].
 
         Args:
             robot: Its index.
@@ -216,7 +216,7 @@ class DropletRun(LivedRun):
     Attributes:
         matrices: In order of publication.
         fixes: In order of their stamps.
-        counts: What happened in all conversations together.
+        counts: Events of all sessions together.
     """
 
     matrices: tuple[PublishedBrightness, ...]
@@ -226,7 +226,7 @@ class DropletRun(LivedRun):
 
 @dataclass
 class _Recorder:
-    """Keeps what happens."""
+    """What is recorded of a run."""
 
     stamps: list[int] = field(default_factory=list)
     poses: list[FloatArray] = field(default_factory=list)
@@ -236,7 +236,7 @@ class _Recorder:
 
 
 def simulate_droplets(settings: DropletRunSettings) -> DropletRun:
-    """Let the swarm live and record it."""
+    """Simulate and record a swarm of Droplets."""
     start = starts(settings)
     errors = DROPLET_WORLDS[settings.world]
     world_settings = DropletWorldSettings(
@@ -262,7 +262,7 @@ def simulate_droplets(settings: DropletRunSettings) -> DropletRun:
 
 
 def _cable(world: DropletWorld, robot: int, settings: DropletRunSettings, recorder: _Recorder) -> Cable:
-    """A robot with its conversation, as a driver has it."""
+    """A robot at a cable, with the session of its driver."""
     turns = TdmaSettings(robot, settings.robots, TURN_S, (FULL_POWER, NEAR_POWER), ())
     session = SessionSettings(DROPLET, ELEMENTS, reply_timeout_s=0.3, exchanges=turns)
 
@@ -275,7 +275,7 @@ def _cable(world: DropletWorld, robot: int, settings: DropletRunSettings, record
 def _live(
     world: DropletWorld, cables: list[Cable], settings: DropletRunSettings, recorder: _Recorder
 ) -> None:
-    """Let time pass; every other robot wanders."""
+    """Step the world; every other robot wanders."""
     robots = len(cables)
     wander = Wander(world.poses.copy(), np.arange(robots) % 2 == 1, settings.seed)
     fixed = tuple(sorted({robot % robots for robot in FIXED}))
@@ -299,7 +299,7 @@ def _live(
 
 
 def _gains(world: DropletWorld, settings: DropletRunSettings) -> tuple[IrGains, ...]:
-    """What a calibration has found, if there was one."""
+    """The gains found by a calibration; empty without one."""
     if not settings.calibrated:
         return ()
     rng = np.random.default_rng([settings.seed, _GAINS])

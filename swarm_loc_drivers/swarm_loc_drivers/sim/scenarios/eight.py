@@ -81,7 +81,7 @@ _CATCH_UP_GAIN = 0.5
 
 @dataclass(frozen=True)
 class EightSettings:
-    """What to simulate.
+    """Settings of a run.
 
     Attributes:
         seed: Two runs with the same settings are identical.
@@ -90,7 +90,7 @@ class EightSettings:
         speed: [m/s].
         errors: The imperfections.
         odometry_rate_hz: 20, 25, 40 or 50 are multiples of the simulation's step.
-        start_known: Whether the description tells where each robot starts.
+        start_known: Whether the description has the start poses.
     """
 
     seed: int = 1
@@ -103,7 +103,7 @@ class EightSettings:
 
 
 def simulate_eight(settings: EightSettings) -> SimulatedRun:
-    """Drive the eight and record what the sensors say."""
+    """Drive the eight and record odometry and sightings."""
     rng = np.random.default_rng(settings.seed)
     swarm, truth, odometry = drive_eight(rng, settings)
     exposures = camera_exposures(rng, settings.robots, truth)
@@ -112,7 +112,7 @@ def simulate_eight(settings: EightSettings) -> SimulatedRun:
 
 
 def camera_exposures(rng: np.random.Generator, robots: int, truth: Trajectories) -> Exposures:
-    """When the cameras look; not before images may be older than their stamps."""
+    """When the cameras expose; late enough that images may be older than their stamps."""
     return schedule_exposures(
         rng, robots, CAMERA_RATE_HZ, int(truth.stamp_ns[0]) + 200_000_000, int(truth.stamp_ns[-1])
     )
@@ -145,7 +145,7 @@ def drive_robots(
 
 
 def describe(settings: EightSettings, start: FloatArray, first_face_id: int = _FIRST_FACE_ID) -> Swarm:
-    """The swarm as its owner would describe it; `start` is (N, 3) in map, each robot has ten ids."""
+    """The swarm description; `start` is (N, 3) in map, each robot has ten ids."""
     odometry = OdometryModel(wheel_separation=WHEEL_SEPARATION, wheel_noise=settings.errors.wheel_noise)
     robots = tuple(
         Robot(
@@ -221,7 +221,7 @@ class EightSteering:
         self._begin_ns: int | None = None
 
     def command(self, robot: int, stamp_ns: int, pose: FloatArray) -> Velocity:
-        """What a robot should do now.
+        """The velocity of a robot now.
 
         Args:
             robot: Its index.

@@ -27,7 +27,7 @@ class ImageRun:
 
     Attributes:
         run: Swarm, truth and odometry; its frames say which images arrive when, and have no sightings.
-        settings: What was simulated.
+        settings: Settings of the run.
         camera: Of all robots, as calibrated.
         hidden: Where cameras and markers truly are.
     """
@@ -50,7 +50,7 @@ class ImageRun:
 
 
 def simulate_eight_images(settings: EightSettings, camera: CameraModel) -> ImageRun:
-    """Drive the eight and let the cameras look; images get late and lost as in `simulate_eight`."""
+    """Drive the eight with rendered images, which are delayed and lost as in `simulate_eight`."""
     rng = np.random.default_rng(settings.seed)
     swarm, truth, odometry = drive_eight(rng, settings)
     exposures = camera_exposures(rng, settings.robots, truth)

@@ -4,7 +4,7 @@
 
 It steers by `<robot>/ground_truth` (geometry_msgs/PoseStamped, motion capture or simulation), so that the way
 does not depend on how well the robots are located, and publishes `<robot>/cmd_vel` at the poses' rate. The
-eight begins when all robots have told odometry, so that none is left behind, and with `wait_for_poses` when
+eight begins when all robots have sent odometry, so that none is left behind, and with `wait_for_poses` when
 all who locate them are there.
 """
 

@@ -148,13 +148,13 @@ _NEAR_FOR_NS = 250_000_000
 
 @dataclass(frozen=True)
 class GridSettings:
-    """What to simulate.
+    """Settings of a run.
 
     Attributes:
         robots: N.
         seed: Two runs with the same settings are identical.
         duration_s: [s].
-        shape: Where robots live and what they do.
+        shape: Layout and motion.
     """
 
     robots: int = 100
@@ -164,7 +164,7 @@ class GridSettings:
 
 
 def simulate_grid(settings: GridSettings) -> SimulatedRun:
-    """Drive the robots about and record what their sensors say."""
+    """Drive the robots and record odometry and sightings."""
     rng = np.random.default_rng(settings.seed)
     steps = round(settings.duration_s * 1e9 / STEP_NS)
     stamp_ns = START_NS + STEP_NS * np.arange(steps + 1, dtype=np.int64)
@@ -183,10 +183,10 @@ def simulate_grid(settings: GridSettings) -> SimulatedRun:
 
 
 def describe(rng: np.random.Generator, start: FloatArray, places: FloatArray) -> Swarm:
-    """The swarm, with landmarks at places (L, 2); starts (N, 3) are told with an error of START_SIGMA."""
+    """The swarm, with landmarks at places (L, 2); the described starts (N, 3) err by START_SIGMA."""
     sigma = np.array([START_SIGMA.x, START_SIGMA.y, START_SIGMA.theta])
-    told = start + sigma * rng.standard_normal(start.shape)
-    told[:, 2] = se2.wrap_angle(told[:, 2])
+    described = start + sigma * rng.standard_normal(start.shape)
+    described[:, 2] = se2.wrap_angle(described[:, 2])
     robots = tuple(
         Robot(
             name=f"robot{index:04d}",
@@ -197,7 +197,7 @@ def describe(rng: np.random.Generator, start: FloatArray, places: FloatArray) ->
             start=(float(pose[0]), float(pose[1]), float(pose[2])),
             start_sigma=START_SIGMA,
         )
-        for index, pose in enumerate(told)
+        for index, pose in enumerate(described)
     )
     marks = tuple(
         Landmark(_FIRST_LANDMARK_ID + k, float(x), float(y), yaw=0.0) for k, (x, y) in enumerate(places)

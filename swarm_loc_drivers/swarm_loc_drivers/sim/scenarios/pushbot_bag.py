@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,137 +61,11 @@ from swarm_loc_estimator.common.messages.typestore import (
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, StartSigma, Swarm
 
 EVENTS = f"{MESSAGE_PACKAGE}/msg/EventPacket"
-STEP_US = 5_000
-"""Of a packet, as the driver makes them."""
-
-
-def event_streams(
-    names: Sequence[str],
-    poses: FloatArray,
-    begin_ns: int,
-    sight: HallSight,
-) -> list[Stream]:
-    """Packets of events of all robots.
-
-    Args:
-        names: Of the robots.
-        poses: (K, N, 3) true poses at every `STEP_US`, in map.
-        begin_ns: Stamp of the first.
-        sight: Their cameras.
-    """
-    lights = [lights_of(robot) for robot in range(len(names))]
-    streams = []
-    for robot, name in enumerate(names):
-        stamps: list[int] = []
-        data: list[bytes] = []
-        for step in range(len(poses) - 1):
-            span_us = step * STEP_US, (step + 1) * STEP_US
-            seen = sight.look(robot, poses[step], poses[step + 1], span_us, lights)
-            if len(seen.x):
-                events = Events(
-                    seen.x.astype(np.uint16),
-                    seen.y.astype(np.uint16),
-                    seen.polarity == 0,
-                    1000 * (seen.time_us - seen.time_us[0]),
-                )
-                stamps.append(begin_ns + 1000 * int(seen.time_us[0]))
-                data.append(_packet(name, stamps[-1], len(data), events))
-        arrival_ns = np.array(stamps, dtype=np.int64) + 1000 * STEP_US
-        streams.append(Stream(f"{name}/events", EVENTS, arrival_ns, data))
-    return streams
-
-
-def _packet(name: str, stamp_ns: int, number: int, events: Events) -> bytes:
-    message = typestore().types[EVENTS](
-        header=message_header(stamp_ns, f"{name}/event_camera_optical_frame"),
-        height=SENSOR_PX,
-        width=SENSOR_PX,
-        seq=number,
-        time_base=stamp_ns,
-        encoding=ENCODING,
-        is_bigendian=False,
-        events=np.frombuffer(encode_events(events), np.uint8),
-    )
-    return encode(message, EVENTS)
-
-
-def poses_between(traces: Sequence[FloatArray], period_us: int, duration_us: int) -> FloatArray:
-    """Poses (K, N, 3) at every `STEP_US` of traces (n, 3) of unwrapped headings every `period_us`."""
-    at_us: IntArray = np.arange(0, duration_us + 1, STEP_US)
-    columns = [
-        [np.interp(at_us, period_us * np.arange(len(trace)), trace[:, k]) for k in range(3)]
-        for trace in traces
-    ]
-    poses: FloatArray = np.array(columns).transpose(2, 0, 1)
-    return poses
-
-
-def sight_of(walls: FloatArray, seed: int, robots: int) -> HallSight:
-    """The cameras of robots in a hall."""
-    built = assembled_robots(seed, robots)
-    return HallSight(walls, built, CameraNoise(), np.random.default_rng([seed, 2]))
-
-
-_PERIOD_NS = 30_000_000_000
-"""Of maps: often enough to see them grow."""
-
-
-class MapNotes:
-    """Maps, noted every half minute.
-
-    Args:
-        begin_ns: Stamp at the time zero of the mapper [ns].
-    """
-
-    def __init__(self, begin_ns: int) -> None:
-        self._begin_ns = begin_ns
-        self._stamps: list[int] = []
-        self._data: list[bytes] = []
-
-    def note(self, time_ns: int, occupancy: OccupancyMap) -> None:
-        """Note the map at a time of the mapper [ns], if one is due."""
-        stamp_ns = self._begin_ns + time_ns
-        if self._stamps and stamp_ns < self._stamps[-1] + _PERIOD_NS:
-            return
-        self._stamps.append(stamp_ns)
-        self._data.append(encode_map(stamp_ns, occupancy))
-
-    def stream(self) -> Stream:
-        """The messages of `map`."""
-        return Stream("map", OCCUPANCY_GRID, np.array(self._stamps, dtype=np.int64), self._data)
-
-
-def encode_map(stamp_ns: int, occupancy: OccupancyMap) -> bytes:
-    """The map as the mapper's node publishes it: -1 unknown, else the probability of an obstacle [%]."""
-    types = typestore().types
-    cells = np.ascontiguousarray(np.round(occupancy.percent).astype(np.int8).T)
-    point, turn = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Quaternion"]
-    header = message_header(stamp_ns, "map")
-    x, y = map(float, occupancy.corner)
-    origin = types["geometry_msgs/msg/Pose"](position=point(x, y, 0.0), orientation=turn(0.0, 0.0, 0.0, 1.0))
-    about = types["nav_msgs/msg/MapMetaData"](
-        map_load_time=header.stamp,
-        resolution=occupancy.cell,
-        width=cells.shape[1],
-        height=cells.shape[0],
-        origin=origin,
-    )
-    message = types[OCCUPANCY_GRID](header=header, info=about, data=cells.ravel())
-    return encode(message, OCCUPANCY_GRID)
-
-
-def goal_stream(name: str, begin_ns: int, goals: Sequence[Goal]) -> Stream:
-    """The messages of `<robot>/goal`."""
-    stamp_ns = begin_ns + np.array([goal.stamp_ns for goal in goals], dtype=np.int64)
-    ways = [goal.position - goal.pose[:2] for goal in goals]
-    poses = [
-        [*goal.position.tolist(), math.atan2(way[1], way[0])] for goal, way in zip(goals, ways, strict=True)
-    ]
-    table = np.array(poses).reshape(-1, 3)
-    return Stream(f"{name}/goal", POSE_STAMPED, stamp_ns, encode_pose_stamped("map", stamp_ns, table))
-
-
+EVENT_STEP_US = 5_000
+"""Time of an event packet, as the driver makes them."""
 BEGIN_NS = 1_700_000_000_000_000_000
+_MAP_PERIOD_NS = 30_000_000_000
+"""Between recorded maps."""
 _TRUTH_EVERY = 5
 _ODOMETRY = OdometryModel(
     wheel_separation=0.085,
@@ -208,7 +80,7 @@ _ODOMETRY = OdometryModel(
 
 @dataclass(frozen=True)
 class PushbotBagSettings:
-    """What is simulated.
+    """Settings of a run.
 
     Attributes:
         seed: Of all noise.
@@ -233,7 +105,7 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
     Beside the bag come `swarm.yaml`, `walls.csv`, and `<robot>.yaml` with the calibration of each laser.
 
     Args:
-        settings: What is simulated.
+        settings: Settings of a run.
         folder: The bag, created; must not exist.
         comment: First lines of `swarm.yaml`, where the run comes from.
 
@@ -246,38 +118,43 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
     plan = floor_plan(settings.plan)
     mapper = CooperativeMapper()
     exploration = Exploration(plan, mapper, np.random.default_rng(settings.seed))
-    recorded: dict[int, list[tuple[Readings, LightSightings | None]]] = defaultdict(list)
+    robots = range(settings.robots)
+    recorded: list[list[tuple[Readings, LightSightings | None]]] = [[] for _ in robots]
     exploration.on_readings = lambda robot, readings, lights: recorded[robot].append((readings, lights))
-    fixes: dict[int, list[Goal]] = defaultdict(list)
-    maps = MapNotes(BEGIN_NS)
-    covariances: dict[int, list[FloatArray]] = defaultdict(list)
-    told = [FixCovariances(_ODOMETRY) for _ in range(settings.robots)]
+    goals: list[list[Goal]] = [[] for _ in robots]
+    covariances: list[list[FloatArray]] = [[] for _ in robots]
+    published = [FixCovariances(_ODOMETRY) for _ in robots]
+    maps: dict[int, bytes] = {}
 
-    def note_fix(arrival: Arrival) -> None:
-        goal = mapper.goal(arrival.robot)
-        if goal is not None:
-            fixes[arrival.robot].append(goal)
-            maps.note(goal.stamp_ns, mapper.occupancy())
-            covariance = told[arrival.robot].told(goal, mapper.covariance(arrival.robot))
-            covariances[arrival.robot].append(covariance)
+    def record_fix(arrival: Arrival) -> None:
+        goal, robot = mapper.goal(arrival.robot), arrival.robot
+        if goal is None:
+            return
+        goals[robot].append(goal)
+        covariances[robot].append(published[robot].told(goal, mapper.covariance(robot)))
+        stamp_ns = BEGIN_NS + goal.stamp_ns
+        if not maps or stamp_ns >= max(maps) + _MAP_PERIOD_NS:
+            maps[stamp_ns] = _encode_map(stamp_ns, mapper.occupancy())
 
-    for _ in range(settings.robots):
+    for _ in robots:
         exploration.join(PushBotNoise(slip=settings.slip))
-    exploration.run(settings.duration_s, note_fix)
-    robots = tuple(_described(number, exploration) for number in range(settings.robots))
+    exploration.run(settings.duration_s, record_fix)
+    described = tuple(_described(robot, exploration) for robot in robots)
+    names = [one.name for one in described]
     built = assembled_robots(settings.seed, settings.robots)
     streams: list[Stream] = []
-    for number, robot in enumerate(robots):
-        readings = [one for one, _ in recorded[number]]
-        streams += [_odometry(robot.name, readings), _laser(robot.name, readings, built[number])]
-        streams += _lights(robot.name, [lights for _, lights in recorded[number] if lights is not None])
-        streams.append(_fixes(robot.name, fixes[number], covariances[number]))
-        streams.append(goal_stream(robot.name, BEGIN_NS, fixes[number]))
-        streams.append(_truth(robot.name, exploration.robots[number].trace))
-    streams.append(maps.stream())
-    names = [robot.name for robot in robots]
-    streams += _events(names, exploration, settings)
-    count = write_streams(streams, Swarm(robots), folder, comment)
+    for robot, name in enumerate(names):
+        readings = [one for one, _ in recorded[robot]]
+        streams += [_odometry(name, readings), _laser(name, readings, built[robot])]
+        streams += _lights(name, [lights for _, lights in recorded[robot] if lights is not None])
+        streams += [_fixes(name, goals[robot], covariances[robot]), _goals(name, goals[robot])]
+        streams.append(_truth(name, exploration.robots[robot].trace))
+    streams.append(Stream("map", OCCUPANCY_GRID, np.array(list(maps), dtype=np.int64), list(maps.values())))
+    if settings.events_s:
+        cameras = HallSight(plan.walls, built, CameraNoise(), np.random.default_rng([settings.seed, 2]))
+        traces = [exploration.robots[robot].trace for robot in robots]
+        streams += _events(names, _poses(traces, settings.events_s), cameras)
+    count = write_streams(streams, Swarm(described), folder, comment)
     np.savetxt(folder / "walls.csv", plan.walls, fmt="%.4f", delimiter=",", header="x0,y0,x1,y1 [m]")
     calibrate_lasers(names, settings.seed, folder)
     return count
@@ -295,24 +172,25 @@ def _described(number: int, exploration: Exploration) -> Robot:
     )
 
 
-def _events(names: list[str], exploration: Exploration, settings: PushbotBagSettings) -> list[Stream]:
-    """What the cameras see at the begin."""
-    if not settings.events_s:
-        return []
-    traces = [exploration.robots[number].trace for number in range(settings.robots)]
-    poses = poses_between(traces, round(1e6 * PERIOD_S), round(1e6 * settings.events_s))
-    sight = sight_of(exploration.plan.walls, settings.seed, settings.robots)
-    return event_streams(names, poses, BEGIN_NS, sight)
-
-
 def _fixes(name: str, goals: list[Goal], covariances: list[FloatArray]) -> Stream:
-    """Where the mapper had the robot when it decided on its goals, as the mapper's node publishes it."""
+    """The mapper's poses of the robot when it chose goals, as the mapper's node publishes them."""
     stamp_ns = BEGIN_NS + np.array([goal.stamp_ns for goal in goals], dtype=np.int64)
     data = [
         encode_fix("map", at_ns, goal.pose, covariance)
         for at_ns, goal, covariance in zip(stamp_ns.tolist(), goals, covariances, strict=True)
     ]
     return Stream(f"{name}/fix", POSE_WITH_COVARIANCE, stamp_ns, data)
+
+
+def _goals(name: str, goals: list[Goal]) -> Stream:
+    """Where the mapper sends the robot; the heading is that of the way there."""
+    stamp_ns = BEGIN_NS + np.array([goal.stamp_ns for goal in goals], dtype=np.int64)
+    ways = [goal.position - goal.pose[:2] for goal in goals]
+    poses = [
+        [*goal.position.tolist(), math.atan2(way[1], way[0])] for goal, way in zip(goals, ways, strict=True)
+    ]
+    table = np.array(poses).reshape(-1, 3)
+    return Stream(f"{name}/goal", POSE_STAMPED, stamp_ns, encode_pose_stamped("map", stamp_ns, table))
 
 
 def _odometry(name: str, readings: list[Readings]) -> Stream:
@@ -384,3 +262,69 @@ def _truth(name: str, trace: FloatArray) -> Stream:
     return Stream(
         f"{name}/ground_truth", POSE_STAMPED, stamp_ns, encode_pose_stamped("map", stamp_ns, chosen)
     )
+
+
+def _poses(traces: list[FloatArray], duration_s: float) -> FloatArray:
+    """Poses (K, N, 3) at every `EVENT_STEP_US` of traces (n, 3), which hold unwrapped headings."""
+    at_us: IntArray = np.arange(0, round(1e6 * duration_s) + 1, EVENT_STEP_US)
+    period_us = round(1e6 * PERIOD_S)
+    columns = [
+        [np.interp(at_us, period_us * np.arange(len(trace)), trace[:, k]) for k in range(3)]
+        for trace in traces
+    ]
+    poses: FloatArray = np.array(columns).transpose(2, 0, 1)
+    return poses
+
+
+def _events(names: list[str], poses: FloatArray, cameras: HallSight) -> list[Stream]:
+    """Event packets of all robots that pass through true poses (K, N, 3) at every `EVENT_STEP_US`."""
+    lights = [lights_of(robot) for robot in range(len(names))]
+    streams = []
+    for robot, name in enumerate(names):
+        stamps: list[int] = []
+        data: list[bytes] = []
+        for step in range(len(poses) - 1):
+            span_us = step * EVENT_STEP_US, (step + 1) * EVENT_STEP_US
+            seen = cameras.look(robot, poses[step], poses[step + 1], span_us, lights)
+            if len(seen.x):
+                x, y = seen.x.astype(np.uint16), seen.y.astype(np.uint16)
+                since_ns = 1000 * (seen.time_us - seen.time_us[0])
+                stamps.append(BEGIN_NS + 1000 * int(seen.time_us[0]))
+                events = Events(x, y, seen.polarity == 0, since_ns)
+                data.append(_encode_packet(name, stamps[-1], len(data), events))
+        arrival_ns = np.array(stamps, dtype=np.int64) + 1000 * EVENT_STEP_US
+        streams.append(Stream(f"{name}/events", EVENTS, arrival_ns, data))
+    return streams
+
+
+def _encode_packet(name: str, stamp_ns: int, number: int, events: Events) -> bytes:
+    message = typestore().types[EVENTS](
+        header=message_header(stamp_ns, f"{name}/event_camera_optical_frame"),
+        height=SENSOR_PX,
+        width=SENSOR_PX,
+        seq=number,
+        time_base=stamp_ns,
+        encoding=ENCODING,
+        is_bigendian=False,
+        events=np.frombuffer(encode_events(events), np.uint8),
+    )
+    return encode(message, EVENTS)
+
+
+def _encode_map(stamp_ns: int, occupancy: OccupancyMap) -> bytes:
+    """The map as the mapper's node publishes it: -1 unknown, else the probability of an obstacle [%]."""
+    types = typestore().types
+    cells = np.ascontiguousarray(np.round(occupancy.percent).astype(np.int8).T)
+    point, turn = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Quaternion"]
+    header = message_header(stamp_ns, "map")
+    x, y = map(float, occupancy.corner)
+    origin = types["geometry_msgs/msg/Pose"](position=point(x, y, 0.0), orientation=turn(0.0, 0.0, 0.0, 1.0))
+    about = types["nav_msgs/msg/MapMetaData"](
+        map_load_time=header.stamp,
+        resolution=occupancy.cell,
+        width=cells.shape[1],
+        height=cells.shape[0],
+        origin=origin,
+    )
+    message = types[OCCUPANCY_GRID](header=header, info=about, data=cells.ravel())
+    return encode(message, OCCUPANCY_GRID)

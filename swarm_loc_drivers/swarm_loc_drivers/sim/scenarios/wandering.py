@@ -39,7 +39,7 @@ _HOMING_GAIN = 3.0
 
 @dataclass(frozen=True)
 class AerialRun(LivedRun):
-    """A simulated swarm that is seen from above.
+    """A simulated swarm with an overhead camera that cannot tell robots apart.
 
     Attributes:
         stamp_ns: (k,) exposure of each image, in order of arrival.
@@ -107,7 +107,7 @@ def _wander(rng: np.random.Generator, robots: int) -> Controller:
 
 
 def _image(rng: np.random.Generator, poses: FloatArray) -> np.typing.NDArray[np.void]:
-    """What an image shows of robots at poses (N, 3): positions alone, in no order."""
+    """Detections in an image of robots at poses (N, 3): positions in random order."""
     seen = poses[rng.random(len(poses)) < _DETECTED, :2]
     half = 0.5 * np.array(ARENA)
     false = rng.uniform(-half, half, (rng.poisson(_FALSE), 2))
