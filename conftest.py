@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from swarm_loc_estimator.common.jit import is_precompiled
-from swarm_loc_vision.markers.precompile import precompile
+from swarm_loc_vision.markers.detector import precompile
 
 if TYPE_CHECKING:
     from node_world import Ros  # unit tests do without ROS

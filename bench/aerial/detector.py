@@ -18,7 +18,7 @@ from bench.shared.common import Cell, ProgressLine, table
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.aerial.detector import AerialDetections, AerialDetector
-from swarm_loc_vision.aerial.settings import AerialSettings
+from swarm_loc_vision.aerial.parameters import AerialSettings
 
 SEEDS = 5
 _MATCHED = 0.3

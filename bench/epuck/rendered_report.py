@@ -24,7 +24,7 @@ from swarm_loc_estimator.offline.report.style import INK, colour_of
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.settings import Settings
-from swarm_loc_vision.markers.precompile import precompile
+from swarm_loc_vision.markers.detector import precompile
 
 OUTPUT_NS = 100_000_000
 """Of the poses, which come twice as often, those that the other rows of the benchmark have, too."""

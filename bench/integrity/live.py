@@ -24,7 +24,7 @@ from swarm_loc_estimator.offline.live.graph import LiveGraph, read_poses
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
-from swarm_loc_vision.markers.precompile import precompile
+from swarm_loc_vision.markers.detector import precompile
 
 _ROBOTS = 5
 _BEFORE_S, _AFTER_S = 8.0, 10.0

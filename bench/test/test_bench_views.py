@@ -14,8 +14,7 @@ from swarm_loc_drivers.sim.render.rigs import Arena
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, FACE_DISTANCE, EightSettings, describe
 from swarm_loc_drivers.sim.worlds import W2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.markers.detector import MarkerDetector
-from swarm_loc_vision.markers.detector_settings import DetectorSettings
+from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import family_named
 
 FAMILY = family_named("artoolkit_bch_thin")
@@ -36,7 +35,7 @@ def test_markers_lie_where_the_detector_finds_them() -> None:
     while not (taken := [one for one in world.step() if one.robot == 0]):
         pass
     camera = CAMERA.camera
-    found = MarkerDetector(DetectorSettings(), [(FAMILY, None)], camera).detect(world.image(taken[0]))
+    found = MarkerDetector(DetectorSettings(), {FAMILY: None}, camera).detect(world.image(taken[0]))
     views = views_of(world.rig, 0, BESIDE)
     clear = (views.margin > 4.0) & ~views.hidden & (views.incidence < 1.2) & (views.side_px > 12.0)
     assert clear.sum() >= 6

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_vision.common.sampling import GRID
 from swarm_loc_vision.markers.decoder import Dictionary
-from swarm_loc_vision.markers.detector import MarkerDetector
-from swarm_loc_vision.markers.detector_settings import DetectorSettings
-from swarm_loc_vision.markers.draw import draw_marker
-from swarm_loc_vision.markers.families import Family, family_named
+from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
+from swarm_loc_vision.markers.families import Family, draw_marker, family_named
 
 Gray = NDArray[np.uint8]
 
@@ -47,7 +45,7 @@ def measure_bch() -> BchFigures:
 
 def _read_right(family: Family, quarters: int) -> NDArray[np.bool_]:
     """(4096,) whether each id is read where it is, turned as it is."""
-    detector = MarkerDetector(DetectorSettings(), [(family, None)])
+    detector = MarkerDetector(DetectorSettings(), {family: None})
     rng = np.random.default_rng(quarters)
     right = np.zeros(len(family.words), np.bool_)
     tile = (family.side + 2 * _MARGIN) * _PIXELS_PER_CELL
@@ -80,7 +78,7 @@ def _sheet(family: Family, ids: NDArray[np.int64], quarters: int, rng: np.random
 def _us_per_candidate(candidates: int = 200, rounds: int = 7) -> float:
     """Median CPU time of decoding, per candidate."""
     family = family_named("artoolkit_bch_thin")
-    dictionary = Dictionary([(family, np.arange(len(family.words)))])
+    dictionary = Dictionary({family: np.arange(len(family.words))})
     rng = np.random.default_rng(0)
     cells = np.full((candidates, GRID, GRID), 200.0)
     for square in cells:

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from bench.vision.peers import FAMILY, own_detector
 from bench.vision.scenes import Look, random_scene
-from swarm_loc_vision.markers.detector import MarkerDetector
-from swarm_loc_vision.markers.detector_settings import DetectorSettings
+from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import Family, families, family_named
 
 Gray = NDArray[np.uint8]
@@ -47,7 +46,7 @@ def black_squares(count: int) -> dict[str, int]:
         )
         for family in families().values()
         for ids in (None, _FEW_IDS)
-        for detector in [MarkerDetector(DetectorSettings(), [(family, ids)])]
+        for detector in [MarkerDetector(DetectorSettings(), {family: ids})]
     }
 
 

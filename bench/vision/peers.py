@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.common.camera import Camera
-from swarm_loc_vision.markers.detector import Detections, MarkerDetector
-from swarm_loc_vision.markers.detector_settings import DetectorSettings
+from swarm_loc_vision.markers.detector import Detections, DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import Family, family_named
 
 Gray = NDArray[np.uint8]
@@ -42,7 +41,7 @@ Peer = Callable[[Gray], Found]
 def own_detector(family: Family, **numbers: float) -> MarkerDetector:
     """This package's, with all ids and the scenes' camera."""
     camera = Camera.from_matrix((WIDTH, HEIGHT), CAMERA, ())
-    return MarkerDetector(DetectorSettings(**numbers), [(family, None)], camera)
+    return MarkerDetector(DetectorSettings(**numbers), {family: None}, camera)
 
 
 def as_found(detections: Detections) -> Found:

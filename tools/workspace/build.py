@@ -104,7 +104,7 @@ def _compiling_beside(env: Mapping[str, str]) -> Iterator[None]:
     Should it fail, they are compiled when they are first needed.
     """
     program = "from swarm_loc_estimator.precompile import precompile_infrared; precompile_infrared()\n"
-    program += "from swarm_loc_vision.markers.precompile import precompile; precompile()"
+    program += "from swarm_loc_vision.markers.detector import precompile; precompile()"
     silent = subprocess.DEVNULL
     beside = subprocess.Popen([VENV_PYTHON, "-c", program], env=env, stdout=silent, stderr=silent)
     with beside:

@@ -28,7 +28,7 @@ from swarm_loc_estimator.common.command_line import command_parser, exit_with_me
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.launch import print_line, run_graph
 from swarm_loc_estimator.common.number_spec import number_specs
-from swarm_loc_vision.markers.precompile import precompile
+from swarm_loc_vision.markers.detector import precompile
 
 
 def parse(arguments: Sequence[str] | None) -> SimulationOptions:

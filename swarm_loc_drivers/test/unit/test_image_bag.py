@@ -19,8 +19,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.messages.typestore import typestore
 from swarm_loc_estimator.swarm.swarm import Landmark
-from swarm_loc_vision.markers.detector import MarkerDetector
-from swarm_loc_vision.markers.detector_settings import DetectorSettings
+from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import family_named
 
 ARGUMENTS = ["--seed", "2", "--duration", "2.5", "--robots", "2", "--world", "w2"]
@@ -75,7 +74,7 @@ def test_a_detector_finds_the_landmarks_where_they_are() -> None:
     camera = CameraModel(exposure_s=1e-4, white_flux=1e8)  # no time to turn, the light of an ordinary image
     recorded = simulate_eight_images(EightSettings(seed=4, duration_s=2.0, robots=3, errors=W0), camera)
     run, family = recorded.run, family_named(FAMILY)
-    detector = MarkerDetector(DetectorSettings(), [(family, None)])
+    detector = MarkerDetector(DetectorSettings(), {family: None})
     marks = {mark.id: mark for mark in run.swarm.landmarks}
     errors: list[float] = []
     for frame, image in zip(run.frames, recorded.images(), strict=True):

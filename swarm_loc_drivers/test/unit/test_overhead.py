@@ -19,9 +19,8 @@ from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.aerial.detector import AerialDetector
-from swarm_loc_vision.aerial.ground.control_points import Noise
-from swarm_loc_vision.aerial.ground.ground_control import GroundControl
-from swarm_loc_vision.aerial.settings import AerialSettings
+from swarm_loc_vision.aerial.ground_control import GroundControl
+from swarm_loc_vision.aerial.parameters import AerialSettings
 
 START = np.array([[0.1, 0.2, 0.3], [0.5, -0.2, 1.9], [-0.4, -0.3, -2.0]])
 RATE_HZ = 5.0
@@ -29,6 +28,7 @@ CAMERA = OverheadSettings(aerial_rate=RATE_HZ, aerial_width=960, aerial_height=7
 TILTED = replace(
     CAMERA, aerial_tilt=0.4, aerial_y=-1.0, aerial_k1=-0.08, aerial_field_of_view=1.5, aerial_light=0.3
 )
+CONTROL = AerialSettings(control_sigma_px=0.3, control_sigma=0.001, max_residual=6.0)
 SEEN = AerialSettings(
     robot_height=TOP_HEIGHT, robot_diameter=2.0 * TOP_RADIUS, x_min=-1.2, x_max=1.2, y_min=-0.8, y_max=0.8
 )
@@ -63,7 +63,7 @@ def first_exposure(made: EpuckWorld) -> Exposure:
 def test_robots_are_found_where_they_are(overhead: OverheadSettings) -> None:
     made = world(START, overhead)
     image = made.image(first_exposure(made))
-    control = GroundControl(eight_floor(), overhead_model(overhead).camera, Noise(0.3, 0.001), 6.0)
+    control = GroundControl(eight_floor(), overhead_model(overhead).camera, CONTROL)
     ground = control.look(image)
     assert ground is not None, control.trouble
     np.testing.assert_allclose(
@@ -85,7 +85,7 @@ def test_nothing_tells_robots_apart() -> None:
     for order in ([0, 1, 2], [2, 0, 1]):
         made = world(START[order], bare)
         images.append(made.image(first_exposure(made)).astype(float))
-    control = GroundControl(eight_floor(), overhead_model(bare).camera, Noise(0.3, 0.001), 6.0)
+    control = GroundControl(eight_floor(), overhead_model(bare).camera, CONTROL)
     ground = control.look(images[0].astype(np.uint8))
     assert ground is not None
     tops = np.concatenate([START[:, :2], np.full((3, 1), TOP_HEIGHT)], axis=1)

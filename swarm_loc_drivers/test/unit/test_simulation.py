@@ -16,7 +16,7 @@ from swarm_loc_estimator.common.parameters import ParameterError, parameter_spec
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
-from swarm_loc_vision.aerial.aerial_parameters import AerialParameters
+from swarm_loc_vision.aerial.parameters import AerialParameters
 
 BAGS = Path(__file__).parents[3] / "bags"
 SECOND = 1_000_000_000

@@ -5,6 +5,7 @@ Messages are those of rclpy or of a bag's type store: the fields have the same n
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,14 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DTYPE
 from swarm_loc_estimator.common.messages.encoders import encode_anonymous
 from swarm_loc_vision.aerial.detector import AerialDetections, AerialDetector
-from swarm_loc_vision.aerial.ground.control_points import Noise
-from swarm_loc_vision.aerial.ground.ground_camera import GroundCamera
-from swarm_loc_vision.aerial.ground.ground_control import NO_GROUND, Ground, GroundControl
+from swarm_loc_vision.aerial.ground_camera import GroundCamera
+from swarm_loc_vision.aerial.ground_control import NO_GROUND, Ground, GroundControl
+from swarm_loc_vision.aerial.ground_file import load_ground
+from swarm_loc_vision.aerial.parameters import AerialParameters, AerialSettings
 from swarm_loc_vision.aerial.rectification import RectificationError
-from swarm_loc_vision.aerial.settings import AerialSettings
-from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, Gray, GrayOf, stamp_ns_of
+from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, GrayOf, stamp_ns_of
 from swarm_loc_vision.common.camera import Camera
-from swarm_loc_vision.common.gray import ImageError
+from swarm_loc_vision.common.images import TRANSPORTS, Gray, ImageError
 
 MAP = "map"
 
@@ -65,9 +66,7 @@ class AerialCamera(CalibratedCamera):
 
     def use(self, camera: Camera) -> None:
         """Find the camera's pose anew."""
-        settings = self._settings
-        noise = Noise(settings.control_sigma_px, settings.control_sigma)
-        self.control = GroundControl(self._ground, camera, noise, settings.max_residual)
+        self.control = GroundControl(self._ground, camera, self._settings)
         self._detector = None
 
     def detect(self, message: Any) -> bytes:
@@ -116,3 +115,15 @@ def anonymous_rows(detections: AerialDetections) -> NDArray[np.void]:
     rows["covariance"] = detections.covariance
     rows["u_px"], rows["v_px"] = detections.pixel.T
     return rows
+
+
+def aerial_camera(parameters: AerialParameters) -> AerialCamera:
+    """The camera as described.
+
+    Raises:
+        GroundFileError: The control points cannot be used.
+    """
+    path = parameters.control_points_file
+    ground = load_ground(Path(path)) if path else Ground()
+    gray_of = TRANSPORTS[parameters.image_transport].gray_of
+    return AerialCamera(parameters.settings, parameters.polarity, ground, gray_of)

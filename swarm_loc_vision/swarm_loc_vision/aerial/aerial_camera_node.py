@@ -15,8 +15,9 @@ from rclpy.qos import QoSProfile
 
 from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import AnonymousDetectionArray
-from swarm_loc_vision.aerial.aerial_parameters import AerialParameters, aerial_camera
-from swarm_loc_vision.aerial.ground.control_points import PoseFit
+from swarm_loc_vision.aerial.aerial_camera import aerial_camera
+from swarm_loc_vision.aerial.control_points import PoseFit
+from swarm_loc_vision.aerial.parameters import AerialParameters
 from swarm_loc_vision.common.camera_node import CameraNode
 
 

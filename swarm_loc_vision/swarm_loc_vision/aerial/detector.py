@@ -10,22 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.aerial.circles import Circles, Rims, likely
-from swarm_loc_vision.aerial.contrast import brightness, noise_of
-from swarm_loc_vision.aerial.diameter import commonest, ladder
-from swarm_loc_vision.aerial.ground.ground_camera import GroundCamera
-from swarm_loc_vision.aerial.heading import Marks, find_marks
+from swarm_loc_vision.aerial.circles import Circles, Edges, Rims, likely, peaks
+from swarm_loc_vision.aerial.ground_camera import GroundCamera
+from swarm_loc_vision.aerial.parameters import POLARITIES, AerialSettings
+from swarm_loc_vision.aerial.pattern import Marks, find_marks
 from swarm_loc_vision.aerial.rectification import (
     Rectification,
     RectificationError,
+    brightness,
+    noise_of,
     rectification,
 )
-from swarm_loc_vision.aerial.settings import AerialSettings
-from swarm_loc_vision.aerial.voting import BRIGHT, DARK, Edges, peaks
-from swarm_loc_vision.common.gray import Gray
-
-POLARITIES = {"auto": (BRIGHT, DARK), "bright": (BRIGHT,), "dark": (DARK,)}
-"""Whether robots are brighter or darker than the floor; by name."""
+from swarm_loc_vision.common.images import Gray
 
 _SIZES_PX = 16.0, 32.0
 """Diameters of robots in the rectified image, least and largest."""
@@ -271,3 +267,22 @@ def _nothing(dropped: Mapping[str, int]) -> AerialDetections:
     return AerialDetections(
         np.zeros((0, 2)), none, np.zeros((0, 3, 3)), np.zeros((0, 2)), none, none, dropped
     )
+
+
+_RATIO = 1.3
+_ALIKE = 1.1
+
+
+def ladder(low: float, high: float) -> FloatArray:
+    """Diameters from low to high, each a little larger than the one before."""
+    count = max(int(np.ceil(np.log(high / low) / np.log(_RATIO))), 0) + 1
+    return np.asarray(low * _RATIO ** np.arange(count))
+
+
+def commonest(diameters: FloatArray, scores: FloatArray) -> float:
+    """The diameter that most discs (N,) agree upon by their scores (N,); 0: there are none."""
+    if not len(diameters):
+        return 0.0
+    alike = np.abs(np.log(diameters[:, None] / diameters)) < np.log(_ALIKE)
+    best = int(np.argmax(alike @ scores))
+    return float(np.median(diameters[alike[best]]))

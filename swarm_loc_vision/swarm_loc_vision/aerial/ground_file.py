@@ -11,9 +11,8 @@ from swarm_loc_estimator.common.errors import UserError
 from swarm_loc_estimator.common.number_spec import NumberSpec, number_specs
 from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree, tree_text
 from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks, nearest
-from swarm_loc_vision.aerial.ground.control_points import ControlPointError, ControlPoints, check_points
-from swarm_loc_vision.aerial.ground.floor_markers import FloorMarker
-from swarm_loc_vision.aerial.ground.ground_control import Ground
+from swarm_loc_vision.aerial.control_points import ControlPointError, ControlPoints, check_points
+from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground
 from swarm_loc_vision.common.camera import Camera, CameraError
 from swarm_loc_vision.markers.families import Family, families
 

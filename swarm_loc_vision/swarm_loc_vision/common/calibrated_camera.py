@@ -7,12 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_vision.common.camera import Camera, CameraError
-from swarm_loc_vision.common.gray import ImageError
+from swarm_loc_vision.common.images import Gray, ImageError
 
-Gray = NDArray[np.uint8]
 GrayOf = Callable[[Any], Gray]
 
 _SECOND = 1_000_000_000

@@ -16,8 +16,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from swarm_loc_estimator.common.node import ConfiguredNode, Parameters
 from swarm_loc_vision.common.calibrated_camera import CalibratedCamera
 from swarm_loc_vision.common.camera import CameraError
-from swarm_loc_vision.common.gray import ImageError
-from swarm_loc_vision.common.transports import TRANSPORTS
+from swarm_loc_vision.common.images import TRANSPORTS, ImageError
 
 IMAGE_QOS = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Images that come faster than they can be read are dropped by the middleware, oldest first."""

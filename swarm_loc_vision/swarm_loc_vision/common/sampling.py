@@ -9,13 +9,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_vision.common.lens import raw_pixel
-
-Gray = NDArray[np.uint8]
+from swarm_loc_vision.common.camera import raw_pixel
+from swarm_loc_vision.common.images import Gray
 
 GRID = 10
 """Cells read along a side: the marker's 6, a ring of its border around them, and a ring around that."""
@@ -203,3 +201,24 @@ def _points_per_cell(h: FloatArray, side: int) -> tuple[int, float]:
     c, d = (h[1, 0] - v * h[2, 0]) / w, (h[1, 1] - v * h[2, 1]) / w
     cell = math.sqrt(abs(a * d - b * c)) / side
     return (1, 0.0) if cell < _MIN_SHARED_CELL_PX else (2, _SPREAD)
+
+
+def homographies(quads: FloatArray) -> FloatArray:
+    """(N, 3, 3) from the unit square, clockwise from its upper left (0, 0), to quadrangles (N, 4, 2)."""
+    first, second, third, fourth = np.moveaxis(quads, 1, 0)
+    uneven = first - second + third - fourth
+    a, b = second - third, fourth - third
+    determinant = _cross(a, b)
+    g, h = _cross(uneven, b) / determinant, _cross(a, uneven) / determinant
+    result = np.empty((len(quads), 3, 3))
+    result[:, :2, 0] = second - first + g[:, None] * second
+    result[:, :2, 1] = fourth - first + h[:, None] * fourth
+    result[:, :2, 2] = first
+    result[:, 2, 0], result[:, 2, 1], result[:, 2, 2] = g, h, 1.0
+    return result
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(N,) cross products of plane vectors (N, 2)."""
+    product: FloatArray = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
+    return product

@@ -117,7 +117,7 @@ def _solve(
     for _ in range(2):  # what a shift does depends on how faces lie, which each alone tells badly
         shifts = [_shift_covariance(at.sigma, c, intrinsics) for at, c in zip(places, own, strict=True)]
         covariance = seen.covariance[rows] + np.stack(shifts)
-        found = body_pose(points, seen.corners[rows], covariance, intrinsics, starts, upright)
+        found = body_pose(points, seen.corners[rows], covariance, intrinsics, *starts, upright)
         if not np.isfinite(found.chi2[0, 0]):
             return
         own = list(points @ found.rotation[0, 0].T + found.position[0, 0])

@@ -8,11 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from swarm_loc_estimator import CONTENT_POSE, CONTENT_POSE_TWO
+from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
 from swarm_loc_estimator.common.messages.encoders import encode_detections
 from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, GrayOf, stamp_ns_of
 from swarm_loc_vision.common.camera import Camera
-from swarm_loc_vision.markers.detector import MarkerDetector
-from swarm_loc_vision.markers.rows import detection_rows
+from swarm_loc_vision.markers.detector import Detections, MarkerDetector
 
 CreateDetector = Callable[[Camera], MarkerDetector]
 
@@ -55,3 +60,46 @@ class CameraDetector(CalibratedCamera):
         self.markers += len(rows)
         self.misfits += detections.misfits
         return encode_detections(message.header.frame_id, stamp_ns_of(message), rows)
+
+
+_MIN_CHI2 = 1e-6
+
+
+def detection_rows(detections: Detections, ambiguity: float) -> NDArray[np.void]:
+    """Rows of `DETECTION_DTYPE`, one per marker that has a pose.
+
+    Args:
+        detections: Of a detector that knows its camera.
+        ambiguity: The mirrored pose is told when its chi square is higher by no more than this.
+
+    Raises:
+        ValueError: The detections have no poses.
+    """
+    if detections.poses is None:
+        raise ValueError("a detector without a camera finds no poses.")
+    solved = np.isfinite(detections.poses.chi2[:, 0])
+    rotation, position, covariance, chi2 = (column[solved] for column in detections.poses)
+    is_two = chi2[:, 1] - chi2[:, 0] <= ambiguity
+    rows = np.zeros(len(chi2), DETECTION_DTYPE)
+    rows["id"] = detections.id[solved]
+    rows["family"] = detections.family[solved]
+    rows["content"] = np.where(is_two, CONTENT_POSE_TWO, CONTENT_POSE)
+    rows["id_margin"] = detections.margin[solved]
+    rows["corners_px"] = detections.corners[solved]
+    rows["position"] = position[:, 0]
+    rows["orientation"] = _quaternions(rotation[:, 0])
+    rows["covariance"] = covariance[:, 0]
+    rows["alternative_orientation"][:, 3] = 1.0
+    rows["alternative_position"][is_two] = position[is_two, 1]
+    rows["alternative_orientation"][is_two] = _quaternions(rotation[is_two, 1])
+    rows["alternative_ratio"] = np.nan
+    least = np.maximum(chi2[is_two], _MIN_CHI2)
+    rows["alternative_ratio"][is_two] = np.sqrt(least[:, 1] / least[:, 0])
+    return rows
+
+
+def _quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 4) x, y, z, w."""
+    if not len(rotations):
+        return np.zeros((0, 4))
+    return np.asarray(Rotation.from_matrix(rotations).as_quat())

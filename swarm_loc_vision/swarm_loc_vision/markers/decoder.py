@@ -7,7 +7,7 @@ differ there at little cost, while a difference in a clear cell costs a whole bi
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -61,7 +61,7 @@ class Dictionary:
     """Words in use of families with the same border.
 
     Args:
-        family_ids: For each family the ids in use.
+        ids_of: Ids in use of each family.
 
     Attributes:
         codes: (N,) the family's code of each word.
@@ -70,11 +70,11 @@ class Dictionary:
         correctable: Bits that may differ; see `FALSE_READINGS`.
     """
 
-    def __init__(self, family_ids: Sequence[tuple[Family, NDArray[np.int64]]]) -> None:
-        self.codes = np.concatenate([np.full(len(ids), family.code) for family, ids in family_ids])
-        self.ids = np.concatenate([ids for _, ids in family_ids])
-        words = np.concatenate([family.words[ids] for family, ids in family_ids])
-        border = family_ids[0][0].border
+    def __init__(self, ids_of: Mapping[Family, NDArray[np.int64]]) -> None:
+        self.codes = np.concatenate([np.full(len(ids), family.code) for family, ids in ids_of.items()])
+        self.ids = np.concatenate(list(ids_of.values()))
+        words = np.concatenate([family.words[ids] for family, ids in ids_of.items()])
+        border = next(iter(ids_of)).border
         self._words = np.concatenate([rotated(words, quarters) for quarters in range(4)])
         self.correctable = correctable_bits(len(words))
         cells = unpacked(words)

@@ -11,19 +11,38 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_vision.common.camera import Camera
-from swarm_loc_vision.common.homographies import homographies
-from swarm_loc_vision.common.lens import LENS_SIZE
-from swarm_loc_vision.common.sampling import GRID, read_cells
-from swarm_loc_vision.markers.bodies import Body, Seen, solve_bodies
+from swarm_loc_estimator.common.jit import note_precompiled
+from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_vision.common.camera import LENS_SIZE, Camera
+from swarm_loc_vision.common.images import Gray
+from swarm_loc_vision.common.sampling import GRID, homographies, read_cells
+from swarm_loc_vision.markers.bodies import Body, Placement, Seen, solve_bodies
 from swarm_loc_vision.markers.decoder import Dictionary
-from swarm_loc_vision.markers.detector_settings import DetectorSettings
 from swarm_loc_vision.markers.edges import refine, refine_read
-from swarm_loc_vision.markers.families import Family
+from swarm_loc_vision.markers.families import Family, draw_marker, family_named
 from swarm_loc_vision.markers.pose import Poses, Upright, marker_poses
 from swarm_loc_vision.markers.quads import find_quads
 
-Gray = NDArray[np.uint8]
+
+@dataclass(frozen=True)
+class DetectorSettings:
+    """Numbers of the detector, with units and ranges.
+
+    Candidates: `min_side_px`, `min_contrast`. Poses: the rest.
+    """
+
+    marker_length: float = number(
+        0.05, "m", 0.001, 10.0, "side of a marker that has no other, black border included"
+    )
+    min_side_px: float = number(8.0, "px", 6.0, 1000.0, "smaller markers are not looked for")
+    min_contrast: float = number(4.0, "1", 1.0, 100.0, "by how much ink is darker than paper [counts]")
+    tilt_sigma: float = number(
+        0.0, "rad", 0.0, 1.0, "how upright markers stand towards a level camera's mount; 0: any way up"
+    )
+    ambiguity: float = number(
+        16.0, "1", 0.0, 1e4, "the mirrored pose is told when it fits worse by no more than this chi square"
+    )
+
 
 _ROUGH_PX = 3.0
 """Distance of the profiles across the sides of candidates."""
@@ -88,7 +107,7 @@ class MarkerDetector:
 
     Args:
         settings: Its numbers.
-        families: Families in use and for each its ids in use; None: all of its ids.
+        families: Ids in use of each family in use; None: all of its ids.
         camera: What takes the images; without one there are no poses, and it has no distortion.
         lengths: Sides of markers that differ from `settings.marker_length`, by id [m].
         up: (3,) direction up in the camera frame, for `settings.tilt_sigma`.
@@ -98,7 +117,7 @@ class MarkerDetector:
     def __init__(
         self,
         settings: DetectorSettings,
-        families: Sequence[tuple[Family, IntArray | None]],
+        families: Mapping[Family, IntArray | None],
         camera: Camera | None = None,
         *,
         lengths: Mapping[int, float] | None = None,
@@ -111,10 +130,10 @@ class MarkerDetector:
         self._lengths = lengths or {}
         self._bodies = bodies
         self._upright = None if up is None or not settings.tilt_sigma else Upright(up, settings.tilt_sigma)
-        by_side: dict[int, list[tuple[Family, IntArray]]] = {}
-        for family, ids in families:
+        by_side: dict[int, dict[Family, IntArray]] = {}
+        for family, ids in families.items():
             used = np.arange(len(family.words)) if ids is None else ids
-            by_side.setdefault(family.side, []).append((family, used))
+            by_side.setdefault(family.side, {})[family] = used
         self._dictionaries = {side: Dictionary(used) for side, used in by_side.items()}
 
     def detect(self, gray: Gray) -> Detections:
@@ -197,3 +216,17 @@ def _best(markers: _Markers) -> _Markers:
 def _diagonals(quads: FloatArray) -> FloatArray:
     """(N,) lengths of a diagonal of quadrangles (N, 4, 2) [px]."""
     return np.asarray(np.linalg.norm(quads[:, 0] - quads[:, 2], axis=1))
+
+
+def precompile() -> None:
+    """Let a detector find two markers of one body, which takes every path through the compiled code."""
+    family = family_named("artoolkit_bch_thin")
+    image = np.hstack([draw_marker(family, marker_id, margin=4) for marker_id in (1, 2)])
+    height, width = image.shape
+    camera = Camera(width, height, 500.0, 500.0, 0.5 * width, 0.5 * height)
+    apart = 0.05 * (family.side + 8) / family.side
+    body = {i: Placement(np.eye(3), np.array([apart * i, 0.0, 0.0]), 0.001) for i in (1, 2)}
+    up = np.array([0.0, -1.0, 0.0])
+    settings = DetectorSettings(tilt_sigma=0.1)
+    MarkerDetector(settings, {family: np.array([1, 2])}, camera, up=up, bodies=[body]).detect(image)
+    note_precompiled(precompile)

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_vision.common.images import Gray
 from swarm_loc_vision.common.sampling import MAX_PROFILES, profile_crossings
 from swarm_loc_vision.markers.families import CELLS
 from swarm_loc_vision.markers.side_pixels import side_pixels
 from swarm_loc_vision.markers.sides import fit_sides
-
-Gray = NDArray[np.uint8]
 
 _MIN_CROSSINGS = 3
 _MIN_SINE = 0.1

@@ -13,7 +13,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_vision.markers import bch
+_BCH_IDS = 4096
+
+_BCH_GENERATOR = 0x1DB2777
+"""The generator polynomial, degree 24, lowest power in bit 0."""
+_BCH_PARITY_BITS = 24
+_BCH_MASK = 0x8F80B8750
+
+
+def bch_words() -> NDArray[np.uint64]:
+    """(4096,) the 36 cells of each id, row by row, the first one in bit 35; 1 is white."""
+    words = np.arange(_BCH_IDS, dtype=np.uint64) << np.uint64(_BCH_PARITY_BITS)
+    remainder = words.copy()
+    for bit in range(35, _BCH_PARITY_BITS - 1, -1):
+        set_here = (remainder >> np.uint64(bit)) & np.uint64(1)
+        remainder ^= set_here * np.uint64(_BCH_GENERATOR << (bit - _BCH_PARITY_BITS))
+    cells: NDArray[np.uint64] = (words | remainder) ^ np.uint64(_BCH_MASK)
+    return cells
+
 
 CELLS = 6
 """Cells along a side, without the border."""
@@ -92,7 +109,7 @@ def families() -> dict[str, Family]:
     OpenCV turns AprilTag's tags by half a turn against the images that AprilTag publishes; here they are
     upright as published.
     """
-    words = bch.codewords()
+    words = bch_words()
     mip = _opencv_words(cv2.aruco.DICT_ARUCO_MIP_36h12, quarters=0)
     tags = _opencv_words(cv2.aruco.DICT_APRILTAG_36h11, quarters=2)
     known = (
@@ -114,3 +131,27 @@ def family_named(name: str) -> Family:
     if name not in known:
         raise ValueError(f"there is no marker family '{name}', only {', '.join(known)}.")
     return known[name]
+
+
+WHITE = 255
+
+
+def draw_marker(
+    family: Family, marker_id: int, pixels_per_cell: int = 8, margin: int = 1
+) -> NDArray[np.uint8]:
+    """A marker as seen by one who faces it upright, inside a white margin.
+
+    Args:
+        family: Of which family; it says how wide the black border is.
+        marker_id: Which one.
+        pixels_per_cell: Size of a cell, at least 1 [px].
+        margin: Width of the white margin [cells]; the marker itself fills `family.side` cells.
+
+    Returns:
+        (n, n) of 0 and 255, n = (family.side + 2 margin) pixels_per_cell.
+
+    Raises:
+        ValueError: The family has no such id.
+    """
+    cells = np.pad(family.pattern(marker_id), margin, constant_values=1)
+    return np.kron(cells, np.full((pixels_per_cell, pixels_per_cell), WHITE, np.uint8))

@@ -18,10 +18,10 @@ from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import MarkerDetectionArray
 from swarm_loc_vision.common.camera_node import CameraNode
-from swarm_loc_vision.common.transports import TRANSPORTS
+from swarm_loc_vision.common.images import TRANSPORTS
 from swarm_loc_vision.markers.camera_detector import CameraDetector
-from swarm_loc_vision.markers.detector_parameters import DetectorParameters, detector_maker
-from swarm_loc_vision.markers.precompile import precompile
+from swarm_loc_vision.markers.detector import precompile
+from swarm_loc_vision.markers.parameters import DetectorParameters, detector_maker
 
 _MAX_MISFIT_SHARE = 0.1
 """Of the markers since the last diagnostics; if more fit no square the camera is not the calibrated one."""

@@ -146,7 +146,8 @@ def body_pose(
     pixels: FloatArray,
     covariance: FloatArray,
     intrinsics: FloatArray,
-    starts: tuple[FloatArray, FloatArray],
+    rotations: FloatArray,
+    positions: FloatArray,
     upright: Upright | None = None,
 ) -> Poses:
     """The pose of a body whose z axis points up, from several of its markers; the best from all starts.
@@ -156,7 +157,8 @@ def body_pose(
         pixels: (M, 4, 2) in the image [ideal px].
         covariance: (M, 8, 8) of each marker's corners [px^2].
         intrinsics: (4,) fx, fy, cx, cy [px].
-        starts: Rotations (S, 3, 3) and positions (S, 3) to search from.
+        rotations: (S, 3, 3) to search from.
+        positions: (S, 3) to search from [m].
         upright: Given when the body is known to stand upright.
 
     Returns:
@@ -165,7 +167,7 @@ def body_pose(
     weights = np.asarray(np.linalg.inv(covariance), np.float64)
     axis, flat = np.array([0.0, 0.0, 1.0]), (points.reshape(-1, 3), pixels.reshape(-1, 2))
     sight = _Sight(*flat, weights, intrinsics, axis, *_tilt(upright))
-    rotations, positions = starts[0].copy(), starts[1].copy()
+    rotations, positions = rotations.copy(), positions.copy()
     covariances = np.zeros((len(rotations), 6, 6))
     chi2 = np.full(len(rotations), np.inf)
     for i in range(len(rotations)):

@@ -18,8 +18,8 @@ from scipy.spatial import KDTree
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_vision.common.images import Gray
 
-Gray = NDArray[np.uint8]
 IntArray = NDArray[np.int32]
 
 _MIN_SIDE_PX = 3

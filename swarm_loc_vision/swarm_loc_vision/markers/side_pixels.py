@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_vision.common.homographies import homographies
-from swarm_loc_vision.common.lens import raw_pixels
-
-Gray = NDArray[np.uint8]
+from swarm_loc_vision.common.camera import raw_pixels
+from swarm_loc_vision.common.images import Gray
+from swarm_loc_vision.common.sampling import homographies
 
 REACH_PX, INNER_REACH_PX = 7.0, 3.5
 """Pixels further from a side, and from where its border ends, than this do not count."""

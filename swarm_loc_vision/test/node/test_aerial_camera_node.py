@@ -17,10 +17,10 @@ from bench.aerial.pictures import DIAMETER, Look, control_pixels, draw_picture
 from swarm_loc_estimator.common.parameters import markdown_table
 from swarm_loc_msgs.msg import AnonymousDetectionArray
 from swarm_loc_vision.aerial.aerial_camera_node import AerialCameraNode
-from swarm_loc_vision.aerial.aerial_parameters import AerialParameters
-from swarm_loc_vision.aerial.ground.control_points import ControlPoints
-from swarm_loc_vision.aerial.ground.ground_control import Ground
+from swarm_loc_vision.aerial.control_points import ControlPoints
+from swarm_loc_vision.aerial.ground_control import Ground
 from swarm_loc_vision.aerial.ground_file import GroundFileError, save_ground
+from swarm_loc_vision.aerial.parameters import AerialParameters
 from swarm_loc_vision.common import camera_node
 
 PICTURE = draw_picture(Look(tilt=0.3, robots=6), seed=2)

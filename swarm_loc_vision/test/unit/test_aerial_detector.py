@@ -11,8 +11,8 @@ import pytest
 from bench.aerial.detector import Score, score_picture
 from bench.aerial.pictures import DIAMETER, Look, Picture, draw_picture
 from swarm_loc_vision.aerial.detector import AerialDetector
+from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.aerial.rectification import RectificationError
-from swarm_loc_vision.aerial.settings import AerialSettings
 
 SETTINGS = AerialSettings(robot_diameter=DIAMETER)
 

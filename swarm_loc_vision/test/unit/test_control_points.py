@@ -10,19 +10,18 @@ import pytest
 from aerial_scenes import LENSES, floor_points, over_floor, spread
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.aerial.ground.control_points import (
+from swarm_loc_vision.aerial.control_points import (
     ControlPointError,
     ControlPoints,
-    Noise,
     misfit,
     solve_pose,
 )
-from swarm_loc_vision.aerial.ground.floor_markers import FloorMarker
-from swarm_loc_vision.aerial.ground.ground_control import Ground
+from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground
 from swarm_loc_vision.aerial.ground_file import GroundFileError, load_ground, save_ground
+from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.markers.families import family_named
 
-NOISE = Noise(pixel=0.5, place=0.0)
+NOISE = AerialSettings(control_sigma_px=0.5, control_sigma=0.0)
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -59,7 +58,7 @@ def test_places_are_as_unsure_as_told(lens: str) -> None:
     pixel = truth.pixels(place)
     away = []
     for _ in range(300):
-        noisy = replace(points, pixels=points.pixels + NOISE.pixel * rng.standard_normal((8, 2)))
+        noisy = replace(points, pixels=points.pixels + NOISE.control_sigma_px * rng.standard_normal((8, 2)))
         ground = solve_pose(truth.camera, noisy, NOISE).ground
         away.append((ground.places(pixel + 0.3 * rng.standard_normal((1, 2)), 0.0) - place[:, :2])[0])
     fit = solve_pose(truth.camera, points, NOISE)
@@ -88,15 +87,15 @@ def test_a_wrong_point_is_named() -> None:
     points = floor_points(truth, rng, 8)
     points.pixels[3] += [25.0, -10.0]
     fit = solve_pose(truth.camera, points, NOISE)
-    assert "control point p3 lies 26.9 px from where all others put it" in misfit(fit, points, NOISE, 4.0)
+    assert "control point p3 lies 26.9 px from where all others put it" in misfit(fit, points, NOISE)
 
 
 def test_points_that_fit_are_fine() -> None:
     rng = np.random.default_rng(6)
     truth = over_floor(LENSES["straight"], rng)
     points = floor_points(truth, rng, 12)
-    points.pixels[:] += NOISE.pixel * rng.standard_normal((12, 2))
-    assert not misfit(solve_pose(truth.camera, points, NOISE), points, NOISE, 4.0)
+    points.pixels[:] += NOISE.control_sigma_px * rng.standard_normal((12, 2))
+    assert not misfit(solve_pose(truth.camera, points, NOISE), points, NOISE)
 
 
 SQUARE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])

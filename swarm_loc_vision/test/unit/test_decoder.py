@@ -22,7 +22,7 @@ from swarm_loc_vision.markers.families import BITS, Family, family_named, rotate
 
 INK, PAPER = 40.0, 200.0
 BCH = family_named("artoolkit_bch_thin")
-ALL_BCH = Dictionary([(BCH, np.arange(4096))])
+ALL_BCH = Dictionary({BCH: np.arange(4096)})
 
 
 def cells_of(patterns: NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -73,7 +73,7 @@ def test_uneven_light_and_noise_do_not_matter() -> None:
 def test_flipped_bits_are_corrected_as_far_as_is_safe(marker_id: int, flipped: set[int]) -> None:
     family = family_named("aruco_mip_36h12")
     used = np.arange(20)
-    dictionary = Dictionary([(family, used)])
+    dictionary = Dictionary({family: used})
     marker_id %= 20
     pattern = patterns_of(family, np.array([marker_id]))
     pattern.reshape(-1)[sorted(flipped)] ^= 1
@@ -96,7 +96,7 @@ def test_flipped_bits_are_corrected_as_far_as_is_safe(marker_id: int, flipped: s
 
 def test_of_a_single_id_the_margin_is_to_itself_turned() -> None:
     family, used = family_named("aruco_mip_36h12"), np.array([7])
-    readings = Dictionary([(family, used)]).read(cells_of(patterns_of(family, used)), 10.0)
+    readings = Dictionary({family: used}).read(cells_of(patterns_of(family, used)), 10.0)
     assert 0.25 * bits_apart(family, used, used) < readings.margin <= 0.5 * bits_apart(family, used, used)
 
 
@@ -112,14 +112,14 @@ def test_fewer_ids_in_use_let_more_bits_be_corrected() -> None:
 @pytest.mark.parametrize(("name", "count"), [("artoolkit_bch_thin", 4096), ("aruco_mip_36h12", 250)])
 def test_random_squares_are_not_read(name: str, count: int) -> None:
     rng = np.random.default_rng(1)
-    dictionary = Dictionary([(family_named(name), np.arange(count))])
+    dictionary = Dictionary({family_named(name): np.arange(count)})
     patterns = rng.integers(0, 2, (20_000, 6, 6)).astype(np.uint8)
     readings = dictionary.read(cells_of(patterns), 10.0)
     assert (readings.word >= 0).sum() <= 2  # 0.2 are expected
 
 
 def test_other_ids_than_those_in_use_are_not_read() -> None:
-    dictionary = Dictionary([(BCH, np.array([5, 9]))])
+    dictionary = Dictionary({BCH: np.array([5, 9])})
     readings = dictionary.read(cells_of(patterns_of(BCH, np.array([5, 6, 9, 4000]))), 10.0)
     assert [dictionary.ids[w] if w >= 0 else None for w in readings.word] == [5, None, 9, None]
 

@@ -20,11 +20,9 @@ from bench.vision.peers import own_detector
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, random_scene
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE, CONTENT_POSE_TWO
 from swarm_loc_vision.common.camera import Camera
-from swarm_loc_vision.markers.detector import Detections, MarkerDetector
-from swarm_loc_vision.markers.detector_settings import DetectorSettings
-from swarm_loc_vision.markers.draw import draw_marker
-from swarm_loc_vision.markers.families import Family, family_named, packed
-from swarm_loc_vision.markers.rows import detection_rows
+from swarm_loc_vision.markers.camera_detector import detection_rows
+from swarm_loc_vision.markers.detector import Detections, DetectorSettings, MarkerDetector
+from swarm_loc_vision.markers.families import Family, draw_marker, family_named, packed
 
 PHOTOS = Path(__file__).resolve().parents[4] / "shared" / "data" / "photos"
 Gray = NDArray[np.uint8]
@@ -84,7 +82,7 @@ def test_a_distorting_lens_does_not_matter() -> None:
     source = camera.to_ideal(np.stack([u, v], axis=2)).astype(np.float32)
     raw = np.asarray(cv2.remap(ideal, source[..., 0], source[..., 1], cv2.INTER_CUBIC), np.uint8)
     lengths = {truth.marker_id: truth.length for truth in truths}
-    detections = MarkerDetector(DetectorSettings(), [(family, None)], camera, lengths=lengths).detect(raw)
+    detections = MarkerDetector(DetectorSettings(), {family: None}, camera, lengths=lengths).detect(raw)
     assert detections.poses is not None
     checked = 0
     for truth in truths:
@@ -101,7 +99,7 @@ def test_only_ids_in_use_are_found() -> None:
     family = family_named("artoolkit_bch_thin")
     image, truths = random_scene(np.random.default_rng(8), family, 12, Look())
     used = np.array([truths[0].marker_id, truths[1].marker_id])
-    detections = MarkerDetector(DetectorSettings(), [(family, used)]).detect(image)
+    detections = MarkerDetector(DetectorSettings(), {family: used}).detect(image)
     assert sorted(detections.id.tolist()) == sorted(used.tolist())
     assert detections.poses is None
 
@@ -234,7 +232,7 @@ def test_photographs(file: str) -> None:
     manifest = json.loads((PHOTOS / "manifest.json").read_text(encoding="utf-8"))
     (entry,) = [entry for entry in manifest if entry["file"] == file]
     image = np.asarray(cv2.imread(str(PHOTOS / file), cv2.IMREAD_GRAYSCALE), np.uint8)
-    detections = MarkerDetector(DetectorSettings(), [(photo_family(entry["dict"]), None)]).detect(image)
+    detections = MarkerDetector(DetectorSettings(), {photo_family(entry["dict"]): None}).detect(image)
     assert not Counter(entry["ids"]) - Counter(detections.id.tolist())
     assert set(detections.id.tolist()) <= set(entry["ids"])
     for marker_id, corners in entry.get("corners", {}).items():

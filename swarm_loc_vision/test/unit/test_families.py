@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from swarm_loc_vision.markers.draw import draw_marker
-from swarm_loc_vision.markers.families import families, family_named, packed, rotated
+from swarm_loc_vision.markers.families import draw_marker, families, family_named, packed, rotated
 
 BCH = family_named("artoolkit_bch_thin")
 

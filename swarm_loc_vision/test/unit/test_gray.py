@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swarm_loc_vision.common.gray import ImageError, Pixels, decoded_image, gray_image
+from swarm_loc_vision.common.images import Gray, ImageError, Pixels, decoded_image, gray_image
 
 WIDTH, HEIGHT = 14, 10
 SHADES = np.linspace(10, 240, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH).astype(np.uint8)
 COLOURS = np.stack([SHADES, SHADES[::-1], 255 - SHADES], axis=2)  # red, green, blue
 RGB_GRAY = cv2.cvtColor(COLOURS, cv2.COLOR_RGB2GRAY)
+
+
+def gray(
+    encoding: str, width: int, height: int, step: int, data: bytes, *, is_bigendian: bool = False
+) -> Gray:
+    fields = {"encoding": encoding, "width": width, "height": height, "step": step, "data": data}
+    return gray_image(SimpleNamespace(**fields, is_bigendian=is_bigendian))
+
+
+def decoded(how: str, data: object) -> Gray:
+    return decoded_image(SimpleNamespace(format=how, data=data))
 
 
 def wide(order: str) -> NDArray[np.uint8]:
@@ -36,28 +49,28 @@ def test_encodings(encoding: str, data: NDArray[np.uint8], expected: NDArray[np.
     rows = np.ascontiguousarray(data).reshape(HEIGHT, -1)
     padded = np.pad(rows, ((0, 0), (0, 5)))  # cameras may leave bytes at the end of rows
     for image in (rows, padded):
-        gray = gray_image(encoding, WIDTH, HEIGHT, image.shape[1], image.tobytes())
-        assert (gray == expected).all()
-        assert gray.flags.writeable
-        assert gray.flags.c_contiguous
+        shown = gray(encoding, WIDTH, HEIGHT, image.shape[1], image.tobytes())
+        assert (shown == expected).all()
+        assert shown.flags.writeable
+        assert shown.flags.c_contiguous
 
 
 def test_big_endian() -> None:
-    gray = gray_image("mono16", WIDTH, HEIGHT, 2 * WIDTH, wide(">").tobytes(), is_bigendian=True)
-    assert (gray == SHADES).all()
+    shown = gray("mono16", WIDTH, HEIGHT, 2 * WIDTH, wide(">").tobytes(), is_bigendian=True)
+    assert (shown == SHADES).all()
 
 
 @pytest.mark.parametrize("bits", [8, 10, 12, 16])
 def test_16_bit_images_show_the_highest_bits_that_any_pixel_uses(bits: int) -> None:
     pixels = (SHADES.astype(np.uint32) << bits >> 8).astype("<u2")
-    assert (gray_image("mono16", WIDTH, HEIGHT, 2 * WIDTH, pixels.tobytes()) == SHADES).all()
-    assert (decoded_image("mono16; png compressed", file_of(pixels, ".png")) == SHADES).all()
+    assert (gray("mono16", WIDTH, HEIGHT, 2 * WIDTH, pixels.tobytes()) == SHADES).all()
+    assert (decoded("mono16; png compressed", file_of(pixels, ".png")) == SHADES).all()
 
 
 def test_bayer_of_a_gray_scene_is_gray() -> None:
     flat = np.full((HEIGHT, WIDTH), 99, np.uint8)
     for encoding in ("bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"):
-        assert (gray_image(encoding, WIDTH, HEIGHT, WIDTH, flat.tobytes()) == 99).all()
+        assert (gray(encoding, WIDTH, HEIGHT, WIDTH, flat.tobytes()) == 99).all()
 
 
 @pytest.mark.parametrize(
@@ -73,7 +86,7 @@ def test_bayer_of_a_gray_scene_is_gray() -> None:
 )
 def test_what_is_no_image_is_refused(encoding: str, width: int, step: int, size: int, reason: str) -> None:
     with pytest.raises(ImageError) as caught:
-        gray_image(encoding, width, HEIGHT, step, bytes(size))
+        gray(encoding, width, HEIGHT, step, bytes(size))
     assert caught.value.reason == reason
 
 
@@ -98,18 +111,18 @@ def test_compressed_images(
 ) -> None:
     data = file_of(np.ascontiguousarray(pixels), suffix)
     for padded in (data, data + bytes(7)):  # cameras may send more bytes than the image has
-        gray = decoded_image(how, np.frombuffer(padded, np.uint8))
-        assert gray.shape == SHADES.shape
-        assert np.abs(gray.astype(int) - expected).max() <= tolerance
-        assert gray.flags.writeable
-        assert gray.flags.c_contiguous
+        shown = decoded(how, np.frombuffer(padded, np.uint8))
+        assert shown.shape == SHADES.shape
+        assert np.abs(shown.astype(int) - expected).max() <= tolerance
+        assert shown.flags.writeable
+        assert shown.flags.c_contiguous
 
 
 def test_an_image_is_not_turned_by_what_its_exif_says() -> None:
     turned = bytes.fromhex("45786966000049492a00080000000100120103000100000006000000000000000000")
     data = file_of(SHADES, ".jpg")
     data = data[:2] + b"\xff\xe1" + (len(turned) + 2).to_bytes(2, "big") + turned + data[2:]
-    assert decoded_image("jpeg", data).shape == SHADES.shape
+    assert decoded("jpeg", data).shape == SHADES.shape
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
@@ -118,7 +131,7 @@ def test_a_compressed_image_cut_off_anywhere_is_refused(suffix: str) -> None:
     end = data.rfind(b"IEND") if suffix == ".png" else len(data) - 1
     for length in range(0, end, 3):
         with pytest.raises(ImageError) as caught:
-            decoded_image(suffix, data[:length])
+            decoded(suffix, data[:length])
         assert caught.value.reason == "corrupt"
 
 
@@ -136,5 +149,5 @@ def test_a_compressed_image_cut_off_anywhere_is_refused(suffix: str) -> None:
 )
 def test_what_is_no_compressed_image_is_refused(how: str, data: bytes, reason: str) -> None:
     with pytest.raises(ImageError) as caught:
-        decoded_image(how, data)
+        decoded(how, data)
     assert caught.value.reason == reason

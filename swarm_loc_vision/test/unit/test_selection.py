@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import pytest
 
-from swarm_loc_vision.markers.selection import SelectionError, parse_ids, parse_lengths
+from swarm_loc_estimator.common.parameters import ParameterError
+from swarm_loc_vision.markers.parameters import parse_ids, parse_lengths
 
 
 def test_ids() -> None:
-    assert parse_ids(["7", "0-2", " 2-3 "], 10).tolist() == [0, 1, 2, 3, 7]
-    assert parse_ids([], 10).tolist() == []
+    assert parse_ids("ids", ["7", "0-2", " 2-3 "], 10).tolist() == [0, 1, 2, 3, 7]
+    assert parse_ids("ids", [], 10).tolist() == []
 
 
 @pytest.mark.parametrize("text", ["", "a", "-1", "3-", "5-3", "10", "0-10", "1.5"])
 def test_what_is_no_id_is_refused(text: str) -> None:
-    with pytest.raises(SelectionError):
-        parse_ids([text], 10)
+    with pytest.raises(ParameterError):
+        parse_ids("ids", [text], 10)
 
 
 def test_lengths() -> None:
@@ -24,5 +25,5 @@ def test_lengths() -> None:
 
 @pytest.mark.parametrize("text", ["1", "1:", "1:0", "1:-0.1", "1:11", "10:0.1", ":0.1", "1:0.1m"])
 def test_what_is_no_length_is_refused(text: str) -> None:
-    with pytest.raises(SelectionError):
+    with pytest.raises(ParameterError):
         parse_lengths([text], 10)

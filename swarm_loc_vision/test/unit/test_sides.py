@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.common.camera import Camera
-from swarm_loc_vision.common.lens import LENS_SIZE
+from swarm_loc_vision.common.camera import LENS_SIZE, Camera
 from swarm_loc_vision.markers.decoder import Dictionary
 from swarm_loc_vision.markers.edges import Corners, refine, refine_read
 from swarm_loc_vision.markers.families import family_named
@@ -26,7 +25,7 @@ STRAIGHT = np.zeros(LENS_SIZE)
 
 
 def strips(marker_id: int) -> NDArray[np.uint8]:
-    return Dictionary([(FAMILY, np.array([marker_id]))]).strips
+    return Dictionary({FAMILY: np.array([marker_id])}).strips
 
 
 def shares(begin: float, cell: float, blur: float, motion: float, cover: float = 0.0) -> FloatArray:

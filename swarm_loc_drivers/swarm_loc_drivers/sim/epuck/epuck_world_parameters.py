@@ -17,7 +17,7 @@ from swarm_loc_estimator.common.number_spec import number
 from swarm_loc_estimator.common.parameters import ParameterError, choice, text
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_vision.aerial.ground.floor_markers import FloorMarker
+from swarm_loc_vision.aerial.ground_control import FloorMarker
 from swarm_loc_vision.aerial.ground_file import load_ground
 from swarm_loc_vision.markers.families import families
 

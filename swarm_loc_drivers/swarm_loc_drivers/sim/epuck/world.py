@@ -23,7 +23,7 @@ from swarm_loc_drivers.sim.run import Trajectories
 from swarm_loc_drivers.sim.worlds import ErrorModel, WorldError, hidden_geometry, start_of
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_vision.aerial.ground.floor_markers import FloorMarker
+from swarm_loc_vision.aerial.ground_control import FloorMarker
 
 _LARGEST = 4095
 _NOISE = 6.0

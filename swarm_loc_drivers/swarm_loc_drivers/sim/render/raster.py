@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_vision.common.lens import CX, CY, FX, FY, LENS_KIND, LENS_SIZE, STRAIGHT, distorted
+from swarm_loc_vision.common.camera import CX, CY, FX, FY, LENS_KIND, LENS_SIZE, STRAIGHT, distorted
 
 Image = NDArray[np.float32]
 Changes = NDArray[np.float32]

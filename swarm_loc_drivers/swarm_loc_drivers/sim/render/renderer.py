@@ -27,7 +27,7 @@ from swarm_loc_drivers.sim.render.scene import ROOM
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import CameraMount
-from swarm_loc_vision.common.lens import CX, CY, FX
+from swarm_loc_vision.common.camera import CX, CY, FX
 
 STEP_PX = 1.0
 """An image is drawn at as many instants of its exposure as keep the motion between them below this."""

@@ -14,8 +14,7 @@ from swarm_loc_drivers.sim.run import SIGHTING_DTYPE, SimulatedRun
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, EightSettings, camera_exposures, drive_eight
 from swarm_loc_drivers.sim.sightings import deliver
 from swarm_loc_drivers.sim.worlds import HiddenGeometry, hidden_geometry
-from swarm_loc_vision.aerial.ground.floor_markers import FloorMarker
-from swarm_loc_vision.aerial.ground.ground_control import Ground
+from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground
 from swarm_loc_vision.markers.families import family_named
 
 FAMILY = "artoolkit_bch_thin"

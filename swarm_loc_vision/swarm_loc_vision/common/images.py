@@ -1,4 +1,4 @@
-"""Convert images of any encoding or compression to 8-bit gray."""
+"""Images as ROS messages: any encoding or compression is read as 8-bit gray."""
 
 from __future__ import annotations
 
@@ -103,26 +103,17 @@ _COMPRESSED_DEPTH = "compressedDepth"
 """Of image_transport's formats the one whose bytes are no plain image."""
 
 
-def gray_image(
-    encoding: str, width: int, height: int, step: int, data: object, *, is_bigendian: bool = False
-) -> Gray:
-    """An image (height, width) of brightness.
-
-    Args:
-        encoding: Of sensor_msgs/Image.
-        width: Of the image [px].
-        height: Likewise.
-        step: Bytes from row to row.
-        data: The bytes.
-        is_bigendian: Byte order of 16-bit pixels.
+def gray_image(message: Any) -> Gray:
+    """The brightness (height, width) of a sensor_msgs/Image.
 
     Raises:
         ImageError: Unknown encoding (`encoding`), or the bytes are not those of such an image (`size`).
     """
+    encoding, width, height, step = message.encoding, message.width, message.height, message.step
     known = _ENCODINGS.get(encoding)
     if known is None:
         raise ImageError("encoding", f"the encoding '{encoding}' is not one of {', '.join(_ENCODINGS)}.")
-    raw = np.frombuffer(data, np.uint8)  # type: ignore[call-overload] # whatever has a buffer
+    raw = np.frombuffer(message.data, np.uint8)
     row = width * known.channels * known.bytes_per_channel
     if width < 1 or height < 1 or step < row or raw.size < step * (height - 1) + row:
         raise ImageError(
@@ -132,25 +123,22 @@ def gray_image(
     rows = np.lib.stride_tricks.as_strided(raw, (height, row), (step, 1))
     pixels: Pixels = np.ascontiguousarray(rows)
     if known.bytes_per_channel == 2:
-        pixels = pixels.view(">u2" if is_bigendian else "<u2")
+        pixels = pixels.view(">u2" if message.is_bigendian else "<u2")
     gray = np.ascontiguousarray(known.to_gray(pixels.reshape(height, width, known.channels)), np.uint8)
     return gray if gray.flags.writeable else gray.copy()  # read-only ones would be compiled for once more
 
 
-def decoded_image(how: str, data: object) -> Gray:
-    """A compressed image as brightness (height, width), as it lies in the file: not turned by its EXIF.
-
-    Args:
-        how: `format` of sensor_msgs/CompressedImage, such as `jpeg` or `bgr8; jpeg compressed bgr8`.
-        data: The bytes.
+def decoded_image(message: Any) -> Gray:
+    """The brightness (height, width) of a sensor_msgs/CompressedImage; an EXIF orientation is ignored.
 
     Raises:
         ImageError: The format is unknown (`encoding`), or the bytes are no whole image of it (`corrupt`).
     """
+    how = message.format
     known = next((_COMPRESSIONS[name] for name in _COMPRESSIONS if name in how.lower()), None)
     if known is None or _COMPRESSED_DEPTH in how:
         raise ImageError("encoding", f"the format '{how}' is not one of {', '.join(_COMPRESSIONS)}.")
-    raw = np.frombuffer(data, np.uint8)  # type: ignore[call-overload] # whatever has a buffer
+    raw = np.frombuffer(message.data, np.uint8)
     gray = _decoded(raw) if known.is_whole(raw.tobytes()) else None
     if gray is None:
         raise ImageError("corrupt", f"{raw.size} bytes are no whole image in '{known.name}'.")
@@ -163,3 +151,25 @@ def _decoded(raw: NDArray[np.uint8]) -> MatLike | None:
         return cv2.imdecode(raw, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         return None
+
+
+@dataclass(frozen=True)
+class Transport:
+    """A way that images come, as image_transport has it.
+
+    Attributes:
+        suffix: Of the topic, behind that of the images as they are.
+        message_type: Of its messages.
+        gray_of: Reads one of them.
+    """
+
+    suffix: str
+    message_type: str
+    gray_of: Callable[[Any], Gray]
+
+
+TRANSPORTS = {
+    "raw": Transport("", "sensor_msgs/msg/Image", gray_image),
+    "compressed": Transport("/compressed", "sensor_msgs/msg/CompressedImage", decoded_image),
+}
+"""By the names of image_transport."""

@@ -1,13 +1,20 @@
-"""Numerical settings of the aerial detector."""
+"""Parameters of `aerial_camera_node`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_estimator.common.parameters import choice, text
+from swarm_loc_vision.common.images import TRANSPORTS
+
+BRIGHT, DARK = 1.0, -1.0
+"""Polarities of discs: brighter or darker than the floor."""
+POLARITIES = {"auto": (BRIGHT, DARK), "bright": (BRIGHT,), "dark": (DARK,)}
+"""The polarities that are tried, by the value of the parameter."""
 
 
 @dataclass(frozen=True)
@@ -51,3 +58,17 @@ class AerialSettings:
     def region(self) -> tuple[FloatArray, FloatArray]:
         """Lower and upper x and y (2,) between which robots are looked for [m]."""
         return np.array([self.x_min, self.y_min]), np.array([self.x_max, self.y_max])
+
+
+@dataclass(frozen=True)
+class AerialParameters:
+    """Parameters of `aerial_camera_node`; those of the detector itself are its settings."""
+
+    image_transport: str = choice("raw", tuple(TRANSPORTS), "how images come: as they are, or as JPEG or PNG")
+    control_points_file: str = text(
+        "", "path of the control points, floor markers and intrinsics; empty: none, and nothing is published"
+    )
+    polarity: str = choice(
+        "auto", tuple(POLARITIES), "whether robots are brighter or darker than the floor; auto: as clearer"
+    )
+    settings: AerialSettings = field(default_factory=AerialSettings, metadata={"numbers_of": AerialSettings})

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.parameters import ParameterError, choice, text, texts
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.common.camera import Camera
-from swarm_loc_vision.common.transports import TRANSPORTS
+from swarm_loc_vision.common.images import TRANSPORTS
 from swarm_loc_vision.markers.bodies import robot_body, up_of
 from swarm_loc_vision.markers.camera_detector import CreateDetector
-from swarm_loc_vision.markers.detector import MarkerDetector
-from swarm_loc_vision.markers.detector_settings import DetectorSettings
+from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import Family, families, family_named
-from swarm_loc_vision.markers.selection import SelectionError, parse_ids, parse_lengths
+
+_IDS = re.compile(r"(\d+)(?:-(\d+))?")
+_LENGTH = re.compile(r"(\d+)(?:-(\d+))?:(\d*\.?\d+)")
+_LONGEST_M = 10.0
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ def detector_maker(parameters: DetectorParameters) -> CreateDetector:
 
     def create(camera: Camera) -> MarkerDetector:
         return MarkerDetector(
-            parameters.settings, [(family, ids)], camera, lengths=lengths, up=up, bodies=bodies
+            parameters.settings, {family: ids}, camera, lengths=lengths, up=up, bodies=bodies
         )
 
     return create
@@ -81,8 +84,7 @@ def _ids(parameters: DetectorParameters, swarm: Swarm, family: Family) -> IntArr
     """The ids in use; None: all."""
     count = len(family.words)
     if parameters.ids:
-        ids: IntArray = _selected("ids", parameters.ids, parse_ids, count)
-        return ids
+        return parse_ids("ids", parameters.ids, count)
     if not swarm.owner_of:
         return None
     unknown = [marker_id for marker_id in swarm.owner_of if marker_id >= count]
@@ -102,13 +104,54 @@ def _lengths(parameters: DetectorParameters, swarm: Swarm, family: Family) -> di
         )
     if parameters.swarm_file:
         return {marker_id: owner.marker.size for marker_id, owner in swarm.owner_of.items()}
-    lengths: dict[int, float] = _selected("lengths", parameters.lengths, parse_lengths, len(family.words))
+    return parse_lengths(parameters.lengths, len(family.words))
+
+
+def parse_ids(name: str, selected: Sequence[str], count: int) -> NDArray[np.int64]:
+    """Ids (N,), ascending.
+
+    Args:
+        name: Parameter, for errors.
+        selected: Ids or ranges, such as 5 or 0-31.
+        count: Ids that there are.
+
+    Raises:
+        ParameterError: A text is not one, or an id does not exist.
+    """
+    chosen: set[int] = set()
+    for one in selected:
+        match = _IDS.fullmatch(one.strip())
+        if match is None:
+            raise ParameterError(
+                f"parameter {name}: '{one}' must be an id such as 5 or a range such as 0-31."
+            )
+        first, last = int(match[1]), int(match[2] or match[1])
+        if not first <= last < count:
+            raise ParameterError(f"parameter {name}: '{one}' must ascend within 0-{count - 1}.")
+        chosen.update(range(first, last + 1))
+    return np.array(sorted(chosen), np.int64)
+
+
+def parse_lengths(selected: Sequence[str], count: int) -> dict[int, float]:
+    """Marker id -> side [m].
+
+    Args:
+        selected: Each an id or a range, a colon, and a length in metres.
+        count: Ids that there are.
+
+    Raises:
+        ParameterError: A text is not one, an id does not exist, or a length is out of range.
+    """
+    lengths: dict[int, float] = {}
+    for one in selected:
+        match = _LENGTH.fullmatch(one.strip())
+        if match is None:
+            raise ParameterError(
+                f"parameter lengths: '{one}' must be ids and a length in metres, such as 100-119:0.08."
+            )
+        length = float(match[3])
+        if not 0.0 < length <= _LONGEST_M:
+            raise ParameterError(f"parameter lengths: '{one}' must give a length in (0, {_LONGEST_M:g}] m.")
+        ids = one.partition(":")[0]
+        lengths.update(dict.fromkeys(parse_ids("lengths", [ids], count).tolist(), length))
     return lengths
-
-
-def _selected(name: str, values: tuple[str, ...], parse: Callable[..., Any], count: int) -> Any:
-    """A list of texts, parsed."""
-    try:
-        return parse(values, count)
-    except SelectionError as error:
-        raise ParameterError(f"parameter {name}: {error}") from error

@@ -10,13 +10,14 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.aerial.ground.ground_camera import (
+from swarm_loc_vision.aerial.ground_camera import (
     POSE_SIZE,
     GroundCamera,
     pose_slopes,
     projected,
     rotation_of,
 )
+from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.common.camera import Camera
 
 MIN_POINTS = 4
@@ -60,19 +61,6 @@ class ControlPoints:
 
 
 NO_POINTS = ControlPoints((), np.zeros((0, 3)), np.zeros((0, 2)))
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Of control points, one standard deviation each.
-
-    Attributes:
-        pixel: Of their pixels [px].
-        place: Of their places, along each axis [m].
-    """
-
-    pixel: float
-    place: float
 
 
 @dataclass(frozen=True)
@@ -132,7 +120,7 @@ def _spread(values: FloatArray) -> float:
     return float(sizes[1] / sizes[0]) if sizes[0] > 0.0 else 0.0
 
 
-def solve_pose(camera: Camera, points: ControlPoints, noise: Noise) -> PoseFit:
+def solve_pose(camera: Camera, points: ControlPoints, settings: AerialSettings) -> PoseFit:
     """The pose that explains the points best: a homography or PnP first, then least squares in raw pixels.
 
     The covariance is that of least squares, grown by the residuals where they are larger than the noise
@@ -143,7 +131,7 @@ def solve_pose(camera: Camera, points: ControlPoints, noise: Noise) -> PoseFit:
     """
     check_points(points)
     guess = _guess(camera, points)
-    sigma = _sigmas(camera, guess, points, noise)
+    sigma = _sigmas(camera, guess, points, settings)
 
     def deviations(pose: FloatArray) -> FloatArray:
         away = (projected(camera, pose, points.places) - points.pixels) / sigma[:, None]
@@ -193,11 +181,11 @@ def _guess(camera: Camera, points: ControlPoints) -> FloatArray:
     return best
 
 
-def _sigmas(camera: Camera, pose: FloatArray, points: ControlPoints, noise: Noise) -> FloatArray:
+def _sigmas(camera: Camera, pose: FloatArray, points: ControlPoints, settings: AerialSettings) -> FloatArray:
     """(N,) noise of each point as the image shows it [px]."""
     depth = (points.places @ rotation_of(pose).T + pose[3:])[:, 2]
-    of_place = noise.place * camera.fx / np.maximum(depth, 1e-3)
-    return np.asarray(np.hypot(noise.pixel, of_place))
+    of_place = settings.control_sigma * camera.fx / np.maximum(depth, 1e-3)
+    return np.asarray(np.hypot(settings.control_sigma_px, of_place))
 
 
 def _covariance(
@@ -217,13 +205,13 @@ def _covariance(
     return np.asarray(growth * np.linalg.inv(even) / np.outer(scale, scale))
 
 
-def misfit(fit: PoseFit, points: ControlPoints, noise: Noise, limit: float) -> str:
+def misfit(fit: PoseFit, points: ControlPoints, settings: AerialSettings) -> str:
     """What is wrong with the points of a fit, a sentence; empty: nothing.
 
     Where leaving one point out lets all the others agree, that one is named; otherwise the worst one.
     """
     worst = int(np.argmax(fit.deviations))
-    if fit.deviations[worst] <= limit:
+    if fit.deviations[worst] <= settings.max_residual:
         return ""
     for suspect in np.argsort(-fit.deviations).tolist():
         rest = ControlPoints(
@@ -232,10 +220,10 @@ def misfit(fit: PoseFit, points: ControlPoints, noise: Noise, limit: float) -> s
             np.delete(points.pixels, suspect, axis=0),
         )
         try:
-            without = solve_pose(fit.ground.camera, rest, noise)
+            without = solve_pose(fit.ground.camera, rest, settings)
         except ControlPointError:
             continue
-        if len(rest) > MIN_POINTS and without.deviations.max() <= limit:
+        if len(rest) > MIN_POINTS and without.deviations.max() <= settings.max_residual:
             away = projected(fit.ground.camera, without.ground.pose, points.places[suspect])
             distance = float(np.linalg.norm(away - points.pixels[suspect]))
             return (

@@ -1,0 +1,183 @@
+"""Pose of an overhead camera from given points and floor markers, kept while it holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_vision.aerial.control_points import (
+    MIN_POINTS,
+    NO_POINTS,
+    ControlPointError,
+    ControlPoints,
+    PoseFit,
+    misfit,
+    solve_pose,
+)
+from swarm_loc_vision.aerial.ground_camera import GroundCamera
+from swarm_loc_vision.aerial.parameters import AerialSettings
+from swarm_loc_vision.common.camera import Camera
+from swarm_loc_vision.common.images import Gray
+from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
+from swarm_loc_vision.markers.families import Family, family_named
+
+_UNIT_CORNERS = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
+"""Clockwise from a marker's upper left, x right and y up as seen by one who faces it."""
+_CORNER_NAMES = ("upper left", "upper right", "lower right", "lower left")
+
+
+@dataclass(frozen=True)
+class FloorMarker:
+    """A marker that lies on the floor, or level above it, and looks up."""
+
+    id: int
+    x: float = number(0.0, "m", -1e4, 1e4, "its centre in map")
+    y: float = number(0.0, "m", -1e4, 1e4, "likewise")
+    z: float = number(0.0, "m", -10.0, 10.0, "likewise")
+    yaw: float = number(0.0, "rad", -6.3, 6.3, "to its own right, from map's x")
+    size: float = number(0.1, "m", 0.001, 10.0, "side of its black square")
+
+    @property
+    def corners(self) -> FloatArray:
+        """(4, 3) in map [m], clockwise from its own upper left."""
+        cos, sin = np.cos(self.yaw), np.sin(self.yaw)
+        flat = self.size * _UNIT_CORNERS @ np.array([[cos, sin], [-sin, cos]]) + [self.x, self.y]
+        return np.concatenate([flat, np.full((4, 1), self.z)], axis=1)
+
+
+class FloorMarkers:
+    """Finds floor markers, and means their corners over the images of a camera that stands still.
+
+    Args:
+        markers: Those that there are.
+        family: Their kind.
+        camera: What takes the images.
+    """
+
+    def __init__(self, markers: Sequence[FloorMarker], family: Family, camera: Camera) -> None:
+        self._markers = {marker.id: marker for marker in markers}
+        ids = np.array(sorted(self._markers), np.int64)
+        self._detector = MarkerDetector(DetectorSettings(), {family: ids}, camera)
+        self._sums: dict[int, FloatArray] = {}
+        self._counts: dict[int, int] = {}
+
+    def look(self, gray: Gray) -> ControlPoints:
+        """Control points by one image (height, width), which counts for the mean, too."""
+        found = self._detector.detect(gray)
+        seen = dict(zip(found.id.tolist(), found.corners, strict=True))
+        for marker_id, corners in seen.items():
+            self._sums[marker_id] = self._sums.get(marker_id, np.zeros((4, 2))) + corners
+            self._counts[marker_id] = self._counts.get(marker_id, 0) + 1
+        return self._points(seen)
+
+    def mean(self) -> ControlPoints:
+        """Control points by all images so far."""
+        return self._points({i: self._sums[i] / self._counts[i] for i in self._sums})
+
+    def _points(self, corners: Mapping[int, FloatArray]) -> ControlPoints:
+        """The corners (4, 2) of markers as control points."""
+        return ControlPoints(
+            [f"{corner} of marker {marker_id}" for marker_id in corners for corner in _CORNER_NAMES],
+            np.array([self._markers[marker_id].corners for marker_id in corners]).reshape(-1, 3),
+            np.array(list(corners.values())).reshape(-1, 2),
+        )
+
+    def forget(self) -> None:
+        """Begin anew: the camera has moved."""
+        self._sums.clear()
+        self._counts.clear()
+
+
+NO_GROUND = "there are neither control points nor floor markers, without which nothing is published."
+_SETTLING, _LATER_EVERY = 10, 10
+"""Markers are looked for in so many first images, then in every so many-th: is the camera where it was?"""
+_MOVED = 3.0
+"""So many standard deviations of one point most of them are away when the camera has moved."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What is known of the floor.
+
+    Attributes:
+        points: Places whose pixels are known.
+        markers: Fiducials on the floor.
+        family: Their kind.
+        camera: Intrinsics; None: they come with the images.
+    """
+
+    points: ControlPoints = NO_POINTS
+    markers: tuple[FloorMarker, ...] = ()
+    family: Family = field(default_factory=lambda: family_named("aruco_mip_36h12"))
+    camera: Camera | None = None
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing to tell a camera's pose by."""
+        return not self.points.names and not self.markers
+
+
+class GroundControl:
+    """Keeps the pose of one camera.
+
+    Args:
+        ground: What is known of the floor.
+        camera: What takes the images.
+        settings: Noise of the control points, and the limit of their residuals.
+
+    Attributes:
+        fit: The pose; None: not known.
+        trouble: Why it is not known, a sentence; empty: it is, or no image has come yet.
+        moves: How often the camera was found to have moved.
+    """
+
+    def __init__(self, ground: Ground, camera: Camera, settings: AerialSettings) -> None:
+        self._ground, self._camera, self._settings = ground, camera, settings
+        self._markers = FloorMarkers(ground.markers, ground.family, camera) if ground.markers else None
+        self._images = self.moves = 0
+        self.fit: PoseFit | None = None
+        self.trouble = NO_GROUND if ground.is_empty else ""
+        if len(ground.points) >= MIN_POINTS or (ground.points.names and not ground.markers):
+            self._solve(ground.points)
+
+    def look(self, gray: Gray) -> GroundCamera | None:
+        """The camera that took an image (height, width), with its pose; None: see `trouble`."""
+        if self._markers is not None:
+            self._look_at(self._markers, gray)
+        self._images += 1
+        return self.fit.ground if self.fit else None
+
+    def _look_at(self, markers: FloorMarkers, gray: Gray) -> None:
+        """Solve for the pose by the first images' markers, then watch whether they stay where they are."""
+        if self._images < _SETTLING:
+            markers.look(gray)
+            if self.fit is None or self._images == _SETTLING - 1:
+                self._solve(self._ground.points.joined(markers.mean()))
+        elif self.fit is None or self._images % _LATER_EVERY == 0:
+            seen = markers.look(gray)
+            if self.fit is None or self._has_moved(self.fit, seen):
+                self.moves += self.fit is not None
+                self._images = 0
+                markers.forget()
+                markers.look(gray)
+                self._solve(self._ground.points.joined(markers.mean()))
+
+    def _has_moved(self, fit: PoseFit, seen: ControlPoints) -> bool:
+        """Whether most of what is seen is no longer where it was."""
+        if not len(seen):
+            return False
+        away = np.linalg.norm(fit.ground.pixels(seen.places) - seen.pixels, axis=1)
+        return not np.median(away) <= _MOVED * np.hypot(self._settings.control_sigma_px, fit.rms_px)
+
+    def _solve(self, points: ControlPoints) -> None:
+        """The pose by points."""
+        try:
+            fit = solve_pose(self._camera, points, self._settings)
+            self.trouble = misfit(fit, points, self._settings)
+        except ControlPointError as error:
+            fit, self.trouble = None, str(error)
+        self.fit = None if self.trouble else fit
