@@ -1,1 +1,1 @@
-"""Fits of sensors, motion and noise to recordings with ground truth; no ROS."""
+"""Calibration of sensors, motion and noise from recordings with ground truth."""

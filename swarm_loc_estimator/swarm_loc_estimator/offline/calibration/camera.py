@@ -29,26 +29,26 @@ from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, SensorModel, Swa
 DENSE_GAP_NS = 200_000_000
 """Ground truth with longer gaps is not interpolated."""
 OFFSET_REACH_NS = 250_000_000
-"""A camera's time offset is looked for this far either way."""
+"""Largest time offset of a camera."""
 
 _SAME_NS = 3_000_000
 _SAME_VIEW_NS = 4_000_000_000
-"""CameraSightings of a marker err alike for about this long."""
+"""Errors of sightings of one marker are correlated for about this long."""
 _MAX_SIGHTINGS = 2000
 
 
 @dataclass(frozen=True)
 class CameraSightings:
-    """What one robot's camera saw where the ground truth is known, as logged: nothing of it is calibrated.
+    """Uncalibrated sightings of one robot's camera where the ground truth is known.
 
     Attributes:
         stamp_ns: (m,).
-        polar: (m,) whether range and bearing were logged, else forward, left and heading.
-        value: (m, 3) as logged, in the frame of a camera at base_link's origin.
+        polar: (m,) whether values are range and bearing, else forward, left and heading.
+        value: (m, 3) in the frame of a camera at the origin of base_link.
         marker_id: (m,).
-        marker: (m, 3) the marker in `map`, or in the target robot's base_link.
+        marker: (m, 3) pose of the marker in `map`, or in the base_link of the target robot.
         target: (m,) index of the target robot; -1 for a landmark.
-        lone: (m, 3) the observer's true pose where it is known at the stamp only, else NaN.
+        lone: (m, 3) true pose of the observer where it is known at the stamp only, else NaN.
     """
 
     stamp_ns: IntArray
@@ -64,13 +64,13 @@ class CameraSightings:
 
     @property
     def independent_share(self) -> float:
-        """How many of the sightings say something of their own, at most 1."""
+        """Share of independent sightings, at most 1."""
         views = np.unique(np.column_stack([self.marker_id, self.stamp_ns // _SAME_VIEW_NS]), axis=0)
         return len(views) / max(1, self.stamp_ns.size)
 
 
 def sightings_of(recording: Recording, swarm: Swarm, observer: int) -> CameraSightings:
-    """A robot's sightings where ground truth is known for it and the target, at most a few thousand."""
+    """A robot's sightings with ground truth of observer and target, at most `_MAX_SIGHTINGS`."""
     logged = _logged(recording, swarm, observer)
     truth = recording.truth.get(swarm.robots[observer].name)
     if truth is None:
@@ -80,7 +80,7 @@ def sightings_of(recording: Recording, swarm: Swarm, observer: int) -> CameraSig
         rows = logged.target == target
         other = recording.truth.get(swarm.robots[target].name)
         known[rows] &= other is not None and _dense_around(other, logged.stamp_ns[rows])
-    known &= np.isnan(lone[:, 0]) | (logged.target < 0)  # a lone pose does not say when the picture was taken
+    known &= np.isnan(lone[:, 0]) | (logged.target < 0)  # a lone pose gives no time of exposure
     rows = np.flatnonzero(known)
     return replace(logged, lone=lone)[rows[:: max(1, -(-rows.size // _MAX_SIGHTINGS))]]
 
@@ -93,15 +93,15 @@ def true_values(
     mount: FloatArray,
     offset_s: float,
 ) -> FloatArray:
-    """What each sighting should have been (m, 3): range and bearing, or forward, left and heading.
+    """True values of sightings (m, 3): range and bearing, or forward, left and heading.
 
     Args:
         sightings: Of the robot `observer`.
-        recording: With the ground truth.
-        swarm: Whose names the ground truth goes by.
+        recording: With ground truth.
+        swarm: The robots.
         observer: Index of the robot.
         mount: (3,) the camera's x [m], y [m], yaw [rad] in base_link.
-        offset_s: The pictures were taken this much after their stamps.
+        offset_s: From the stamps to the exposures.
     """
     stamp_ns = sightings.stamp_ns + round(offset_s * 1e9)
     own, _ = interpolate(recording.truth[swarm.robots[observer].name], stamp_ns, DENSE_GAP_NS)
@@ -125,7 +125,7 @@ def true_values(
 
 
 def _logged(recording: Recording, swarm: Swarm, observer: int) -> CameraSightings:
-    """All of a robot's sightings of known markers."""
+    """All sightings of known markers by a robot."""
     ideal = replace(swarm, robots=tuple(_ideal(robot) for robot in swarm.robots))
     rows = chosen(recording.detections, recording.detections.robot == observer)
     if not rows.robot.size:
@@ -146,15 +146,15 @@ def _logged(recording: Recording, swarm: Swarm, observer: int) -> CameraSighting
 
 
 def _ideal(robot: Robot) -> Robot:
-    """A robot whose sightings come out as logged; only the mount's tilt is taken out."""
+    """The robot with an ideal sensor and a camera at its origin; the mount's tilt and height are kept."""
     camera = robot.camera and CameraMount(z=robot.camera.z, pitch=robot.camera.pitch, roll=robot.camera.roll)
     return replace(robot, camera=camera, sensor=SensorModel())
 
 
 def _observer_known(truth: Trajectory, stamp_ns: IntArray) -> tuple[BoolArray, FloatArray]:
-    """Where the observer's pose is known (m,), and the poses (m, 3) that are known at the stamp only.
+    """Whether the observer's pose is known (m,), and the poses (m, 3) that are known at the stamp only.
 
-    A true pose that stands alone was found for the picture of that stamp, whenever it was taken.
+    An isolated true pose with the stamp of an image belongs to its exposure, whatever the time offset is.
     """
     lone = np.full((stamp_ns.size, 3), np.nan)
     known = _dense_around(truth, stamp_ns)
@@ -165,18 +165,18 @@ def _observer_known(truth: Trajectory, stamp_ns: IntArray) -> tuple[BoolArray, F
 
 
 def _dense_around(truth: Trajectory, stamp_ns: IntArray) -> BoolArray:
-    """Whether the ground truth is dense around stamps, wherever the time offset is looked for."""
+    """Whether the ground truth is dense around stamps, for all time offsets up to `OFFSET_REACH_NS`."""
     times = truth.stamp_ns
     first = np.searchsorted(times, stamp_ns - OFFSET_REACH_NS, side="right") - 1
     last = np.searchsorted(times, stamp_ns + OFFSET_REACH_NS, side="left")
     inside = (first >= 0) & (last < times.size)
-    gaps = np.concatenate([[0], np.cumsum(np.diff(times) > DENSE_GAP_NS)])  # long ones before each time
+    gaps = np.concatenate([[0], np.cumsum(np.diff(times) > DENSE_GAP_NS)])  # long gaps before each time
     known: BoolArray = inside & (gaps[np.minimum(last, times.size - 1)] == gaps[np.maximum(first, 0)])
     return known
 
 
 MIN_SIGHTINGS = 100
-"""Fewer sightings with ground truth do not calibrate a camera."""
+"""Sightings with ground truth needed to calibrate a camera."""
 
 _OF_CAMERA = ("x", "y", "yaw")
 _WIDE = {
@@ -193,24 +193,24 @@ _WIDE = {
     "bearing_curve": 0.1,
     "time_offset_s": 0.1,
 }
-"""How far a number may be from what the swarm description says, one standard deviation."""
+"""Standard deviations of the prior about the swarm description."""
 _POLAR = tuple(name for name in _WIDE if name != "yaw")
 _POSE = ("x", "y", "yaw", "time_offset_s")
 _FIRST_SPREAD = np.array([[0.1, 0.05, 1.0], [0.05, 0.05, 0.2]])
-"""To begin with, of polar sightings (range per metre, bearing) and of poses (forward, left, heading)."""
+"""Initial spread of polar sightings (range per metre, bearing) and of poses (forward, left, heading)."""
 _ROUNDS = 2
 
 
 @dataclass(frozen=True)
 class CameraFit:
-    """What became of one robot's camera.
+    """Calibration of one robot's camera.
 
     Attributes:
         robot: Calibrated.
-        count: CameraSightings used; 0 when there was too little to fit to.
+        count: Sightings used; 0 if there were too few.
         before: (m, 3) measured minus true: range [m] and bearing [rad], or forward, left [m], heading [rad].
-        after: (m, 3) likewise, calibrated.
-        sightings: What was used.
+        after: (m, 3) the same errors, calibrated.
+        sightings: All that were used.
     """
 
     robot: Robot
@@ -240,7 +240,7 @@ class _Camera:
         return self.sightings.stamp_ns.size >= MIN_SIGHTINGS
 
     def errors(self, values: FloatArray) -> FloatArray:
-        """Measured minus true (m, 3) with numbers (p,)."""
+        """Measured minus true (m, 3) with parameters (p,)."""
         calibrated = with_numbers(self.robot, values)
         camera, offset_s = calibrated.camera or CameraMount(), calibrated.sensor.time_offset_s
         mount = np.array([camera.x, camera.y, camera.yaw])
@@ -252,13 +252,13 @@ class _Camera:
         return error
 
     def in_sigmas(self, values: FloatArray) -> FloatArray:
-        """Errors (3 m,) by their spread, thinned to what is independent."""
+        """Errors (3 m,) in sigmas, weighted by the share of independent sightings."""
         error = self._relative(self.errors(values))
         error /= np.where(self.sightings.polar[:, None], self.spread[0], self.spread[1])
         return np.asarray(error * np.sqrt(self.sightings.independent_share)).ravel()
 
     def fit(self, mean: FloatArray, sigma: FloatArray) -> None:
-        """Fit all active numbers about a prior (p,); the spread of the errors is found along."""
+        """Fit all active parameters about a prior (p,), and the spread of the errors."""
         self.value, self.sigma = mean.copy(), sigma.copy()
         for _ in range(_ROUNDS):
 
@@ -279,13 +279,13 @@ class _Camera:
             )
 
     def _relative(self, error: FloatArray) -> FloatArray:
-        """Range errors per metre: far ranges err more."""
+        """Errors with those of ranges per metre, since they grow with the range."""
         per_metre = np.where(self.sightings.polar, np.maximum(self.sightings.value[:, 0], 0.1), 1.0)
         return np.column_stack([error[:, 0] / per_metre, error[:, 1:]])
 
 
 def fit_cameras(recording: Recording, swarm: Swarm, members: Sequence[int]) -> list[CameraFit]:
-    """Calibrate the cameras of the robots of one type; those with too little get the type's mean."""
+    """Calibrate the cameras of robots of one type; those with too few sightings get the mean of the type."""
     cameras = [
         _Camera(recording, swarm, index) for index in members if swarm.robots[index].camera is not None
     ]
@@ -297,7 +297,7 @@ def fit_cameras(recording: Recording, swarm: Swarm, members: Sequence[int]) -> l
     for camera in usable:
         camera.fit(numbers_of(camera.robot), wide)
     mean, sigma = population(np.array([c.value for c in usable]), np.array([c.sigma for c in usable]), wide)
-    sigma[[*_WIDE].index("time_offset_s")] = 1e-3  # one make of camera has one delay
+    sigma[[*_WIDE].index("time_offset_s")] = 1e-3  # cameras of one type have one delay
     result = []
     for camera, start in zip(cameras, starts, strict=True):
         if camera.usable:
@@ -316,7 +316,7 @@ def fit_cameras(recording: Recording, swarm: Swarm, members: Sequence[int]) -> l
 
 
 def calibrated_values(robot: Robot, sightings: CameraSightings) -> FloatArray:
-    """Logged values (m, 3) as the robot's sensor model reads them."""
+    """Logged values (m, 3) corrected by the robot's sensor model."""
     s = robot.sensor
     value: FloatArray = sightings.value.copy()
     rows = sightings.polar
@@ -329,13 +329,13 @@ def calibrated_values(robot: Robot, sightings: CameraSightings) -> FloatArray:
 
 
 def numbers_of(robot: Robot) -> FloatArray:
-    """The numbers that the fit may change (p,)."""
+    """The parameters of the fit (p,)."""
     camera = robot.camera or CameraMount()
     return np.array([getattr(camera if name in _OF_CAMERA else robot.sensor, name) for name in _WIDE])
 
 
 def with_numbers(robot: Robot, values: FloatArray) -> Robot:
-    """The robot with other numbers (p,)."""
+    """The robot with other parameters (p,)."""
     numbers = {name: float(value) for name, value in zip(_WIDE, values, strict=True)}
     reach_s = OFFSET_REACH_NS * 1e-9
     numbers["time_offset_s"] = min(reach_s, max(-reach_s, numbers["time_offset_s"]))

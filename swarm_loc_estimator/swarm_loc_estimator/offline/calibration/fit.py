@@ -1,7 +1,7 @@
 """Calibrate a swarm from a recording with ground truth: cameras, motion, and the noise that remains.
 
-The noise is fitted to errors that the calibration has not seen: each half of the recording is run with what
-the other half gave. So the covariances admit that a calibration is never quite right elsewhere.
+The noise is fitted to held-out data: each half of the recording is run with the calibration from the other
+half. So the covariances contain the errors of a calibration in other recordings.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ from swarm_loc_estimator.swarm.motion_response import MotionResponse
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
 
 EVALUATIONS = 80
-"""How often the estimator runs over the recording to fit the noise."""
+"""Runs of the estimator to fit the noise."""
 
 _MIN_WINDOWS = 50
 _CORRELATION = 2.7
-"""White noise that stands for errors that last is about so much larger than the scatter; a beginning."""
+"""Initial ratio of the white noise that represents correlated errors to their scatter."""
 _TICK_S = 0.5
 _FLOORS = {"wheel_noise": 0.0, "distance_drift": 1e-5, "lateral_drift": 1e-6, "range_sigma": 1e-3}
-"""Not fitted: the fitted terms say the same, these keep the covariance of a crawling robot positive."""
+"""Not fitted, since they duplicate fitted terms; they keep the covariance of a slow robot positive."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,9 @@ class Options:
     """What is fitted.
 
     Attributes:
-        plain: Only noise, no calibration.
-        response: Whether a table of shares may be fitted, else one share of speed and one of turn rate.
-        evaluations: How often the estimator may run to fit the noise.
+        plain: Whether only noise is fitted.
+        response: Whether a table of scale factors may be fitted, else one of speed and one of turn rate.
+        evaluations: Limit of runs of the estimator to fit the noise.
     """
 
     plain: bool = False
@@ -72,15 +72,15 @@ class Options:
 
 @dataclass(frozen=True)
 class DriveFit:
-    """What became of the motion of a type of robot.
+    """Calibrated motion of a type of robot.
 
     Attributes:
         members: Indices of its robots.
         drives: Those with dense ground truth.
         late: Delay and lag.
-        response: Shares; None when plain numbers were fitted.
+        response: Scale factors; None if only noise is fitted.
         before: (m, 2) errors of path [m] and turn [rad] of 5 s windows as reported.
-        after: (m, 2) calibrated.
+        after: (m, 2) the same errors, calibrated.
     """
 
     members: tuple[int, ...]
@@ -97,8 +97,8 @@ class FittedModels:
 
     Attributes:
         swarm: Calibrated.
-        cameras: By type, what became of the cameras.
-        motion: By type, what became of the motion.
+        cameras: Of all robots, ordered by type.
+        motion: One per type.
         remarks: What could not be fitted, one sentence each.
     """
 
@@ -110,14 +110,14 @@ class FittedModels:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Everything that a calibration gives.
+    """Result of a calibration.
 
     Attributes:
         swarm: Calibrated; robots start where they started before.
-        models: How it came about.
-        noise: The fitted noise by name.
-        before: How the estimator did on the recording, started at the true poses.
-        after: How it does now.
+        models: The fits behind it.
+        noise: Fitted noise parameters by name.
+        before: Score of the estimator on the recording, started at the true poses.
+        after: The same, calibrated.
     """
 
     swarm: Swarm
@@ -128,16 +128,16 @@ class Calibration:
 
 
 def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Progress) -> Calibration:
-    """Fit everything.
+    """Fit cameras, motion and noise.
 
     Args:
         recording: With ground truth of at least one robot.
-        swarm: As it is described so far.
+        swarm: The description to begin with.
         options: What is fitted.
         progress: Called now and then with the share done and what is being done.
 
     Raises:
-        CalibrationError: There is no ground truth, or too little of it, or the recording's clock was set.
+        CalibrationError: There is no or too little ground truth, or the clock of the recording jumps.
     """
     if not recording.truth:
         raise CalibrationError(
@@ -146,7 +146,7 @@ def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Pr
     if recording.longest_pause_ns > MAX_PAUSE_NS:
         raise CalibrationError(
             f"recording '{recording.name}' has a jump of {recording.longest_pause_ns / 3.6e12:.0f} h"
-            " in its times; a calibration needs a part of it without."
+            " in its times; calibrate from a part without it."
         )
     whole = fit_models(recording, swarm, options, progress)
     folds = _folds(recording, swarm, whole, options)
@@ -165,10 +165,10 @@ def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Pr
 
 
 def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: Progress) -> FittedModels:
-    """Fit sensors and motion type by type; with `plain` only look at the errors.
+    """Fit cameras and motion type by type; with `plain` only compute the errors.
 
     Raises:
-        CalibrationError: Nothing could be fitted to.
+        CalibrationError: There is too little ground truth.
     """
     robots = list(swarm.robots)
     cameras: list[CameraFit] = []
@@ -196,7 +196,7 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
     if not motion and not any(fit.count for fit in cameras):
         raise CalibrationError(
             f"recording '{recording.name}' holds too little ground truth together with odometry or sightings;"
-            " a minute of a moving robot that sees markers is the least."
+            " at least a minute of a moving robot that sees markers is needed."
         )
     return FittedModels(replace(swarm, robots=tuple(robots)), tuple(cameras), tuple(motion), tuple(remarks))
 
@@ -204,7 +204,7 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
 def _fit_drive(
     recording: Recording, swarm: Swarm, members: Sequence[int], options: Options
 ) -> DriveFit | None:
-    """The motion of a type; None without a robot whose ground truth is dense."""
+    """Fit the motion of a type; None without a robot with dense ground truth."""
     drives = []
     for index in members:
         track, truth = recording.track(index), recording.truth.get(swarm.robots[index].name)
@@ -226,7 +226,7 @@ def _fit_drive(
 
 
 def _with_motion(robot: Robot, drive: DriveFit) -> Robot:
-    """The robot with its type's delay, lag and shares."""
+    """The robot with the delay, lag and scale factors of its type."""
     late, response = drive.late, drive.response
     numbers = {
         "delay_s": round(late.delay_s, 4),
@@ -242,7 +242,7 @@ def _with_motion(robot: Robot, drive: DriveFit) -> Robot:
 
 
 def _folds(recording: Recording, swarm: Swarm, whole: FittedModels, options: Options) -> list[Fold]:
-    """Each half of the recording with the models of the other; where one gives none, of the whole."""
+    """Each half of the recording with the models of the other half; if that has too little, of the whole."""
     if options.plain:
         return [Fold(recording, started_at_truth(whole.swarm, recording))]
     first_ns, last_ns = recording.range_ns
@@ -259,7 +259,7 @@ def _folds(recording: Recording, swarm: Swarm, whole: FittedModels, options: Opt
 
 
 def _first_noise(models: FittedModels, *, plain: bool) -> dict[str, float]:
-    """Where the fit of noise begins: the scatter of sightings, half the errors of windows for each cause."""
+    """Initial noise parameters, from the scatter of sightings and the errors of motion windows."""
     polar = np.concatenate([fit.sightings.polar for fit in models.cameras] or [np.zeros(0, dtype=bool)])
     errors = [fit.before if plain else fit.after for fit in models.cameras]
     error = np.concatenate(errors or [np.zeros((0, 3))])
@@ -280,7 +280,7 @@ def _first_noise(models: FittedModels, *, plain: bool) -> dict[str, float]:
 
 
 def _first_motion_noise(motion: Sequence[DriveFit], *, plain: bool) -> dict[str, float]:
-    """Each cause explains a part of the mean squared errors of windows."""
+    """Initial noise of motion: each parameter explains a part of the mean squared errors of windows."""
     path = turn = seconds = path2 = turn2 = 0.0
     for fit in motion:
         for drive in fit.drives:
@@ -305,7 +305,7 @@ def _first_motion_noise(motion: Sequence[DriveFit], *, plain: bool) -> dict[str,
 def _remarks(
     swarm: Swarm, members: Sequence[int], fits: Sequence[CameraFit], drive: DriveFit | None
 ) -> list[str]:
-    """What could not be fitted."""
+    """One sentence for everything that could not be fitted."""
     poor = [fit.robot.name for fit in fits if not fit.count]
     remarks = [
         f"{name} has too few sightings with ground truth: it gets the mean of its type." for name in poor

@@ -20,7 +20,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.offline.calibration.camera import DENSE_GAP_NS
-from swarm_loc_estimator.offline.calibration.robust import ridge, spread
+from swarm_loc_estimator.offline.calibration.robust import ridge
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
 from swarm_loc_estimator.swarm.swarm import OdometryModel
 
@@ -30,7 +30,7 @@ _SETTLING_S = 5.0
 
 @dataclass(frozen=True)
 class Steps:
-    """Odometry as speeds: from one message to the next.
+    """Speeds between consecutive odometry messages.
 
     Attributes:
         stamp_ns: (n + 1,) of the messages.
@@ -47,7 +47,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class TrueMotion:
-    """A robot's true motion, gathered on an even grid.
+    """A robot's true motion, accumulated on a regular grid of time.
 
     Attributes:
         time_s: (g,) since the first odometry.
@@ -65,16 +65,16 @@ class TrueMotion:
 
 
 def steps_of(track: Trajectory, model: OdometryModel) -> Steps:
-    """The reported motion between messages; steps that the estimator would not believe stand still."""
+    """The reported motion between messages; zero for steps that the estimator would reject."""
     duration_s = np.maximum(np.diff(track.stamp_ns) * 1e-9, 1e-6)
     turn = se2.wrap_angle(np.diff(track.pose[:, 2]))
     middle = track.pose[:-1, 2] + 0.5 * turn
     dx, dy = np.diff(track.pose[:, :2], axis=0).T
     distance = np.cos(middle) * dx + np.sin(middle) * dy
-    believed = (duration_s <= model.timeout_s) & (
+    plausible = (duration_s <= model.timeout_s) & (
         np.hypot(dx, dy) <= model.max_speed * duration_s + 0.5 * model.wheel_separation
     )
-    zero = np.where(believed, 1.0 / duration_s, 0.0)
+    zero = np.where(plausible, 1.0 / duration_s, 0.0)
     return Steps(track.stamp_ns, distance * zero, turn * zero, duration_s)
 
 
@@ -92,7 +92,7 @@ def true_motion(truth: Trajectory, begin_ns: int, end_ns: int) -> TrueMotion:
 
 
 def windows(motion: TrueMotion, length_s: float) -> tuple[IntArray, IntArray]:
-    """First and last grid index of windows within which the ground truth is dense throughout."""
+    """First and last grid index of windows with dense ground truth."""
     length = max(1, round(length_s / GRID_S))
     settling = round(_SETTLING_S / GRID_S)
     first = np.arange(settling, motion.time_s.size - length, max(length // 8, 5))
@@ -104,7 +104,7 @@ def windows(motion: TrueMotion, length_s: float) -> tuple[IntArray, IntArray]:
 def gathered(
     values: FloatArray, steps: Steps, motion: TrueMotion, delay_s: float, lag_s: float
 ) -> FloatArray:
-    """Integral (g, p) over the grid of values (n, p) per second held during the steps, late and lagged."""
+    """Integral (g, p) over the grid of rates (n, p) that are constant during steps, with delay and lag."""
     ends = (steps.stamp_ns - steps.stamp_ns[0]) * 1e-9 + delay_s
     total = np.concatenate(
         [np.zeros((1, values.shape[1])), np.cumsum(values * steps.duration_s[:, None], axis=0)]
@@ -123,20 +123,20 @@ LONGEST_DELAY_S = 0.5
 LONGEST_LAG_S = 1.0
 
 WINDOW_S = 5.0
-"""Errors of motion are looked at over so long."""
+"""Length of the windows in which motion is compared."""
 
 _SHORT_WINDOW_S = 0.5
 _NODES = (0, 2, 5)
-"""So many points above 0 are tried for the table; none: one share everywhere."""
+"""Numbers of points above 0 that are tried for the table; 0: one scale factor."""
 _BLOCKS = 5
 _CLEAR_SIGMAS = 2.0
 _NEAR_ZERO = 0.05
 _CLEARLY = 0.85
-"""Lateness is believed where it lessens the errors of short windows to this share."""
+"""Delay and lag are used if they reduce the errors of short windows to this share."""
 _MOVING = 1e-3
-"""Slower than this is standing [m/s, rad/s]."""
+"""Slower robots stand still [m/s, rad/s]."""
 _SMOOTHNESS, _TO_ONE = 0.02, 0.001
-"""Weight of the prior that neighbouring shares are alike, and that shares are 1."""
+"""Weights of the priors that neighbouring scale factors are equal, and that they are 1."""
 _FIRST_LATENESS = (0.05, 0.1)
 
 
@@ -150,11 +150,11 @@ class Drive:
 
 @dataclass(frozen=True)
 class Lateness:
-    """When a reported motion happens.
+    """Delay of the true motion after the reported one.
 
     Attributes:
-        delay_s: After its stamp.
-        lag_s: Time constant with which it is followed.
+        delay_s: Dead time.
+        lag_s: Time constant of a first-order lag.
     """
 
     delay_s: float
@@ -162,7 +162,7 @@ class Lateness:
 
 
 def fit_lateness(drives: Sequence[Drive]) -> Lateness:
-    """Delay and lag that explain the turns of short windows best, with one share driving and one in place."""
+    """Delay and lag that explain turns in short windows best, with scale factors for driving and in place."""
 
     def cost(late: FloatArray) -> float:
         delay_s, lag_s = late
@@ -179,7 +179,7 @@ def fit_lateness(drives: Sequence[Drive]) -> Lateness:
                 drive.motion.turn[last] - drive.motion.turn[first],
             )
             share = ridge(basis, wanted, 1e-9 * np.eye(2), np.ones(2), rounds=2)
-            total += float(np.sum(np.abs(wanted - basis @ share)))  # not squared: slips are no lateness
+            total += float(np.sum(np.abs(wanted - basis @ share)))  # not squared: slip is no delay
         return total
 
     simplex = np.array(_FIRST_LATENESS) + np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.15]])
@@ -195,7 +195,7 @@ def fit_lateness(drives: Sequence[Drive]) -> Lateness:
 
 
 def nodes_of(values: FloatArray, duration_s: FloatArray, count: int) -> FloatArray:
-    """Grid points for reported values (n,): 0, and points evenly spaced over what was driven for long.
+    """Grid points for reported values (n,): 0, and points evenly spaced over the frequent ones.
 
     Args:
         values: Absolute speeds or turn rates.
@@ -208,22 +208,22 @@ def nodes_of(values: FloatArray, duration_s: FloatArray, count: int) -> FloatArr
     order = np.argsort(values[used])
     held = np.cumsum(duration_s[used][order])
     low, high = np.interp([0.01, 0.99], held / held[-1], values[used][order])
-    if low < _NEAR_ZERO * high:  # a point so near to 0 would say what 0 says
+    if low < _NEAR_ZERO * high:  # a point this near to 0 would duplicate it
         low = high / count
     spaced = np.linspace(low, high, count) if high > 1.2 * low else np.array([high])
     return np.concatenate([[0.0], np.round(spaced, 4)])
 
 
 def fit_response(drives: Sequence[Drive], late: Lateness, *, table: bool) -> MotionResponse:
-    """The shares of speed and turn rate that are true, for robots of one type.
+    """True per reported speed and turn rate, for robots of one type.
 
-    Several grids are tried on stretches of time that they were not fitted to; the smallest wins that does
-    about as well as the best: a table has to earn its numbers.
+    Several grids are compared by cross-validation over blocks of time; the smallest is used that is not
+    clearly worse than the best.
 
     Args:
         drives: Of all robots of the type.
         late: Their delay and lag.
-        table: Whether there may be more than one share of each.
+        table: Whether there may be more than one scale factor of each.
     """
     grids = [_grid(drives, count) for count in (_NODES if table else _NODES[:1])]
     held_out = [_held_out_error(drives, late, *grid) for grid in grids]
@@ -241,7 +241,7 @@ def fit_response(drives: Sequence[Drive], late: Lateness, *, table: bool) -> Mot
 
 
 def _grid(drives: Sequence[Drive], count: int) -> tuple[FloatArray, FloatArray]:
-    """Speeds and turn rates of a grid with so many points above 0; no points: one share everywhere."""
+    """Speeds and turn rates of a grid with `count` points above 0; 0: one scale factor."""
     if not count:
         return np.zeros(1), np.zeros(1)
     speed = np.concatenate([np.abs(drive.steps.speed) for drive in drives])
@@ -254,7 +254,7 @@ def _grid(drives: Sequence[Drive], count: int) -> tuple[FloatArray, FloatArray]:
 def _held_out_error(
     drives: Sequence[Drive], late: Lateness, speeds: FloatArray, turn_rates: FloatArray
 ) -> FloatArray:
-    """Mean absolute errors (blocks,) of path and turn, relative to what was driven, block by block."""
+    """Mean absolute errors (blocks,) of path and turn in held-out blocks, relative to the motion."""
     total = np.zeros(_BLOCKS)
     for column in range(2):
         rows = _regression(drives, late, speeds, turn_rates, column)
@@ -274,13 +274,13 @@ def hats(values: FloatArray, nodes: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Regression:
-    """True motion of windows as a sum of shares.
+    """Linear regression of the true motion in windows by scale factors.
 
     Attributes:
-        basis: (m, V W) what each share contributes.
-        wanted: (m,) path [m] or turn [rad].
-        block: (m,) which stretch of time a window begins in.
-        last_block: (m,) and which it ends in.
+        basis: (m, V W) reported motion by grid point.
+        wanted: (m,) true path [m] or turn [rad].
+        block: (m,) block of time in which a window begins.
+        last_block: (m,) block in which it ends.
     """
 
     basis: FloatArray
@@ -295,7 +295,7 @@ class _Regression:
 def _regression(
     drives: Sequence[Drive], late: Lateness, speeds: FloatArray, turn_rates: FloatArray, column: int
 ) -> _Regression:
-    """All windows, of the path (column 0) or the turn (column 1)."""
+    """The regression of all windows, of the path (column 0) or the turn (column 1)."""
     bases, targets, borders = [], [], []
     for drive in drives:
         steps, motion = drive.steps, drive.motion
@@ -309,22 +309,22 @@ def _regression(
         first, last = windows(motion, WINDOW_S)
         bases.append(integral[last] - integral[first])
         targets.append(true[last] - true[first])
-        # each block holds windows, whichever part of the time is known
+        # each block holds windows, whichever part of the time has ground truth
         cuts = np.quantile(first, np.arange(1, _BLOCKS) / _BLOCKS)
         borders.append(np.searchsorted(cuts, np.column_stack([first, last]), side="right"))
     return _Regression(np.concatenate(bases), np.concatenate(targets), *np.concatenate(borders).T)
 
 
 def _solved(rows: _Regression, speeds: FloatArray, turn_rates: FloatArray) -> FloatArray:
-    """Shares (V, W)."""
-    typical = np.mean(np.sum(rows.basis, axis=1) ** 2)  # of a window: the prior does not depend on units
+    """Scale factors (V, W)."""
+    typical = np.mean(np.sum(rows.basis, axis=1) ** 2)  # makes the prior independent of units
     penalty = _prior(speeds.size, turn_rates.size) * typical
     shares = ridge(rows.basis, rows.wanted, penalty, np.ones(rows.basis.shape[1]))
     return np.asarray(np.clip(shares, 0.0, 10.0).reshape(speeds.size, turn_rates.size))
 
 
 def _prior(speeds: int, turn_rates: int) -> FloatArray:
-    """Information (V W, V W) that neighbours in the grid are alike and all shares near 1."""
+    """Information (V W, V W) of the priors on scale factors."""
     size = speeds * turn_rates
     index = np.arange(size).reshape(speeds, turn_rates)
     pairs = np.concatenate(
@@ -356,8 +356,3 @@ def explained(drives: Sequence[Drive], late: Lateness, response: MotionResponse 
         true = np.column_stack([motion.path, motion.turn])
         errors.append((true[last] - true[first]) - (integral[last] - integral[first]))
     return np.concatenate(errors)
-
-
-def spread_of(errors: FloatArray) -> tuple[float, float]:
-    """Standard deviation of the good part of path [m] and turn [rad]."""
-    return spread(errors[:, 0]), spread(errors[:, 1])

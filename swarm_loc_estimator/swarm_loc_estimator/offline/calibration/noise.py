@@ -1,9 +1,9 @@
 """Calibrate process and measurement noise: small position errors at a consistent NEES.
 
-What is minimised is the position error, and how far the mean normalised error squared (NEES) is from what it
-should be. White noise has to stand for errors that last, so the likelihood of the true poses is no criterion:
-a few spells of lasting errors would have it enlarge the noise until all else is smoothed away. Nor is the
-scatter of the sightings: it gives sigmas two or three times too small.
+The cost is the position error, with a penalty for the distance of the NEES from its aim. The filter's white
+noise represents correlated errors, too, so the likelihood of the true poses does not work as a cost: a few
+periods of correlated errors would increase the noise until measurements hardly count. Nor does the scatter of
+the sightings, which gives standard deviations two to three times too small.
 """
 
 from __future__ import annotations
@@ -26,23 +26,21 @@ from swarm_loc_estimator.sensors.messages import chosen
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, SensorModel, Swarm
 
 TICK_S = 1.0
-"""Errors are looked at this often."""
+"""Interval at which errors are computed."""
 NEES_AIM = 2.5
-"""A little less than 3: what was not fitted to errs more."""
+"""A little less than 3: errors in other recordings are larger."""
 
 _SPACING_NS = 50_000_000
 _INCONSISTENCY = 0.2
-"""A NEES off by half its aim is as bad as a tenth more error."""
+"""A NEES of half or twice its aim costs as much as 10 % more error."""
 _LOSS = 5.0
-"""A hundredth of the poses missing is as bad as a twentieth more error."""
+"""A hundredth of the poses missing costs as much as 5 % more error."""
 _FORGETTING = 0.005
-"""Weight of the prior that a number stays near where it began, per squared factor of e."""
+"""Weight of the prior that parameters stay near their initial values, per squared factor of e."""
 _FIRST_STEP, _LAST_STEP = 0.7, 0.07
 _WORST = 1e3
 _BAD = 0.3
-"""How much worse than the beginning is all the same: where robots get lost the score says nothing more."""
-
-NumberNames = tuple[str, ...]
+"""Costs are capped this far above the initial one: when robots get lost, a score means nothing."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +48,8 @@ class Fold:
     """A part of a recording, and the swarm as calibrated without it.
 
     Attributes:
-        recording: To run the estimator over.
-        swarm: Started where the ground truth says.
+        recording: Input of the estimator.
+        swarm: With the true starts.
     """
 
     recording: Recording
@@ -60,13 +58,13 @@ class Fold:
 
 @dataclass(frozen=True)
 class Score:
-    """How an estimate does.
+    """Quality of an estimate.
 
     Attributes:
         position_rmse: [m].
         heading_rmse: [rad].
         nees: Ideally 3.
-        given: Share of the poses known in truth that were estimated.
+        given: Share of the poses with ground truth that were estimated.
     """
 
     position_rmse: float
@@ -76,7 +74,7 @@ class Score:
 
     @property
     def cost(self) -> float:
-        """Logarithm of the position error, and penalties; small is good."""
+        """Logarithm of the position error plus penalties; smaller is better."""
         if not (self.given > 0.0 and 0.0 < self.nees < math.inf and self.position_rmse > 0.0):
             return _WORST
         inconsistency = math.log(self.nees / NEES_AIM) ** 2
@@ -84,7 +82,7 @@ class Score:
 
 
 def score(results: Sequence[ReplayResult]) -> Score:
-    """The score of all poses where the ground truth is dense, pooled."""
+    """The score of all poses with dense ground truth, pooled."""
     errors, covariances, known_poses = [np.zeros((0, 3))], [np.zeros((0, 3, 3))], 0
     for result in results:
         for index, robot in enumerate(result.swarm.robots):
@@ -109,12 +107,12 @@ def score(results: Sequence[ReplayResult]) -> Score:
 
 
 def with_noise(swarm: Swarm, values: dict[str, float]) -> Swarm:
-    """The swarm with noise numbers, given by name, the same for every robot."""
+    """The swarm with noise parameters by name, the same for every robot."""
     return replace(swarm, robots=tuple(_robot_with(robot, values) for robot in swarm.robots))
 
 
 def thinned(recording: Recording) -> Recording:
-    """The recording with odometry no denser than the fit of noise needs."""
+    """The recording with at most one odometry message per robot and 50 ms, for speed."""
     rows = recording.odometry
     keep = np.ones(rows.robot.size, dtype=bool)
     for robot in np.unique(rows.robot).tolist():
@@ -131,14 +129,14 @@ def fit_noise(
     evaluations: int,
     report: Callable[[int, Score], None],
 ) -> dict[str, float]:
-    """Numbers, by name, with the best score over all folds.
+    """Noise parameters by name with the best score over all folds.
 
     Args:
-        folds: What to run the estimator over.
-        begin: Numbers to fit, and where to begin; positive.
-        fixed: Other noise numbers.
-        evaluations: How often the estimator may run over all folds.
-        report: Called after each with its count and its score.
+        folds: Recordings with swarms.
+        begin: Initial values of the fitted parameters; positive.
+        fixed: Other noise parameters.
+        evaluations: Limit of runs of the estimator over all folds.
+        report: Called after each run with its number and score.
     """
     small = [replace(fold, recording=thinned(fold.recording)) for fold in folds]
     names, start = tuple(begin), np.log(np.array([*begin.values()]))
@@ -157,8 +155,8 @@ def fit_noise(
     return _clipped(names, start + found.x)
 
 
-def _clipped(names: NumberNames, logarithms: FloatArray) -> dict[str, float]:
-    """Numbers within what a swarm description may hold, to three digits."""
+def _clipped(names: Sequence[str], logarithms: FloatArray) -> dict[str, float]:
+    """Parameters within their ranges, rounded to three digits."""
     specs = {**number_specs(OdometryModel), **number_specs(SensorModel)}
     return {
         name: float(f"{min(specs[name].high, np.exp(min(value, 50.0))):.3g}")

@@ -21,7 +21,7 @@ from swarm_loc_estimator.offline.calibration.robust import (
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 _WIDE = np.array([0.05, 0.05])
-"""How large course offset [rad] and axle offset [m] may be, one standard deviation."""
+"""Standard deviations of the prior of course offset [rad] and axle offset [m]."""
 _WINDOW_NS = 2_000_000_000
 _STRIDE_NS = 500_000_000
 _SHORTEST_NS, _LONGEST_NS = 1_000_000_000, 20_000_000_000
@@ -30,12 +30,12 @@ _MIN_WINDOWS = 20
 
 @dataclass(frozen=True)
 class _Lateral:
-    """Sideways motion of windows: what was seen, and what each offset contributes.
+    """Linear regression of lateral motion in windows by the offsets.
 
     Attributes:
-        wanted: (m,) to the left [m], per square root of a second.
-        basis: (m, 2) of course offset and axle offset, likewise.
-        independent_share: How many of the windows say something of their own.
+        wanted: (m,) motion to the left [m], per square root of a second.
+        basis: (m, 2) its derivatives by course offset and axle offset.
+        independent_share: Share of independent windows.
     """
 
     wanted: FloatArray
@@ -43,7 +43,7 @@ class _Lateral:
     independent_share: float
 
     def fit(self, mean: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Offsets (2,) and how sure they are (2,)."""
+        """Offsets (2,) and their standard deviations (2,)."""
         scale = max(spread(self.wanted), 1e-5) / np.sqrt(self.independent_share)
         for _ in range(2):
             level = scale
@@ -58,7 +58,7 @@ class _Lateral:
 
 
 def fit_offsets(recording: Recording, swarm: Swarm, members: Sequence[int]) -> dict[int, Robot]:
-    """Robots of one type with course and axle offset; those with too little ground truth get the mean."""
+    """Fit course and axle offset of robots of one type; those with too little ground truth get the mean."""
     laterals = {index: _lateral(recording, swarm, index) for index in members}
     usable = {index: lateral for index, lateral in laterals.items() if lateral is not None}
     if not usable:
@@ -76,7 +76,7 @@ def _with_offsets(robot: Robot, offsets: FloatArray) -> Robot:
 
 
 def _lateral(recording: Recording, swarm: Swarm, index: int) -> _Lateral | None:
-    """Sideways motion of a robot; None where too little is known."""
+    """The regression of a robot; None with too little ground truth."""
     robot, track = swarm.robots[index], recording.track(index)
     truth = recording.truth.get(robot.name)
     if truth is None or track.stamp_ns.size < 2:
@@ -100,7 +100,7 @@ def _lateral(recording: Recording, swarm: Swarm, index: int) -> _Lateral | None:
 
 
 def _windows(truth: Trajectory, begin_ns: int, end_ns: int) -> tuple[IntArray, IntArray]:
-    """Stamps between which the true motion is known: short windows, or sparse poses as they come."""
+    """First and last stamps of windows: of 2 s in dense ground truth, else between sparse true poses."""
     first = np.arange(begin_ns, end_ns - _WINDOW_NS, _STRIDE_NS)
     known = (
         interpolate(truth, first, DENSE_GAP_NS)[1] & interpolate(truth, first + _WINDOW_NS, DENSE_GAP_NS)[1]

@@ -1,8 +1,9 @@
-"""Plots and table of a calibration: residuals before and after."""
+"""Table and plots of a calibration: residuals before and after."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,6 @@ from matplotlib.figure import Figure
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.offline.calibration.camera import CameraFit
 from swarm_loc_estimator.offline.calibration.fit import Calibration
-from swarm_loc_estimator.offline.calibration.motion import spread_of
 from swarm_loc_estimator.offline.calibration.noise import Score
 from swarm_loc_estimator.offline.calibration.robust import spread
 from swarm_loc_estimator.offline.report.style import INK, SOFT, TRUTH, colour_of, save, style
@@ -20,18 +20,25 @@ from swarm_loc_estimator.swarm.motion_response import MotionResponse
 
 _BINS = 60
 _COLUMNS = 3
+_SIGHTING_LABELS = {True: ("range [m]", "bearing [rad]"), False: ("forward [m]", "left [m]", "heading [rad]")}
+"""Of the errors of polar sightings and of poses."""
+_MOTION_LABELS = ("path [m]", "turn [rad]")
 
 
 def text_of(done: Calibration) -> str:
-    """The table before and after."""
+    """The residuals before and after, the fitted noise and the remarks."""
     lines = [f"{'':34}{'before':>10}{'after':>10}"]
     for fit in done.models.cameras:
-        if fit.count:
-            lines += _camera_lines(fit)
+        errors = _sighting_errors([fit] if fit.count else [])
+        lines += [
+            _line(f"{fit.robot.name} {label}", spread(before), spread(after))
+            for label, before, after in errors
+        ]
     for motion in done.models.motion:
-        (path, turn), (path_after, turn_after) = spread_of(motion.before), spread_of(motion.after)
-        lines.append(_line("motion over 5 s, path [m]", path, path_after))
-        lines.append(_line("motion over 5 s, turn [rad]", turn, turn_after))
+        lines += [
+            _line(f"motion over 5 s, {label}", spread(motion.before[:, k]), spread(motion.after[:, k]))
+            for k, label in enumerate(_MOTION_LABELS)
+        ]
         late = motion.late
         lines.append(f"delay {late.delay_s:.3f} s, lag {late.lag_s:.3f} s")
     if done.before is not None and done.after is not None:
@@ -41,7 +48,7 @@ def text_of(done: Calibration) -> str:
 
 
 def draw(done: Calibration, path: Path) -> Path:
-    """Residuals of sightings and of motion before and after, and the table of shares; returns the file."""
+    """Plot residuals before and after, and the table of scale factors; returns the file."""
     responses = [motion.response for motion in done.models.motion if motion.response is not None]
     response = responses[0] if responses and len(responses[0].speeds) > 1 else None
     panels = _panels(done)
@@ -63,24 +70,20 @@ def draw(done: Calibration, path: Path) -> Path:
     return path
 
 
-def _camera_lines(fit: CameraFit) -> list[str]:
-    """Scatter of one camera's sightings."""
-    lines = []
-    for polar, labels in (
-        (True, ("range [m]", "bearing [rad]")),
-        (False, ("forward [m]", "left [m]", "heading [rad]")),
-    ):
-        rows = fit.sightings.polar == polar
-        if rows.any():
-            lines += [
-                _line(f"{fit.robot.name} {label}", spread(fit.before[rows, k]), spread(fit.after[rows, k]))
-                for k, label in enumerate(labels)
-            ]
-    return lines
+def _sighting_errors(fits: Sequence[CameraFit]) -> Iterator[tuple[str, FloatArray, FloatArray]]:
+    """Label, errors before and errors after of the sightings of some cameras."""
+    for polar, labels in _SIGHTING_LABELS.items():
+        rows = [fit.sightings.polar == polar for fit in fits]
+        for k, label in enumerate(labels if any(one.any() for one in rows) else ()):
+            before, after = (
+                np.concatenate([getattr(fit, name)[one, k] for fit, one in zip(fits, rows, strict=True)])
+                for name in ("before", "after")
+            )
+            yield label, before, after
 
 
 def _score_lines(before: Score, after: Score) -> list[str]:
-    """How the estimator does."""
+    """Errors of the estimator."""
     return [
         _line("estimator, position RMSE [m]", before.position_rmse, after.position_rmse),
         _line(
@@ -97,31 +100,20 @@ def _line(name: str, before: float, after: float) -> str:
 
 
 def _panels(done: Calibration) -> list[tuple[str, FloatArray, FloatArray]]:
-    """Label, residuals before and after of everything that was fitted."""
-    panels = []
-    for polar, labels in (
-        (True, ("range [m]", "bearing [rad]")),
-        (False, ("forward [m]", "left [m]", "heading [rad]")),
-    ):
-        fits = [fit for fit in done.models.cameras if (fit.sightings.polar == polar).any()]
-        for k, label in enumerate(labels if fits else ()):
-            before, after = (
-                np.concatenate([getattr(fit, name)[fit.sightings.polar == polar, k] for fit in fits])
-                for name in ("before", "after")
-            )
-            panels.append((f"sightings, {label}", before, after))
-    if done.models.motion:
-        for k, label in enumerate(("path [m]", "turn [rad]")):
-            before, after = (
-                np.concatenate([getattr(fit, name)[:, k] for fit in done.models.motion])
-                for name in ("before", "after")
-            )
-            panels.append((f"motion over 5 s, {label}", before, after))
+    """Label, errors before and errors after of everything that was fitted."""
+    errors = _sighting_errors(done.models.cameras)
+    panels = [(f"sightings, {label}", before, after) for label, before, after in errors]
+    for k, label in enumerate(_MOTION_LABELS if done.models.motion else ()):
+        before, after = (
+            np.concatenate([getattr(fit, name)[:, k] for fit in done.models.motion])
+            for name in ("before", "after")
+        )
+        panels.append((f"motion over 5 s, {label}", before, after))
     return panels
 
 
 def _histogram(axis: Any, label: str, before: FloatArray, after: FloatArray) -> None:
-    """Errors before and after in one histogram."""
+    """Histograms of the errors before and after."""
     reach = max(
         1e-6, 4.0 * max(spread(before - np.median(before)), spread(after)) + abs(float(np.median(before)))
     )
@@ -136,7 +128,7 @@ def _histogram(axis: Any, label: str, before: FloatArray, after: FloatArray) -> 
 
 
 def _shares(axis: Any, response: MotionResponse, name: str) -> None:
-    """True shares as a coloured table."""
+    """A coloured table of scale factors."""
     table = np.array(response.speed_share if name == "speed" else response.turn_share)
     axis.imshow(table, cmap="coolwarm", vmin=0.4, vmax=1.6, aspect="auto", origin="lower")
     for (row, column), share in np.ndenumerate(table):

@@ -1,7 +1,6 @@
 """A recording in memory: odometry, detections, other inputs and ground truth of a swarm.
 
-A fit runs the estimator over the same data a hundred times and looks at parts of it; reading the bag once is
-enough for that.
+A fit runs the estimator over the same data a hundred times; the bag is read only once.
 """
 
 from __future__ import annotations
@@ -37,12 +36,12 @@ from swarm_loc_estimator.timeline.settings import Settings
 
 
 class CalibrationError(UserError):
-    """There is nothing to fit to; the message is one sentence."""
+    """A recording that cannot be used for calibration; the message is one sentence."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What a bag holds about a swarm.
+    """Inputs and ground truth of a bag.
 
     Attributes:
         name: Of the bag.
@@ -64,13 +63,13 @@ class Recording:
 
     @property
     def range_ns(self) -> tuple[int, int]:
-        """First and last arrival; (0, 0) when nothing came."""
+        """First and last arrival of odometry and detections; (0, 0) without any."""
         arrivals = np.concatenate([self.odometry.arrival_ns, self.detections.arrival_ns])
         return (int(arrivals.min()), int(arrivals.max())) if arrivals.size else (0, 0)
 
     @property
     def longest_pause_ns(self) -> int:
-        """The longest time between two neighbouring stamps, or between two arrivals."""
+        """The longest time between consecutive stamps or arrivals."""
         parts = (self.odometry, self.detections)
         times = (
             np.concatenate([part.stamp_ns for part in parts]),
@@ -79,7 +78,7 @@ class Recording:
         return max(int(np.diff(np.sort(column)).max(initial=0)) for column in times)
 
     def between(self, from_ns: int, to_ns: int) -> Recording:
-        """Odometry and detections that arrived from `from_ns` on and before `to_ns`; all else is whole."""
+        """The recording with only the odometry and detections that arrived in [from_ns, to_ns)."""
         driven, seen = (
             (rows.arrival_ns >= from_ns) & (rows.arrival_ns < to_ns)
             for rows in (self.odometry, self.detections)
@@ -103,8 +102,8 @@ def read_recording(bag: Path, swarm: Swarm, progress: Progress = unwatched) -> R
 
     Args:
         bag: rosbag2 folder, .mcap or .db3 file.
-        swarm: Whose messages are wanted.
-        progress: Called now and then.
+        swarm: Robots whose messages are read.
+        progress: Called now and then with the share done and what is being done.
 
     Raises:
         BagError: Nothing in the bag can be read.
@@ -127,7 +126,7 @@ def read_recording(bag: Path, swarm: Swarm, progress: Progress = unwatched) -> R
 
 
 def started_at_truth(swarm: Swarm, recording: Recording) -> Swarm:
-    """The swarm with each robot at its true pose where its odometry begins; unknown without ground truth."""
+    """The swarm with the true pose of each robot at its first odometry as start; unknown without truth."""
     robots = [
         replace(robot, start=_start_of(recording, robot, recording.track(index)))
         for index, robot in enumerate(swarm.robots)
@@ -136,7 +135,7 @@ def started_at_truth(swarm: Swarm, recording: Recording) -> Swarm:
 
 
 def _start_of(recording: Recording, robot: Robot, track: Trajectory) -> Pose2 | None:
-    """The true pose where a robot's odometry begins."""
+    """The true pose at a robot's first odometry."""
     truth = recording.truth.get(robot.name)
     if truth is None or not track.stamp_ns.size:
         return None
@@ -147,7 +146,7 @@ def _start_of(recording: Recording, robot: Robot, track: Trajectory) -> Pose2 | 
 
 
 def _each_stamp_once(track: Trajectory) -> Trajectory:
-    """The track with the first of the poses that share a stamp."""
+    """The track with only the first pose of each stamp."""
     stamp_ns, first = np.unique(track.stamp_ns, return_index=True)
     return Trajectory(stamp_ns, track.pose[first])
 
@@ -155,7 +154,7 @@ def _each_stamp_once(track: Trajectory) -> Trajectory:
 def rerun(
     recording: Recording, swarm: Swarm, tick_s: float, settings: Settings | None = None
 ) -> ReplayResult:
-    """Poses at every whole multiple of `tick_s`, each from what had arrived by then."""
+    """Run the estimator over a recording, with poses at every whole multiple of `tick_s`, as `replay`."""
     runner = Runner(Estimator(swarm, settings), PeriodicSchedule(round(tick_s * 1e9)))
     runner.take(recording.messages)
     runner.finish(recording.range_ns[1])

@@ -1,4 +1,4 @@
-"""Robust least squares with Gaussian priors, and the prior that robots of a type give each other."""
+"""Robust least squares with Gaussian priors, and the common prior of robots of one type."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from scipy.optimize import least_squares
 from swarm_loc_estimator.common.arrays import FloatArray
 
 _BEND = 3.0
-"""From this many sigmas on a residual counts linearly."""
+"""Residuals beyond this many sigmas have linear cost."""
 _NORMAL = 1.4826
 """Standard deviation per median absolute deviation, for normal errors."""
 
 
 def spread(residuals: FloatArray) -> float:
-    """Standard deviation of the good part of residuals about zero."""
+    """Robust standard deviation of residuals about zero; NaN without any."""
     return float(_NORMAL * np.median(np.abs(residuals))) if residuals.size else float("nan")
 
 
@@ -49,12 +49,12 @@ def fit_with_prior(
 
 
 def population(values: FloatArray, sigma: FloatArray, wide: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The prior that the robots of a type are for each other: mean (p,) and standard deviation (p,).
+    """Mean (p,) and standard deviation (p,) of the parameters of the robots of a type, as prior of each.
 
     Args:
         values: (n, p) parameters of each robot fitted alone.
-        sigma: (n, p) how sure they are.
-        wide: (p,) the prior that they were fitted with; no wider prior comes out, and at least a tenth of it.
+        sigma: (n, p) their standard deviations.
+        wide: (p,) the prior of those fits; the result is between a tenth of it and it.
     """
     weight = 1.0 / (sigma**2 + (0.3 * wide) ** 2)
     mean = np.sum(weight * values, axis=0) / np.sum(weight, axis=0)
