@@ -11,10 +11,10 @@ from bench.pushbot.event_feed import StandingBody
 from bench.pushbot.event_flow import RATE, EventFlow, Measured
 from bench.shared.common import Cell, new_plot, save_plot, table
 from swarm_loc_drivers.common.link import Address
-from swarm_loc_drivers.pushbot.commands import Lights
+from swarm_loc_drivers.common.odometry import WheelGeometry
 from swarm_loc_drivers.pushbot.hardware import SECOND_FIRMWARE, TIMESTAMPS
-from swarm_loc_drivers.pushbot.session import PushbotSession
-from swarm_loc_drivers.pushbot.settings import PushbotSettings, WheelGeometry
+from swarm_loc_drivers.pushbot.protocol import Lights
+from swarm_loc_drivers.pushbot.session import PushbotSession, PushbotSettings
 from swarm_loc_drivers.sim.pushbot.board import EventRing
 from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bench.epuck.views import views_of
-from swarm_loc_drivers.epuck.wheels import WheelGeometry
+from swarm_loc_drivers.epuck.hardware import wheel_geometry
 from swarm_loc_drivers.sim.epuck.world import EpuckWorld, EpuckWorldSettings
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena
@@ -25,7 +25,7 @@ BESIDE = np.array([[-0.6, 0.0, 0.1], [0.0, 0.1, 2.0], [-0.1, -0.25, -1.0]])
 
 def world_at(poses: FloatArray, camera: CameraModel = CAMERA) -> EpuckWorld:
     settings = EpuckWorldSettings(
-        3, STILL, Arena(ARENA, FAMILY), camera, WheelGeometry(0.041, 0.053), 7.5, 10**12
+        3, STILL, Arena(ARENA, FAMILY), camera, wheel_geometry(0.041, 0.053), 7.5, 10**12
     )
     return EpuckWorld(describe(EightSettings(robots=len(poses)), poses), settings)
 
@@ -81,7 +81,7 @@ def test_size_and_incidence_are_those_of_the_plane_geometry() -> None:
         STILL, camera_yaw_sigma=0.0, scale_sigma=0.0, map_position_sigma=0.0, face_position_sigma=0.0
     )
     settings = EpuckWorldSettings(
-        3, exact, Arena(ARENA, FAMILY), CameraModel(), WheelGeometry(0.041, 0.053), 7.5, 10**12
+        3, exact, Arena(ARENA, FAMILY), CameraModel(), wheel_geometry(0.041, 0.053), 7.5, 10**12
     )
     views = views_of(EpuckWorld(swarm, settings).rig, 0, start)
     back = views.id == 22

@@ -1,10 +1,14 @@
-"""A link to a robot: bytes with deadlines, over a serial port or TCP."""
+"""Links to robots: bytes with deadlines, over a serial port or TCP."""
 
 from __future__ import annotations
 
+import socket
+import termios
 from dataclasses import dataclass
 from typing import Protocol
 from urllib.parse import urlsplit
+
+import serial
 
 from swarm_loc_estimator.common.errors import UserError
 
@@ -75,3 +79,101 @@ def parse_address(text: str, default_port: int) -> Address:
             f"'{text}' must be the path of a serial port, such as /dev/rfcomm0, or tcp://HOST or tcp://HOST:PORT."
         )
     return Address(host=host, port=port or default_port)
+
+
+_BROKEN = (OSError, TypeError, termios.error)
+"""What pyserial raises when a port hangs up; one that vanishes makes it compare None."""
+
+
+class SerialLink:
+    """An open serial port, 8N1, for this process alone.
+
+    Args:
+        device: Its path.
+        baud_rate: [bit/s].
+        write_timeout_s: After so long a write that is not taken breaks the link.
+
+    Raises:
+        LinkError: It cannot be opened.
+    """
+
+    def __init__(self, device: str, baud_rate: int, write_timeout_s: float) -> None:
+        self._device = device
+        try:
+            self._port = serial.Serial(device, baud_rate, write_timeout=write_timeout_s, exclusive=True)
+        except (OSError, ValueError, termios.error) as error:
+            raise LinkError(f"{device} cannot be opened: {_reason(error)}") from error
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Link.read`."""
+        try:
+            self._port.timeout = timeout_s
+            first = self._port.read(1)
+            return bytes(first + self._port.read(self._port.in_waiting)) if first else b""
+        except _BROKEN as error:
+            raise LinkError(f"{self._device} is broken: {_reason(error)}") from error
+
+    def write(self, data: bytes) -> None:
+        """See `Link.write`."""
+        try:
+            self._port.write(data)
+        except _BROKEN as error:
+            raise LinkError(f"{self._device} is broken: {_reason(error)}") from error
+
+    def close(self) -> None:
+        """See `Link.close`."""
+        self._port.close()
+
+
+def _reason(error: Exception) -> str:
+    return str(error.args[-1])
+
+
+_CHUNK = 1 << 16
+
+
+class TcpLink:
+    """A connection to a robot that is the server.
+
+    Args:
+        host: Name or number.
+        port: TCP port.
+        timeout_s: How long connecting, or a write that is not taken, may last.
+
+    Raises:
+        LinkError: It cannot be opened.
+    """
+
+    def __init__(self, host: str, port: int, timeout_s: float) -> None:
+        self._name = f"tcp://{host}:{port}"
+        self._timeout_s = timeout_s
+        try:
+            self._socket = socket.create_connection((host, port), timeout_s)
+        except OSError as error:
+            raise LinkError(f"{self._name} cannot be opened: {error.strerror or error}") from error
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Link.read`."""
+        try:
+            self._socket.settimeout(timeout_s)
+            data = self._socket.recv(_CHUNK)
+        except (TimeoutError, BlockingIOError):
+            return b""
+        except OSError as error:
+            raise LinkError(f"{self._name} is broken: {error.strerror or error}") from error
+        if not data:
+            raise LinkError(f"{self._name} was closed by the robot")
+        return data
+
+    def write(self, data: bytes) -> None:
+        """See `Link.write`."""
+        try:
+            self._socket.settimeout(self._timeout_s)
+            self._socket.sendall(data)
+        except OSError as error:
+            raise LinkError(f"{self._name} is broken: {error.strerror or error}") from error
+
+    def close(self) -> None:
+        """See `Link.close`: at once, since some robots never close their end."""
+        self._socket.close()

@@ -15,9 +15,9 @@ from collections.abc import Callable, Generator
 from typing import TypeVar
 
 from swarm_loc_drivers.common.robot_driver import SessionError
-from swarm_loc_drivers.droplet import console as protocol
-from swarm_loc_drivers.droplet.console import Echo, Said
-from swarm_loc_drivers.droplet.infrared_timing import HANDLING_NS, message_ns
+from swarm_loc_drivers.droplet import protocol
+from swarm_loc_drivers.droplet.hardware import HANDLING_NS, message_ns
+from swarm_loc_drivers.droplet.protocol import Echo, Said
 
 Result = TypeVar("Result")
 Talk = Generator[int, None, Result]

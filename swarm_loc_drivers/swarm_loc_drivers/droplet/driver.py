@@ -6,16 +6,14 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from swarm_loc_drivers.common.link import Link
-from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.link import Link, SerialLink
+from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.robot_driver import RobotDriver
-from swarm_loc_drivers.common.serial_link import SerialLink
 from swarm_loc_drivers.common.velocity_command import Velocity, VelocityCommand
-from swarm_loc_drivers.droplet.commanded_motion import CommandedMotion, MotionNoise
 from swarm_loc_drivers.droplet.exchange import Brightness
 from swarm_loc_drivers.droplet.hardware import BAUD_RATE
-from swarm_loc_drivers.droplet.mover import DropletMover
-from swarm_loc_drivers.droplet.session import DropletSession, SessionSettings
+from swarm_loc_drivers.droplet.odometry import CommandedMotion, MotionNoise
+from swarm_loc_drivers.droplet.session import DropletMover, DropletSession, SessionSettings
 
 OWN = ""
 """In place of a name: the robot at the cable."""

@@ -5,7 +5,7 @@
 
 It follows `cmd_vel` and publishes `odom`, `brightness`, `/tf` and `/diagnostics`; for Droplets without cable
 it follows and publishes `cmd_vel`, `odom` and `/tf` besides. Service: `~/measure`. Parameters: see
-`droplet_parameters.py` and `doc/droplet_driver_node.md`.
+`parameters.py` and `doc/droplet_driver_node.md`.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from swarm_loc_drivers.common.driver_diagnostics import DriverDiagnostics
-from swarm_loc_drivers.common.odometry_output import OdometryOutput, stamp_message, transform_publisher
-from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
+from swarm_loc_drivers.common.ros_messages import OdometryOutput, stamp_message, transform_publisher
 from swarm_loc_drivers.droplet.driver import OWN, DropletDriver, DropletListeners
-from swarm_loc_drivers.droplet.droplet_parameters import DropletParameters, droplet_settings
 from swarm_loc_drivers.droplet.exchange import Brightness
+from swarm_loc_drivers.droplet.parameters import DropletParameters, droplet_settings
 from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import BrightnessMatrix
 

@@ -16,7 +16,7 @@ from typing import Any
 from rclpy.parameter import Parameter
 
 from swarm_loc_drivers.droplet.droplet_driver_node import DropletDriverNode
-from swarm_loc_drivers.droplet.droplet_parameters import DropletFleetParameters
+from swarm_loc_drivers.droplet.parameters import DropletFleetParameters
 from swarm_loc_estimator.common.node import ConfiguredNode, Stop, run_node, spin
 from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_estimator.swarm.swarm_file import load_swarm

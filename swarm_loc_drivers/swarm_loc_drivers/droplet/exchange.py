@@ -15,14 +15,14 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.droplet import console as protocol
-from swarm_loc_drivers.droplet.console import Matrix, Said, SendAborted
+from swarm_loc_drivers.droplet import protocol
 from swarm_loc_drivers.droplet.console_session import MARGIN_NS, ConsoleTalk, Talk, relay
-from swarm_loc_drivers.droplet.infrared_timing import (
+from swarm_loc_drivers.droplet.hardware import (
     EMITTED_AFTER_NS,
     PRINTED_AFTER_NS,
     SET_POWER_DELAY_NS,
 )
+from swarm_loc_drivers.droplet.protocol import Matrix, Said, SendAborted
 
 _BRIGHTER = 1.5
 """So much brighter in all is the far matrix of a pair than the near one, at any distance up to 30 cm."""

@@ -11,8 +11,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from swarm_loc_drivers.droplet import console as protocol
-from swarm_loc_drivers.droplet.console import Matrix, Said
+from swarm_loc_drivers.droplet import protocol
 from swarm_loc_drivers.droplet.console_session import MARGIN_NS, ConsoleTalk, Talk
 from swarm_loc_drivers.droplet.exchange import (
     Brightness,
@@ -22,11 +21,12 @@ from swarm_loc_drivers.droplet.exchange import (
     brightness_of,
     publish_pair,
 )
-from swarm_loc_drivers.droplet.infrared_timing import (
+from swarm_loc_drivers.droplet.hardware import (
     EMITTED_AFTER_NS,
     PRINTED_AFTER_NS,
     SET_POWER_DELAY_NS,
 )
+from swarm_loc_drivers.droplet.protocol import Matrix, Said
 
 _LATEST = 0.5
 """Later in a half than this share of it no emission begins: it might end in the next one."""

@@ -10,15 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.common.link import Link
-from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.link import Link, SerialLink, TcpLink
+from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.robot_driver import RobotDriver
-from swarm_loc_drivers.common.serial_link import SerialLink
-from swarm_loc_drivers.common.tcp_link import TcpLink
 from swarm_loc_drivers.common.velocity_command import VelocityCommand
+from swarm_loc_drivers.epuck.odometry import WheelOdometry
 from swarm_loc_drivers.epuck.serial_session import SerialSession
 from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession, EpuckSettings
-from swarm_loc_drivers.epuck.wheel_odometry import WheelOdometry
 from swarm_loc_drivers.epuck.wifi_session import WifiSession
 
 _MAX_IDLE_S = 0.5
@@ -27,7 +25,7 @@ _READ_S = 0.02
 
 
 @dataclass(frozen=True)
-class Listeners:
+class EpuckListeners:
     """Who gets what the robot measures; called in the driver's thread.
 
     Attributes:
@@ -50,7 +48,7 @@ class EpuckDriver(RobotDriver[EpuckSession]):
         clock: Tells the time [ns]; may be simulated, and 0 is none.
     """
 
-    def __init__(self, settings: EpuckSettings, listeners: Listeners, clock: Callable[[], int]) -> None:
+    def __init__(self, settings: EpuckSettings, listeners: EpuckListeners, clock: Callable[[], int]) -> None:
         super().__init__(str(settings.address))
         self._settings = settings
         self._listeners = listeners
@@ -110,7 +108,7 @@ class EpuckDriver(RobotDriver[EpuckSession]):
     def _speeds(self) -> tuple[int, int]:
         """What the wheels are told now."""
         speed, _, turn_rate = self._command.velocity()
-        left, right = self._settings.geometry.commands_for(speed, turn_rate, self._settings.model)
+        left, right = self._settings.model.wheel_commands(self._settings.geometry, speed, turn_rate)
         rate = self._settings.model.rate
         self._odometry.note_rates(self._clock(), rate(left), rate(right))
         return left, right

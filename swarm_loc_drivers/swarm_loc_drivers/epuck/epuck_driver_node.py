@@ -8,26 +8,42 @@ It takes `cmd_vel` and publishes `odom`, `proximity/ps0` to `ps7`, `image_raw`, 
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Twist
+from geometry_msgs.msg import Transform, TransformStamped, Twist, Vector3
 from numpy.typing import NDArray
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, Image, Range
+from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_drivers.common.camera_messages import camera_info_message, image_message
 from swarm_loc_drivers.common.driver_diagnostics import DriverDiagnostics
-from swarm_loc_drivers.common.odometry_output import OdometryOutput, transform_publisher
 from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
-from swarm_loc_drivers.epuck import epuck_messages
-from swarm_loc_drivers.epuck.driver import EpuckDriver, Listeners
-from swarm_loc_drivers.epuck.epuck_parameters import EpuckParameters, camera_calibration, epuck_settings
+from swarm_loc_drivers.common.ros_messages import (
+    OdometryOutput,
+    camera_info_message,
+    image_message,
+    stamp_message,
+    transform_publisher,
+    yaw_quaternion,
+)
+from swarm_loc_drivers.epuck.driver import EpuckDriver, EpuckListeners
+from swarm_loc_drivers.epuck.hardware import (
+    FIELD_OF_VIEW,
+    MAX_RANGE_M,
+    MIN_RANGE_M,
+    PROXIMITY_BEARINGS,
+    PROXIMITY_RADIUS_M,
+    range_of_raw,
+)
+from swarm_loc_drivers.epuck.parameters import EpuckParameters, camera_calibration, epuck_settings
 from swarm_loc_drivers.epuck.session import CameraImage
 from swarm_loc_estimator.common.node import run_node
 
+_PROXIMITY_NAMES = tuple(f"ps{sensor}" for sensor in range(len(PROXIMITY_BEARINGS)))
 _COMMAND_QOS = QoSProfile(depth=1)
 _TF_STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _RATES = ("readings", "images")
@@ -57,7 +73,7 @@ class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
         transforms = transform_publisher(self) if parameters.publish_tf else None
         odom_frame = f"{self._prefix}{parameters.odom_frame}"
         odometry = OdometryOutput(self, "odom", odom_frame, self._base_frame, transforms)
-        listeners = Listeners(odometry.publish, self._publish_proximity, self._publish_image)
+        listeners = EpuckListeners(odometry.publish, self._publish_proximity, self._publish_image)
         self._driver = EpuckDriver(settings, listeners, self._now_ns)
         self._advertise()
         name, address = f"{self._prefix}{self.get_name()}", str(settings.address)
@@ -69,14 +85,14 @@ class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
         # one topic each: eight at once on one would overrun the few places of a sensor-data queue
         self._proximity = [
             self.create_publisher(Range, f"proximity/{name}", qos_profile_sensor_data)
-            for name in epuck_messages.PROXIMITY_NAMES
+            for name in _PROXIMITY_NAMES
         ]
         if self._calibration is not None:
             self._image = self.create_publisher(Image, "image_raw", qos_profile_sensor_data)
             self._camera_info = self.create_publisher(CameraInfo, "camera_info", qos_profile_sensor_data)
         # tf2's listeners know this absolute name, whatever the namespace
         self._tf_static = self.create_publisher(TFMessage, "/tf_static", _TF_STATIC_QOS)
-        sensors = epuck_messages.proximity_transforms(self._now_ns(), self._base_frame, self._prefix)
+        sensors = _proximity_transforms(self._now_ns(), self._base_frame, self._prefix)
         self._tf_static.publish(TFMessage(transforms=sensors))
 
     def _on_cmd_vel(self, message: Twist) -> None:
@@ -84,7 +100,7 @@ class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
 
     def _publish_proximity(self, stamp_ns: int, raw: NDArray[np.int64]) -> None:
         if any(publisher.get_subscription_count() for publisher in self._proximity):
-            messages = epuck_messages.range_messages(stamp_ns, raw, self._prefix)
+            messages = _range_messages(stamp_ns, raw, self._prefix)
             for publisher, message in zip(self._proximity, messages, strict=True):
                 publisher.publish(message)
 
@@ -94,6 +110,38 @@ class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
         image = image_message(taken.pixels, taken.stamp_ns, self._camera_frame)
         self._image.publish(image)
         self._camera_info.publish(camera_info_message(self._calibration, image.header))
+
+
+def _proximity_frames(prefix: str) -> list[str]:
+    """Names of the sensors' frames, x out of the sensor."""
+    return [f"{prefix}{name}" for name in _PROXIMITY_NAMES]
+
+
+def _proximity_transforms(stamp_ns: int, base_frame: str, prefix: str) -> list[TransformStamped]:
+    """Where the proximity sensors sit."""
+    header = Header(stamp=stamp_message(stamp_ns), frame_id=base_frame)
+    transforms = []
+    for frame, bearing in zip(_proximity_frames(prefix), PROXIMITY_BEARINGS, strict=True):
+        place = Vector3(x=PROXIMITY_RADIUS_M * math.cos(bearing), y=PROXIMITY_RADIUS_M * math.sin(bearing))
+        transform = Transform(translation=place, rotation=yaw_quaternion(bearing))
+        transforms.append(TransformStamped(header=header, child_frame_id=frame, transform=transform))
+    return transforms
+
+
+def _range_messages(stamp_ns: int, raw: NDArray[np.int64], prefix: str) -> list[Range]:
+    """The proximity sensors' raw values (8,) as ranges, ps0 first."""
+    stamp = stamp_message(stamp_ns)
+    return [
+        Range(
+            header=Header(stamp=stamp, frame_id=frame),
+            radiation_type=Range.INFRARED,
+            field_of_view=FIELD_OF_VIEW,
+            min_range=MIN_RANGE_M,
+            max_range=MAX_RANGE_M,
+            range=distance,
+        )
+        for frame, distance in zip(_proximity_frames(prefix), range_of_raw(raw).tolist(), strict=True)
+    ]
 
 
 main = partial(run_node, "epuck_driver_node", EpuckDriverNode)

@@ -1,9 +1,15 @@
-"""Hardware of e-puck and e-puck2: stepper motors, counters, proximity sensors, image buffers."""
+"""Hardware of e-puck and e-puck2: motors, counters, proximity sensors, camera pixels."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from swarm_loc_drivers.common.odometry import WheelGeometry
+from swarm_loc_estimator.common.arrays import FloatArray
 
 STEPS_PER_TURN = 1000
 """20 steps of the motor by a gear of 50:1."""
@@ -54,6 +60,11 @@ class EpuckModel:
             return 0.0
         return math.copysign(self.timer_hz / (self.timer_hz // speed), command)
 
+    def wheel_commands(self, geometry: WheelGeometry, speed: float, turn_rate: float) -> tuple[int, int]:
+        """Commands [steps/s] for the left and the right wheel, from a speed [m/s] and a turn rate [rad/s]."""
+        left, right = geometry.commands_for(speed, turn_rate, self.max_rate)
+        return self.command_for(left), self.command_for(right)
+
     @property
     def max_rate(self) -> float:
         """The fastest rate [steps/s]."""
@@ -85,6 +96,11 @@ EPUCK2 = EpuckModel(
 EPUCK_MODELS = {model.name: model for model in (EPUCK1, EPUCK2)}
 
 
+def wheel_geometry(wheel_diameter: float, wheel_separation: float) -> WheelGeometry:
+    """The wheels of an e-puck, from their diameter and their separation [m]."""
+    return WheelGeometry(math.pi * wheel_diameter / STEPS_PER_TURN, wheel_separation)
+
+
 def as_counter(steps: int) -> int:
     """The signed 16-bit counter that a robot sends for its steps."""
     return (steps + _COUNTER_SPAN // 2) % _COUNTER_SPAN - _COUNTER_SPAN // 2
@@ -94,3 +110,44 @@ def unwrapped_difference(before: int, after: int, expected: float) -> int:
     """Steps between two counters of 16 bits: of all that they allow, the number closest to the expected."""
     surplus = as_counter(after - before - round(expected))
     return round(expected) + surplus
+
+
+_DISTANCE_M = np.array([0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.06])
+_RAW = np.array([4095.0, 2133.33, 1465.73, 601.46, 383.84, 234.93, 158.03, 120.0, 104.09])
+
+MIN_RANGE_M = 0.005
+MAX_RANGE_M = 0.06
+FIELD_OF_VIEW = 0.26
+"""Opening of a sensor's cone [rad]."""
+
+
+def raw_of_distance(distance_m: ArrayLike) -> FloatArray:
+    """Raw values (...) of a wall at distances (...) [m]; past the table's end that of free space."""
+    raw: FloatArray = np.interp(np.asarray(distance_m, dtype=float), _DISTANCE_M, _RAW)
+    return raw
+
+
+def range_of_raw(raw: ArrayLike) -> FloatArray:
+    """Ranges (...) [m] of raw values (...); by REP 117 +inf when nothing is near, -inf when too close."""
+    raw = np.asarray(raw, dtype=float)
+    distance = np.interp(raw, _RAW[::-1], _DISTANCE_M[::-1])
+    distance = np.where(raw <= _RAW[-1], np.inf, distance)
+    return np.where(distance < MIN_RANGE_M, -np.inf, distance)
+
+
+Image = NDArray[np.uint8]
+
+
+def decode_rgb565(data: bytes, width: int, height: int) -> Image:
+    """The image (height, width, 3) RGB of 2 * width * height bytes; full scale stays full scale."""
+    pixels = np.frombuffer(data, ">u2").reshape(height, width)
+    red, green, blue = pixels >> 11, (pixels >> 5) & 0x3F, pixels & 0x1F
+    channels = [(red << 3) | (red >> 2), (green << 2) | (green >> 4), (blue << 3) | (blue >> 2)]
+    return np.stack(channels, axis=-1).astype(np.uint8)
+
+
+def encode_rgb565(image: Image) -> bytes:
+    """The bytes of an image (height, width, 3) RGB."""
+    red, green, blue = np.moveaxis(image.astype(np.uint16), -1, 0)
+    pixels: NDArray[np.uint16] = ((red >> 3) << 11) | ((green >> 2) << 5) | (blue >> 3)
+    return pixels.astype(">u2").tobytes()

@@ -11,7 +11,7 @@ import numpy as np
 
 from swarm_loc_drivers.common.robot_driver import SessionError
 from swarm_loc_drivers.epuck import serial_protocol as protocol
-from swarm_loc_drivers.epuck.rgb565 import decode_rgb565
+from swarm_loc_drivers.epuck.hardware import decode_rgb565
 from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, EpuckSettings, Reading, Speeds
 
 _MAX_MISSED = 5

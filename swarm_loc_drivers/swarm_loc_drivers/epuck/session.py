@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.link import Address
+from swarm_loc_drivers.common.odometry import WheelGeometry
 from swarm_loc_drivers.common.robot_driver import Session
-from swarm_loc_drivers.epuck.hardware import EpuckModel
-from swarm_loc_drivers.epuck.rgb565 import Image
-from swarm_loc_drivers.epuck.wheels import WheelGeometry
+from swarm_loc_drivers.epuck.hardware import EpuckModel, Image
 
 Speeds = Callable[[], tuple[int, int]]
 """Tells what the wheels are to do, left and right [steps/s]; called when it is about to be sent."""

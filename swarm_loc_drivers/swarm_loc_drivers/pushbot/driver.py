@@ -6,16 +6,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from swarm_loc_drivers.common.link import Link
-from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.link import Link, SerialLink, TcpLink
+from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.robot_driver import RobotDriver
-from swarm_loc_drivers.common.serial_link import SerialLink
-from swarm_loc_drivers.common.tcp_link import TcpLink
 from swarm_loc_drivers.common.velocity_command import VelocityCommand
 from swarm_loc_drivers.pushbot.event_packets import EventPacket
-from swarm_loc_drivers.pushbot.session import PushbotSession
-from swarm_loc_drivers.pushbot.settings import PushbotSettings
-from swarm_loc_drivers.pushbot.wheel_odometry import PushbotOdometry
+from swarm_loc_drivers.pushbot.hardware import wheel_velocities
+from swarm_loc_drivers.pushbot.odometry import PushbotOdometry
+from swarm_loc_drivers.pushbot.session import PushbotSession, PushbotSettings
 
 _READ_S = 0.02
 _BATCH_S = 0.002
@@ -23,7 +21,7 @@ _BATCH_S = 0.002
 
 
 @dataclass(frozen=True)
-class Listeners:
+class PushbotListeners:
     """Who gets what the robot measures; called in the driver's thread.
 
     Attributes:
@@ -44,7 +42,9 @@ class PushbotDriver(RobotDriver[PushbotSession]):
         clock: Tells the time [ns]; may be simulated, and 0 is none.
     """
 
-    def __init__(self, settings: PushbotSettings, listeners: Listeners, clock: Callable[[], int]) -> None:
+    def __init__(
+        self, settings: PushbotSettings, listeners: PushbotListeners, clock: Callable[[], int]
+    ) -> None:
         super().__init__(str(settings.address))
         self._settings = settings
         self._listeners = listeners
@@ -89,4 +89,4 @@ class PushbotDriver(RobotDriver[PushbotSession]):
     def _velocities(self) -> tuple[int, int]:
         """What the wheels are told now."""
         speed, _, turn_rate = self._command.velocity()
-        return self._settings.geometry.velocities(speed, turn_rate)
+        return wheel_velocities(self._settings.geometry, speed, turn_rate)

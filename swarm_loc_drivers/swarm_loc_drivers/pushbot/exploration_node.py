@@ -22,9 +22,9 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from swarm_loc_drivers.common.odometry_output import nanoseconds
+from swarm_loc_drivers.common.ros_messages import nanoseconds
 from swarm_loc_drivers.common.velocity_command import Velocity
-from swarm_loc_drivers.pushbot.exploration_parameters import ExplorationParameters, driven_robots
+from swarm_loc_drivers.pushbot.parameters import ExplorationParameters, driven_robots
 from swarm_loc_drivers.pushbot.stop_and_go import MapGoal, StopAndGo, StopAndGoSettings
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.planar import yaw_of

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from swarm_loc_drivers.common.odometry import WheelGeometry
+
 SENSOR_PX = 128
 """Rows and columns of the event camera."""
 MAX_VELOCITY = 100
@@ -53,6 +55,12 @@ SECOND_FIRMWARE = FirmwareGeneration(
 )
 """Version 0.7 and later."""
 GENERATIONS = {one.name: one for one in (FIRST_FIRMWARE, SECOND_FIRMWARE)}
+
+
+def wheel_velocities(geometry: WheelGeometry, speed: float, turn_rate: float) -> tuple[int, int]:
+    """Velocities of the left and the right wheel [ticks per 21 ms]; speed [m/s], turn rate [rad/s]."""
+    left, right = geometry.commands_for(speed, turn_rate, MAX_VELOCITY, VELOCITY_PERIOD_S)
+    return round(left), round(right)
 
 
 def tick_difference(before: int, after: int) -> int:

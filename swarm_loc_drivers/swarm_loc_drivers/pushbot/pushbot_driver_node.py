@@ -8,20 +8,23 @@ It takes `cmd_vel` and publishes `odom`, `events`, `/tf` and `/diagnostics`. Par
 
 from __future__ import annotations
 
+from array import array
 from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import Twist
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Header
 
 from swarm_loc_drivers.common.driver_diagnostics import DriverDiagnostics
-from swarm_loc_drivers.common.odometry_output import OdometryOutput, transform_publisher
 from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
-from swarm_loc_drivers.pushbot.driver import Listeners, PushbotDriver
-from swarm_loc_drivers.pushbot.event_output import event_message
+from swarm_loc_drivers.common.ros_messages import OdometryOutput, stamp_message, transform_publisher
+from swarm_loc_drivers.pushbot.driver import PushbotDriver, PushbotListeners
 from swarm_loc_drivers.pushbot.event_packets import EventPacket
-from swarm_loc_drivers.pushbot.precompile import precompile
-from swarm_loc_drivers.pushbot.pushbot_parameters import PushbotParameters, pushbot_settings
+from swarm_loc_drivers.pushbot.event_parser import precompile
+from swarm_loc_drivers.pushbot.hardware import SENSOR_PX
+from swarm_loc_drivers.pushbot.parameters import PushbotParameters, pushbot_settings
+from swarm_loc_estimator.common.messages.event_encoding import ENCODING
 from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import EventPacket as EventPacketMessage
 
@@ -56,7 +59,9 @@ class PushbotDriverNode(RobotDriverNode[PushbotParameters]):
         odometry = OdometryOutput(self, "odom", *frames, transforms)
         self._camera_frame = f"{self._prefix}event_camera_optical_frame"
         self._events = self.create_publisher(EventPacketMessage, "events", EVENT_QOS)
-        self._driver = PushbotDriver(settings, Listeners(odometry.publish, self._publish), self._now_ns)
+        self._driver = PushbotDriver(
+            settings, PushbotListeners(odometry.publish, self._publish), self._now_ns
+        )
         name, address = f"{self._prefix}{self.get_name()}", str(settings.address)
         self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
         self.create_subscription(Twist, "cmd_vel", self._on_cmd_vel, _COMMAND_QOS)
@@ -65,7 +70,16 @@ class PushbotDriverNode(RobotDriverNode[PushbotParameters]):
         self._driver.set_velocity(message.linear.x, message.angular.z)
 
     def _publish(self, packet: EventPacket) -> None:
-        self._events.publish(event_message(packet, self._camera_frame))
+        message = EventPacketMessage(
+            header=Header(stamp=stamp_message(packet.stamp_ns), frame_id=self._camera_frame),
+            height=SENSOR_PX,
+            width=SENSOR_PX,
+            seq=packet.number,
+            time_base=max(0, packet.board_ns),
+            encoding=ENCODING,
+        )
+        message.events = array("B", packet.data)
+        self._events.publish(message)
 
 
 main = partial(run_node, "pushbot_driver_node", PushbotDriverNode)

@@ -10,16 +10,65 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Generator
+from dataclasses import dataclass
 from typing import TypeVar
 
+from swarm_loc_drivers.common.link import Address
+from swarm_loc_drivers.common.odometry import WheelGeometry
 from swarm_loc_drivers.common.robot_driver import SessionError
-from swarm_loc_drivers.pushbot import commands, lines
-from swarm_loc_drivers.pushbot.event_bytes import EventParser, Parsed
-from swarm_loc_drivers.pushbot.event_clock import EventClock
+from swarm_loc_drivers.pushbot import protocol
+from swarm_loc_drivers.pushbot.clocks import EventClock, TickClock
 from swarm_loc_drivers.pushbot.event_packets import EventPacket, EventPackets
+from swarm_loc_drivers.pushbot.event_parser import EventParser, Parsed
 from swarm_loc_drivers.pushbot.hardware import FirmwareGeneration
-from swarm_loc_drivers.pushbot.settings import PushbotSettings, WheelTicks
-from swarm_loc_drivers.pushbot.tick_clock import TickClock
+from swarm_loc_drivers.pushbot.protocol import Lights
+
+
+@dataclass(frozen=True)
+class PushbotSettings:
+    """How to reach a robot and what it is to do.
+
+    Attributes:
+        address: Where it answers.
+        baud_rate: Of a serial port [bit/s].
+        geometry: Its wheels.
+        wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
+        command_timeout_s: How long a velocity counts [s].
+        reply_timeout_s: How long an answer, or the next wheel ticks, may take [s].
+        tick_period_s: Between two readings of the wheel ticks [s].
+        timestamps: Of events, a key of `hardware.TIMESTAMPS`; "" for no events at all.
+        on_bit: The polarity bit of pixels that became brighter.
+        packet_period_s: Of packets of events [s].
+        lights: Frequencies of laser and LEDs.
+    """
+
+    address: Address
+    baud_rate: int
+    geometry: WheelGeometry
+    wheel_noise: float
+    command_timeout_s: float
+    reply_timeout_s: float
+    tick_period_s: float
+    timestamps: str
+    on_bit: int
+    packet_period_s: float
+    lights: Lights
+
+
+@dataclass(frozen=True)
+class WheelTicks:
+    """A reading of the wheels' counters.
+
+    Attributes:
+        stamp_ns: Acquisition, as well as it can be known [ns].
+        left: Ticks of the left wheel, 32 bits, wrapping.
+        right: Likewise of the right wheel.
+    """
+
+    stamp_ns: int
+    left: int
+    right: int
+
 
 Velocities = Callable[[], tuple[int, int]]
 """Tells what the wheels are to do, left and right [ticks per 21 ms]; called when it is about to be sent."""
@@ -86,26 +135,26 @@ class PushbotSession:
         return output
 
     def _run(self) -> Talk[None]:
-        yield from self._answer(commands.RESET, lines.BANNER, _BOOT_S)
+        yield from self._answer(protocol.RESET, protocol.BANNER, _BOOT_S)
         if not self.ending:
             generation = yield from self._set_up()
             yield from self._stream(generation)
-        yield from self._answer(self._farewell(), lines.FORMAT, 0.0)
+        yield from self._answer(self._farewell(), protocol.FORMAT, 0.0)
 
     def _set_up(self) -> Talk[FirmwareGeneration]:
         """Find out what firmware it is, and have it do what is wanted; it streams at the end."""
         settings = self._settings
-        self._output += commands.NO_ECHO
-        listing = yield from self._answer(commands.LIST_SENSORS, lines.LAST_SENSORS, 0.0)
-        generation = self.generation = lines.generation_of(listing)
+        self._output += protocol.NO_ECHO
+        listing = yield from self._answer(protocol.LIST_SENSORS, protocol.LAST_SENSORS, 0.0)
+        generation = self.generation = protocol.generation_of(listing)
         if generation is None:
             raise SessionError("the board's firmware has no wheels: it is not one built for PushBots")
         if settings.timestamps:
             yield from self._choose_format(generation, settings.timestamps)
-        self._output += commands.lights(settings.lights) + commands.BRAKE + commands.MOTORS_ON
-        self._output += commands.stream_ticks(generation, _tick_period_ms(settings))
+        self._output += protocol.lights(settings.lights) + protocol.BRAKE + protocol.MOTORS_ON
+        self._output += protocol.stream_ticks(generation, _tick_period_ms(settings))
         if settings.timestamps:
-            self._output += commands.EVENTS_ON
+            self._output += protocol.EVENTS_ON
         return generation
 
     def _choose_format(self, generation: FirmwareGeneration, timestamps: str) -> Talk[None]:
@@ -114,8 +163,8 @@ class PushbotSession:
                 f"the firmware, of the {generation.name} generation, has no timestamps '{timestamps}', only"
                 f" {', '.join(generation.formats)}"
             )
-        wanted = commands.event_format(generation, timestamps) + commands.QUERY_FORMAT
-        answer = yield from self._answer(wanted, lines.FORMAT, 0.0)
+        wanted = protocol.event_format(generation, timestamps) + protocol.QUERY_FORMAT
+        answer = yield from self._answer(wanted, protocol.FORMAT, 0.0)
         if int(answer.strip()[-1:]) != generation.formats[timestamps]:
             raise SessionError(f"the robot answers {answer!r} to the choice of timestamps '{timestamps}'")
 
@@ -129,7 +178,7 @@ class PushbotSession:
                 yield
                 if match := pattern.search(self._received):
                     answer, self._received = self._received[: match.end()], self._received[match.end() :]
-                    return answer if pattern is lines.LAST_SENSORS else match[0]
+                    return answer if pattern is protocol.LAST_SENSORS else match[0]
                 self._received = self._received[-_MAX_RECEIVED:]
         raise SessionError(f"the robot does not answer {request.split()[0].decode()}")
 
@@ -177,14 +226,14 @@ class PushbotSession:
         Raises:
             SessionError: The board has begun anew.
         """
-        ticks = lines.wheel_ticks(line, generation)
+        ticks = protocol.wheel_ticks(line, generation)
         if ticks is not None:
             self._counts["readings"] += 1
             self.found.append(WheelTicks(readings.stamp_ns(self._now_ns), *ticks))
             return True
-        if lines.BANNER.search(line + b"\n"):
+        if protocol.BANNER.search(line + b"\n"):
             raise SessionError("the robot has been reset")
-        self._counts["refused_commands" if lines.is_refusal(line) else "other_lines"] += 1
+        self._counts["refused_commands" if protocol.is_refusal(line) else "other_lines"] += 1
         return False
 
     def _tell_velocity(self, generation: FirmwareGeneration) -> None:
@@ -192,14 +241,14 @@ class PushbotSession:
         wanted = self._velocities() if self.connected else (0, 0)
         if wanted == self._told and (wanted == (0, 0) or self._steady_s < self._told_s + _REPEAT_S):
             return
-        self._output += commands.velocity(generation, *wanted) if any(wanted) else commands.BRAKE
+        self._output += protocol.velocity(generation, *wanted) if any(wanted) else protocol.BRAKE
         self._told, self._told_s = wanted, self._steady_s
 
     def _farewell(self) -> bytes:
         """Everything off; the answer to the question behind it says that all of it was heard."""
-        dark = commands.lights(commands.Lights(0.0, 0.0))
-        off = commands.EVENTS_OFF + commands.STOP_SENSORS + commands.MOTORS_OFF
-        return b"\n" + commands.BRAKE + off + dark + commands.QUERY_FORMAT
+        dark = protocol.lights(protocol.Lights(0.0, 0.0))
+        off = protocol.EVENTS_OFF + protocol.STOP_SENSORS + protocol.MOTORS_OFF
+        return b"\n" + protocol.BRAKE + off + dark + protocol.QUERY_FORMAT
 
 
 def _tick_period_ms(settings: PushbotSettings) -> int:

@@ -13,7 +13,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
-from swarm_loc_drivers.common.odometry_output import stamp_message
+from swarm_loc_drivers.common.ros_messages import stamp_message
 from swarm_loc_drivers.sim.link_host import FirmwareHost
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.encoders import encode_pose_stamped

@@ -158,7 +158,7 @@ def test_stamps_motion_and_timeout_follow_simulated_time(world: World, ros: Ros,
     world.until(lambda: world.odometry)
     world.rest()
     world.command(0.1)
-    speeds = GEOMETRY.commands_for(0.1, 0.0, EPUCK2)
+    speeds = EPUCK2.wheel_commands(GEOMETRY, 0.1, 0.0)
     ros.until(lambda: struct.pack("<2h", *speeds) in world.heard)
     for _ in range(10):
         world.step()

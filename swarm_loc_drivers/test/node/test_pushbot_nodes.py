@@ -18,7 +18,7 @@ from node_world import Program, Ros, stamp_ns
 from rclpy.qos import qos_profile_sensor_data
 from test_world_node import free_ports
 
-from swarm_loc_drivers.pushbot.settings import WheelGeometry
+from swarm_loc_drivers.common.odometry import WheelGeometry
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import FOCAL_PX
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldSettings

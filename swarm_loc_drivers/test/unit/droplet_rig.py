@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from swarm_loc_drivers.droplet.commanded_motion import MotionNoise
 from swarm_loc_drivers.droplet.exchange import Brightness, PollingSettings
 from swarm_loc_drivers.droplet.hardware import DROPLET, ELEMENTS, FULL_POWER
+from swarm_loc_drivers.droplet.odometry import MotionNoise
 from swarm_loc_drivers.droplet.session import SessionSettings
 from swarm_loc_drivers.droplet.tdma import TdmaSettings
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware

@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.epuck.wheels import WheelGeometry
+from swarm_loc_drivers.epuck.hardware import wheel_geometry
 
-GEOMETRY = WheelGeometry(wheel_diameter=0.041, wheel_separation=0.053)
+GEOMETRY = wheel_geometry(wheel_diameter=0.041, wheel_separation=0.053)
 _CAMERA_PERIOD_NS = 66_000_000
 PROXIMITY = np.array([150, 110, 60, 60, 60, 60, 110, 2000])
 

@@ -15,8 +15,8 @@ from epuck_body import GEOMETRY, DrivenBody
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.link import Address
-from swarm_loc_drivers.common.odometry_state import OdometryState
-from swarm_loc_drivers.epuck.driver import EpuckDriver, Listeners
+from swarm_loc_drivers.common.odometry import OdometryState
+from swarm_loc_drivers.epuck.driver import EpuckDriver, EpuckListeners
 from swarm_loc_drivers.epuck.hardware import EPUCK2, EpuckModel
 from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, EpuckSettings
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
@@ -65,7 +65,7 @@ class Bench:
         self.proximity: list[NDArray[np.int64]] = []
         self.velocity = (0.0, 0.0)
         self._news = threading.Condition()
-        listeners = Listeners(
+        listeners = EpuckListeners(
             self._keep(self.states), lambda _, raw: self.proximity.append(raw), self._keep(self.images)
         )
         self.driver = EpuckDriver(settings, listeners, time.monotonic_ns)

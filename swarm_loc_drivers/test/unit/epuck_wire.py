@@ -11,12 +11,12 @@ import numpy as np
 from epuck_body import GEOMETRY, DrivenBody
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.robot_driver import SessionError
 from swarm_loc_drivers.epuck.hardware import EpuckModel
+from swarm_loc_drivers.epuck.odometry import WheelOdometry
 from swarm_loc_drivers.epuck.serial_session import SerialSession
 from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession, EpuckSettings, Reading
-from swarm_loc_drivers.epuck.wheel_odometry import WheelOdometry
 from swarm_loc_drivers.epuck.wifi_session import WifiSession
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware
@@ -155,7 +155,7 @@ class Wire:
         """Drive legs of speed [m/s], turn rate [rad/s] and amount [m or rad] by odometry, then stand."""
         for speed, turn_rate, amount in legs:
             self._until(lambda: len(self.states) > 0)
-            self.speeds = GEOMETRY.commands_for(speed, turn_rate, self._model)
+            self.speeds = self._model.wheel_commands(GEOMETRY, speed, turn_rate)
             start = self.states[-1].pose
             part = slice(2, 3) if turn_rate else slice(0, 2)
             self._until(

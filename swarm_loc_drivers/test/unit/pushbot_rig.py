@@ -9,21 +9,20 @@ from typing import Any
 import numpy as np
 
 from swarm_loc_drivers.common.link import Address
-from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.odometry import OdometryState, WheelGeometry
 from swarm_loc_drivers.common.robot_driver import SessionError
-from swarm_loc_drivers.pushbot.commands import Lights
 from swarm_loc_drivers.pushbot.event_packets import EventPacket
 from swarm_loc_drivers.pushbot.hardware import SECOND_FIRMWARE, FirmwareGeneration
-from swarm_loc_drivers.pushbot.session import PushbotSession
-from swarm_loc_drivers.pushbot.settings import PushbotSettings, WheelGeometry, WheelTicks
-from swarm_loc_drivers.pushbot.wheel_odometry import PushbotOdometry
+from swarm_loc_drivers.pushbot.odometry import PushbotOdometry
+from swarm_loc_drivers.pushbot.protocol import Lights
+from swarm_loc_drivers.pushbot.session import PushbotSession, PushbotSettings, WheelTicks
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
 from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, outline
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldSettings, SimulatedPushbot
 from swarm_loc_estimator.common import se2
 
-GEOMETRY = WheelGeometry(metres_per_tick=1e-4, wheel_separation=0.085)
+GEOMETRY = WheelGeometry(metres_per_step=1e-4, wheel_separation=0.085)
 HALL = FloorPlan("hall", outline([(-2.0, -2.0, 3.0, 2.0)], []), np.zeros((1, 2)))
 
 

@@ -10,8 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_drivers.droplet import console
-from swarm_loc_drivers.droplet.console import (
+from swarm_loc_drivers.droplet import protocol as console
+from swarm_loc_drivers.droplet.hardware import (
+    DIRECTIONS,
+    ELEMENTS,
+    TURN_CLOCKWISE,
+    TURN_COUNTERCLOCKWISE,
+    gait,
+)
+from swarm_loc_drivers.droplet.protocol import (
     Broken,
     Complaint,
     ConsoleParser,
@@ -32,13 +39,6 @@ from swarm_loc_drivers.droplet.console import (
     StepLength,
     Title,
     Unknown,
-)
-from swarm_loc_drivers.droplet.hardware import (
-    DIRECTIONS,
-    ELEMENTS,
-    TURN_CLOCKWISE,
-    TURN_COUNTERCLOCKWISE,
-    gait,
 )
 
 ROWS = tuple(tuple(range(10 * emitter, 10 * emitter + 6)) for emitter in range(6))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from droplet_rig import IDEAL, IDS, LINK, NOISE, SECOND, TRIANGLE, asking, session_settings, world_of
 
-from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.droplet.driver import OWN, DropletDriver, DropletListeners, DropletSettings
 from swarm_loc_drivers.droplet.exchange import Brightness, PollingSettings
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware

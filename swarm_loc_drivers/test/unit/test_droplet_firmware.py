@@ -8,8 +8,7 @@ from droplet_rig import IDS, TRIANGLE, world_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_drivers.droplet.console import ConsoleParser, Matrix
-from swarm_loc_drivers.droplet.infrared_timing import (
+from swarm_loc_drivers.droplet.hardware import (
     EMITTED_AFTER_NS,
     EXCHANGE_NS,
     HANDLING_NS,
@@ -17,6 +16,7 @@ from swarm_loc_drivers.droplet.infrared_timing import (
     PRINT_DELAY_NS,
     message_ns,
 )
+from swarm_loc_drivers.droplet.protocol import ConsoleParser, Matrix
 from swarm_loc_drivers.sim.droplet.firmware import (
     DropletFirmware,
     Print,

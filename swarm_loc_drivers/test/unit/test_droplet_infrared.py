@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from droplet_rig import IDEAL, LINK, QUIET, SECOND, TRIANGLE, world_of
 
-from swarm_loc_drivers.droplet.hardware import FULL_POWER
-from swarm_loc_drivers.droplet.infrared_timing import EXCHANGE_NS, message_ns
+from swarm_loc_drivers.droplet.hardware import EXCHANGE_NS, FULL_POWER, message_ns
 from swarm_loc_drivers.sim.droplet.infrared import ExchangeReadings, InfraredCommand, InfraredSettings
 from swarm_loc_drivers.sim.droplet.world import NEAR_POWER, STEP_NS, DropletErrors, DropletWorld
 from swarm_loc_estimator.common import se2

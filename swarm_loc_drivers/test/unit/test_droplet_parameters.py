@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from swarm_loc_drivers.droplet.droplet_parameters import (
+from swarm_loc_drivers.droplet.exchange import PollingSettings
+from swarm_loc_drivers.droplet.hardware import AUDIO_DROPLET
+from swarm_loc_drivers.droplet.parameters import (
     DropletFleetParameters,
     DropletParameters,
     droplet_settings,
 )
-from swarm_loc_drivers.droplet.exchange import PollingSettings
-from swarm_loc_drivers.droplet.hardware import AUDIO_DROPLET
 from swarm_loc_drivers.droplet.tdma import TdmaSettings
 from swarm_loc_drivers.sim.droplet.droplet_world_parameters import DropletWorldParameters
 from swarm_loc_estimator.common.parameters import ParameterError, markdown_table

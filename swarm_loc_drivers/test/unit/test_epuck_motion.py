@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.velocity_command import STANDING_CLOCK_S, STILL, Velocity, VelocityCommand
 from swarm_loc_drivers.epuck.hardware import EPUCK1, EPUCK2, as_counter
-from swarm_loc_drivers.epuck.wheel_odometry import WheelOdometry
+from swarm_loc_drivers.epuck.odometry import WheelOdometry
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot
@@ -28,7 +28,7 @@ AHEAD = (0.05, 0.0, 0.0)
 
 @given(speed=st.floats(-0.5, 0.5), turn_rate=st.floats(-20.0, 20.0))
 def test_beyond_the_limit_the_curve_stays(speed: float, turn_rate: float) -> None:
-    left, right = (EPUCK2.rate(c) for c in GEOMETRY.commands_for(speed, turn_rate, EPUCK2))
+    left, right = (EPUCK2.rate(c) for c in EPUCK2.wheel_commands(GEOMETRY, speed, turn_rate))
     wanted_left = (speed - 0.5 * GEOMETRY.wheel_separation * turn_rate) / GEOMETRY.metres_per_step
     wanted_right = (speed + 0.5 * GEOMETRY.wheel_separation * turn_rate) / GEOMETRY.metres_per_step
     slower = min(1.0, EPUCK2.max_rate / max(abs(wanted_left), abs(wanted_right), 1e-9))

@@ -9,7 +9,7 @@ import pytest
 
 from swarm_loc_drivers.common.calibration_file import CalibrationFileError, load_calibration
 from swarm_loc_drivers.common.link import Address, AddressError, parse_address
-from swarm_loc_drivers.epuck.epuck_parameters import EpuckParameters, camera_calibration, epuck_settings
+from swarm_loc_drivers.epuck.parameters import EpuckParameters, camera_calibration, epuck_settings
 from swarm_loc_estimator.common.parameters import ParameterError, markdown_table
 
 PAGE = Path(__file__).parents[2] / "doc" / "epuck_driver_node.md"

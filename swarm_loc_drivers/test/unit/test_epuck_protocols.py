@@ -19,13 +19,16 @@ from swarm_loc_drivers.epuck import wifi_protocol as epuck_wifi
 from swarm_loc_drivers.epuck.hardware import (
     EPUCK1,
     EPUCK2,
+    MAX_RANGE_M,
     PROXIMITY_BEARINGS,
     EpuckModel,
     as_counter,
+    decode_rgb565,
+    encode_rgb565,
+    range_of_raw,
+    raw_of_distance,
     unwrapped_difference,
 )
-from swarm_loc_drivers.epuck.proximity import MAX_RANGE_M, range_of_raw, raw_of_distance
-from swarm_loc_drivers.epuck.rgb565 import decode_rgb565, encode_rgb565
 from swarm_loc_drivers.epuck.wifi_protocol import SENSORS_DTYPE, Command, StreamParser, plausible
 
 MODELS = pytest.mark.parametrize("model", [EPUCK1, EPUCK2], ids=lambda model: model.name)

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.epuck.proximity import raw_of_distance
-from swarm_loc_drivers.epuck.wheels import WheelGeometry
+from swarm_loc_drivers.epuck.hardware import raw_of_distance, wheel_geometry
 from swarm_loc_drivers.sim.epuck.world import (
     STEP_NS,
     EpuckWorld,
@@ -23,7 +22,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_vision.markers.families import family_named
 
-WHEELS = WheelGeometry(wheel_diameter=0.041, wheel_separation=0.053)
+WHEELS = wheel_geometry(wheel_diameter=0.041, wheel_separation=0.053)
 IDEAL = replace(W0, wheel_noise=0.0)
 CAMERA = CameraModel(width=320, height=240)
 START = np.array([[0.0, 0.0, 0.3], [0.3, 0.05, 2.0], [-0.4, 0.3, -1.0]])

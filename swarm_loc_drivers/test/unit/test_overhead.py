@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.epuck.wheels import WheelGeometry
+from swarm_loc_drivers.epuck.hardware import wheel_geometry
 from swarm_loc_drivers.sim.epuck.world import OVERHEAD, EpuckWorld, EpuckWorldSettings, Exposure
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena, OverheadSettings, overhead_model
@@ -41,7 +41,7 @@ def world(start: FloatArray, overhead: OverheadSettings, seed: int = 1) -> Epuck
         errors=W0,
         arena=Arena(ARENA, ground.family),
         camera=CameraModel(width=64, height=48),
-        wheels=WheelGeometry(0.041, 0.053),
+        wheels=wheel_geometry(0.041, 0.053),
         camera_rate_hz=7.5,
         start_ns=START_NS,
         overhead=overhead,

@@ -9,17 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_drivers.pushbot.event_clock import EventClock
+from swarm_loc_drivers.common.odometry import WheelGeometry
+from swarm_loc_drivers.pushbot.clocks import EventClock, TickClock
 from swarm_loc_drivers.pushbot.event_packets import MAX_EVENTS, EventPackets
-from swarm_loc_drivers.pushbot.hardware import tick_difference
-from swarm_loc_drivers.pushbot.settings import WheelGeometry, WheelTicks
-from swarm_loc_drivers.pushbot.tick_clock import TickClock
-from swarm_loc_drivers.pushbot.wheel_odometry import PushbotOdometry
+from swarm_loc_drivers.pushbot.hardware import tick_difference, wheel_velocities
+from swarm_loc_drivers.pushbot.odometry import PushbotOdometry
+from swarm_loc_drivers.pushbot.session import WheelTicks
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.messages.event_encoding import ENCODING, decode_events
 
 MS = 1_000_000
-GEOMETRY = WheelGeometry(metres_per_tick=1e-4, wheel_separation=0.085)
+GEOMETRY = WheelGeometry(metres_per_step=1e-4, wheel_separation=0.085)
 
 
 def run(clock: EventClock, made_us: IntArray, late_ns: IntArray) -> IntArray:
@@ -117,7 +117,7 @@ def odometry() -> tuple[PushbotOdometry, Counter[str]]:
 
 def test_a_quarter_turn_and_a_metre() -> None:
     reckoning, counts = odometry()
-    turn = round(0.25 * np.pi * GEOMETRY.wheel_separation / GEOMETRY.metres_per_tick)
+    turn = round(0.25 * np.pi * GEOMETRY.wheel_separation / GEOMETRY.metres_per_step)
     readings = [(0, 0), (-turn, turn), (10_000 - turn, 10_000 + turn)]
     for k, (left, right) in enumerate(readings):
         state = reckoning.update(WheelTicks(10**9 + k * 3 * 10**9, left, right))
@@ -153,7 +153,7 @@ def test_a_stamp_that_is_corrected_backwards_is_no_jump_of_time() -> None:
 
 
 def test_commands_keep_the_curve_at_the_limit() -> None:
-    left, right = GEOMETRY.velocities(1.0, 2.0)
+    left, right = wheel_velocities(GEOMETRY, 1.0, 2.0)
     assert max(left, right) == 100
     assert left / right == pytest.approx((1.0 - 0.085) / (1.0 + 0.085), rel=0.02)
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pushbot_events import Sent, event_pieces, random_events
 
-from swarm_loc_drivers.pushbot.event_bytes import CONFIRMATIONS, EventParser, Parsed
+from swarm_loc_drivers.pushbot.event_parser import CONFIRMATIONS, EventParser, Parsed
 from swarm_loc_drivers.pushbot.hardware import TIMESTAMPS
 
 STAMPED = [name for name in TIMESTAMPS if name != "none"]

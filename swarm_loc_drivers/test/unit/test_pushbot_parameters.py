@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.pushbot.exploration_parameters import ExplorationParameters
-from swarm_loc_drivers.pushbot.pushbot_parameters import PushbotParameters, pushbot_settings
+from swarm_loc_drivers.pushbot.parameters import ExplorationParameters, PushbotParameters, pushbot_settings
 from swarm_loc_drivers.sim.pushbot.pushbot_world_parameters import (
     PushbotWorldParameters,
     make_pushbot_world,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pushbot_rig import PushbotWire, pushbot_settings
 
-from swarm_loc_drivers.pushbot import commands
+from swarm_loc_drivers.pushbot import protocol as commands
 from swarm_loc_drivers.pushbot.hardware import FIRST_FIRMWARE, SECOND_FIRMWARE, FirmwareGeneration
 from swarm_loc_estimator.common.messages.event_encoding import ENCODING, decode_events
 

@@ -9,9 +9,8 @@ from typing import Any
 
 import pytest
 
-from swarm_loc_drivers.common.link import LinkError
+from swarm_loc_drivers.common.link import LinkError, SerialLink
 from swarm_loc_drivers.common.robot_driver import RobotDriver
-from swarm_loc_drivers.common.serial_link import SerialLink
 
 
 @pytest.mark.parametrize("call", ["tcsetattr", "tcflush"])

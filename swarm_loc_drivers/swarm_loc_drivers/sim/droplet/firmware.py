@@ -12,13 +12,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.droplet.hardware import DIRECTIONS, FULL_POWER, gait
-from swarm_loc_drivers.droplet.infrared_timing import (
+from swarm_loc_drivers.droplet.hardware import (
+    DIRECTIONS,
     EMIT_DELAY_NS,
+    FULL_POWER,
     HANDLING_NS,
     MAX_MESSAGE,
     PRINT_DELAY_NS,
     SET_POWER_DELAY_NS,
+    gait,
 )
 from swarm_loc_drivers.sim.droplet.infrared import ExchangeReadings, InfraredCommand
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.droplet import infrared_timing as timing
+from swarm_loc_drivers.droplet import hardware as timing
 from swarm_loc_drivers.droplet.hardware import ELEMENTS, FULL_POWER
 from swarm_loc_estimator import expected_brightness
 from swarm_loc_estimator.common import se2

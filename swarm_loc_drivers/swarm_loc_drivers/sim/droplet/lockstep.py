@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.velocity_command import Velocity, VelocityCommand
-from swarm_loc_drivers.droplet.commanded_motion import CommandedMotion, MotionNoise
 from swarm_loc_drivers.droplet.exchange import Brightness
-from swarm_loc_drivers.droplet.mover import DropletMover
-from swarm_loc_drivers.droplet.session import DropletSession, SessionSettings
+from swarm_loc_drivers.droplet.odometry import CommandedMotion, MotionNoise
+from swarm_loc_drivers.droplet.session import DropletMover, DropletSession, SessionSettings
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
 from swarm_loc_drivers.sim.droplet.world import DropletWorld, SimulatedDroplet
 from swarm_loc_drivers.sim.link_host import ConsoleFirmware

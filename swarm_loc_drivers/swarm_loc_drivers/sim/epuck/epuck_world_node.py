@@ -18,11 +18,11 @@ from typing import Any
 
 from rclpy.qos import QoSProfile
 
-from swarm_loc_drivers.common.odometry_output import nanoseconds
-from swarm_loc_drivers.epuck.camera_output import CameraOutput
+from swarm_loc_drivers.common.ros_messages import nanoseconds
 from swarm_loc_drivers.epuck.hardware import EPUCK_MODELS
-from swarm_loc_drivers.epuck.pending_images import Unanswered
+from swarm_loc_drivers.sim.epuck.camera_output import CameraOutput
 from swarm_loc_drivers.sim.epuck.epuck_world_parameters import WorldParameters, make_world
+from swarm_loc_drivers.sim.epuck.parts import Unanswered
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware
 from swarm_loc_drivers.sim.epuck.world import OVERHEAD, STEP_NS, SimulatedEpuck

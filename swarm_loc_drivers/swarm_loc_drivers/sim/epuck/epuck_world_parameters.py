@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from swarm_loc_drivers.epuck.hardware import EPUCK2, EPUCK_MODELS
-from swarm_loc_drivers.epuck.wheels import WheelGeometry
+from swarm_loc_drivers.epuck.hardware import EPUCK2, EPUCK_MODELS, wheel_geometry
 from swarm_loc_drivers.sim.epuck.world import EpuckWorld, EpuckWorldSettings
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena, OverheadSettings
@@ -95,7 +94,7 @@ def make_world(parameters: WorldParameters) -> tuple[Swarm, EpuckWorld]:
             errors=WORLDS[parameters.world],
             arena=arena,
             camera=parameters.camera,
-            wheels=WheelGeometry(parameters.wheel_diameter, parameters.wheel_separation),
+            wheels=wheel_geometry(parameters.wheel_diameter, parameters.wheel_separation),
             camera_rate_hz=parameters.camera_rate,
             start_ns=START_NS,
             overhead=parameters.overhead,

@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Generator
 
 from swarm_loc_drivers.epuck import wifi_protocol as wifi
-from swarm_loc_drivers.epuck.hardware import EPUCK2, as_counter
-from swarm_loc_drivers.epuck.rgb565 import encode_rgb565
+from swarm_loc_drivers.epuck.hardware import EPUCK2, as_counter, encode_rgb565
 from swarm_loc_drivers.sim.epuck.parts import EpuckBody, Motors, camera_image, sensor_values
 
 DELAY_NS = 10_000_000

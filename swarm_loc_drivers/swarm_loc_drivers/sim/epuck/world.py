@@ -13,9 +13,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.epuck.hardware import PROXIMITY_BEARINGS, PROXIMITY_RADIUS_M
-from swarm_loc_drivers.epuck.proximity import FIELD_OF_VIEW, raw_of_distance
-from swarm_loc_drivers.epuck.wheels import WheelGeometry
+from swarm_loc_drivers.common.odometry import WheelGeometry
+from swarm_loc_drivers.epuck.hardware import (
+    FIELD_OF_VIEW,
+    PROXIMITY_BEARINGS,
+    PROXIMITY_RADIUS_M,
+    raw_of_distance,
+)
 from swarm_loc_drivers.sim.differential_drive import Drive, LastingNoise, roll
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena, CameraRig, OverheadRig, OverheadSettings

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from swarm_loc_drivers.common.odometry import WheelGeometry
 from swarm_loc_drivers.pushbot.hardware import GENERATIONS, SECOND_FIRMWARE
-from swarm_loc_drivers.pushbot.settings import WheelGeometry
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS, floor_plan
 from swarm_loc_drivers.sim.pushbot.world import (

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.pushbot.settings import WheelGeometry
+from swarm_loc_drivers.common.odometry import WheelGeometry
 from swarm_loc_drivers.sim.differential_drive import Drive, LastingNoise, roll
 from swarm_loc_drivers.sim.pushbot.event_camera import Blinking, CameraNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, clearance
@@ -149,7 +149,7 @@ class PushbotWorld:
     def _rolled(self, ticks: FloatArray) -> FloatArray:
         """Poses after the wheels' ticks; a robot that would hit something only turns."""
         step_s = STEP_NS * 1e-9
-        left, right = (self._settings.wheels.metres_per_tick * ticks / step_s).T
+        left, right = (self._settings.wheels.metres_per_step * ticks / step_s).T
         slip = self._slip.next()
         noise = np.sqrt(self._drive.wheel_noise) * slip[:, :2]
         turn_rate = (right - left) / self._drive.wheel_separation

@@ -1,32 +1,87 @@
-"""Dead reckoning of a differential drive: paths of two wheels add up to a pose with its covariance."""
+"""Odometry of a robot at an instant, and dead reckoning of a differential drive."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
-from swarm_loc_drivers.common.odometry_state import OdometryState, carried_on
 from swarm_loc_estimator.common.arrays import FloatArray
+
+
+@dataclass(frozen=True)
+class OdometryState:
+    """Odometry at an instant.
+
+    Attributes:
+        stamp_ns: Acquisition [ns].
+        pose: (3,) x [m], y [m], theta [rad] of base_link in odom.
+        covariance: (3, 3) of the pose.
+        twist: (3,) forward [m/s], to the left [m/s], turn rate [rad/s] since the state before.
+        twist_covariance: (3, 3).
+    """
+
+    stamp_ns: int
+    pose: FloatArray
+    covariance: FloatArray
+    twist: FloatArray
+    twist_covariance: FloatArray
+
+
+def carried_on(covariance: FloatArray, dx: float, dy: float) -> FloatArray:
+    """The covariance (3, 3) of a pose after a way (dx, dy): an error of the heading leads aside on it."""
+    transition = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
+    carried: FloatArray = transition @ covariance @ transition.T
+    return carried
+
 
 _STEP_VARIANCE = 1.0 / 12.0
 """Of a counter that has cut off the fraction of a step."""
 _FORWARD_TURN = np.ix_((0, 2), (0, 2))
 
 
+@dataclass(frozen=True)
+class WheelGeometry:
+    """The two driven wheels of a robot.
+
+    Attributes:
+        metres_per_step: Path of a wheel per step of its counter [m].
+        wheel_separation: [m].
+    """
+
+    metres_per_step: float
+    wheel_separation: float
+
+    def commands_for(
+        self, speed: float, turn_rate: float, limit: float, period_s: float = 1.0
+    ) -> tuple[float, float]:
+        """Commands for the left and the right wheel [steps per period], not rounded.
+
+        Args:
+            speed: Forward [m/s], finite.
+            turn_rate: To the left [rad/s], finite.
+            limit: Largest command; beyond it both wheels slow down by the same factor, which keeps the curve.
+            period_s: Period of the commands [s].
+        """
+        half_turn, unit = 0.5 * self.wheel_separation * turn_rate, self.metres_per_step / period_s
+        left, right = (speed - half_turn) / unit, (speed + half_turn) / unit
+        slower = min(1.0, limit / max(abs(left), abs(right), 1.0))
+        return slower * left, slower * right
+
+
 class DeadReckoning:
     """Adds up the paths of the wheels, from zero.
 
     Args:
-        wheel_separation: [m].
+        geometry: The wheels.
         wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
-        metres_per_step: Resolution of the wheels' counters [m].
     """
 
-    def __init__(self, wheel_separation: float, wheel_noise: float, metres_per_step: float) -> None:
-        self._separation = wheel_separation
+    def __init__(self, geometry: WheelGeometry, wheel_noise: float) -> None:
+        self._separation = geometry.wheel_separation
         self._wheel_noise = wheel_noise
-        self._step = metres_per_step
+        self._step = geometry.metres_per_step
         self._pose = (0.0, 0.0, 0.0)
         self._covariance = np.zeros((3, 3))
 

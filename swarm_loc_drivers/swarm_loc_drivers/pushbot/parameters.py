@@ -1,15 +1,18 @@
-"""Parameters of `pushbot_driver_node`, and the driver's settings that follow from them."""
+"""Parameters of `pushbot_driver_node` and `exploration_node`, and the settings that follow from them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from swarm_loc_drivers.common.link import Address, AddressError, parse_address
-from swarm_loc_drivers.pushbot.commands import Lights
+from swarm_loc_drivers.common.odometry import WheelGeometry
 from swarm_loc_drivers.pushbot.hardware import BAUD_RATE, TIMESTAMPS
-from swarm_loc_drivers.pushbot.settings import PushbotSettings, WheelGeometry
+from swarm_loc_drivers.pushbot.protocol import Lights
+from swarm_loc_drivers.pushbot.session import PushbotSettings
+from swarm_loc_drivers.pushbot.stop_and_go import StopAndGoSettings
 from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, text
+from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, text, texts
+from swarm_loc_estimator.swarm.swarm import Swarm
 
 TCP_PORT = 56000
 """Of the radio's transparent link."""
@@ -80,3 +83,28 @@ def _address(parameters: PushbotParameters) -> Address:
         return parse_address(parameters.address, TCP_PORT)
     except AddressError as error:
         raise ParameterError(f"parameter address = {error}") from error
+
+
+@dataclass(frozen=True)
+class ExplorationParameters:
+    """Parameters of `exploration_node`; how the robots move is in its settings."""
+
+    swarm_file: str = text("", "path of the swarm description", required=True)
+    robots: tuple[str, ...] = texts("those that are driven; empty: all of the description")
+    wait_for_poses: bool = flag(False, "begin only when swarm/poses is announced, too")
+    settings: StopAndGoSettings = field(
+        default_factory=StopAndGoSettings, metadata={"numbers_of": StopAndGoSettings}
+    )
+
+
+def driven_robots(parameters: ExplorationParameters, swarm: Swarm) -> list[str]:
+    """The names of the robots that are driven, in the order of the description.
+
+    Raises:
+        ParameterError: One of those wanted is not known.
+    """
+    known = [robot.name for robot in swarm.robots]
+    for name in parameters.robots:
+        if name not in known:
+            raise ParameterError(f"parameter robots: there is no robot '{name}' in the swarm description.")
+    return [name for name in known if not parameters.robots or name in parameters.robots]

@@ -13,8 +13,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
 from swarm_loc_drivers.common.calibration_file import CameraCalibration
-from swarm_loc_drivers.common.camera_messages import camera_info_message, image_message
-from swarm_loc_drivers.common.odometry_output import stamp_message
+from swarm_loc_drivers.common.ros_messages import camera_info_message, image_message, stamp_message
 
 _QOS = QoSProfile(depth=5)
 """Reliable: who wants so gets every image, and who listens with best effort gets what comes."""

@@ -12,9 +12,8 @@ from swarm_loc_drivers.common.calibration_file import (
 )
 from swarm_loc_drivers.common.link import Address, AddressError, parse_address
 from swarm_loc_drivers.epuck import wifi_protocol as epuck_wifi
-from swarm_loc_drivers.epuck.hardware import EPUCK2, EPUCK_MODELS, EpuckModel
+from swarm_loc_drivers.epuck.hardware import EPUCK2, EPUCK_MODELS, EpuckModel, wheel_geometry
 from swarm_loc_drivers.epuck.session import CameraSettings, EpuckSettings
-from swarm_loc_drivers.epuck.wheels import WheelGeometry
 from swarm_loc_estimator.common.number_spec import number
 from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, text
 from swarm_loc_estimator.swarm.swarm import OdometryModel
@@ -79,7 +78,7 @@ def epuck_settings(parameters: EpuckParameters) -> EpuckSettings:
     return EpuckSettings(
         address=address,
         model=model,
-        geometry=WheelGeometry(parameters.wheel_diameter, parameters.wheel_separation),
+        geometry=wheel_geometry(parameters.wheel_diameter, parameters.wheel_separation),
         wheel_noise=parameters.wheel_noise,
         command_timeout_s=parameters.cmd_vel_timeout_s,
         baud_rate=parameters.baud_rate,

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 
-from swarm_loc_drivers.common.dead_reckoning import DeadReckoning
-from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.odometry import DeadReckoning, OdometryState, WheelGeometry
 from swarm_loc_drivers.pushbot.hardware import MAX_TICK_RATE, tick_difference
-from swarm_loc_drivers.pushbot.settings import WheelGeometry, WheelTicks
+from swarm_loc_drivers.pushbot.session import WheelTicks
 
 _MAX_RATE = 2.0 * MAX_TICK_RATE
 """No wheel is faster, not even when its controller catches up [ticks/s]."""
@@ -29,8 +28,8 @@ class PushbotOdometry:
     """
 
     def __init__(self, geometry: WheelGeometry, wheel_noise: float, counts: Counter[str]) -> None:
-        self._metres_per_tick = geometry.metres_per_tick
-        self._reckoning = DeadReckoning(geometry.wheel_separation, wheel_noise, geometry.metres_per_tick)
+        self._metres_per_tick = geometry.metres_per_step
+        self._reckoning = DeadReckoning(geometry, wheel_noise)
         self._counts = counts
         self._last: WheelTicks | None = None
         self._doubtful = False

@@ -1,21 +1,25 @@
-"""A robot's odometry as ROS messages: `odom` and the transform from odom to base_link."""
+"""Odometry, images and calibrations as ROS messages."""
 
 from __future__ import annotations
 
 import math
+from array import array
 
 import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.time import Time
+from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.calibration_file import CameraCalibration
+from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_estimator.common.messages.planar import PLANE
 
 ODOMETRY_QOS = QoSProfile(depth=10)
@@ -98,3 +102,31 @@ class OdometryOutput:
 def transform_publisher(node: Node) -> Publisher:
     """The publisher of /tf; tf2's listeners know this absolute name, whatever the namespace."""
     return node.create_publisher(TFMessage, "/tf", _TF_QOS)
+
+
+def image_message(pixels: NDArray[np.uint8], stamp_ns: int, frame_id: str) -> Image:
+    """Pixels (height, width) of grey or (height, width, 3) of RGB as sensor_msgs/Image."""
+    height, width = pixels.shape[:2]
+    message = Image(
+        header=Header(stamp=stamp_message(stamp_ns), frame_id=frame_id),
+        height=height,
+        width=width,
+        encoding="mono8" if pixels.ndim == 2 else "rgb8",
+        step=pixels[0].nbytes,
+    )
+    message.data = array("B", pixels.tobytes())  # a list would be checked byte by byte
+    return message
+
+
+def camera_info_message(calibration: CameraCalibration, header: Header) -> CameraInfo:
+    """The calibration that goes with an image of this header."""
+    return CameraInfo(
+        header=header,
+        height=calibration.height,
+        width=calibration.width,
+        distortion_model=calibration.model,
+        d=list(calibration.distortion),
+        k=list(calibration.matrix),
+        r=list(calibration.rectification),
+        p=list(calibration.projection),
+    )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.pushbot.hardware import TIMESTAMPS
 from swarm_loc_estimator.common.arrays import IntArray
-from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_estimator.common.jit import cached_njit, note_precompiled
 
 CONFIRMATIONS = 8
 """So many events in a row must agree with a jump of time."""
@@ -208,3 +208,9 @@ def _is_plausible(elapsed: int, stamp_bytes: int) -> bool:
     """Whether events can be so far apart [us]."""
     longest = _MAX_SHORT_GAP_US if stamp_bytes == 2 else _MAX_GAP_US
     return 0 <= elapsed <= longest
+
+
+def precompile() -> None:
+    """Parse an event and a line."""
+    EventParser("16bit", Counter()).feed(b"\xe4\xa5\xe2\x40-S28 1 2\n")
+    note_precompiled(precompile)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swarm_loc_drivers.common.odometry_state import OdometryState, carried_on
+from swarm_loc_drivers.common.odometry import OdometryState, carried_on
 from swarm_loc_drivers.droplet.hardware import Gait
 from swarm_loc_estimator.common.arrays import FloatArray
 

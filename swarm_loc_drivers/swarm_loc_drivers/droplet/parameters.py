@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, fields
 
-from swarm_loc_drivers.droplet.commanded_motion import MotionNoise
 from swarm_loc_drivers.droplet.driver import DropletSettings
 from swarm_loc_drivers.droplet.exchange import PollingSettings
 from swarm_loc_drivers.droplet.hardware import DROPLET_MODELS, ELEMENTS, FULL_POWER
+from swarm_loc_drivers.droplet.odometry import MotionNoise
 from swarm_loc_drivers.droplet.session import SessionSettings
 from swarm_loc_drivers.droplet.tdma import MIN_TURN_S, TdmaSettings
 from swarm_loc_estimator.common.number_spec import number

@@ -10,10 +10,8 @@ from __future__ import annotations
 from collections import Counter, deque
 from typing import NamedTuple
 
-from swarm_loc_drivers.common.dead_reckoning import DeadReckoning
-from swarm_loc_drivers.common.odometry_state import OdometryState
+from swarm_loc_drivers.common.odometry import DeadReckoning, OdometryState, WheelGeometry
 from swarm_loc_drivers.epuck.hardware import as_counter, unwrapped_difference
-from swarm_loc_drivers.epuck.wheels import WheelGeometry
 
 Rates = tuple[float, float]
 
@@ -47,7 +45,7 @@ class WheelOdometry:
     def __init__(self, geometry: WheelGeometry, wheel_noise: float, counts: Counter[str]) -> None:
         self._geometry = geometry
         self._counts = counts
-        self._reckoning = DeadReckoning(geometry.wheel_separation, wheel_noise, geometry.metres_per_step)
+        self._reckoning = DeadReckoning(geometry, wheel_noise)
         self._last: tuple[int, int, int] | None = None
         self._last_doubt_ns = 0
         self._rates: Rates = (0.0, 0.0)
