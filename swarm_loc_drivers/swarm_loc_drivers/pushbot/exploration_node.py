@@ -9,17 +9,13 @@ It takes `<robot>/goal` and `<robot>/fix` of `mapper_node`, `<robot>/odom` of th
 
 from __future__ import annotations
 
-from collections import Counter
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Pose, PoseStamped, PoseWithCovarianceStamped, Twist, Vector3
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from swarm_loc_drivers.common.ros_messages import nanoseconds
@@ -27,6 +23,7 @@ from swarm_loc_drivers.common.velocity_command import Velocity
 from swarm_loc_drivers.pushbot.parameters import ExplorationParameters, driven_robots
 from swarm_loc_drivers.pushbot.stop_and_go import MapGoal, StopAndGo, StopAndGoSettings
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.health import Report, drop_values, listed
 from swarm_loc_estimator.common.messages.planar import yaw_of
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -34,8 +31,6 @@ from swarm_loc_msgs.msg import LaserDistance
 
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _QOS = QoSProfile(depth=10)
-_PERIOD_S = 1.0
-_THROTTLE_S = 10.0
 
 
 class _Robot:
@@ -56,9 +51,7 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
         chosen = self.params
         self._names = driven_robots(chosen, load_swarm(Path(chosen.swarm_file)))
         self._robots = [_Robot(chosen.settings) for _ in self._names]
-        self._drops: Counter[str] = Counter()
         self._commands = [self.create_publisher(Twist, f"{name}/cmd_vel", 1) for name in self._names]
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", _QOS)
         for index, name in enumerate(self._names):
             self.create_subscription(Odometry, f"{name}/odom", partial(self._on_odometry, index), _QOS)
             self.create_subscription(LaserDistance, f"{name}/laser", partial(self._on_laser, index), _QOS)
@@ -66,8 +59,7 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
                 PoseWithCovarianceStamped, f"{name}/fix", partial(self._on_fix, index), _QOS
             )
             self.create_subscription(PoseStamped, f"{name}/goal", partial(self._on_goal, index), _LATCHED)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_PERIOD_S, self._on_diagnostics, clock=steady)
+        self.start_diagnostics(self._on_diagnostics)
         self.get_logger().info(f"ready: {len(self._names)} robots of '{chosen.swarm_file}'")
 
     def destroy_node(self) -> None:
@@ -83,7 +75,7 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
         if not robot.drives:
             return
         if stamp_ns < 0 or not np.isfinite(pose).all():
-            self._drops["bad_odometry"] += 1
+            self.health.drop("bad_odometry")
             return
         self._command(index, robot.motion.command(stamp_ns, pose))
 
@@ -112,32 +104,26 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
         stamp_ns, position = robot.goal
         pose, robot.goal = robot.fix[1], None
         if not (np.isfinite(pose).all() and np.isfinite(position).all()):
-            self._drops["bad_goal"] += 1
+            self.health.drop("bad_goal")
         elif not robot.motion.take_goal(MapGoal(stamp_ns, pose, position)):
-            self._drops["goal_of_another_time"] += 1
+            self.health.drop("goal_of_another_time")
 
     def _command(self, index: int, velocity: Velocity) -> None:
         forward, _, rate = velocity
         self._commands[index].publish(Twist(linear=Vector3(x=forward), angular=Vector3(z=rate)))
 
     def _on_diagnostics(self) -> None:
+        self.health.warn_of_drops()
         waiting = [name for name, robot in zip(self._names, self._robots, strict=True) if not robot.drives]
         motions = [robot.motion for robot in self._robots]
-        values = {
+        values: dict[str, object] = {
             "goals": sum(one.goals for one in motions),
             "halts": sum(one.halts for one in motions),
             "odometry_restarts": sum(one.restarts for one in motions),
-            **{f"dropped: {reason}": count for reason, count in sorted(self._drops.items())},
+            **drop_values(self.health.drops),
         }
-        status = DiagnosticStatus(
-            level=DiagnosticStatus.OK,
-            name=self.get_name(),
-            message=f"waiting for all that map with {', '.join(waiting)}" if waiting else "driving",
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
-        )
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
+        message = f"waiting for all that map with {listed(waiting)}" if waiting else "driving"
+        self.publish_reports(Report(self.get_name(), message, values=values))
 
 
 def _planar(pose: Pose) -> FloatArray:

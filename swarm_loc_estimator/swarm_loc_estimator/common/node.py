@@ -13,6 +13,7 @@ from types import FrameType
 from typing import Any, Generic, TypeVar
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, JumpThreshold
 from rclpy.clock_type import ClockType
@@ -22,12 +23,15 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Task
+from rclpy.time import Time
 from rclpy.time_source import TimeSource
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.health import Health, Report
 from swarm_loc_estimator.common.parameters import ParameterSpec, Value, from_values, parameter_specs
 
 Parameters = TypeVar("Parameters")
@@ -43,6 +47,7 @@ _LEAVE_S = 0.7
 """The process ends this long after a signal, even if it is busy. Destroying thousands of publishers takes DDS
 20 s, since for each of them it announces all remaining ones."""
 _CLOCK_THROTTLE_S = 10.0
+_DIAGNOSTICS_PERIOD_S = 1.0
 _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
 """Name of a node that the middleware has not discovered yet, though its publisher."""
 
@@ -99,6 +104,7 @@ class ConfiguredNode(Node, Generic[Parameters]):
 
     Attributes:
         params: Values of the parameters.
+        health: What the log and /diagnostics say.
 
     Raises:
         UserError: A parameter, or a file that it names, cannot be used.
@@ -107,6 +113,34 @@ class ConfiguredNode(Node, Generic[Parameters]):
     def __init__(self, name: str, parameters: type[Parameters], **node_arguments: Any) -> None:
         super().__init__(name, **node_arguments)
         self.params = declare_parameters(self, parameters)
+        self.health = Health(self.get_logger().warning)
+
+    @property
+    def status_name(self) -> str:
+        """Name of the node with its namespace, as robots' nodes are called in /diagnostics."""
+        return f"{self.get_namespace().strip('/')}/{self.get_name()}".lstrip("/")
+
+    def start_diagnostics(self, report: Callable[[], None]) -> None:
+        """Advertise /diagnostics and call `report` once per second, which calls `publish_reports`."""
+        qos = QoSProfile(depth=10)
+        self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", qos)
+        self.create_steady_timer(_DIAGNOSTICS_PERIOD_S, report)
+
+    def publish_reports(self, *reports: Report, stamp: Time | None = None) -> None:
+        """Publish reports on /diagnostics, stamped with the node's time unless another one is given."""
+        message = DiagnosticArray()
+        message.header.stamp = (stamp or self.get_clock().now()).to_msg()
+        message.status = [
+            DiagnosticStatus(
+                level=bytes([report.level]),
+                name=report.name,
+                message=report.message,
+                hardware_id=report.hardware_id,
+                values=[KeyValue(key=key, value=str(value)) for key, value in report.values.items()],
+            )
+            for report in reports
+        ]
+        self._diagnostics_publisher.publish(message)
 
     def create_steady_timer(self, period_s: float, callback: Callable[[], None]) -> None:
         """Call back once per period of a clock that runs also while simulated time stands still."""

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.health import Level, Report, drop_values, level_of, listed
 from swarm_loc_estimator.filter.measurement_model import MeasurementArray
 from swarm_loc_estimator.identification.memory import Identities
-from swarm_loc_estimator.nodes.wording import listed
 from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
 from swarm_loc_estimator.sensors.topics import InputKind, InputTopic
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
@@ -25,23 +25,6 @@ _FULL_LOAD = 0.95
 _IN_MAP = frozenset({InputKind.FIXES, InputKind.AERIAL, InputKind.SWARM_FIXES})
 _PATIENCE_S, _PATIENCE_PERIODS = 10.0, 5.0
 """An expected input that is silent for longer than so many seconds and of its mean periods may have died."""
-
-
-@dataclass
-class Report:
-    """One status of /diagnostics.
-
-    Attributes:
-        name: Whose.
-        message: One sentence.
-        warning: Whether something is wrong.
-        values: Figures with their units.
-    """
-
-    name: str
-    message: str
-    warning: bool = False
-    values: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -83,7 +66,7 @@ def add_contradictions(reports: Sequence[Report], contradictions: Sequence[Contr
     for one in contradictions:
         report = report_of.get(one.about, reports[-1])
         report.message = f"{report.message}; {one.text}" if report.warning else one.text
-        report.warning = True
+        report.level = Level.WARN
 
 
 def add_identities(reports: Sequence[Report], identities: Identities | None) -> None:
@@ -148,7 +131,8 @@ class Diagnostics:
         by_cause: dict[str, list[str]] = {}
         for topic in self.missing():
             by_cause.setdefault(self._why_missing(topic), []).append(topic.name)
-        return "; ".join(f"nothing received on {listed(names)}{cause}" for cause, names in by_cause.items())
+        causes = by_cause.items()
+        return "; ".join(f"no messages received on {listed(names)}{cause}" for cause, names in causes)
 
     def reports(
         self, now_ns: int, estimate: Estimate, recent: Recent, drops: Mapping[str, int]
@@ -175,14 +159,14 @@ class Diagnostics:
             reports.append(report)
         self._was_located |= estimate.status != Status.WAITING
         troubles = [*common, *filter(None, [self.missing_text()])]
-        values = {f"dropped: {reason}": str(count) for reason, count in drops.items()}
+        values = drop_values(drops)
         for handle, topic in self._of_swarm:
             troubles += self._input_troubles(handle, topic, None, now_ns)
             if self._ingest.statistics[handle].received:
                 values.update(self._input_values(handle, topic, now_ns, elapsed_s))
         summary = {int(status): int(np.sum(estimate.status == status)) for status in Status}
         words = ", ".join(f"{summary[status]} {status.name.lower()}" for status in Status if summary[status])
-        reports.append(Report("estimator", "; ".join(troubles) or words, bool(troubles), values))
+        reports.append(Report("estimator", "; ".join(troubles) or words, level_of(troubles), values))
         return reports
 
     def _why_missing(self, topic: InputTopic) -> str:
@@ -200,7 +184,7 @@ class Diagnostics:
         """State and inputs of one robot."""
         troubles = self._duplicates_on([topic.name for _, topic in self._inputs_of[index]])
         self.duplicate_publishers += troubles
-        values: dict[str, str] = {}
+        values: dict[str, object] = {}
         for handle, topic in self._inputs_of[index]:
             troubles += self._input_troubles(handle, topic, robot, now_ns)
             if topic.expected or self._ingest.statistics[handle].received:
@@ -216,13 +200,14 @@ class Diagnostics:
         sigma = np.sqrt(np.diagonal(estimate.covariances[index]))
         values["sigma x [m]"], values["sigma y [m]"] = _figure(sigma[0]), _figure(sigma[1])
         values["sigma theta [rad]"] = _figure(sigma[2])
-        return Report(robot.name, "; ".join(troubles) or status.name.lower(), bool(troubles), values)
+        return Report(robot.name, "; ".join(troubles) or status.name.lower(), level_of(troubles), values)
 
     def _input_troubles(self, handle: int, topic: InputTopic, robot: Robot | None, now_ns: int) -> list[str]:
         """What is wrong with an input, in words."""
         statistics = self._ingest.statistics[handle]
         if not statistics.received:
-            return [f"nothing received on {topic.name}{self._why_missing(topic)}"] if topic.expected else []
+            missing = f"no messages received on {topic.name}{self._why_missing(topic)}"
+            return [missing] if topic.expected else []
         if statistics.last_arrival_ns is None:
             return [f"no message on {topic.name} is a {topic.kind.message_type}"]
         troubles, found = [], self._ingest.frame_id(handle)
@@ -239,13 +224,15 @@ class Diagnostics:
             )
         return troubles
 
-    def _input_values(self, handle: int, topic: InputTopic, now_ns: int, elapsed_s: float) -> dict[str, str]:
+    def _input_values(
+        self, handle: int, topic: InputTopic, now_ns: int, elapsed_s: float
+    ) -> dict[str, object]:
         """Figures of an input over the interval; begins its next one."""
         statistics, name = self._ingest.statistics[handle], topic.kind.topic
         arrived = statistics.received - self._received[handle]
         self._received[handle] = statistics.received
         arrival_ns, count = statistics.last_arrival_ns, statistics.late_count
-        values = {
+        values: dict[str, object] = {
             f"{name} received": str(statistics.received),
             f"{name} malformed": str(statistics.malformed),
             f"{name} rate [1/s]": _figure(arrived / elapsed_s if elapsed_s > 0.0 else None),
@@ -269,7 +256,7 @@ def load_report(cost: TickCost, elapsed_s: float, period_s: float, fusion_period
         fusion_period_s: The fusion period in force [s].
     """
     load = cost.sum_s / elapsed_s if elapsed_s > 0.0 else 0.0
-    values = {
+    values: dict[str, object] = {
         "ticks": str(cost.count),
         "tick mean [ms]": _figure(1e3 * cost.sum_s / cost.count if cost.count else None),
         "tick max [ms]": _figure(1e3 * cost.max_s),
@@ -281,40 +268,39 @@ def load_report(cost: TickCost, elapsed_s: float, period_s: float, fusion_period
         f"a tick takes {1e3 * cost.sum_s / cost.count:.0f} ms, more than its share: raise fusion_period_s"
         f" (now {fusion_period_s:g} s) or tick_period_s (now {period_s:g} s)"
     )
-    return Report("load", advice, warning=True, values=values)
+    return Report("load", advice, level=Level.WARN, values=values)
 
 
 def shedding_report(cost: TickCost) -> Report:
-    """How much of what was measured is left out.
+    """Which share of the measurements is dropped under overload.
 
     Args:
         cost: The ticks of the interval.
     """
     share = cost.shed / cost.sightings if cost.sightings else 0.0
-    values = {"sightings left out [1]": _figure(share)}
+    values: dict[str, object] = {"sightings left out [1]": _figure(share)}
     if not cost.shed:
-        return Report("shedding", "all sightings are used", values=values)
-    sentence = (
-        f"more comes than can be used: {cost.shed} of {cost.sightings} sightings ({100.0 * share:.0f} %)"
-        " were left out, evenly over all robots"
-    )
-    return Report("shedding", sentence, warning=True, values=values)
+        return Report("shedding", "all measurements are used", values=values)
+    dropped = f"{cost.shed} of {cost.sightings} measurements"
+    sentence = f"overload: dropped {dropped} ({100.0 * share:.0f} %), uniformly over robots"
+    return Report("shedding", sentence, Level.WARN, values)
 
 
 def overload_report(count: int) -> Report:
-    """Says that messages come faster than they are used.
+    """A warning that messages were lost before they were taken.
 
     Args:
-        count: How many were dropped for it in the interval.
+        count: How many, in the interval.
     """
-    return Report("overload", f"{count} messages were dropped: more come than can be used", warning=True)
+    return Report("overload", f"overload: {count} messages were lost in full queues", Level.WARN)
 
 
 def merged(reports: Sequence[Report], name: str) -> Report:
     """Several reports as one; the sentences of those that warn come first."""
     warnings = [report.message for report in reports if report.warning]
     values = {key: value for report in reports for key, value in report.values.items()}
-    return Report(name, "; ".join(warnings or [report.message for report in reports]), bool(warnings), values)
+    message = "; ".join(warnings or [report.message for report in reports])
+    return Report(name, message, level_of(warnings), values)
 
 
 def _patience_s(topic: InputTopic, robot: Robot | None, statistics: InputStatistics) -> float:

@@ -12,25 +12,22 @@ Services: `~/reset`, `~/set_robot_pose`. Parameters: see `doc/estimator_node.md`
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.time import Time
 from std_srvs.srv import Trigger
 
+from swarm_loc_estimator.common.health import PATIENCE_S, Level, Report
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.node import BACKWARDS, ConfiguredNode, Ticks, run_node
 from swarm_loc_estimator.nodes.estimator_diagnostics import (
     Diagnostics,
-    Report,
     TickCost,
     add_contradictions,
     add_identities,
@@ -50,13 +47,10 @@ from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.topics import live_topics
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.timeline.contradictions import Contradicted, Contradiction
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.thinning import SHED_REASONS, Thinning
 
-_DIAGNOSTICS_PERIOD_S = 1.0
-_THROTTLE_S = 30.0
 _ORDINARY_DROPS = frozenset(
     {
         "aerial_ambiguous",
@@ -76,10 +70,6 @@ _ORDINARY_DROPS = frozenset(
 )
 """Late, double or outlying data is a matter of course, and so is light of robots too far or too near; what is
 shed is told in a sentence of its own."""
-_MOST_TOLD = 8
-"""So many new contradictions are logged one by one; where more come at once, something else is wrong."""
-_PATIENCE_S = 5.0
-"""How long nothing may come before the log names what is missing."""
 
 CreateEstimator = Callable[[Swarm, Settings], Estimator]
 
@@ -109,18 +99,9 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         self._cost = TickCost()
         self._diagnostics = self._create_diagnostics()
         self._outputs = EstimateOutputs(self, self._swarm, self.params)
-        self._diagnostics_publisher = self.create_publisher(
-            DiagnosticArray, "/diagnostics", QoSProfile(depth=10)
-        )
-        self._waiting_since_s = self._reported_s = time.monotonic()
-        self._clock_runs = False
-        self._has_said_missing = False
-        self._known_drops: dict[str, int] = {}
-        self._told_drops_s = -math.inf
-        self._overload = 0
-        self._known_duplicates: list[str] = []
+        self._reported_s = time.monotonic()
+        self._lost = 0
         self._static_transforms = StaticTransforms(self, self._owned_frames())
-        self._known_contradictions: set[tuple[str, Contradicted]] = set()
         self._inputs = EstimatorInputs(self, self._ingest.topics, self._estimator.drop)
         self.create_service(Trigger, "~/reset", self._on_reset)
         frame = self.params.map_frame
@@ -153,7 +134,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         self._jumps_back = self.get_clock().create_jump_callback(
             BACKWARDS, pre_callback=partial(self._receive, self._time_ns)
         )
-        self.create_steady_timer(_DIAGNOSTICS_PERIOD_S, self._on_diagnostics)
+        self.start_diagnostics(self._on_diagnostics)
         self.get_logger().info(
             f"ready: {len(self._swarm.robots)} robots and {len(self._swarm.landmarks)} landmarks"
             f" of '{self.params.swarm_file}'"
@@ -214,104 +195,50 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
 
     def _on_diagnostics(self) -> None:
         begin_s = time.perf_counter()
-        self._tell_diagnostics()
-        self._shedding.note(time.perf_counter() - begin_s)
-
-    def _tell_diagnostics(self) -> None:
         now_s = time.monotonic()
         elapsed_s, self._reported_s = now_s - self._reported_s, now_s
         cost, self._cost = self._cost, TickCost()
-        if not self.get_clock().now().nanoseconds:
-            reports = [Report("estimator", NO_CLOCK, warning=True)]
+        if not self._time_ns():
+            missing, reports = NO_CLOCK, [Report("estimator", NO_CLOCK, Level.WARN)]
         else:
-            period_s, settings = self.params.tick_period_s, self._estimator.settings
-            load = load_report(cost, elapsed_s, period_s, settings.fusion_period_s)
-            if load.warning:
-                self.get_logger().warning(load.message, throttle_duration_sec=_THROTTLE_S)
-            shedding = shedding_report(cost)
-            if shedding.warning:
-                self.get_logger().warning(shedding.message, throttle_duration_sec=_THROTTLE_S)
-            load = merged([load, shedding], "load")
-            reports = self._estimate_reports(load)
-            self._warn_of_drops(now_s)
-            self._warn_of_duplicates()
-        self._say_what_is_missing(now_s)
-        self._publish_diagnostics(reports)
+            missing, reports = self._diagnostics.missing_text(), self._make_reports(cost, elapsed_s)
+        self.health.warn_of("missing", {self._time_ns() > 0: missing} if missing else {}, PATIENCE_S)
+        for report in reports:
+            report.name = f"{self.get_name()}: {report.name}".removesuffix(": estimator")
+        # inputs are taken for poses, so counts belong to the stamp of the poses
+        stamp = Time(nanoseconds=self._estimate.stamp_ns) if self._estimate is not None else None
+        self.publish_reports(*reports, stamp=stamp)
+        self._shedding.note(time.perf_counter() - begin_s)
 
-    def _estimate_reports(self, load: Report) -> list[Report]:
-        """One report per robot and one for the estimator."""
+    def _make_reports(self, cost: TickCost, elapsed_s: float) -> list[Report]:
+        """One report per robot and one for the estimator; warnings are logged."""
+        load = load_report(
+            cost, elapsed_s, self.params.tick_period_s, self._estimator.settings.fusion_period_s
+        )
+        causes = [load, shedding_report(cost)]
+        for report in causes:
+            if report.warning:
+                self.health.warn(report.name, report.message)
+        drops = self._estimator.drops
+        self.health.warn_of_drops({k: n for k, n in drops.items() if k not in _ORDINARY_DROPS})
         if self._estimate is None:
-            return [Report("estimator", load.message, load.warning, load.values)]
-        now_ns = self.get_clock().now().nanoseconds
-        recent, drops = self._estimator.recent(), self._estimator.drops
-        reports = self._diagnostics.reports(now_ns, self._estimate, recent, drops)
+            return [merged(causes, "estimator")]
+        now_ns = self._time_ns()
+        reports = self._diagnostics.reports(now_ns, self._estimate, self._estimator.recent(), drops)
         contradictions = self._estimator.contradictions(now_ns)
         add_contradictions(reports, contradictions)
         add_identities(reports, self._estimator.identities)
-        self._warn_of_contradictions(contradictions)
         *robots, whole = reports
-        overload = drops.get("overload", 0) - self._overload
-        self._overload += overload
-        whole.values["time jumps"] = str(self._estimator.time_jumps)
-        whole.values.update({name: str(count) for name, count in self._estimator.counters.items()})
-        causes = [whole, load, *([overload_report(overload)] if overload else [])]
-        causes += [Report("transforms", text, warning=True) for text in self._static_transforms.foreign]
-        return [*robots, merged(causes, "estimator")]
-
-    def _warn_of_drops(self, now_s: float) -> None:
-        """Tell of data that is dropped for being wrong, not too often; what is not told now is told later."""
-        drops = self._estimator.drops
-        wrong = {reason: count for reason, count in drops.items() if reason not in _ORDINARY_DROPS}
-        if wrong != self._known_drops and now_s >= self._told_drops_s + _THROTTLE_S:
-            self._known_drops, self._told_drops_s = wrong, now_s
-            words = ", ".join(f"{count} {reason}" for reason, count in wrong.items())
-            self.get_logger().warning(f"dropped so far: {words}")
-
-    def _warn_of_duplicates(self) -> None:
-        """Tell of topics with too many publishers, and of foreign transforms, once whenever these change."""
-        duplicates = [*self._diagnostics.duplicate_publishers, *self._static_transforms.foreign]
-        if duplicates != self._known_duplicates:
-            self._known_duplicates = duplicates
-            for sentence in self._known_duplicates:
-                self.get_logger().warning(sentence)
-
-    def _warn_of_contradictions(self, contradictions: list[Contradiction]) -> None:
-        """Tell of each contradiction once, until it has gone."""
-        new = [one.text for one in contradictions if (one.about, one.kind) not in self._known_contradictions]
-        for text in new[:_MOST_TOLD]:
-            self.get_logger().warning(text)
-        if len(new) > _MOST_TOLD:
-            self.get_logger().warning(f"more contradictions, see /diagnostics: {len(new) - _MOST_TOLD}")
-        self._known_contradictions = {(one.about, one.kind) for one in contradictions}
-
-    def _say_what_is_missing(self, now_s: float) -> None:
-        """Name what is waited for, after a while and once: first the clock, then the topics."""
-        clock_runs = bool(self.get_clock().now().nanoseconds)
-        if clock_runs != self._clock_runs:
-            self._clock_runs, self._waiting_since_s, self._has_said_missing = clock_runs, now_s, False
-        if self._has_said_missing or now_s < self._waiting_since_s + _PATIENCE_S:
-            return
-        self._has_said_missing = True
-        missing = self._diagnostics.missing_text() if clock_runs else NO_CLOCK
-        if missing:
-            self.get_logger().warning(f"waiting: {missing}")
-
-    def _publish_diagnostics(self, reports: list[Report]) -> None:
-        now = self.get_clock().now()  # inputs are taken in for poses, and what is counted is of those
-        stamp = Time(nanoseconds=self._estimate.stamp_ns) if self._estimate is not None else now
-        message = DiagnosticArray()
-        message.header.stamp = stamp.to_msg()
-        message.status = [self._status_message(report) for report in reports]
-        self._diagnostics_publisher.publish(message)
-
-    def _status_message(self, report: Report) -> DiagnosticStatus:
-        name = self.get_name() if report.name == "estimator" else f"{self.get_name()}: {report.name}"
-        return DiagnosticStatus(
-            level=DiagnosticStatus.WARN if report.warning else DiagnosticStatus.OK,
-            name=name,
-            message=report.message,
-            values=[KeyValue(key=key, value=value) for key, value in report.values.items()],
+        whole.values |= {"time jumps": self._estimator.time_jumps, **self._estimator.counters}
+        foreign = self._static_transforms.foreign
+        lost, self._lost = drops.get("overload", 0) - self._lost, drops.get("overload", 0)
+        causes += [overload_report(lost)] if lost else []
+        causes += [Report("transforms", text, Level.WARN) for text in foreign]
+        self.health.warn_of(
+            "publishers", {text: text for text in [*self._diagnostics.duplicate_publishers, *foreign]}
         )
+        self.health.warn_of("contradictions", {(one.about, one.kind): one.text for one in contradictions})
+        return [*robots, merged([whole, *causes], "estimator")]
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._estimator.drop("reset", len(self._inputs.take(self._time_ns)))

@@ -24,6 +24,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
+from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of
 from swarm_loc_estimator.common.messages.cdr import CdrError
 from swarm_loc_estimator.common.messages.estimates import SwarmPosesReader, decode_sightings
 from swarm_loc_estimator.common.messages.typestore import SWARM_POSES
@@ -37,18 +38,14 @@ from swarm_loc_estimator.watch.newest_messages import NewestMessages
 from swarm_loc_estimator.watch.robot_commands import RobotCommands
 from swarm_loc_estimator.watch.robot_places import AerialNames, Places
 from swarm_loc_estimator.watch.server import WatchServer
-from swarm_loc_estimator.watch.watch_diagnostics import WatchDiagnostics
 from swarm_loc_estimator.watch.watch_parameters import WatchParameters
 from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities, SwarmPoses, SwarmSightings
 
 _FLEETING = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Hears every publisher, and what comes too fast for it is lost to it alone."""
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-_OUTPUT_QOS = QoSProfile(depth=10)
-_WORK_S, _LOOK_S, _DIAGNOSTICS_S = 0.05, 1.0, 1.0
+_WORK_S, _LOOK_S = 0.05, 1.0
 _PLACES_PERIOD_S = 0.1
-_PATIENCE_S = 5.0
-_THROTTLE_S = 30.0
 
 
 class WatchNode(ConfiguredNode[WatchParameters]):
@@ -67,7 +64,7 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         self._newest_ns = 0
         self._places_s = -1.0
         self._heard_s = time.monotonic()
-        self._drops: Counter[str] = Counter()
+        self._known_drops: Counter[str] = Counter()
         self._aerial = AerialNames(dict(self._swarm.index_of))
         self._sightings: Subscription | None = None
         self._truth, self._truth_places = self._places("truth", "ground_truth", keeps=False)
@@ -78,11 +75,9 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         access = Access(self.params.address, self.params.token)
         self.server = WatchServer(told, access, self.params.port, self.params.rate, self._commands.order)
         self._subscribe()
-        self._diagnostics = WatchDiagnostics(self.get_name())
-        self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", _OUTPUT_QOS)
         self.create_steady_timer(_WORK_S, self._commands.work)
         self.create_steady_timer(_LOOK_S, self._look_around)
-        self.create_steady_timer(_DIAGNOSTICS_S, self._publish_diagnostics)
+        self.start_diagnostics(self._on_diagnostics_timer)
         self.get_logger().info(f"watch the swarm at {self.server.url}")
 
     @property
@@ -192,27 +187,33 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         elif not self.server.has_viewers and self._sightings is not None:
             self.destroy_subscription(self._sightings)
             self._sightings = None
-        if time.monotonic() > self._heard_s + _PATIENCE_S:
+        if time.monotonic() > self._heard_s + PATIENCE_S:
             self._heard_s = time.monotonic()
-            why = self.why_missing("swarm/poses", SWARM_POSES)
-            missing = f"nothing received on swarm/poses{why}"
-            self.get_logger().warning(f"waiting: {missing}", throttle_duration_sec=_THROTTLE_S)
-            self.server.tell({"kind": "said", "text": f"Waiting: {missing}.", "ok": False})
+            missing = f"messages received on swarm/poses{self.why_missing('swarm/poses', SWARM_POSES)}"
+            self.health.warn("missing", f"no {missing}")
+            self.server.tell({"kind": "said", "text": f"No {missing}.", "ok": False})
 
-    def _publish_diagnostics(self) -> None:
-        drops = {
-            **self._drops,
-            **({"command too_many": dropped} if (dropped := self._commands.dropped) else {}),
+    def _on_diagnostics_timer(self) -> None:
+        self.health.warn_of_drops()
+        self.health.drops["command too_many"] = self._commands.dropped
+        load, drops = self.server.load(), +self.health.drops
+        grown, self._known_drops = drops - self._known_drops, drops
+        said = [f"{count} dropped: {what}" for what, count in grown.items()]
+        said += [f"{load.slow} slow"] if load.slow else []
+        values: dict[str, object] = {
+            "pages": load.pages,
+            "slow pages": load.slow,
+            "frames left out for slow pages": load.left_out,
+            "texts left out for slow pages": load.texts_left_out,
+            "pages refused": load.refused,
+            **drop_values(drops),
         }
-        message = DiagnosticArray(status=[self._diagnostics.status(self.server.load(), drops)])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics_publisher.publish(message)
+        message = ", ".join([f"{load.pages} pages", *said])
+        self.publish_reports(Report(self.get_name(), message, level_of(said), values))
 
     def _drop(self, topic: str, reason: str) -> None:
-        """Count a message that cannot be used, and tell of it now and then."""
-        self._drops[f"{topic} {reason}"] += 1
-        words = ", ".join(f"{count} {name}" for name, count in self._drops.items())
-        self.get_logger().warning(f"dropped so far: {words}", throttle_duration_sec=_THROTTLE_S)
+        """Count a message that cannot be used."""
+        self.health.drop(f"{topic} {reason}")
 
 
 main = partial(run_node, "watch_node", WatchNode)

@@ -122,7 +122,7 @@ def test_robots_without_odometry_are_located_by_light_and_by_fixes(ros: Ros, dro
     assert "odom received" not in values
     status, values = report(heard, "estimator")
     assert values["infrared exchanges measured"] == "8"
-    assert "nothing received on beta/brightness (no publisher)" in status.message
+    assert "no messages received on beta/brightness (no publisher)" in status.message
     assert "gamma" not in status.message
     assert not [key for key in values if key.startswith("dropped: ir")]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -30,9 +29,10 @@ from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.health import Health
+from swarm_loc_estimator.nodes.estimator_diagnostics import TickCost
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 from swarm_loc_estimator.sensors.messages import RawInputs
-from swarm_loc_estimator.timeline.contradictions import Contradicted, Contradiction
 from swarm_loc_estimator.timeline.estimator import Estimate
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.timeline import GoOn
@@ -206,46 +206,28 @@ def test_a_reset_counts_what_had_not_been_read_yet(ros: Ros, robots: Robots, nod
     assert report(heard, "estimator")[1]["dropped: reset"] == "3"
 
 
-def test_drops_of_a_second_kind_are_told_once_the_throttle_allows(
-    ros: Ros, swarm_file: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    told: Any = StandIn()
-    node = ros.add(EstimatorNode(lambda *_: told, parameter_overrides=overrides(swarm_file=str(swarm_file))))
+def test_drops_are_warned_of_once_in_a_while_and_ordinary_ones_never(ros: Ros, swarm_file: Any) -> None:
+    estimator: Any = StandIn()
+    node = ros.add(
+        EstimatorNode(lambda *_: estimator, parameter_overrides=overrides(swarm_file=str(swarm_file)))
+    )
     lines: list[str] = []
-    monkeypatch.setattr(node, "get_logger", lambda: SimpleNamespace(warning=lines.append))
-    for now_s, drops in (
+    now_s = [0.0]
+    node.health = Health(lines.append, lambda: now_s[0])
+    for now_s[0], drops in (
         (0.0, {"absurd": 3}),
-        (1.0, {"absurd": 3, "non_finite": 40}),
-        (29.0, {"absurd": 3, "non_finite": 40}),
-        (31.0, {"absurd": 3, "non_finite": 40}),
-        (90.0, {"absurd": 3, "non_finite": 40, "gated": 7}),
+        (1.0, {"absurd": 4, "non_finite": 40}),
+        (29.0, {"absurd": 5, "non_finite": 40}),
+        (31.0, {"absurd": 5, "non_finite": 40}),
+        (90.0, {"absurd": 5, "non_finite": 40, "gated": 7}),
     ):
-        told.drops = drops
-        node._warn_of_drops(now_s)
-    assert lines == ["dropped so far: 3 absurd", "dropped so far: 3 absurd, 40 non_finite"]
-
-
-def test_eight_new_contradictions_are_told_one_by_one_and_more_in_a_sentence(
-    ros: Ros, swarm_file: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each once, until it has gone."""
-    told: Any = StandIn()
-    node = ros.add(EstimatorNode(lambda *_: told, parameter_overrides=overrides(swarm_file=str(swarm_file))))
-    lines: list[str] = []
-    monkeypatch.setattr(node, "get_logger", lambda: SimpleNamespace(warning=lines.append))
-    all_of = [Contradiction(f"robot{k}", Contradicted.POSE, f"robot{k} is elsewhere") for k in range(19)]
-    texts = [one.text for one in all_of]
-    other = Contradiction("robot0", Contradicted.NOISE, "robot0 is noisy")
-    for now, expected in (
-        (all_of[:8], texts[:8]),
-        (all_of[:9], texts[8:9]),
-        (all_of[:18], [*texts[9:17], "more contradictions, see /diagnostics: 1"]),
-        ([*all_of[1:18], other], [other.text]),
-        (all_of, [texts[0], texts[18]]),
-    ):
-        lines.clear()
-        node._warn_of_contradictions(now)
-        assert lines == expected
+        estimator.drops = drops
+        node._make_reports(TickCost(), 1.0)
+    assert lines == [
+        "dropped so far: 3 absurd",
+        "dropped so far: 40 non_finite",
+        "dropped so far: 5 absurd",
+    ]
 
 
 def test_diagnostics_name_what_is_missing_and_why(ros: Ros, swarm_file: Any) -> None:
@@ -259,7 +241,8 @@ def test_diagnostics_name_what_is_missing_and_why(ros: Ros, swarm_file: Any) -> 
     status, _ = report(heard, "estimator")
     assert status.level == DiagnosticStatus.WARN
     assert (
-        "nothing received on alpha/odom, alpha/detections, beta/detections (no publisher)" in status.message
+        "no messages received on alpha/odom, alpha/detections, beta/detections (no publisher)"
+        in status.message
     )
     status, _ = report(heard, "estimator: alpha")
     assert status.level == DiagnosticStatus.WARN

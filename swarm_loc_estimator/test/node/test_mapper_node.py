@@ -119,7 +119,7 @@ def test_what_is_missing_and_what_is_wrong_is_told(ros: Ros, files: Path) -> Non
     driver = Driver(ros, node)
     ros.until(lambda: reports)
     first = reports[0].status[0]
-    assert first.message.startswith("nothing on alpha/odom")
+    assert first.message.startswith("no messages received on alpha/odom")
     assert "beta/laser (no publisher)" in first.message
     driver.laser.publish(b"\0\1\0\0\1")
     driver.laser.publish(laser_bytes(T0_NS, 0.0, 1.0))

@@ -118,7 +118,7 @@ def test_the_clock_cannot_be_changed_while_the_node_runs(ros: Ros, robots: Robot
     (result,) = response.results
     assert (result.successful, result.reason) == (
         False,
-        "use_sim_time is read at the start only: start the node anew.",
+        "use_sim_time is read at the start only: restart the node.",
     )
     robots.run(T0_NS + 2 * STEP_NS, 2)
 
@@ -159,7 +159,7 @@ def test_a_flood_is_dropped_and_counted_memory_stays_and_a_signal_ends_the_node(
         program.wait_for("ready")
         flood = subprocess.Popen(command)
         try:
-            ros.until(lambda: "more come than can be used" in newest_status(heard, "estimator").message)
+            ros.until(lambda: "lost in full queues" in newest_status(heard, "estimator").message)
             assert "dropped: overload" in values_of(newest_status(heard, "estimator"))
             before, begin_s = resident_bytes(program.process.pid), time.monotonic()
             ros.until(lambda: time.monotonic() > begin_s + FLOOD_S)

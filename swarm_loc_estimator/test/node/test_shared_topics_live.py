@@ -86,4 +86,4 @@ def test_what_is_missing_is_named_by_the_shared_topic(ros: Ros, swarm_file: Path
     def sentence() -> str:
         return " ".join(one.message for one in heard[-1].status if one.name == "estimator") if heard else ""
 
-    ros.until(lambda: "nothing received on swarm/odom, swarm/detections (no publisher)" in sentence())
+    ros.until(lambda: "no messages received on swarm/odom, swarm/detections (no publisher)" in sentence())

@@ -90,7 +90,7 @@ def test_missing_topics_are_grouped_by_cause() -> None:
     world = World()
     assert [topic.name for topic in world.diagnostics.missing()] == ["a/odom", "a/detections", "b/odom"]
     assert world.diagnostics.missing_text() == (
-        "nothing received on a/odom, a/detections (why a); nothing received on b/odom (why b)"
+        "no messages received on a/odom, a/detections (why a); no messages received on b/odom (why b)"
     )
     world.odometry("b", 0, 0)
     assert "b/odom" not in world.diagnostics.missing_text()
@@ -104,7 +104,7 @@ def test_topics_with_too_many_publishers_are_named_where_they_belong() -> None:
     a, b, whole = world.reports(0, tracked, recent(), {})
     assert "publishers" not in a.message
     assert (b.warning, b.message) == (True, "b/odom has 2 publishers: /player, /player")
-    assert whole.message.startswith("swarm/poses has 2 publishers: /one, /two; nothing received")
+    assert whole.message.startswith("swarm/poses has 2 publishers: /one, /two; no messages received")
     assert world.diagnostics.duplicate_publishers == [whole.message.partition(";")[0], b.message]
     world.graph.publishers = {}
     _, b, _ = world.reports(0, tracked, recent(), {})
@@ -133,7 +133,7 @@ def test_a_robot_is_told_apart_as_waiting_lost_silent_or_in_a_foreign_frame() ->
     world.odometry("b", 0, 0)
     _, b, whole = world.reports(0, estimate(0, Status.TRACKED, Status.WAITING), recent(), {"gated": 3})
     assert (b.warning, b.message) == (True, "waiting for a sighting or a fix that locates it")
-    assert whole.values == {"dropped: gated": "3"}
+    assert whole.values == {"dropped: gated": 3}
     world.reports(0, estimate(0, Status.TRACKED, Status.TRACKED), recent(), {})
     _, b, _ = world.reports(0, estimate(0, Status.TRACKED, Status.WAITING), recent(), {})
     assert b.message == "lost, waiting for a sighting or a fix that locates it"

@@ -16,13 +16,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
 from std_msgs.msg import Header
 
+from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of
 from swarm_loc_estimator.common.messages.event_encoding import EventError, decode_events
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_msgs.msg import EventPacket, LaserDistance, LightBearing, LightBearingArray
@@ -38,11 +36,8 @@ from swarm_loc_vision.laser.calibration import UNKNOWN, Distance
 
 EVENT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 _OUTPUT_QOS = QoSProfile(depth=50)
-_PERIOD_S = 1.0
-_PATIENCE_S = 5.0
 _LASER_PATIENCE_S, _SEEN_PATIENCE_S = 15.0, 60.0
 """For the laser, before it was first seen and afterwards: in large halls often nothing is within range."""
-_THROTTLE_S = 30.0
 _MAX_PIXELS = 1 << 21
 """Bound on the pixels of a sensor: the tracker stores the last bursts of each."""
 
@@ -62,13 +57,10 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
         self._counts: Counter[str] = Counter()
         self._next_seq: int | None = None
         self._packet_s = self._laser_s = time.monotonic()
-        self._told = ""
         self._laser = self.create_publisher(LaserDistance, "laser", _OUTPUT_QOS)
         self._lights = self.create_publisher(LightBearingArray, "lights", _OUTPUT_QOS)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
         self.create_subscription(EventPacket, "events", self._on_events, EVENT_QOS)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)  # runs also while simulated time stands still
-        self.create_timer(_PERIOD_S, self._on_diagnostics, clock=steady)
+        self.start_diagnostics(self._on_diagnostics)
 
     def _on_events(self, message: EventPacket) -> None:
         self._packet_s = time.monotonic()
@@ -83,7 +75,7 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
                 memoryview(message.events), message.encoding, size, is_bigendian=message.is_bigendian
             )
         except EventError as error:
-            self._drop(str(error))
+            self.health.drop(str(error))
             return
         if self._tracker is None or size != self._size:
             self._size, self._tracker = size, LightTracker(self._sources, size, self.params.settings)
@@ -92,13 +84,9 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
         for report in self._tracker.track(events._replace(time_ns=stamp_ns + events.time_ns)):
             self._publish(report)
 
-    def _drop(self, reason: str) -> None:
-        self._counts[f"dropped: {reason}"] += 1
-        self.get_logger().warning(f"dropped a packet: {reason}", throttle_duration_sec=_THROTTLE_S)
-
     def _publish(self, report: WindowReport) -> None:
         if report.stamp_ns < 0:
-            self._drop("its stamp is before zero")
+            self.health.drop("its stamp is before zero")
             return
         self._counts["reports"] += 1
         laser = [one for one in report.sightings if not self._sources[one.source].is_above]
@@ -153,31 +141,22 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
 
     def _on_diagnostics(self) -> None:
         trouble = self._trouble()
-        if trouble and trouble != self._told:
-            self.get_logger().warning(trouble, throttle_duration_sec=_THROTTLE_S)
-        self._told = trouble
-        jumps = self._tracker.time_jumps if self._tracker else 0
-        values = {
-            **{name: str(count) for name, count in sorted(self._counts.items())},
-            "time jumps": str(jumps),
+        self.health.warn_of("trouble", {trouble: trouble} if trouble else {})
+        self.health.warn_of_drops()
+        values: dict[str, object] = {
+            **dict(sorted(self._counts.items())),
+            **drop_values(self.health.drops),
+            "time jumps": self._tracker.time_jumps if self._tracker else 0,
         }
-        status = DiagnosticStatus(
-            level=DiagnosticStatus.WARN if trouble else DiagnosticStatus.OK,
-            name=f"{self.get_namespace().strip('/')}/{self.get_name()}".lstrip("/"),
-            message=trouble or "tracking",
-            values=[KeyValue(key=key, value=value) for key, value in values.items()],
-        )
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
+        self.publish_reports(Report(self.status_name, trouble or "tracking", level_of(trouble), values))
 
     def _trouble(self) -> str:
         """What keeps the node from its work; said in the log when it begins."""
         now_s = time.monotonic()
-        if now_s > self._packet_s + _PATIENCE_S:
+        if now_s > self._packet_s + PATIENCE_S:
             self._laser_s = now_s
             topic = self.resolve_topic_name("events")
-            return f"waiting: nothing has come on {topic} for {_PATIENCE_S:g} s and more"
+            return f"no messages received on {topic} for {PATIENCE_S:g} s and more"
         has_seen = self._counts["reports"] > self._counts["windows without the laser"]
         patience_s = _SEEN_PATIENCE_S if has_seen else _LASER_PATIENCE_S
         if self._has_laser and now_s > self._laser_s + patience_s:

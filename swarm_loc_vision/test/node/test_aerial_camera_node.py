@@ -14,6 +14,7 @@ from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from bench.aerial.pictures import DIAMETER, Look, control_pixels, draw_picture
+from swarm_loc_estimator.common import node
 from swarm_loc_estimator.common.parameters import markdown_table
 from swarm_loc_msgs.msg import AnonymousDetectionArray
 from swarm_loc_vision.aerial.aerial_camera_node import AerialCameraNode
@@ -21,7 +22,6 @@ from swarm_loc_vision.aerial.control_points import ControlPoints
 from swarm_loc_vision.aerial.ground_control import Ground
 from swarm_loc_vision.aerial.ground_file import GroundFileError, save_ground
 from swarm_loc_vision.aerial.parameters import AerialParameters
-from swarm_loc_vision.common import camera_node
 
 PICTURE = draw_picture(Look(tilt=0.3, robots=6), seed=2)
 HEIGHT, WIDTH = PICTURE.gray.shape
@@ -31,7 +31,7 @@ FRAME = "aerial/camera_optical_frame"
 @pytest.fixture(autouse=True)
 def _frequent_diagnostics(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the node say at once what the tests wait for."""
-    monkeypatch.setattr(camera_node, "_DIAGNOSTICS_PERIOD_S", 0.05)
+    monkeypatch.setattr(node, "_DIAGNOSTICS_PERIOD_S", 0.05)
 
 
 @pytest.fixture

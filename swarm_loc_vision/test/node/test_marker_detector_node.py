@@ -15,6 +15,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profi
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
+from swarm_loc_estimator.common import health, node
 from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_msgs.msg import MarkerDetection, MarkerDetectionArray
 from swarm_loc_vision.common import camera_node
@@ -113,7 +114,7 @@ class Camera:
 @pytest.fixture(autouse=True)
 def _frequent_diagnostics(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the node say at once what the tests wait for."""
-    monkeypatch.setattr(camera_node, "_DIAGNOSTICS_PERIOD_S", 0.05)
+    monkeypatch.setattr(node, "_DIAGNOSTICS_PERIOD_S", 0.05)
 
 
 def test_images_become_detections_with_their_stamp_and_frame(ros: Ros) -> None:
@@ -148,8 +149,9 @@ def test_cameras_that_publish_in_any_way_are_heard(
 
 
 def test_a_camera_that_falls_silent_is_told_each_time(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(camera_node, "_PATIENCE_S", 0.3)
-    silence = "nothing has come on /image_raw for "
+    for module in (camera_node, health):
+        monkeypatch.setattr(module, "PATIENCE_S", 0.3)
+    silence = "no messages received on /image_raw for "
     logged: list[Log] = ros.listen(Log, "/rosout")
     camera = Camera(ros)
     camera.calibrate(camera_info(), "image_raw")
@@ -157,7 +159,7 @@ def test_a_camera_that_falls_silent_is_told_each_time(ros: Ros, monkeypatch: pyt
         camera._publish_until(image(number), lambda: camera.status().message == "detecting")
         ros.until(lambda: camera.status().message.startswith(silence))
         assert camera.status().level == DiagnosticStatus.WARN
-        ros.until(lambda: any(f"waiting: {silence}" in log.msg for log in logged))
+        ros.until(lambda: any(f"{silence}" in log.msg for log in logged))
         logged.clear()
 
 
@@ -203,7 +205,7 @@ def test_bad_images_are_dropped_and_counted(ros: Ros) -> None:
 
 def test_compressed_images_are_read_and_bad_ones_dropped_and_counted(ros: Ros) -> None:
     camera = Camera(ros, image_transport="compressed")
-    camera.calibrate(camera_info(), "nothing has come on /image_raw/compressed")
+    camera.calibrate(camera_info(), "no messages received on /image_raw/compressed")
     assert not ros.tester.get_subscriptions_info_by_topic("/image_raw")
     for number, message in enumerate(
         (compressed(1), compressed(2, "rgb8; jpeg compressed bgr8"), compressed(3, "png", ".png")), start=1

@@ -9,18 +9,17 @@ Services: `~/save_map`, `~/reset`. Parameters: see `doc/mapper_node.md`.
 
 from __future__ import annotations
 
-import time
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
+from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of, listed
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.node import BACKWARDS, ConfiguredNode, run_node
 from swarm_loc_estimator.mapping.fix_covariance import FixCovariances
@@ -51,9 +50,6 @@ _MESSAGE_CLASSES = {
     MapperInput.LASER: LaserDistance,
     MapperInput.LIGHTS: LightBearingArray,
 }
-_DIAGNOSTICS_PERIOD_S = 1.0
-_PATIENCE_S = 5.0
-_THROTTLE_S = 30.0
 
 
 class MapperNode(ConfiguredNode[MapperParameters]):
@@ -77,8 +73,6 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         if not is_precompiled(precompile):
             self.get_logger().info("compiling the mapper for this machine: about half a minute")
         precompile()
-        self._known_drops: dict[str, int] = {}
-        self._since_s, self._has_said_missing = time.monotonic(), False
         self._begin_anew()
         self._create_publishers()
         for index, robot in enumerate(self._robots):
@@ -90,7 +84,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._jumps = self.get_clock().create_jump_callback(BACKWARDS, post_callback=self._on_jump)
         self.create_steady_timer(self.params.map_period_s, self._publish_map)
-        self.create_steady_timer(_DIAGNOSTICS_PERIOD_S, self._on_diagnostics)
+        self.start_diagnostics(self._on_diagnostics)
         self.get_logger().info(f"ready: {len(self._robots)} robots of '{self.params.swarm_file}'")
 
     def _begin_anew(self) -> None:
@@ -105,7 +99,6 @@ class MapperNode(ConfiguredNode[MapperParameters]):
     def _create_publishers(self) -> None:
         self._map = self.create_publisher(OccupancyGrid, "map", _LATCHED)
         self._visitation = self.create_publisher(OccupancyGrid, "visitation", _LATCHED)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", _OUTPUT_QOS)
         names = [robot.name for robot in self._robots]
         self._goals = [self.create_publisher(PoseStamped, f"{name}/goal", _LATCHED) for name in names]
         self._fixes = [
@@ -158,30 +151,21 @@ class MapperNode(ConfiguredNode[MapperParameters]):
 
     def _on_diagnostics(self) -> None:
         missing = [self._why(topic) for topic in self.feed.missing()]
-        if missing and not self._has_said_missing and time.monotonic() > self._since_s + _PATIENCE_S:
-            self._has_said_missing = True
-            self.get_logger().warning(f"waiting: nothing has come on {', '.join(missing)}")
-        drops = dict(self.feed.all_drops)
-        if drops != self._known_drops:
-            self._known_drops = drops
-            words = ", ".join(f"{count} {reason}" for reason, count in drops.items())
-            self.get_logger().warning(f"dropped so far: {words}", throttle_duration_sec=_THROTTLE_S)
-        graph, counters = self._mapper.graph, self._mapper.counters
-        values = {"stops": graph.count, "bearings": graph.constraints.bearing_count, **counters}
-        values |= {f"dropped: {reason}": count for reason, count in drops.items()}
+        sentence = f"no messages received on {listed(missing)}" if missing else ""
+        self.health.warn_of("missing", {"": sentence} if missing else {}, PATIENCE_S)
+        self.health.warn_of_drops(self.feed.all_drops)
+        graph = self._mapper.graph
+        values: dict[str, object] = {
+            "stops": graph.count,
+            "bearings": graph.constraints.bearing_count,
+            **self._mapper.counters,
+            **drop_values(self.feed.all_drops),
+        }
         for kind in MapperInput:
             count = sum(self.feed.received[index, kind] for index in range(len(self._robots)))
             values[f"<robot>/{kind.topic} received"] = count
-        text = f"nothing on {', '.join(missing)}" if missing else f"{graph.count} stops"
-        status = DiagnosticStatus(
-            level=DiagnosticStatus.WARN if missing else DiagnosticStatus.OK,
-            name=self.get_name(),
-            message=text,
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
-        )
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
+        message = sentence or f"{graph.count} stops"
+        self.publish_reports(Report(self.get_name(), message, level_of(missing), values))
 
     def _why(self, topic: str) -> str:
         kind = next(one for one in MapperInput if topic.endswith(f"/{one.topic}"))

@@ -22,12 +22,12 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from swarm_loc_estimator.common.bags.reader import BagReader, BagTopic, RawMessage
+from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.node import ConfiguredNode, Stop, run_node
 from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_estimator.nodes.player.playback import STEP_S, PlayedSoFar, play
 from swarm_loc_estimator.nodes.player.player_parameters import PlayerParameters
 from swarm_loc_estimator.nodes.player.playing_qos import RELIABLE, playing_qos
-from swarm_loc_estimator.nodes.wording import listed
 
 _CLOCK = "clock"
 _POLL_S = 0.05

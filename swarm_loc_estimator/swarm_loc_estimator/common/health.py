@@ -1,0 +1,155 @@
+"""Health of a node, for its log and for /diagnostics: drops, silent topics, lasting problems. No ROS here."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any
+
+PATIENCE_S = 5.0
+"""A topic may be silent for so long before the log says so."""
+THROTTLE_S = 30.0
+"""The same warning is logged at most once in this time."""
+_MAX_LINES = 8
+"""So many new problems of a kind are logged one by one."""
+_MAX_NAMES = 8
+
+
+class Level(IntEnum):
+    """Levels of diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+@dataclass
+class Report:
+    """One status of /diagnostics.
+
+    Attributes:
+        name: Name of the status.
+        message: One sentence.
+        level: How bad it is.
+        values: Figures; their names hold the units.
+        hardware_id: Address of the hardware that it is about, "" for none.
+    """
+
+    name: str
+    message: str
+    level: Level = Level.OK
+    values: dict[str, object] = field(default_factory=dict)
+    hardware_id: str = ""
+
+    @property
+    def warning(self) -> bool:
+        """Whether something is wrong."""
+        return self.level is not Level.OK
+
+
+def level_of(trouble: object) -> Level:
+    """WARN where there is trouble, else OK."""
+    return Level.WARN if trouble else Level.OK
+
+
+def drop_values(drops: Mapping[str, int]) -> dict[str, object]:
+    """Counts of dropped data as values of a report."""
+    return {f"dropped: {reason}": count for reason, count in sorted(drops.items()) if count}
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in one line; of many only the first ones, and how many more there are."""
+    more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+    return ", ".join(names[:_MAX_NAMES]) + more
+
+
+class Health:
+    """Counts drops, notes when topics were received last, and logs each problem once in a while.
+
+    Args:
+        warn: Logs a sentence as a warning.
+        now_s: A steady clock [s].
+
+    Attributes:
+        drops: Count of dropped data by reason.
+    """
+
+    def __init__(self, warn: Callable[[str], object], now_s: Callable[[], float] = time.monotonic) -> None:
+        self.drops: Counter[str] = Counter()
+        self._warn = warn
+        self._now_s = now_s
+        self._details: dict[str, str] = {}
+        self._warned_drops: Counter[str] = Counter()
+        self._warned_s: dict[tuple[str, object], float] = {}
+        self._begun_s: dict[str, dict[object, float]] = {}
+        self._received_s: dict[str, float] = {}
+
+    def drop(self, reason: str, detail: str = "") -> None:
+        """Count one message or datum that was not used; `detail` explains the reason in the log."""
+        self.drops[reason] += 1
+        self._details[reason] = detail
+
+    def warn_of_drops(self, drops: Mapping[str, int] | None = None, what: str = "dropped") -> None:
+        """Log the reasons whose counts have grown since they were logged last.
+
+        Args:
+            drops: Counts by reason; None: those of `drop`.
+            what: What the counts are.
+        """
+        drops = self.drops if drops is None else drops
+        grown = [reason for reason, count in drops.items() if count > self._warned_drops[reason]]
+        due = [reason for reason in grown if self._is_due("drops", reason)]
+        if due:
+            details = [f" ({detail})" if (detail := self._details.get(reason)) else "" for reason in due]
+            said = [f"{drops[reason]} {reason}{detail}" for reason, detail in zip(due, details, strict=True)]
+            self._warn(f"{what} so far: {', '.join(said)}")
+            self._warned_drops.update({reason: drops[reason] - self._warned_drops[reason] for reason in due})
+
+    def received(self, topic: str) -> None:
+        """Note that a message of a topic has been received."""
+        self._received_s[topic] = self._now_s()
+
+    def silence(self, topic: str) -> str:
+        """A sentence where no message of a topic has been received yet, or none for a while; else ""."""
+        received_s = self._received_s.get(topic)
+        if received_s is None:
+            return f"no messages received on {topic}"
+        silent_s = self._now_s() - received_s
+        return f"no messages received on {topic} for {silent_s:.0f} s" if silent_s > PATIENCE_S else ""
+
+    def warn(self, problem: str, sentence: str) -> None:
+        """Log a problem, unless it was logged a short while ago."""
+        if self._is_due("", problem):
+            self._warn(sentence)
+
+    def warn_of(self, kind: str, problems: Mapping[Any, str], patience_s: float = 0.0) -> None:
+        """Log each problem of a kind once; again only once it has gone and come back.
+
+        Args:
+            kind: Name of the kind.
+            problems: All present problems of this kind, each with its sentence.
+            patience_s: How long a problem must last before it is logged [s].
+        """
+        now_s, begun_s = self._now_s(), self._begun_s.setdefault(kind, {})
+        for gone in begun_s.keys() - problems.keys():
+            del begun_s[gone]
+        self._warned_s = {key: at_s for key, at_s in self._warned_s.items() if now_s - at_s < THROTTLE_S}
+        lasting = [one for one in problems if now_s - begun_s.setdefault(one, now_s) >= patience_s]
+        due = [one for one in lasting if self._is_due(kind, one)]
+        begun_s.update(dict.fromkeys(due, math.inf))  # logged
+        for one in due[:_MAX_LINES]:
+            self._warn(problems[one])
+        if len(due) > _MAX_LINES:
+            self._warn(f"{len(due) - _MAX_LINES} more warnings of this kind, see /diagnostics")
+
+    def _is_due(self, kind: str, problem: object) -> bool:
+        """Whether a problem was not logged lately; if so, it counts as logged now."""
+        now_s = self._now_s()
+        if now_s - self._warned_s.get((kind, problem), -math.inf) < THROTTLE_S:
+            return False
+        self._warned_s[kind, problem] = now_s
+        return True
