@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from bench.aerial import printed
+from bench.aerial.paper_methods import identify_by_way, own_displacement, relation
 from bench.aerial.rates import SWARMS, Results
 from bench.aerial.worlds import PERIOD_NS, Conditions, World, picture_of, simulate
 from swarm_loc_estimator.identification.anchors import Scale
 from swarm_loc_estimator.identification.chain import ChainModel, Chains
-from swarm_loc_estimator.identification.own_motion import own_displacement, relation
-from swarm_loc_estimator.identification.random_motion import identify_by_way
 
 _PAPERS = ChainModel(detection_probability=0.999, absent=1e-3, entering=1e-3, false_detections=0.01)
 """All robots are on each image, and nothing else."""

@@ -9,8 +9,8 @@ import numpy as np
 from swarm_loc_estimator.common.se2 import wrap_angle
 
 if TYPE_CHECKING:
+    from bench.aerial.paper_methods import ComplexArray
     from swarm_loc_estimator.common.arrays import FloatArray
-    from swarm_loc_estimator.identification.own_motion import ComplexArray
 
 
 def algorithm_1(first: FloatArray, second: FloatArray, own_turn: float) -> int:

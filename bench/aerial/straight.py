@@ -7,11 +7,10 @@ import time
 import numpy as np
 
 from bench.aerial import printed
+from bench.aerial.paper_methods import ComplexArray, identify_by_speeds
 from bench.aerial.rates import SWARMS, Results
 from bench.aerial.worlds import PERIOD_S
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.identification.linear_variation import identify_by_speeds
-from swarm_loc_estimator.identification.own_motion import ComplexArray
 
 _SIGMA = 0.025
 """Of each coordinate [unit]; with it the printed method has about the printed rate."""

@@ -7,10 +7,10 @@ import time
 import numpy as np
 
 from bench.aerial import printed
+from bench.aerial.paper_methods import identify_by_turns, turn_misfits
 from bench.aerial.rates import SWARMS, Results
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.identification.angular_variation import identify_by_turns, turn_misfits
 
 _SIGMA = np.radians(1.4)
 """Of a heading: the mean deviation of a turn is then 1.6 degrees, as printed."""

@@ -18,8 +18,8 @@ import numpy as np
 from swarm_loc_estimator.identification.picture import Picture, TrackPoint
 
 if TYPE_CHECKING:
+    from bench.aerial.paper_methods import ComplexArray
     from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-    from swarm_loc_estimator.identification.own_motion import ComplexArray
 
 PERIOD_S = 10.0
 PERIOD_NS = 10_000_000_000

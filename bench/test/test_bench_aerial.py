@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from bench.aerial import calibration, driving, printed, straight, turning
+from bench.aerial.paper_methods import ComplexArray, identify_by_turns, identify_by_way
 from bench.aerial.rates import Rate, Results
 from bench.aerial.worlds import Conditions, simulate
-from swarm_loc_estimator.identification.angular_variation import identify_by_turns
 from swarm_loc_estimator.identification.chain import ChainModel
-from swarm_loc_estimator.identification.own_motion import ComplexArray
-from swarm_loc_estimator.identification.random_motion import identify_by_way
 
 SEED = 77
 

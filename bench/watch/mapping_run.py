@@ -8,8 +8,8 @@ from bench.pushbot.runs import RunSettings
 from swarm_loc_drivers.sim.pushbot.exploration import Arrival, Exploration, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_estimator.common.messages.estimates import EstimateMessage
-from swarm_loc_estimator.mapping.grid_messages import GridMessage
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.mapping.messages import GridMessage
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimate import Status
 from swarm_loc_estimator.watch.about import about

@@ -11,7 +11,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.estimates import EstimateMessage
-from swarm_loc_estimator.mapping.grid_messages import GridMessage
+from swarm_loc_estimator.mapping.messages import GridMessage
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.sightings import Sightings
 from swarm_loc_estimator.watch.about import about

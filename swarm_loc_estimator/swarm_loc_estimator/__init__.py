@@ -13,20 +13,20 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 if TYPE_CHECKING:
     from swarm_loc_estimator.infrared.brightness import expected_brightness as expected_brightness
-    from swarm_loc_estimator.mapping.exploration.goal import Goal as Goal
-    from swarm_loc_estimator.mapping.fix_covariance import FixCovariances as FixCovariances
-    from swarm_loc_estimator.mapping.grid.occupancy import OccupancyMap as OccupancyMap
-    from swarm_loc_estimator.mapping.grid_messages import OCCUPANCY_GRID as OCCUPANCY_GRID
-    from swarm_loc_estimator.mapping.laser_messages import LASER as LASER
-    from swarm_loc_estimator.mapping.laser_messages import LIGHTS as LIGHTS
-    from swarm_loc_estimator.mapping.laser_messages import BadMessageError as BadMessageError
-    from swarm_loc_estimator.mapping.laser_messages import decode_laser as decode_laser
+    from swarm_loc_estimator.mapping.exploration import Goal as Goal
+    from swarm_loc_estimator.mapping.grid import OccupancyMap as OccupancyMap
     from swarm_loc_estimator.mapping.mapper import SCAN_TURN as SCAN_TURN
     from swarm_loc_estimator.mapping.mapper import START_TURN as START_TURN
     from swarm_loc_estimator.mapping.mapper import CooperativeMapper as CooperativeMapper
-    from swarm_loc_estimator.mapping.readings import UNSEEN as UNSEEN
-    from swarm_loc_estimator.mapping.readings import LightSightings as LightSightings
-    from swarm_loc_estimator.mapping.readings import Readings as Readings
+    from swarm_loc_estimator.mapping.mapper_feed import FixCovariances as FixCovariances
+    from swarm_loc_estimator.mapping.messages import LASER as LASER
+    from swarm_loc_estimator.mapping.messages import LIGHTS as LIGHTS
+    from swarm_loc_estimator.mapping.messages import OCCUPANCY_GRID as OCCUPANCY_GRID
+    from swarm_loc_estimator.mapping.messages import BadMessageError as BadMessageError
+    from swarm_loc_estimator.mapping.messages import decode_laser as decode_laser
+    from swarm_loc_estimator.mapping.scans import UNSEEN as UNSEEN
+    from swarm_loc_estimator.mapping.scans import LightSightings as LightSightings
+    from swarm_loc_estimator.mapping.scans import Readings as Readings
     from swarm_loc_estimator.offline.metrics import Errors as Errors
     from swarm_loc_estimator.offline.metrics import ErrorSummary as ErrorSummary
     from swarm_loc_estimator.offline.replay import replay as replay
@@ -50,13 +50,12 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "infrared.brightness": ("expected_brightness",),
-    "mapping.exploration.goal": ("Goal",),
-    "mapping.fix_covariance": ("FixCovariances",),
-    "mapping.grid.occupancy": ("OccupancyMap",),
-    "mapping.grid_messages": ("OCCUPANCY_GRID",),
-    "mapping.laser_messages": ("LASER", "LIGHTS", "BadMessageError", "decode_laser"),
+    "mapping.exploration": ("Goal",),
+    "mapping.grid": ("OccupancyMap",),
     "mapping.mapper": ("SCAN_TURN", "START_TURN", "CooperativeMapper"),
-    "mapping.readings": ("UNSEEN", "LightSightings", "Readings"),
+    "mapping.mapper_feed": ("FixCovariances",),
+    "mapping.messages": ("OCCUPANCY_GRID", "LASER", "LIGHTS", "BadMessageError", "decode_laser"),
+    "mapping.scans": ("UNSEEN", "LightSightings", "Readings"),
     "offline.metrics": ("Errors", "ErrorSummary"),
     "offline.replay": ("replay",),
     "offline.report.report": ("write_report",),

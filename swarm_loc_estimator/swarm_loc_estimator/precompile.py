@@ -21,7 +21,7 @@ from swarm_loc_estimator.filter.integrity.fault_detection import is_elsewhere
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE_TWO, CONTENT_POSITION
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.swarm.board_file import load_ir_platform

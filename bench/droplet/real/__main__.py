@@ -27,17 +27,17 @@ from bench.shared.common import OUT, Cell, ProgressLine, table, write_figures
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.command_line import exit_with_message
 from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.infrared.closed_form import ClosedForm
+from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.solution import IrEstimator
-from swarm_loc_estimator.infrared.solvers.closed_form import ClosedForm
-from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
 from swarm_loc_estimator.offline.calibration.infrared.board import (
+    MAX_RANGE,
     BoardCalibration,
     calibrate_board,
     pair_gains,
     without_dead,
 )
 from swarm_loc_estimator.offline.calibration.infrared.board_fit import BoardReadings, turned
-from swarm_loc_estimator.offline.calibration.infrared.board_recording import MAX_RANGE
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
 

@@ -24,10 +24,9 @@ from swarm_loc_estimator.common.command_line import (
     swarm_beside,
     yaml_to_write,
 )
-from swarm_loc_estimator.offline.calibration.infrared.board_plots import board_text, draw_board
-from swarm_loc_estimator.offline.calibration.infrared.board_recording import calibrate_from, with_board
+from swarm_loc_estimator.offline.calibration.infrared.board import calibrate_from, with_board
 from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_infrared
-from swarm_loc_estimator.offline.calibration.infrared.plots import draw, text_of
+from swarm_loc_estimator.offline.calibration.infrared.plots import board_text, draw, draw_board, text_of
 from swarm_loc_estimator.offline.calibration.recording import read_recording
 from swarm_loc_estimator.swarm.board_writer import save_ir_platform
 from swarm_loc_estimator.swarm.swarm import Swarm

@@ -31,9 +31,9 @@ from swarm_loc_estimator.common.command_line import (
     swarm_beside,
 )
 from swarm_loc_estimator.common.errors import UserError
-from swarm_loc_estimator.mapping.led_frequencies import led_frequencies
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.mapping.messages import led_frequencies
 from swarm_loc_estimator.mapping.settings import MapperSettings
 from swarm_loc_estimator.offline.map_replay import draw_map, map_figures, replay_map, truth_of
 from swarm_loc_estimator.swarm.swarm_file import load_swarm

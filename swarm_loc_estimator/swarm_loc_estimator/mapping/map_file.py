@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.errors import UserError
 from swarm_loc_estimator.common.yaml_tree import read_tree, shown, tree_text
-from swarm_loc_estimator.mapping.grid.occupancy import LOG_ODDS_CAP, OccupancyMap
+from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
 
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196

@@ -14,16 +14,18 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import between, compose, wrap_angle
-from swarm_loc_estimator.mapping.exploration.explorer import next_stop
-from swarm_loc_estimator.mapping.exploration.goal import Goal, goal_by_odometry
-from swarm_loc_estimator.mapping.grid.occupancy import OccupancyMap, draw_map
-from swarm_loc_estimator.mapping.grid.visitation import VisitationMap
-from swarm_loc_estimator.mapping.localization.alignment import align, align_all, align_start
-from swarm_loc_estimator.mapping.localization.lights import LightBook, Visit
-from swarm_loc_estimator.mapping.localization.loop_closure import close_loop
-from swarm_loc_estimator.mapping.pose_graph.graph import PoseGraph
-from swarm_loc_estimator.mapping.readings import LightSightings, Readings
-from swarm_loc_estimator.mapping.scans.turn_ratio import turn_ratio
+from swarm_loc_estimator.mapping.exploration import Goal, goal_by_odometry, next_stop
+from swarm_loc_estimator.mapping.grid import OccupancyMap, VisitationMap, draw_map
+from swarm_loc_estimator.mapping.localization import (
+    LightBook,
+    Visit,
+    align,
+    align_all,
+    align_start,
+    close_loop,
+)
+from swarm_loc_estimator.mapping.pose_graph import PoseGraph
+from swarm_loc_estimator.mapping.scans import LightSightings, Readings, turn_ratio
 from swarm_loc_estimator.mapping.settings import MapperSettings
 from swarm_loc_estimator.mapping.stops import MIN_TURN, MotionTracker, Stop
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import between, compose, exp, log
-from swarm_loc_estimator.mapping.readings import UNSEEN, Readings
+from swarm_loc_estimator.mapping.scans import UNSEEN, Readings
 
 MAX_WAITING = 500
 """Of either kind: what is older than so many is dropped."""

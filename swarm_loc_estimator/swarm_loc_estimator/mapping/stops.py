@@ -12,7 +12,7 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.mapping.readings import Readings
+from swarm_loc_estimator.mapping.scans import Readings
 
 MIN_TURN = 0.5
 """A robot that has not turned so much [rad] has not looked around: it drives on."""

@@ -17,7 +17,7 @@ from swarm_loc_estimator.common.messages.markers import MarkersEncoder
 from swarm_loc_estimator.common.messages.outputs import SwarmPosesEncoder, TransformsEncoder
 from swarm_loc_estimator.common.messages.typestore import MARKERS, POSE_STAMPED, SWARM_POSES, TRANSFORMS
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.mapping.grid_messages import OCCUPANCY_GRID
+from swarm_loc_estimator.mapping.messages import OCCUPANCY_GRID
 from swarm_loc_estimator.offline.result import ReplayResult
 
 _MAP = "map"

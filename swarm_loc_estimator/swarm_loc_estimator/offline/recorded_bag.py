@@ -14,7 +14,7 @@ from swarm_loc_estimator.common.messages.cdr import CdrError, decode_pose_stampe
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.messages.streams import PoseReader
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.mapping.grid_messages import decode_occupancy_grid
+from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
 from swarm_loc_estimator.offline.result import RecordedMap
 from swarm_loc_estimator.offline.spool import Spool
 from swarm_loc_estimator.sensors.ingest import Ingest

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.mapping.grid_messages import GridMessage, decode_occupancy_grid
+from swarm_loc_estimator.mapping.messages import GridMessage, decode_occupancy_grid
 from swarm_loc_estimator.offline.metrics import Errors, ErrorSummary, compare, pool, summarise
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.sightings import Sightings

@@ -18,9 +18,9 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.gating import gate_threshold
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, Kind, MeasurementArray
+from swarm_loc_estimator.infrared.closed_form import ClosedForm
+from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.solution import IrEstimator, IrSolutions, Outcome
-from swarm_loc_estimator.infrared.solvers.closed_form import ClosedForm
-from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
 from swarm_loc_estimator.sensors.exchanges import ExchangeKey, MatrixScreening, Readings
 from swarm_loc_estimator.sensors.messages import NO_MEASUREMENTS, BrightnessRows
 from swarm_loc_estimator.sensors.validation import REJECT_REASONS, reject_reasons

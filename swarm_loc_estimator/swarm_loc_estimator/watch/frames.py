@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from swarm_loc_estimator.common.messages.estimates import EstimateMessage
-from swarm_loc_estimator.mapping.grid_messages import GridMessage
+from swarm_loc_estimator.mapping.messages import GridMessage
 from swarm_loc_estimator.timeline.sightings import Sightings
 
 _TYPES = {"float64": "f8", "float32": "f4", "int32": "i4", "uint8": "u1", "int8": "i1"}

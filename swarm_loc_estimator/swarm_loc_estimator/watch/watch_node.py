@@ -29,7 +29,7 @@ from swarm_loc_estimator.common.messages.cdr import CdrError
 from swarm_loc_estimator.common.messages.estimates import SwarmPosesReader, decode_sightings
 from swarm_loc_estimator.common.messages.typestore import SWARM_POSES
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
-from swarm_loc_estimator.mapping.grid_messages import decode_occupancy_grid
+from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.watch.about import about
 from swarm_loc_estimator.watch.access import Access

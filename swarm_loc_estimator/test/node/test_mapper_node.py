@@ -19,9 +19,9 @@ from rclpy.time import Time
 from std_srvs.srv import Trigger
 
 from swarm_loc_estimator.common.errors import UserError
-from swarm_loc_estimator.mapping.grid.occupancy import CELL
+from swarm_loc_estimator.mapping.grid import CELL
 from swarm_loc_estimator.mapping.map_file import load_map
-from swarm_loc_estimator.mapping.readings import Readings
+from swarm_loc_estimator.mapping.scans import Readings
 from swarm_loc_estimator.nodes.mapper.mapper_node import MapperNode
 from swarm_loc_msgs.msg import LaserDistance
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.infrared.solvers.cost import Pair, new_costs, write_costs
-from swarm_loc_estimator.infrared.solvers.readings import classify
+from swarm_loc_estimator.infrared.cost import Pair, new_costs, write_costs
+from swarm_loc_estimator.infrared.search import classify
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.mapping.readings import Readings
+from swarm_loc_estimator.mapping.scans import Readings
 
 PERIOD_NS = 20_000_000
 MAX_RANGE = 2.5

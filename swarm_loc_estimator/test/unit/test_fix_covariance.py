@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.mapping.exploration.goal import Goal
-from swarm_loc_estimator.mapping.fix_covariance import FixCovariances, pose_covariance
+from swarm_loc_estimator.mapping.exploration import Goal
+from swarm_loc_estimator.mapping.mapper_feed import FixCovariances, pose_covariance
 from swarm_loc_estimator.swarm.swarm import OdometryModel
 
 ELEMENTS = st.floats(-0.3, 0.3)

@@ -10,7 +10,7 @@ from ir_world import droplet, random_poses
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.infrared.solvers.gains import Exchanges
+from swarm_loc_estimator.infrared.gains import Exchanges
 from swarm_loc_estimator.offline.calibration.infrared.gain_validation import helpful_gains
 from swarm_loc_estimator.offline.calibration.infrared.held_out import (
     ALIKE,

@@ -11,15 +11,19 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
+from bench.aerial.paper_methods import (
+    fit_chains,
+    identify_by_speeds,
+    identify_by_turns,
+    identify_by_way,
+    own_displacement,
+    relation,
+)
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.identification.anchors import Scale
-from swarm_loc_estimator.identification.angular_variation import identify_by_turns
 from swarm_loc_estimator.identification.chain import ChainModel, Chains
-from swarm_loc_estimator.identification.linear_variation import identify_by_speeds
-from swarm_loc_estimator.identification.own_motion import fit_chains, own_displacement, relation
 from swarm_loc_estimator.identification.picture import Picture, TrackPoint, gathered_between
-from swarm_loc_estimator.identification.random_motion import identify_by_way
 
 SECOND = 10**9
 SIGMA = 0.01

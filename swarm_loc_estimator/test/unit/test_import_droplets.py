@@ -11,7 +11,7 @@ import pytest
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.offline.calibration.infrared.board_recording import read_board
+from swarm_loc_estimator.offline.calibration.infrared.board import read_board
 from swarm_loc_estimator.offline.calibration.recording import read_recording
 from swarm_loc_estimator.offline.datasets.droplets import (
     DropletRecordingError,

@@ -13,15 +13,15 @@ from ir_world import droplet, nees, pair_of, pose_errors, random_poses, readings
 from scipy.integrate import quad
 from scipy.optimize import minimize
 
+from bench.droplet.cramer_rao import information
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.infrared.cramer_rao import information
+from swarm_loc_estimator.infrared.closed_form import ClosedForm
+from swarm_loc_estimator.infrared.cost import cost_of, new_scratch
+from swarm_loc_estimator.infrared.gains import Exchanges, estimate_gains
+from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
+from swarm_loc_estimator.infrared.reading_cost import SATURATED
 from swarm_loc_estimator.infrared.solution import IrEstimator, Outcome, ReadingsError
-from swarm_loc_estimator.infrared.solvers.closed_form import ClosedForm
-from swarm_loc_estimator.infrared.solvers.cost import cost_of, new_scratch
-from swarm_loc_estimator.infrared.solvers.gains import Exchanges, estimate_gains
-from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.solvers.reading_cost import SATURATED
 from swarm_loc_estimator.swarm.ir_board import PairGains
 
 LIMIT = 240.0

@@ -7,8 +7,8 @@ import pytest
 from ir_world import droplet, nees, pose_errors, random_poses, readings_of
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.infrared.solvers.gains import Exchanges, GainsError, GainsFit, estimate_gains
-from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
+from swarm_loc_estimator.infrared.gains import Exchanges, GainsError, GainsFit, estimate_gains
+from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.swarm.ir_board import PairGains
 
 ROBOTS = 3

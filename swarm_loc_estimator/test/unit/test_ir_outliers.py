@@ -7,11 +7,10 @@ import pytest
 from ir_world import nees, pair_of, pose_errors, random_poses, readings_of
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.infrared.cost import cost_of, new_scratch
+from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.solution import Outcome
-from swarm_loc_estimator.infrared.solvers.coarse_posterior import add_spread
-from swarm_loc_estimator.infrared.solvers.cost import cost_of, new_scratch
-from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.solvers.start_table import new_start_room
+from swarm_loc_estimator.infrared.start_table import add_spread, new_start_room
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 
 BOARD = load_ir_platform("droplet_2016")

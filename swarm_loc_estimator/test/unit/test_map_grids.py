@@ -11,11 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.errors import UserError
-from swarm_loc_estimator.mapping.exploration.explorer import next_stop
-from swarm_loc_estimator.mapping.exploration.goal import goal_by_odometry
-from swarm_loc_estimator.mapping.exploration.planning_grid import paths_from
-from swarm_loc_estimator.mapping.grid.occupancy import CELL, OccupancyMap, grid_around
-from swarm_loc_estimator.mapping.grid.visitation import VisitationMap
+from swarm_loc_estimator.mapping.exploration import goal_by_odometry, next_stop, paths_from
+from swarm_loc_estimator.mapping.grid import CELL, OccupancyMap, VisitationMap, grid_around
 from swarm_loc_estimator.mapping.map_file import load_map, save_map
 from swarm_loc_estimator.mapping.settings import MapperSettings
 

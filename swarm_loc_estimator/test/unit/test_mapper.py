@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from mapping_world import ROOM, RoomRobot, distance_in_room
 
+from bench.pushbot.particle_mapper import ParticleMapper
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, CooperativeMapper
-from swarm_loc_estimator.mapping.printed.particle_mapper import ParticleMapper
-from swarm_loc_estimator.mapping.readings import LightSightings, Readings
+from swarm_loc_estimator.mapping.scans import LightSightings, Readings
 from swarm_loc_estimator.mapping.settings import MapperSettings
 from swarm_loc_estimator.mapping.stops import MotionTracker, Stop
 

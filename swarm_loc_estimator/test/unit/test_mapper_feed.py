@@ -11,9 +11,9 @@ import pytest
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.encoders import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.common.messages.typestore import encode, typestore
-from swarm_loc_estimator.mapping.laser_messages import LASER
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
+from swarm_loc_estimator.mapping.messages import LASER
 from swarm_loc_estimator.swarm.swarm import Robot
 
 STEP_NS = 20_000_000

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from compiled_code import compiled_since, printed_by_process, signatures
 
-from swarm_loc_estimator.mapping.fix_covariance import FixCovariances
+from swarm_loc_estimator.mapping.mapper_feed import FixCovariances
 from swarm_loc_estimator.mapping.settings import MapperSettings
 from swarm_loc_estimator.nodes.mapper.precompile import precompile
 from swarm_loc_estimator.offline.map_replay import replay_map

@@ -11,18 +11,28 @@ from hypothesis import strategies as st
 from mapping_world import MAX_RANGE, SIGMA, inverse_distances
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.mapping.matching.beam_matching import (
+from swarm_loc_estimator.mapping.matching import (
     CAUCHY,
     FIT,
+    Lattice,
     Scans,
     accumulate,
     agreement,
     beam_residual,
+    search_offsets,
 )
-from swarm_loc_estimator.mapping.matching.correlative_search import Lattice, search_offsets
-from swarm_loc_estimator.mapping.scans.beams import MAX_BEAMS, Beams, no_beams, set_beams
-from swarm_loc_estimator.mapping.scans.lines import BINS, FREE, LINE, fit_lines, no_lines
-from swarm_loc_estimator.mapping.scans.turn_ratio import turn_ratio
+from swarm_loc_estimator.mapping.scans import (
+    BINS,
+    FREE,
+    LINE,
+    MAX_BEAMS,
+    Beams,
+    fit_lines,
+    no_beams,
+    no_lines,
+    set_beams,
+    turn_ratio,
+)
 
 TURN = np.linspace(0.0, 2.1 * math.pi, 400)
 POSES = np.array([[1.5, 1.2, 0.4], [1.9, 1.4, -2.0]])

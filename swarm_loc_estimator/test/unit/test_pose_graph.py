@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.mapping.pose_graph import constraints as model
-from swarm_loc_estimator.mapping.pose_graph.graph import PoseGraph
-from swarm_loc_estimator.mapping.pose_graph.normal_equations import NormalEquations
+from swarm_loc_estimator.mapping import constraints as model
+from swarm_loc_estimator.mapping.constraints import NormalEquations
+from swarm_loc_estimator.mapping.pose_graph import PoseGraph
 from swarm_loc_estimator.mapping.settings import MapperSettings
 
 SEEDS = range(5)

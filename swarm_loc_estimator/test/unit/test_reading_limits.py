@@ -10,7 +10,7 @@ from ir_world import random_poses
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.infrared.solvers.gains import Exchanges
+from swarm_loc_estimator.infrared.gains import Exchanges
 from swarm_loc_estimator.offline.calibration.infrared.reading_limits import (
     ReadingLimits,
     contradictions,

@@ -25,7 +25,7 @@ from swarm_loc_estimator.common.messages.encoders import (
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.messages.typestore import ODOMETRY, POSE_STAMPED, encode, typestore
 from swarm_loc_estimator.identification.memory import Identities
-from swarm_loc_estimator.mapping.grid_messages import MAX_CELLS, OCCUPANCY_GRID, decode_occupancy_grid
+from swarm_loc_estimator.mapping.messages import MAX_CELLS, OCCUPANCY_GRID, decode_occupancy_grid
 from swarm_loc_estimator.offline.export import write_mcap
 from swarm_loc_estimator.offline.recorded_bag import MapReader
 from swarm_loc_estimator.offline.replay import AerialImages, replay

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.encoders import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.common.messages.typestore import ODOMETRY, encode, typestore
-from swarm_loc_estimator.mapping.laser_messages import LASER
+from swarm_loc_estimator.mapping.messages import LASER
 from swarm_loc_vision.laser.calibration import (
     LaserCalibration,
     LaserFileError,

@@ -12,8 +12,8 @@ from std_msgs.msg import Header
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.planar import PLANE, planar_covariance
-from swarm_loc_estimator.mapping.exploration.goal import Goal
-from swarm_loc_estimator.mapping.grid.occupancy import OccupancyMap
+from swarm_loc_estimator.mapping.exploration import Goal
+from swarm_loc_estimator.mapping.grid import OccupancyMap
 
 
 def occupancy_message(occupancy: OccupancyMap, header: Header) -> OccupancyGrid:

@@ -22,12 +22,11 @@ from std_srvs.srv import Trigger
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of, listed
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.node import BACKWARDS, ConfiguredNode, run_node
-from swarm_loc_estimator.mapping.fix_covariance import FixCovariances
-from swarm_loc_estimator.mapping.grid.occupancy import CELL, OccupancyMap
-from swarm_loc_estimator.mapping.led_frequencies import led_frequencies
+from swarm_loc_estimator.mapping.grid import CELL, OccupancyMap
 from swarm_loc_estimator.mapping.map_file import MapFileError, load_map, save_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
+from swarm_loc_estimator.mapping.mapper_feed import FixCovariances, MapperFeed, MapperInput
+from swarm_loc_estimator.mapping.messages import led_frequencies
 from swarm_loc_estimator.nodes.mapper.map_messages import (
     fix_message,
     goal_message,

@@ -11,8 +11,8 @@ from swarm_loc_estimator.common.jit import note_precompiled
 from swarm_loc_estimator.common.messages.planar import yaw_of
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, START_TURN, CooperativeMapper
-from swarm_loc_estimator.mapping.matching.correlative_search import Lattice, search_offsets
-from swarm_loc_estimator.mapping.readings import Readings
+from swarm_loc_estimator.mapping.matching import Lattice, search_offsets
+from swarm_loc_estimator.mapping.scans import Readings
 from swarm_loc_estimator.mapping.settings import MapperSettings
 
 _ROOM = (1.7, 1.1)

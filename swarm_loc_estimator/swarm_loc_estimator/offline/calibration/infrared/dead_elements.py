@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.infrared.solvers.gains import Exchanges
+from swarm_loc_estimator.infrared.gains import Exchanges
 from swarm_loc_estimator.offline.calibration.infrared.element_likelihood import (
     SHARES,
     WHOLE,

@@ -19,7 +19,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.solution import DARKEST
-from swarm_loc_estimator.infrared.solvers.start_table import start_table
+from swarm_loc_estimator.infrared.start_table import start_table
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
 SHARES: FloatArray = np.array([0.0, 0.15, 0.35, 0.7, 1.0, 1.4])

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.infrared.solvers.gains import Exchanges, GainsError, estimate_gains
+from swarm_loc_estimator.infrared.gains import Exchanges, GainsError, estimate_gains
 from swarm_loc_estimator.offline.calibration.infrared.held_out import (
     ALIKE,
     GAINS,

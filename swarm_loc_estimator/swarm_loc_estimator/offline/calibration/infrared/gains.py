@@ -11,7 +11,7 @@ import numpy as np
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import interpolate
-from swarm_loc_estimator.infrared.solvers.gains import Exchanges, GainsError, GainsFit, estimate_gains
+from swarm_loc_estimator.infrared.gains import Exchanges, GainsError, GainsFit, estimate_gains
 from swarm_loc_estimator.offline.calibration.camera import DENSE_GAP_NS
 from swarm_loc_estimator.offline.calibration.infrared.dead_elements import ElementVerdicts, find_dead_elements
 from swarm_loc_estimator.offline.calibration.infrared.gain_validation import helpful_gains

@@ -16,9 +16,9 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.infrared.brightness import expected_brightness
+from swarm_loc_estimator.infrared.gains import POSE_SIGMA, Exchanges
+from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.solution import DARKEST, IrSolutions
-from swarm_loc_estimator.infrared.solvers.gains import POSE_SIGMA, Exchanges
-from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
 from swarm_loc_estimator.offline.calibration.infrared.element_likelihood import (
     BRIGHT_SPAN,
     LOWEST,

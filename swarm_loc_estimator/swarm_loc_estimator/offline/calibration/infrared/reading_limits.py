@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc, fdtrc
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.infrared.solvers.gains import Exchanges
+from swarm_loc_estimator.infrared.gains import Exchanges
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
 FALSE_ALARM = 0.01

@@ -1,14 +1,80 @@
-"""The occupancy map: log odds of cells, drawn anew from all stops whenever these have moved."""
+"""Grids: occupancy by log odds, beams drawn on it, and visits."""
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.mapping.grid.drawing import draw_stop
-from swarm_loc_estimator.mapping.matching.beam_matching import Scans
+from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_estimator.mapping.matching import Scans
+from swarm_loc_estimator.mapping.scans import BINS, LINE, POINT, UNKNOWN, Lines
+
+_FREE_STEP, _HIT_STEP = 0.25, 0.9
+"""Log odds that one ray tells."""
+_POINT_HIT = 0.25
+"""Share of that where something came back but no line could be told."""
+_FREE_RANGE_SHARE = 0.76
+"""Where nothing came back, space is free to this share of the range."""
+_SHARP_M = 0.03
+"""A wall that is known worse than this tells less of a cell."""
+
+
+@cached_njit
+def draw_stop(
+    log_odds: FloatArray,
+    corner: FloatArray,
+    cell: float,
+    pose: FloatArray,
+    stop: int,
+    lines: Lines,
+    max_range: float,
+) -> None:
+    """Add the evidence of a stop to a grid; what lies outside is left out.
+
+    Args:
+        log_odds: (nx, ny).
+        corner: (2,) lower left corner of the grid in map [m].
+        cell: [m].
+        pose: (3,) of the stop.
+        stop: Its number.
+        lines: Of all stops.
+        max_range: Of the laser [m].
+    """
+    for m in range(BINS):
+        kind, distance = lines.kind[stop, m], lines.distance[stop, m]
+        if kind == UNKNOWN:
+            continue
+        hit, end = 0.0, _FREE_RANGE_SHARE * max_range
+        if kind == LINE:
+            sigma = distance * distance * math.sqrt(lines.variance[stop, m])
+            hit, end = _HIT_STEP / (1.0 + (sigma / _SHARP_M) ** 2), distance - 0.03 - 1.5 * sigma
+        elif kind == POINT:
+            hit, end = _HIT_STEP * _POINT_HIT, distance - 0.12 - 0.02 * distance * distance
+        angle = pose[2] + (m + 0.5) * 2.0 * math.pi / BINS
+        cos, sin = math.cos(angle) / cell, math.sin(angle) / cell
+        x, y = (pose[0] - corner[0]) / cell, (pose[1] - corner[1]) / cell
+        _draw_free(log_odds, x, y, cos, sin, end, 0.7 * cell)
+        i, j = math.floor(x + distance * cos), math.floor(y + distance * sin)
+        if hit > 0.0 and 0 <= i < log_odds.shape[0] and 0 <= j < log_odds.shape[1]:
+            log_odds[i, j] += hit
+
+
+@cached_njit
+def _draw_free(
+    log_odds: FloatArray, x: float, y: float, cos: float, sin: float, end: float, step: float
+) -> None:
+    """Lower each cell along a ray from (x, y) in cells, whose direction is in cells per metre, once."""
+    last_i, last_j = -1, -1
+    for k in range(int(end / step) + 1 if end > 0.0 else 0):
+        i, j = math.floor(x + k * step * cos), math.floor(y + k * step * sin)
+        if (i != last_i or j != last_j) and 0 <= i < log_odds.shape[0] and 0 <= j < log_odds.shape[1]:
+            log_odds[i, j] -= _FREE_STEP
+        last_i, last_j = i, j
+
 
 CELL = 0.02
 """Size of a cell, that of the PushBot paper [m]."""
@@ -108,3 +174,33 @@ def grid_around(points: FloatArray, cell: float, max_cells: int) -> tuple[FloatA
         size = np.minimum(size, limit)
         low = np.floor(0.5 * (low + high - size))
     return low * cell, (int(size[0]), int(size[1]))
+
+
+_MAX_CELLS = 1_000_000
+
+
+class VisitationMap:
+    """Counts of the 3 x 3 cells around each pose, as the PushBot paper has them (IV-B)."""
+
+    def __init__(self) -> None:
+        self._visits: Counter[tuple[int, int]] = Counter()
+        self.dropped = 0
+
+    def add(self, positions: FloatArray) -> None:
+        """A robot was at positions (n, 2) in map [m]."""
+        cells, counts = np.unique(np.floor(positions / CELL).astype(int), axis=0, return_counts=True)
+        for (i, j), count in zip(cells.tolist(), counts.tolist(), strict=True):
+            for cell in ((i + a, j + b) for a in (-1, 0, 1) for b in (-1, 0, 1)):
+                if cell in self._visits or len(self._visits) < _MAX_CELLS:
+                    self._visits[cell] += count
+                else:
+                    self.dropped += count
+
+    def on(self, occupancy: OccupancyMap) -> IntArray:
+        """Counts (nx, ny) on the cells of an occupancy map."""
+        counts = np.zeros(occupancy.log_odds.shape, dtype=np.int64)
+        if self._visits:
+            cells = np.array(list(self._visits)) - np.round(occupancy.corner / CELL).astype(int)
+            inside = ((cells >= 0) & (cells < counts.shape)).all(axis=1)
+            counts[tuple(cells[inside].T)] = np.array(list(self._visits.values()))[inside]
+        return counts

@@ -1,22 +1,87 @@
-"""The pose graph: stops of all robots, what ties them together, and where all of it puts them."""
+"""The pose graph: stops as nodes, slip as a state, Gauss-Newton."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.mapping.matching.beam_matching import Scans, agreement, match_pairs
-from swarm_loc_estimator.mapping.pose_graph import constraints as model
-from swarm_loc_estimator.mapping.pose_graph.constraint_lists import ConstraintLists
-from swarm_loc_estimator.mapping.pose_graph.constraints import STOP_UNKNOWNS
-from swarm_loc_estimator.mapping.pose_graph.normal_equations import Factor, NormalEquations
-from swarm_loc_estimator.mapping.scans.beams import Beams, no_beams, set_beams
-from swarm_loc_estimator.mapping.scans.lines import Lines, fit_lines, no_lines
+from swarm_loc_estimator.mapping import constraints as model
+from swarm_loc_estimator.mapping.constraints import STOP_UNKNOWNS, Factor, NormalEquations
+from swarm_loc_estimator.mapping.matching import Scans, agreement, match_pairs
+from swarm_loc_estimator.mapping.scans import Beams, Lines, fit_lines, no_beams, no_lines, set_beams
 from swarm_loc_estimator.mapping.settings import MapperSettings
+
+_Row = tuple[int, int, FloatArray]
+
+
+class ConstraintLists:
+    """Priors, odometry, ties and bearings in the order in which they came."""
+
+    def __init__(self) -> None:
+        self._priors: list[_Row] = []
+        self._departures: list[_Row] = []
+        self._ties: list[_Row] = []
+        self._bearings: list[_Row] = []
+
+    def add_prior(self, stop: int, pose: FloatArray, sigma: FloatArray) -> None:
+        """A pose (3,) with sigmas (3,) that a stop is known to have."""
+        self._priors.append((stop, stop, np.concatenate([pose, sigma])))
+
+    def add_departure(self, begin: int, end: int, turn: float, motion: FloatArray, sigma: FloatArray) -> None:
+        """Odometry from stop to stop, see `constraints.Departures`."""
+        self._departures.append((begin, end, np.concatenate([[turn], motion, sigma])))
+
+    def add_tie(self, begin: int, end: int, pose: FloatArray, sigma: FloatArray) -> None:
+        """A relative pose, see `constraints.Ties`."""
+        self._ties.append((begin, end, np.concatenate([pose, sigma])))
+
+    def add_bearing(self, begin: int, end: int, turn: float, sigma: float) -> None:
+        """The light of a robot at another stop, see `constraints.Bearings`."""
+        self._bearings.append((begin, end, np.array([turn, sigma])))
+
+    @property
+    def tie_count(self) -> int:
+        """How many relative poses there are."""
+        return len(self._ties)
+
+    @property
+    def bearing_count(self) -> int:
+        """How many bearings there are."""
+        return len(self._bearings)
+
+    def remove_stop(self, stop: int) -> None:
+        """Forget everything that says something of a stop."""
+        for rows in (self._priors, self._departures, self._ties, self._bearings):
+            rows[:] = [one for one in rows if stop not in one[:2]]
+
+    def remove_departure_to(self, stop: int) -> None:
+        """Forget how a robot came to a stop, as when it was carried there."""
+        self._departures[:] = [one for one in self._departures if one[1] != stop]
+
+    def linearised(self, states: FloatArray) -> Iterator[model.Linearised]:
+        """All of them at states (k, 4)."""
+        if self._priors:
+            stop, _, v = _arrays(self._priors)
+            yield model.priors(states, stop, v[:, :3], v[:, 3:])
+        if self._departures:
+            begin, end, v = _arrays(self._departures)
+            yield model.odometry(states, model.Departures(begin, end, v[:, 0], v[:, 1:4], v[:, 4:]))
+        if self._ties:
+            begin, end, v = _arrays(self._ties)
+            yield model.ties(states, model.Ties(begin, end, v[:, :3], v[:, 3:]))
+        if self._bearings:
+            begin, end, v = _arrays(self._bearings)
+            yield model.bearings(states, model.Bearings(begin, end, v[:, 0], v[:, 1]))
+
+
+def _arrays(rows: list[_Row]) -> tuple[IntArray, IntArray, FloatArray]:
+    begin, end, values = zip(*rows, strict=True)
+    return np.array(begin), np.array(end), np.array(values)
+
 
 _REFIT_RATIO = 0.0006
 """Lines are fitted anew when the ratio of turns has changed by more."""

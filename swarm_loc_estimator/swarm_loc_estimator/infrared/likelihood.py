@@ -17,20 +17,26 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit
 from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
+from swarm_loc_estimator.infrared.cost import Pair, with_stray_light, write_costs
+from swarm_loc_estimator.infrared.reading_cost import DARK, MEASURED
+from swarm_loc_estimator.infrared.search import (
+    TABLE_STARTS,
+    Room,
+    classify,
+    compress_readings,
+    new_room,
+    pose_covariance,
+    search,
+)
 from swarm_loc_estimator.infrared.solution import IrSolutions, Outcome, checked, no_solutions
-from swarm_loc_estimator.infrared.solvers.coarse_posterior import add_spread
-from swarm_loc_estimator.infrared.solvers.cost import Pair, with_stray_light, write_costs
-from swarm_loc_estimator.infrared.solvers.reading_cost import DARK, MEASURED
-from swarm_loc_estimator.infrared.solvers.readings import classify, compress_readings
-from swarm_loc_estimator.infrared.solvers.search import pose_covariance, search
-from swarm_loc_estimator.infrared.solvers.start_table import (
+from swarm_loc_estimator.infrared.start_table import (
     StartTable,
+    add_spread,
     blurred,
     compress,
     find_starts,
     start_table,
 )
-from swarm_loc_estimator.infrared.solvers.workspace import TABLE_STARTS, Room, new_room
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 
 _WORSE = 2.0

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.infrared.brightness import expected_with_slopes
+from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.solution import DARKEST, Outcome
-from swarm_loc_estimator.infrared.solvers.likelihood import MaximumLikelihood
 from swarm_loc_estimator.swarm.ir_board import GAIN_RANGE, IrGains, IrPlatform, PairGains
 
 Progress = Callable[[str], None]

@@ -1,4 +1,4 @@
-"""Damped Gauss-Newton search of the maximum likelihood from a start.
+"""Search for the pose of least cost: preparation of readings, workspace and search.
 
 At a kink of the curves the slope is one-sided, which the damping bears. The covariance looks beyond a kink
 that is near.
@@ -7,13 +7,139 @@ that is near.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import norefcount_njit
+from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit
 from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.common.small_matrix import assign_matrix
-from swarm_loc_estimator.infrared.solvers.cost import Pair, Scratch, cost_of
+from swarm_loc_estimator.infrared.cost import Costs, Pair, Scratch, cost_of, new_costs, new_scratch
+from swarm_loc_estimator.infrared.reading_cost import MEASURED, MISSING, SATURATED, stabilized
+from swarm_loc_estimator.infrared.solution import DARKEST
+from swarm_loc_estimator.infrared.start_table import (
+    Float32Array,
+    StartRoom,
+    StartTable,
+    compress,
+    new_start_room,
+)
 from swarm_loc_estimator.swarm.ir_board import IrModel
+
+TABLE_STARTS = 3
+"""How many starts are taken of the table at most."""
+
+
+class Room(NamedTuple):
+    """Room to work in.
+
+    Attributes:
+        plain: To search the pose only.
+        full: To search gains besides where they are not known, else the same.
+        start: To look for starts.
+        starts: (S, 4) range, bearing, heading, misfit.
+        pattern: (F,) compressed readings.
+        present: (F,) 1 where there is a reading, else 0.
+        cut, stable, kinds: (F,) of `Pair`.
+        exact, soft: What readings cost by either model.
+        prior: (2, 2) of `Pair`.
+        minima: (2, 4) range, bearing, heading and cost of the best two minima that lie apart.
+        best: (P,) the best with its gains.
+        found: (P,) another one.
+        first: (4,) the table's best start.
+        covariance: (3, 3) of its pose.
+    """
+
+    plain: Scratch
+    full: Scratch
+    start: StartRoom
+    starts: FloatArray
+    pattern: Float32Array
+    present: Float32Array
+    cut: FloatArray
+    stable: FloatArray
+    kinds: NDArray[np.int8]
+    exact: Costs
+    soft: Costs
+    prior: FloatArray
+    minima: FloatArray
+    best: FloatArray
+    found: FloatArray
+    first: FloatArray
+    covariance: FloatArray
+
+
+@cached_njit
+def new_room(table: StartTable, modes: int, n: int, known: bool) -> Room:
+    """Room for one platform, with gains known or not."""
+    plain = new_scratch(modes, n, False)
+    full = plain if known else new_scratch(modes, n, True)
+    readings = modes * n * n
+    return Room(
+        plain,
+        full,
+        new_start_room(table),
+        np.empty((1 + TABLE_STARTS, 4)),
+        np.empty(readings, np.float32),
+        np.empty(readings, np.float32),
+        np.empty(readings),
+        np.empty(readings),
+        np.empty(readings, np.int8),
+        new_costs(readings),
+        new_costs(readings),
+        np.empty((2, 2)),
+        np.empty((2, 4)),
+        np.empty(full.at.size),
+        np.empty(full.at.size),
+        np.empty(4),
+        np.empty((3, 3)),
+    )
+
+
+@norefcount_njit
+def compress_readings(model: IrModel, pair: Pair, pattern: Float32Array, present: Float32Array) -> None:
+    """Write the readings as they would be without the elements' gains, in the form of the table."""
+    n = pair.sensor.size
+    for f in range(pair.kinds.size):
+        there = pair.kinds[f] != MISSING
+        gain = pair.sensor[f // n % n] * pair.emitter[f % n]
+        pattern[f] = compress(model, pair.readings[f] / gain) if there else 0.0
+        present[f] = 1.0 if there else 0.0
+
+
+@norefcount_njit
+def classify(model: IrModel, saturation: FloatArray, pair: Pair) -> tuple[int, int, float]:
+    """Write `cut`, `stable` and `kinds`; returns how many are measured and saturated, and how bright all are.
+
+    Args:
+        model: Of the platform.
+        saturation: (modes,) from where on readings are SATURATED [count].
+        pair: The readings.
+
+    Returns:
+        The brightness is the sum of squares in sigmas.
+    """
+    n, measured, saturated, bright = pair.sensor.size, 0, 0, 0.0
+    for f in range(pair.kinds.size):
+        reading, limit = pair.readings[f], saturation[f // (n * n)]
+        dead = math.isnan(pair.sensor[f // n % n] * pair.emitter[f % n])
+        pair.kinds[f], pair.cut[f] = MISSING, 0.0
+        if dead or not math.isfinite(reading) or reading < DARKEST * model.noise:
+            continue
+        pair.cut[f] = min(reading, limit)
+        sigmas = pair.cut[f] / model.noise
+        bright += sigmas * sigmas
+        pair.stable[f] = stabilized(model.errors, pair.cut[f])[0]
+        if reading >= limit:
+            pair.kinds[f] = SATURATED
+            saturated += 1
+        else:
+            pair.kinds[f] = MEASURED
+            measured += 1
+    return measured, saturated, bright
+
 
 _ROUNDS = 40
 _FIRST_DAMPING = 1e-3

@@ -1,4 +1,4 @@
-"""Lines that the beams of one stop tell: per degree, a wall as a linear function of cosine and sine.
+"""Scans: readings of a laser, the beams of a turn, and the lines of walls.
 
 A wall at distance D with normal n is met by a beam of direction u at the inverse distance (n.u)/D, which is
 A cos(a) + B sin(a) with (A, B) = n/D: linear least squares with noise that is the same everywhere.
@@ -12,9 +12,82 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.mapping.scans.beams import Beams
+
+UNSEEN = 0.0
+"""The inverse distance of a beam that came back from nothing."""
+
+
+class Readings(NamedTuple):
+    """Readings (n,) of one robot in order of time.
+
+    The inverse of a distance is what a camera beside a laser measures: it is linear in the pixel at which the
+    reflection is seen, d = f b / (p - p_inf), so its noise does not depend on the distance.
+
+    Attributes:
+        stamp_ns: (n,).
+        odometry: (n, 3) pose by odometry at each stamp, in the robot's own odom frame.
+        inverse: (n,) inverse distance along x of the robot, from its centre [1/m]; `UNSEEN`: nothing.
+        sigma: Standard deviation of an inverse distance, sigma_px / (f b) [1/m]; NaN where
+            nothing was seen so far.
+    """
+
+    stamp_ns: IntArray
+    odometry: FloatArray
+    inverse: FloatArray
+    sigma: float
+
+
+class LightSightings(NamedTuple):
+    """Lights (m,) of other robots that one robot saw.
+
+    Attributes:
+        stamp_ns: (m,).
+        target: (m,) number of the robot whose light it is.
+        bearing: (m,) in the frame of the robot that saw it [rad].
+        sigma: (m,) its standard deviation [rad].
+    """
+
+    stamp_ns: IntArray
+    target: IntArray
+    bearing: FloatArray
+    sigma: FloatArray
+
+
+MAX_BEAMS = 768
+"""Of one stop; where there are more, every second one is left out."""
+
+
+class Beams(NamedTuple):
+    """Beams of stops (k,).
+
+    Attributes:
+        turn: (k, MAX_BEAMS) turn by odometry since the robot came to this stop [rad].
+        inverse: (k, MAX_BEAMS) inverse distance [1/m], 0: nothing seen.
+        counts: (k,) how many beams there are.
+        sigma: (k,) standard deviation of an inverse distance [1/m].
+    """
+
+    turn: FloatArray
+    inverse: FloatArray
+    counts: IntArray
+    sigma: FloatArray
+
+
+def no_beams(capacity: int) -> Beams:
+    """Room for the beams of so many stops."""
+    shape = (capacity, MAX_BEAMS)
+    return Beams(np.zeros(shape), np.zeros(shape), np.zeros(capacity, dtype=np.int64), np.ones(capacity))
+
+
+def set_beams(beams: Beams, stop: int, turn: FloatArray, inverse: FloatArray) -> None:
+    """Set the beams (n,) of a stop."""
+    every = -(-len(turn) // MAX_BEAMS) or 1
+    turn, inverse = turn[::every], inverse[::every]
+    beams.turn[stop, : len(turn)], beams.inverse[stop, : len(turn)] = turn, inverse
+    beams.counts[stop] = len(turn)
+
 
 BINS = 360
 UNKNOWN, FREE, POINT, LINE = 0, 1, 2, 3
@@ -189,3 +262,49 @@ def _is_free(total: FloatArray, m: int) -> bool:
         return False
     around = total[here + 3, _ALL] - total[here - 2, _ALL]
     return bool(total[here + 3, _SEEN] - total[here - 2, _SEEN] <= 0.34 * around)
+
+
+MIN_OVERLAP = 50
+"""So many beams of the first turn must have one of the second beside them."""
+_LOW, _HIGH, _STEP = 0.90, 1.02, 0.0005
+_OUTLIER = 9.0
+
+
+@cached_njit
+def turn_ratio(turn: FloatArray, inverse: FloatArray, sigma: float) -> float:
+    """The ratio at which beams (n,) agree best with those one turn later; NaN where too few overlap.
+
+    Args:
+        turn: (n,) by odometry, increasing or decreasing throughout [rad].
+        inverse: (n,) inverse distances, 0: nothing [1/m].
+        sigma: Of an inverse distance [1/m].
+    """
+    forward = np.abs(turn - turn[0])
+    best, found = math.inf, math.nan
+    for m in range(round((_HIGH - _LOW) / _STEP) + 1):
+        ratio = _HIGH - m * _STEP
+        cost, count = _disagreement(forward, inverse, sigma, 2.0 * math.pi / ratio)
+        if count >= MIN_OVERLAP and cost / count < best:
+            best, found = cost / count, ratio
+    return found
+
+
+@cached_njit
+def _disagreement(turn: FloatArray, inverse: FloatArray, sigma: float, later: float) -> tuple[float, int]:
+    """Sum of capped squares between each beam and that a turn `later` [rad], and their number."""
+    cost, count, j = 0.0, 0, 0
+    for i in range(len(turn)):
+        wanted = turn[i] + later
+        while j + 1 < len(turn) and turn[j + 1] < wanted:
+            j += 1
+        if j + 1 >= len(turn):
+            break
+        count += 1
+        if (inverse[i] > 0.0) != (inverse[j] > 0.0):
+            cost += _OUTLIER
+        elif inverse[i] > 0.0 and inverse[j + 1] > 0.0:
+            gap = turn[j + 1] - turn[j]
+            share = (wanted - turn[j]) / gap if gap > 0.0 else 0.0
+            off = (inverse[i] - (1.0 - share) * inverse[j] - share * inverse[j + 1]) / (1.3 * sigma)
+            cost += min(off * off, _OUTLIER)
+    return cost, count

@@ -16,14 +16,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit, reassociated_njit
 from swarm_loc_estimator.infrared.brightness import WAY_ROWS, predict_brightness
-from swarm_loc_estimator.infrared.solvers.reading_cost import (
-    BELIEVED,
-    DARK,
-    MEASURED,
-    MISSING,
-    reading_cost,
-    spread,
-)
+from swarm_loc_estimator.infrared.reading_cost import BELIEVED, DARK, MEASURED, MISSING, reading_cost, spread
 from swarm_loc_estimator.swarm.ir_board import IrModel, ReadingErrors
 
 _MOST = math.sqrt(2.0 * BELIEVED)

@@ -1,1 +1,0 @@
-"""Relative poses and gains from brightness matrices."""

@@ -1,1 +1,0 @@
-"""Grids: occupancy and visits."""

@@ -1,0 +1,277 @@
+"""Where a scan was made: alignment with the map, loop closure, lights of other robots."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.se2 import between, wrap_angle
+from swarm_loc_estimator.mapping.matching import Lattice, accumulate, search_offsets
+from swarm_loc_estimator.mapping.pose_graph import PoseGraph
+from swarm_loc_estimator.mapping.scans import LightSightings
+from swarm_loc_estimator.mapping.stops import Stop
+
+_TARGETS, _MIN_OVERLAP = 7, 0.2
+_START_TARGETS, _MIN_START_OVERLAP = 8, 0.08
+_FINAL_TARGETS, _MIN_FINAL_OVERLAP = 9, 0.35
+_GATE = 0.06
+_MAX_SHIFT, _MAX_SHIFT_PER_METRE, _MAX_TURN = 0.10, 0.08, math.radians(5.0)
+"""A scan that alignment moves further than odometry can be wrong is left where odometry put it."""
+_SOLVE_ALL_EVERY = 4
+"""At every stop it is worse: a closed ring then gets half as precise again."""
+_RECENT = 8
+_START_SEARCH = Lattice(0.3, 0.05, math.radians(12.0), math.radians(1.5))
+_START_RADIUS, _START_AGAINST, _MIN_START_SCORE = 2.5, 48, 0.35
+"""A first scan has ten parts: against a dozen would be against those of the nearest robot alone."""
+_MAX_START_SIGMAS, _LEAST_START_SHIFT = 4.0, 0.02
+
+
+def align(graph: PoseGraph, stop: int, path: float) -> bool:
+    """Align the scan of a new stop with those around; whether it fitted where odometry had put it.
+
+    Args:
+        graph: Is changed.
+        stop: The newest.
+        path: Driven from the stop before [m].
+    """
+    graph.targets[stop] = graph.neighbours(stop, _TARGETS, _MIN_OVERLAP)
+    fitted = _align_alone(graph, stop, path) if graph.targets[stop] else True
+    graph.targets[stop] = graph.neighbours(stop, _TARGETS, _MIN_OVERLAP)
+    graph.match_both_ways(stop)
+    if graph.count % _SOLVE_ALL_EVERY == 0:
+        graph.solve(3)
+    else:
+        recent = range(max(0, graph.count - _RECENT * len(graph.slip)), graph.count)
+        graph.solve(2, {*recent, *graph.targets[stop]})
+    return fitted
+
+
+def _align_alone(graph: PoseGraph, stop: int, path: float) -> bool:
+    """Move the newest stop only, and back again where that cannot be."""
+    predicted, slip = graph.states[stop].copy(), graph.slip.copy()
+    graph.solve(4, [stop], _GATE)
+    shift, turn = np.hypot(*(graph.states[stop] - predicted)[:2]), graph.states[stop, 2] - predicted[2]
+    if shift <= _MAX_SHIFT + _MAX_SHIFT_PER_METRE * path and abs(turn) <= _MAX_TURN:
+        return True
+    graph.states[stop], graph.slip = predicted, slip
+    graph.fit(stop)
+    return False
+
+
+def align_start(graph: PoseGraph, parts: Sequence[int], sigma: FloatArray) -> None:
+    """Align the parts of a robot's first scan with each other and, as one body, with older scans.
+
+    Args:
+        graph: Is changed.
+        parts: The newest stops, all at one place.
+        sigma: (3,) how well that is known. Where older scans would move it further than four of these, they
+            are not believed, and the robot is left where it was said to be.
+    """
+    away = graph.distances(parts[0])
+    others = [one for one in np.argsort(away, kind="stable") if one < parts[0] and away[one] < _START_RADIUS]
+    told, states, slip = graph.states[parts[0]].copy(), graph.states.copy(), graph.slip.copy()
+    if others:
+        against = np.array(others[:_START_AGAINST])
+        found = search_offsets(graph.scans, np.array(parts), against, _START_SEARCH)
+        if found.score > _MIN_START_SCORE:
+            graph.states[parts, :3] += found.offset
+    _match_parts(graph, parts, 0)
+    if (np.abs(graph.states[parts[0], :3] - told[:3]) > _MAX_START_SIGMAS * sigma + _LEAST_START_SHIFT).any():
+        graph.states[:], graph.slip = states, slip
+        for one, targets in graph.targets.items():
+            graph.targets[one] = [other for other in targets if (one in parts) == (other in parts)]
+        _match_parts(graph, parts, parts[0])
+
+
+def _match_parts(graph: PoseGraph, parts: Sequence[int], oldest: int) -> None:
+    """Match parts of a first scan with stops from the oldest on, and solve."""
+    for stop in parts:
+        near = graph.neighbours(stop, _START_TARGETS, _MIN_START_OVERLAP)
+        graph.targets[stop] = [other for other in near if other >= oldest]
+        graph.match_both_ways(stop)
+    graph.solve(6, gate=_GATE, stride=1)
+    for stop in range(graph.count):
+        graph.fit(stop)
+
+
+def align_all(graph: PoseGraph) -> None:
+    """Align all scans anew with all their beams: the final solution."""
+    for stop in range(graph.count):
+        graph.targets[stop] = graph.neighbours(stop, _FINAL_TARGETS, _MIN_FINAL_OVERLAP)
+    graph.solve(5, stride=1)
+    for stop in range(graph.count):
+        graph.fit(stop)
+
+
+_RADIUS, _MIN_AGE, _MIN_STOPS = 1.8, 10, 12
+_REACH, _MIN_REACH, _SIGMAS = 0.55, 0.15, 3.5
+_TURN_REACH, _MIN_TURN_REACH = math.radians(9.0), math.radians(3.0)
+_STEP, _TURN_STEP = 0.06, math.radians(1.5)
+_MIN_SCORE, _MAX_OTHER = 0.35, 0.9
+_MIN_FIT, _MAX_SIGMA, _MAX_SIGMAS = 0.5, 0.03, 4.0
+_TIE_SIGMA = np.array([0.03, 0.03, 0.012])
+_LOOP_TARGETS, _MIN_LOOP_OVERLAP = 9, 0.2
+_LOOP_GATE = 0.05
+
+
+def close_loop(graph: PoseGraph, stop: int) -> bool:
+    """Tie the newest stop to old ones nearby that nothing connects it with; whether it was tied.
+
+    The whole graph is solved anew then.
+    """
+    if graph.count < _MIN_STOPS:
+        return False
+    candidates = _unconnected(graph, stop)
+    if not candidates:
+        return False
+    nearest = candidates[0]
+    against = [one for one in candidates if abs(one - nearest) <= 6][:2]
+    sigma, turn_sigma = graph.relative_sigma(stop, nearest)
+    lattice = Lattice(
+        min(_REACH, max(_MIN_REACH, _SIGMAS * sigma)),
+        _STEP,
+        min(_TURN_REACH, max(_MIN_TURN_REACH, _SIGMAS * turn_sigma)),
+        _TURN_STEP,
+    )
+    found = search_offsets(graph.scans, np.array([stop]), np.array(against), lattice)
+    if found.score < _MIN_SCORE or found.other > _MAX_OTHER * found.score:
+        return False
+    before = graph.states[stop].copy()
+    graph.states[stop, :3] += found.offset
+    fits = refine(graph, stop, against)
+    pose, shift = graph.states[stop, :3].copy(), np.hypot(*(graph.states[stop] - before)[:2])
+    graph.states[stop] = before
+    if not fits or shift > _MAX_SIGMAS * max(sigma, 0.04) + 0.05:
+        return False
+    tie(graph, stop, pose, against)
+    return True
+
+
+def tie(graph: PoseGraph, stop: int, pose: FloatArray, against: list[int]) -> None:
+    """Tie a stop, whose pose (3,) has been found, to the first of others, and solve everything."""
+    relative = between(graph.states[against[0], :3], pose)
+    graph.constraints.add_tie(against[0], stop, relative, _TIE_SIGMA)
+    graph.solve(4)
+    for one in dict.fromkeys([stop, *against]):
+        graph.targets[one] = graph.neighbours(one, _LOOP_TARGETS, _MIN_LOOP_OVERLAP)
+    graph.solve(4)
+
+
+def refine(graph: PoseGraph, stop: int, against: list[int]) -> bool:
+    """Align a stop with others only, without odometry; whether it fits and is held in all directions."""
+    fit, H = 0.0, np.zeros((8, 8))
+    for _ in range(4):
+        H, g, fit = np.zeros((8, 8)), np.zeros(8), 0.0
+        for other in against:
+            matched, tried = accumulate(graph.scans, stop, other, _LOOP_GATE, 1, H, g)
+            fit = max(fit, matched / max(1, tried))
+        held = H[:3, :3] + np.diag([1.0 / 0.05**2, 1.0 / 0.05**2, 1.0 / 0.03**2])
+        graph.states[stop, :3] += np.linalg.solve(held, g[:3])
+    return fit >= _MIN_FIT and bool(np.linalg.eigvalsh(H[:2, :2])[0] >= _MAX_SIGMA**-2.0)
+
+
+def _unconnected(graph: PoseGraph, stop: int) -> list[int]:
+    """Old stops nearby, the nearest first, that are neither matched with this one nor with its targets."""
+    near = {stop, *graph.targets.get(stop, ())}
+    connected = near.union(*(graph.targets.get(one, ()) for one in near))
+    away, robot = graph.distances(stop), graph.robot
+    return [
+        int(one)
+        for one in np.argsort(away, kind="stable")
+        if one not in connected
+        and away[one] < _RADIUS
+        and (robot[one] != robot[stop] or stop - one > _MIN_AGE)
+    ]
+
+
+_MAX_PENDING = 20_000
+_MAX_VISITS = 50
+_LIGHT_OFFSET = 0.03
+"""How far a robot's lights are from its middle, of which turning leaves this [m]."""
+_LEAST_SIGMA = math.radians(1.0)
+
+
+@dataclass(frozen=True)
+class Visit:
+    """When a robot stood where.
+
+    Attributes:
+        node: Number of its stop in the graph.
+        begin_ns: First reading.
+        end_ns: Last reading.
+        stop: Its readings.
+        turn_begin: Turn by odometry at which the node begins [rad].
+    """
+
+    node: int
+    begin_ns: int
+    end_ns: int
+    stop: Stop
+    turn_begin: float
+
+
+class LightBook:
+    """Sightings that wait until the stops of both robots are known, the newest `_MAX_PENDING` of them."""
+
+    def __init__(self) -> None:
+        self._pending: deque[tuple[int, int, int, float]] = deque(maxlen=_MAX_PENDING)
+        self._visits: dict[int, deque[Visit]] = {}
+        self._until_ns: dict[int, int] = {}
+        self.dropped = 0
+
+    def add(self, robot: int, sightings: LightSightings) -> None:
+        """Take sightings (m,) by a robot."""
+        columns = (sightings.stamp_ns.tolist(), sightings.target.tolist(), sightings.bearing.tolist())
+        for stamp_ns, target, bearing in zip(*columns, strict=True):
+            self.dropped += len(self._pending) == _MAX_PENDING
+            self._pending.append((robot, target, stamp_ns, bearing))
+
+    def note_visit(self, robot: int, visit: Visit) -> None:
+        """A robot has left where it stood."""
+        self._visits.setdefault(robot, deque(maxlen=_MAX_VISITS)).append(visit)
+
+    def forget_node(self, node: int) -> None:
+        """The number of a stop is given to another one."""
+        for robot, visits in self._visits.items():
+            self._visits[robot] = deque((one for one in visits if one.node != node), maxlen=_MAX_VISITS)
+
+    def note_time(self, robot: int, stamp_ns: int) -> None:
+        """Where a robot stood until a time is known."""
+        self._until_ns[robot] = stamp_ns
+
+    def settle(self, graph: PoseGraph) -> None:
+        """Give the graph the bearings that are known now; one for each pair of stops."""
+        found: dict[tuple[int, int], list[float]] = defaultdict(list)
+        for _ in range(len(self._pending)):
+            one = self._pending.popleft()
+            robot, target, stamp_ns, bearing = one
+            if stamp_ns > min(self._until_ns.get(robot, 0), self._until_ns.get(target, 0)):
+                self._pending.append(one)
+                continue
+            seer, seen = self._visit(robot, stamp_ns), self._visit(target, stamp_ns)
+            if seer is not None and seen is not None:
+                turn = seer.stop.turn_at(stamp_ns) - seer.turn_begin
+                found[seer.node, seen.node].append(turn + bearing)
+        for (seer_node, seen_node), turns in found.items():
+            _add_bearing(graph, seer_node, seen_node, np.array(turns))
+
+    def _visit(self, robot: int, stamp_ns: int) -> Visit | None:
+        """The stop of a robot at a time; None: it drove."""
+        for visit in self._visits.get(robot, ()):
+            if visit.begin_ns <= stamp_ns <= visit.end_ns:
+                return visit
+        return None
+
+
+def _add_bearing(graph: PoseGraph, seer: int, seen: int, turns: FloatArray) -> None:
+    """One bearing from the directions (n,) in which a light was seen, as turns by odometry [rad]."""
+    middle = turns[0] + float(np.median(wrap_angle(turns - turns[0])))
+    away = math.dist(graph.states[seer, :2], graph.states[seen, :2])
+    if away > 2.0 * _LIGHT_OFFSET:
+        sigma = math.hypot(_LEAST_SIGMA, _LIGHT_OFFSET / away)
+        graph.constraints.add_bearing(seer, seen, middle, sigma)

@@ -1,1 +1,0 @@
-"""Where a new scan was made: alignment, loop closure, relocalization."""

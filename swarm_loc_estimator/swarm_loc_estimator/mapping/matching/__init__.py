@@ -1,1 +1,0 @@
-"""Beams of one scan against the lines of another."""

@@ -1,1 +1,0 @@
-"""The pose graph: stops as nodes, constraints, Gauss-Newton."""

@@ -1,1 +1,0 @@
-"""What a robot saw from one place: its beams, and their lines."""
