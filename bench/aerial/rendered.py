@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from rclpy.time import Time
 from sensor_msgs.msg import Image
 
-from bench.graph.listener import Listener
+from bench.graph.listener import ROBOTS, Listener, starting_swarm
 from bench.shared.common import OUT, Cell, ProgressLine, table
-from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, seen_from_above
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common import se2
@@ -33,7 +32,6 @@ from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
 from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities
 
-ROBOTS = 5
 WORLD = "w2"
 WORLDS_RUN, DURATION_S = 3, 30.0
 PICTURE = OUT / "aerial_names.png"
@@ -143,13 +141,6 @@ def _together(runs: Sequence[AerialRun]) -> AerialRun:
     )
 
 
-def starting_swarm() -> Swarm:
-    """The robots where the eight begins."""
-    path = Lemniscate(HALF_WIDTH)
-    start, _ = path.at(np.arange(ROBOTS) * path.length / ROBOTS)
-    return describe(EightSettings(robots=ROBOTS, errors=WORLDS[WORLD]), start)
-
-
 def run_aerial(
     seed: int, duration_s: float, folder: Path, say: Say, *, known_start: bool = False
 ) -> AerialRun:
@@ -165,7 +156,7 @@ def run_aerial(
     Raises:
         LiveError: A node has ended, or nothing goes on.
     """
-    links, swarm = folder / "links", starting_swarm()
+    links, swarm = folder / "links", starting_swarm(WORLDS[WORLD])
     links.mkdir(parents=True)
     save_swarm(swarm, folder / "swarm.yaml")
     names = [robot.name for robot in swarm.robots]

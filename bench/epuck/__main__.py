@@ -118,7 +118,7 @@ def papers_own(swarm: Swarm) -> Swarm:
 
 
 def self_calibrating(swarm: Swarm) -> Swarm:
-    """What a careful user knows of such robots and maps: sizes of the systematic errors, not their values."""
+    """A description with the sizes of the systematic errors, not their values."""
     landmarks = (replace(mark, position_sigma=0.02, yaw_sigma=0.03) for mark in swarm.landmarks)
     return Swarm(tuple(_self_calibrating(robot) for robot in swarm.robots), tuple(landmarks))
 
@@ -152,7 +152,7 @@ FILTERS: dict[str, tuple[Prepare, Settings]] = {
 
 
 def cases(worlds: int) -> list[Case]:
-    """All rows, the long ones first."""
+    """All cases, long ones first."""
     rows = [
         Case(f"{name}.{kind}.robots{robots}", robots, count, world, speed, kind)
         for name, world, speed, count in (
@@ -170,7 +170,7 @@ def cases(worlds: int) -> list[Case]:
 
 
 def simulate(case: Case, seed: int) -> SimulatedRun:
-    """The case's world."""
+    """Simulate a world of a case."""
     if case.robots == 0:
         run = simulate_dense(DenseSettings(seed=seed, errors=case.world))
     else:
@@ -206,7 +206,7 @@ def outcome(task: tuple[Case, int]) -> tuple[str, Outcome]:
 
 
 def measure(rows: Sequence[Case]) -> dict[str, list[Outcome]]:
-    """Run all cases in all their worlds, telling how far it is."""
+    """Run all cases in all their worlds, with a line of progress."""
     tasks = [(case, seed) for case in rows for seed in range(1, case.seeds + 1)]
     results: dict[str, list[Outcome]] = {case.name: [] for case in rows}
     with ProcessPoolExecutor(_PROCESSES, get_context("spawn")) as pool:
@@ -250,7 +250,7 @@ def report(results: dict[str, list[Outcome]]) -> dict[str, float]:
 
 
 def draw(results: dict[str, list[Outcome]]) -> None:
-    """Every world's errors, case by case."""
+    """Plot the errors of every world by case."""
     figure, (position, heading) = new_plot(2, width=6.4, height=4.4)
     names = list(results)
     rng = np.random.default_rng(0)
@@ -273,10 +273,10 @@ def draw(results: dict[str, list[Outcome]]) -> None:
 
 
 def measure_rendered(count: int) -> dict[str, float]:
-    """The figures of so many worlds through the whole graph.
+    """The figures of `count` worlds through the whole graph.
 
     Raises:
-        LiveError: A node has ended, or nothing goes on.
+        LiveError: A node has ended, or the graph has stopped.
     """
     if not count:
         return {}

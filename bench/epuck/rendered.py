@@ -1,8 +1,7 @@
 """The eight through rendered pictures, the real detector, emulated firmware and the whole graph over DDS.
 
-What `simulate` starts runs as child processes; this process listens and keeps what robots and cameras send
-as a bag. Nothing is drawn onto true poses: errors are those of what sees, drives and computes. Part of
-`make bench-epuck`.
+The nodes of `simulate` run as child processes; this process records the messages of robots and cameras as a
+bag. Part of `make bench-epuck`.
 """
 
 from __future__ import annotations
@@ -15,9 +14,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 
 from bench.graph.listener import TYPE_OF, Listener, Say
-from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
-from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import DetectionArrayMessage, decode_detections
 from swarm_loc_estimator.common.messages.encoders import UNKNOWN_COVARIANCE, encode_detections
@@ -26,7 +23,6 @@ from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
-ROBOTS = 5
 WORLD = "w2"
 _SILENCE_PATIENCE_S = 120.0
 _PICTURES_S = 1.5
@@ -34,18 +30,18 @@ _PICTURES_S = 1.5
 
 @dataclass(frozen=True)
 class RenderedRun:
-    """What came of one world.
+    """Results of one world.
 
     Attributes:
         seed: Of the world.
-        swarm_file: Description that world and estimator were given.
-        bag: All that robots and cameras sent, at the times at which it came.
-        described_bag: Likewise, but detections leave their noise to the description.
-        live: Poses as the graph gave them, from when the robots drove.
-        age_s: (A,) of these poses when they were received [s].
-        seen: Robot name -> its pictures' detections, in order.
-        cpu_s: Node -> CPU time that its process used meanwhile [s].
-        pictures: Robot name and stamp -> a picture, of the last ones.
+        swarm_file: Description for world and estimator.
+        bag: Messages of robots and cameras at their times of arrival.
+        described_bag: The same, but detections with unknown covariance.
+        live: Poses of the graph while the robots drove.
+        age_s: (A,) age of these poses when received [s].
+        seen: Robot name -> its detections, in order.
+        cpu_s: Node -> CPU time of its process [s].
+        pictures: Robot name and stamp -> image, of the last ones.
     """
 
     seed: int
@@ -65,7 +61,7 @@ class RenderedRun:
 
     @property
     def end_ns(self) -> int:
-        """When it was over."""
+        """When the run ended."""
         return int(self.live.stamp_ns[-1])
 
     @property
@@ -75,7 +71,7 @@ class RenderedRun:
 
 
 def _write(listener: Listener, folder: Path, *, with_noise: bool) -> None:
-    """Everything as a bag, in order of arrival; detections tell of their noise, or do not know it."""
+    """Write all messages as a bag in order of arrival, detections with or without covariance."""
     rows = [
         (
             arrival_ns,
@@ -93,32 +89,25 @@ def _write(listener: Listener, folder: Path, *, with_noise: bool) -> None:
 
 
 def _without_noise(data: bytes) -> bytes:
-    """Detections whose covariance is unknown, so that the noise counts that the swarm's description gives."""
+    """Detections with unknown covariance, for which the noise of the swarm description is used."""
     message = decode_detections(data)
     detections = message.detections.copy()
     detections["covariance"][:, 0, 0] = UNKNOWN_COVARIANCE[0, 0]
     return encode_detections(message.frame_id, message.stamp_ns, detections)
 
 
-def starting_swarm() -> Swarm:
-    """The robots where the eight begins, as the world describes them."""
-    path = Lemniscate(HALF_WIDTH)
-    start, _ = path.at(np.arange(ROBOTS) * path.length / ROBOTS)
-    return describe(EightSettings(robots=ROBOTS, errors=WORLDS[WORLD]), start)
-
-
 def run_rendered(swarm: Swarm, seed: int, duration_s: float, folder: Path, say: Say) -> RenderedRun:
-    """Let the swarm drive the eight in a rendered world.
+    """Drive the eight in a rendered world.
 
     Args:
         swarm: As described to the estimator.
         seed: Of the world.
-        duration_s: How long they drive [s].
-        folder: Where the description, the nodes' log and the bag go; created.
-        say: Is told how far it is.
+        duration_s: Of driving [s].
+        folder: For description, log and bag; created.
+        say: Called with the progress.
 
     Raises:
-        LiveError: A node has ended, or nothing goes on.
+        LiveError: A node has ended, or the graph has stopped.
     """
     links = folder / "links"
     links.mkdir(parents=True)
@@ -133,7 +122,7 @@ def run_rendered(swarm: Swarm, seed: int, duration_s: float, folder: Path, say: 
         used_s = {name: cpu_seconds(pid) for name, pid in processes.items()}
 
         def is_over() -> bool:
-            """Whether they have driven long enough; tell how far it is."""
+            """Whether they have driven long enough; reports the progress."""
             now_s = (listener.now_ns - begin_ns) * 1e-9
             if now_s > duration_s - _PICTURES_S and not listener.looked_at:
                 listener.listen_to_camera(names[0])
@@ -159,7 +148,7 @@ def run_rendered(swarm: Swarm, seed: int, duration_s: float, folder: Path, say: 
 
 
 def _lived(listener: Listener, swarm: Swarm, begin_ns: int) -> tuple[ReplayResult, NDArray[np.float64]]:
-    """The poses as they came out, and the truth; and how old they were then (A,) [s]."""
+    """Poses of the graph while the robots drove, and their ages when received (A,) [s]."""
     recorder = listener.graph.recorder
     live = recorder.result("rendered, live", swarm, listener.truth(swarm))
     driving = live.stamp_ns >= begin_ns
@@ -168,6 +157,6 @@ def _lived(listener: Listener, swarm: Swarm, begin_ns: int) -> tuple[ReplayResul
 
 
 def _seen(listener: Listener, name: str, begin_ns: int) -> list[DetectionArrayMessage]:
-    """What a robot's camera saw while it drove."""
+    """Detections of a robot's camera while it drove."""
     decoded = map(decode_detections, listener.kept[name, "detections"][1])
     return [one for one in decoded if one.stamp_ns >= begin_ns]

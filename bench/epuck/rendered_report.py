@@ -14,9 +14,11 @@ from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from bench.epuck.rendered import RenderedRun, run_rendered, starting_swarm
+from bench.epuck.rendered import WORLD, RenderedRun, run_rendered
 from bench.epuck.seen import Seen, count_seen
+from bench.graph.listener import starting_swarm
 from bench.shared.common import OUT, Cell, ProgressLine, new_plot, save_plot, table
+from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.offline.metrics import ErrorSummary
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.report.plots import plot_overview
@@ -27,23 +29,23 @@ from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_vision.markers.detector import precompile
 
 OUTPUT_NS = 100_000_000
-"""Of the poses, which come twice as often, those that the other rows of the benchmark have, too."""
+"""Interval of the compared poses, as in the other rows of the benchmark; poses come twice as often."""
 _LANDMARK_COLOUR = "#E69F00"
 _PICTURE_IN = (12.8, 9.6)
 _WIDE_PX = 50.0
-"""Below wider markers there is room for their distance."""
+"""The distance is written below wider markers only."""
 
 Describe = Callable[[Swarm], Swarm]
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """All that is told of one world.
+    """Results of one world.
 
     Attributes:
-        run: What was recorded.
-        seen: What cameras saw.
-        paper: The same data by the paper's own filter.
+        run: The recorded run.
+        seen: Statistics of detections.
+        paper: The same data by the filter of the paper.
     """
 
     run: RenderedRun
@@ -54,20 +56,20 @@ class Rendered:
 def rendered_worlds(
     seeds: Sequence[int], duration_s: float, describe: Describe, paper: Describe, settings: Settings
 ) -> list[Rendered]:
-    """Run worlds one after the other, telling how far it is.
+    """Run worlds one after the other, with a line of progress.
 
     Args:
         seeds: Of the worlds.
-        duration_s: How long the robots drive [s].
-        describe: The swarm as the graph's estimator is told.
-        paper: The swarm as the paper's filter is told.
-        settings: Of the paper's filter.
+        duration_s: Of driving [s].
+        describe: Changes the swarm description for the estimator of the graph.
+        paper: Changes the swarm description for the filter of the paper.
+        settings: Of the filter of the paper.
 
     Raises:
-        LiveError: A node has ended, or nothing goes on.
+        LiveError: A node has ended, or the graph has stopped.
     """
     precompile()  # once, not in every robot's detector at a time
-    swarm, worlds = starting_swarm(), []
+    swarm, worlds = starting_swarm(WORLDS[WORLD]), []
     for count, seed in enumerate(seeds, start=1):
         folder = OUT / "epuck_rendered" / f"seed{seed}"
         shutil.rmtree(folder, ignore_errors=True)
@@ -82,13 +84,13 @@ def rendered_worlds(
 
 
 def errors_within(result: ReplayResult, begin_ns: int, end_ns: int) -> ErrorSummary:
-    """The errors ten times a second in a stretch of time, of all robots."""
-    chosen = (result.stamp_ns >= begin_ns) & (result.stamp_ns <= end_ns) & (result.stamp_ns % OUTPUT_NS == 0)
-    return result.chosen(chosen).overall
+    """Errors ten times a second between two stamps, of all robots."""
+    within = (result.stamp_ns >= begin_ns) & (result.stamp_ns <= end_ns) & (result.stamp_ns % OUTPUT_NS == 0)
+    return result.chosen(within).overall
 
 
 def figures_of(one: Rendered, settling_s: float) -> dict[str, float]:
-    """The figures of one world; errors from when the filter has settled."""
+    """The figures of one world; errors after `settling_s`."""
     run, seen = one.run, one.seen
     settled_ns = run.begin_ns + round(settling_s * 1e9)
     live = errors_within(run.live, settled_ns, run.end_ns)
@@ -114,7 +116,7 @@ def figures_of(one: Rendered, settling_s: float) -> dict[str, float]:
 
 
 def report(worlds: Sequence[Rendered], settling_s: float) -> dict[str, float]:
-    """Print the table, draw the pictures of the first world, and return the means."""
+    """Print the table, plot the first world, and return the means."""
     figures = [figures_of(one, settling_s) for one in worlds]
     means = {key: float(np.mean([one[key] for one in figures])) for key in figures[0]}
     rows: list[list[Cell]] = [
@@ -130,7 +132,7 @@ def report(worlds: Sequence[Rendered], settling_s: float) -> dict[str, float]:
 
 
 def draw_picture(run: RenderedRun) -> Path | None:
-    """The camera's last picture that has become detections, with these in it; None where there is none."""
+    """Draw the image with the most detections and these on it; None without any."""
     reported = {(name, one.stamp_ns): one.detections for name, seen in run.seen.items() for one in seen}
     shown = [key for key in run.pictures if key in reported]
     if not shown:
@@ -156,7 +158,7 @@ def draw_picture(run: RenderedRun) -> Path | None:
 
 
 def _draw_detection(axes: Axes, detection: NDArray[np.void], colour: str) -> None:
-    """The outline of a marker, its first corner, its id and its distance."""
+    """Draw the outline of a marker, its first corner, its id and its distance."""
     corners = detection["corners_px"].reshape(4, 2)
     axes.add_patch(Polygon(corners, closed=True, fill=False, edgecolor=colour, linewidth=2.0))
     axes.plot(*corners[0], "o", color=colour, markersize=4)

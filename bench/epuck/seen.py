@@ -1,4 +1,4 @@
-"""What cameras of a rendered world should have seen, and what of that their detectors have."""
+"""Compare detections in a rendered world with the markers that are visible in its images."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from swarm_loc_drivers.sim.epuck.world import EpuckWorld
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 
 _PENDING_NS = 300_000_000
-"""At the end of a run pictures so fresh may still be on their way; the world waits for older ones."""
+"""Images of the last moments of a run may still be in transport; the world waits for older ones."""
 MAX_INCIDENCE, MIN_SIDE_PX, MIN_MARGIN_PX = math.radians(70.0), 10.0, 6.0
-"""Which markers count as visible, as in the pictures that the detectors' comparison draws."""
+"""Limits of visible markers, as in the comparison of detectors."""
 _NEAR_PX, _NEAR = 12.0, 0.3
-"""A detection is of the marker whose corners are so near, in pixels or in the marker's own sides.
+"""Largest distance of a detection from its marker, in pixels or in sides of the marker.
 
 True poses are known twenty times a second, and wheels slip in between.
 """
@@ -27,15 +27,15 @@ True poses are known twenty times a second, and wheels slip in between.
 
 @dataclass(frozen=True)
 class Seen:
-    """The pictures of a run, summed up.
+    """Statistics of the images of a run.
 
     Attributes:
-        frames: Pictures that were taken while the robots drove, but for those of the last moment.
-        lost: Those of which no detections have come.
-        detections: Markers reported of the others.
-        visible: Markers that can be seen well in the others.
-        found: Those of them that were reported.
-        false_ids: Reports of markers that are not there.
+        frames: Images taken while the robots drove, except the last ones.
+        lost: Images without a message of detections.
+        detections: Detections in the others.
+        visible: Visible markers in the others.
+        found: Visible markers that were detected.
+        false_ids: Detections of markers that are not there.
     """
 
     frames: int
@@ -47,7 +47,7 @@ class Seen:
 
 
 def count_seen(run: RenderedRun) -> Seen:
-    """Compare a run's detections with where the markers truly were."""
+    """Compare detections of a run with the true positions of the markers."""
     wishes = WorldParameters(swarm_file=str(run.swarm_file), world=WORLD, seed=run.seed)
     swarm, world = make_world(wishes)
     counts = np.zeros(6, np.int64)
@@ -78,13 +78,13 @@ def _of_robot(run: RenderedRun, world: EpuckWorld, robot: int, name: str) -> NDA
 
 
 def _taken_before(world: EpuckWorld, robot: int, stamp_ns: int) -> int:
-    """How many pictures of a camera have an earlier stamp."""
+    """Number of images of a camera with an earlier stamp."""
     nearest = world.exposure_of(robot, stamp_ns)
     return nearest.number + (nearest.stamp_ns < stamp_ns)
 
 
 def is_visible(views: Views) -> NDArray[np.bool_]:
-    """Which markers can be seen well."""
+    """Whether markers are visible."""
     return np.asarray(
         (views.margin > MIN_MARGIN_PX)
         & (views.incidence < MAX_INCIDENCE)
@@ -94,7 +94,7 @@ def is_visible(views: Views) -> NDArray[np.bool_]:
 
 
 def _matched(views: Views, detections: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Which detections lie where their marker is."""
+    """Whether detections are close to their marker."""
     place = {int(marker): k for k, marker in enumerate(views.id)}
     matched = np.zeros(len(detections), bool)
     for row, one in enumerate(detections):
@@ -106,6 +106,6 @@ def _matched(views: Views, detections: NDArray[np.void]) -> NDArray[np.bool_]:
 
 
 def _poses(run: RenderedRun, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Where all robots truly were (K, N, 3); NaN where that is not known."""
+    """True poses of all robots (K, N, 3); NaN where unknown."""
     tracks = (run.live.truth[robot.name] for robot in run.live.swarm.robots)
     return np.stack([interpolate(track, stamp_ns, DEFAULT_GAP_NS)[0] for track in tracks], axis=1)

@@ -4,8 +4,8 @@
     make bench-large_swarms ARGS="--robots 1000 --duration 60"
 
 A recording of the grid of `bench-scaling` is played into the estimator by another process: once with topics
-of each robot, once with topics that all share (`shared_topics`). A pose's age is that of its stamp when it is
-received here; the data behind it is older.
+of each robot, once with topics that all share (`shared_topics`). The age of a pose is that of its stamp at
+reception; the data behind it is older.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from swarm_loc_estimator.timeline.thinning import SHED_REASONS
 SIZES = (100, 300, 1000)
 DURATION_S = 30.0
 SETTLING_S = 5.0
-"""Errors count from here on."""
+"""Errors are computed after this time."""
 OWN, SHARED = "own", "shared"
 LAYOUTS = (OWN, SHARED)
-"""Of topics."""
+"""Layouts of topics."""
 _FIGURES_OF = {OWN: "live", SHARED: "shared"}
-"""What the names of their figures begin with."""
+"""Prefixes of the names of figures."""
 _PARAMETERS = "estimator: {{ros__parameters: {{shared_topics: {shared}}}}}\n"
 _UNITS = {
     "start_up_s": "start-up [s]",
@@ -105,7 +105,7 @@ def run(recording: SimulatedRun, *, shared: bool) -> dict[str, float]:
 
 
 def draw(results: dict[str, dict[int, dict[str, float]]]) -> None:
-    """What grows with the swarm."""
+    """Plot figures over the size of the swarm."""
     names = ("start_up_s", "estimator_core", "memory_mb", "pose_age_ms")
     figure, axes = new_plot(len(names), width=3.4)
     for axis, name in zip(axes, names, strict=True):

@@ -1,4 +1,4 @@
-"""Listen to a live graph of simulated robots: what they send, and where they truly are."""
+"""Record a live graph of simulated robots on the eight: their messages and true poses."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from rclpy.time import Time
 from sensor_msgs.msg import Image
 
+from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
+from swarm_loc_drivers.sim.worlds import ErrorModel
 from swarm_loc_estimator.common.messages.cdr import decode_pose_stamped
 from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED
 from swarm_loc_estimator.common.trajectory import Trajectory
@@ -23,28 +25,36 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
 TYPE_OF = {"odom": ODOMETRY, "detections": DETECTIONS, "ground_truth": POSE_STAMPED}
-"""What is kept of each robot, with its message type."""
+"""Recorded topics of each robot with their message types."""
 _CLASS_OF: dict[str, type] = {
     "odom": Odometry,
     "detections": MarkerDetectionArray,
     "ground_truth": PoseStamped,
 }
+ROBOTS = 5
 _MOVED_M = 0.002
 _DEPTH = 1000
 
 Say = Callable[[str], None]
 
 
+def starting_swarm(errors: ErrorModel) -> Swarm:
+    """Five robots at their starts on the eight, as a world with some errors describes them."""
+    path = Lemniscate(HALF_WIDTH)
+    start, _ = path.at(np.arange(ROBOTS) * path.length / ROBOTS)
+    return describe(EightSettings(robots=ROBOTS, errors=errors), start)
+
+
 @dataclass
 class Listener:
-    """Keeps what is sent in the graph.
+    """Records messages of a graph.
 
     Attributes:
-        graph: Whose recorder listens.
+        graph: The graph; its recorder subscribes.
         names: Of the robots.
-        looked_at: The robot whose pictures are kept.
-        kept: Robot and topic -> times of arrival in the graph's time [ns], and messages.
-        pictures: Robot and stamp -> picture.
+        looked_at: The robot whose images are recorded.
+        kept: Robot and topic -> times of arrival by the graph's clock [ns], and messages.
+        pictures: Robot and stamp -> image.
     """
 
     graph: LiveGraph
@@ -66,7 +76,7 @@ class Listener:
         messages.append(data)
 
     def listen_to_camera(self, name: str) -> None:
-        """Keep a robot's pictures, too, from here on: they are large."""
+        """Record a robot's images from now on; they are large."""
 
         def keep(message: Image) -> None:
             self.pictures[name, Time.from_msg(message.header.stamp).nanoseconds] = message
@@ -76,12 +86,12 @@ class Listener:
 
     @property
     def now_ns(self) -> int:
-        """How far the world is, by its newest truth; 0 before the first."""
+        """Time of the world by its newest ground truth; 0 before the first."""
         newest = self.newest_truth(self.names[0])
         return newest[0] if newest else 0
 
     def newest_truth(self, name: str) -> tuple[int, NDArray[np.float64]] | None:
-        """Stamp and place (2,) of a robot, and None before the first."""
+        """Stamp and true position (2,) of a robot; None before the first."""
         messages = self.kept[name, "ground_truth"][1]
         if not messages:
             return None
@@ -89,11 +99,11 @@ class Listener:
         return truth.stamp_ns, np.array(truth.pose[:2])
 
     def truth(self, swarm: Swarm) -> dict[str, Trajectory]:
-        """Where the robots were."""
+        """Robot name -> ground truth."""
         return read_truth(swarm, {name: self.kept[name, "ground_truth"][1] for name in self.names})
 
     def wait_until_they_drive(self, say: Say) -> int:
-        """When the robots began to drive [ns].
+        """Wait until the robots drive; returns the time [ns].
 
         Raises:
             LiveError: They do not.

@@ -1,11 +1,11 @@
-"""The live graph beside replay: do poses that come over DDS agree with those of the same bag replayed?
+"""Compare poses of the live graph over DDS with those of a replay of the same bag.
 
     make bench-live
     make bench-live ARGS="--mrclam FOLDER"
 
-The demo's bag at its own speed and, where the data are, the first five minutes of MRCLAM set 1 at ten times
-theirs. A live pose cannot know what is still on its way, so differences come from the newest messages;
-"equal" is the share of poses that are the same to a micrometre, "settled" those when nothing was on its way.
+The bag of the demo is played at its own speed and, if the data are present, the first five minutes of MRCLAM
+set 1 at ten times theirs. Live poses lack messages that are still in transport. "equal" is the share of poses
+that differ by less than a micrometre; at "settled" stamps no message was in transport.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def figures_of(outcome: Outcome) -> dict[str, float]:
 
 
 def draw(outcomes: dict[str, Outcome]) -> None:
-    """How many poses differ by how much."""
+    """Plot the distribution of differences."""
     figure, (axis,) = new_plot(1, width=6.0)
     for name, (_, compared) in outcomes.items():
         distance = np.sort(compared.distance_m[np.isfinite(compared.distance_m)])

@@ -1,11 +1,11 @@
-"""The live graph for an hour: does its memory stay, does it lose messages, does it end when asked?
+"""Run the live graph for an hour: memory, lost messages, and the time to end by SIGINT.
 
     make bench-soak
     make bench-soak ARGS="--minutes 6 --rate 3 --overload-minutes 3"
 
-A bag is looped through the live graph (player and estimator), at a rate that the machine bears and then at
-one that it does not. Every second memory, CPU, lost messages and the age of poses are noted. Growth of memory
-is that of its largest value behind the first tenth of a run.
+A bag is looped through the live graph (player and estimator), first at a rate that the machine can process,
+then at one that it cannot. Memory, CPU, lost messages and the age of poses are recorded every second. Growth
+of memory is that of its maximum after the first tenth of a run.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def run(bag: Path, rate: float, minutes: float) -> tuple[FloatArray, float]:
         before_cpu_s = cpu_seconds(estimator.pid)
 
         def is_over() -> bool:
-            """Note a row once a second."""
+            """Append a row once a second."""
             nonlocal before_s, before_cpu_s
             now_s = time.monotonic()
             if now_s >= before_s + 1.0:
@@ -73,7 +73,7 @@ def run(bag: Path, rate: float, minutes: float) -> tuple[FloatArray, float]:
 
 
 def heard(recorder: Recorder) -> tuple[float, float]:
-    """Messages lost so far, and the median age of poses [s of the bag] since the last call; forgets these."""
+    """Messages lost so far, and the median age of poses [s of the bag] since the last call; clears these."""
     pairs = zip(recorder.received_ns, recorder.raw, strict=True)
     ages_s = [1e-9 * (at_ns - read_poses(data).stamp_ns) for at_ns, data in pairs]
     recorder.raw.clear()
@@ -99,7 +99,7 @@ def figures_of(rows: FloatArray, sigint_s: float) -> dict[str, float]:
 
 
 def draw(name: str, rows: FloatArray) -> None:
-    """Memory, CPU, lost messages and age of poses by time."""
+    """Plot memory, CPU, lost messages and age of poses over time."""
     figure, axes = new_plot(len(COLUMNS) - 1)
     for axis, column, title in zip(axes, rows.T[1:], COLUMNS[1:], strict=True):
         axis.plot(rows[:, 0] / 60.0, column)

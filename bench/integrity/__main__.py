@@ -1,9 +1,9 @@
-"""Whether poses told as tracked are so, whatever fails: faults in five simulated e-pucks on the eight.
+"""Integrity: are poses with status TRACKED correct under faults? Five simulated e-pucks on the eight.
 
-Each scenario puts one fault into a run of a minute through the core, see `scenarios.py`; or it kills and
-restarts a process of the whole graph, emulated robots in a rendered world, see `live.py`. A robot-second is
-misleading when the robot is told as tracked with an error beyond 5 sigma and 2 cm. In `kidnapped` no data can
-tell of the fault before the robot has seen something, and that has arrived; this time is left out.
+Each scenario injects one fault into a simulated run of a minute, see `scenarios.py`, or kills and restarts a
+process of the live graph in a rendered world, see `live.py`. A robot-second is
+misleading when the robot is TRACKED with an error beyond 5 sigma and 2 cm. In `kidnapped` no data shows the
+fault before the first sighting after it has arrived; this time is excluded.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _COLUMNS = ("scenario", "misleading", "worst seed", "tracked", "RMSE [cm]", "NEE
 
 
 def main() -> None:
-    """Print the table, write the figures, draw the errors."""
+    """Print the table, write the figures, plot the errors."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=5, help="runs of each scenario")
     parser.add_argument("--scenarios", nargs="+", choices=_NAMES, default=list(_NAMES))
@@ -60,7 +60,7 @@ def _run(name: str, seed: int) -> Score:
 
 
 def _figures(name: str, runs: Sequence[Score]) -> dict[str, float]:
-    """Means over the seeds; recovery is that of the worst."""
+    """Means over the seeds; of the recovery the maximum."""
     figures = {
         f"{name}.misleading_share": float(np.mean([one.misleading_share for one in runs])),
         f"{name}.tracked_share": float(np.mean([one.tracked_share for one in runs])),
@@ -80,7 +80,7 @@ def _row(name: str, runs: Sequence[Score]) -> list[Cell]:
 
 
 def _plots(scores: Mapping[str, Sequence[Score]]) -> list[Path]:
-    """Errors of all robots over time, a plot per scenario, misleading ones marked."""
+    """Plot errors of all robots over time, an axis per scenario, with misleading ones marked."""
     names, files = list(scores), []
     for first in range(0, len(names), _PLOTS_PER_FILE):
         some = names[first : first + _PLOTS_PER_FILE]

@@ -1,4 +1,4 @@
-"""Faults put into simulated runs: odometry that lies, false sightings, geometry that is not as described."""
+"""Faults injected into simulated runs: wrong odometry, false sightings, geometry other than described."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def simulate(
     as_it_is: SwarmChange | None = None,
     moved: TruthChange | None = None,
 ) -> SimulatedRun:
-    """The eight, where the world may differ from its description.
+    """Simulate the eight in a world that differs from its description.
 
     Args:
         settings: Of the run.
-        as_it_is: Makes the swarm that the cameras see of the one that is described.
-        moved: Changes where robots are without their odometry noticing.
+        as_it_is: From the described swarm to the one that cameras see.
+        moved: Changes true poses without any odometry.
     """
     rng = np.random.default_rng(settings.seed)
     swarm, truth, odometry = drive_eight(rng, settings)
@@ -59,7 +59,7 @@ def seconds(run: SimulatedRun, stamp_ns: IntArray) -> FloatArray:
 
 
 def rescaled_odometry(run: SimulatedRun, robot: int, scale: float) -> SimulatedRun:
-    """Odometry of a robot whose wheels are larger or smaller than described."""
+    """Scale the odometry of a robot."""
     odometry = run.odometry.copy()
     rows = np.flatnonzero(odometry["robot"] == robot)
     rows = rows[np.argsort(odometry["stamp_ns"][rows], kind="stable")]
@@ -71,7 +71,7 @@ def rescaled_odometry(run: SimulatedRun, robot: int, scale: float) -> SimulatedR
 
 
 def restarted_driver(run: SimulatedRun, robot: int, begin_s: float, end_s: float) -> SimulatedRun:
-    """Neither odometry nor images of a robot for a while, and odometry from zero behind it."""
+    """Remove odometry and images of a robot for a while, and restart its odometry from zero."""
     time_s, mine = seconds(run, run.odometry["stamp_ns"]), run.odometry["robot"] == robot
     kept = ~(mine & (time_s >= begin_s) & (time_s < end_s))
     odometry = run.odometry[kept].copy()
@@ -84,7 +84,7 @@ def restarted_driver(run: SimulatedRun, robot: int, begin_s: float, end_s: float
 
 
 def second_odometry(run: SimulatedRun, robot: int, begin_s: float, rate_hz: float) -> SimulatedRun:
-    """A second publisher on a robot's odometry, which says that it stands somewhere else."""
+    """Add a second publisher of a robot's odometry, with a constant other pose."""
     stamps_ns = _stamps(run, begin_s, run.duration_s - 1.0, rate_hz)
     rows = np.zeros(stamps_ns.size, ODOMETRY_DTYPE)
     rows["robot"], rows["stamp_ns"], rows["arrival_ns"] = robot, stamps_ns, stamps_ns + _LATENESS_NS
@@ -96,13 +96,13 @@ def second_odometry(run: SimulatedRun, robot: int, begin_s: float, rate_hz: floa
 def false_sightings(
     run: SimulatedRun, sight: tuple[int, int], span_s: tuple[float, float], source: SightingSource
 ) -> SimulatedRun:
-    """More sightings at 30 Hz, of what is not there.
+    """Add false sightings at 30 Hz.
 
     Args:
-        run: What else is seen.
-        sight: Who sees (index), and the id of which marker.
-        span_s: From when to when.
-        source: What is seen.
+        run: The run.
+        sight: Index of the observer, and id of the marker.
+        span_s: Begin and end.
+        source: Values of the sightings.
     """
     stamps_ns = _stamps(run, *span_s, 30.0)
     found = np.zeros(stamps_ns.size, SIGHTING_DTYPE)
@@ -114,14 +114,14 @@ def false_sightings(
 
 
 def changed_cameras(before: SimulatedRun, after: SimulatedRun, robot: int, at_s: float) -> SimulatedRun:
-    """What a run shows, but from an instant on with a robot's images of another run."""
+    """The run `before`, with a robot's images of the run `after` from `at_s` on."""
     old = ~(_from(before, robot, at_s))
     new = _from(after, robot, at_s)
     return merged_frames(before, *(_some_frames(run, rows) for run, rows in ((before, old), (after, new))))
 
 
 def merged_frames(run: SimulatedRun, *parts: tuple[Records, Records]) -> SimulatedRun:
-    """A run with the frames and sightings of some parts in order of arrival."""
+    """A run with the frames and sightings of several parts, in order of arrival."""
     frames = np.concatenate([part[0] for part in parts])
     offsets = np.cumsum([0, *(len(part[1]) for part in parts[:-1])])
     first = np.concatenate([part[0]["first"] + offset for part, offset in zip(parts, offsets, strict=True)])
@@ -144,7 +144,7 @@ def busiest_landmark(run: SimulatedRun) -> int:
 
 
 def moved_landmark(swarm: Swarm, marker_id: int, step: Sequence[float]) -> Swarm:
-    """A swarm one of whose landmarks is elsewhere by `step` (2,) [m]."""
+    """The swarm with a landmark moved by `step` (2,) [m]."""
     return Swarm(
         swarm.robots,
         tuple(
@@ -155,7 +155,7 @@ def moved_landmark(swarm: Swarm, marker_id: int, step: Sequence[float]) -> Swarm
 
 
 def turned_camera(swarm: Swarm, robot: int, yaw: float) -> Swarm:
-    """A swarm in which a robot's camera is turned to the left [rad]."""
+    """The swarm with a robot's camera turned to the left by `yaw` [rad]."""
     robots = list(swarm.robots)
     camera = robots[robot].camera
     robots[robot] = replace(robots[robot], camera=camera and replace(camera, yaw=camera.yaw + yaw))
@@ -163,7 +163,7 @@ def turned_camera(swarm: Swarm, robot: int, yaw: float) -> Swarm:
 
 
 def kidnapped(robot: int, at_s: float) -> TruthChange:
-    """A robot is taken to the opposite place of the eight, and drives on there as if nothing had happened."""
+    """Move a robot to the opposite side of the eight, where it keeps driving."""
 
     def change(truth: Trajectories) -> Trajectories:
         poses = truth.poses.copy()
@@ -175,21 +175,21 @@ def kidnapped(robot: int, at_s: float) -> TruthChange:
 
 
 def next_sighting_s(run: SimulatedRun, robot: int, at_s: float) -> float:
-    """When the first image of a robot from an instant on that shows a marker has arrived [s]."""
+    """Arrival of the first image with a marker that a robot takes from `at_s` on [s]."""
     frames = run.frames[_from(run, robot, at_s) & (run.frames["count"] > 0)]
     return float(seconds(run, frames["arrival_ns"]).min(initial=run.duration_s))
 
 
 def wrong_starts(run: SimulatedRun, rng: np.random.Generator) -> SimulatedRun:
-    """All robots but the last stand elsewhere than their description says."""
+    """Describe wrong starts for all robots but the last."""
     robots = [
-        replace(robot, start=_elsewhere(rng, robot.start)) if k + 1 < len(run.swarm.robots) else robot
+        replace(robot, start=_random_start(rng, robot.start)) if k + 1 < len(run.swarm.robots) else robot
         for k, robot in enumerate(run.swarm.robots)
     ]
     return replace(run, swarm=Swarm(tuple(robots), run.swarm.landmarks))
 
 
-def _elsewhere(
+def _random_start(
     rng: np.random.Generator, start: tuple[float, float, float] | None
 ) -> tuple[float, float, float]:
     x, y, theta = start or (0.0, 0.0, 0.0)

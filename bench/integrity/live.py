@@ -11,9 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.graph.listener import Listener, Say
+from bench.graph.listener import Listener, Say, starting_swarm
 from bench.integrity.scoring import Estimated, Score, scored
-from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
 from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common import se2
@@ -26,7 +25,6 @@ from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
 from swarm_loc_vision.markers.detector import precompile
 
-_ROBOTS = 5
 _BEFORE_S, _AFTER_S = 8.0, 10.0
 _PATIENCE_S = 120.0
 _ESTIMATOR = "estimator"
@@ -34,14 +32,14 @@ _ESTIMATOR = "estimator"
 
 @dataclass(frozen=True)
 class _Live:
-    """A graph that runs, and what is heard of it."""
+    """A running graph and its listener."""
 
     graph: LiveGraph
     listener: Listener
     nodes: frozenset[str]
 
     def go_on(self, duration_s: float, without: str = "") -> None:
-        """Let the world go on; `without` names a node that is not there."""
+        """Wait for simulated time; `without` names a node that is down."""
         until_ns = self.listener.now_ns + round(duration_s * 1e9)
         self.graph.wait_for(
             lambda: self.listener.now_ns >= until_ns, "go on driving", _PATIENCE_S, self.nodes - {without}
@@ -49,11 +47,11 @@ class _Live:
 
 
 Break = Callable[[_Live, float], float]
-"""Breaks something of a graph for some time [s], mends it, and returns when it was mended [s]."""
+"""Causes a fault for some time [s], repairs it, and returns the time of the repair [s]."""
 
 
 def _driver_restart(live: _Live, away_s: float) -> float:
-    """Kill a driver; mended with the first sighting of its robot that was made once odometry came again."""
+    """Kill a driver; repaired with the first sighting of its robot after its odometry has returned."""
     robot, kept = live.listener.names[0], live.listener.kept
     driver, (_, odometry), (arrivals, images) = (
         f"{robot}/epuck_driver",
@@ -76,7 +74,7 @@ def _driver_restart(live: _Live, away_s: float) -> float:
 
 
 def _estimator_restart_moved(live: _Live, away_s: float) -> float:
-    """Kill the estimator: when it begins anew, the robots are not at their starts; mended with its poses."""
+    """Kill the estimator; then the robots are not at their starts. Repaired with its first poses."""
     raw = live.graph.recorder.raw
     live.graph.kill(_ESTIMATOR)
     live.go_on(away_s, without=_ESTIMATOR)
@@ -96,16 +94,16 @@ def run_live(name: str, seed: int, folder: Path, say: Say) -> Score:
     """Run a scenario of `LIVE_SCENARIOS`.
 
     Args:
-        name: Which.
-        seed: Of the world, and of how long the process is away.
-        folder: Where description and log go; created.
-        say: Is told how far it is.
+        name: Of the scenario.
+        seed: Of the world and of the duration of the fault.
+        folder: For description and log; created.
+        say: Called with the progress.
 
     Raises:
-        LiveError: A node has ended, or nothing goes on.
+        LiveError: A node has ended, or the graph has stopped.
     """
     precompile()  # once, not in every robot's detector at a time
-    links, swarm = folder / "links", _swarm()
+    links, swarm = folder / "links", starting_swarm(W0)
     links.mkdir(parents=True, exist_ok=True)
     save_swarm(swarm, folder / "swarm.yaml")
     names = [robot.name for robot in swarm.robots]
@@ -118,21 +116,14 @@ def run_live(name: str, seed: int, folder: Path, say: Say) -> Score:
         begin_ns = listener.wait_until_they_drive(say)
         live.go_on(_BEFORE_S)
         say(f"breaks for {away_s:.1f} s")
-        mended_s = LIVE_SCENARIOS[name](live, away_s)
-        say("mended")
+        repaired_s = LIVE_SCENARIOS[name](live, away_s)
+        say("repaired")
         live.go_on(_AFTER_S)
-    return scored(_estimated(listener, swarm, begin_ns), mended_s - begin_ns * 1e-9)
-
-
-def _swarm() -> Swarm:
-    """The robots where the eight begins."""
-    path = Lemniscate(HALF_WIDTH)
-    start, _ = path.at(np.arange(_ROBOTS) * path.length / _ROBOTS)
-    return describe(EightSettings(robots=_ROBOTS, errors=W0), start)
+    return scored(_estimated(listener, swarm, begin_ns), repaired_s - begin_ns * 1e-9)
 
 
 def _estimated(listener: Listener, swarm: Swarm, begin_ns: int) -> Estimated:
-    """The poses as they came out while the robots drove, held against the truth."""
+    """Poses and errors while the robots drove."""
     live = listener.graph.recorder.result("live", swarm, listener.truth(swarm))
     places = np.stack(
         [interpolate(live.truth[name], live.stamp_ns, DEFAULT_GAP_NS)[0] for name in listener.names], axis=1

@@ -1,4 +1,4 @@
-"""The scenarios: each a fault in five e-pucks on the eight, sixty seconds, seeded."""
+"""Scenarios: each injects a fault into a run of five e-pucks on the eight, sixty seconds, by seed."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ _FACE = 20
 """A marker of the second robot."""
 
 DETECTOR = SensorModel(forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.06)
-"""What the marker detector says of its own noise."""
+"""Noise as described."""
 CLEAN = replace(W0, forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.06, described=DETECTOR)
 SYSTEMATIC = replace(W2, forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.06, described=DETECTOR)
-"""The systematic errors of w2, described as if there were none."""
+"""Systematic errors of w2 that the description does not contain."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A run with something wrong in it.
+    """A run with a fault.
 
     Attributes:
         run: The run.
-        ends_s: When it is over, and the estimate should come right again; None: it lasts.
-        about: Whose it is, where it is not obvious.
-        hidden_s: From when to when nothing that has arrived can tell of it.
+        ends_s: End of the fault, after which the estimate should recover; None: it does not end.
+        about: Name of the faulty robot or landmark, if it depends on the seed.
+        hidden_s: Begin and end of the time in which no data that has arrived shows the fault.
     """
 
     run: SimulatedRun
@@ -128,7 +128,7 @@ def _creeping_spoof(seed: int, observers: int = 1) -> Fault:
 def _creeping(
     run: SimulatedRun, rng: np.random.Generator, observer: int, target: int
 ) -> faults.SightingSource:
-    """Sightings that are true at first and then walk away at 2 cm/s."""
+    """Sightings that are true at first and then drift at 2 cm/s."""
     camera, face = run.swarm.robots[observer].camera, run.swarm.robots[target].faces[0]
     assert camera is not None  # noqa: S101
     angle = rng.uniform(0.0, 2.0 * math.pi)

@@ -1,4 +1,4 @@
-"""How honest an estimate is: what is told as tracked and is not so, and how soon a fault is over."""
+"""Score the integrity of an estimate: misleading robot-seconds, and the time to recover from a fault."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _STEADY_S = 3.0
 
 
 class Estimated(NamedTuple):
-    """What an estimator said, and how wrong it was.
+    """Estimates and their errors.
 
     Attributes:
         time_s: (T,) since the run began [s].
         error: (T, N, 3) estimate minus truth; NaN where not located.
         covariance: (T, N, 3, 3).
-        tracked: (T, N) who is told as tracked.
+        tracked: (T, N) whether the status is TRACKED.
     """
 
     time_s: FloatArray
@@ -44,7 +44,7 @@ class Score:
     """One run of a scenario.
 
     Attributes:
-        misleading_share: Of robot-seconds told as tracked with an error beyond 5 sigma and 2 cm.
+        misleading_share: Share of robot-seconds TRACKED with an error beyond 5 sigma and 2 cm.
         tracked_share: Of robot-seconds after the first second.
         position_m: RMSE while tracked, after the first second.
         nees: Mean normalised error squared of the same, 3 is ideal.
@@ -52,7 +52,7 @@ class Score:
         time_s: (T,) of the ticks.
         error_m: (T, N) distance from the truth; NaN where not located.
         misleading: (T, N) whether misleading.
-        told: What was said to be contradicted, by name and kind.
+        reported: Reported contradictions by name and kind.
     """
 
     misleading_share: float
@@ -63,31 +63,31 @@ class Score:
     time_s: FloatArray
     error_m: FloatArray
     misleading: BoolArray
-    told: frozenset[tuple[str, Contradicted]] = frozenset()
+    reported: frozenset[tuple[str, Contradicted]] = frozenset()
 
 
 def score(fault: Fault) -> Score:
-    """Run the core over a fault, ticking ten times a second."""
+    """Run the estimator over a scenario, ticking ten times a second."""
     run = fault.run
     tick_ns = np.arange(run.start_ns + TICK_NS, run.end_ns + 1, TICK_NS)
     estimator, estimates = Estimator(run.swarm), []
-    told: set[tuple[str, Contradicted]] = set()
+    reported: set[tuple[str, Contradicted]] = set()
     for now_ns, inputs in zip(tick_ns.tolist(), inputs_between(run, tick_ns), strict=True):
         estimator.receive(inputs)
         estimates.append(estimator.tick(now_ns))
-        told |= {(one.about, one.kind) for one in estimator.contradictions(now_ns)}
+        reported |= {(one.about, one.kind) for one in estimator.contradictions(now_ns)}
     error = errors_of(np.array([one.poses for one in estimates]), run, tick_ns)
     covariance = np.array([one.covariances for one in estimates])
     tracked = np.array([one.status for one in estimates]) == Status.TRACKED
     estimated = Estimated(seconds(run, tick_ns), error, covariance, tracked)
     found = scored(estimated, fault.ends_s, fault.hidden_s)
-    return replace(found, told=frozenset(told))
+    return replace(found, reported=frozenset(reported))
 
 
 def scored(
     estimated: Estimated, ends_s: float | None = None, hidden_s: tuple[float, float] | None = None
 ) -> Score:
-    """Score estimates, see `Fault` for the times."""
+    """Score estimates; see `Fault` for the times."""
     time_s, error, covariance, tracked = estimated
     distance: FloatArray = np.hypot(error[..., 0], error[..., 1])
     squared = np.full(distance.shape, np.nan)
@@ -112,7 +112,7 @@ def scored(
 
 
 def _recovery_s(time_s: FloatArray, right: BoolArray, ends_s: float | None) -> float:
-    """How long the slowest robot takes to be right for good."""
+    """Time until the last robot stays right [s]; NaN if the fault does not end."""
     if ends_s is None:
         return float("nan")
     begin = int(np.searchsorted(time_s, ends_s))

@@ -1,14 +1,14 @@
-"""Five real robots (MRCLAM): parameters fitted on one set, then all sets untouched.
+"""Five real robots (MRCLAM): calibrate on one set, evaluate on all.
 
     make bench-mrclam
     make bench-mrclam ARGS="FOLDER --fit 1"
 
-FOLDER holds MRCLAM_Dataset<k> folders, or is one; robots and ground truth may be missing. Parameters are
-fitted on set 1, which is looked for in ../shared/data/mrclam where FOLDER does not have it.
+FOLDER holds MRCLAM_Dataset<k> folders, or is one; robots and ground truth may be missing. Set 1 is used for
+calibration, from ../shared/data/mrclam if FOLDER does not hold it.
 
-Online poses at 10 Hz against ground truth, started at the true pose. "plain" has only its noise fitted,
-"calibrated" everything. The smoother is the offline limit with the same models and noise. In `blind_robots`
-two robots see landmarks and all see robots; the errors are those of the others, pooled over all choices.
+Errors are those of online poses at 10 Hz, started at the true pose. For "plain" only the noise is fitted, for
+"calibrated" everything. The smoother is the offline optimum with the same models and noise. In `blind_robots`
+only two robots see landmarks and all see robots; errors are those of the others, pooled over all pairs.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def chosen_to_fit(
     sets: dict[int, Path], wanted: int | None, elsewhere: Path = DEFAULT_FOLDER
 ) -> tuple[int, Path]:
-    """Number and folder of the set to fit to: the wanted one or set 1, here or elsewhere; else the first."""
+    """Number and folder of a set for calibration: the wanted one, or set 1 of either folder, or the first."""
     others = find_sets(elsewhere) if elsewhere.is_dir() else {}
     known = {**others, **sets}
     number = 1 if wanted is None else wanted
@@ -68,7 +68,7 @@ def chosen_to_fit(
 
 
 def measure(sets: Mapping[int, Path], fitted: int, fitted_folder: Path) -> Results:
-    """Import all sets, fit to one of them, run everything."""
+    """Import all sets, calibrate with one of them, and run all jobs."""
     with ProcessPoolExecutor(_PROCESSES, mp_context=get_context("spawn")) as workers:
         imported = {fitted: fitted_folder, **sets}
         for number, remarks in _done(workers, prepare, list(imported.items()), "import"):
@@ -86,7 +86,7 @@ def measure(sets: Mapping[int, Path], fitted: int, fitted_folder: Path) -> Resul
 def _done(
     workers: ProcessPoolExecutor, function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], what: str
 ) -> list[Any]:
-    """Results of all calls, with a line of progress."""
+    """Results of all calls; prints the progress."""
     began = time.monotonic()
     waiting = [workers.submit(function, *call) for call in calls]
     results = []

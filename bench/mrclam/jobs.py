@@ -1,4 +1,4 @@
-"""What the MRCLAM benchmark computes, each job in a process of its own: fits, runs and their errors."""
+"""Jobs of the MRCLAM benchmark, run in parallel processes: fits, runs and their errors."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 MODELS = ("plain", "calibrated")
 ONLINE = "landmarks_robots"
-"""The column with everything that there is."""
+"""The column with landmarks and robots."""
 SMOOTHER = "smoother"
 WORK = OUT / "mrclam"
 TICK_S, BLIND_TICK_S = 0.1, 0.5
 EARLY_S = 600.0
-"""What has been published is about the first minutes."""
+"""Published errors are those of the first 600 s."""
 _REPLAYS = 3
 _SHARE_PRINTED = 0.1
 
 
 @dataclass(frozen=True)
 class Job:
-    """One thing to compute.
+    """One run of a set.
 
     Attributes:
         number: Of the set.
         model: "plain" or "calibrated".
-        column: What is run.
-        seeing: For blind_robots, which two robots see landmarks.
+        column: Of the table.
+        seeing: For blind_robots, the two robots that see landmarks.
     """
 
     number: int
@@ -59,15 +59,15 @@ class Job:
 
 @dataclass(frozen=True)
 class Sums:
-    """Errors in a form that adds up over runs: counts, and means of squares by count.
+    """Sums of squared errors, which add up over runs.
 
     Attributes:
         count: Of poses.
         position: Sum of squared position errors [m^2].
         heading: Sum of squared heading errors [rad^2].
-        nees: Sum of the normalised ones.
-        nees_count: Of these.
-        early: Mean position error over the first minutes as published [m].
+        nees: Sum of normalized errors squared.
+        nees_count: Their number.
+        early: Mean position error over the first 600 s [m].
     """
 
     count: int
@@ -98,12 +98,12 @@ class Sums:
 
 @dataclass(frozen=True)
 class Done:
-    """What became of a job.
+    """Result of a job.
 
     Attributes:
-        job: Which.
-        sums: Its errors; None where there is nothing to compare with.
-        failure: Why it has failed, in a sentence; "" where it has not.
+        job: The job.
+        sums: Its errors; None without ground truth.
+        failure: Why it has failed, one sentence; "" if it has not.
     """
 
     job: Job
@@ -113,7 +113,7 @@ class Done:
 
 @dataclass(frozen=True)
 class Results:
-    """All that the benchmark reports.
+    """Results of all jobs.
 
     Attributes:
         figures: By name, such as set1.calibrated.smoother.nees.
@@ -127,7 +127,7 @@ class Results:
 
 
 def collected(all_done: Iterable[Done]) -> Results:
-    """Errors pooled over the jobs of a column; a job that has failed leaves its column without figures."""
+    """Pool errors over the jobs of a column; a failed job leaves its column without figures."""
     totals: dict[tuple[int, str, str], Sums] = {}
     failures: dict[tuple[int, str, str], str] = {}
     for done in all_done:
@@ -147,7 +147,7 @@ def collected(all_done: Iterable[Done]) -> Results:
 
 
 def bag_of(number: int) -> Path:
-    """Where a set lies as a bag."""
+    """The bag of a set."""
     return WORK / f"set{number}"
 
 
@@ -157,7 +157,7 @@ def prepare(number: int, folder: Path) -> tuple[int, tuple[str, ...]]:
 
 
 def fit(number: int, model: str) -> tuple[str, str]:
-    """Fit a model to a set and keep it as a file; returns what came out in a line."""
+    """Fit a model to a set and write it to a file; returns a line with the fitted noise."""
     recording, swarm = load(bag_of(number))
     printed = 0.0
 
@@ -194,7 +194,7 @@ def run(job: Job) -> Done:
 
 
 def sums_of(errors: Mapping[str, Errors]) -> Sums | None:
-    """Errors of robots, by name, pooled; None without any."""
+    """Errors of robots by name, pooled; None without any."""
     pooled = pool([*errors.values()])
     if not pooled.stamp_ns.size:
         return None
@@ -210,7 +210,7 @@ def sums_of(errors: Mapping[str, Errors]) -> Sums | None:
 
 
 def smoothed(job: Job, recording: Recording, swarm: Swarm) -> Done:
-    """Errors of the offline limit; why, where it cannot be found."""
+    """Errors of the smoother, or why it failed."""
     from bench.mrclam.smoother import SmootherError, smooth  # noqa: PLC0415 # only benchmarks require gtsam
 
     try:
@@ -220,7 +220,7 @@ def smoothed(job: Job, recording: Recording, swarm: Swarm) -> Done:
 
 
 def jobs_of(number: int, swarm: Swarm) -> list[Job]:
-    """Everything to run on a set, long jobs first."""
+    """All jobs of a set, long ones first."""
     robots = len(swarm.robots)
     pairs = [*itertools.combinations(range(robots), 2)] if robots > 2 else []
     columns = ("smoother", "landmarks_robots", "unknown_start", "landmarks", "odometry")
@@ -229,7 +229,7 @@ def jobs_of(number: int, swarm: Swarm) -> list[Job]:
 
 
 def speed_factor(number: int) -> float:
-    """How much faster than its own time a set replays from its bag, best of a few."""
+    """Duration of a set divided by that of its replay from a bag, best of a few."""
     bag = bag_of(number)
     swarm = transferred(load_swarm(WORK / "calibrated.yaml"), load_swarm(bag / "swarm.yaml"))
     return max(replay(bag, swarm).speed_factor for _ in range(_REPLAYS))

@@ -42,7 +42,7 @@ def report(results: Results, sets: Collection[int]) -> None:
 
 
 def beside_published(early: dict[tuple[int, str], float]) -> list[tuple[str, float]]:
-    """Mean errors by name, ours and the published ones."""
+    """Mean errors by name, ours and published ones."""
     ours = [(f"ours, set {k}, {model}", value) for (k, model), value in sorted(early.items())]
     return ours + [(f"{name}, set 2", value) for name, value in PUBLISHED]
 
@@ -59,7 +59,7 @@ def _cell(results: Results, key: tuple[int, str, str]) -> str:
 
 
 def draw(results: Results, sets: Collection[int]) -> Path:
-    """Errors and consistency by column, and ours beside the published; returns the file."""
+    """Plot errors and NEES by column, and ours beside published errors; returns the file."""
     figure, axes = new_plot(4, width=5.8, height=4.4)
     labels = ("position RMSE [m]", "heading RMSE [deg]", "NEES")
     for axis, name, label in zip(axes, FIGURES, labels, strict=False):
@@ -79,7 +79,7 @@ def draw(results: Results, sets: Collection[int]) -> Path:
 
 
 def _bars(axis: Axes, figures: dict[str, float], cases: list[tuple[int, str]], name: str) -> None:
-    """A group of bars per column, one per set and model: pale where plain."""
+    """Plot a group of bars per column, one per set and model; plain ones are pale."""
     width = 0.84 / len(cases)
     numbers = sorted({number for number, _ in cases})
     for place, (number, model) in enumerate(cases):

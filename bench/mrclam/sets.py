@@ -1,4 +1,4 @@
-"""The sets of the MRCLAM benchmark: where they are, as bags, and what a run leaves out of them."""
+"""Sets of the MRCLAM benchmark: find them, import them as bags, and mask parts of them."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 
 class NoSetsError(UserError):
-    """There is nothing to run; the message is one sentence."""
+    """No set to run; the message is one sentence."""
 
 
 def find_sets(folder: Path) -> dict[int, Path]:
-    """Number -> folder of every set; a folder that is a set itself counts by the number in its name."""
+    """Number -> folder of every set in a folder; the folder may be a set itself."""
     if not folder.is_dir():
         raise NoSetsError(
             f"There is no folder '{folder}'; name one that holds MRCLAM_Dataset<k> folders: make bench-mrclam"
@@ -45,7 +45,7 @@ def find_sets(folder: Path) -> dict[int, Path]:
 
 
 def import_set(folder: Path, bag: Path) -> tuple[str, ...]:
-    """Write a set as a bag, replacing what is there; returns what there is to say about it."""
+    """Write a set as a bag, replacing an existing one; returns the remarks of the import."""
     if bag.exists():
         shutil.rmtree(bag)
     bag.parent.mkdir(parents=True, exist_ok=True)
@@ -60,40 +60,40 @@ def load(bag: Path) -> tuple[Recording, Swarm]:
 
 
 def transferred(fitted: Swarm, swarm: Swarm) -> Swarm:
-    """Another set's swarm with the models that were fitted, robot by name; unknown robots get the mean."""
+    """The swarm of another set with the fitted models by name; other robots get the mean."""
     by_name = {robot.name: robot for robot in fitted.robots}
     mean = _mean(fitted.robots)
     return replace(swarm, robots=tuple(_with_models(r, by_name.get(r.name, mean)) for r in swarm.robots))
 
 
 def without_robots(recording: Recording, swarm: Swarm) -> Recording:
-    """The recording as if robots had not been seen."""
+    """The recording without detections of robots."""
     return _masked(recording, _shows_landmark(recording, swarm))
 
 
 def without_sightings(recording: Recording) -> Recording:
-    """The recording as if nothing had been seen."""
+    """The recording without detections."""
     return replace(recording, detections=NO_DETECTIONS)
 
 
 def with_two_seeing(recording: Recording, swarm: Swarm, seeing: tuple[int, int]) -> Recording:
-    """The recording as if only two robots could see landmarks; everybody sees robots."""
+    """The recording with detections of landmarks by two robots only; all see robots."""
     kept = np.isin(recording.detections.robot, seeing) | ~_shows_landmark(recording, swarm)
     return _masked(recording, kept)
 
 
 def _masked(recording: Recording, kept: BoolArray) -> Recording:
-    """The recording as if only some of the detections (d,) had been made."""
+    """The recording with only some of the detections (d,)."""
     return replace(recording, detections=chosen(recording.detections, kept))
 
 
 def _shows_landmark(recording: Recording, swarm: Swarm) -> BoolArray:
-    """Which detections (d,) are of landmarks."""
+    """Whether detections (d,) are of landmarks."""
     return np.isin(recording.detections.detection["id"], [landmark.id for landmark in swarm.landmarks])
 
 
 def unknown_start(swarm: Swarm) -> Swarm:
-    """The swarm with no robot's start known."""
+    """The swarm with unknown starts."""
     return replace(swarm, robots=tuple(replace(robot, start=None) for robot in swarm.robots))
 
 

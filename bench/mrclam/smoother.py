@@ -1,8 +1,8 @@
-"""The offline limit: gtsam's batch solution of a recording with the estimator's own models and noise.
+"""Batch solution of a recording by gtsam, with the models and noise of the estimator.
 
-A filter knows the past, a smoother also the future: no online estimate can be as good. Each robot has a pose
-at every stamp at which it sees or is seen, and at every stamp at which the result is compared; and a bias of
-its turn rate, where its model has one, that steps a few times within its time constant.
+A smoother uses past and future measurements: its errors are a lower bound for online estimates. Each robot
+has a pose at every stamp of a sighting or a comparison; and, if its model has one, a bias of its turn rate
+that is constant for a tenth of its time constant.
 """
 
 from __future__ import annotations
@@ -33,33 +33,33 @@ from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
 from swarm_loc_estimator.timeline.settings import Settings
 
 _FLOOR = np.diag([1e-10, 1e-10, 1e-10])
-"""A robot that stands gathers no noise; a factor needs some."""
+"""Least covariance of a motion factor; that of a standing robot would be zero."""
 _UNKNOWN = np.array([30.0, 30.0, 10.0])
 _BEND = 3.0
-"""From this many sigmas on a sighting counts less and less (Cauchy), where the filter has its gate."""
+"""Width of the Cauchy loss of sightings [sigma], in place of the filter's gate."""
 _NEES_POSES = 400
-"""Marginal covariances are slow; the NEES is taken over about so many poses of each robot."""
+"""Number of poses of each robot for the NEES; marginal covariances are slow."""
 _MAX_ROUNDS = 25
 _SETTLED = 1e-4
-"""Share of the error by which the last round may still lessen it."""
+"""The solution has converged if a step reduces the error by less than this share."""
 _SHORTEST_STEP = 1e-3
 _BIAS_STEP = 0.1
 """A bias is constant for this share of its time constant."""
 
 
 class SmootherError(Exception):
-    """There is no solution; the message is one sentence."""
+    """The batch solution has failed; the message is one sentence."""
 
 
 @dataclass(frozen=True)
 class _Nodes:
-    """The poses to solve for; the position in these arrays is the key.
+    """Poses to solve for; their index is the key.
 
     Attributes:
         stamps_ns: Per robot, ascending.
-        compared: Per robot, which of them are compared with the truth.
+        compared: Per robot, indices of those that are compared with ground truth.
         first: (N,) key of each robot's first pose.
-        initial: (V, 3) where to begin.
+        initial: (V, 3) initial values.
     """
 
     stamps_ns: list[IntArray]
@@ -68,7 +68,7 @@ class _Nodes:
     initial: FloatArray
 
     def keys(self, robots: IntArray, stamps_ns: IntArray) -> IntArray:
-        """The keys (m,) of poses that exist; -1 for nobody."""
+        """Keys (m,) of poses; -1 for robot -1."""
         keys = np.full(robots.size, -1)
         for robot, stamps in enumerate(self.stamps_ns):
             rows = robots == robot
@@ -80,21 +80,20 @@ def smooth(recording: Recording, online: ReplayResult) -> Mapping[str, Errors]:
     """Solve a whole recording; returns the errors of robots with ground truth, by name.
 
     Args:
-        recording: What was reported and seen, and the truth to compare with.
-        online: What the estimator made of it; its swarm has the models, its poses are where to begin and
-            its stamps those of the comparison.
+        recording: With ground truth.
+        online: The estimate from it, which gives models, initial values and the stamps of the comparison.
 
     Raises:
-        SmootherError: There is no solution, or it does not settle.
+        SmootherError: There is no solution, or it does not converge.
     """
     try:
         return _smooth(recording, online)
-    except RuntimeError as error:  # as gtsam says that a system is indeterminate
+    except RuntimeError as error:  # gtsam's error for indeterminate systems
         raise SmootherError(f"gtsam: {' '.join(str(error).split('.')[0].split())}.") from error
 
 
 def _smooth(recording: Recording, online: ReplayResult) -> Mapping[str, Errors]:
-    """Like `smooth`, with gtsam's own errors."""
+    """As `smooth`, with errors of gtsam."""
     swarm = online.swarm
     tracks, measured = _tracks_and_measurements(recording, swarm)
     estimates = [online.track(index) for index in range(len(swarm.robots))]
@@ -117,10 +116,10 @@ def _tracks_and_measurements(recording: Recording, swarm: Swarm) -> tuple[Odomet
 
 
 def _solved(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
-    """The best values by Gauss-Newton from values near them.
+    """Optimize by Gauss-Newton with step halving.
 
-    gtsam's own optimizers let go of the interpreter's lock, which each factor written in Python then waits
-    for: they take a hundred times as long.
+    The optimizers of gtsam release the interpreter lock, which every factor in Python must take again: they
+    take a hundred times as long.
     """
     error = graph.error(values)
     for _ in range(_MAX_ROUNDS):
@@ -136,11 +135,11 @@ def _solved(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Va
         values, settled, error = stepped, error - found < _SETTLED * error, found
         if settled:
             return values
-    raise SmootherError(f"the batch solution has not settled after {_MAX_ROUNDS} rounds.")
+    raise SmootherError(f"the batch solution has not converged after {_MAX_ROUNDS} rounds.")
 
 
 def _scaled(step: gtsam.VectorValues, share: float) -> gtsam.VectorValues:
-    """A part of a step."""
+    """A step times a factor."""
     scaled = gtsam.VectorValues()
     for key in range(step.size()):
         scaled.insert(key, share * step.at(key))
@@ -148,7 +147,7 @@ def _scaled(step: gtsam.VectorValues, share: float) -> gtsam.VectorValues:
 
 
 def _within(measured: MeasurementArray, estimates: list[Trajectory]) -> NDArray[np.bool_]:
-    """Which measurements (m,) were taken while the online estimate knew both robots."""
+    """Whether measurements (m,) were taken while both robots were located online."""
     inside = np.ones(measured.size, dtype=bool)
     for name in ("observer", "target"):
         for robot, track in enumerate(estimates):
@@ -160,7 +159,7 @@ def _within(measured: MeasurementArray, estimates: list[Trajectory]) -> NDArray[
 
 
 def _nodes(tracks: OdometryTracks, estimates: list[Trajectory], measured: MeasurementArray) -> _Nodes:
-    """A pose of each robot at every stamp that matters, at first by odometry from the last online one."""
+    """Poses of each robot at all its stamps, initialized by odometry from the last online pose."""
     stamps_ns, compared, initial = [], [], [np.zeros((0, 3))]
     for robot, track in enumerate(estimates):
         seen = [measured["stamp_ns"][measured[name] == robot] for name in ("observer", "target")]
@@ -184,7 +183,7 @@ def _add_motion(
     tracks: OdometryTracks,
     nodes: _Nodes,
 ) -> None:
-    """Starts and odometry as factors, and the biases in which odometry errs."""
+    """Add priors of the starts, odometry, and biases of the turn rate."""
     for index, (robot, stamps) in enumerate(zip(swarm.robots, nodes.stamps_ns, strict=True)):
         if not stamps.size:
             continue
@@ -206,7 +205,7 @@ def _add_motion(
 
 
 def _start_noise(robot: Robot) -> gtsam.noiseModel.Base:
-    """How sure the first online pose is: as the start is, a moment before; or not at all."""
+    """Noise of the first pose: that of the start plus some motion, or very large if it is unknown."""
     if robot.start is None:
         return gtsam.noiseModel.Diagonal.Sigmas(_UNKNOWN)
     s = robot.start_sigma
@@ -216,24 +215,24 @@ def _start_noise(robot: Robot) -> gtsam.noiseModel.Base:
 def _add_biases(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, model: OdometryModel, stamps_ns: IntArray
 ) -> IntArray:
-    """A Gauss-Markov chain of a robot's biases, if any; returns the key (m - 1,) of each step's."""
+    """Add a Gauss-Markov chain of biases, if the model has one; returns the key (m - 1,) of each step."""
     sigma, step_ns = model.turn_bias_sigma, _BIAS_STEP * model.turn_bias_time_s * 1e9
     if not sigma:
         return np.zeros(0, dtype=np.int64)
     kept = np.exp(-_BIAS_STEP)
     keys: IntArray = values.size() + ((stamps_ns[:-1] - stamps_ns[0]) // step_ns).astype(np.int64)
-    anew = gtsam.noiseModel.Isotropic.Sigma(1, sigma * np.sqrt(1.0 - kept**2))
+    innovation_noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma * np.sqrt(1.0 - kept**2))
     for key in range(int(keys[0]), int(keys[-1]) + 1):
         values.insert(key, np.zeros(1))
         if key == keys[0]:
             graph.add(gtsam.PriorFactorVector(key, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, sigma)))
         else:
-            graph.add(gtsam.CustomFactor(anew, [key - 1, key], _Fading(kept)))
+            graph.add(gtsam.CustomFactor(innovation_noise, [key - 1, key], _Fading(kept)))
     return keys
 
 
 def _add_sightings(graph: gtsam.NonlinearFactorGraph, measured: MeasurementArray, nodes: _Nodes) -> None:
-    """Sightings as factors at their own stamps, with the estimator's prediction."""
+    """Add sightings at their stamps, with the measurement models of the estimator."""
     columns = MeasurementColumns.of(measured)
     observers = nodes.keys(measured["observer"], measured["stamp_ns"]).tolist()
     targets = nodes.keys(measured["target"], measured["stamp_ns"]).tolist()
@@ -247,7 +246,7 @@ def _add_sightings(graph: gtsam.NonlinearFactorGraph, measured: MeasurementArray
 
 
 class _Fading:
-    """A bias minus what the one before left."""
+    """Residual of a bias: minus the decayed previous one."""
 
     def __init__(self, kept: float) -> None:
         self._kept = kept
@@ -262,7 +261,7 @@ class _Fading:
 
 
 class _Drifting:
-    """True minus reported motion of a step, the latter with a bias, as in gtsam's BetweenFactor."""
+    """Residual of a step of odometry with a bias, as in gtsam's BetweenFactor."""
 
     def __init__(self, moved: gtsam.Pose2, drift: FloatArray) -> None:
         self._moved, self._drift = moved, drift
@@ -281,7 +280,7 @@ class _Drifting:
 
 
 class _Sighting:
-    """Predicted minus measured of one sighting, and its Jacobians by the poses in their own frames."""
+    """Residual of a sighting, with Jacobians by the poses in their own frames."""
 
     def __init__(self, columns: MeasurementColumns, k: int, size: int) -> None:
         self._columns, self._k, self._size = columns, k, size
@@ -310,7 +309,7 @@ def _errors(
     solution: gtsam.Values,
     graph: gtsam.NonlinearFactorGraph,
 ) -> dict[str, Errors]:
-    """Errors at the stamps of the online poses; normalised ones at some of them."""
+    """Errors at the stamps of the online poses; the NEES at some of them."""
     marginals = gtsam.Marginals(graph, solution)
     errors = {}
     for index, robot in enumerate(swarm.robots):

@@ -1,4 +1,4 @@
-"""What all benchmarks share: where results go, how a table is printed, and one look for the plots."""
+"""What all benchmarks share: the folder of results, tables, figures and the style of plots."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 OUT = Path(__file__).resolve().parents[2] / "out"
-"""Where results of this workspace go."""
+"""Folder of results."""
 
 _STYLE = {
     "figure.constrained_layout.use": True,
@@ -37,7 +37,7 @@ Cell = str | float | int | None
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
-    """A table as text: numbers to three significant digits at the right, a dash where there is none."""
+    """A table as text: numbers to three significant digits at the right, a dash for None."""
     texts = [[*columns], *([_text(cell) for cell in row] for row in rows)]
     widths = [max(len(text) for text in column) for column in zip(*texts, strict=True)]
     lines = ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)) for row in texts]
@@ -84,13 +84,13 @@ def _text(cell: Cell) -> str:
 
 
 class ProgressLine:
-    """A line that tells how far something is."""
+    """A line of progress that is rewritten."""
 
     def __init__(self, what: str) -> None:
-        self._what, self._told = what, ""
+        self._what, self._shown = what, ""
 
     def __call__(self, text: str) -> None:
-        """Tell how far it is, when that has changed."""
-        if text != self._told:
+        """Print a text if it has changed."""
+        if text != self._shown:
             print(f"\r{self._what}: {text:32}", end="", flush=True)
-            self._told = text
+            self._shown = text

@@ -29,7 +29,7 @@ _TICK_NS = 100_000_000
 
 @dataclass(frozen=True)
 class CoreResult:
-    """What the estimator made of a run.
+    """Estimates of a run.
 
     Attributes:
         cpu_s: [s].
@@ -43,7 +43,7 @@ class CoreResult:
 
 
 def run_core(run: SimulatedRun, tick_ns: NDArray[np.int64], settings: Settings) -> CoreResult:
-    """Feed a run in order of arrival to the estimator, and tick it."""
+    """Run the estimator over a run in order of arrival."""
     runner = Runner(Estimator(run.swarm, settings), ListedSchedule(tick_ns))
     parts = inputs_between(run, tick_ns)
     begun = time.process_time()
@@ -55,7 +55,7 @@ def run_core(run: SimulatedRun, tick_ns: NDArray[np.int64], settings: Settings) 
 
 
 def inputs_between(run: SimulatedRun, tick_ns: NDArray[np.int64]) -> list[RawInputs]:
-    """What a run's robots have sent that arrived since the tick before, for each tick."""
+    """The inputs that arrived between the previous tick and each tick."""
     rows, frames = run.odometry, run.frames
     names = ("robot", "stamp_ns", "arrival_ns")
     robot, stamp_ns, arrival_ns = (rows[name].astype(np.int64) for name in names)
@@ -74,7 +74,7 @@ def inputs_between(run: SimulatedRun, tick_ns: NDArray[np.int64]) -> list[RawInp
 
 
 def without_delay(run: SimulatedRun) -> SimulatedRun:
-    """The run as if everything arrived at the moment at which it happens."""
+    """The run with arrivals at the stamps."""
     odometry, frames = run.odometry.copy(), run.frames.copy()
     odometry["arrival_ns"], frames["arrival_ns"] = odometry["stamp_ns"], frames["stamp_ns"]
     of_sighting = np.repeat(frames["arrival_ns"], frames["count"])
@@ -87,7 +87,7 @@ def without_delay(run: SimulatedRun) -> SimulatedRun:
 
 
 def ticks(run: SimulatedRun) -> NDArray[np.int64]:
-    """When all poses are asked for (K,): ten times a second."""
+    """Stamps of outputs (K,), ten times a second."""
     return np.arange(run.start_ns + _TICK_NS, run.end_ns + 1, _TICK_NS)
 
 

@@ -1,4 +1,4 @@
-"""Faults are named, and nobody is told as tracked who is elsewhere; with seeds that no figure comes from."""
+"""Faults are reported, and no robot is TRACKED with a wrong pose; with seeds that no figure comes from."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SEED = 23
 def test_a_fault_is_named_and_misleads_nobody(scenario: str, about: str, kind: Contradicted) -> None:
     found = score(SCENARIOS[scenario](SEED))
     assert found.misleading_share <= 0.001
-    assert (about, kind) in found.told
+    assert (about, kind) in found.reported
 
 
 def test_noise_that_the_description_hides_is_found_and_costs_no_robot() -> None:
@@ -30,21 +30,21 @@ def test_noise_that_the_description_hides_is_found_and_costs_no_robot() -> None:
     assert found.misleading_share <= 0.001
     assert found.tracked_share >= 0.99
     assert found.position_m <= 0.015
-    assert ("epuck1", Contradicted.NOISE) in found.told
+    assert ("epuck1", Contradicted.NOISE) in found.reported
 
 
 def test_a_landmark_that_was_moved_is_named() -> None:
     fault = SCENARIOS["moved_landmark"](SEED)
     found = score(fault)
     assert found.misleading_share <= 0.001
-    assert (fault.about, Contradicted.DESCRIPTION) in found.told
+    assert (fault.about, Contradicted.DESCRIPTION) in found.reported
 
 
 def test_starts_that_are_wrong_give_way_and_nothing_is_said_where_nothing_is_wrong() -> None:
     moved, clean = (score(SCENARIOS[name](SEED)) for name in ("wrong_starts", "clean_w0"))
     assert moved.misleading_share <= 0.001
     assert moved.recovery_s <= 3.0
-    assert not clean.told
+    assert not clean.reported
     assert clean.tracked_share == 1.0
 
 
