@@ -15,7 +15,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.time import Time
 from sensor_msgs.msg import Image
 
 from bench.graph.listener import ROBOTS, Listener, starting_swarm
@@ -25,6 +24,7 @@ from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launch import NodeSpec
+from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.offline.live.graph import LiveGraph
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -222,11 +222,11 @@ class _Overhead:
             (RobotIdentities, "aerial/identities", self._identities),
         ):
             recorder.create_subscription(
-                kind, topic, lambda one, kept=kept: kept.update({_ns(one): one}), 100
+                kind, topic, lambda one, kept=kept: kept.update({nanoseconds(one.header.stamp): one}), 100
             )
 
     def _on_image(self, message: Image) -> None:
-        self._images[_ns(message)] = message
+        self._images[nanoseconds(message.header.stamp)] = message
         for old in sorted(self._images)[:-_KEPT]:
             del self._images[old]
 
@@ -262,7 +262,3 @@ def named_picture(
             place = centre[0] + 30, centre[1] + 8
             cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, width, cv2.LINE_AA)
     return np.asarray(picture, np.uint8)
-
-
-def _ns(message: Image | AnonymousDetectionArray | RobotIdentities) -> int:
-    return int(Time.from_msg(message.header.stamp).nanoseconds)

@@ -11,12 +11,11 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
-from rclpy.time import Time
 from sensor_msgs.msg import Image
 
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_drivers.sim.worlds import ErrorModel
-from swarm_loc_estimator.common.messages.cdr import decode_pose_stamped
+from swarm_loc_estimator.common.messages.cdr import decode_pose_stamped, nanoseconds
 from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveError, LiveGraph
@@ -79,7 +78,7 @@ class Listener:
         """Record a robot's images from now on; they are large."""
 
         def keep(message: Image) -> None:
-            self.pictures[name, Time.from_msg(message.header.stamp).nanoseconds] = message
+            self.pictures[name, nanoseconds(message.header.stamp)] = message
 
         self.graph.recorder.create_subscription(Image, f"{name}/image_raw", keep, 1)
         self.looked_at = name

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray
-from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
 from swarm_loc_estimator.offline.datasets.mrclam import read_dataset
 from swarm_loc_estimator.offline.datasets.mrclam_bag import Delay, convert

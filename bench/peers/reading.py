@@ -23,7 +23,7 @@ from bench.mrclam.sets import import_set
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.common.bags.cut import copy_beginning
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.messages.cdr import decode_odometry
+from swarm_loc_estimator.common.messages.cdr import decode_odometry, nanoseconds
 from swarm_loc_estimator.common.messages.planar import yaw_of
 from swarm_loc_estimator.common.messages.streams import DetectionReader, PoseReader
 from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY, typestore
@@ -120,7 +120,7 @@ def _odometry_numbers(message: Any) -> Iterator[tuple[float, ...]]:
     stamp, pose = message.header.stamp, message.pose.pose
     turned = pose.orientation
     yaw = yaw_of(turned.x, turned.y, turned.z, turned.w)
-    yield float(stamp.sec * 1_000_000_000 + stamp.nanosec), pose.position.x, pose.position.y, yaw
+    yield float(nanoseconds(stamp)), pose.position.x, pose.position.y, yaw
 
 
 def _detection_numbers(message: Any) -> Iterator[tuple[float, ...]]:

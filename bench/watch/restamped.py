@@ -16,7 +16,7 @@ from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
 
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.messages.cdr import ENCAPSULATION
+from swarm_loc_estimator.common.messages.cdr import ENCAPSULATION, SECOND_NS
 from swarm_loc_estimator.common.messages.cdr_writer import STAMP_SIZE, stamp_bytes
 from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY
 from swarm_loc_msgs.msg import MarkerDetectionArray
@@ -35,8 +35,8 @@ def messages(bag: Path) -> Iterator[tuple[str, str, int, bytes]]:
 def moved(data: bytes, later_ns: int) -> bytes:
     """A message whose header's stamp is so much later."""
     end = ENCAPSULATION + STAMP_SIZE
-    seconds, nanoseconds = np.frombuffer(data, "<i4", 2, ENCAPSULATION).tolist()
-    stamp = stamp_bytes(np.array([seconds * 1_000_000_000 + nanoseconds + later_ns])).tobytes()
+    seconds, rest_ns = np.frombuffer(data, "<i4", 2, ENCAPSULATION).tolist()
+    stamp = stamp_bytes(np.array([seconds * SECOND_NS + rest_ns + later_ns])).tobytes()
     return data[:ENCAPSULATION] + stamp + data[end:]
 
 

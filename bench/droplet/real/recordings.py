@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.shared.common import ProgressLine
-from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.offline.calibration.infrared.board import BoardRecording, read_board
 from swarm_loc_estimator.offline.calibration.infrared.board_fit import BoardReadings
 from swarm_loc_estimator.offline.calibration.recording import read_recording

@@ -27,7 +27,7 @@ from swarm_loc_drivers.sim.simulation import (
 from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.launch import print_line, run_graph
-from swarm_loc_estimator.common.number_spec import number_specs
+from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_vision.markers.detector import precompile
 
 

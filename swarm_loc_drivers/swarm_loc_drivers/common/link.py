@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 import serial
 
-from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import UserError
 
 
 class LinkError(OSError):

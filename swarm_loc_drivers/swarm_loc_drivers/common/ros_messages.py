@@ -34,11 +34,6 @@ def stamp_message(stamp_ns: int) -> TimeMessage:
     return Time(nanoseconds=stamp_ns).to_msg()
 
 
-def nanoseconds(stamp: TimeMessage) -> int:
-    """A message's time [ns]; also one before zero, which `rclpy.time.Time` cannot be."""
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-
-
 def yaw_quaternion(yaw: float) -> Quaternion:
     """A rotation about z [rad]."""
     return Quaternion(z=math.sin(0.5 * yaw), w=math.cos(0.5 * yaw))

@@ -11,8 +11,7 @@ from swarm_loc_drivers.droplet.hardware import DROPLET_MODELS, ELEMENTS, FULL_PO
 from swarm_loc_drivers.droplet.odometry import MotionNoise
 from swarm_loc_drivers.droplet.session import SessionSettings
 from swarm_loc_drivers.droplet.tdma import MIN_TURN_S, TdmaSettings
-from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import ParameterError, Value, choice, flag, text, texts
+from swarm_loc_estimator.common.parameters import ParameterError, Value, choice, flag, number, text, texts
 
 _ID = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})")
 _RELAYED = re.compile(r"([A-Za-z]\w*)=(.*)")

@@ -14,8 +14,7 @@ from swarm_loc_drivers.common.link import Address, AddressError, parse_address
 from swarm_loc_drivers.epuck import wifi_protocol as epuck_wifi
 from swarm_loc_drivers.epuck.hardware import EPUCK2, EPUCK_MODELS, EpuckModel, wheel_geometry
 from swarm_loc_drivers.epuck.session import CameraSettings, EpuckSettings
-from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, text
+from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text
 from swarm_loc_estimator.swarm.swarm import OdometryModel
 
 _ODOMETRY = OdometryModel()

@@ -18,12 +18,12 @@ from geometry_msgs.msg import Pose, PoseStamped, PoseWithCovarianceStamped, Twis
 from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from swarm_loc_drivers.common.ros_messages import nanoseconds
 from swarm_loc_drivers.common.velocity_command import Velocity
 from swarm_loc_drivers.pushbot.parameters import ExplorationParameters, driven_robots
 from swarm_loc_drivers.pushbot.stop_and_go import MapGoal, StopAndGo, StopAndGoSettings
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.health import Report, drop_values, listed
+from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.messages.planar import yaw_of
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_estimator.swarm.swarm_file import load_swarm

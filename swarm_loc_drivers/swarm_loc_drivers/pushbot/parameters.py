@@ -10,8 +10,7 @@ from swarm_loc_drivers.pushbot.hardware import BAUD_RATE, TIMESTAMPS
 from swarm_loc_drivers.pushbot.protocol import Lights
 from swarm_loc_drivers.pushbot.session import PushbotSettings
 from swarm_loc_drivers.pushbot.stop_and_go import StopAndGoSettings
-from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, text, texts
+from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text, texts
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 TCP_PORT = 56000

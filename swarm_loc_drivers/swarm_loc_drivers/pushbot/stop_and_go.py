@@ -16,7 +16,7 @@ import numpy as np
 from swarm_loc_drivers.common.velocity_command import STILL, Velocity
 from swarm_loc_estimator import SCAN_TURN, START_TURN
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_estimator.common.parameters import number
 from swarm_loc_estimator.common.se2 import wrap_angle
 
 _SLOW_TURN = 0.5 * math.pi

@@ -20,8 +20,7 @@ from swarm_loc_drivers.sim.scenarios.eight import ARENA
 from swarm_loc_drivers.sim.scenarios.eight_images import eight_floor
 from swarm_loc_drivers.sim.worlds import WorldError, start_of
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue, check_parameter_file
-from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import ParameterError
+from swarm_loc_estimator.common.parameters import ParameterError, number
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm

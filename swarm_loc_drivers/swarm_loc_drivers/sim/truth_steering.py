@@ -12,9 +12,9 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
 
-from swarm_loc_drivers.common.ros_messages import nanoseconds
 from swarm_loc_drivers.common.velocity_command import Velocity
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.cdr import nanoseconds
 
 Steer = Callable[[int, int, FloatArray], Velocity]
 """Robot's index, stamp [ns], true pose (3,) in map -> its velocity."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, SensorModel, Swarm
 
 PRINTED_SENSOR = SensorModel(forward_sigma=0.026, left_sigma=0.029, heading_sigma=0.508)

@@ -30,7 +30,7 @@ from swarm_loc_estimator.common.command_line import (
     parameters_of,
     swarm_beside,
 )
-from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.messages import led_frequencies

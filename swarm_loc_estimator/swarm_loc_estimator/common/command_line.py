@@ -16,8 +16,13 @@ from typing import ParamSpec, TextIO, TypeVar
 
 from typing_extensions import Self
 
-from swarm_loc_estimator.common.errors import UserError
-from swarm_loc_estimator.common.parameters import ParameterError, Value, from_values, parameter_specs
+from swarm_loc_estimator.common.parameters import (
+    ParameterError,
+    UserError,
+    Value,
+    from_values,
+    parameter_specs,
+)
 
 Arguments = ParamSpec("Arguments")
 Parameters = TypeVar("Parameters")

@@ -17,9 +17,7 @@ from math import nan
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
-from swarm_loc_estimator.common.errors import UserError
-from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import ParameterError
+from swarm_loc_estimator.common.parameters import ParameterError, UserError, number
 from swarm_loc_estimator.common.yaml_tree import read_tree
 
 Options = TypeVar("Options")

@@ -30,9 +30,14 @@ from rclpy.time import Time
 from rclpy.time_source import TimeSource
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from swarm_loc_estimator.common.errors import UserError
 from swarm_loc_estimator.common.health import Health, Report
-from swarm_loc_estimator.common.parameters import ParameterSpec, Value, from_values, parameter_specs
+from swarm_loc_estimator.common.parameters import (
+    ParameterSpec,
+    UserError,
+    Value,
+    from_values,
+    parameter_specs,
+)
 
 Parameters = TypeVar("Parameters")
 

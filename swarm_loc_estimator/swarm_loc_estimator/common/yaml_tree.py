@@ -15,7 +15,7 @@ from ruamel.yaml.nodes import Node, ScalarNode
 from ruamel.yaml.representer import SafeRepresenter
 from ruamel.yaml.resolver import VersionedResolver
 
-from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import UserError
 
 if TYPE_CHECKING:
     from pathlib import Path

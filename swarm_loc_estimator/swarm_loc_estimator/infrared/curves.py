@@ -17,7 +17,7 @@ from scipy.interpolate import PchipInterpolator
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.number_spec import number, number_specs
+from swarm_loc_estimator.common.parameters import number, number_specs
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.yaml_tree import read_tree, shown, tree_text
 from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
 

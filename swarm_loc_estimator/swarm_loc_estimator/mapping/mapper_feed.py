@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.errors import UserError
 from swarm_loc_estimator.common.messages.cdr import CdrError, decode_odometry
 from swarm_loc_estimator.common.messages.typestore import ODOMETRY
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.se2 import between, compose
 from swarm_loc_estimator.filter.process_noise import OdometryStep, add_step_noise
 from swarm_loc_estimator.mapping.exploration import Goal

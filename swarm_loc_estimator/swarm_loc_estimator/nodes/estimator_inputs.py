@@ -14,6 +14,7 @@ from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 from tf2_msgs.msg import TFMessage
 
+from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.sensors.topics import InputKind, InputTopic
 from swarm_loc_msgs.msg import (
     AnonymousDetectionArray,
@@ -140,7 +141,7 @@ def newest_time_ns(node: Node) -> int:
     if taken is None:
         return now_ns
     newest = taken[0].clock
-    if newest.sec * 1_000_000_000 + newest.nanosec < now_ns:
+    if nanoseconds(newest) < now_ns:
         node.executor.create_task(source.clock_callback, taken[0])
         return now_ns
     source.clock_callback(taken[0])

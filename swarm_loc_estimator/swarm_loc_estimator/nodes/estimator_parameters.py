@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import flag, text
+from swarm_loc_estimator.common.parameters import flag, number, text
 from swarm_loc_estimator.timeline.settings import Settings
 
 

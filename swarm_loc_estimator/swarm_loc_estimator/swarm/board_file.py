@@ -7,8 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from swarm_loc_estimator.common.errors import UserError
-from swarm_loc_estimator.common.number_spec import NumberSpec, number_specs
+from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number_specs
 from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree, shown
 from swarm_loc_estimator.infrared.curves import (
     Amplitude,

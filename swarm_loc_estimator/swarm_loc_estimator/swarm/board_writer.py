@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import fields
 from pathlib import Path
 
-from swarm_loc_estimator.common.number_spec import number_specs
+from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.common.yaml_tree import tree_text
 from swarm_loc_estimator.infrared.curves import Amplitude, PowerCurve, TabulatedCurve
 from swarm_loc_estimator.swarm.board_file import FILE_VERSION

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.number_spec import number, number_specs
+from swarm_loc_estimator.common.parameters import number, number_specs
 from swarm_loc_estimator.infrared.curves import (
     Amplitude,
     AngleCurve,

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from swarm_loc_estimator.common.number_spec import number_specs
+from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.common.yaml_tree import Tree
 from swarm_loc_estimator.infrared.curves import IrPlatformError
 from swarm_loc_estimator.swarm.board_file import IrPlatformFileError, load_ir_platform

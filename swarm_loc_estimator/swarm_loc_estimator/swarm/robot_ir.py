@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_estimator.common.parameters import number
 from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform
 
 

@@ -46,8 +46,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from swarm_loc_estimator.common.errors import UserError
-from swarm_loc_estimator.common.number_spec import number_specs
+from swarm_loc_estimator.common.parameters import UserError, number_specs
 from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
 from swarm_loc_estimator.filter.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.ir_section import IrSection, Values

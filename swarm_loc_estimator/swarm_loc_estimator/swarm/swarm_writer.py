@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from swarm_loc_estimator.common.number_spec import number_specs
+from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.common.yaml_tree import tree_text
 from swarm_loc_estimator.swarm.ir_section import ir_tree
 from swarm_loc_estimator.swarm.motion_response import MotionResponse

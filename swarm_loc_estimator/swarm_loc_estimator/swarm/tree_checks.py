@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from swarm_loc_estimator.common.number_spec import NumberSpec
+from swarm_loc_estimator.common.parameters import NumberSpec
 from swarm_loc_estimator.common.yaml_tree import Tree, shown
 
 Numbers = dict[str, "float | None"]

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from swarm_loc_estimator.common.errors import UserError
-from swarm_loc_estimator.common.number_spec import number, number_specs
+from swarm_loc_estimator.common.parameters import UserError, number, number_specs
 from swarm_loc_estimator.timeline.scheduling import Policy
 
 if TYPE_CHECKING:

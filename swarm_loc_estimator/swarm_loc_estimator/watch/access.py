@@ -8,7 +8,7 @@ import socket
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
-from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import UserError
 
 _LOCAL_NAMES = {"localhost", "127.0.0.1", "::1"}
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from rclpy.time import Time
 
-from swarm_loc_estimator.common.messages.cdr import CdrError, decode_pose_stamped
+from swarm_loc_estimator.common.messages.cdr import CdrError, decode_pose_stamped, nanoseconds
 from swarm_loc_estimator.watch.frames import Frame, aerial_frame, places_frame
 from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities
 
@@ -72,7 +71,7 @@ class AerialNames:
 
     def detections(self, message: AnonymousDetectionArray) -> Frame:
         """An image, of which nobody is known yet."""
-        stamp_ns = Time.from_msg(message.header.stamp).nanoseconds
+        stamp_ns = nanoseconds(message.header.stamp)
         self._images[stamp_ns] = message
         while len(self._images) > _IMAGES:
             del self._images[next(iter(self._images))]
@@ -80,7 +79,7 @@ class AerialNames:
 
     def identities(self, message: RobotIdentities) -> Frame | None:
         """Who is who in one of the newest images; None for an older one."""
-        stamp_ns = Time.from_msg(message.header.stamp).nanoseconds
+        stamp_ns = nanoseconds(message.header.stamp)
         if stamp_ns not in self._images:
             return None
         return self._frame(

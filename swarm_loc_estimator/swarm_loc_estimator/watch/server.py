@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 from aiohttp import WSMsgType, web
 
-from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.watch.access import Access, is_loopback
 from swarm_loc_estimator.watch.frames import Frame
 from swarm_loc_estimator.watch.history import History

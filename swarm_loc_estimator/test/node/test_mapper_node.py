@@ -18,7 +18,7 @@ from rclpy.serialization import serialize_message
 from rclpy.time import Time
 from std_srvs.srv import Trigger
 
-from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.grid import CELL
 from swarm_loc_estimator.mapping.map_file import load_map
 from swarm_loc_estimator.mapping.scans import Readings

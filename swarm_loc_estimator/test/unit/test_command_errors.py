@@ -9,7 +9,7 @@ import pytest
 
 from swarm_loc_estimator.cli import calibrate, calibrate_ir, replay
 from swarm_loc_estimator.common.command_line import exit_with_message, folder_to_write
-from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import UserError
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from swarm_loc_estimator.cli import calibrate, calibrate_ir, import_mrclam, replay, replay_map, watch
-from swarm_loc_estimator.common.number_spec import number_specs
+from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from swarm_loc_estimator.cli.graph import check_graph
-from swarm_loc_estimator.common.errors import UserError
 from swarm_loc_estimator.common.launch import GraphOptions, options_from
-from swarm_loc_estimator.common.parameters import ParameterError
+from swarm_loc_estimator.common.parameters import ParameterError, UserError
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_one_robot_slow"
 SWARM_FILE = str(BAG / "swarm.yaml")

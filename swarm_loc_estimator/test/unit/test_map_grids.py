@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.exploration import goal_by_odometry, next_stop, paths_from
 from swarm_loc_estimator.mapping.grid import CELL, OccupancyMap, VisitationMap, grid_around
 from swarm_loc_estimator.mapping.map_file import load_map, save_map

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DTYPE
+from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DTYPE, nanoseconds
 from swarm_loc_estimator.common.messages.encoders import encode_anonymous
 from swarm_loc_vision.aerial.detector import AerialDetections, AerialDetector
 from swarm_loc_vision.aerial.ground_camera import GroundCamera
@@ -19,7 +19,7 @@ from swarm_loc_vision.aerial.ground_control import NO_GROUND, Ground, GroundCont
 from swarm_loc_vision.aerial.ground_file import load_ground
 from swarm_loc_vision.aerial.parameters import AerialParameters, AerialSettings
 from swarm_loc_vision.aerial.rectification import RectificationError
-from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, GrayOf, stamp_ns_of
+from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, GrayOf
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.common.images import TRANSPORTS, Gray, ImageError
 
@@ -80,7 +80,7 @@ class AerialCamera(CalibratedCamera):
         self.used += 1
         self.robots += len(detections)
         self.headings += int(np.isfinite(detections.theta).sum())
-        return encode_anonymous(MAP, stamp_ns_of(message), anonymous_rows(detections))
+        return encode_anonymous(MAP, nanoseconds(message.header.stamp), anonymous_rows(detections))
 
     def _seen(self, gray: Gray) -> AerialDetections:
         """The robots in an image."""

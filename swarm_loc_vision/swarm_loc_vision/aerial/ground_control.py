@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_estimator.common.parameters import number
 from swarm_loc_vision.aerial.control_points import (
     MIN_POINTS,
     NO_POINTS,

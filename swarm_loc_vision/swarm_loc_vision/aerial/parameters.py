@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import choice, text
+from swarm_loc_estimator.common.parameters import choice, number, text
 from swarm_loc_vision.common.images import TRANSPORTS
 
 BRIGHT, DARK = 1.0, -1.0

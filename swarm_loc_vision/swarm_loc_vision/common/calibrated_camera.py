@@ -13,8 +13,6 @@ from swarm_loc_vision.common.images import Gray, ImageError
 
 GrayOf = Callable[[Any], Gray]
 
-_SECOND = 1_000_000_000
-
 
 class CalibratedCamera:
     """The calibration of one camera, and its images as far as they belong to it.
@@ -109,9 +107,3 @@ def camera_of(message: Any) -> Camera:
         tuple(message.d),
         message.distortion_model,
     )
-
-
-def stamp_ns_of(message: Any) -> int:
-    """When an image was exposed [ns]."""
-    stamp = message.header.stamp
-    return int(stamp.sec * _SECOND + stamp.nanosec)

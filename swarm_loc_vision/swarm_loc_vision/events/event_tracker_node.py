@@ -21,6 +21,7 @@ from rclpy.time import Time
 from std_msgs.msg import Header
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of
+from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.messages.event_encoding import EventError, decode_events
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_msgs.msg import EventPacket, LaserDistance, LightBearing, LightBearingArray
@@ -79,7 +80,7 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
             return
         if self._tracker is None or size != self._size:
             self._size, self._tracker = size, LightTracker(self._sources, size, self.params.settings)
-        stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+        stamp_ns = nanoseconds(message.header.stamp)
         self._counts["events"] += len(events.x)
         for report in self._tracker.track(events._replace(time_ns=stamp_ns + events.time_ns)):
             self._publish(report)

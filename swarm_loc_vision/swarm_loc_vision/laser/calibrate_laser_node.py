@@ -25,9 +25,9 @@ from rclpy.clock_type import ClockType
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.qos import QoSProfile
 
+from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.node import ConfiguredNode, Stop, run_node
-from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import ParameterError, text
+from swarm_loc_estimator.common.parameters import ParameterError, number, text
 from swarm_loc_msgs.msg import LaserDistance
 from swarm_loc_vision.laser.calibration import LaserCalibration, save_laser
 from swarm_loc_vision.laser.drive import WallDrive, recorded_drive
@@ -131,18 +131,13 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
         if not all(map(math.isfinite, (place.x, place.y, theta))):
             return
         try:
-            self._drive.take_odometry(_nanoseconds(message), place.x, place.y, theta)
+            self._drive.take_odometry(nanoseconds(message.header.stamp), place.x, place.y, theta)
         except CalibrationError as error:
             self._error = error
 
     def _on_laser(self, message: LaserDistance) -> None:
         self._heard_s["laser"] = time.monotonic()
-        self._drive.take_row(_nanoseconds(message), message.v_px)
-
-
-def _nanoseconds(message: Odometry | LaserDistance) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+        self._drive.take_row(nanoseconds(message.header.stamp), message.v_px)
 
 
 def summary(calibration: LaserCalibration, count: int, path: str) -> str:

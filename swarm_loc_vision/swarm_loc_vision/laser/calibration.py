@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.errors import UserError
-from swarm_loc_estimator.common.number_spec import NumberSpec, number, number_specs
+from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number, number_specs
 from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
 
 STEP_PX = 0.2

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_vision.laser.calibration import STEP_PX, LaserCalibration, RowBias
 
 MIN_SAMPLES = 50

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator import CONTENT_POSE, CONTENT_POSE_TWO
-from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE, nanoseconds
 from swarm_loc_estimator.common.messages.encoders import encode_detections
-from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, GrayOf, stamp_ns_of
+from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, GrayOf
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.detector import Detections, MarkerDetector
 
@@ -59,7 +59,7 @@ class CameraDetector(CalibratedCamera):
         self.drops.update(detections.dropped)
         self.markers += len(rows)
         self.misfits += detections.misfits
-        return encode_detections(message.header.frame_id, stamp_ns_of(message), rows)
+        return encode_detections(message.header.frame_id, nanoseconds(message.header.stamp), rows)
 
 
 _MIN_CHI2 = 1e-6

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import note_precompiled
-from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_estimator.common.parameters import number
 from swarm_loc_vision.common.camera import LENS_SIZE, Camera
 from swarm_loc_vision.common.images import Gray
 from swarm_loc_vision.common.sampling import GRID, homographies, read_cells

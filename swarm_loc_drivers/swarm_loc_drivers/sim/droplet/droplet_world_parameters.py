@@ -14,8 +14,7 @@ from swarm_loc_drivers.sim.droplet.world import (
 )
 from swarm_loc_drivers.sim.scenarios.eight import START_NS
 from swarm_loc_drivers.sim.worlds import WorldError, start_of
-from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import ParameterError, choice, text, texts
+from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text, texts
 from swarm_loc_estimator.swarm.robot_ir import RobotIr
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm

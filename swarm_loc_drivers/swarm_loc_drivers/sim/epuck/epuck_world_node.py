@@ -18,7 +18,6 @@ from typing import Any
 
 from rclpy.qos import QoSProfile
 
-from swarm_loc_drivers.common.ros_messages import nanoseconds
 from swarm_loc_drivers.epuck.hardware import EPUCK_MODELS
 from swarm_loc_drivers.sim.epuck.camera_output import CameraOutput
 from swarm_loc_drivers.sim.epuck.epuck_world_parameters import WorldParameters, make_world
@@ -28,6 +27,7 @@ from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware
 from swarm_loc_drivers.sim.epuck.world import OVERHEAD, STEP_NS, SimulatedEpuck
 from swarm_loc_drivers.sim.render.rigs import overhead_model
 from swarm_loc_drivers.sim.world_node import WorldNode
+from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import AnonymousDetectionArray, MarkerDetectionArray
 

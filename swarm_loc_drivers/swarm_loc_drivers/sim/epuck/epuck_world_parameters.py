@@ -12,8 +12,7 @@ from swarm_loc_drivers.sim.render.rigs import Arena, OverheadSettings
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, CAMERA_RATE_HZ, START_NS
 from swarm_loc_drivers.sim.scenarios.eight_images import FAMILY
 from swarm_loc_drivers.sim.worlds import WORLDS, WorldError
-from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import ParameterError, choice, text
+from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.aerial.ground_control import FloorMarker

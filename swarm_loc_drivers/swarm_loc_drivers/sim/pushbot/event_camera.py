@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.pushbot.hardware import SENSOR_PX
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_estimator.common.parameters import number
 
 
 class Blinking(NamedTuple):

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.common.errors import UserError
 from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_estimator.common.parameters import UserError
 
 Rectangle = tuple[float, float, float, float]
 """Left, lower, right and upper edge [m]."""

@@ -16,8 +16,7 @@ from swarm_loc_drivers.sim.pushbot.world import (
     PushbotWorldSettings,
 )
 from swarm_loc_drivers.sim.worlds import WorldError, start_of
-from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import ParameterError, choice, text
+from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 

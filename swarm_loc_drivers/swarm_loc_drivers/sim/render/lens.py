@@ -14,7 +14,7 @@ from swarm_loc_drivers.common.calibration_file import CameraCalibration
 from swarm_loc_drivers.sim.render.raster import Image
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_estimator.common.parameters import number
 from swarm_loc_vision.common.camera import Camera
 
 _REACH_MARGIN = 1.1

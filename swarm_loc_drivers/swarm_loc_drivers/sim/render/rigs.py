@@ -16,7 +16,7 @@ from swarm_loc_drivers.sim.render.renderer import Renderer, RobotCamera, Scene
 from swarm_loc_drivers.sim.run import Trajectories
 from swarm_loc_drivers.sim.worlds import HiddenGeometry
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.number_spec import number
+from swarm_loc_estimator.common.parameters import number
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Swarm
 from swarm_loc_vision.aerial.ground_control import FloorMarker
 from swarm_loc_vision.markers.families import Family

@@ -17,8 +17,7 @@ import numpy as np
 from swarm_loc_drivers.sim.scenarios.droplets import Wander
 from swarm_loc_drivers.sim.truth_steering import TruthSteering
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
-from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import ParameterError, text
+from swarm_loc_estimator.common.parameters import ParameterError, number, text
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 

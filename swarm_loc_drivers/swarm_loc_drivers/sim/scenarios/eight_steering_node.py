@@ -18,8 +18,7 @@ from typing import Any
 from swarm_loc_drivers.sim.scenarios.eight import EightSteering
 from swarm_loc_drivers.sim.truth_steering import TruthSteering
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
-from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import flag, text
+from swarm_loc_estimator.common.parameters import flag, number, text
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 

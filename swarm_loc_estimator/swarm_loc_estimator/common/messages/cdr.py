@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import struct
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,24 @@ ENCAPSULATION = 4
 
 MAX_PADDING = 7
 """Bytes that may come behind a message."""
-_NANOSECONDS = 1_000_000_000
+SECOND_NS = 1_000_000_000
+
+
+class Stamp(Protocol):
+    """A builtin_interfaces/Time, whatever has built it."""
+
+    @property
+    def sec(self) -> int:
+        """Whole seconds, which may be negative."""
+
+    @property
+    def nanosec(self) -> int:
+        """The rest [ns]."""
+
+
+def nanoseconds(stamp: Stamp) -> int:
+    """A stamp [ns]; it may lie before zero, which `rclpy.time.Time` refuses."""
+    return int(stamp.sec) * SECOND_NS + int(stamp.nanosec)
 
 
 class CdrError(ValueError):
@@ -213,12 +230,12 @@ def read_header(data: bytes, layout: Layout) -> tuple[int, str, int]:
     if len(data) < ENCAPSULATION + 12:
         raise CdrError(f"cut off after {len(data)} bytes.")
     sec, nanosec, length = layout.header.unpack_from(data, ENCAPSULATION)
-    if nanosec >= _NANOSECONDS:
+    if nanosec >= SECOND_NS:
         raise CdrError(f"stamp has {nanosec} nanoseconds, more than a second.")
     end = ENCAPSULATION + 12 + length
     if end > len(data):
         raise CdrError(f"cut off after {len(data)} bytes.")
-    return sec * _NANOSECONDS + nanosec, _text(bytes(data[ENCAPSULATION + 12 : end])), end
+    return sec * SECOND_NS + nanosec, _text(bytes(data[ENCAPSULATION + 12 : end])), end
 
 
 def check_end(data: bytes, end: int) -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass, field
 
-from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import ParameterError, text, texts
+from swarm_loc_estimator.common.parameters import ParameterError, number, text, texts
 from swarm_loc_estimator.mapping.settings import MapperSettings
 
 

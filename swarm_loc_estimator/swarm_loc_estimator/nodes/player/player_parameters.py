@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from swarm_loc_estimator.common.number_spec import number
-from swarm_loc_estimator.common.parameters import flag, text, texts
+from swarm_loc_estimator.common.parameters import flag, number, text, texts
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.number_spec import number_specs
+from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 from swarm_loc_estimator.offline.calibration.recording import Recording, rerun

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
 from swarm_loc_estimator.offline.recorded_bag import Progress, read_bag, unwatched
 from swarm_loc_estimator.offline.replay import PeriodicSchedule, Runner

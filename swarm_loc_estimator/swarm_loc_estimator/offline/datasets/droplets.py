@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.se2 import wrap_angle
 
 _NUMBER = r"\s*(-?\d{1,7}(?:\.\d{0,9})?)\s*"

@@ -20,7 +20,7 @@ from scipy.optimize import linear_sum_assignment
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.errors import UserError
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 
 MAX_TRUTH_GAP_NS = 500_000_000

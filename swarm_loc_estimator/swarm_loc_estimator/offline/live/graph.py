@@ -25,12 +25,12 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
-from rclpy.time import Time
 from typing_extensions import Self
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.errors import UserError
 from swarm_loc_estimator.common.launch import Child, NodeSpec, node_command, start, stop
+from swarm_loc_estimator.common.messages.cdr import nanoseconds
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.sensors.topics import InputKind
@@ -266,7 +266,7 @@ class Recorder(Node):
         if not own:  # of another node
             return
         taken = _taken(message.status)
-        self.taken[Time.from_msg(message.header.stamp).nanoseconds] = taken
+        self.taken[nanoseconds(message.header.stamp)] = taken
         self.inputs = sum(taken.values())
         self.drops = {
             value.key.removeprefix(_DROPPED): int(value.value)
@@ -290,10 +290,9 @@ def _taken(statuses: Sequence[DiagnosticStatus]) -> dict[str, int]:
 def read_poses(data: bytes) -> Poses:
     """Decode a serialized SwarmPoses."""
     message = deserialize_message(data, SwarmPoses)
-    stamp = message.header.stamp
     robots = message.robots
     return Poses(
-        stamp.sec * 1_000_000_000 + stamp.nanosec,
+        nanoseconds(message.header.stamp),
         np.array([(one.x, one.y, one.theta) for one in robots]).reshape(-1, 3),
         np.array([one.covariance for one in robots]).reshape(-1, 3, 3),
         np.array([one.status for one in robots], dtype=np.uint8),
