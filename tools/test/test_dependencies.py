@@ -1,9 +1,10 @@
-"""Each package names in its package.xml what it imports."""
+"""Each package names in its package.xml what it imports; vision and drivers need little of the estimator."""
 
 from __future__ import annotations
 
 import ast
 import re
+import subprocess
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -61,3 +62,21 @@ def test_what_is_imported_is_declared(name: str) -> None:
     package = ROOT / name
     assert imported(package, [name, "launch"]) == declared(package, "exec_depend")
     assert imported(package, ["test"]) <= declared(package, "exec_depend") | declared(package, "test_depend")
+
+
+@pytest.mark.parametrize("name", ["swarm_loc_vision", "swarm_loc_drivers"])
+def test_of_the_estimator_others_import_only_common_swarm_and_the_public_api(name: str) -> None:
+    allowed = re.compile(r"swarm_loc_estimator(\.(common|swarm)(\..+)?)?")
+    for path in (ROOT / name).glob(f"{name}/**/*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("swarm_loc_estimator"):
+                assert allowed.fullmatch(node.module or ""), f"{path} imports {node.module}"
+
+
+@pytest.mark.parametrize("robot", ["epuck", "droplet", "pushbot"])
+def test_a_driver_loads_neither_the_filter_nor_what_pages_and_plots_need(robot: str) -> None:
+    module = f"swarm_loc_drivers.{robot}.{robot}_driver_node"
+    command = [sys.executable, "-c", f"import sys, {module}; print(*sys.modules)"]
+    loaded = set(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
+    assert module in loaded
+    assert not {"aiohttp", "matplotlib", "swarm_loc_estimator.filter"} & loaded
