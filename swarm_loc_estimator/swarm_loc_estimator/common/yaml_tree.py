@@ -106,6 +106,24 @@ def shown(value: object) -> str:
     return _SHORT.repr(value).replace("\n", " ")
 
 
+def read_file(path: Path, most_bytes: int) -> bytes:
+    """The content of a regular file.
+
+    Raises:
+        YamlTreeError: It cannot be read, is no regular file, or is larger than `most_bytes`.
+    """
+    try:
+        if path.exists() and not path.is_file():  # opening a pipe would wait for ever
+            raise YamlTreeError(f"{path} cannot be read: it is no regular file.")
+        with path.open("rb") as file:
+            data = file.read(most_bytes + 1)
+    except (OSError, ValueError) as error:  # a ValueError is a null byte in the path
+        raise YamlTreeError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
+    if len(data) > most_bytes:
+        raise YamlTreeError(f"{path} has more than the {most_bytes} bytes that are allowed.")
+    return data
+
+
 def read_tree(path: Path, most_bytes: int = MAX_BYTES) -> Tree:
     """Read a YAML file.
 
@@ -119,13 +137,7 @@ def read_tree(path: Path, most_bytes: int = MAX_BYTES) -> Tree:
     Raises:
         YamlTreeError: It cannot be read, is too large, is not YAML, or has a key twice.
     """
-    try:
-        with path.open("rb") as file:
-            data = file.read(most_bytes + 1)
-    except OSError as error:
-        raise YamlTreeError(f"{path} cannot be read: {error.strerror or error}.") from error
-    if len(data) > most_bytes:
-        raise YamlTreeError(f"{path} has more than the {most_bytes} bytes that are sensible.")
+    data = read_file(path, most_bytes)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of anchors that are used twice

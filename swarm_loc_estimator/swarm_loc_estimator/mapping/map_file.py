@@ -1,24 +1,34 @@
-"""Maps as files: an image in PGM and a YAML beside it, by the convention of ROS's map_server."""
+"""Maps as files: an image and a YAML beside it, by the convention of ROS's map_server."""
 
 from __future__ import annotations
 
+import io
 import math
-import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.common.yaml_tree import read_tree, shown, tree_text
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.parameters import NumberSpec, UserError
+from swarm_loc_estimator.common.yaml_tree import read_file, read_tree, tree_text
 from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
+from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
 
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
-_MAX_BYTES = 500_000_000
-_PGM = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(\d{1,9})\s+255\s")
+_MODES = ("trinary", "scale", "raw")
+_MAX_BYTES = 200_000_000
+_MAX_CELLS = 50_000_000
+"""A grid of this size takes 400 MB: 141 x 141 m with cells of 2 cm."""
+_NUMBERS = {
+    "resolution": NumberSpec("m", 0.0, 10.0, True, "side of a pixel"),
+    "occupied_thresh": NumberSpec("1", 0.0, 1.0, False, "cells above are occupied"),
+    "free_thresh": NumberSpec("1", 0.0, 1.0, False, "cells below are free"),
+}
+_PLACE = NumberSpec("m", -1e6, 1e6, False, "of the lower left corner")
 
 
 class MapFileError(UserError):
@@ -34,8 +44,8 @@ def save_map(occupancy: OccupancyMap, path: Path) -> tuple[Path, Path]:
     image_path, yaml_path = path.with_suffix(".pgm"), path.with_suffix(".yaml")
     pixels = np.full(occupancy.log_odds.shape, _UNKNOWN, dtype=np.uint8)
     pixels[occupancy.free], pixels[occupancy.occupied] = _FREE, _OCCUPIED
-    rows = pixels.T[::-1]  # the first row is the uppermost
-    header = f"P5\n# {occupancy.cell:.6f} m a pixel\n{rows.shape[1]} {rows.shape[0]}\n255\n"
+    image = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels.T[::-1])).save(image, "PPM")  # the first row is the uppermost
     about = {
         "image": image_path.name,
         "mode": "trinary",
@@ -47,10 +57,7 @@ def save_map(occupancy: OccupancyMap, path: Path) -> tuple[Path, Path]:
     }
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for target, data in (
-            (image_path, header.encode() + rows.tobytes()),
-            (yaml_path, tree_text(about).encode()),
-        ):
+        for target, data in ((image_path, image.getvalue()), (yaml_path, tree_text(about).encode())):
             part = target.with_name(f"{target.name}.part")
             part.write_bytes(data)
             part.replace(target)
@@ -60,54 +67,84 @@ def save_map(occupancy: OccupancyMap, path: Path) -> tuple[Path, Path]:
 
 
 def load_map(path: Path, cell: float) -> OccupancyMap:
-    """Read a map that has cells of some size [m].
+    """Read a map of any of map_server's modes, with cells of the given size [m].
+
+    Pixels of another size are resampled by the nearest one.
 
     Raises:
         UserError: It cannot be read, or is not such a map.
     """
-    about = read_tree(path)
-    if not isinstance(about, dict):
-        raise MapFileError(f"'{path}' does not describe a map.")
-    resolution = _number(about, "resolution", path)
-    if not math.isclose(resolution, cell, rel_tol=1e-3):
-        raise MapFileError(f"'{path}' has cells of {resolution:g} m but the mapper's have {cell:g} m.")
-    origin = about.get("origin")
-    if (
-        not isinstance(origin, list)
-        or len(origin) != 3
-        or not all(isinstance(o, int | float) for o in origin)
-    ):
-        raise MapFileError(f"'{path}': origin must be a list of x, y and yaw.")
-    if not all(math.isfinite(o) for o in origin) or origin[2] != 0.0:
-        raise MapFileError(f"'{path}': origin must be finite and its yaw 0, not {origin[2]:g}.")
-    pixels = _read_pgm(path.parent / str(about.get("image", "")))
-    shade = pixels / 255.0 if about.get("negate") else 1.0 - pixels / 255.0
-    occupied, free = _number(about, "occupied_thresh", path), _number(about, "free_thresh", path)
-    log_odds = np.where(shade > occupied, LOG_ODDS_CAP, np.where(shade < free, -LOG_ODDS_CAP, 0.0))
-    corner = np.round(np.array(origin[:2], dtype=float) / cell) * cell
+    checks = TreeChecks(path, MapFileError)
+    about = checks.mapping(read_tree(path), WHOLE_FILE, required=("image", "origin", *_NUMBERS))
+    numbers = {name: checks.number(about[name], name, spec) or 0.0 for name, spec in _NUMBERS.items()}
+    origin = [
+        checks.number(value, "origin", _PLACE) or 0.0 for value in checks.items(about["origin"], "origin")
+    ]
+    if len(origin) != 3 or origin[2] != 0.0:
+        raise checks.error("origin", about["origin"], "must be x, y and a yaw of 0")
+    mode, negate = about.get("mode", "trinary"), about.get("negate", 0)
+    if mode not in _MODES:
+        raise checks.error("mode", mode, f"must be one of {', '.join(_MODES)}")
+    if negate not in (0, 1):
+        raise checks.error("negate", negate, "must be 0 or 1")
+    if not isinstance(about["image"], str):
+        raise checks.error("image", about["image"], "must be the path of a file")
+    pixels, seen = _read_image(path.parent / about["image"])
+    shade = np.arange(256) if negate or mode == "raw" else 255 - np.arange(256)
+    occupied, free = numbers["occupied_thresh"], numbers["free_thresh"]
+    log_odds = _log_odds(shade, mode, free, occupied)[pixels]
+    if mode == "scale":
+        log_odds[~seen] = 0.0
+    scale = cell / numbers["resolution"]
+    if not math.isclose(scale, 1.0, rel_tol=1e-3):
+        log_odds = _resampled(log_odds, scale, checks)
+    corner = np.round(np.array(origin[:2]) / cell) * cell
     return OccupancyMap(corner, cell, np.ascontiguousarray(log_odds[::-1].T))
 
 
-def _number(about: Mapping[str, Any], key: str, path: Path) -> float:
-    value = about.get(key)
-    if not isinstance(value, int | float) or not math.isfinite(value) or value <= 0.0:
-        raise MapFileError(f"'{path}': {key} must be a number above 0, not {shown(value)}.")
-    return float(value)
+def _log_odds(shade: NDArray[np.int64], mode: str, free: float, occupied: float) -> FloatArray:
+    """Log odds (256,) of pixel values whose darkness, or occupancy in percent, is given (256,)."""
+    if mode == "raw":
+        probability = np.where(shade <= 100, shade / 100.0, 0.5)
+        free, occupied = 0.0, 1.0
+    else:
+        probability = shade / 255.0
+    between = (probability - free) / max(occupied - free, 1e-9) if mode != "trinary" else np.full(256, 0.5)
+    between = np.clip(between, 1e-6, 1.0 - 1e-6)
+    ends = np.where(probability > occupied, LOG_ODDS_CAP, np.where(probability < free, -LOG_ODDS_CAP, 0.0))
+    inside = np.clip(np.log(between / (1.0 - between)), -LOG_ODDS_CAP, LOG_ODDS_CAP)
+    return np.asarray(np.where(ends == 0.0, inside, ends))
 
 
-def _read_pgm(path: Path) -> NDArray[np.uint8]:
-    """Pixels (height, width) of a binary PGM of one byte a pixel."""
+def _resampled(log_odds: FloatArray, scale: float, checks: TreeChecks) -> FloatArray:
+    """Log odds (height, width), the last row lowest, with pixels larger by a factor; by the nearest pixel."""
+    height, width = (max(1, round(size / scale)) for size in log_odds.shape)
+    if height * width > _MAX_CELLS:
+        raise checks.said(
+            f"the map has {height * width} cells of the mapper's size but may have {_MAX_CELLS}"
+        )
+    rows, columns = (
+        np.minimum(((np.arange(count) + 0.5) * scale).astype(np.int64), size - 1)
+        for count, size in zip((height, width), log_odds.shape, strict=True)
+    )
+    resampled: FloatArray = log_odds[::-1][rows][::-1][:, columns]
+    return resampled
+
+
+def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Gray values (height, width) of an image of any usual format, and which pixels are opaque.
+
+    Raises:
+        UserError: It cannot be read, or is too large.
+    """
+    data = read_file(path, _MAX_BYTES)
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise MapFileError(f"The image '{path}' of a map is larger than {_MAX_BYTES} bytes.")
-        data = path.read_bytes()
-    except OSError as error:
-        raise MapFileError(f"The image '{path}' of a map cannot be read: {error.strerror}.") from error
-    header = _PGM.match(data)
-    if header is None:
-        raise MapFileError(f"'{path}' is no binary PGM with values up to 255.")
-    width, height = int(header[1]), int(header[2])
-    pixels = np.frombuffer(data, dtype=np.uint8, offset=header.end())
-    if len(pixels) != width * height or not len(pixels):
-        raise MapFileError(f"'{path}' says {width} x {height} pixels but holds {len(pixels)}.")
-    return pixels.reshape(height, width)
+        with Image.open(io.BytesIO(data)) as image:
+            small_enough = 0 < image.width * image.height <= _MAX_CELLS
+            gray: Any = image.convert("LA") if small_enough else None
+    except Exception as error:  # the library raises whatever a broken file makes its decoders raise
+        raise MapFileError(f"The image '{path}' of a map cannot be decoded: {error}.") from error
+    if gray is None:
+        raise MapFileError(f"The image '{path}' of a map has more than {_MAX_CELLS} pixels.")
+    values = np.asarray(gray, dtype=np.uint8)
+    return values[..., 0], values[..., 1] == 255

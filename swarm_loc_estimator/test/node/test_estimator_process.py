@@ -48,7 +48,7 @@ def test_a_bad_parameter_ends_the_node_with_one_sentence(
         ("  robot{}: {{}}", "robots names 10000 robots but must name at most 1000."),
         (
             LONG_ROBOT,
-            "has more than the 2000000 bytes that are sensible.",
+            "has more than the 2000000 bytes that are allowed.",
         ),
     ],
     ids=["short", "long"],

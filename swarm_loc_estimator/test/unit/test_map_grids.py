@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.exploration import goal_by_odometry, next_stop, paths_from
@@ -117,22 +119,36 @@ def test_maps_survive_a_file(tmp_path: Path) -> None:
     assert np.array_equal(loaded.occupied, occupancy.occupied)
     assert np.array_equal(loaded.free, occupancy.free)
     assert np.allclose(loaded.corner, occupancy.corner)
-    assert image.read_bytes().startswith(b"P5\n#")
+    assert image.read_bytes().startswith(b"P5\n160 110\n255\n")
     assert "resolution: 0.02" in path.read_text()
 
 
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("resolution: 0.02", "resolution: 0.05", "cells of 0.05 m but the mapper's have 0.02 m"),
-        ("image: hall.pgm", "image: other.pgm", "cannot be read"),
-        ("origin: [0.0, 0.0, 0.0]", "origin: [0.0, 0.0]", "origin must be a list"),
-        ("origin: [0.0, 0.0, 0.0]", "origin: [0.0, 0.0, 0.5]", "yaw 0, not 0.5"),
-        ("free_thresh: 0.196", "free_thresh: much", "free_thresh must be a number above 0"),
+        ("resolution: 0.02", "resolution: 0", r"resolution is 0 but must lie in \(0, 10\] m"),
+        ("resolution: 0.02", "resolution: " + "9" * 400, "resolution is .* but must lie in"),
+        ("resolution: 0.02", "resolution: 10.0", "may have 50000000"),
+        ("resolution: 0.02", "other: 0.02", "the file lacks resolution"),
+        ("image: hall.pgm", "image: other.pgm", "cannot be read: No such file"),
+        ("image: hall.pgm", 'image: "a\\0b"', "cannot be read: embedded null byte"),
+        ("image: hall.pgm", "image: /dev/zero", "cannot be read: it is no regular file"),
+        ("image: hall.pgm", "image: pipe", "cannot be read: it is no regular file"),
+        ("image: hall.pgm", "image: [1]", "image is .* but must be the path of a file"),
+        ("image: hall.pgm", "image: sparse", "has more than the 200000000 bytes"),
+        ("origin: [0.0, 0.0, 0.0]", "origin: [0.0, 0.0]", "must be x, y and a yaw of 0"),
+        ("origin: [0.0, 0.0, 0.0]", "origin: [0.0, 0.0, 0.5]", "must be x, y and a yaw of 0"),
+        ("origin: [0.0, 0.0, 0.0]", f"origin: [{'9' * 30}, 0.0, 0.0]", "must lie in"),
+        ("free_thresh: 0.196", "free_thresh: much", "free_thresh is 'much' but must be a number"),
+        ("mode: trinary", "mode: binary", "mode is 'binary' but must be one of trinary, scale, raw"),
+        ("negate: 0", "negate: 2", "negate is 2 but must be 0 or 1"),
     ],
 )
-def test_a_wrong_description_is_told_in_a_sentence(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_a_wrong_description_is_refused_in_a_sentence(tmp_path: Path, old: str, new: str, said: str) -> None:
     path, _ = save_map(hall(), tmp_path / "hall")
+    os.mkfifo(tmp_path / "pipe")
+    with (tmp_path / "sparse").open("wb") as file:
+        file.truncate(480_000_000)
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new))
@@ -140,16 +156,45 @@ def test_a_wrong_description_is_told_in_a_sentence(tmp_path: Path, old: str, new
         load_map(path, CELL)
 
 
-@pytest.mark.parametrize(
-    ("data", "said"),
-    [
-        (b"P5\n160 110\n255\n" + bytes(99), "160 x 110 pixels but holds 99"),
-        (b"P2\n1 1\n255\n0", "no binary PGM"),
-        (b"", "no binary PGM"),
-    ],
-)
-def test_an_image_of_another_size_is_told_in_a_sentence(tmp_path: Path, data: bytes, said: str) -> None:
+@pytest.mark.parametrize("data", [b"P5\n160 110\n255\n" + bytes(99), b"\x89PNG\r\n\x1a\n", b""])
+def test_a_broken_image_is_refused_in_a_sentence(tmp_path: Path, data: bytes) -> None:
     path, image = save_map(hall(), tmp_path / "hall")
     image.write_bytes(data)
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=r"^The image '.*hall.pgm' of a map cannot be decoded"):
         load_map(path, CELL)
+
+
+def write_map(folder: Path, pixels: Image.Image, **changes: object) -> Path:
+    """A map with cells of `CELL`, its image as PNG."""
+    about = {"image": "map.png", "resolution": CELL, "origin": [0.0, 0.0, 0.0], "negate": 0}
+    about |= {"occupied_thresh": 0.65, "free_thresh": 0.2, **changes}
+    pixels.save(folder / "map.png")
+    (folder / "map.yaml").write_text("\n".join(f"{key}: {value}" for key, value in about.items()))
+    return folder / "map.yaml"
+
+
+def test_the_modes_of_map_server_are_understood(tmp_path: Path) -> None:
+    shades = np.array([[0, 128, 254, 255]], dtype=np.uint8)
+    trinary = load_map(write_map(tmp_path, Image.fromarray(shades), mode="trinary"), CELL).log_odds[:, 0]
+    assert np.sign(trinary).tolist() == [1, 0, -1, -1]
+    negated = load_map(write_map(tmp_path, Image.fromarray(shades), negate=1), CELL).log_odds[:, 0]
+    assert np.sign(negated).tolist() == [-1, 0, 1, 1]
+    alpha = np.stack([np.array([[0, 100, 150, 255]]), np.array([[255, 255, 255, 0]])], axis=-1)
+    scale = Image.fromarray(alpha.astype(np.uint8), "LA")
+    scaled = load_map(write_map(tmp_path, scale, mode="scale"), CELL).log_odds[:, 0]
+    assert np.sign(scaled).tolist() == [1, 1, -1, 0]  # the last one is transparent: unknown
+    assert scaled[0] > scaled[1] > 0.0
+    percent = np.array([[100, 80, 50, 20, 0, 255]], dtype=np.uint8)
+    raw = load_map(write_map(tmp_path, Image.fromarray(percent), mode="raw"), CELL).log_odds[:, 0]
+    assert np.sign(raw).tolist() == [1, 1, 0, -1, -1, 0]
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0, 2.5])
+def test_pixels_of_another_size_are_resampled(tmp_path: Path, factor: float) -> None:
+    pixels = np.full((40, 60), 255, dtype=np.uint8)
+    pixels[-10:, :20] = 0  # a block at the lower left corner
+    path = write_map(tmp_path, Image.fromarray(pixels), resolution=factor * CELL)
+    loaded = load_map(path, CELL)
+    assert loaded.log_odds.shape == (60 * factor, 40 * factor)
+    assert loaded.occupied.sum() == pytest.approx(200 * factor**2, rel=0.1)
+    assert loaded.occupied[: int(20 * factor), : int(10 * factor)].all()

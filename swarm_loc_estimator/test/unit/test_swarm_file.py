@@ -260,7 +260,7 @@ def test_one_sentence_names_key_value_and_range(tmp_path: Path, old: str, new: s
             + "".join(f"  {k}: {{x: {k}, y: 0}}\n" for k in range(3_333)),
             "what has a sigma makes a filter of 10002 states but must make at most 10000",
         ),
-        ("#" * 2_000_001, "has more than the 2000000 bytes that are sensible"),
+        ("#" * 2_000_001, "has more than the 2000000 bytes that are allowed"),
         ("%YAML 1.1\n---\nfileversion: 010", "fileversion is 10 but must be 1"),
         ("fileversion: !!bool maybe", "is not YAML"),
         ("fileversion: !!int ''", "is not YAML"),
