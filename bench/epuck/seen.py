@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from bench.epuck.rendered import WORLD, RenderedRun
 from bench.epuck.views import Views, views_of
-from swarm_loc_drivers.sim.epuck.epuck_world_parameters import WorldParameters, make_world
-from swarm_loc_drivers.sim.epuck.world import EpuckWorld
+from swarm_loc_drivers.sim.epuck.world import EpuckWorld, EpuckWorldParameters, make_world
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 
 _PENDING_NS = 300_000_000
@@ -48,7 +47,7 @@ class Seen:
 
 def count_seen(run: RenderedRun) -> Seen:
     """Compare detections of a run with the true positions of the markers."""
-    wishes = WorldParameters(swarm_file=str(run.swarm_file), world=WORLD, seed=run.seed)
+    wishes = EpuckWorldParameters(swarm_file=str(run.swarm_file), world=WORLD, seed=run.seed)
     swarm, world = make_world(wishes)
     counts = np.zeros(6, np.int64)
     for robot, one in enumerate(swarm.robots):

@@ -12,7 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.sim.run import ODOMETRY_DTYPE, Lateness, Records, arrival_ns, in_order_of_arrival
+from swarm_loc_drivers.sim.run import (
+    ODOMETRY_DTYPE,
+    ODOMETRY_LATENESS,
+    START_NS,
+    Lateness,
+    Records,
+    Trajectories,
+    arrival_ns,
+    in_order_of_arrival,
+)
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 
@@ -132,6 +141,25 @@ def drive(
         truth[k + 1] = roll(truth[k], speeds[k], turn_rates[k], model, step_s, noise[k])
     commanded = wheel_paths(speeds, turn_rates, model.wheel_separation, step_s)
     return Driven(truth, integrate(twist_of(commanded, model.wheel_separation)))
+
+
+def record_drive(
+    rng: np.random.Generator,
+    start: FloatArray,
+    control: Controller,
+    model: Drive,
+    *,
+    step_ns: int,
+    duration_s: float,
+    odometry_rate_hz: float,
+) -> tuple[Trajectories, Records]:
+    """Drive N robots from `start` (N, 3) at START_NS: their true tracks, and odometry of ODOMETRY_DTYPE."""
+    steps = round(duration_s * 1e9 / step_ns)
+    stamp_ns = START_NS + step_ns * np.arange(steps + 1, dtype=np.int64)
+    driven = drive(rng, start, control, model, step_s=step_ns * 1e-9, steps=steps)
+    every = round(1e9 / odometry_rate_hz / step_ns)
+    odometry = report_odometry(rng, stamp_ns, driven.reported, every, ODOMETRY_LATENESS)
+    return Trajectories(stamp_ns, driven.truth), odometry
 
 
 def integrate(twists: FloatArray) -> FloatArray:

@@ -80,6 +80,9 @@ FRAME_DTYPE = np.dtype(
 SIGHTING_DTYPE = np.dtype([("marker_id", "<u4"), ("value", "<f8", (3,))])
 """One marker: forward [m] and left [m] of the camera, its normal from the optical axis [rad]."""
 
+START_NS = 1_000 * 10**9
+"""First moment of simulated runs."""
+
 Records = NDArray[Any]
 """A structured array of one of the types above."""
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from swarm_loc_drivers.sim.droplet.droplet_world_parameters import check_droplets
+from swarm_loc_drivers.sim.droplet.world import check_droplets
 from swarm_loc_drivers.sim.epuck.world import check_swarm
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
 from swarm_loc_drivers.sim.pushbot.optics import MAX_ROBOTS, laser_hz, led_hz

@@ -18,10 +18,9 @@ from node_world import Program, Ros, stamp_ns
 from rclpy.qos import qos_profile_sensor_data
 from test_world_node import free_ports
 
-from swarm_loc_drivers.common.odometry import WheelGeometry
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import FOCAL_PX
-from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldSettings
+from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldParameters
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
 from swarm_loc_estimator.common.parameters import markdown_table
 from swarm_loc_msgs.msg import EventPacket, LaserDistance, LightBearingArray, SwarmPose, SwarmPoses
@@ -42,8 +41,7 @@ SIM_TIME = {"use_sim_time": "true"}
 
 def world() -> PushbotWorld:
     """The world of the node, to know how its robots were put together."""
-    settings = PushbotWorldSettings(SEED, floor_plan("corridor"), WheelGeometry(1e-4, 0.085))
-    return PushbotWorld(list(STARTS.values()), settings)
+    return PushbotWorld(list(STARTS.values()), floor_plan("corridor"), PushbotWorldParameters(seed=SEED))
 
 
 def true_calibration(robot: int) -> LaserCalibration:

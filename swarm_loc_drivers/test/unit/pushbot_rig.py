@@ -19,7 +19,7 @@ from swarm_loc_drivers.pushbot.session import PushbotSession, PushbotSettings, W
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
 from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, outline
-from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldSettings, SimulatedPushbot
+from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldParameters, SimulatedPushbot
 from swarm_loc_estimator.common import se2
 
 GEOMETRY = WheelGeometry(metres_per_step=1e-4, wheel_separation=0.085)
@@ -55,16 +55,16 @@ class PushbotWire:
     def __init__(
         self, settings: PushbotSettings, generation: FirmwareGeneration = SECOND_FIRMWARE, seed: int = 1
     ) -> None:
-        world = PushbotWorldSettings(
+        params = PushbotWorldParameters(
             seed=seed,
-            plan=HALL,
-            wheels=GEOMETRY,
+            metres_per_tick=GEOMETRY.metres_per_step,
+            wheel_separation=GEOMETRY.wheel_separation,
             wheel_noise=0.0,
             turn_noise=0.0,
             turn_slip=0.0,
             camera=CameraNoise(noise_rate=0.5),
         )
-        self.world = PushbotWorld([(0.0, 0.0, 0.0)], world)
+        self.world = PushbotWorld([(0.0, 0.0, 0.0)], HALL, params)
         self.firmware = PushbotFirmware(SimulatedPushbot(self.world, 0), generation)
         self.world.firmwares[0] = self.firmware
         self.counts: Counter[str] = Counter()

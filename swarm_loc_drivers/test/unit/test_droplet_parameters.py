@@ -16,7 +16,7 @@ from swarm_loc_drivers.droplet.parameters import (
     droplet_settings,
 )
 from swarm_loc_drivers.droplet.tdma import TdmaSettings
-from swarm_loc_drivers.sim.droplet.droplet_world_parameters import DropletWorldParameters
+from swarm_loc_drivers.sim.droplet.world import DropletWorldParameters
 from swarm_loc_estimator.common.parameters import ParameterError, markdown_table
 
 DOC = Path(__file__).parents[2] / "doc"

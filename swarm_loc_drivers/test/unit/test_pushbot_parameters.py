@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from swarm_loc_drivers.pushbot.parameters import ExplorationParameters, PushbotParameters, pushbot_settings
-from swarm_loc_drivers.sim.pushbot.pushbot_world_parameters import (
+from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
+from swarm_loc_drivers.sim.pushbot.world import (
     PushbotWorldParameters,
     make_pushbot_world,
 )
-from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
 from swarm_loc_drivers.sim.worlds import WorldError
 from swarm_loc_estimator.common.parameters import ParameterError, markdown_table

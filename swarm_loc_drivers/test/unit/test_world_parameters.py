@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.sim.epuck.epuck_world_parameters import WorldParameters, make_world
+from swarm_loc_drivers.sim.epuck.world import EpuckWorldParameters, make_world
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, EightSteering, describe
 from swarm_loc_drivers.sim.worlds import WORLDS
@@ -17,50 +17,50 @@ START = np.array([[0.1, 0.2, 0.3], [0.5, -0.2, 1.0]])
 
 
 @pytest.fixture
-def parameters(tmp_path: Path) -> WorldParameters:
+def parameters(tmp_path: Path) -> EpuckWorldParameters:
     save_swarm(describe(EightSettings(robots=2), START), tmp_path / "swarm.yaml")
-    return WorldParameters(
+    return EpuckWorldParameters(
         swarm_file=str(tmp_path / "swarm.yaml"), camera=CameraModel(width=64, height=48), world="w0"
     )
 
 
 def test_the_page_has_all_parameters() -> None:
     page = Path(__file__).parents[2] / "doc" / "epuck_world_node.md"
-    assert markdown_table(WorldParameters) in page.read_text(encoding="utf-8")
+    assert markdown_table(EpuckWorldParameters) in page.read_text(encoding="utf-8")
 
 
-def test_robots_begin_where_the_description_says(parameters: WorldParameters) -> None:
+def test_robots_begin_where_the_description_says(parameters: EpuckWorldParameters) -> None:
     swarm, world = make_world(parameters)
     assert [robot.name for robot in swarm.robots] == ["epuck1", "epuck2"]
     np.testing.assert_allclose(world.poses, START)
 
 
 def test_the_worlds_that_there_are_can_be_chosen() -> None:
-    (spec,) = (spec for spec in parameter_specs(WorldParameters) if spec.name == "world")
+    (spec,) = (spec for spec in parameter_specs(EpuckWorldParameters) if spec.name == "world")
     assert [spec.checked(name) for name in WORLDS] == list(WORLDS)
     with pytest.raises(ParameterError, match=r"parameter world = 'w9' must be one of w0, w2, w2fast\."):
         spec.checked("w9")
 
 
-def test_robots_without_wifi_need_serial_ports(parameters: WorldParameters) -> None:
+def test_robots_without_wifi_need_serial_ports(parameters: EpuckWorldParameters) -> None:
     with pytest.raises(ParameterError, match="parameter model = 'epuck1' needs the parameter link_folder"):
         make_world(replace(parameters, model="epuck1"))
 
 
-def test_a_family_without_a_markers_id_is_named(parameters: WorldParameters) -> None:
+def test_a_family_without_a_markers_id_is_named(parameters: EpuckWorldParameters) -> None:
     save_swarm(describe(EightSettings(robots=2), START, first_face_id=250), Path(parameters.swarm_file))
     with pytest.raises(ParameterError, match=r"parameter family = 'aruco_mip_36h12': .* has ids 0 to 249"):
         make_world(replace(parameters, family="aruco_mip_36h12"))
 
 
-def test_a_robot_without_a_start_is_named(parameters: WorldParameters) -> None:
+def test_a_robot_without_a_start_is_named(parameters: EpuckWorldParameters) -> None:
     save_swarm(describe(EightSettings(robots=2, start_known=False), START), Path(parameters.swarm_file))
     with pytest.raises(ParameterError, match=r"parameter swarm_file = .* robot 'epuck1' has no start pose"):
         make_world(parameters)
 
 
 def test_the_cameras_parameters_are_among_the_worlds() -> None:
-    names = {spec.name for spec in parameter_specs(WorldParameters)}
+    names = {spec.name for spec in parameter_specs(EpuckWorldParameters)}
     assert {"exposure_s", "width", "k1", "rate", "first_port"} <= names
 
 

@@ -39,7 +39,7 @@ for file in sorted(pathlib.Path(package.__path__[0]).rglob("*.py")):
             "swarm_loc_estimator",
             {"timeline.estimator", "cli.replay"},
         ),
-        ("swarm_loc_drivers", {"sim.run", "sim.epuck.epuck_world_parameters"}),
+        ("swarm_loc_drivers", {"sim.run", "sim.epuck.world"}),
         ("swarm_loc_vision", {"markers.detector"}),
     ],
 )

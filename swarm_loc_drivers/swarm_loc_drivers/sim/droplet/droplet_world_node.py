@@ -16,12 +16,15 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.qos import QoSProfile
 
 from swarm_loc_drivers.common.ros_messages import stamp_message, yaw_quaternion
-from swarm_loc_drivers.sim.droplet.droplet_world_parameters import (
+from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
+from swarm_loc_drivers.sim.droplet.world import (
+    STEP_NS,
     DropletWorldParameters,
+    Fix,
+    SimulatedDroplet,
+    Tracker,
     make_droplet_world,
 )
-from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
-from swarm_loc_drivers.sim.droplet.world import STEP_NS, Fix, SimulatedDroplet, Tracker
 from swarm_loc_drivers.sim.world_node import WorldNode
 from swarm_loc_estimator.common.messages.planar import planar_covariance
 from swarm_loc_estimator.common.node import run_node

@@ -20,11 +20,16 @@ from rclpy.qos import QoSProfile
 
 from swarm_loc_drivers.epuck.hardware import EPUCK_MODELS
 from swarm_loc_drivers.sim.epuck.camera_output import CameraOutput
-from swarm_loc_drivers.sim.epuck.epuck_world_parameters import WorldParameters, make_world
 from swarm_loc_drivers.sim.epuck.parts import Unanswered
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware
-from swarm_loc_drivers.sim.epuck.world import OVERHEAD, STEP_NS, SimulatedEpuck
+from swarm_loc_drivers.sim.epuck.world import (
+    OVERHEAD,
+    STEP_NS,
+    EpuckWorldParameters,
+    SimulatedEpuck,
+    make_world,
+)
 from swarm_loc_drivers.sim.render.rigs import overhead_model
 from swarm_loc_drivers.sim.world_node import WorldNode
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
@@ -38,11 +43,11 @@ _ANSWER_PATIENCE_S = 10.0
 _THROTTLE_S = 30.0
 
 
-class EpuckWorldNode(WorldNode[WorldParameters]):
+class EpuckWorldNode(WorldNode[EpuckWorldParameters]):
     """Steps the world, serves its robots' links, publishes clock, true poses and images."""
 
     def __init__(self, **node_arguments: Any) -> None:
-        super().__init__("epuck_world", WorldParameters, **node_arguments)
+        super().__init__("epuck_world", EpuckWorldParameters, **node_arguments)
         params = self.params
         swarm, self._world = make_world(params)
         self._names = [robot.name for robot in swarm.robots]

@@ -1,83 +1,35 @@
 """One world of e-pucks, stepped in simulated time: motors turn wheels, wheels slip, cameras look.
 
 The seed and the times of the robots' commands fix what happens; images are drawn only on demand, and look
-the same whenever that is.
+the same whenever that is. At the end stand the parameters of `epuck_world_node`. No ROS here.
 """
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.odometry import WheelGeometry
-from swarm_loc_drivers.epuck.hardware import (
-    FIELD_OF_VIEW,
-    PROXIMITY_BEARINGS,
-    PROXIMITY_RADIUS_M,
-    raw_of_distance,
-)
+from swarm_loc_drivers.epuck.hardware import EPUCK2, EPUCK_MODELS, wheel_geometry
 from swarm_loc_drivers.sim.differential_drive import Drive, LastingNoise, roll
+from swarm_loc_drivers.sim.epuck.parts import proximity_values
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena, CameraRig, OverheadRig, OverheadSettings
-from swarm_loc_drivers.sim.run import Trajectories
-from swarm_loc_drivers.sim.worlds import ErrorModel, WorldError, hidden_geometry, start_of
+from swarm_loc_drivers.sim.run import START_NS, Trajectories
+from swarm_loc_drivers.sim.scenarios.eight import ARENA, CAMERA_RATE_HZ
+from swarm_loc_drivers.sim.scenarios.eight_images import FAMILY
+from swarm_loc_drivers.sim.worlds import WORLDS, ErrorModel, WorldError, hidden_geometry, start_of
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text
+from swarm_loc_estimator.swarm.swarm import OdometryModel, Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.aerial.ground_control import FloorMarker
-
-_LARGEST = 4095
-_NOISE = 6.0
-_RAYS = np.array([-0.5, 0.0, 0.5]) * FIELD_OF_VIEW
-"""A sensor reports the nearest of what these rays of its cone meet."""
-
-
-def proximity_values(
-    poses: FloatArray, robot: int, arena: tuple[float, float], rng: np.random.Generator
-) -> NDArray[np.int64]:
-    """Raw values (8,) of one robot.
-
-    Args:
-        poses: (N, 3) of all robots in map.
-        robot: Index of the one.
-        arena: Its size along x and y, around map's origin [m].
-        rng: Source of the noise.
-    """
-    x, y, heading = poses[robot]
-    outwards = heading + np.array(PROXIMITY_BEARINGS)
-    origins = np.array([x, y]) + PROXIMITY_RADIUS_M * np.column_stack([np.cos(outwards), np.sin(outwards)])
-    angles = outwards[:, None] + _RAYS
-    rays = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    others = np.delete(poses[:, :2], robot, axis=0)
-    distance = np.minimum(_to_walls(origins, rays, arena), _to_discs(origins, rays, others)).min(axis=1)
-    raw = raw_of_distance(distance) + _NOISE * rng.standard_normal(len(distance))
-    return np.clip(np.rint(raw), 0, _LARGEST).astype(np.int64)
-
-
-def _to_walls(origins: FloatArray, rays: FloatArray, arena: tuple[float, float]) -> FloatArray:
-    """Along rays (S, R, 2) from origins (S, 2) to the walls (S, R) [m]; 0 from outside of them."""
-    half = 0.5 * np.array(arena)
-    with np.errstate(divide="ignore"):
-        along = (half - np.sign(rays) * origins[:, None]) / np.abs(rays)
-    nearest: FloatArray = np.maximum(along.min(axis=-1), 0.0)
-    return nearest
-
-
-def _to_discs(origins: FloatArray, rays: FloatArray, centres: FloatArray) -> FloatArray:
-    """Along rays (S, R, 2) to robots at (M, 2) (S, R) [m]; infinite where they meet none."""
-    if not len(centres):
-        return np.full(rays.shape[:2], math.inf)
-    to_centre = centres - origins[:, None, None]
-    along = (to_centre * rays[:, :, None]).sum(axis=-1)
-    beside = (to_centre**2).sum(axis=-1) - along**2
-    depth = np.sqrt(np.maximum(PROXIMITY_RADIUS_M**2 - beside, 0.0))
-    met = (beside < PROXIMITY_RADIUS_M**2) & (along > 0.0)
-    nearest: FloatArray = np.where(met, np.maximum(along - depth, 0.0), math.inf).min(axis=-1)
-    return nearest
-
+from swarm_loc_vision.aerial.ground_file import load_ground
+from swarm_loc_vision.markers.families import families
 
 GrayImage = NDArray[np.uint8]
 
@@ -312,3 +264,89 @@ def check_swarm(swarm: Swarm) -> None:
     for marker_id, owner in swarm.owner_of.items():
         if owner.marker.yaw is None:
             raise WorldError(f"marker {marker_id} has no yaw, and a simulated marker needs one.")
+
+
+@dataclass(frozen=True)
+class EpuckWorldParameters:
+    """Parameters of `epuck_world_node`; the cameras' are those of `CameraModel` and `OverheadSettings`."""
+
+    swarm_file: str = text("", "path of the swarm description; every robot needs a start", required=True)
+    world: str = choice("w2", tuple(WORLDS), "which errors robots and cameras have; see sim/worlds.py")
+    seed: int = number(1, "1", 0, 2**31 - 1, "fixes the errors")
+    rate: float = number(
+        1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
+    )
+    answer_within: float = number(
+        0.0,
+        "s",
+        0.0,
+        10.0,
+        "simulated time waits for <robot>/detections of images older than this; 0: never",
+    )
+    link_folder: str = text(
+        "", "where each robot's serial port appears under its name; empty: robots on WiFi"
+    )
+    first_port: int = number(0, "1", 0, 65000, "TCP port of the first robot on WiFi, the others follow")
+    model: str = choice("epuck2", tuple(EPUCK_MODELS), "generation of the robots; only epuck2 has WiFi")
+    wheel_diameter: float = number(0.041, "m", 0.001, 1.0, "diameter of the wheels")
+    wheel_separation: float = number(
+        OdometryModel().wheel_separation, "m", 0.001, 10.0, "distance between the two wheels"
+    )
+    arena_x: float = number(ARENA[0], "m", 0.1, 1000.0, "size of the arena along x, around the origin")
+    arena_y: float = number(ARENA[1], "m", 0.1, 1000.0, "size of the arena along y")
+    family: str = choice(FAMILY, tuple(families()), "kind of the markers")
+    camera_rate: float = number(CAMERA_RATE_HZ, "1/s", 2.0, 60.0, "images of each camera")
+    truth_rate: float = number(20.0, "1/s", 0.1, 200.0, "published true poses of each robot")
+    control_points_file: str = text(
+        "", "path of the floor markers that the overhead camera sees; empty: none are on the floor"
+    )
+    camera: CameraModel = field(default_factory=CameraModel, metadata={"numbers_of": CameraModel})
+    overhead: OverheadSettings = field(
+        default_factory=OverheadSettings, metadata={"numbers_of": OverheadSettings}
+    )
+
+
+def _floor_markers(parameters: EpuckWorldParameters) -> tuple[FloorMarker, ...]:
+    """The markers on the floor."""
+    path = parameters.control_points_file
+    if not path:
+        return ()
+    ground = load_ground(Path(path))
+    if ground.markers and ground.family.name != parameters.family:
+        raise ParameterError(
+            f"parameter family = '{parameters.family}' must be that of the floor markers in '{path}':"
+            f" {ground.family.name}."
+        )
+    return ground.markers
+
+
+def make_world(parameters: EpuckWorldParameters) -> tuple[Swarm, EpuckWorld]:
+    """The swarm as described, and its world.
+
+    Raises:
+        ParameterError: A parameter cannot be used.
+        SwarmFileError: The swarm description cannot be used.
+    """
+    if not parameters.link_folder and EPUCK_MODELS[parameters.model] is not EPUCK2:
+        raise ParameterError(
+            f"parameter model = '{parameters.model}' needs the parameter link_folder: only epuck2 has WiFi."
+        )
+    swarm = load_swarm(Path(parameters.swarm_file))
+    try:
+        arena = Arena((parameters.arena_x, parameters.arena_y), families()[parameters.family])
+        settings = EpuckWorldSettings(
+            seed=parameters.seed,
+            errors=WORLDS[parameters.world],
+            arena=arena,
+            camera=parameters.camera,
+            wheels=wheel_geometry(parameters.wheel_diameter, parameters.wheel_separation),
+            camera_rate_hz=parameters.camera_rate,
+            start_ns=START_NS,
+            overhead=parameters.overhead,
+            floor_markers=_floor_markers(parameters),
+        )
+        return swarm, EpuckWorld(swarm, settings)
+    except WorldError as error:
+        raise ParameterError(f"parameter swarm_file = '{parameters.swarm_file}': {error}") from error
+    except ValueError as error:
+        raise ParameterError(f"parameter family = '{parameters.family}': {error}") from error

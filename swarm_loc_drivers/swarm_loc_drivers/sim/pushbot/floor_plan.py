@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -78,125 +80,19 @@ def _within(x: FloatArray, y: FloatArray, rectangles: Sequence[Rectangle]) -> Bo
     return inside
 
 
-def _corridor() -> FloorPlan:
-    """The hallway of the PushBot paper, 12.0 x 3.3 m, with door niches and furniture."""
-    niches: list[Rectangle] = [
-        (2, -0.12, 2.9, 0),
-        (7, -0.12, 7.9, 0),
-        (4.5, 3.3, 5.4, 3.42),
-        (9.5, 3.3, 10.4, 3.42),
-    ]
-    furniture: list[Rectangle] = [
-        (5.5, 0, 6.3, 0.35),
-        (0, 2.6, 0.4, 3.3),
-        (11.6, 0.6, 12, 1.8),
-        (2.2, 2.9, 3.0, 3.3),
-        (8.6, 1.2, 9.0, 1.7),
-    ]
-    starts = [(1.5, 1.5), (1.5, 0.7), (1.2, 2.2), (2.3, 1.1), (2.4, 2.0)]
-    starts += [(3.2, 0.7), (3.2, 1.5), (3.3, 2.3), (4.1, 0.9), (4.1, 1.9)]
-    return FloorPlan("corridor", outline([(0, 0, 12, 3.3), *niches], furniture), np.array(starts))
+def _load() -> dict[str, FloorPlan]:
+    """The plans of `floor_plans.json`: free rectangles without solid ones, polygons, rectangular columns."""
+    plans = {}
+    data = Path(__file__).with_name("floor_plans.json").read_text(encoding="utf-8")
+    for name, plan in json.loads(data).items():
+        walls = [outline(plan["free"], plan["solid"])] if "free" in plan else []
+        walls += [polygon(corners) for corners in plan.get("polygons", ())]
+        walls += [outline([column], []) for column in plan.get("columns", ())]
+        plans[name] = FloorPlan(name, np.vstack(walls), np.array(plan["starts"]))
+    return plans
 
 
-def _office() -> FloorPlan:
-    """A hallway between four rooms."""
-    rooms: list[Rectangle] = [
-        (0, 3.2, 9, 4.7),
-        (0, 0, 4.4, 3.1),
-        (4.5, 0, 9, 3.1),
-        (0, 4.8, 3.9, 8),
-        (4.0, 4.8, 9, 8),
-    ]
-    doors: list[Rectangle] = [
-        (3.0, 3.1, 3.9, 3.2),
-        (5.2, 3.1, 6.1, 3.2),
-        (1.0, 4.7, 1.9, 4.8),
-        (7.0, 4.7, 7.9, 4.8),
-    ]
-    furniture: list[Rectangle] = [
-        (0, 0, 0.6, 1.4),
-        (1.9, 0, 3.1, 0.5),
-        (8.3, 0.8, 9, 2.2),
-        (6.2, 1.2, 7.0, 1.7),
-        (0, 7.4, 1.6, 8),
-        (3.3, 6, 3.9, 7),
-        (6.3, 6.3, 7.2, 6.9),
-        (8.5, 5.2, 9, 6.2),
-        (4.6, 4.35, 5.4, 4.7),
-    ]
-    starts = [(1.6, 3.8), (2.4, 4.2), (2.5, 3.6), (0.8, 4.2), (0.8, 3.6)]
-    return FloorPlan("office", outline([*rooms, *doors], furniture), np.array(starts))
-
-
-def _ring() -> FloorPlan:
-    """A corridor around a block, which closes a loop of 26 m."""
-    solid: list[Rectangle] = [
-        (1.5, 1.5, 6.5, 6.5),
-        (3.2, 0, 4.0, 0.3),
-        (7.75, 2.5, 8, 3.4),
-        (4.6, 7.6, 5.2, 8),
-        (0, 4.8, 0.25, 5.7),
-        (6.5, 5.0, 6.7, 5.4),
-        (1.3, 2.6, 1.5, 3.2),
-    ]
-    starts = [(0.75, 0.75), (1.5, 0.8), (0.8, 1.6), (2.2, 0.7), (0.7, 2.3)]
-    return FloorPlan("ring", outline([(0, 0, 8, 8)], solid), np.array(starts))
-
-
-def _bend() -> FloorPlan:
-    """Two legs of a corridor that meet at 60 degrees, with slanted walls and a pillar of five sides."""
-    hall = polygon(
-        [
-            (0, 0),
-            (7.0, 0),
-            (10.0, 5.196),
-            (8.1, 6.293),
-            (5.7, 2.136),
-            (4.9, 2.0),
-            (4.6, 2.4),
-            (0.5, 2.4),
-            (0, 1.9),
-        ]
-    )
-    pillar = polygon([(6.2, 0.7), (6.6, 0.6), (6.8, 0.95), (6.55, 1.25), (6.2, 1.1)])
-    cabinet = polygon([(2.0, 0), (2.0, 0.4), (2.9, 0.4), (2.9, 0)])
-    starts = [(1.0, 1.2), (1.6, 0.7), (1.7, 1.7), (2.5, 1.2), (0.7, 0.5)]
-    return FloorPlan("bend", np.vstack([hall, pillar, cabinet]), np.array(starts))
-
-
-def _atrium() -> FloorPlan:
-    """An eight-sided hall of 7 m with four columns and an alcove."""
-    lower = [(2.0, 0), (5.0, 0), (7.0, 2.0), (7.0, 3.0), (8.0, 3.0), (8.0, 4.2)]
-    upper = [(7.0, 4.2), (7.0, 5.0), (5.0, 7.0), (2.0, 7.0), (0, 5.0), (0, 2.0)]
-    hall = polygon([*lower, *upper])
-    columns = [
-        outline([(x, y, x + 0.5, y + 0.4)], []) for x, y in [(1.9, 2.1), (4.7, 1.9), (2.1, 4.6), (4.5, 4.8)]
-    ]
-    starts = [(3.5, 1.0), (2.7, 0.7), (4.3, 0.8), (3.2, 1.8), (4.0, 1.7)]
-    return FloorPlan("atrium", np.vstack([hall, *columns]), np.array(starts))
-
-
-def _tee() -> FloorPlan:
-    """Three arms of different widths, one of them with a door to a small room."""
-    free: list[Rectangle] = [(0, 0, 9, 1.8), (4.0, 1.8, 5.6, 7.0), (5.7, 3.6, 8.6, 6.6), (5.6, 4.6, 5.7, 5.5)]
-    solid: list[Rectangle] = [
-        (1.2, 1.4, 2.0, 1.8),
-        (6.8, 0, 7.5, 0.4),
-        (4.0, 4.0, 4.3, 4.8),
-        (7.4, 3.6, 8.6, 4.2),
-    ]
-    starts = [(1.0, 0.8), (0.6, 1.2), (1.6, 0.5), (2.3, 1.0), (3.0, 0.7)]
-    return FloorPlan("tee", outline(free, solid), np.array(starts))
-
-
-FLOOR_PLANS: dict[str, Callable[[], FloorPlan]] = {
-    "corridor": _corridor,
-    "office": _office,
-    "ring": _ring,
-    "bend": _bend,
-    "atrium": _atrium,
-    "tee": _tee,
-}
+FLOOR_PLANS = _load()
 
 
 def floor_plan(name: str) -> FloorPlan:
@@ -207,7 +103,7 @@ def floor_plan(name: str) -> FloorPlan:
     """
     if name not in FLOOR_PLANS:
         raise FloorPlanError(f"There is no floor plan '{name}'; there are {', '.join(FLOOR_PLANS)}.")
-    return FLOOR_PLANS[name]()
+    return FLOOR_PLANS[name]
 
 
 _PARALLEL = 1e-12

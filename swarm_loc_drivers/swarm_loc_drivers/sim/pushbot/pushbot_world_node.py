@@ -14,11 +14,12 @@ from typing import Any
 
 from swarm_loc_drivers.pushbot.hardware import GENERATIONS
 from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
-from swarm_loc_drivers.sim.pushbot.pushbot_world_parameters import (
+from swarm_loc_drivers.sim.pushbot.world import (
+    STEP_NS,
     PushbotWorldParameters,
+    SimulatedPushbot,
     make_pushbot_world,
 )
-from swarm_loc_drivers.sim.pushbot.world import STEP_NS, SimulatedPushbot
 from swarm_loc_drivers.sim.world_node import WorldNode
 from swarm_loc_estimator.common.node import run_node
 

@@ -1,30 +1,29 @@
 """One world of PushBots, stepped in simulated time: motors, slipping wheels, walls, lasers, event cameras.
 
-The seed and the times of the robots' commands fix what happens.
+The seed and the times of the robots' commands fix what happens. At the end stand the parameters of
+`pushbot_world_node`. No ROS here.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.common.odometry import WheelGeometry
+from swarm_loc_drivers.pushbot.hardware import GENERATIONS, SECOND_FIRMWARE
 from swarm_loc_drivers.sim.differential_drive import Drive, LastingNoise, roll
 from swarm_loc_drivers.sim.pushbot.event_camera import Blinking, CameraNoise
-from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, clearance
-from swarm_loc_drivers.sim.pushbot.optics import (
-    BODY_RADIUS_M,
-    HallSight,
-    Lights,
-    assembled_robots,
-)
-from swarm_loc_drivers.sim.worlds import WorldError
+from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS, FloorPlan, clearance, floor_plan
+from swarm_loc_drivers.sim.pushbot.optics import BODY_RADIUS_M, HallSight, Lights, assembled_robots
+from swarm_loc_drivers.sim.worlds import WorldError, start_of
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.swarm.swarm import Pose2
+from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text
+from swarm_loc_estimator.swarm.swarm import Pose2, Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 _FREE_RATE = 6000.0
 """A wheel at full voltage [ticks/s]; the firmware's fastest velocity needs four fifths of it."""
@@ -60,34 +59,36 @@ class Drivetrain:
 
 STEP_NS = 5_000_000
 _MS_PER_STEP = 5
+_START_NS = 1_000_000_000
 _SLIP_S = 0.05
 WHEEL_NOISE, TURN_NOISE = 1e-7, math.radians(0.64)
 """Headings err by .3 deg a root metre driven straight on, and by this for each root turn [m], [rad]."""
 
 
 @dataclass(frozen=True)
-class PushbotWorldSettings:
-    """Settings of a world.
+class PushbotWorldParameters:
+    """Parameters of `pushbot_world_node`; the event cameras' are those of `CameraNoise`."""
 
-    Attributes:
-        seed: Fixes the assembly of the robots and all noise.
-        plan: The hall.
-        wheels: Of all robots.
-        wheel_noise: Variance of a wheel's path per metre it rolls [m^2/m].
-        turn_noise: Further standard deviation of a whole turn [rad].
-        turn_slip: Share of every turn that is lost by slip [1].
-        camera: How far event cameras are from ideal ones.
-        start_ns: First moment.
-    """
-
-    seed: int
-    plan: FloorPlan
-    wheels: WheelGeometry
-    wheel_noise: float = WHEEL_NOISE
-    turn_noise: float = TURN_NOISE
-    turn_slip: float = 0.02
-    camera: CameraNoise = field(default_factory=CameraNoise)
-    start_ns: int = 1_000_000_000
+    swarm_file: str = text("", "path of the swarm description; every robot needs a start", required=True)
+    plan: str = choice("corridor", tuple(FLOOR_PLANS), "the hall")
+    seed: int = number(1, "1", 0, 2**31 - 1, "fixes the assembly of the robots, and all noise")
+    rate: float = number(
+        1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
+    )
+    turn_slip: float = number(0.02, "1", 0.0, 0.5, "share of every turn that slips")
+    wheel_noise: float = number(
+        WHEEL_NOISE, "m", 0.0, 0.01, "variance of each wheel's path per metre it rolls [m^2/m]"
+    )
+    turn_noise: float = number(
+        TURN_NOISE, "rad", 0.0, 1.0, "further error of a whole turn, one standard deviation"
+    )
+    link_folder: str = text("", "where each robot's serial port appears under its name; empty: TCP")
+    first_port: int = number(0, "1", 0, 65000, "TCP port of the first robot, the others follow; 0: any")
+    firmware: str = choice(SECOND_FIRMWARE.name, tuple(GENERATIONS), "generation of the robots' firmware")
+    metres_per_tick: float = number(1e-4, "m", 1e-6, 1e-2, "path of a wheel per tick")
+    wheel_separation: float = number(0.085, "m", 0.01, 1.0, "distance between the two wheels")
+    truth_rate: float = number(20.0, "1/s", 0.1, 200.0, "published true poses of each robot")
+    camera: CameraNoise = field(default_factory=CameraNoise, metadata={"numbers_of": CameraNoise})
 
 
 class StepsAlong(Protocol):
@@ -104,30 +105,31 @@ class PushbotWorld:
     """Robots in a hall.
 
     Args:
-        starts: Where they begin.
-        settings: How the world is.
+        starts: Start poses of the robots.
+        plan: The hall.
+        params: Errors of robots and cameras; files, links and the name of the plan are not used.
 
     Raises:
         WorldError: A robot starts within a wall or another robot.
     """
 
-    def __init__(self, starts: list[Pose2], settings: PushbotWorldSettings) -> None:
-        self._settings = settings
-        rng = np.random.default_rng(settings.seed)
+    def __init__(self, starts: list[Pose2], plan: FloorPlan, params: PushbotWorldParameters) -> None:
+        self._plan, self._params = plan, params
+        rng = np.random.default_rng(params.seed)
         count = len(starts)
-        self.now_ns = settings.start_ns
+        self.now_ns = _START_NS
         self.poses: FloatArray = np.array(starts, dtype=float).reshape(count, 3)
         """(N, 3) where the robots truly are, in map."""
         self.drivetrain = Drivetrain(count, 1e-3)
-        self.optics = assembled_robots(settings.seed, count)
+        self.optics = assembled_robots(params.seed, count)
         """Optics of the robots, for evaluation."""
         self.lights: list[Lights] = [(Blinking(), Blinking(), Blinking()) for _ in range(count)]
         """Laser, rear and front LED of each robot."""
         self.firmwares: list[StepsAlong | None] = [None] * count
-        self.sight = HallSight(settings.plan.walls, self.optics, settings.camera, rng)
+        self.sight = HallSight(plan.walls, self.optics, params.camera, rng)
         """What their cameras see."""
         self._slip = LastingNoise(rng, (count, 3), STEP_NS * 1e-9, _SLIP_S)
-        self._drive = Drive(settings.wheels.wheel_separation, settings.wheel_noise, settings.turn_slip)
+        self._drive = Drive(params.wheel_separation, params.wheel_noise, params.turn_slip)
         for robot in range(count):
             if self._is_blocked(robot, self.poses):
                 raise WorldError(f"robot {robot + 1} of the swarm begins within a wall or another robot.")
@@ -149,12 +151,12 @@ class PushbotWorld:
     def _rolled(self, ticks: FloatArray) -> FloatArray:
         """Poses after the wheels' ticks; a robot that would hit something only turns."""
         step_s = STEP_NS * 1e-9
-        left, right = (self._settings.wheels.metres_per_step * ticks / step_s).T
+        left, right = (self._params.metres_per_tick * ticks / step_s).T
         slip = self._slip.next()
         noise = np.sqrt(self._drive.wheel_noise) * slip[:, :2]
         turn_rate = (right - left) / self._drive.wheel_separation
         turns = np.abs(turn_rate) * step_s / (2.0 * np.pi)
-        turn_rate += self._settings.turn_noise * np.sqrt(turns) * slip[:, 2] / step_s
+        turn_rate += self._params.turn_noise * np.sqrt(turns) * slip[:, 2] / step_s
         poses = roll(self.poses, 0.5 * (left + right), turn_rate, self._drive, step_s, noise)
         for robot in range(len(poses)):
             if self._is_blocked(robot, poses):
@@ -164,7 +166,7 @@ class PushbotWorld:
     def _is_blocked(self, robot: int, poses: FloatArray) -> bool:
         others = np.delete(poses[:, :2], robot, axis=0)
         x, y, _ = poses[robot]
-        return bool(clearance(self._settings.plan.walls, others, BODY_RADIUS_M, x, y) < BODY_RADIUS_M)
+        return bool(clearance(self._plan.walls, others, BODY_RADIUS_M, x, y) < BODY_RADIUS_M)
 
     def _look(self, robot: int, before: FloatArray) -> None:
         """Pass the events of a robot's camera since poses `before` (N, 3) to its firmware."""
@@ -204,3 +206,18 @@ class SimulatedPushbot:
     def now_ns(self) -> int:
         """The world's time [ns]."""
         return self._world.now_ns
+
+
+def make_pushbot_world(params: PushbotWorldParameters) -> tuple[Swarm, PushbotWorld]:
+    """The swarm as described, and its world.
+
+    Raises:
+        ParameterError: A parameter cannot be used.
+        SwarmFileError: The swarm description cannot be used.
+    """
+    swarm = load_swarm(Path(params.swarm_file))
+    try:
+        starts = [start_of(robot) for robot in swarm.robots]
+        return swarm, PushbotWorld(starts, floor_plan(params.plan), params)
+    except WorldError as error:
+        raise ParameterError(f"parameter swarm_file = '{params.swarm_file}': {error}") from error

@@ -31,12 +31,13 @@ from swarm_loc_drivers.sim.droplet.world import (
 from swarm_loc_drivers.sim.run import (
     ODOMETRY_DTYPE,
     ODOMETRY_LATENESS,
+    START_NS,
     LivedRun,
     Trajectories,
     arrival_ns,
     in_order_of_arrival,
 )
-from swarm_loc_drivers.sim.scenarios.eight import START_NS, rounded
+from swarm_loc_drivers.sim.scenarios.eight import rounded
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.board_file import load_ir_platform

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.special import ellipk, ellipkinc
 
 from swarm_loc_drivers.common.velocity_command import Velocity
-from swarm_loc_drivers.sim.differential_drive import Controller, Drive, drive, report_odometry
-from swarm_loc_drivers.sim.run import ODOMETRY_LATENESS, Records, SimulatedRun, Trajectories
+from swarm_loc_drivers.sim.differential_drive import Controller, Drive, record_drive
+from swarm_loc_drivers.sim.run import Records, SimulatedRun, Trajectories
 from swarm_loc_drivers.sim.sightings import Exposures, View, observe_markers, schedule_exposures
 from swarm_loc_drivers.sim.worlds import W0, ErrorModel
 from swarm_loc_estimator.common import se2
@@ -70,7 +70,6 @@ CAMERA = CameraMount(x=0.03, z=0.08)
 VIEW = View(field_of_view=math.radians(60.0), nearest=0.12, farthest=1.5, incidence=math.radians(65.0))
 WHEEL_SEPARATION = 0.053
 CAMERA_RATE_HZ = 7.5
-START_NS = 1_000 * 10**9
 STEP_NS = 5_000_000
 
 _FIRST_FACE_ID, _FIRST_LANDMARK_ID = 10, 100
@@ -134,13 +133,11 @@ def drive_robots(
     first_face_id: int = _FIRST_FACE_ID,
 ) -> tuple[Swarm, Trajectories, Records]:
     """Drive robots from `start` (N, 3): the swarm as described, where it went, and its odometry."""
-    steps = round(settings.duration_s * 1e9 / STEP_NS)
-    stamp_ns = START_NS + STEP_NS * np.arange(steps + 1, dtype=np.int64)
     model = Drive(WHEEL_SEPARATION, settings.errors.wheel_noise, settings.errors.turn_slip)
-    driven = drive(rng, start, control, model, step_s=STEP_NS * 1e-9, steps=steps)
-    truth = Trajectories(stamp_ns, driven.truth)
-    every = round(1e9 / settings.odometry_rate_hz / STEP_NS)
-    odometry = report_odometry(rng, stamp_ns, driven.reported, every, ODOMETRY_LATENESS)
+    duration_s, rate_hz = settings.duration_s, settings.odometry_rate_hz
+    truth, odometry = record_drive(
+        rng, start, control, model, step_ns=STEP_NS, duration_s=duration_s, odometry_rate_hz=rate_hz
+    )
     return describe(settings, start, first_face_id), truth, odometry
 
 

@@ -15,8 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from swarm_loc_drivers.sim.differential_drive import Controller, Drive, drive, report_odometry
-from swarm_loc_drivers.sim.run import ODOMETRY_LATENESS, SIGHTING_DTYPE, Records, SimulatedRun, Trajectories
+from swarm_loc_drivers.sim.differential_drive import Controller, Drive, record_drive
+from swarm_loc_drivers.sim.run import (
+    SIGHTING_DTYPE,
+    Records,
+    SimulatedRun,
+    Trajectories,
+)
 from swarm_loc_drivers.sim.sightings import Exposures, View, deliver, schedule_exposures
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -138,7 +143,6 @@ ODOMETRY = OdometryModel(wheel_separation=0.053, wheel_noise=2e-5)
 ODOMETRY_RATE_HZ = 20.0
 CAMERA_RATE_HZ = 7.5
 START_SIGMA = StartSigma(x=0.01, y=0.01, theta=0.02)
-START_NS = 1_000 * 10**9
 STEP_NS = 10_000_000
 
 _FIRST_LANDMARK_ID = 1_000_000
@@ -166,18 +170,17 @@ class GridSettings:
 def simulate_grid(settings: GridSettings) -> SimulatedRun:
     """Drive the robots and record odometry and sightings."""
     rng = np.random.default_rng(settings.seed)
-    steps = round(settings.duration_s * 1e9 / STEP_NS)
-    stamp_ns = START_NS + STEP_NS * np.arange(steps + 1, dtype=np.int64)
     homes = settings.shape.homes(settings.robots)
     start = np.column_stack([homes, rng.uniform(-math.pi, math.pi, settings.robots)])
     model = Drive(ODOMETRY.wheel_separation, ODOMETRY.wheel_noise)
     control = roam(rng, homes) if settings.shape.wanders else stay(rng, homes, STEP_NS * 1e-9)
-    driven = drive(rng, start, control, model, step_s=STEP_NS * 1e-9, steps=steps)
-    truth = Trajectories(stamp_ns, driven.truth)
-    every = round(1e9 / ODOMETRY_RATE_HZ / STEP_NS)
-    odometry = report_odometry(rng, stamp_ns, driven.reported, every, ODOMETRY_LATENESS)
+    duration_s, rate_hz = settings.duration_s, ODOMETRY_RATE_HZ
+    truth, odometry = record_drive(
+        rng, start, control, model, step_ns=STEP_NS, duration_s=duration_s, odometry_rate_hz=rate_hz
+    )
     swarm = describe(rng, start, settings.shape.landmarks(homes))
-    exposures = schedule_exposures(rng, settings.robots, CAMERA_RATE_HZ, int(stamp_ns[0]), int(stamp_ns[-1]))
+    begin_ns, end_ns = truth.stamp_ns[[0, -1]].tolist()
+    exposures = schedule_exposures(rng, settings.robots, CAMERA_RATE_HZ, begin_ns, end_ns)
     frames, sightings = observe_neighbours(rng, swarm, truth, exposures, settings.shape)
     return SimulatedRun(swarm, truth, odometry, frames, sightings)
 

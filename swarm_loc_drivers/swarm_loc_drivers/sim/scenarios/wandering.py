@@ -12,14 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from swarm_loc_drivers.sim.differential_drive import Controller
-from swarm_loc_drivers.sim.run import CAMERA_LATENESS, LivedRun, arrival_ns
-from swarm_loc_drivers.sim.scenarios.eight import (
-    ARENA,
-    START_NS,
-    STEP_NS,
-    EightSettings,
-    drive_robots,
-)
+from swarm_loc_drivers.sim.run import CAMERA_LATENESS, START_NS, LivedRun, arrival_ns
+from swarm_loc_drivers.sim.scenarios.eight import ARENA, STEP_NS, EightSettings, drive_robots
 from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
