@@ -10,15 +10,11 @@ from urllib.parse import urlsplit
 
 import serial
 
-from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.common.parameters import ParameterError
 
 
 class LinkError(OSError):
     """A link cannot be opened or has broken; the message says which and why."""
-
-
-class AddressError(UserError):
-    """An address that cannot be understood; the message is one sentence."""
 
 
 class Link(Protocol):
@@ -62,10 +58,10 @@ class Address:
 
 
 def parse_address(text: str, default_port: int) -> Address:
-    """Understand `/dev/rfcomm0` or `tcp://192.168.1.1[:1000]`.
+    """The address in a parameter `address`: `/dev/rfcomm0` or `tcp://192.168.1.1[:1000]`.
 
     Raises:
-        AddressError: It is neither.
+        ParameterError: It is neither.
     """
     if text.startswith("/"):
         return Address(device=text)
@@ -75,10 +71,27 @@ def parse_address(text: str, default_port: int) -> Address:
     except ValueError:
         parts, host, port = urlsplit(""), None, None
     if parts.scheme != "tcp" or not host or parts.path or port == 0:
-        raise AddressError(
-            f"'{text}' must be the path of a serial port, such as /dev/rfcomm0, or tcp://HOST or tcp://HOST:PORT."
+        raise ParameterError(
+            f"parameter address = '{text}' must be the path of a serial port, such as /dev/rfcomm0,"
+            " or tcp://HOST or tcp://HOST:PORT."
         )
     return Address(host=host, port=port or default_port)
+
+
+def open_link(address: Address, baud_rate: int, timeout_s: float) -> Link:
+    """Open a serial port or a TCP connection.
+
+    Args:
+        address: Where the robot answers.
+        baud_rate: Of a serial port [bit/s].
+        timeout_s: Timeout of a write; connecting by TCP may take twice as long [s].
+
+    Raises:
+        LinkError: It cannot be opened.
+    """
+    if address.device:
+        return SerialLink(address.device, baud_rate, timeout_s)
+    return TcpLink(address.host, address.port, 2.0 * timeout_s)
 
 
 _BROKEN = (OSError, TypeError, termios.error)

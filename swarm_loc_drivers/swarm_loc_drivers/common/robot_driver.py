@@ -8,31 +8,14 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 from swarm_loc_drivers.common.link import Link, LinkError
+from swarm_loc_drivers.common.session import Session, SessionError
 
 _MIN_PAUSE_S, _MAX_PAUSE_S = 0.1, 2.0
 MAX_STOP_S = 3.0
 """A robot that may be running is asked, or sought, for so long before the driver gives up."""
-
-
-class SessionError(Exception):
-    """The robot answers, but not as it must; the link is opened anew."""
-
-
-class Session(Protocol):
-    """A conversation with one robot over one link, without I/O.
-
-    Attributes:
-        ending: Set it to have the robot stand and the conversation end.
-        connected: Whether the robot has answered.
-        ended: Whether the conversation has ended; the robot stands.
-    """
-
-    ending: bool
-    connected: bool
-    ended: bool
 
 
 SomeSession = TypeVar("SomeSession", bound=Session)

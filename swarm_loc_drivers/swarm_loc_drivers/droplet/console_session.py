@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Generator
 from typing import TypeVar
 
-from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.common.session import SessionError
 from swarm_loc_drivers.droplet import protocol
 from swarm_loc_drivers.droplet.hardware import HANDLING_NS, message_ns
 from swarm_loc_drivers.droplet.protocol import Echo, Said

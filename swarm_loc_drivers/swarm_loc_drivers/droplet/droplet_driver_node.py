@@ -14,7 +14,6 @@ from array import array
 from functools import partial
 from typing import Any
 
-from geometry_msgs.msg import Twist
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
@@ -22,14 +21,13 @@ from std_srvs.srv import Trigger
 from swarm_loc_drivers.common.driver_diagnostics import DriverDiagnostics
 from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
-from swarm_loc_drivers.common.ros_messages import OdometryOutput, stamp_message, transform_publisher
+from swarm_loc_drivers.common.ros_messages import stamp_message
 from swarm_loc_drivers.droplet.driver import OWN, DropletDriver, DropletListeners
 from swarm_loc_drivers.droplet.exchange import Brightness
 from swarm_loc_drivers.droplet.parameters import DropletParameters, droplet_settings
 from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import BrightnessMatrix
 
-_COMMAND_QOS = QoSProfile(depth=1)
 _BRIGHTNESS_QOS = QoSProfile(depth=50)
 _RATES = ("exchanges", "lines")
 _WRONG = {
@@ -54,8 +52,6 @@ class DropletDriverNode(RobotDriverNode[DropletParameters]):
         super().__init__("droplet_driver", DropletParameters, **node_arguments)
         settings = droplet_settings(self.params)
         robot = self.get_namespace().strip("/")
-        self._base_frame = f"{self._prefix}{self.params.base_frame}"
-        self._transforms = transform_publisher(self) if self.params.publish_tf else None
         self._brightness = self.create_publisher(BrightnessMatrix, "brightness", _BRIGHTNESS_QOS)
         self._odometry = {OWN: self._odometry_output("odom", self._prefix)}
         for name in settings.relayed:
@@ -65,17 +61,10 @@ class DropletDriverNode(RobotDriverNode[DropletParameters]):
         self._driver = DropletDriver(settings, listeners, self._now_ns)
         for name in self._odometry:
             topic = f"/{_relayed_path(robot, name)}/cmd_vel" if name else "cmd_vel"
-            self.create_subscription(Twist, topic, partial(self._on_cmd_vel, name), _COMMAND_QOS)
+            self._follow(topic, partial(self._driver.set_velocity, name))
         self.create_service(Trigger, "~/measure", self._on_measure)
         name, address = f"{self._prefix}{self.get_name()}", settings.device
         self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
-
-    def _odometry_output(self, topic: str, prefix: str) -> OdometryOutput:
-        odom_frame, base_frame = f"{prefix}{self.params.odom_frame}", f"{prefix}{self.params.base_frame}"
-        return OdometryOutput(self, topic, odom_frame, base_frame, self._transforms)
-
-    def _on_cmd_vel(self, name: str, message: Twist) -> None:
-        self._driver.set_velocity(name, (message.linear.x, message.linear.y, message.angular.z))
 
     def _on_measure(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self.params.turns or not self.params.partners:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.common.session import SessionError
 from swarm_loc_drivers.common.velocity_command import STILL, Velocity, VelocityCommand
 from swarm_loc_drivers.droplet import protocol
 from swarm_loc_drivers.droplet.console_session import ConsoleTalk, Talk, relay

@@ -85,7 +85,7 @@ class TdmaExchange:
         self._counts = counts
         self._power: int | None = None
         self._emitted = -1
-        self._kept: dict[int, tuple[int, Brightness]] = {}
+        self._kept: dict[int, Brightness] = {}  # near matrices
 
     def request(self) -> None:
         """Nobody asks where turns are taken."""
@@ -98,24 +98,28 @@ class TdmaExchange:
         if transmitter is None:
             return
         stamp_ns = said.stamp_ns - PRINTED_AFTER_NS
-        turn, half = divmod(stamp_ns // self._half_ns, 2)
-        one = brightness_of(said.event, stamp_ns, transmitter, Power.FAR if half else Power.NEAR)
-        kept = self._kept.pop(transmitter, None)
-        if kept is not None and (kept[0], Power.NEAR, one.power) == (turn, kept[1].power, Power.FAR):
+        power = Power.FAR if stamp_ns // self._half_ns % 2 else Power.NEAR
+        one = brightness_of(said.event, stamp_ns, transmitter, power)
+        near = self._kept.pop(transmitter, None)
+        if near is not None and power is Power.FAR and self._turn(near) == self._turn(one):
             self._counts["exchanges"] += 1
-            publish_pair([kept[1], one], self._publish)
+            publish_pair([near, one], self._publish)
             return
-        self._publish_alone(kept)
-        if one.power is Power.NEAR:
-            self._kept[transmitter] = turn, one
+        if near is not None:
+            self._publish_alone(near)
+        if power is Power.NEAR:
+            self._kept[transmitter] = one
         else:
-            self._publish_alone((turn, one))
+            self._publish_alone(one)
 
-    def _publish_alone(self, kept: tuple[int, Brightness] | None) -> None:
+    def _turn(self, one: Brightness) -> int:
+        """The number of the turn in which a matrix was measured."""
+        return one.stamp_ns // self._half_ns // 2
+
+    def _publish_alone(self, one: Brightness) -> None:
         """Publish the only matrix of its exchange."""
-        if kept is not None:
-            self._counts["half_exchanges"] += 1
-            publish_pair([kept[1]], self._publish)
+        self._counts["half_exchanges"] += 1
+        publish_pair([one], self._publish)
 
     def is_quiet(self, now_ns: int) -> bool:
         """Whether nobody emits now: else the robot is deaf, or prints what an echo would break."""
@@ -135,7 +139,7 @@ class TdmaExchange:
     def _expired(self, now_ns: int) -> list[int]:
         """The robots whose far matrix will not come any more."""
         latest = (now_ns - _LATE_NS) // (2 * self._half_ns)
-        return [robot for robot, (turn, _) in self._kept.items() if turn < latest]
+        return [robot for robot, near in self._kept.items() if self._turn(near) < latest]
 
     def talk(self) -> Talk[None]:
         """Publish what came alone, and emit if it is this robot's turn."""

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.common.link import Link, SerialLink, TcpLink
+from swarm_loc_drivers.common.link import Link, open_link
 from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.robot_driver import RobotDriver
-from swarm_loc_drivers.common.velocity_command import VelocityCommand
+from swarm_loc_drivers.common.velocity_command import Velocity, VelocityCommand
 from swarm_loc_drivers.epuck.odometry import WheelOdometry
 from swarm_loc_drivers.epuck.serial_session import SerialSession
 from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession, EpuckSettings
@@ -61,9 +61,10 @@ class EpuckDriver(RobotDriver[EpuckSession]):
         """It is time to ask the robot, where it has to be asked."""
         self._tick.set()
 
-    def set_velocity(self, speed: float, turn_rate: float) -> None:
-        """Drive forward [m/s] and turn to the left [rad/s] from now on."""
-        self._command.set((speed, 0.0, turn_rate))
+    def set_velocity(self, velocity: Velocity) -> None:
+        """Follow a velocity from now on; wheels ignore its component to the left."""
+        forward, _, turn_rate = velocity
+        self._command.set((forward, 0.0, turn_rate))
         self._tick.set()
 
     def begin_to_stop(self) -> None:
@@ -73,9 +74,7 @@ class EpuckDriver(RobotDriver[EpuckSession]):
 
     def _open(self) -> Link:
         settings = self._settings
-        if settings.address.device:
-            return SerialLink(settings.address.device, settings.baud_rate, settings.reply_timeout_s)
-        return TcpLink(settings.address.host, settings.address.port, 2.0 * settings.reply_timeout_s)
+        return open_link(settings.address, settings.baud_rate, settings.reply_timeout_s)
 
     def _begin(self) -> EpuckSession:
         if self._settings.address.device:

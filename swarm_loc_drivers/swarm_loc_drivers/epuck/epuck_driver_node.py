@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Transform, TransformStamped, Twist, Vector3
+from geometry_msgs.msg import Transform, TransformStamped, Vector3
 from numpy.typing import NDArray
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, Image, Range
@@ -23,11 +23,9 @@ from tf2_msgs.msg import TFMessage
 from swarm_loc_drivers.common.driver_diagnostics import DriverDiagnostics
 from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
 from swarm_loc_drivers.common.ros_messages import (
-    OdometryOutput,
     camera_info_message,
     image_message,
     stamp_message,
-    transform_publisher,
     yaw_quaternion,
 )
 from swarm_loc_drivers.epuck.driver import EpuckDriver, EpuckListeners
@@ -44,7 +42,6 @@ from swarm_loc_drivers.epuck.session import CameraImage
 from swarm_loc_estimator.common.node import run_node
 
 _PROXIMITY_NAMES = tuple(f"ps{sensor}" for sensor in range(len(PROXIMITY_BEARINGS)))
-_COMMAND_QOS = QoSProfile(depth=1)
 _TF_STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _RATES = ("readings", "images")
 _WRONG = {
@@ -67,18 +64,15 @@ class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
         super().__init__("epuck_driver", EpuckParameters, **node_arguments)
         parameters = self.params
         settings = epuck_settings(parameters)
-        self._base_frame = f"{self._prefix}{parameters.base_frame}"
         self._camera_frame = f"{self._prefix}camera_optical_frame"
         self._calibration = camera_calibration(parameters, settings.camera) if settings.camera else None
-        transforms = transform_publisher(self) if parameters.publish_tf else None
-        odom_frame = f"{self._prefix}{parameters.odom_frame}"
-        odometry = OdometryOutput(self, "odom", odom_frame, self._base_frame, transforms)
+        odometry = self._odometry_output("odom", self._prefix)
         listeners = EpuckListeners(odometry.publish, self._publish_proximity, self._publish_image)
         self._driver = EpuckDriver(settings, listeners, self._now_ns)
         self._advertise()
         name, address = f"{self._prefix}{self.get_name()}", str(settings.address)
         self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
-        self.create_subscription(Twist, "cmd_vel", self._on_cmd_vel, _COMMAND_QOS)
+        self._follow("cmd_vel", self._driver.set_velocity)
         self.create_timer(1.0 / parameters.reading_rate, self._driver.tick)
 
     def _advertise(self) -> None:
@@ -94,9 +88,6 @@ class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
         self._tf_static = self.create_publisher(TFMessage, "/tf_static", _TF_STATIC_QOS)
         sensors = _proximity_transforms(self._now_ns(), self._base_frame, self._prefix)
         self._tf_static.publish(TFMessage(transforms=sensors))
-
-    def _on_cmd_vel(self, message: Twist) -> None:
-        self._driver.set_velocity(message.linear.x, message.angular.z)
 
     def _publish_proximity(self, stamp_ns: int, raw: NDArray[np.int64]) -> None:
         if any(publisher.get_subscription_count() for publisher in self._proximity):

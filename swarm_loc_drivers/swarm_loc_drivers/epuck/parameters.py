@@ -10,7 +10,7 @@ from swarm_loc_drivers.common.calibration_file import (
     CameraCalibration,
     load_calibration,
 )
-from swarm_loc_drivers.common.link import Address, AddressError, parse_address
+from swarm_loc_drivers.common.link import Address, parse_address
 from swarm_loc_drivers.epuck import wifi_protocol as epuck_wifi
 from swarm_loc_drivers.epuck.hardware import EPUCK2, EPUCK_MODELS, EpuckModel, wheel_geometry
 from swarm_loc_drivers.epuck.session import CameraSettings, EpuckSettings
@@ -69,7 +69,7 @@ def epuck_settings(parameters: EpuckParameters) -> EpuckSettings:
     Raises:
         ParameterError: One cannot be used, or does not go with another.
     """
-    address, model = _address(parameters), EPUCK_MODELS[parameters.model]
+    address, model = parse_address(parameters.address, epuck_wifi.PORT), EPUCK_MODELS[parameters.model]
     if address.host and model is not EPUCK2:
         raise ParameterError(
             f"parameter model = '{model.name}' does not go with address = '{address}': only epuck2 has WiFi."
@@ -101,13 +101,6 @@ def camera_calibration(parameters: EpuckParameters, camera: CameraSettings) -> C
         return load_calibration(Path(parameters.camera_info_file), camera.width, camera.height)
     except CalibrationFileError as error:
         raise ParameterError(f"parameter camera_info_file: {error}") from error
-
-
-def _address(parameters: EpuckParameters) -> Address:
-    try:
-        return parse_address(parameters.address, epuck_wifi.PORT)
-    except AddressError as error:
-        raise ParameterError(f"parameter address = {error}") from error
 
 
 def _camera(parameters: EpuckParameters, address: Address, model: EpuckModel) -> CameraSettings:

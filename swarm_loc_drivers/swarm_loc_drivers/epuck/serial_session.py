@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Generator
-from typing import TypeVar
+from collections.abc import Callable
 
 import numpy as np
 
-from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.common.session import SessionError, Talk, TalkSession
 from swarm_loc_drivers.epuck import serial_protocol as protocol
 from swarm_loc_drivers.epuck.hardware import decode_rgb565
 from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, EpuckSettings, Reading, Speeds
@@ -18,12 +17,8 @@ _MAX_MISSED = 5
 """So many exchanges in a row without an answer, and the link is opened anew."""
 _NS = 1_000_000_000
 
-Result = TypeVar("Result")
-Talk = Generator[None, None, Result]
-"""Goes on at every step."""
 
-
-class SerialSession:
+class SerialSession(TalkSession):
     """Asks for readings at every step that finds it idle, and for images in between; see `EpuckSession`.
 
     Args:
@@ -36,30 +31,16 @@ class SerialSession:
     def __init__(
         self, settings: EpuckSettings, speeds: Speeds, doubt: Callable[[], None], counts: Counter[str]
     ) -> None:
-        self.ending = self.connected = self.ended = self.is_idle = False
+        super().__init__(counts)
+        self.is_idle = False
         self.found: list[Reading | CameraImage] = []
         self._settings = settings
         self._wanted_speeds = speeds
         self._doubt = doubt
-        self._counts = counts
-        self._received = self._output = b""
-        self._now_ns, self._steady_s = 0, 0.0
-        self._told = (0, 0)
+        self._sent = (0, 0)
         self._missed = 0
         self._image_due_ns = 0
         self._way_ns = 0
-        self._talk = self._run()
-
-    def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
-        """See `EpuckSession.step`."""
-        self._received += data
-        self._now_ns, self._steady_s = now_ns, steady_s
-        try:
-            next(self._talk)
-        except StopIteration:
-            self.ended = True
-        output, self._output = self._output, b""
-        return output
 
     def _run(self) -> Talk[None]:
         yield from self._resync()
@@ -99,10 +80,10 @@ class SerialSession:
     def _read(self, speeds: tuple[int, int]) -> Talk[bool]:
         """Counters and proximity; taken in the middle between question and answer."""
         asked_ns = self._now_ns
-        body = yield from self._ask(protocol.readings_request(*speeds, is_new=speeds != self._told))
+        body = yield from self._ask(protocol.readings_request(*speeds, is_new=speeds != self._sent))
         if body is None:
             return False
-        self._told = speeds
+        self._sent = speeds
         self._way_ns = max(0, self._now_ns - asked_ns) // 2
         left, right, proximity = protocol.decode_readings(body)
         stamp_ns, sensors = asked_ns + self._way_ns, np.array(proximity, dtype=np.int64)
@@ -136,7 +117,9 @@ class SerialSession:
         self._received = b""
         self._output += request.data
         parser = protocol.ReplyParser(request)
-        deadline_s = self._deadline_s(len(request.data) + request.size + 2 * len(request.mark))
+        deadline_s = self._steady_s + self._timeout_s(
+            len(request.data) + request.size + 2 * len(request.mark)
+        )
         while self._steady_s < deadline_s:
             yield
             received, self._received = self._received, b""
@@ -147,44 +130,39 @@ class SerialSession:
                 return body
         return None
 
-    def _deadline_s(self, bytes_in_all: int) -> float:
-        """Until when an answer must have come, if so many bytes are under way."""
-        settings = self._settings
-        return self._steady_s + settings.reply_timeout_s + 20.0 * bytes_in_all / settings.baud_rate
+    def _timeout_s(self, bytes_in_all: int) -> float:
+        """How long an exchange of so many bytes may take [s]."""
+        return self._settings.reply_timeout_s + 20.0 * bytes_in_all / self._settings.baud_rate
 
     def _set_camera(self, camera: CameraSettings) -> Talk[None]:
         """Choose the size of images, and check that the robot has really taken it."""
         setting = protocol.camera_setting(camera.width, camera.height, camera.zoom)
-        yield from self._line(lambda: (setting, protocol.ASCII_CAMERA_SET))
-        answer = yield from self._line(lambda: (protocol.ASCII_CAMERA_QUERY, protocol.ASCII_CAMERA_REPLY))
+        yield from self._answer(setting, protocol.ASCII_CAMERA_SET)
+        answer = yield from self._answer(protocol.ASCII_CAMERA_QUERY, protocol.ASCII_CAMERA_REPLY)
         wanted = (protocol.RGB565_MODE, camera.width, camera.height, camera.zoom)
         taken = tuple(int(number) for number in answer.groups()[:4])
         if taken != wanted:
             raise SessionError(f"the robot's camera is set to {taken} though {wanted} was asked for")
 
     def _resync(self) -> Talk[None]:
-        """Bring the robot back to idle, whatever bytes were lost, and tell it the speeds of the moment.
+        """Bring the robot back to idle, whatever bytes were lost, and send the current speeds.
 
-        It may hear and not be heard; so each attempt says what the wheels are to do when it is made.
+        Each attempt sends the speeds of its moment, since the robot may hear and not be heard.
         """
-
-        def attempt() -> tuple[bytes, re.Pattern[bytes]]:
-            self._counts["resyncs"] += 1
-            self._told = self._speeds()
-            return protocol.resync(*self._told), protocol.speed_reply(*self._told)
-
-        yield from self._line(attempt)
-
-    def _line(self, attempt: Callable[[], tuple[bytes, re.Pattern[bytes]]]) -> Talk[re.Match[bytes]]:
-        """The answer to an ASCII line, behind whatever was still under way; both as each attempt has them."""
         for _ in range(_MAX_MISSED):
-            line, answer = attempt()
-            self._received = b""
-            self._output += line
-            deadline_s = self._deadline_s(len(line))
-            while self._steady_s < deadline_s:
-                yield
-                if match := answer.search(self._received):
-                    self._received = b""
-                    return match
+            self._counts["resyncs"] += 1
+            self._sent = self._speeds()
+            line = protocol.resync(*self._sent)
+            answer = protocol.speed_reply(*self._sent)
+            if (yield from self._ask_once(line, answer, self._timeout_s(len(line)))) is not None:
+                self._received = b""
+                return
+        raise SessionError("the robot does not answer")
+
+    def _answer(self, line: bytes, answer: re.Pattern[bytes]) -> Talk[re.Match[bytes]]:
+        """The answer to an ASCII line, which is sent several times."""
+        for _ in range(_MAX_MISSED):
+            if (match := (yield from self._ask_once(line, answer, self._timeout_s(len(line))))) is not None:
+                self._received = b""
+                return match
         raise SessionError("the robot does not answer")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.link import Address
 from swarm_loc_drivers.common.odometry import WheelGeometry
-from swarm_loc_drivers.common.robot_driver import Session
+from swarm_loc_drivers.common.session import Session
 from swarm_loc_drivers.epuck.hardware import EpuckModel, Image
 
 Speeds = Callable[[], tuple[int, int]]

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.common.session import SessionError
 from swarm_loc_drivers.epuck import wifi_protocol as protocol
 from swarm_loc_drivers.epuck.hardware import decode_rgb565
 from swarm_loc_drivers.epuck.session import CameraImage, EpuckSettings, Reading, Speeds
@@ -60,8 +61,8 @@ class WifiSession:
         self._speeds = speeds
         self._counts = counts
         self._parser = protocol.StreamParser()
-        self._said: protocol.Command | None = None
-        self._said_s = -math.inf
+        self._sent: protocol.Command | None = None
+        self._sent_s = -math.inf
         self._heard: tuple[int, float] | None = None
         self._arrivals: dict[int, _Arrival] = {}
         self._due_ns = 0
@@ -69,14 +70,14 @@ class WifiSession:
     def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
         """See `EpuckSession.step`."""
         self._check_silence(bool(data), now_ns, steady_s)
-        newest: dict[int, tuple[int, protocol.Message]] = {}
+        newest: dict[int, protocol.Message] = {}
         for message in self._parsed(data, now_ns):
             self.connected = True
             self.ended |= self.ending and message.id == protocol.NOTHING_ID
             before = self._arrivals.get(message.id)
             arrival = before.next(message.stamp_ns) if before else _Arrival(message.stamp_ns)
             if before is not None and not before.is_late and not arrival.is_late:
-                newest[message.id] = before.stamp_ns, message
+                newest[message.id] = replace(message, stamp_ns=before.stamp_ns)
             self._arrivals[message.id] = arrival
         self._keep(newest)
         return self._command(steady_s)
@@ -102,18 +103,20 @@ class WifiSession:
         self._counts["resyncs"] += self._parser.resyncs - resyncs
         return messages
 
-    def _keep(self, newest: dict[int, tuple[int, protocol.Message]]) -> None:
+    def _keep(self, newest: dict[int, protocol.Message]) -> None:
         """Note what the newest messages of each kind say: of those that come at once the last is fresh."""
         if protocol.SENSORS_ID in newest:
-            stamp_ns, message = newest[protocol.SENSORS_ID]
-            if self._is_due(stamp_ns):
+            message = newest[protocol.SENSORS_ID]
+            if self._is_due(message.stamp_ns):
                 values = message.sensors
                 left, right = int(values["left_counter"]), int(values["right_counter"])
-                self.found.append(Reading(stamp_ns, 0, left, right, values["proximity"].astype(np.int64)))
+                self.found.append(
+                    Reading(message.stamp_ns, 0, left, right, values["proximity"].astype(np.int64))
+                )
         if protocol.IMAGE_ID in newest:
-            stamp_ns, message = newest[protocol.IMAGE_ID]
+            message = newest[protocol.IMAGE_ID]
             pixels = decode_rgb565(message.payload, protocol.WIDTH, protocol.HEIGHT)
-            self.found.append(CameraImage(stamp_ns, pixels))
+            self.found.append(CameraImage(message.stamp_ns, pixels))
 
     def _is_due(self, stamp_ns: int) -> bool:
         """Whether a reading is the next to be used; the period is kept on average."""
@@ -128,7 +131,7 @@ class WifiSession:
         left, right = self._speeds() if self.connected and not self.ending else (0, 0)
         streams = not self.ending
         command = protocol.Command(left, right, camera=self._camera and streams, sensors=streams)
-        if command == self._said and steady_s <= self._said_s + _REPEAT_S:
+        if command == self._sent and steady_s <= self._sent_s + _REPEAT_S:
             return b""
-        self._said, self._said_s = command, steady_s
+        self._sent, self._sent_s = command, steady_s
         return command.encode()

@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from swarm_loc_drivers.common.link import Link, SerialLink, TcpLink
+from swarm_loc_drivers.common.link import Link, open_link
 from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.robot_driver import RobotDriver
-from swarm_loc_drivers.common.velocity_command import VelocityCommand
+from swarm_loc_drivers.common.velocity_command import Velocity, VelocityCommand
 from swarm_loc_drivers.pushbot.event_packets import EventPacket
 from swarm_loc_drivers.pushbot.hardware import wheel_velocities
 from swarm_loc_drivers.pushbot.odometry import PushbotOdometry
@@ -53,15 +53,14 @@ class PushbotDriver(RobotDriver[PushbotSession]):
         self._odometry = PushbotOdometry(settings.geometry, settings.wheel_noise, self.counts)
         self._read_s = 0.0
 
-    def set_velocity(self, speed: float, turn_rate: float) -> None:
-        """Drive forward [m/s] and turn to the left [rad/s] from now on."""
-        self._command.set((speed, 0.0, turn_rate))
+    def set_velocity(self, velocity: Velocity) -> None:
+        """Follow a velocity from now on; wheels ignore its component to the left."""
+        forward, _, turn_rate = velocity
+        self._command.set((forward, 0.0, turn_rate))
 
     def _open(self) -> Link:
         settings = self._settings
-        if settings.address.device:
-            return SerialLink(settings.address.device, settings.baud_rate, settings.reply_timeout_s)
-        return TcpLink(settings.address.host, settings.address.port, 2.0 * settings.reply_timeout_s)
+        return open_link(settings.address, settings.baud_rate, settings.reply_timeout_s)
 
     def _begin(self) -> PushbotSession:
         self._odometry.restart()

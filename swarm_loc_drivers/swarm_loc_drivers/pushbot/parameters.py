@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from swarm_loc_drivers.common.link import Address, AddressError, parse_address
+from swarm_loc_drivers.common.link import parse_address
 from swarm_loc_drivers.common.odometry import WheelGeometry
 from swarm_loc_drivers.pushbot.hardware import BAUD_RATE, TIMESTAMPS
 from swarm_loc_drivers.pushbot.protocol import Lights
@@ -57,7 +57,7 @@ def pushbot_settings(parameters: PushbotParameters) -> PushbotSettings:
         _frequency("led_frequency", parameters.led_frequency),
     )
     return PushbotSettings(
-        address=_address(parameters),
+        address=parse_address(parameters.address, TCP_PORT),
         baud_rate=parameters.baud_rate,
         geometry=WheelGeometry(parameters.metres_per_tick, parameters.wheel_separation),
         wheel_noise=parameters.wheel_noise,
@@ -75,13 +75,6 @@ def _frequency(name: str, value: float) -> float:
     if 0.0 < value < _MIN_FREQUENCY:
         raise ParameterError(f"parameter {name} = {value} must be 0, or at least {_MIN_FREQUENCY:g} Hz.")
     return value
-
-
-def _address(parameters: PushbotParameters) -> Address:
-    try:
-        return parse_address(parameters.address, TCP_PORT)
-    except AddressError as error:
-        raise ParameterError(f"parameter address = {error}") from error
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,12 @@ from array import array
 from functools import partial
 from typing import Any
 
-from geometry_msgs.msg import Twist
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
 
 from swarm_loc_drivers.common.driver_diagnostics import DriverDiagnostics
 from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
-from swarm_loc_drivers.common.ros_messages import OdometryOutput, stamp_message, transform_publisher
+from swarm_loc_drivers.common.ros_messages import stamp_message
 from swarm_loc_drivers.pushbot.driver import PushbotDriver, PushbotListeners
 from swarm_loc_drivers.pushbot.event_packets import EventPacket
 from swarm_loc_drivers.pushbot.event_parser import precompile
@@ -30,7 +29,6 @@ from swarm_loc_msgs.msg import EventPacket as EventPacketMessage
 
 EVENT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Half a second of packets."""
-_COMMAND_QOS = QoSProfile(depth=1)
 _RATES = ("events", "packets", "readings")
 _WRONG = {
     "bad_cmd_vel": "velocities that were not finite, or absurd",
@@ -51,12 +49,9 @@ class PushbotDriverNode(RobotDriverNode[PushbotParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("pushbot_driver", PushbotParameters, **node_arguments)
-        parameters = self.params
-        settings = pushbot_settings(parameters)
+        settings = pushbot_settings(self.params)
         precompile()
-        transforms = transform_publisher(self) if parameters.publish_tf else None
-        frames = f"{self._prefix}{parameters.odom_frame}", f"{self._prefix}{parameters.base_frame}"
-        odometry = OdometryOutput(self, "odom", *frames, transforms)
+        odometry = self._odometry_output("odom", self._prefix)
         self._camera_frame = f"{self._prefix}event_camera_optical_frame"
         self._events = self.create_publisher(EventPacketMessage, "events", EVENT_QOS)
         self._driver = PushbotDriver(
@@ -64,10 +59,7 @@ class PushbotDriverNode(RobotDriverNode[PushbotParameters]):
         )
         name, address = f"{self._prefix}{self.get_name()}", str(settings.address)
         self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
-        self.create_subscription(Twist, "cmd_vel", self._on_cmd_vel, _COMMAND_QOS)
-
-    def _on_cmd_vel(self, message: Twist) -> None:
-        self._driver.set_velocity(message.linear.x, message.angular.z)
+        self._follow("cmd_vel", self._driver.set_velocity)
 
     def _publish(self, packet: EventPacket) -> None:
         message = EventPacketMessage(

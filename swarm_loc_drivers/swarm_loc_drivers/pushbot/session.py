@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
 
 from swarm_loc_drivers.common.link import Address
 from swarm_loc_drivers.common.odometry import WheelGeometry
-from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.common.session import SessionError, Talk, TalkSession
 from swarm_loc_drivers.pushbot import protocol
 from swarm_loc_drivers.pushbot.clocks import EventClock, TickClock
 from swarm_loc_drivers.pushbot.event_packets import EventPacket, EventPackets
@@ -78,15 +77,9 @@ _BOOT_S = 2.0
 _ATTEMPTS = 3
 _REPEAT_S = 0.4
 """A velocity that does not change is told again after so long; a decaying one holds for a second."""
-_MAX_RECEIVED = 1 << 16
-"""Bytes kept while an answer is awaited: a camera may still be streaming."""
-
-Result = TypeVar("Result")
-Talk = Generator[None, None, Result]
-"""Goes on at every step."""
 
 
-class PushbotSession:
+class PushbotSession(TalkSession):
     """Goes on whenever there are bytes, or time has passed.
 
     Args:
@@ -103,36 +96,12 @@ class PushbotSession:
     """
 
     def __init__(self, settings: PushbotSettings, velocities: Velocities, counts: Counter[str]) -> None:
-        self.ending = self.connected = self.ended = False
+        super().__init__(counts)
         self.found: list[WheelTicks | EventPacket] = []
         self.generation: FirmwareGeneration | None = None
         self._settings = settings
         self._velocities = velocities
-        self._counts = counts
-        self._received = self._output = b""
-        self._now_ns, self._steady_s = 0, 0.0
         self._told, self._told_s = (0, 0), 0.0
-        self._talk = self._run()
-
-    def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
-        """Go on; what to send.
-
-        Args:
-            data: What has come since the last step.
-            now_ns: The time, which may be simulated, stand still or jump back; 0 is none.
-            steady_s: Real time.
-
-        Raises:
-            SessionError: The robot does not answer, or not as it must.
-        """
-        self._received += data
-        self._now_ns, self._steady_s = now_ns, steady_s
-        try:
-            next(self._talk)
-        except StopIteration:
-            self.ended = True
-        output, self._output = self._output, b""
-        return output
 
     def _run(self) -> Talk[None]:
         yield from self._answer(protocol.RESET, protocol.BANNER, _BOOT_S)
@@ -146,7 +115,7 @@ class PushbotSession:
         settings = self._settings
         self._output += protocol.NO_ECHO
         listing = yield from self._answer(protocol.LIST_SENSORS, protocol.LAST_SENSORS, 0.0)
-        generation = self.generation = protocol.generation_of(listing)
+        generation = self.generation = protocol.generation_of(listing.string[: listing.end()])
         if generation is None:
             raise SessionError("the board's firmware has no wheels: it is not one built for PushBots")
         if settings.timestamps:
@@ -165,21 +134,15 @@ class PushbotSession:
             )
         wanted = protocol.event_format(generation, timestamps) + protocol.QUERY_FORMAT
         answer = yield from self._answer(wanted, protocol.FORMAT, 0.0)
-        if int(answer.strip()[-1:]) != generation.formats[timestamps]:
-            raise SessionError(f"the robot answers {answer!r} to the choice of timestamps '{timestamps}'")
+        if int(answer[1]) != generation.formats[timestamps]:
+            raise SessionError(f"the robot answers {answer[0]!r} to the choice of timestamps '{timestamps}'")
 
-    def _answer(self, request: bytes, pattern: re.Pattern[bytes], extra_s: float) -> Talk[bytes]:
-        """What came up to the end of an answer, which is taken; the question is asked up to three times."""
+    def _answer(self, request: bytes, pattern: re.Pattern[bytes], extra_s: float) -> Talk[re.Match[bytes]]:
+        """The answer to a request, which is sent up to three times."""
         for _ in range(_ATTEMPTS):
-            self._received = b""
-            self._output += request
-            deadline_s = self._steady_s + self._settings.reply_timeout_s + extra_s
-            while self._steady_s < deadline_s:
-                yield
-                if match := pattern.search(self._received):
-                    answer, self._received = self._received[: match.end()], self._received[match.end() :]
-                    return answer if pattern is protocol.LAST_SENSORS else match[0]
-                self._received = self._received[-_MAX_RECEIVED:]
+            timeout_s = self._settings.reply_timeout_s + extra_s
+            if (match := (yield from self._ask_once(request, pattern, timeout_s))) is not None:
+                return match
         raise SessionError(f"the robot does not answer {request.split()[0].decode()}")
 
     def _stream(self, generation: FirmwareGeneration) -> Talk[None]:

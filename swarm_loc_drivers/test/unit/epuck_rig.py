@@ -92,7 +92,8 @@ class Bench:
             if self._silent.is_set():
                 self.driver.tick()
             else:
-                self.driver.set_velocity(*self.velocity)
+                forward, turn_rate = self.velocity
+                self.driver.set_velocity((forward, 0.0, turn_rate))
 
     def fall_silent(self) -> None:
         """No velocities any more; ticks go on."""

@@ -12,7 +12,7 @@ from epuck_body import GEOMETRY, DrivenBody
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.odometry import OdometryState
-from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.common.session import SessionError
 from swarm_loc_drivers.epuck.hardware import EpuckModel
 from swarm_loc_drivers.epuck.odometry import WheelOdometry
 from swarm_loc_drivers.epuck.serial_session import SerialSession

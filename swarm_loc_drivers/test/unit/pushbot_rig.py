@@ -10,7 +10,7 @@ import numpy as np
 
 from swarm_loc_drivers.common.link import Address
 from swarm_loc_drivers.common.odometry import OdometryState, WheelGeometry
-from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.common.session import SessionError
 from swarm_loc_drivers.pushbot.event_packets import EventPacket
 from swarm_loc_drivers.pushbot.hardware import SECOND_FIRMWARE, FirmwareGeneration
 from swarm_loc_drivers.pushbot.odometry import PushbotOdometry

@@ -14,7 +14,7 @@ from epuck_wire import MS, SECOND, Wire
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.link import Address
-from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.common.session import SessionError
 from swarm_loc_drivers.epuck import serial_protocol as protocol
 from swarm_loc_drivers.epuck.hardware import EPUCK1, EPUCK2
 from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, EpuckSettings, Reading
