@@ -12,9 +12,8 @@ from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.messages import GridMessage
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimate import Status
-from swarm_loc_estimator.watch.about import about
 from swarm_loc_estimator.watch.frames import Frame, map_frame, places_frame, poses_frame
-from swarm_loc_estimator.watch.recording import recording
+from swarm_loc_estimator.watch.page import about, recording
 
 _MAP_EVERY_S = 20.0
 

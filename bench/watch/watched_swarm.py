@@ -14,7 +14,6 @@ from swarm_loc_estimator.common.messages.estimates import EstimateMessage
 from swarm_loc_estimator.mapping.messages import GridMessage
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.sightings import Sightings
-from swarm_loc_estimator.watch.about import about
 from swarm_loc_estimator.watch.access import Access
 from swarm_loc_estimator.watch.frames import (
     Frame,
@@ -24,6 +23,7 @@ from swarm_loc_estimator.watch.frames import (
     poses_frame,
     sightings_frame,
 )
+from swarm_loc_estimator.watch.page import about
 from swarm_loc_estimator.watch.server import Answer, Command, WatchServer
 
 SWARM = Swarm(

@@ -29,7 +29,7 @@ from swarm_loc_estimator.common.command_line import (
 )
 from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.common.trajectory import interpolate
-from swarm_loc_estimator.nodes.player.playback import clock_step_ns
+from swarm_loc_estimator.nodes.playback import clock_step_ns
 from swarm_loc_estimator.offline.live.graph import Recorder, read_poses
 from swarm_loc_estimator.offline.live.run import (
     Agreement,

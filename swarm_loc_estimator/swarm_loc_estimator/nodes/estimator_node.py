@@ -36,11 +36,14 @@ from swarm_loc_estimator.nodes.estimator_diagnostics import (
     overload_report,
     shedding_report,
 )
-from swarm_loc_estimator.nodes.estimator_inputs import EstimatorInputs, StaticTransforms, newest_time_ns
-from swarm_loc_estimator.nodes.estimator_outputs import EstimateOutputs
-from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
-from swarm_loc_estimator.nodes.load.fusion_pace import FusionPace
-from swarm_loc_estimator.nodes.load.shedding import Shedding
+from swarm_loc_estimator.nodes.estimator_topics import (
+    EstimateOutputs,
+    EstimatorInputs,
+    StaticTransforms,
+    newest_time_ns,
+)
+from swarm_loc_estimator.nodes.load import FusionPace, Shedding
+from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.nodes.set_pose import NO_CLOCK, PoseCommands
 from swarm_loc_estimator.precompile import precompile
 from swarm_loc_estimator.sensors.ingest import Ingest

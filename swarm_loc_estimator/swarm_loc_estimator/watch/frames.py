@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -21,6 +22,10 @@ from swarm_loc_estimator.timeline.sightings import Sightings
 
 _TYPES = {"float64": "f8", "float32": "f4", "int32": "i4", "uint8": "u1", "int8": "i1"}
 _ALIGNMENT = 8
+SPAN_NS = 180_000_000_000
+MAX_BYTES = 24_000_000
+_SPACING_NS = {"poses": 200_000_000, "truth": 200_000_000, "map": 5_000_000_000}
+_ELSE_NS = 500_000_000
 
 
 class Frame(NamedTuple):
@@ -127,3 +132,56 @@ def map_frame(stamp_ns: int, grid: GridMessage) -> Frame:
     height, width = grid.cells.shape
     shape = {"width": width, "height": height, "resolution": grid.resolution, "origin": grid.origin}
     return pack("map", stamp_ns, {"cells": grid.cells}, **shape)
+
+
+class History:
+    """A ring of frames.
+
+    Args:
+        span_ns: How far it reaches back.
+        max_bytes: How much it may hold; the oldest frames go first.
+    """
+
+    def __init__(self, span_ns: int = SPAN_NS, max_bytes: int = MAX_BYTES) -> None:
+        self._span_ns = span_ns
+        self._max_bytes = max_bytes
+        self._frames: deque[Frame] = deque()
+        self._bytes = 0
+        self._newest_of: dict[str, Frame] = {}
+        self._kept_ns: dict[str, int] = {}
+
+    def add(self, frame: Frame) -> bool:
+        """Take a frame in; returns whether time has jumped back, which begins the history anew."""
+        before = self._newest_of.get(frame.kind)
+        jumped = before is not None and frame.kind == "poses" and frame.stamp_ns < before.stamp_ns
+        if jumped:
+            self.clear()
+        self._newest_of[frame.kind] = frame
+        spacing_ns = _SPACING_NS.get(frame.kind, _ELSE_NS)
+        if frame.stamp_ns < self._kept_ns.get(frame.kind, -spacing_ns) + spacing_ns:
+            return jumped
+        self._kept_ns[frame.kind] = frame.stamp_ns
+        self._frames.append(frame)
+        self._bytes += len(frame.data)
+        first_ns = frame.stamp_ns - self._span_ns
+        while self._frames and (self._bytes > self._max_bytes or self._frames[0].stamp_ns < first_ns):
+            self._bytes -= len(self._frames.popleft().data)
+        return jumped
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._frames.clear()
+        self._newest_of.clear()
+        self._kept_ns.clear()
+        self._bytes = 0
+
+    def frames(self) -> list[Frame]:
+        """All that is kept, and the newest of each kind, in the order of their arrival."""
+        kept = list(self._frames)
+        known = set(map(id, kept))
+        return kept + [frame for frame in self._newest_of.values() if id(frame) not in known]
+
+    @property
+    def size(self) -> int:
+        """Bytes held in the ring."""
+        return self._bytes

@@ -24,9 +24,9 @@ from swarm_loc_estimator.common.messages.estimates import EstimateMessage, Swarm
 from swarm_loc_estimator.common.messages.markers import MarkersEncoder
 from swarm_loc_estimator.common.messages.planar import PLANE, planar_covariance
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
+from swarm_loc_estimator.nodes.parameters import MarkersParameters
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.sightings import Sightings
-from swarm_loc_estimator.watch.markers_parameters import MarkersParameters
 from swarm_loc_msgs.msg import SwarmPoses, SwarmSightings
 
 _LOOK_S = 0.5

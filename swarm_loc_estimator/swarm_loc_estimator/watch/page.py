@@ -1,11 +1,19 @@
-"""The page as one text: markup, style and scripts in one, for the server and for a report alike."""
+"""The page as one text, what it gets before any frame, and a recorded run inside it."""
 
 from __future__ import annotations
 
 import base64
+import gzip
 import hashlib
+import json
+import struct
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
+
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.watch.frames import Frame
 
 _FOLDER = Path(__file__).parent / "page"
 _SCRIPTS = (
@@ -19,6 +27,9 @@ _SCRIPTS = (
     "panel.js",
     "actions.js",
 )
+_ALIGNMENT = 8
+_BODY_PER_WHEELS = 0.66
+"""Radius of a robot's body by the distance of its wheels, as of an e-puck."""
 
 
 @lru_cache(maxsize=1)
@@ -34,7 +45,7 @@ def page(data: str = "") -> str:
     """The page.
 
     Args:
-        data: A recorded run (see `recording.py`) to play; "": the page asks its server for a live one.
+        data: A recorded run (see `recording`) to play; "": the page asks its server for a live one.
     """
     markup, style, script = _parts()
     body, end = markup.split("<!-- data -->")
@@ -49,3 +60,38 @@ def content_security_policy() -> str:
         f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; img-src data:;"
         " connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     )
+
+
+def recording(about: dict[str, Any], frames: Iterable[Frame]) -> str:
+    """The text: base64 of gzip of the length of a JSON text, that text, and the frames.
+
+    Args:
+        about: What the page is told first, see `about`.
+        frames: In the order of their stamps.
+    """
+    head = json.dumps(about).encode()
+    head += b" " * (-(4 + len(head)) % _ALIGNMENT)
+    whole = b"".join([struct.pack("<I", len(head)), head, *(frame.data for frame in frames)])
+    return base64.b64encode(gzip.compress(whole, compresslevel=6, mtime=0)).decode("ascii")
+
+
+def about(swarm: Swarm, title: str, *, teleop: bool = False, commands: bool = True) -> dict[str, Any]:
+    """The swarm for the page.
+
+    Args:
+        swarm: Its description.
+        title: Heading of the page.
+        teleop: Whether robots may be driven.
+        commands: Whether poses may be set and the estimator reset.
+    """
+    landmarks = [[mark.id, mark.x, mark.y, mark.yaw] for mark in swarm.landmarks]
+    return {
+        "kind": "about",
+        "title": title,
+        "names": [robot.name for robot in swarm.robots],
+        "radius": [round(_BODY_PER_WHEELS * one.odometry.wheel_separation, 4) for one in swarm.robots],
+        "infrared": [int(robot.ir is not None and robot.camera is None) for robot in swarm.robots],
+        "landmarks": landmarks,
+        "teleop": teleop,
+        "commands": commands,
+    }

@@ -12,8 +12,8 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
+from swarm_loc_estimator.nodes.parameters import WatchParameters
 from swarm_loc_estimator.watch.server import Answer, Command
-from swarm_loc_estimator.watch.watch_parameters import WatchParameters
 from swarm_loc_msgs.srv import SetRobotPose
 
 _MAX_WAITING = 64

@@ -30,15 +30,14 @@ from swarm_loc_estimator.common.messages.estimates import SwarmPosesReader, deco
 from swarm_loc_estimator.common.messages.typestore import SWARM_POSES
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
+from swarm_loc_estimator.nodes.parameters import WatchParameters
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.watch.about import about
 from swarm_loc_estimator.watch.access import Access
 from swarm_loc_estimator.watch.frames import Frame, map_frame, poses_frame, sightings_frame
-from swarm_loc_estimator.watch.newest_messages import NewestMessages
+from swarm_loc_estimator.watch.page import about
 from swarm_loc_estimator.watch.robot_commands import RobotCommands
-from swarm_loc_estimator.watch.robot_places import AerialNames, Places
+from swarm_loc_estimator.watch.robot_places import AerialNames, NewestMessages, Places
 from swarm_loc_estimator.watch.server import WatchServer
-from swarm_loc_estimator.watch.watch_parameters import WatchParameters
 from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities, SwarmPoses, SwarmSightings
 
 _FLEETING = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)

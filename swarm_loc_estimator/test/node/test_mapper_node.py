@@ -22,7 +22,7 @@ from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.grid import CELL
 from swarm_loc_estimator.mapping.map_file import load_map
 from swarm_loc_estimator.mapping.scans import Readings
-from swarm_loc_estimator.nodes.mapper.mapper_node import MapperNode
+from swarm_loc_estimator.nodes.mapper_node import MapperNode
 from swarm_loc_msgs.msg import LaserDistance
 
 START = (1.0, 1.0, 0.3)

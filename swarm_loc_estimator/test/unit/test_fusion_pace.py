@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from swarm_loc_estimator.nodes.load.fusion_pace import FusionPace
+from swarm_loc_estimator.nodes.load import FusionPace
 
 TICK_NS = 50_000_000
 T0_NS = 1_000_000_000_000

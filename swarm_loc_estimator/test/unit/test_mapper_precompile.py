@@ -10,7 +10,7 @@ from compiled_code import compiled_since, printed_by_process, signatures
 
 from swarm_loc_estimator.mapping.mapper_feed import FixCovariances
 from swarm_loc_estimator.mapping.settings import MapperSettings
-from swarm_loc_estimator.nodes.mapper.precompile import precompile
+from swarm_loc_estimator.nodes.mapper_precompile import precompile
 from swarm_loc_estimator.offline.map_replay import replay_map
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 

@@ -16,12 +16,14 @@ from swarm_loc_estimator.common.parameters import (
     markdown_table,
     parameter_specs,
 )
-from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
-from swarm_loc_estimator.nodes.mapper.mapper_parameters import MapperParameters
-from swarm_loc_estimator.nodes.player.player_parameters import PlayerParameters
+from swarm_loc_estimator.nodes.parameters import (
+    EstimatorParameters,
+    MapperParameters,
+    MarkersParameters,
+    PlayerParameters,
+    WatchParameters,
+)
 from swarm_loc_estimator.timeline.settings import Settings
-from swarm_loc_estimator.watch.markers_parameters import MarkersParameters
-from swarm_loc_estimator.watch.watch_parameters import WatchParameters
 
 DOC = Path(__file__).parents[2] / "doc"
 

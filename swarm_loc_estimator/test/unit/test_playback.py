@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from swarm_loc_estimator.common.bags.bag_file import RawMessage
-from swarm_loc_estimator.nodes.player.playback import LONGEST_STEP_NS, STEP_S, PlayedSoFar, play
+from swarm_loc_estimator.nodes.playback import LONGEST_STEP_NS, STEP_S, PlayedSoFar, play
 
 SECOND = 1_000_000_000
 T0_NS = 500 * SECOND

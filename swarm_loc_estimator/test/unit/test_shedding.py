@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from swarm_loc_estimator.nodes.load.shedding import MIN_SHARE, Shedding
+from swarm_loc_estimator.nodes.load import MIN_SHARE, Shedding
 
 PERIOD_S = 0.05
 HORIZON_S = 2.0

@@ -15,11 +15,9 @@ from hypothesis import strategies as st
 from processor_wait import THIS_THREAD, waited_s
 
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.watch.about import about
 from swarm_loc_estimator.watch.access import Access, AccessError
-from swarm_loc_estimator.watch.frames import Frame, pack, unpack
-from swarm_loc_estimator.watch.history import History
-from swarm_loc_estimator.watch.page import content_security_policy, page
+from swarm_loc_estimator.watch.frames import Frame, History, pack, unpack
+from swarm_loc_estimator.watch.page import about, content_security_policy, page
 from swarm_loc_estimator.watch.server import Answer, Command, ServerError, ServerLoad, WatchServer
 
 SECOND = 1_000_000_000

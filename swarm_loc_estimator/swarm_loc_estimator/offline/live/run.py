@@ -15,7 +15,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.launch import GraphOptions, NodeSpec, ParameterValue, graph_nodes
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.nodes.estimator_parameters import EstimatorParameters
+from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.offline.live.graph import (
     START_PATIENCE_S,
     LiveError,

@@ -28,7 +28,6 @@ from swarm_loc_estimator.offline.report.table import (
     text_report,
 )
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.watch.about import about
 from swarm_loc_estimator.watch.frames import (
     Frame,
     aerial_frame,
@@ -37,8 +36,7 @@ from swarm_loc_estimator.watch.frames import (
     poses_frame,
     sightings_frame,
 )
-from swarm_loc_estimator.watch.page import page
-from swarm_loc_estimator.watch.recording import recording
+from swarm_loc_estimator.watch.page import about, page, recording
 
 
 @dataclass(frozen=True)

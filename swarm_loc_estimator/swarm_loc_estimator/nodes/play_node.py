@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Sequence
 from functools import partial
 from importlib import import_module
 from itertools import takewhile
@@ -18,16 +19,17 @@ from typing import Any
 from rclpy.duration import Duration
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
+from rosbags.interfaces import Qos, QosDurability, QosLiveliness, QosReliability, QosTime
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from swarm_loc_estimator.common.bags.reader import BagReader, BagTopic, RawMessage
 from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.node import ConfiguredNode, Stop, run_node
 from swarm_loc_estimator.common.parameters import ParameterError
-from swarm_loc_estimator.nodes.player.playback import STEP_S, PlayedSoFar, play
-from swarm_loc_estimator.nodes.player.player_parameters import PlayerParameters
-from swarm_loc_estimator.nodes.player.playing_qos import RELIABLE, playing_qos
+from swarm_loc_estimator.nodes.parameters import PlayerParameters
+from swarm_loc_estimator.nodes.playback import STEP_S, PlayedSoFar, play
 
 _CLOCK = "clock"
 _POLL_S = 0.05
@@ -40,6 +42,22 @@ also by a radio, whose lost packets are asked for again only every 3 s."""
 _AT_ONCE = Duration(nanoseconds=0)
 _RUN_ON_S = 0.25
 """The clock runs on for so long behind the last message, so that nodes that work by timers use it, too."""
+DEPTH = 1000
+"""The player's own, whatever the recorded publisher kept: deep enough for any rate."""
+RELIABLE = QoSProfile(depth=DEPTH)
+"""Subscribers that ask for reliability hear it, and those that do not."""
+LATCHED = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_LATCHED_TOPICS = frozenset({"tf_static", "robot_description", "map"})
+
+_RELIABILITY = {
+    QosReliability.RELIABLE: ReliabilityPolicy.RELIABLE,
+    QosReliability.BEST_EFFORT: ReliabilityPolicy.BEST_EFFORT,
+}
+_LIVELINESS = {
+    QosLiveliness.AUTOMATIC: LivelinessPolicy.AUTOMATIC,
+    QosLiveliness.MANUAL_BY_TOPIC: LivelinessPolicy.MANUAL_BY_TOPIC,
+}
+_LONGEST_NS = 2**63 - 1
 
 
 class PlayNode(ConfiguredNode[PlayerParameters]):
@@ -174,6 +192,39 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
                 self._own_executor.spin_once(timeout_sec=_POLL_S)
         if silent and not stop.requested:
             self.get_logger().warning(f"not everything was received on {listed([*silent])}")
+
+
+def playing_qos(topic: str, recorded: Sequence[Qos]) -> QoSProfile:
+    """The profile to publish a topic with.
+
+    Args:
+        topic: Its name in the bag.
+        recorded: Those of its publishers. Where these differ, or none is known, it is reliable, and latched
+            if its name says so.
+    """
+    profiles = [_profile(one) for one in recorded]
+    if profiles and all(one == profiles[0] for one in profiles):
+        return profiles[0]
+    return LATCHED if topic in _LATCHED_TOPICS else RELIABLE
+
+
+def _profile(recorded: Qos) -> QoSProfile:
+    """A recorded profile; policies that only ask for some default become this player's."""
+    latched = recorded.durability is QosDurability.TRANSIENT_LOCAL
+    return QoSProfile(
+        # of a latched topic, late subscribers get as much as they used to
+        depth=recorded.depth if latched and 0 < recorded.depth < DEPTH else DEPTH,
+        reliability=_RELIABILITY.get(recorded.reliability, RELIABLE.reliability),
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        liveliness=_LIVELINESS.get(recorded.liveliness, LivelinessPolicy.AUTOMATIC),
+        deadline=_duration(recorded.deadline),
+        lifespan=_duration(recorded.lifespan),
+        liveliness_lease_duration=_duration(recorded.liveliness_lease_duration),
+    )
+
+
+def _duration(time: QosTime) -> Duration:
+    return Duration(nanoseconds=min(time.sec * 1_000_000_000 + time.nsec, _LONGEST_NS))
 
 
 main = partial(run_node, "play", PlayNode)

@@ -1,1 +1,0 @@
-"""The mapper as a node."""

@@ -1,1 +1,0 @@
-"""The player of bags as a node."""
