@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -42,3 +45,38 @@ def test_a_digest_sees_contents_names_and_facts() -> None:
     assert digest != stamps.digest(files[:1], "fact")
     assert digest != stamps.digest(files, "facts")
     assert digest != stamps.digest(files, "fa", "ct")
+
+
+@pytest.mark.parametrize(("patience_s", "said"), [(0.0, "Another set-up of this workspace"), (60.0, "")])
+def test_only_a_long_wait_for_another_setup_is_reported(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    patience_s: float,
+    said: str,
+) -> None:
+    monkeypatch.setattr(stamps, "STATE", tmp_path)
+    reported, entered = threading.Event(), threading.Event()
+    monkeypatch.setattr("builtins.print", _noting(print, reported))
+
+    def second() -> None:
+        with stamps.only_one(patience_s):
+            entered.set()
+
+    with stamps.only_one(60.0):
+        waiting = threading.Thread(target=second)
+        waiting.start()
+        assert not said or reported.wait(30.0)
+        assert not entered.is_set()
+    waiting.join(30.0)
+    assert entered.is_set()
+    assert capsys.readouterr().out.startswith(said)
+    assert reported.is_set() == bool(said)
+
+
+def _noting(function: Callable[..., None], called: threading.Event) -> Callable[..., None]:
+    def noting(*arguments: object, **options: Any) -> None:
+        function(*arguments, **options)
+        called.set()
+
+    return noting

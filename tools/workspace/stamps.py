@@ -8,6 +8,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
+import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -61,13 +62,18 @@ class Stamp:
 
 
 @contextmanager
-def only_one() -> Iterator[None]:
-    """Hold the workspace's lock, so that two set-ups do not meet; the kernel frees it when a holder dies."""
+def only_one(patience_s: float = 2.0) -> Iterator[None]:
+    """Hold the workspace's lock, so that two set-ups do not meet; the kernel frees it when a holder dies.
+
+    Args:
+        patience_s: Waiting longer is reported. Nodes that start at once hold the lock for a moment each.
+    """
     STATE.mkdir(exist_ok=True)
+    sentence = "Another set-up of this workspace is running: waiting for it."
     with (STATE / "lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            print("Another set-up of this workspace is running: waiting for it.", flush=True)
-            fcntl.flock(lock, fcntl.LOCK_EX)
+        report = threading.Timer(patience_s, print, [sentence], {"flush": True})
+        report.daemon = True
+        report.start()
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        report.cancel()
         yield

@@ -36,7 +36,7 @@ robots:
 landmarks:
   100: {x: 1.2, y: -0.4, yaw: 3.14159, size: 0.05}      # yaw null or left out: shows no heading
 ```
-Numbers, units, ranges and defaults are those of the classes in `core.description`.
+Numbers, units, ranges and defaults are those of the classes in `swarm/swarm.py`.
 """
 
 from __future__ import annotations
@@ -94,6 +94,26 @@ _MAX_ID = 2**32 - 1
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _MAX_NAME = 64
 """Characters; topics and frames are built from names, and DDS bounds them."""
+RESERVED_NAMES = frozenset(
+    [
+        "aerial",
+        "clock",
+        "diagnostics",
+        "estimator",
+        "map",
+        "mapper",
+        "odom",
+        "parameter_events",
+        "player",
+        "rosout",
+        "swarm",
+        "tf",
+        "tf_static",
+        "visitation",
+        "watch",
+    ]
+)
+"""Topics, nodes and frames of the workspace and of ROS; a robot's name is a namespace beside them."""
 MAX_ROBOTS = 1000
 """So many have been simulated and run live; larger swarms are not known to work."""
 MAX_STATES = 10_000
@@ -159,6 +179,9 @@ class _Loader(TreeChecks):
         named = self._named(sections.get("robots", {}), "robots")
         if not named:
             raise self.said("robots is empty but must name at least one robot")
+        if taken := [name for name, _ in named if name in RESERVED_NAMES]:
+            rule = f"must be none of {', '.join(sorted(RESERVED_NAMES))}, which topics, nodes and frames have"
+            raise self.error("a name in robots", taken[0], rule)
         if len(named) > MAX_ROBOTS:
             raise self.said(f"robots names {len(named)} robots but must name at most {MAX_ROBOTS}")
         robots = tuple(self._robot(name, tree, defaults, types) for name, tree in named)

@@ -233,6 +233,13 @@ def test_one_sentence_names_key_value_and_range(tmp_path: Path, old: str, new: s
     assert error_of(tmp_path, EXAMPLE.replace(old, new, 1)) == sentence
 
 
+@pytest.mark.parametrize("name", ["map", "swarm", "aerial", "estimator", "tf"])
+def test_names_that_topics_and_frames_have_are_refused(tmp_path: Path, name: str) -> None:
+    assert "\n  four:" in EXAMPLE
+    said = error_of(tmp_path, EXAMPLE.replace("\n  four:", f"\n  {name}:"))
+    assert said.startswith(f"a name in robots is '{name}' but must be none of aerial, clock,")
+
+
 @pytest.mark.parametrize(
     ("text", "part"),
     [
