@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,8 +38,7 @@ _SAME_VIEW_NS = 4_000_000_000
 _MAX_SIGHTINGS = 2000
 
 
-@dataclass(frozen=True)
-class CameraSightings:
+class CameraSightings(NamedTuple):
     """Uncalibrated sightings of one robot's camera where the ground truth is known.
 
     Attributes:
@@ -59,9 +59,6 @@ class CameraSightings:
     target: IntArray
     lone: FloatArray
 
-    def __getitem__(self, rows: BoolArray | IntArray) -> CameraSightings:
-        return CameraSightings(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
-
     @property
     def independent_share(self) -> float:
         """Share of independent sightings, at most 1."""
@@ -74,15 +71,15 @@ def sightings_of(recording: Recording, swarm: Swarm, observer: int) -> CameraSig
     logged = _logged(recording, swarm, observer)
     truth = recording.truth.get(swarm.robots[observer].name)
     if truth is None:
-        return logged[np.zeros(logged.stamp_ns.size, dtype=bool)]
+        return chosen(logged, slice(0))
     known, lone = _observer_known(truth, logged.stamp_ns)
     for target in np.unique(logged.target[logged.target >= 0]).tolist():
         rows = logged.target == target
         other = recording.truth.get(swarm.robots[target].name)
         known[rows] &= other is not None and _dense_around(other, logged.stamp_ns[rows])
     known &= np.isnan(lone[:, 0]) | (logged.target < 0)  # a lone pose gives no time of exposure
-    rows = np.flatnonzero(known)
-    return replace(logged, lone=lone)[rows[:: max(1, -(-rows.size // _MAX_SIGHTINGS))]]
+    used = chosen(logged._replace(lone=lone), known)
+    return chosen(used, slice(None, None, max(1, -(-used.stamp_ns.size // _MAX_SIGHTINGS))))
 
 
 def true_values(

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 
@@ -21,9 +21,29 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.offline.calibration.camera import DENSE_GAP_NS
 from swarm_loc_estimator.offline.calibration.robust import ridge
+from swarm_loc_estimator.sensors.messages import chosen
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
 from swarm_loc_estimator.swarm.swarm import OdometryModel
 
+LONGEST_DELAY_S = 0.5
+LONGEST_LAG_S = 1.0
+
+WINDOW_S = 5.0
+"""Length of the windows in which motion is compared."""
+
+_SHORT_WINDOW_S = 0.5
+_NODES = (0, 2, 5)
+"""Numbers of points above 0 that are tried for the table; 0: one scale factor."""
+_BLOCKS = 5
+_CLEAR_SIGMAS = 2.0
+_NEAR_ZERO = 0.05
+_CLEARLY = 0.85
+"""Delay and lag are used if they reduce the errors of short windows to this share."""
+_MOVING = 1e-3
+"""Slower robots stand still [m/s, rad/s]."""
+_SMOOTHNESS, _TO_ONE = 0.02, 0.001
+"""Weights of the priors that neighbouring scale factors are equal, and that they are 1."""
+_FIRST_LATENESS = (0.05, 0.1)
 GRID_S = 0.02
 _SETTLING_S = 5.0
 
@@ -64,6 +84,27 @@ class TrueMotion:
     known: npt.NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class Drive:
+    """One robot's reported and true motion."""
+
+    steps: Steps
+    motion: TrueMotion
+
+
+@dataclass(frozen=True)
+class Lateness:
+    """Delay of the true motion after the reported one.
+
+    Attributes:
+        delay_s: Dead time.
+        lag_s: Time constant of a first-order lag.
+    """
+
+    delay_s: float
+    lag_s: float
+
+
 def steps_of(track: Trajectory, model: OdometryModel) -> Steps:
     """The reported motion between messages; zero for steps that the estimator would reject."""
     duration_s = np.maximum(np.diff(track.stamp_ns) * 1e-9, 1e-6)
@@ -101,64 +142,21 @@ def windows(motion: TrueMotion, length_s: float) -> tuple[IntArray, IntArray]:
     return first, first + length
 
 
-def gathered(
-    values: FloatArray, steps: Steps, motion: TrueMotion, delay_s: float, lag_s: float
-) -> FloatArray:
+def gathered(values: FloatArray, drive: Drive, late: Lateness) -> FloatArray:
     """Integral (g, p) over the grid of rates (n, p) that are constant during steps, with delay and lag."""
-    ends = (steps.stamp_ns - steps.stamp_ns[0]) * 1e-9 + delay_s
+    steps, time_s = drive.steps, drive.motion.time_s
+    ends = (steps.stamp_ns - steps.stamp_ns[0]) * 1e-9 + late.delay_s
     total = np.concatenate(
         [np.zeros((1, values.shape[1])), np.cumsum(values * steps.duration_s[:, None], axis=0)]
     )
-    share = np.interp(motion.time_s, ends, np.arange(ends.size))
+    share = np.interp(time_s, ends, np.arange(ends.size))
     row = np.minimum(share.astype(np.int64), ends.size - 2)
     on_grid: FloatArray = total[row] + (share - row)[:, None] * (total[row + 1] - total[row])
-    if lag_s <= 0.0:
+    if late.lag_s <= 0.0:
         return on_grid
-    remaining = np.exp(-GRID_S / lag_s)
+    remaining = np.exp(-GRID_S / late.lag_s)
     lagged: FloatArray = lfilter([1.0 - remaining], [1.0, -remaining], on_grid, axis=0)
     return lagged
-
-
-LONGEST_DELAY_S = 0.5
-LONGEST_LAG_S = 1.0
-
-WINDOW_S = 5.0
-"""Length of the windows in which motion is compared."""
-
-_SHORT_WINDOW_S = 0.5
-_NODES = (0, 2, 5)
-"""Numbers of points above 0 that are tried for the table; 0: one scale factor."""
-_BLOCKS = 5
-_CLEAR_SIGMAS = 2.0
-_NEAR_ZERO = 0.05
-_CLEARLY = 0.85
-"""Delay and lag are used if they reduce the errors of short windows to this share."""
-_MOVING = 1e-3
-"""Slower robots stand still [m/s, rad/s]."""
-_SMOOTHNESS, _TO_ONE = 0.02, 0.001
-"""Weights of the priors that neighbouring scale factors are equal, and that they are 1."""
-_FIRST_LATENESS = (0.05, 0.1)
-
-
-@dataclass(frozen=True)
-class Drive:
-    """One robot's reported and true motion."""
-
-    steps: Steps
-    motion: TrueMotion
-
-
-@dataclass(frozen=True)
-class Lateness:
-    """Delay of the true motion after the reported one.
-
-    Attributes:
-        delay_s: Dead time.
-        lag_s: Time constant of a first-order lag.
-    """
-
-    delay_s: float
-    lag_s: float
 
 
 def fit_lateness(drives: Sequence[Drive]) -> Lateness:
@@ -173,11 +171,9 @@ def fit_lateness(drives: Sequence[Drive]) -> Lateness:
             moving = np.abs(drive.steps.speed) > _MOVING
             values = drive.steps.turn_rate[:, None] * np.column_stack([moving, ~moving])
             first, last = windows(drive.motion, _SHORT_WINDOW_S)
-            integral = gathered(values, drive.steps, drive.motion, delay_s, lag_s)
-            basis, wanted = (
-                integral[last] - integral[first],
-                drive.motion.turn[last] - drive.motion.turn[first],
-            )
+            integral = gathered(values, drive, Lateness(delay_s, lag_s))
+            basis, turn = integral[last] - integral[first], drive.motion.turn
+            wanted = turn[last] - turn[first]
             share = ridge(basis, wanted, 1e-9 * np.eye(2), np.ones(2), rounds=2)
             total += float(np.sum(np.abs(wanted - basis @ share)))  # not squared: slip is no delay
         return total
@@ -228,14 +224,16 @@ def fit_response(drives: Sequence[Drive], late: Lateness, *, table: bool) -> Mot
     grids = [_grid(drives, count) for count in (_NODES if table else _NODES[:1])]
     held_out = [_held_out_error(drives, late, *grid) for grid in grids]
     best = held_out[int(np.argmin([np.mean(errors) for errors in held_out]))]
-    chosen = next(
+    smallest = next(
         grid
         for grid, errors in zip(grids, held_out, strict=True)
         if np.mean(errors - best) <= _CLEAR_SIGMAS * np.std(errors - best) / np.sqrt(_BLOCKS - 1)
     )
-    tables = [_solved(_regression(drives, late, *chosen, column), *chosen).round(4) for column in range(2)]
+    tables = [
+        _solved(_regression(drives, late, *smallest, column), *smallest).round(4) for column in range(2)
+    ]
     return MotionResponse(
-        *(tuple(axis.tolist()) for axis in chosen),
+        *(tuple(axis.tolist()) for axis in smallest),
         *(tuple(tuple(row) for row in table.tolist()) for table in tables),
     )
 
@@ -261,7 +259,7 @@ def _held_out_error(
         for block in range(_BLOCKS):
             held_out = (rows.block == block) & (rows.last_block == block)
             fitted = (rows.block != block) & (rows.last_block != block)
-            shares = _solved(rows[fitted], speeds, turn_rates).ravel()
+            shares = _solved(chosen(rows, fitted), speeds, turn_rates).ravel()
             error = rows.wanted[held_out] - rows.basis[held_out] @ shares
             total[block] += np.mean(np.abs(error)) / np.mean(np.abs(rows.wanted))
     return total
@@ -272,8 +270,7 @@ def hats(values: FloatArray, nodes: FloatArray) -> FloatArray:
     return np.column_stack([np.interp(values, nodes, row) for row in np.eye(nodes.size)])
 
 
-@dataclass(frozen=True)
-class _Regression:
+class _Regression(NamedTuple):
     """Linear regression of the true motion in windows by scale factors.
 
     Attributes:
@@ -288,9 +285,6 @@ class _Regression:
     block: IntArray
     last_block: IntArray
 
-    def __getitem__(self, rows: NDArray[np.bool_]) -> _Regression:
-        return _Regression(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
-
 
 def _regression(
     drives: Sequence[Drive], late: Lateness, speeds: FloatArray, turn_rates: FloatArray, column: int
@@ -304,7 +298,7 @@ def _regression(
         )
         reported = steps.turn_rate if column else steps.speed
         values = weight.reshape(reported.size, -1) * reported[:, None]
-        integral = gathered(values, steps, motion, late.delay_s, late.lag_s)
+        integral = gathered(values, drive, late)
         true = motion.turn if column else motion.path
         first, last = windows(motion, WINDOW_S)
         bases.append(integral[last] - integral[first])
@@ -351,7 +345,7 @@ def explained(drives: Sequence[Drive], late: Lateness, response: MotionResponse 
             turn_rate = hats(np.abs(steps.turn_rate), np.array(response.turn_rates))
             for column, table in enumerate((response.speed_share, response.turn_share)):
                 reported[:, column] *= np.einsum("nv,vw,nw->n", speed, np.array(table), turn_rate)
-        integral = gathered(reported, steps, motion, late.delay_s, late.lag_s)
+        integral = gathered(reported, drive, late)
         first, last = windows(motion, WINDOW_S)
         true = np.column_stack([motion.path, motion.turn])
         errors.append((true[last] - true[first]) - (integral[last] - integral[first]))

@@ -90,7 +90,8 @@ def read_dataset(folder: Path) -> Dataset:
         )
     barcodes = _table(folder / "Barcodes.dat", 2)
     landmarks = _table(folder / "Landmark_Groundtruth.dat", 3)
-    sparse = _sparse_truth(folder / "sparse_groundtruth.csv")
+    path = folder / "sparse_groundtruth.csv"
+    sparse = _table(path, 5, delimiter=",") if path.exists() else np.empty((0, 5))
     remarks: list[str] = []
     robots = tuple(_read_robot(folder, subject, sparse, remarks) for subject in subjects)
     dataset = Dataset(
@@ -214,11 +215,6 @@ def _truth(folder: Path, subject: int, sparse: FloatArray, remarks: list[str]) -
     return Trajectory(_nanoseconds(table[:, 0]), pose)
 
 
-def _sparse_truth(path: Path) -> FloatArray:
-    """(N, 5) subject, time, x, y, theta; empty without the file."""
-    return _table(path, 5, delimiter=",") if path.exists() else np.empty((0, 5))
-
-
 def _table(path: Path, columns: int, delimiter: str | None = None) -> FloatArray:
     """The first columns (N, `columns`) of a text file of numbers."""
     try:
@@ -227,16 +223,10 @@ def _table(path: Path, columns: int, delimiter: str | None = None) -> FloatArray
             table = np.loadtxt(path, comments="#", delimiter=delimiter, usecols=range(columns), ndmin=2)
     except (OSError, ValueError) as error:
         raise MrclamError(f"'{path}' cannot be read: {' '.join(str(error).split())}.") from error
-    if len(table) and not np.isfinite(table).all():
-        raise MrclamError(
-            f"'{path}' holds a number that is not finite in row {_first_bad(table)} of its data."
-        )
+    bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
+    if bad.size:
+        raise MrclamError(f"'{path}' holds a number that is not finite in row {bad[0] + 1} of its data.")
     return table.reshape(-1, columns)
-
-
-def _first_bad(table: FloatArray) -> int:
-    """The first row, counted from 1, with a number that is not finite."""
-    return int(np.flatnonzero(~np.isfinite(table).all(axis=1))[0]) + 1
 
 
 def _in_order(table: FloatArray) -> FloatArray:
