@@ -89,7 +89,7 @@ def outcome_of(result: ReplayResult) -> Outcome:
     since_s = (result.stamp_ns - begin_ns) * 1e-9
     first_s = [float(since_s[known[:, robot]].min(initial=np.inf)) for robot in range(known.shape[1])]
     settled = result.stamp_ns >= begin_ns + SETTLED_S * 1e9
-    whole = result.chosen(settled).overall
+    whole = result.select(settled).overall
     return Outcome(
         result.title,
         100.0 * whole.position_mean,

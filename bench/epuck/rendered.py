@@ -153,7 +153,7 @@ def _lived(listener: Listener, swarm: Swarm, begin_ns: int) -> tuple[ReplayResul
     live = recorder.result("rendered, live", swarm, listener.truth(swarm))
     driving = live.stamp_ns >= begin_ns
     age_ns = np.array(recorder.received_ns, dtype=np.int64) - live.stamp_ns
-    return live.chosen(driving), age_ns[driving].astype(np.float64) * 1e-9
+    return live.select(driving), age_ns[driving].astype(np.float64) * 1e-9
 
 
 def _seen(listener: Listener, name: str, begin_ns: int) -> list[DetectionArrayMessage]:

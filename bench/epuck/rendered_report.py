@@ -86,7 +86,7 @@ def rendered_worlds(
 def errors_within(result: ReplayResult, begin_ns: int, end_ns: int) -> ErrorSummary:
     """Errors ten times a second between two stamps, of all robots."""
     within = (result.stamp_ns >= begin_ns) & (result.stamp_ns <= end_ns) & (result.stamp_ns % OUTPUT_NS == 0)
-    return result.chosen(within).overall
+    return result.select(within).overall
 
 
 def figures_of(one: Rendered, settling_s: float) -> dict[str, float]:

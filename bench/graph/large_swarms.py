@@ -89,7 +89,7 @@ def run(recording: SimulatedRun, *, shared: bool) -> dict[str, float]:
         options = GraphOptions(str(bag / "swarm.yaml"), bag=str(bag), parameter_file=str(parameters))
         live = play_live(options, log=log, inputs_only=True)
     settled = live.result.stamp_ns >= recording.start_ns + SETTLING_S * 1e9
-    errors = live.result.chosen(settled).overall
+    errors = live.result.select(settled).overall
     figures = (
         live.start_up_s,
         live.sent,

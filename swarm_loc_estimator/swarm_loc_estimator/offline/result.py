@@ -89,7 +89,7 @@ class ReplayResult:
         """Duration of the data divided by that of the replay."""
         return self.data_s / self.wall_s if self.wall_s > 0.0 else float("nan")
 
-    def chosen(self, rows: npt.NDArray[np.bool_]) -> ReplayResult:
+    def select(self, rows: npt.NDArray[np.bool_]) -> ReplayResult:
         """The result with the poses at some of the stamps (T,) only."""
         return replace(
             self,

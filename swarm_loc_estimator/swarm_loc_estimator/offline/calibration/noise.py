@@ -23,7 +23,7 @@ from swarm_loc_estimator.offline.calibration.recording import Recording, rerun
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.sensors.messages import chosen
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, SensorModel, Swarm
+from swarm_loc_estimator.swarm.swarm import OdometryModel, SensorModel, Swarm
 
 TICK_S = 1.0
 """Interval at which errors are computed."""
@@ -108,7 +108,15 @@ def score(results: Sequence[ReplayResult]) -> Score:
 
 def with_noise(swarm: Swarm, values: dict[str, float]) -> Swarm:
     """The swarm with noise parameters by name, the same for every robot."""
-    return replace(swarm, robots=tuple(_robot_with(robot, values) for robot in swarm.robots))
+    odometry, sensor = (
+        {field.name: values[field.name] for field in fields(model) if field.name in values}
+        for model in (OdometryModel, SensorModel)
+    )
+    robots = (
+        replace(robot, odometry=replace(robot.odometry, **odometry), sensor=replace(robot.sensor, **sensor))
+        for robot in swarm.robots
+    )
+    return replace(swarm, robots=tuple(robots))
 
 
 def thinned(recording: Recording) -> Recording:
@@ -162,11 +170,3 @@ def _clipped(names: Sequence[str], logarithms: FloatArray) -> dict[str, float]:
         name: float(f"{min(specs[name].high, np.exp(min(value, 50.0))):.3g}")
         for name, value in zip(names, logarithms.tolist(), strict=True)
     }
-
-
-def _robot_with(robot: Robot, values: dict[str, float]) -> Robot:
-    odometry = {f.name: values[f.name] for f in fields(OdometryModel) if f.name in values}
-    sensor = {f.name: values[f.name] for f in fields(SensorModel) if f.name in values}
-    return replace(
-        robot, odometry=replace(robot.odometry, **odometry), sensor=replace(robot.sensor, **sensor)
-    )

@@ -67,12 +67,12 @@ def fit_offsets(recording: Recording, swarm: Swarm, members: Sequence[int]) -> d
     mean, sigma = population(np.array([one[0] for one in alone]), np.array([one[1] for one in alone]), _WIDE)
     found = dict.fromkeys(members, mean)
     found |= {index: lateral.fit(mean, sigma)[0] for index, lateral in usable.items()}
-    return {index: _with_offsets(swarm.robots[index], offsets) for index, offsets in found.items()}
-
-
-def _with_offsets(robot: Robot, offsets: FloatArray) -> Robot:
-    course, axle = (round(float(value), 5) for value in offsets)
-    return replace(robot, odometry=replace(robot.odometry, course_offset=course, axle_offset=axle))
+    calibrated = {}
+    for index, offsets in found.items():
+        robot, (course, axle) = swarm.robots[index], np.round(offsets, 5).tolist()
+        odometry = replace(robot.odometry, course_offset=course, axle_offset=axle)
+        calibrated[index] = replace(robot, odometry=odometry)
+    return calibrated
 
 
 def _lateral(recording: Recording, swarm: Swarm, index: int) -> _Lateral | None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
 from swarm_loc_estimator.offline.recorded_bag import Progress, read_bag, unwatched
@@ -92,9 +93,8 @@ class Recording:
 
     def track(self, robot: int) -> Trajectory:
         """A robot's raw odometry in the order of its stamps, each stamp once."""
-        rows = np.flatnonzero(self.odometry.robot == robot)
-        stamp_ns, first = np.unique(self.odometry.stamp_ns[rows], return_index=True)
-        return Trajectory(stamp_ns, self.odometry.pose[rows[first]])
+        rows = chosen(self.odometry, self.odometry.robot == robot)
+        return _each_stamp_once(rows.stamp_ns, rows.pose)
 
 
 def read_recording(bag: Path, swarm: Swarm, progress: Progress = unwatched) -> Recording:
@@ -118,7 +118,7 @@ def read_recording(bag: Path, swarm: Swarm, progress: Progress = unwatched) -> R
         bag.name,
         odometry,
         joined(detections or [NO_DETECTIONS]),
-        {name: _each_stamp_once(track) for name, track in summary.truth.items()},
+        {name: _each_stamp_once(track.stamp_ns, track.pose) for name, track in summary.truth.items()},
         joined([NO_BRIGHTNESS, *(part.brightness for part in parts)]),
         joined([NO_FIXES, *(part.fixes for part in parts)]),
         (*summary.remarks, *unused),
@@ -145,10 +145,10 @@ def _start_of(recording: Recording, robot: Robot, track: Trajectory) -> Pose2 | 
     return (x, y, theta) if known[0] else None
 
 
-def _each_stamp_once(track: Trajectory) -> Trajectory:
-    """The track with only the first pose of each stamp."""
-    stamp_ns, first = np.unique(track.stamp_ns, return_index=True)
-    return Trajectory(stamp_ns, track.pose[first])
+def _each_stamp_once(stamp_ns: IntArray, pose: FloatArray) -> Trajectory:
+    """Poses sorted by their stamps, the first of each stamp."""
+    stamp_ns, first = np.unique(stamp_ns, return_index=True)
+    return Trajectory(stamp_ns, pose[first])
 
 
 def rerun(

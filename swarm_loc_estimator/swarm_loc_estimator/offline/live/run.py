@@ -174,7 +174,10 @@ def play_live(
         data_s=(content.end_ns - content.begin_ns) * 1e-9,
         wall_s=played_s,
     )
-    age_s = _ages(np.array(recorder.received_ns, dtype=np.int64), result.stamp_ns)
+    received_ns = np.array(recorder.received_ns, dtype=np.int64)
+    age_s: FloatArray = 1e-9 * (received_ns - result.stamp_ns)[received_ns > 0].astype(
+        np.float64
+    )  # 0 before the first /clock
     return LiveRun(
         result,
         content.arrival_ns,
@@ -194,12 +197,6 @@ def _player_of(player: NodeSpec, inputs: Sequence[str], *, inputs_only: bool) ->
     if inputs_only:
         changes["topics"] = [*inputs]
     return replace(player, parameters={**player.parameters, **changes})
-
-
-def _ages(received_ns: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> FloatArray:
-    """Ages of poses at reception [s]; the time of reception is 0 before the first /clock."""
-    known = received_ns > 0
-    return (received_ns - stamp_ns)[known].astype(np.float64) * 1e-9
 
 
 def _wait_for_the_rest(graph: LiveGraph, content: BagContent) -> None:

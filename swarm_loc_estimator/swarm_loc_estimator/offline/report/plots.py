@@ -79,7 +79,7 @@ def _until_truth_ends(result: ReplayResult) -> ReplayResult:
     ends = [int(track.stamp_ns[-1]) for track in result.truth.values() if len(track.stamp_ns)]
     if not ends:
         return result
-    return result.chosen(result.stamp_ns <= max(ends))
+    return result.select(result.stamp_ns <= max(ends))
 
 
 def _title(result: ReplayResult) -> str:
