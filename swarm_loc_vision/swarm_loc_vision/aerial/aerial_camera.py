@@ -1,6 +1,6 @@
 """Overhead camera: CameraInfo and images in, serialized anonymous detections out.
 
-Messages are those of rclpy or of a bag's type store: the fields have the same names.
+Messages may be those of rclpy or of rosbags, whose fields have the same names.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ class AerialCamera(CalibratedCamera):
 
     Args:
         settings: Numbers of the detector.
-        polarity: One of `detector.POLARITIES`.
-        ground: What tells the camera's pose; its intrinsics, where it has any, stand for camera_info.
-        gray_of: Reads an image's message, see `TRANSPORTS`.
+        polarity: One of `POLARITIES`.
+        ground: Control points; its intrinsics, if any, replace camera_info.
+        gray_of: Reads an image message, see `TRANSPORTS`.
 
     Attributes:
-        used: Images in which robots were looked for.
-        robots: Detections in all of them.
-        headings: How many of these show a heading.
+        used: Number of images that were searched.
+        robots: Number of detections.
+        headings: Number of detections with a heading.
         control: The camera's pose; None before the calibration.
     """
 
@@ -54,26 +54,26 @@ class AerialCamera(CalibratedCamera):
 
     @property
     def diameter(self) -> float:
-        """Of the robots [m]; 0: not known yet."""
+        """Diameter of the robots [m]; 0: not known yet."""
         return self._detector[1].diameter if self._detector else 0.0
 
     @property
     def why_nothing(self) -> str:
-        """What keeps robots from being found, a sentence; empty: nothing."""
+        """Why no robots can be found, a sentence; empty: they can."""
         if self.control is None:
             return self.trouble or (NO_GROUND if self._ground.is_empty else "")
         return self.control.trouble or self._seeing_trouble
 
     def use(self, camera: Camera) -> None:
-        """Find the camera's pose anew."""
+        """Solve for the camera's pose again."""
         self.control = GroundControl(self._ground, camera, self._settings)
         self._detector = None
 
     def detect(self, message: Any) -> bytes:
-        """The serialized swarm_loc_msgs/AnonymousDetectionArray of an image, in map, with its stamp.
+        """The serialized swarm_loc_msgs/AnonymousDetectionArray of an image, in map.
 
         Raises:
-            ImageError: The image was dropped, and counted.
+            ImageError: The image was dropped and counted.
         """
         detections = self._seen(self.gray(message))
         self.drops.update(detections.dropped)
@@ -118,7 +118,7 @@ def anonymous_rows(detections: AerialDetections) -> NDArray[np.void]:
 
 
 def aerial_camera(parameters: AerialParameters) -> AerialCamera:
-    """The camera as described.
+    """The camera that the parameters describe.
 
     Raises:
         GroundFileError: The control points cannot be used.

@@ -1,9 +1,9 @@
-"""An overhead camera that finds robots without telling which is which, as a ROS 2 node.
+"""Finds robots in the images of an overhead camera, without identity, as a ROS 2 node.
 
     ./run swarm_loc_vision aerial_camera_node --ros-args -r __ns:=/aerial -p control_points_file:=points.yaml
 
-It subscribes to `camera_info`, and to `image_raw` or `image_raw/compressed`, and publishes `detections` in
-`map` with the images' own stamps, and `/diagnostics`. Parameters: see `doc/aerial_camera_node.md`.
+The node subscribes to `camera_info` and to `image_raw` or `image_raw/compressed`, and publishes `detections`
+in `map` with the stamps of the images, and `/diagnostics`. Parameters: see `doc/aerial_camera_node.md`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from swarm_loc_vision.common.camera_node import CameraNode
 
 
 class AerialCameraNode(CameraNode[AerialParameters]):
-    """Receives overhead images, lets the core find the robots, publishes."""
+    """Receives overhead images and publishes detections."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("aerial_camera", AerialParameters, **node_arguments)
@@ -51,7 +51,7 @@ class AerialCameraNode(CameraNode[AerialParameters]):
         }
 
     def trouble(self) -> str:
-        """Why no robots can be found; said in the log, too, whenever it changes."""
+        """Why no robots can be found; logged whenever it changes."""
         why = self._camera.why_nothing
         if why and why != self._said:
             self._say(why)
@@ -63,7 +63,7 @@ class AerialCameraNode(CameraNode[AerialParameters]):
 
 
 def _pose_figures(fit: PoseFit | None) -> dict[str, str]:
-    """Of the camera's pose."""
+    """Diagnostics of the camera's pose."""
     if fit is None:
         return {"control points": "0"}
     worst = int(fit.residuals.argmax())

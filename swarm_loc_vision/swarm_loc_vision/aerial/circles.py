@@ -16,9 +16,9 @@ from swarm_loc_vision.aerial.rectification import Brightness, Plain, logarithm
 _RADII = np.array([0.82, 0.91, 1.0, 1.09, 1.18])
 _MAX_EDGES = 400_000
 _EDGE_SHARE = 0.15
-"""Of the least contrast, the slope that an edge must have, per pixel."""
+"""Least slope of an edge per pixel, over the least contrast."""
 _BLUR_SHARE, _APART_SHARE = 0.08, 0.3
-"""Of a diameter: smoothing of votes, and how near two candidates may be."""
+"""Smoothing of votes and least distance of candidates, in diameters."""
 
 
 class Edges:
@@ -26,8 +26,8 @@ class Edges:
 
     Args:
         log: (rows, columns) logarithm of brightness.
-        seen: (rows, columns) where it shows something.
-        contrast: The least step that counts.
+        seen: (rows, columns) where the image is valid.
+        contrast: Least step of an edge.
     """
 
     def __init__(self, log: Plain, seen: NDArray[np.bool_], contrast: float) -> None:
@@ -48,7 +48,7 @@ class Edges:
         self._place = np.stack([columns, rows], axis=1).astype(np.float32)
         towards = np.stack([across[rows, columns], down[rows, columns]], axis=1)
         self._towards = towards / np.maximum(strength, 1e-12)[:, None]
-        # strong edges count little more than weak ones: a shadow's rim may weaken one side of a disc
+        # strong edges count little more than weak ones: a shadow may weaken one side of a disc
         self._weight = strength / (strength + 2.0 * least)
 
     def votes(self, diameter_px: float, polarity: float) -> Plain:
@@ -65,7 +65,7 @@ class Edges:
 
 
 def peaks(votes: Plain, diameter_px: float, most: int) -> FloatArray:
-    """(C, 2) columns and rows of the highest peaks of votes, at most so many, the highest first."""
+    """(C, 2) columns and rows of the highest peaks of votes, in descending order, at most `most`."""
     side = 2 * max(int(_APART_SHARE * diameter_px), 1) + 1
     highest = cv2.dilate(votes, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
     rows, columns = np.nonzero((votes >= highest) & (votes > 0.0))
@@ -74,28 +74,28 @@ def peaks(votes: Plain, diameter_px: float, most: int) -> FloatArray:
 
 
 def _shrunk(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Where everything around is seen, too: the rim of what is seen is no edge."""
+    """Erode the valid area: its rim is no edge."""
     return np.asarray(cv2.erode(seen.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
 
 
 RAYS = 64
 _NEAREST, _FARTHEST, _SAMPLES = 0.45, 1.6, 47
 _SIDE = 5
-"""Samples on each side of an edge that are compared; a quarter of the diameter's half."""
+"""Number of samples compared on each side of an edge: an eighth of the diameter."""
 _WIDEST = 0.3
-"""By which share a rim may be wider or narrower than expected."""
+"""Largest relative difference of a rim from the expected radius."""
 _OFF = 0.12
-"""Farther from the circle than this share of its radius an edge is not its own."""
+"""Largest distance of an edge from its circle, in radii."""
 _BLOCK = 30_000
 """OpenCV's images have fewer than 2^15 rows."""
 _ROUNDS = 3
 _EVERY, _LIKELY = 4, 0.4
-"""At first every fourth ray is looked along, and this share of them must meet an edge."""
+"""Candidates are first tested on every fourth ray; this share of them must meet an edge."""
 _MIN_RAYS = 12
 _NOISES = 0.5
-"""Of one pixel, that an edge's step must reach: its two sides are means over many."""
+"""Least step of an edge over the noise of one pixel: its two sides are means over many pixels."""
 _SLACK_PX = 0.03
-"""Error of an edge that its neighbours share [px], beside what the residuals show."""
+"""Error of an edge that its neighbours share [px], on top of the residuals."""
 
 _ANGLES = 2.0 * np.pi * np.arange(RAYS) / RAYS
 DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
@@ -103,7 +103,7 @@ _SHARES = np.linspace(_NEAREST, _FARTHEST, _SAMPLES)
 
 
 class Circles(NamedTuple):
-    """Candidates that were measured, one row each.
+    """Measured candidates, one row each.
 
     Attributes:
         centre: (C, 2) column and row [px].
@@ -140,13 +140,13 @@ def sampled(image: Plain, cells: FloatArray) -> FloatArray:
 
 
 Light = Callable[[FloatArray], FloatArray]
-"""What is to be left out of the images of discs: (C, ...) counts at places (..., 2) in their radii."""
+"""Light to subtract from discs: (C, ...) counts at places (..., 2) in their radii."""
 
 
 def likely(
     image: Brightness, centres: FloatArray, radius: float, polarity: float, min_contrast: float
 ) -> FloatArray:
-    """Those of candidates (C, 2) with enough edges around to be discs of about a radius [px]."""
+    """The candidates (C, 2) with enough edges around to be discs of about a radius [px]."""
     rims = Rims(image, polarity, min_contrast)
     is_edge = rims.edges(centres, np.full(len(centres), radius), every=_EVERY)[2]
     return np.asarray(centres[is_edge.mean(axis=1) >= _LIKELY], float)
@@ -157,9 +157,9 @@ class Rims:
     """Measures rims of discs.
 
     Attributes:
-        image: Where they are.
-        polarity: Of the discs.
-        min_contrast: The least step of an edge, of the logarithm of brightness.
+        image: The image.
+        polarity: Polarity of the discs.
+        min_contrast: Least step of an edge in the logarithm of brightness.
     """
 
     image: Brightness
@@ -167,7 +167,7 @@ class Rims:
     min_contrast: float
 
     def measure(self, centre: FloatArray, radius: FloatArray, without: Light | None = None) -> Circles:
-        """Discs near centres (C, 2), of about radii (C,) [px]."""
+        """Fit circles near centres (C, 2) of about radii (C,) [px]."""
         low, high = (1.0 - _WIDEST) * radius, (1.0 + _WIDEST) * radius
         found = radius
         for _ in range(_ROUNDS):
@@ -182,7 +182,7 @@ class Rims:
     def edges(
         self, centre: FloatArray, radius: FloatArray, *, every: int = 1, without: Light | None = None
     ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """Of every so many rays the strongest edge: its radius (C, R) [px], its step, whether it counts."""
+        """The strongest edge on each `every`-th ray: its radius (C, R) [px], its step, whether it counts."""
         places = _SHARES[:, None] * DIRECTIONS[::every, None]
         cells = centre[:, None, None] + radius[:, None, None, None] * places
         if without is None:
@@ -192,12 +192,12 @@ class Rims:
         return _strongest(values, radius, self.polarity, self._least)
 
     def _least(self, darkest: FloatArray) -> FloatArray:
-        """The least steps where the darker side of an edge is so dark."""
+        """Least steps of edges by the logarithm of brightness on their darker side."""
         return np.maximum(self.min_contrast, _NOISES * self.image.log_noise(darkest))
 
 
 def _masked_median(values: FloatArray, mask: NDArray[np.bool_], otherwise: FloatArray) -> FloatArray:
-    """(C,) medians of those of each row (C, R) that a mask has."""
+    """(C,) medians over the masked entries of each row (C, R)."""
     rows = zip(values, mask, otherwise, strict=True)
     return np.array([np.median(row[own]) if own.any() else default for row, own, default in rows])
 
@@ -205,7 +205,7 @@ def _masked_median(values: FloatArray, mask: NDArray[np.bool_], otherwise: Float
 def _strongest(
     values: FloatArray, radius: FloatArray, polarity: float, least: Callable[[FloatArray], FloatArray]
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """As `Rims.edges`, by values (C, R, S) along the rays."""
+    """`Rims.edges` from values (C, R, S) along the rays."""
     sums = np.concatenate([np.zeros((*values.shape[:2], 1)), np.cumsum(values, axis=2)], axis=2)
     inner = (sums[..., _SIDE:-_SIDE] - sums[..., : -2 * _SIDE]) / _SIDE
     outer = (sums[..., 2 * _SIDE :] - sums[..., _SIDE:-_SIDE]) / _SIDE
@@ -229,7 +229,7 @@ def _strongest(
 def _fit(
     edge: FloatArray, is_edge: NDArray[np.bool_], radius: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Circles through edges: shift of the centre (C, 2), radius, covariance, spread, and whose own edges."""
+    """Fit circles to edges: shift of the centre (C, 2), radius, covariance, spread, and the edges used."""
     design = np.concatenate([DIRECTIONS, np.ones((RAYS, 1))], axis=1)
     solution = np.zeros((len(edge), 3))
     solution[:, 2] = radius
@@ -244,7 +244,7 @@ def _fit(
     count = own.sum(axis=1)
     spread = np.sqrt(np.sum(own * residual**2, axis=1) / np.maximum(count - 3, 1))
     normal = np.einsum("cr,ri,rj->cij", own.astype(float), design, design) + 1e-6 * np.eye(3)
-    # neighbouring rays share pixels: about every other one is a measurement of its own
+    # neighbouring rays share pixels: about every other ray is an independent measurement
     variance = 2.0 * spread**2 + _SLACK_PX**2
     covariance = variance[:, None, None] * np.linalg.inv(normal)[:, :2, :2]
     few = count < _MIN_RAYS

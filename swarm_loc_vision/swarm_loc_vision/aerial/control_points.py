@@ -23,23 +23,23 @@ from swarm_loc_vision.common.camera import Camera
 MIN_POINTS = 4
 MAX_POINTS = 1000
 _MIN_SPREAD = 0.02
-"""Of the points' narrower extent over the wider one; below it they are as good as on one line."""
+"""Least ratio of the extents of points; below it they count as on one line."""
 _GUESS_PX = 1.0
 _STEPS = 200
 _FAR = 1e4
-"""Stands for the residual of a point that a pose does not see [sigma]."""
+"""Residual of a point that a pose does not see [sigma]."""
 
 
 class ControlPointError(ValueError):
-    """Control points that tell no pose; the message is one sentence."""
+    """Control points that do not determine a pose; the message is one sentence."""
 
 
 @dataclass(frozen=True)
 class ControlPoints:
-    """Places and where the image shows them, one row each.
+    """Places and their pixels, one row each.
 
     Attributes:
-        names: (N,) for people.
+        names: (N,) for messages.
         places: (N, 3) in map [m].
         pixels: (N, 2) in the raw image [px].
     """
@@ -52,7 +52,7 @@ class ControlPoints:
         return len(self.names)
 
     def joined(self, other: ControlPoints) -> ControlPoints:
-        """These and others."""
+        """These points and others."""
         return ControlPoints(
             [*self.names, *other.names],
             np.concatenate([self.places, other.places]),
@@ -65,13 +65,13 @@ NO_POINTS = ControlPoints((), np.zeros((0, 3)), np.zeros((0, 2)))
 
 @dataclass(frozen=True)
 class PoseFit:
-    """A camera's pose by control points.
+    """Pose of a camera from control points.
 
     Attributes:
         ground: The camera with its pose.
-        residuals: (N,) distance of each point from where the pose puts it [px].
-        deviations: (N,) likewise, in the standard deviations that the points' noise allows.
-        names: (N,) of the points.
+        residuals: (N,) reprojection errors [px].
+        deviations: (N,) reprojection errors over their standard deviations.
+        names: (N,) names of the points.
     """
 
     ground: GroundCamera
@@ -86,7 +86,7 @@ class PoseFit:
 
 
 def check_points(points: ControlPoints) -> None:
-    """Make sure that points can tell a pose at all.
+    """Check that points can determine a pose.
 
     Raises:
         ControlPointError: They are too few or too many, or lie on one line in map or in the image.
@@ -108,26 +108,26 @@ def check_points(points: ControlPoints) -> None:
 
 
 def _determines(values: FloatArray) -> bool:
-    """Whether points span a plane also when any one of them is left out."""
+    """Whether points span a plane even without any one of them."""
     if len(np.unique(np.round(values, 9), axis=0)) < MIN_POINTS:
         return False
     return all(_spread(np.delete(values, k, axis=0)) > _MIN_SPREAD for k in range(min(len(values), 8)))
 
 
 def _spread(values: FloatArray) -> float:
-    """Second extent of points over the first."""
+    """Ratio of the second to the first extent of points."""
     sizes = np.linalg.svd(values - values.mean(axis=0), compute_uv=False)
     return float(sizes[1] / sizes[0]) if sizes[0] > 0.0 else 0.0
 
 
 def solve_pose(camera: Camera, points: ControlPoints, settings: AerialSettings) -> PoseFit:
-    """The pose that explains the points best: a homography or PnP first, then least squares in raw pixels.
+    """Solve for the pose: IPPE or PnP, then least squares in raw pixels.
 
-    The covariance is that of least squares, grown by the residuals where they are larger than the noise
-    allows; each point's noise is that of its pixel and, seen from where the camera is, of its place.
+    The noise of a point is that of its pixel and that of its place, projected. The covariance is that of
+    least squares, scaled up by residuals that exceed the noise.
 
     Raises:
-        ControlPointError: The points tell no pose, or only one under the floor.
+        ControlPointError: The points do not determine a pose, or only one under the floor.
     """
     check_points(points)
     guess = _guess(camera, points)
@@ -154,7 +154,7 @@ def solve_pose(camera: Camera, points: ControlPoints, settings: AerialSettings) 
 
 
 def _guess(camera: Camera, points: ControlPoints) -> FloatArray:
-    """A first pose (6,)."""
+    """An initial pose (6,)."""
     ideal = camera.to_ideal(points.pixels)
     seen = np.isfinite(ideal).all(axis=1)
     if seen.sum() < MIN_POINTS or not _determines(points.places[seen]):
@@ -182,7 +182,7 @@ def _guess(camera: Camera, points: ControlPoints) -> FloatArray:
 
 
 def _sigmas(camera: Camera, pose: FloatArray, points: ControlPoints, settings: AerialSettings) -> FloatArray:
-    """(N,) noise of each point as the image shows it [px]."""
+    """(N,) standard deviations of the points in the image [px]."""
     depth = (points.places @ rotation_of(pose).T + pose[3:])[:, 2]
     of_place = settings.control_sigma * camera.fx / np.maximum(depth, 1e-3)
     return np.asarray(np.hypot(settings.control_sigma_px, of_place))
@@ -191,7 +191,7 @@ def _sigmas(camera: Camera, pose: FloatArray, points: ControlPoints, settings: A
 def _covariance(
     camera: Camera, pose: FloatArray, points: ControlPoints, sigma: FloatArray, away: FloatArray
 ) -> FloatArray:
-    """(6, 6) of a pose by least squares."""
+    """(6, 6) covariance of a pose by least squares."""
     slopes = (pose_slopes(camera, pose, points.places) / sigma[:, None, None]).reshape(-1, POSE_SIZE)
     information = slopes.T @ slopes
     scale = np.sqrt(np.diag(information))
@@ -208,7 +208,7 @@ def _covariance(
 def misfit(fit: PoseFit, points: ControlPoints, settings: AerialSettings) -> str:
     """What is wrong with the points of a fit, a sentence; empty: nothing.
 
-    Where leaving one point out lets all the others agree, that one is named; otherwise the worst one.
+    If all points but one agree, that one is named, otherwise the worst one.
     """
     worst = int(np.argmax(fit.deviations))
     if fit.deviations[worst] <= settings.max_residual:

@@ -1,4 +1,4 @@
-"""Aerial detector: an overhead image in, places and headings of robots out, none of them named."""
+"""Aerial detector: an overhead image in, places and headings of robots without identity out."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from swarm_loc_vision.aerial.rectification import (
 from swarm_loc_vision.common.images import Gray
 
 _SIZES_PX = 16.0, 32.0
-"""Diameters of robots in the rectified image, least and largest."""
+"""Least and largest diameter of robots in the rectified image."""
 _ROUGH_PX = 14.0
 _MAX_SHARE = 0.25
-"""Of the image's lesser side, the largest robot that is looked for."""
+"""Largest robot that is searched for, over the shorter side of the image."""
 _SPARE, _SPARE_SHARE = 60, 4
 _APART = 0.75
-"""Of a diameter: two robots are farther apart."""
+"""Least distance of two robots, in diameters."""
 _MAX_SPREAD, _MAX_SPREAD_PX = 0.03, 0.2
-"""Root mean square distance of a disc's rim from a circle, in radii, and beyond that [px]."""
+"""Largest rms distance of a disc's rim from a circle: a share of the radius, plus pixels."""
 _SAME_SIZE = 0.2
-"""By this share a disc may be wider or narrower than the others of its image."""
+"""Largest relative difference of a disc's radius from the others in the image."""
 _SAME_CONTRAST = 0.45
-"""So much of the others' contrast a disc must have: shadows have less."""
+"""Least contrast of a disc over that of the others: shadows have less."""
 _TOUCHING, _USUAL = 1.3, 0.65
-"""Discs nearer than so many diameters may touch; one alone must show so much of the usual share of rim."""
+"""Largest distance of touching discs, in diameters; least share of the usual coverage of any other disc."""
 _MARK_ROUNDS = 2
 _MOST, _CLEAR = 0.6, 0.85
-"""Share of the discs with a mark from which on others need so much of their rim."""
+"""If this share of discs shows a mark, discs without one need this coverage."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +50,12 @@ class AerialDetections:
 
     Attributes:
         place: (N, 2) of their centres in map [m].
-        theta: (N,) headings in map [rad]; NaN: the pattern shows none.
-        covariance: (N, 3, 3) of x, y and theta; of a heading that is not known it is that of any heading.
-        pixel: (N, 2) of the centres in the raw image.
+        theta: (N,) headings in map [rad]; NaN: unknown.
+        covariance: (N, 3, 3) of x, y and theta; an unknown heading has that of a uniform distribution.
+        pixel: (N, 2) centres in the raw image.
         diameter: (N,) [m].
         coverage: (N,) share of the rim that shows an edge.
-        dropped: Discs that were not taken, by reason.
+        dropped: Number of discs left out, by reason.
     """
 
     place: FloatArray
@@ -78,7 +78,7 @@ class _Found(NamedTuple):
 
     @property
     def score(self) -> float:
-        """How clear they are together."""
+        """Sum of their quality."""
         return float(np.sum(_quality(self.circles)))
 
 
@@ -86,12 +86,12 @@ class AerialDetector:
     """Finds discs of one size on a level plane, and the mark on them.
 
     Args:
-        settings: Its numbers.
-        ground: The camera; without a diameter in the settings the first images tell it.
+        settings: Its numbers; without a diameter it is estimated from the first images.
+        ground: The camera.
         polarity: One of POLARITIES.
 
     Attributes:
-        diameter: Of the robots [m]; 0: not known yet.
+        diameter: Diameter of the robots [m]; 0: not known yet.
     """
 
     def __init__(self, settings: AerialSettings, ground: GroundCamera, polarity: str = "auto") -> None:
@@ -120,7 +120,7 @@ class AerialDetector:
     def _discs(
         self, gray: Gray, grid: Rectification, diameter: float, noise: float
     ) -> tuple[_Found, dict[str, int]]:
-        """Discs of the polarity that shows clearer ones."""
+        """Discs of the polarity with the higher score, and numbers of dropped ones."""
         settings = self._settings
         wide = diameter / grid.metres_per_px
         image = brightness(grid.apply(gray), wide, noise)
@@ -136,7 +136,7 @@ class AerialDetector:
         return max(kinds, key=lambda kind: kind[0].score)
 
     def _chosen(self, rims: Rims, circles: Circles, grid: Rectification) -> tuple[_Found, dict[str, int]]:
-        """Those that are discs, none over another, all alike."""
+        """Select discs that do not overlap and are alike."""
         covered = circles.coverage >= self._settings.min_coverage
         circles = circles.chosen((_quality(circles) > 0.0) & covered & _inside(grid, circles.centre))
         circles = circles.chosen(_apart(circles))
@@ -155,7 +155,7 @@ class AerialDetector:
         return _Found(rims, circles.chosen(order)), dropped
 
     def _located(self, grid: Rectification, found: _Found, dropped: dict[str, int]) -> AerialDetections:
-        """Discs in map: the mark first, and then the rim without what the mark adds beside it."""
+        """Locate discs in map: fit the mark, then the rim again without the light of the mark."""
         circles, rims, settings = found.circles, found.rims, self._settings
         if not len(circles.radius):
             return _nothing(dropped)
@@ -172,7 +172,7 @@ class AerialDetector:
             )
         marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
         has_mark = np.isfinite(marks.theta)
-        is_strong |= has_mark  # a shadow on it or beside it may weaken a rim, but shows no mark
+        is_strong |= has_mark  # a shadow may weaken a rim, but shows no mark
         alike = _marked_alike(circles, has_mark) | ~is_strong
         dropped |= {"other_contrast": int(np.sum(~is_strong)), "without_mark": int(np.sum(~alike))}
         kept = alike & is_strong
@@ -192,7 +192,7 @@ class AerialDetector:
         )
 
     def _estimated(self, gray: Gray, noise: float) -> float:
-        """Diameter of the robots by one image [m]; 0: there are none."""
+        """Estimate the diameter of the robots from one image [m]; 0: there are none."""
         settings, ground = self._settings, self._ground
         middle = ground.places(np.array([0.5 * gray.shape[1], 0.5 * gray.shape[0]]), settings.robot_height)
         if not np.isfinite(middle).all():
@@ -209,15 +209,15 @@ class AerialDetector:
 
 
 def _quality(circles: Circles) -> FloatArray:
-    """(C,) how clear discs are, 0 to 1: how much of their rims is seen, and how round it is."""
+    """(C,) quality of discs, 0 to 1, from the coverage and the roundness of their rims."""
     limit = _MAX_SPREAD * circles.radius + _MAX_SPREAD_PX
     return np.asarray(circles.coverage**2 * np.maximum(1.0 - (circles.spread / limit) ** 2, 0.0))
 
 
 def _whole(circles: Circles) -> NDArray[np.bool_]:
-    """Which discs show as much of their rims as they should: those alone as much as the others.
+    """Which discs show enough of their rims.
 
-    A rim may be hidden by a disc that touches it, hardly by anything else.
+    A touching disc may hide a rim, hardly anything else; so a disc alone must show as much as the others.
     """
     away = np.linalg.norm(circles.centre[:, None] - circles.centre, axis=2)
     np.fill_diagonal(away, np.inf)
@@ -227,7 +227,7 @@ def _whole(circles: Circles) -> NDArray[np.bool_]:
 
 
 def _marked_alike(circles: Circles, has_mark: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which discs may carry the same pattern: where most show a mark, those without must be clear discs."""
+    """Which discs may carry the same pattern: where most show a mark, the others need a high coverage."""
     quality = _quality(circles)
     if quality[has_mark].sum() < _MOST * quality.sum():
         return np.ones(len(quality), np.bool_)
@@ -235,7 +235,7 @@ def _marked_alike(circles: Circles, has_mark: NDArray[np.bool_]) -> NDArray[np.b
 
 
 def _inside(grid: Rectification, centre: FloatArray) -> NDArray[np.bool_]:
-    """Whether the image shows centres (C, 2)."""
+    """Whether centres (C, 2) lie in the valid area."""
     rows, columns = grid.seen.shape
     cells = np.rint(centre).astype(np.int64)
     inside = np.asarray(((cells >= 0) & (cells < [columns, rows])).all(axis=1))
@@ -244,7 +244,7 @@ def _inside(grid: Rectification, centre: FloatArray) -> NDArray[np.bool_]:
 
 
 def _apart(circles: Circles) -> NDArray[np.int64]:
-    """Rows of the clearest circles of which none lies over another."""
+    """Rows of the circles of highest quality that do not overlap."""
     kept: list[int] = []
     for row in np.argsort(-_quality(circles), kind="stable").tolist():
         away = np.linalg.norm(circles.centre[kept] - circles.centre[row], axis=1)
@@ -254,7 +254,7 @@ def _apart(circles: Circles) -> NDArray[np.int64]:
 
 
 def _with_heading(spread: FloatArray, turned: Marks) -> FloatArray:
-    """(N, 3, 3) of x, y and theta from that of x and y (N, 2, 2)."""
+    """(N, 3, 3) covariance of x, y and theta from that of x and y (N, 2, 2)."""
     covariance = np.zeros((len(spread), 3, 3))
     covariance[:, :2, :2] = spread
     covariance[:, 2, 2] = np.where(np.isfinite(turned.theta), turned.variance, np.pi**2 / 3.0)
@@ -274,13 +274,13 @@ _ALIKE = 1.1
 
 
 def ladder(low: float, high: float) -> FloatArray:
-    """Diameters from low to high, each a little larger than the one before."""
+    """A geometric series of diameters from low to high."""
     count = max(int(np.ceil(np.log(high / low) / np.log(_RATIO))), 0) + 1
     return np.asarray(low * _RATIO ** np.arange(count))
 
 
 def commonest(diameters: FloatArray, scores: FloatArray) -> float:
-    """The diameter that most discs (N,) agree upon by their scores (N,); 0: there are none."""
+    """The diameter that most discs (N,) share, weighted by scores (N,); 0: no discs."""
     if not len(diameters):
         return 0.0
     alike = np.abs(np.log(diameters[:, None] / diameters)) < np.log(_ALIKE)

@@ -14,21 +14,21 @@ from swarm_loc_vision.common.camera import Camera
 
 POSE_SIZE = 6
 _GRID = 48
-"""Places along a side of the image at which the reach of the lens is looked up."""
+"""Samples along a side of the image for the reach of the lens."""
 _PLACE_STEP = 1e-4
 _POSE_STEPS = np.array([1e-6] * 3 + [1e-6] * 3)
 _MIN_DEPTH = 1e-3
-"""What is nearer to the camera's plane is not projected [m]."""
+"""Least depth of a projected place [m]."""
 
 
 @dataclass(frozen=True)
 class GroundCamera:
-    """A camera whose pose in map is known; map's plane z = 0 is the floor.
+    """A camera with a known pose in map; the plane z = 0 of map is the floor.
 
     Attributes:
         camera: Its intrinsics.
         pose: (6,) from map to the optical frame (x right, y down, z forward): rotation vector, shift [m].
-        covariance: (6, 6) of the pose.
+        covariance: (6, 6) covariance of the pose.
     """
 
     camera: Camera
@@ -41,7 +41,7 @@ class GroundCamera:
 
     @cached_property
     def reach(self) -> float:
-        """Radius at distance 1 up to which the image shows something."""
+        """Largest radius at distance 1 that the image shows."""
         camera = self.camera
         u, v = np.meshgrid(np.linspace(0, camera.width - 1, _GRID), np.linspace(0, camera.height - 1, _GRID))
         ideal = camera.to_ideal(np.stack([u, v], axis=-1))
@@ -55,11 +55,11 @@ class GroundCamera:
 
     @cached_property
     def centre(self) -> FloatArray:
-        """(3,) where the camera is in map [m]."""
+        """(3,) position of the camera in map [m]."""
         return np.asarray(-self.rotation.T @ self.pose[3:])
 
     def places(self, pixels: FloatArray, height: float) -> FloatArray:
-        """(..., 2) x, y [m] on the plane z = `height` of raw pixels (..., 2); NaN where they show none."""
+        """(..., 2) x, y [m] on the plane z = `height` of raw pixels (..., 2); NaN where it is not seen."""
         camera = self.camera
         ideal = (camera.to_ideal(pixels) - camera.intrinsics[2:]) / camera.intrinsics[:2]
         rays = np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1) @ self.rotation
@@ -70,13 +70,13 @@ class GroundCamera:
         return np.asarray(places)
 
     def scale(self, places: FloatArray) -> FloatArray:
-        """(...) pixels per metre at places (..., 3) on a level plane: the root of how areas grow."""
+        """(...) pixels per metre at places (..., 3) on a level plane: the root of the scale of areas."""
         return np.asarray(np.sqrt(np.abs(np.linalg.det(self._slopes(places)[..., :2]))))
 
     def covariances(
         self, places: FloatArray, pixel_covariance: FloatArray, height_sigma: float
     ) -> FloatArray:
-        """(N, 2, 2) covariance of places on a level plane, by that of their pixels, of pose and of height.
+        """(N, 2, 2) covariance of places on a level plane from those of pixels, pose and height.
 
         With z the pixel, p the place, c the camera's pose and h the height, z = f(p, h, c) gives
         dp = (df/dp)^-1 (dz - df/dc dc - df/dh dh).
@@ -84,7 +84,7 @@ class GroundCamera:
         Args:
             places: (N, 3) in map.
             pixel_covariance: (N, 2, 2) of their raw pixels [px^2].
-            height_sigma: [m].
+            height_sigma: Standard deviation of the height [m].
         """
         slopes = self._slopes(places)
         inverse = np.linalg.inv(slopes[..., :2])
@@ -95,7 +95,7 @@ class GroundCamera:
         return np.asarray(inverse @ spread @ np.swapaxes(inverse, -1, -2))
 
     def pixel_covariances(self, places: FloatArray, covariance: FloatArray) -> FloatArray:
-        """(N, 2, 2) of raw pixels [px^2] by that of their places (N, 3) on a level plane (N, 2, 2) [m^2]."""
+        """(N, 2, 2) covariance of raw pixels [px^2] from that of places (N, 3) on a level plane [m^2]."""
         slopes = self._slopes(places)[..., :2]
         return np.asarray(slopes @ covariance @ np.swapaxes(slopes, -1, -2))
 
@@ -107,7 +107,7 @@ class GroundCamera:
 
 
 def rotation_of(pose: FloatArray) -> FloatArray:
-    """(3, 3) of a pose (6,) or longer."""
+    """(3, 3) rotation of a pose (6,)."""
     return np.asarray(cv2.Rodrigues(pose[:3])[0], np.float64)
 
 

@@ -26,19 +26,19 @@ from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import Family, family_named
 
 _UNIT_CORNERS = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
-"""Clockwise from a marker's upper left, x right and y up as seen by one who faces it."""
+"""Clockwise from the upper left of a marker, x right and y up when facing it."""
 _CORNER_NAMES = ("upper left", "upper right", "lower right", "lower left")
 
 
 @dataclass(frozen=True)
 class FloorMarker:
-    """A marker that lies on the floor, or level above it, and looks up."""
+    """A marker that lies on the floor, or level above it, face up."""
 
     id: int
-    x: float = number(0.0, "m", -1e4, 1e4, "its centre in map")
-    y: float = number(0.0, "m", -1e4, 1e4, "likewise")
-    z: float = number(0.0, "m", -10.0, 10.0, "likewise")
-    yaw: float = number(0.0, "rad", -6.3, 6.3, "to its own right, from map's x")
+    x: float = number(0.0, "m", -1e4, 1e4, "x of its centre in map")
+    y: float = number(0.0, "m", -1e4, 1e4, "y of its centre in map")
+    z: float = number(0.0, "m", -10.0, 10.0, "z of its centre in map")
+    yaw: float = number(0.0, "rad", -6.3, 6.3, "direction to its right, from the x axis of map")
     size: float = number(0.1, "m", 0.001, 10.0, "side of its black square")
 
     @property
@@ -50,12 +50,12 @@ class FloorMarker:
 
 
 class FloorMarkers:
-    """Finds floor markers, and means their corners over the images of a camera that stands still.
+    """Finds floor markers, and averages their corners over the images of a static camera.
 
     Args:
-        markers: Those that there are.
-        family: Their kind.
-        camera: What takes the images.
+        markers: The markers.
+        family: Family of the markers.
+        camera: The camera.
     """
 
     def __init__(self, markers: Sequence[FloorMarker], family: Family, camera: Camera) -> None:
@@ -66,7 +66,7 @@ class FloorMarkers:
         self._counts: dict[int, int] = {}
 
     def look(self, gray: Gray) -> ControlPoints:
-        """Control points by one image (height, width), which counts for the mean, too."""
+        """Control points from one image (height, width), which also adds to the mean."""
         found = self._detector.detect(gray)
         seen = dict(zip(found.id.tolist(), found.corners, strict=True))
         for marker_id, corners in seen.items():
@@ -75,7 +75,7 @@ class FloorMarkers:
         return self._points(seen)
 
     def mean(self) -> ControlPoints:
-        """Control points by all images so far."""
+        """Control points from all images so far."""
         return self._points({i: self._sums[i] / self._counts[i] for i in self._sums})
 
     def _points(self, corners: Mapping[int, FloatArray]) -> ControlPoints:
@@ -87,27 +87,27 @@ class FloorMarkers:
         )
 
     def forget(self) -> None:
-        """Begin anew: the camera has moved."""
+        """Reset the mean after the camera has moved."""
         self._sums.clear()
         self._counts.clear()
 
 
 NO_GROUND = "there are neither control points nor floor markers, without which nothing is published."
 _SETTLING, _LATER_EVERY = 10, 10
-"""Markers are looked for in so many first images, then in every so many-th: is the camera where it was?"""
+"""Markers are searched in this many first images, then in every n-th to detect motion of the camera."""
 _MOVED = 3.0
-"""So many standard deviations of one point most of them are away when the camera has moved."""
+"""Median displacement of markers that shows a motion of the camera, in standard deviations of a point."""
 
 
 @dataclass(frozen=True)
 class Ground:
-    """What is known of the floor.
+    """Known references on the floor.
 
     Attributes:
-        points: Places whose pixels are known.
-        markers: Fiducials on the floor.
-        family: Their kind.
-        camera: Intrinsics; None: they come with the images.
+        points: Control points.
+        markers: Floor markers.
+        family: Family of the floor markers.
+        camera: Intrinsics; None: those of camera_info.
     """
 
     points: ControlPoints = NO_POINTS
@@ -117,7 +117,7 @@ class Ground:
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is nothing to tell a camera's pose by."""
+        """Whether there is neither a point nor a marker."""
         return not self.points.names and not self.markers
 
 
@@ -125,14 +125,14 @@ class GroundControl:
     """Keeps the pose of one camera.
 
     Args:
-        ground: What is known of the floor.
-        camera: What takes the images.
+        ground: Known references on the floor.
+        camera: The camera.
         settings: Noise of the control points, and the limit of their residuals.
 
     Attributes:
-        fit: The pose; None: not known.
-        trouble: Why it is not known, a sentence; empty: it is, or no image has come yet.
-        moves: How often the camera was found to have moved.
+        fit: The pose; None: unknown.
+        trouble: Why it is unknown, a sentence; empty: it is known, or there was no image yet.
+        moves: Number of detected motions of the camera.
     """
 
     def __init__(self, ground: Ground, camera: Camera, settings: AerialSettings) -> None:
@@ -145,14 +145,14 @@ class GroundControl:
             self._solve(ground.points)
 
     def look(self, gray: Gray) -> GroundCamera | None:
-        """The camera that took an image (height, width), with its pose; None: see `trouble`."""
+        """The camera with its pose at an image (height, width); None: see `trouble`."""
         if self._markers is not None:
             self._look_at(self._markers, gray)
         self._images += 1
         return self.fit.ground if self.fit else None
 
     def _look_at(self, markers: FloorMarkers, gray: Gray) -> None:
-        """Solve for the pose by the first images' markers, then watch whether they stay where they are."""
+        """Solve for the pose with the markers of the first images, then detect motions of the camera."""
         if self._images < _SETTLING:
             markers.look(gray)
             if self.fit is None or self._images == _SETTLING - 1:
@@ -167,14 +167,14 @@ class GroundControl:
                 self._solve(self._ground.points.joined(markers.mean()))
 
     def _has_moved(self, fit: PoseFit, seen: ControlPoints) -> bool:
-        """Whether most of what is seen is no longer where it was."""
+        """Whether most markers have moved in the image."""
         if not len(seen):
             return False
         away = np.linalg.norm(fit.ground.pixels(seen.places) - seen.pixels, axis=1)
         return not np.median(away) <= _MOVED * np.hypot(self._settings.control_sigma_px, fit.rms_px)
 
     def _solve(self, points: ControlPoints) -> None:
-        """The pose by points."""
+        """Solve for the pose with points."""
         try:
             fit = solve_pose(self._camera, points, self._settings)
             self.trouble = misfit(fit, points, self._settings)

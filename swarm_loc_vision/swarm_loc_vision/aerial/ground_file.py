@@ -27,14 +27,14 @@ _CAMERA = {
 
 
 class GroundFileError(UserError):
-    """A file of control points that cannot be used; the message is one sentence."""
+    """An invalid file of control points; the message is one sentence."""
 
 
 def load_ground(path: Path) -> Ground:
     """Read control points.
 
     Raises:
-        GroundFileError: It cannot be read, or a value is wrong, or the points can tell no pose.
+        GroundFileError: It cannot be read, a value is wrong, or the points do not determine a pose.
     """
     try:
         tree = read_tree(path)
@@ -44,7 +44,7 @@ def load_ground(path: Path) -> Ground:
 
 
 def save_ground(ground: Ground, path: Path, comment: str = "") -> None:
-    """Write control points and floor markers so that `load_ground` reads them back."""
+    """Write control points and floor markers for `load_ground`."""
     points = ground.points
     rows = zip(points.names, points.places.tolist(), points.pixels.tolist(), strict=True)
     tree = {

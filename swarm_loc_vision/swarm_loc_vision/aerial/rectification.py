@@ -17,9 +17,9 @@ from swarm_loc_vision.common.images import Gray
 Plain = NDArray[np.float32]
 
 _CELL_PX = 16
-"""Raw pixels from one place to the next at which the extent of a plane is looked up."""
+"""Distance of the raw pixels at which the extent of a plane is sampled."""
 _MAX_AREA = 12_000_000
-"""Pixels of a rectified image."""
+"""Bound on the pixels of a rectified image."""
 
 
 class RectificationError(ValueError):
@@ -31,12 +31,12 @@ class Rectification:
     """A grid over a level plane, and the raw pixels that show it.
 
     Attributes:
-        origin: (2,) x, y of the middle of its first pixel, the corner of least x and least y [m].
-        metres_per_px: Of the grid.
-        height: Of the plane [m].
-        maps: (2, rows, columns) raw pixels u and v, columns along x, rows along y; -1 where nothing is seen.
-        seen: (rows, columns) whether the raw image shows it.
-        blur_px: Of the raw image before it is sampled, where the grid is coarser than the image.
+        origin: (2,) x, y of the middle of the first pixel, which has the least x and y [m].
+        metres_per_px: Size of a pixel.
+        height: Height of the plane [m].
+        maps: (2, rows, columns) raw pixels u and v, columns along x, rows along y; -1 outside the image.
+        seen: (rows, columns) whether the raw image shows the pixel.
+        blur_px: Blur of the raw image before sampling, where the grid is coarser than the image.
     """
 
     origin: FloatArray
@@ -47,14 +47,14 @@ class Rectification:
     blur_px: float
 
     def apply(self, image: Gray) -> Plain:
-        """The plane as the image shows it (rows, columns)."""
+        """The rectified image (rows, columns)."""
         raw = cv2.GaussianBlur(image, (0, 0), self.blur_px) if self.blur_px else image
         raw = raw.astype(np.float32)
         flat = cv2.remap(raw, self.maps[0], self.maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(flat, np.float32)
 
     def places(self, cells: FloatArray) -> FloatArray:
-        """(..., 3) in map of columns and rows (..., 2) of the grid."""
+        """(..., 3) places in map of columns and rows (..., 2) of the grid."""
         flat = self.origin + cells * self.metres_per_px
         return np.concatenate([flat, np.full((*flat.shape[:-1], 1), self.height)], axis=-1)
 
@@ -66,9 +66,10 @@ def rectification(
 
     Args:
         ground: The camera.
-        settings: Height of the plane, region, and how small robots may look in the raw image.
-        diameter: Of robots [m].
-        size_px: Least and largest diameter of robots in the rectified image; in between as in the raw one.
+        settings: Height of the plane, region, and least diameter of robots in the raw image.
+        diameter: Diameter of robots [m].
+        size_px: Least and largest diameter of robots in the rectified image; in between that in the raw
+            image.
 
     Raises:
         RectificationError: The camera does not see the plane, or robots on it look too small.
@@ -104,7 +105,7 @@ def rectification(
 
 
 def _visible(ground: GroundCamera, height: float) -> tuple[FloatArray, FloatArray]:
-    """Places (K, 2) of a plane, evenly spread in the image, and pixels per metre there."""
+    """Places (K, 2) of a plane, evenly spread in the image, and the pixels per metre there."""
     camera = ground.camera
     across, down = (
         np.linspace(0.0, n - 1.0, max(math.ceil(n / _CELL_PX), 2)) for n in (camera.width, camera.height)
@@ -119,13 +120,13 @@ def _visible(ground: GroundCamera, height: float) -> tuple[FloatArray, FloatArra
 
 
 _DARK = 10.0
-"""Counts that black still has: below it the logarithm would show noise alone."""
+"""Counts added to brightness: without them the logarithm of dark pixels is mostly noise."""
 _SMOOTHING_SHARE, _MIN_SMOOTHING_PX = 0.035, 0.6
 _KERNEL = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
 _KERNEL_NORM = 6.0
 _MEDIAN_OF_NORMAL = 0.6745
 _LEAST_NOISE = 0.3
-"""Counts: the noise of quantization alone."""
+"""Noise of quantization alone [counts]."""
 
 
 @dataclass(frozen=True)
@@ -133,9 +134,9 @@ class Brightness:
     """A rectified image.
 
     Attributes:
-        plain: (rows, columns) counts, smoothed a little.
-        log: (rows, columns) their logarithm.
-        noise: Of the counts of the raw image, one standard deviation.
+        plain: (rows, columns) counts, slightly smoothed.
+        log: (rows, columns) their logarithm, in which uneven light and shadows change edges little.
+        noise: Standard deviation of the noise of the raw image [counts].
     """
 
     plain: Plain
@@ -143,24 +144,24 @@ class Brightness:
     noise: float
 
     def log_noise(self, log: FloatArray) -> FloatArray:
-        """By how much noise moves values of the logarithm."""
+        """Standard deviation of values of the logarithm."""
         return np.asarray(self.noise * np.exp(-log))
 
 
 def logarithm(plain: Plain | FloatArray) -> FloatArray:
-    """Of counts, and of what black still has."""
+    """The logarithm of counts, with an offset."""
     return np.asarray(np.log(np.maximum(plain, 0.0) + _DARK))
 
 
 def brightness(flat: Plain, diameter_px: float, noise: float) -> Brightness:
-    """A rectified image in which robots have a diameter, by a raw image with so much noise."""
+    """Smooth a rectified image; `noise` is that of the raw image."""
     sigma = max(_SMOOTHING_SHARE * diameter_px, _MIN_SMOOTHING_PX)
     plain = np.asarray(cv2.GaussianBlur(flat, (0, 0), sigma), np.float32)
     return Brightness(plain, np.asarray(logarithm(plain), np.float32), noise)
 
 
 def noise_of(image: Gray) -> float:
-    """Noise of an image's counts by its second differences (Immerkaer 1996), here by their median."""
+    """Noise of an image [counts] from the median of its second differences, after Immerkaer (1996)."""
     rough = cv2.filter2D(image[::2], cv2.CV_32F, _KERNEL)
     median = float(np.median(np.abs(rough)))
     return max(median / (_MEDIAN_OF_NORMAL * _KERNEL_NORM), _LEAST_NOISE)

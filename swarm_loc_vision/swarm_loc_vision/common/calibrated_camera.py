@@ -1,4 +1,4 @@
-"""A camera as its messages tell of it: calibration and images in, whatever is made of them out."""
+"""One camera by its messages: the calibration, and the images that fit it."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ GrayOf = Callable[[Any], Gray]
 
 
 class CalibratedCamera:
-    """The calibration of one camera, and its images as far as they belong to it.
+    """The calibration of one camera, and its images.
 
     Args:
-        gray_of: Reads an image's message.
+        gray_of: Reads an image message, see `TRANSPORTS`.
 
     Attributes:
-        images: How many came.
-        drops: What was dropped, by reason.
-        camera: The calibration; None: none has come, or it cannot be used.
-        trouble: What is wrong with it, a sentence; empty: nothing.
+        images: Number of images received.
+        drops: Number of drops by reason.
+        camera: The calibration; None: none was received, or it cannot be used.
+        trouble: What is wrong with the calibration, a sentence; empty: nothing.
     """
 
     def __init__(self, gray_of: GrayOf) -> None:
@@ -34,13 +34,8 @@ class CalibratedCamera:
         self.trouble = ""
         self._gray_of = gray_of
 
-    @property
-    def is_calibrated(self) -> bool:
-        """Whether images can be used."""
-        return self.camera is not None
-
     def calibrate(self, message: Any) -> None:
-        """Take over a sensor_msgs/CameraInfo.
+        """Use a sensor_msgs/CameraInfo from now on.
 
         Raises:
             CameraError: The camera is not calibrated; its images are dropped from now on.
@@ -60,50 +55,44 @@ class CalibratedCamera:
             self.use(camera)
 
     def use(self, camera: Camera) -> None:
-        """A calibration has come that is another one than before."""
+        """Adapt to a calibration that differs from the previous one."""
         raise NotImplementedError
 
     def gray(self, message: Any) -> Gray:
-        """An image (height, width) of this camera, counted.
+        """The brightness (height, width) of an image of this camera.
 
         Raises:
-            ImageError: It was dropped, and counted.
+            ImageError: The image was dropped and counted.
         """
         self.images += 1
         try:
-            return self._usable(message)
+            return self._of_this_camera(message)
         except ImageError as error:
             self.drops[error.reason] += 1
             raise
 
-    def _usable(self, message: Any) -> Gray:
-        """An image that has the size that was calibrated."""
+    def _of_this_camera(self, message: Any) -> Gray:
         if self.camera is None:
-            raise ImageError("no_calibration", self.trouble or "no camera_info has come yet.")
+            raise ImageError("no_calibration", self.trouble or "no camera_info was received yet.")
         gray = self._gray_of(message)
-        height, width = gray.shape
-        if (width, height) != (self.camera.width, self.camera.height):
+        size, calibrated = gray.shape[::-1], (self.camera.width, self.camera.height)
+        if size != calibrated:
+            shown, wanted = (f"{width} x {height}" for width, height in (size, calibrated))
             raise ImageError(
-                "size",
-                f"the image has {width} x {height} pixels, but the camera is calibrated for"
-                f" {self.camera.width} x {self.camera.height}.",
+                "size", f"the image has {shown} pixels, but the camera is calibrated for {wanted}."
             )
         return gray
 
 
 def camera_of(message: Any) -> Camera:
-    """The camera that a sensor_msgs/CameraInfo describes.
+    """The camera of a sensor_msgs/CameraInfo.
 
     Raises:
-        CameraError: It is not calibrated, or its images are cut or binned.
+        CameraError: It is not calibrated, or its images are cropped or binned.
     """
     roi = message.roi
-    is_cut = (roi.width, roi.height) not in ((0, 0), (message.width, message.height))
-    if is_cut or max(message.binning_x, message.binning_y) > 1:
-        raise CameraError("the camera's images are cut or binned; only whole ones can be read.")
-    return Camera.from_matrix(
-        (message.width, message.height),
-        np.reshape(message.k, (3, 3)),
-        tuple(message.d),
-        message.distortion_model,
-    )
+    is_cropped = (roi.width, roi.height) not in ((0, 0), (message.width, message.height))
+    if is_cropped or max(message.binning_x, message.binning_y) > 1:
+        raise CameraError("the camera's images are cropped or binned; only whole images can be read.")
+    matrix = np.reshape(message.k, (3, 3))
+    return Camera.from_matrix((message.width, message.height), matrix, message.d, message.distortion_model)

@@ -21,7 +21,7 @@ STRAIGHT, RADIAL, FISHEYE = 0.0, 1.0, 2.0
 
 @cached_njit
 def distorted(lens: FloatArray, x: float, y: float) -> tuple[float, float]:
-    """The direction (x, y, 1) as the lens bends it."""
+    """The direction (x, y, 1) after distortion."""
     if lens[LENS_KIND] == STRAIGHT:
         return x, y
     r2 = x * x + y * y
@@ -43,7 +43,7 @@ def distorted(lens: FloatArray, x: float, y: float) -> tuple[float, float]:
 
 @cached_njit
 def raw_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
-    """Where the raw image shows an ideal pixel, one of an image without distortion."""
+    """The raw pixel of an ideal pixel, one of an image without distortion."""
     if lens[LENS_KIND] == STRAIGHT:
         return u, v
     x, y = distorted(lens, (u - lens[CX]) / lens[FX], (v - lens[CY]) / lens[FY])
@@ -63,13 +63,13 @@ _MODELS = {"": (0,), "plumb_bob": (0, 4, 5), "rational_polynomial": (0, 8), "equ
 """Distortion models of sensor_msgs/CameraInfo, and how many coefficients they may have."""
 
 _LONGEST_FOCAL = 100.0
-"""Of all lenses that could see a marker, in widths of the image."""
+"""Bound on focal lengths, in widths of the image."""
 _STRONGEST = 1e4
 _MAX_OFF_AXIS = math.tan(math.radians(80.0))
-"""Further out a flat image is stretched too much to tell straight sides."""
+"""Further off the axis a flat image is stretched too much to detect straight sides."""
 _ROUNDS, _EXACT_PX = 50, 1e-4
 _MAX_ERROR_PX = 0.01
-"""By which an ideal pixel may miss the raw one it is of; where it does by more, there is none."""
+"""Largest error of an ideal pixel, projected back; with a larger error there is no ideal pixel."""
 
 
 class CameraError(ValueError):
@@ -81,17 +81,17 @@ class Camera:
     """Intrinsics of a camera.
 
     Attributes:
-        width: Of the image [px].
-        height: Likewise.
-        fx: Focal length [px].
-        fy: Likewise.
-        cx: Principal point [px].
-        cy: Likewise.
-        distortion: Coefficients, as OpenCV orders them.
-        model: Distortion model, as sensor_msgs/CameraInfo names it.
+        width: Columns of the image.
+        height: Rows of the image.
+        fx: Horizontal focal length [px].
+        fy: Vertical focal length [px].
+        cx: Column of the principal point [px].
+        cy: Row of the principal point [px].
+        distortion: Coefficients in the order of OpenCV.
+        model: Distortion model by its name in sensor_msgs/CameraInfo.
 
     Raises:
-        CameraError: It is not calibrated, or its numbers cannot be.
+        CameraError: The camera is not calibrated, or a number is out of its range.
     """
 
     width: int
@@ -149,7 +149,7 @@ class Camera:
 
     @cached_property
     def lens(self) -> FloatArray:
-        """The constants of `lens.distorted`."""
+        """The lens (LENS_SIZE,) for compiled code such as `raw_pixels`."""
         lens = np.zeros(LENS_SIZE)
         lens[[FX, FY, CX, CY]] = self.fx, self.fy, self.cx, self.cy
         if self.model == "equidistant" or any(self.distortion):
@@ -159,9 +159,9 @@ class Camera:
         return lens
 
     def to_ideal(self, pixels: FloatArray) -> FloatArray:
-        """(..., 2) pixels of an image without distortion, from raw ones; NaN where there are none.
+        """(..., 2) pixels of an image without distortion from raw pixels; NaN where there is none.
 
-        That is where a fisheye sees what lies far off its axis, and where the model of a lens has no inverse.
+        There is none far off the axis of a fisheye, and where the model of the lens has no inverse.
         """
         if self.lens[LENS_KIND] == STRAIGHT or not pixels.size:
             return np.array(pixels)
@@ -173,18 +173,18 @@ class Camera:
             ideal = cv2.undistortPoints(flat, self.matrix, coefficients, P=self.matrix)
         found = np.asarray(ideal, np.float64).reshape(pixels.shape)
         missed = pixels - self.to_raw(found)
-        for _ in range(_ROUNDS):  # OpenCV stops after few, up to a pixel away at the rim of a strong lens
+        for _ in range(_ROUNDS):  # OpenCV stops early, up to a pixel off at the rim of a strong lens
             if not np.nanmax(np.abs(missed), initial=0.0) > _EXACT_PX:
                 break
             found += missed
             missed = pixels - self.to_raw(found)
         is_wrong = ~(np.abs(missed).max(axis=-1) < _MAX_ERROR_PX)
-        with np.errstate(over="ignore"):  # where there is no inverse the search runs away
+        with np.errstate(over="ignore"):  # the search diverges where there is no inverse
             off_axis = np.linalg.norm((found - self.intrinsics[2:]) / self.intrinsics[:2], axis=-1)
         found[is_wrong | (off_axis > _MAX_OFF_AXIS)] = np.nan
         return found
 
     def to_raw(self, pixels: FloatArray) -> FloatArray:
-        """(..., 2) raw pixels, from those of an image without distortion."""
+        """(..., 2) raw pixels from pixels of an image without distortion."""
         raw = raw_pixels(self.lens, np.ascontiguousarray(pixels, float).reshape(-1, 2))
         return np.asarray(raw.reshape(pixels.shape))

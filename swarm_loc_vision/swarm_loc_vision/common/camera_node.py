@@ -1,4 +1,4 @@
-"""What nodes of cameras share: images and calibrations in, diagnostics out, and what is missing."""
+"""Base of the nodes of cameras: subscriptions, diagnostics, and warnings about missing topics."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from swarm_loc_vision.common.camera import CameraError
 from swarm_loc_vision.common.images import TRANSPORTS, ImageError
 
 IMAGE_QOS = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Images that come faster than they can be read are dropped by the middleware, oldest first."""
+"""Where images arrive faster than they are processed, the middleware drops the oldest ones."""
 
 _MESSAGES = {"sensor_msgs/msg/Image": Image, "sensor_msgs/msg/CompressedImage": CompressedImage}
 _THROTTLE_S = 30.0
 
 
 class CameraNode(ConfiguredNode[Parameters]):
-    """Receives the images of one camera and publishes what is found in them; a kind says what and how."""
+    """Receives the images of one camera and publishes detections; subclasses detect."""
 
     def __init__(self, name: str, parameters: type[Parameters], **node_arguments: Any) -> None:
         super().__init__(name, parameters, **node_arguments)
@@ -34,9 +34,9 @@ class CameraNode(ConfiguredNode[Parameters]):
         """Subscribe to the camera's topics.
 
         Args:
-            camera: What they belong to.
+            camera: The camera.
             transport_name: One of `TRANSPORTS`.
-            detections: Where what is found is published.
+            detections: Publisher of what is found.
         """
         transport = TRANSPORTS[transport_name]
         self._source, self._detections = camera, detections
@@ -48,7 +48,7 @@ class CameraNode(ConfiguredNode[Parameters]):
             qos_profile_sensor_data,
             qos_overriding_options=overriding,
         )
-        # as image_transport does: who renames image_raw means all of its transports
+        # as image_transport does: a remapping of image_raw applies to all of its transports
         self._image_topic = self.resolve_topic_name("image_raw") + transport.suffix
         self.create_subscription(
             _MESSAGES[transport.message_type],
@@ -63,16 +63,16 @@ class CameraNode(ConfiguredNode[Parameters]):
         """The serialized detections of an image.
 
         Raises:
-            ImageError: It was dropped, and counted.
+            ImageError: The image was dropped and counted.
         """
         raise NotImplementedError
 
     def figures(self) -> dict[str, str]:
-        """What the diagnostics tell beside images, cost and drops."""
+        """Values for the diagnostics beside images, cost and drops."""
         raise NotImplementedError
 
     def trouble(self) -> str:
-        """What is wrong beside missing topics, a sentence; empty: nothing. Asked once per diagnostics."""
+        """What is wrong beside missing topics, a sentence; empty: nothing. Called once per diagnostics."""
         raise NotImplementedError
 
     def _on_camera_info(self, message: CameraInfo) -> None:
@@ -106,6 +106,6 @@ class CameraNode(ConfiguredNode[Parameters]):
 
     def _missing(self) -> str:
         """What is not received, a sentence; "": nothing."""
-        if not self._source.is_calibrated and not self._source.trouble:
+        if self._source.camera is None and not self._source.trouble:
             return f"no messages received on {self.resolve_topic_name('camera_info')}"
         return self.health.silence(self._image_topic)

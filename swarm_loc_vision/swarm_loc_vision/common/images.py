@@ -29,7 +29,7 @@ class ImageError(ValueError):
 
 @dataclass(frozen=True)
 class _Encoding:
-    """How pixels lie in memory, and how they become gray."""
+    """Layout of pixels in memory, and their conversion to gray."""
 
     channels: int
     to_gray: Callable[[Pixels], Pixels]
@@ -37,7 +37,7 @@ class _Encoding:
 
 
 def _converted(code: int) -> Callable[[Pixels], Pixels]:
-    """By a conversion of OpenCV."""
+    """A conversion of OpenCV."""
 
     def convert(pixels: Pixels) -> Pixels:
         return np.asarray(cv2.cvtColor(pixels, code), np.uint8)
@@ -46,7 +46,7 @@ def _converted(code: int) -> Callable[[Pixels], Pixels]:
 
 
 def _highest_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
-    """The highest 8 bits that any pixel uses: cameras of 10 or 12 bits may leave the upper ones empty."""
+    """The highest 8 bits that any pixel uses: cameras of 10 or 12 bits may leave the upper bits empty."""
     surplus = max(int(pixels.max()).bit_length() - 8, 0)
     return (pixels >> surplus).astype(np.uint8)
 
@@ -77,13 +77,13 @@ _ENCODINGS = {
 
 @dataclass(frozen=True)
 class _Compression:
-    """How the bytes of a compressed image begin, and what stands at the end of a whole one.
+    """Markers in the bytes of a compressed image.
 
     Attributes:
-        name: As formats tell it.
+        name: Its name in error messages.
         begin: First bytes.
-        data: What comes before pixels; the end is looked for behind its last occurrence.
-        end: Comes behind all pixels.
+        data: Mark before pixel data; `end` must follow its last occurrence.
+        end: Mark behind all pixel data.
     """
 
     name: str
@@ -92,7 +92,7 @@ class _Compression:
     end: bytes
 
     def is_whole(self, data: bytes) -> bool:
-        """Whether bytes begin and end as such an image; cameras may add bytes behind it."""
+        """Whether bytes are a whole image; cameras may append bytes."""
         return data.startswith(self.begin) and data.rfind(self.end) > data.rfind(self.data) > 0
 
 
@@ -100,7 +100,7 @@ _JPEG = _Compression("jpeg", b"\xff\xd8\xff", b"\xff\xda", b"\xff\xd9")
 _PNG = _Compression("png", b"\x89PNG\r\n\x1a\n", b"IDAT", b"IEND")
 _COMPRESSIONS = {"jpeg": _JPEG, "jpg": _JPEG, "png": _PNG}
 _COMPRESSED_DEPTH = "compressedDepth"
-"""Of image_transport's formats the one whose bytes are no plain image."""
+"""The format of image_transport whose bytes are no plain image."""
 
 
 def gray_image(message: Any) -> Gray:
@@ -125,7 +125,7 @@ def gray_image(message: Any) -> Gray:
     if known.bytes_per_channel == 2:
         pixels = pixels.view(">u2" if message.is_bigendian else "<u2")
     gray = np.ascontiguousarray(known.to_gray(pixels.reshape(height, width, known.channels)), np.uint8)
-    return gray if gray.flags.writeable else gray.copy()  # read-only ones would be compiled for once more
+    return gray if gray.flags.writeable else gray.copy()  # a read-only array would be compiled for separately
 
 
 def decoded_image(message: Any) -> Gray:
@@ -146,7 +146,7 @@ def decoded_image(message: Any) -> Gray:
 
 
 def _decoded(raw: NDArray[np.uint8]) -> MatLike | None:
-    """What OpenCV makes of the bytes; None: nothing, be it that the image would be too large."""
+    """The image that OpenCV decodes; None: none, or it would be too large."""
     try:
         return cv2.imdecode(raw, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
@@ -155,12 +155,12 @@ def _decoded(raw: NDArray[np.uint8]) -> MatLike | None:
 
 @dataclass(frozen=True)
 class Transport:
-    """A way that images come, as image_transport has it.
+    """A transport of images, as in image_transport.
 
     Attributes:
-        suffix: Of the topic, behind that of the images as they are.
-        message_type: Of its messages.
-        gray_of: Reads one of them.
+        suffix: Suffix of the topic `image_raw`.
+        message_type: Type of its messages.
+        gray_of: Reads a message.
     """
 
     suffix: str

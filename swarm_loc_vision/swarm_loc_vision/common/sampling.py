@@ -1,7 +1,7 @@
 """Sample brightness: profiles across the sides of quadrangles, and the cells inside.
 
-Places are given as in an image of the same camera without distortion ("ideal" pixels), where straight lines
-are straight, and looked up in the raw image through the lens, the array that `camera.Camera` makes.
+Places are "ideal" pixels: those of an image without distortion, where straight lines are straight. The lens
+(`Camera.lens`) maps them to the raw image.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from swarm_loc_vision.common.camera import raw_pixel
 from swarm_loc_vision.common.images import Gray
 
 GRID = 10
-"""Cells read along a side: the marker's 6, a ring of its border around them, and a ring around that."""
+"""Cells read along a side: the 6 of the marker, a ring of its border, and a ring around that."""
 MAX_PROFILES = 40
 _MIN_REACH_PX, _MAX_REACH_PX = 1.5, 6.0
 _STEP_PX = 0.5
 _MIN_SHARED_CELL_PX = 2.0
 _SPREAD = 0.4
 _MIN_CLEAR_CELL_PX = 4.5
-"""Cells narrower than this do not all reach the brightness of ink and paper."""
+"""Narrower cells do not all reach the brightness of ink and paper."""
 
 
 @cached_njit
@@ -38,7 +38,7 @@ def _brightness(image: Gray, u: float, v: float) -> float:
 
 @cached_njit
 def _is_inside(image: Gray, u: float, v: float) -> bool:
-    """Whether `_brightness` may be asked; not where a number is not one."""
+    """Whether `_brightness` is defined at a raw pixel; False for NaN."""
     return bool(0.0 <= u < image.shape[1] - 1 and 0.0 <= v < image.shape[0] - 1)
 
 
@@ -51,16 +51,16 @@ def profile_crossings(
     spacing: float,
     crossings: FloatArray,
 ) -> None:
-    """Where brightness crosses half way between dark and light, along profiles across the sides.
+    """Find where brightness crosses the middle level between dark and light on profiles across the sides.
 
     Args:
         image: (height, width).
         lens: See `camera.Camera`.
         quads: (N, 4, 2) clockwise, dark inside [ideal px].
-        reaches: (N,) how far to both sides a profile looks [px].
-        spacing: Of the profiles along a side, and at most MAX_PROFILES of them [px].
+        reaches: (N,) length of a profile to each side [px].
+        spacing: Distance of profiles along a side, if MAX_PROFILES are enough [px].
         crossings: (N, 4, MAX_PROFILES, 3) filled with the place along side k, from corner k to k + 1 [px],
-            how far outside it the crossing lies [px], and the contrast there; contrast 0: there is none.
+            the distance of the crossing outside of it [px], and the contrast; contrast 0: no crossing.
     """
     most = 2 * math.ceil(_MAX_REACH_PX / _STEP_PX) + 1
     profiles = np.empty((4, MAX_PROFILES, most))
@@ -110,8 +110,8 @@ def _common_level(contrasts: FloatArray, dark: FloatArray, light: FloatArray) ->
     """The middle level of the clearest quarter of a small marker's profiles.
 
     Where cells are hardly wider than the blur, a white cell behind the border keeps many profiles from
-    getting dark, and what is behind the narrow margin keeps them from getting light. Half way between their
-    own extremes they would be biased.
+    getting dark, and the surroundings of a narrow margin keep them from getting light. Their own middle
+    levels would be biased.
     """
     all_dark, all_light = np.empty(contrasts.size), np.empty(contrasts.size)
     count = 0
@@ -127,7 +127,7 @@ def _common_level(contrasts: FloatArray, dark: FloatArray, light: FloatArray) ->
 
 @cached_njit
 def _profile(image: Gray, u: float, v: float, du: float, dv: float, half: int, profile: FloatArray) -> bool:
-    """Brightness along 2 half + 1 points around a raw pixel; False when they leave the image."""
+    """Sample 2 half + 1 points around a raw pixel; False when they leave the image."""
     du, dv = _STEP_PX * du, _STEP_PX * dv
     for end in (-half, half):
         if not _is_inside(image, u + end * du, v + end * dv):
@@ -139,7 +139,7 @@ def _profile(image: Gray, u: float, v: float, du: float, dv: float, half: int, p
 
 @cached_njit
 def _extremes(profile: FloatArray, half: int) -> tuple[float, float]:
-    """The darkest inner and the lightest outer brightness of a profile (2 half + 1,)."""
+    """The darkest inner and the lightest outer value of a profile (2 half + 1,)."""
     dark, light = profile[half], profile[half]
     for j in range(half):
         dark = min(dark, profile[j])
@@ -149,7 +149,7 @@ def _extremes(profile: FloatArray, half: int) -> tuple[float, float]:
 
 @cached_njit
 def _crossing(profile: FloatArray, half: int, level: float) -> tuple[float, bool]:
-    """Where a profile (2 half + 1,) rises through a level next to its centre [steps], and whether it does."""
+    """Where a profile (2 half + 1,) rises through a level next to its centre [steps]; whether it does."""
     best, found = 0.0, False
     for j in range(2 * half):
         low, high = profile[j], profile[j + 1]
@@ -194,7 +194,7 @@ def read_cells(image: Gray, lens: FloatArray, homographies: FloatArray, side: in
 
 @cached_njit
 def _points_per_cell(h: FloatArray, side: int) -> tuple[int, float]:
-    """Points along a cell's side, and their distance [cells]; one where a pixel is half a cell."""
+    """Number of points along a cell's side, one for small cells, and their distance [cells]."""
     w = 0.5 * (h[2, 0] + h[2, 1]) + h[2, 2]
     u, v = (0.5 * (h[0, 0] + h[0, 1]) + h[0, 2]) / w, (0.5 * (h[1, 0] + h[1, 1]) + h[1, 2]) / w
     a, b = (h[0, 0] - u * h[2, 0]) / w, (h[0, 1] - u * h[2, 1]) / w

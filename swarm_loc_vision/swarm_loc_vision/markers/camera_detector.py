@@ -1,6 +1,6 @@
-"""Detector of one camera: CameraInfo and images in, serialized detections out, live or from a bag.
+"""Detector of one camera: CameraInfo and images in, serialized detections out.
 
-Messages are those of rclpy or of a bag's type store: the fields have the same names.
+Messages may be those of rclpy or of rosbags, whose fields have the same names.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ CreateDetector = Callable[[Camera], MarkerDetector]
 
 
 class CameraDetector(CalibratedCamera):
-    """The detector of one camera, made as soon as the calibration has come.
+    """The detector of one camera, created with its calibration.
 
     Args:
-        create: Makes the detector for a camera.
-        gray_of: Reads an image's message, see `TRANSPORTS`.
-        ambiguity: See `rows.detection_rows`.
+        create: Creates the detector for a camera.
+        gray_of: Reads an image message, see `TRANSPORTS`.
+        ambiguity: See `detection_rows`.
 
     Attributes:
-        markers: How many were found; `drops` counts those without a pose, too, and candidates.
-        misfits: How many of these had corners that fit no square by far.
+        markers: Number of markers with a pose; `drops` also counts those without, and candidates.
+        misfits: Number of them whose corners do not fit a square.
     """
 
     def __init__(self, create: CreateDetector, gray_of: GrayOf, ambiguity: float) -> None:
@@ -40,17 +40,17 @@ class CameraDetector(CalibratedCamera):
         self.markers = self.misfits = 0
         self._create = create
         self._ambiguity = ambiguity
-        self._detector: MarkerDetector  # with the calibration, without which there is no image
+        self._detector: MarkerDetector  # set with the calibration, without which images are dropped
 
     def use(self, camera: Camera) -> None:
-        """Make the detector anew."""
+        """Create the detector for another calibration."""
         self._detector = self._create(camera)
 
     def detect(self, message: Any) -> bytes:
-        """The serialized swarm_loc_msgs/MarkerDetectionArray of an image, with its stamp and frame.
+        """The serialized swarm_loc_msgs/MarkerDetectionArray of an image.
 
         Raises:
-            ImageError: The image was dropped, and counted.
+            ImageError: The image was dropped and counted.
         """
         gray = self.gray(message)
         detections = self._detector.detect(gray)
@@ -69,11 +69,11 @@ def detection_rows(detections: Detections, ambiguity: float) -> NDArray[np.void]
     """Rows of `DETECTION_DTYPE`, one per marker that has a pose.
 
     Args:
-        detections: Of a detector that knows its camera.
-        ambiguity: The mirrored pose is told when its chi square is higher by no more than this.
+        detections: Detections with poses.
+        ambiguity: The mirrored pose is included if its chi square is higher by at most this.
 
     Raises:
-        ValueError: The detections have no poses.
+        ValueError: The detector has no camera.
     """
     if detections.poses is None:
         raise ValueError("a detector without a camera finds no poses.")

@@ -1,7 +1,7 @@
 """Decode the brightness of cells: the nearest code word over all ids and rotations, and its margin.
 
-Blur mixes neighbouring cells, so cells are sharpened first. A cell near the threshold says little: a word may
-differ there at little cost, while a difference in a clear cell costs a whole bit.
+Blur mixes neighbouring cells, so cells are sharpened first. Bits are weighted by their clearness: a
+difference in a cell near the threshold costs little, in a clear cell a whole bit.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ from swarm_loc_vision.markers.families import BITS, CELLS, Family, rotated, unpa
 Words = NDArray[np.uint64]
 
 FALSE_READINGS = 1e-5
-"""Of random squares, so many may be read as a marker in use, by whole bits at one threshold. Weighed bits and
-the second threshold add to it: with all 4096 ids one or two of 100 000 are read."""
+"""Rate of random squares read as a marker in use, for whole bits and one threshold. Weighted bits and the
+second threshold add to it: with all 4096 ids one or two of 100 000 random squares are read."""
 _SHARPENING = 0.2
-"""How much of the difference to its four neighbours is added to a cell, each."""
+"""Share of the difference to each of its four neighbours that is added to a cell."""
 _MAX_DARK_ERRORS = 3.0
-"""Cells of the 28 of the border's inner ring that may look light."""
+"""Largest number of the 28 cells of the border's inner ring that may look light."""
 _MAX_SLOPE = 0.5
-"""Over the contrast: by how much the border's darkness may differ from side to side."""
+"""Largest difference of the border's brightness between its sides, over the contrast."""
 _MIDDLE, _LOW = 0.5, 0.28
-"""Where dark ends between ink and paper; and where, if half the marker lies in a shadow."""
+"""Thresholds between ink and paper: the usual one, and that for a marker half in shadow."""
 _MIN_CORRELATION = 0.4
-"""Between a candidate and its word. The cells of a black square with a speck of light are neither
-dark nor light and fit any word at little cost: 0.37 at most, where markers in motion have 0.5 and more."""
+"""Least correlation of a candidate and its word. The cells of a black square with a speck of light are
+neither dark nor light and fit any word at little cost; they reach 0.37, moving markers 0.5 and more."""
 _FAR = 1e9
 _WEIGHED = 4
-"""Words that differ in so many bits more than the nearest one may still be nearer when bits are weighed."""
+"""Words with up to so many more different bits than the nearest may be nearer by weighted bits."""
 
 
 class Readings(NamedTuple):
-    """What candidates say, one row each.
+    """Decoded candidates, one row each.
 
     Attributes:
         word: Index of the nearest word, -1: no marker in use.
-        quarters: Counter-clockwise quarter turns that the marker is turned by in the image.
-        errors: Weighed bits by which the candidate differs from it.
-        margin: Weighed bits that could still flip before another reading would be nearer.
+        quarters: Counter-clockwise quarter turns of the marker in the image.
+        errors: Weighted bits by which the candidate differs from the word.
+        margin: Weighted bits that could flip before another reading would be nearer.
         contrast: Light minus dark cells [counts].
     """
 
@@ -97,7 +97,7 @@ class Dictionary:
 
 
 def correctable_bits(words: int) -> int:
-    """Most whole bits that may differ while random squares are read at most at a rate of FALSE_READINGS."""
+    """Largest number of different bits for which random squares are read at most at FALSE_READINGS."""
     near, bits = 1, 0
     while bits < BITS // 4:
         near += math.comb(BITS, bits + 1)
@@ -140,10 +140,10 @@ def _read(
 
 @cached_njit
 def _flatten(cells: FloatArray, sharp: FloatArray) -> float:
-    """Write sharpened brightness above what is dark, (GRID - 2, GRID - 2); that of light, 0 if there is none.
+    """Write sharpened brightness above dark (GRID - 2, GRID - 2); returns that of light, 0 if there is none.
 
-    Dark is a plane through the border's inner ring, which takes in light that falls off; light is the mean
-    of the lighter cells.
+    Dark is a plane through the border's inner ring, to allow for uneven light; light is the mean of the
+    lighter cells.
     """
     for row in range(GRID - 2):
         for column in range(GRID - 2):
@@ -187,9 +187,9 @@ def _flatten(cells: FloatArray, sharp: FloatArray) -> float:
 
 @cached_njit
 def _clear_cells(flat: FloatArray, light: float, level: float, clear: FloatArray) -> bool:
-    """From brightness to -1 (dark) ... 1 (light), in `clear`; whether the border is dark.
+    """Map brightness to -1 (dark) ... 1 (light) in `clear`; returns whether the border is dark.
 
-    What lies at `level` between dark and `light`, 0 to 1, is neither.
+    The share `level` of `light` maps to 0.
     """
     wrong = 0.0
     for row in range(GRID - 2):
@@ -207,25 +207,25 @@ def _clear_cells(flat: FloatArray, light: float, level: float, clear: FloatArray
 def nearest(
     words: Words, seen: np.uint64, clear: FloatArray, bits: NDArray[np.uint8]
 ) -> tuple[int, float, float]:
-    """The nearest word to what was seen.
+    """Find the nearest word to a candidate.
 
     Args:
-        words: (N,) all that there are.
+        words: (N,) all words.
         seen: The candidate's bits.
-        clear: (BITS,) how clear each is, -1 to 1.
-        bits: (N,) filled with the number of bits that differ.
+        clear: (BITS,) clearness of each bit, -1 to 1.
+        bits: (N,) filled with the number of different bits.
 
     Returns:
-        Index of the nearest word, its weighed distance, and that of the second nearest. A second that
-        is far off is the one with the fewest bits that differ: another may weigh a tenth of a bit less.
+        Index of the nearest word, its weighted distance, and that of the second nearest. A distant second is
+        that with the fewest different bits, although another may be nearer by a tenth of a weighted bit.
     """
     fewest, second = np.uint8(BITS), np.uint8(BITS)
     for i in range(len(words)):
         bits[i] = _bits_set(words[i] ^ seen)
         fewest = min(fewest, bits[i])
-    for i in range(len(words)):  # a loop of its own: together the compiler does not turn them into vectors
+    for i in range(len(words)):  # a separate loop: the compiler does not vectorize a joint one
         second = min(second, bits[i] if bits[i] > fewest else np.uint8(BITS))
-    reach = max(fewest + _WEIGHED, second)  # so that there is a second nearest, however far it is
+    reach = max(fewest + _WEIGHED, second)  # so that there is always a second nearest
     best, distance, runner_up = -1, _FAR, _FAR
     for i in range(len(words)):
         if bits[i] > reach:
@@ -244,7 +244,7 @@ def nearest(
 
 @cached_njit
 def _bits_set(x: np.uint64) -> np.uint8:
-    """Number of ones, by shifts and sums, which the compiler turns into vectors."""
+    """Number of ones, by shifts and sums, which the compiler vectorizes."""
     x -= (x >> np.uint64(1)) & np.uint64(0x5555555555555555)
     x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
     x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)

@@ -1,12 +1,12 @@
-"""Find the markers in a bag's images: a bag with detections, for replay.
+"""Find the markers in the images of a bag, and write a bag with detections for replay.
 
     detect bags/eight_pictures --output out/detected
     detect recording.mcap --swarm swarm.yaml --output out/detected --set family=aruco_mip_36h12
 
-Of every camera in the bag, <robot>/image_raw or <robot>/image_raw/compressed with <robot>/camera_info, the
-images are replaced by <robot>/detections; all else is copied. The swarm description is the `swarm.yaml`
-inside the bag's folder unless --swarm names another, and is copied, too. --set takes the parameters of
-marker_detector_node.
+The images of each camera, <robot>/image_raw or <robot>/image_raw/compressed with <robot>/camera_info, are
+replaced by <robot>/detections with the log times of the images; all other messages are copied, so that the
+same bag gives the same bytes. The swarm description is the `swarm.yaml` in the folder of the bag unless
+--swarm names another; it is copied as well. --set takes the parameters of marker_detector_node.
 """
 
 from __future__ import annotations
@@ -47,22 +47,22 @@ Progress = Callable[[float, str], None]
 
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _NOT_A_MESSAGE = (SerdeError, struct.error, ValueError)
-"""What the type store raises at bytes that are not a whole message."""
+"""Errors of the type store for bytes that are not a whole message."""
 
 
 class ImageBag:
     """A bag with images, to be read once.
 
     Args:
-        bag: rosbag2 folder, .mcap or .db3 file; may have been cut off.
-        create: Makes the detector of the camera in a namespace, whose images come in a certain way.
+        bag: rosbag2 folder, .mcap or .db3 file; may be truncated.
+        create: Creates the detector of a camera from its namespace and transport.
 
     Attributes:
-        cameras: The detectors by namespace of their camera.
+        cameras: The detectors by namespace.
         losses: What could not be read, a sentence each.
 
     Raises:
-        BagError: The bag cannot be read, or it holds no images.
+        BagError: The bag cannot be read, or has no images.
     """
 
     def __init__(self, bag: Path, create: CreateCamera) -> None:
@@ -70,7 +70,7 @@ class ImageBag:
         self._bag = bag
         with BagReader(bag) as reader:
             topics = reader.topics
-        # where a camera's images come in two ways those with all their bytes are read
+        # of two transports of one camera, the uncompressed images are read
         self._images: dict[str, tuple[str, Transport]] = {}
         for transport in reversed(TRANSPORTS.values()):
             for space in _spaces(topics, f"image_raw{transport.suffix}", transport.message_type):
@@ -87,14 +87,14 @@ class ImageBag:
         """Write a bag with detections in place of images.
 
         Args:
-            folder: The new bag, created; must not exist.
-            progress: Called now and then with the share done and what is being done.
+            folder: The new bag; must not exist.
+            progress: Called with the share done and a word for the activity.
 
         Returns:
             Number of messages.
 
         Raises:
-            BagError: The bag cannot be read, or the new one not be created.
+            BagError: The bag cannot be read, or the new one cannot be created.
         """
         count = 0
         camera_at = {name: self.cameras[space.rstrip("/")] for space, (name, _) in self._images.items()}
@@ -122,7 +122,7 @@ class ImageBag:
 
 
 def _spaces(topics: Sequence[BagTopic], name: str, message_type: str) -> list[str]:
-    """The namespaces, with their slash, in which there is a topic of a name and type."""
+    """The namespaces, with slash, of topics of a name and type."""
     return [
         topic.name.removesuffix(name)
         for topic in topics
@@ -131,7 +131,7 @@ def _spaces(topics: Sequence[BagTopic], name: str, message_type: str) -> list[st
 
 
 def _detected(camera: CameraDetector, kind: str, data: bytes) -> bytes | None:
-    """The detections of an image's message; None: it was dropped, and counted."""
+    """The detections of an image message; None: it was dropped and counted."""
     try:
         message: Any = typestore().deserialize_cdr(data, kind)
     except _NOT_A_MESSAGE:
@@ -145,7 +145,7 @@ def _detected(camera: CameraDetector, kind: str, data: bytes) -> bytes | None:
 
 
 def _calibrate(camera: CameraDetector, data: bytes) -> None:
-    """Take over a calibration; one that cannot be used is told by the camera's `trouble`."""
+    """Use a calibration; `trouble` of the camera says why it cannot be used."""
     try:
         message: Any = typestore().deserialize_cdr(data, _CAMERA_INFO)
     except _NOT_A_MESSAGE:
@@ -178,7 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def camera_maker(parameters: DetectorParameters) -> CreateCamera:
-    """What makes the detectors of a bag's cameras; a camera in a robot's namespace is the robot's."""
+    """Creates the detectors of a bag's cameras; a camera in the namespace of a robot belongs to it."""
     robots = load_swarm(Path(parameters.swarm_file)).index_of if parameters.swarm_file else {}
 
     def create(space: str, transport: Transport) -> CameraDetector:
@@ -189,7 +189,7 @@ def camera_maker(parameters: DetectorParameters) -> CreateCamera:
 
 
 def _summary(name: str, camera: CameraDetector) -> str:
-    """What came of a camera's images."""
+    """A line about a camera."""
     drops: Mapping[str, int] = {reason: count for reason, count in sorted(camera.drops.items()) if count}
     dropped = "".join(f", dropped: {reason} {count}" for reason, count in drops.items())
     trouble = f" ({camera.trouble})" if camera.trouble else ""

@@ -1,4 +1,4 @@
-"""Detector of square fiducial markers: an image in, their corners, ids and poses out."""
+"""Detector of square fiducial markers: an image in; ids, corners and poses out."""
 
 from __future__ import annotations
 
@@ -26,34 +26,31 @@ from swarm_loc_vision.markers.quads import find_quads
 
 @dataclass(frozen=True)
 class DetectorSettings:
-    """Numbers of the detector, with units and ranges.
-
-    Candidates: `min_side_px`, `min_contrast`. Poses: the rest.
-    """
+    """Numbers of the detector."""
 
     marker_length: float = number(
-        0.05, "m", 0.001, 10.0, "side of a marker that has no other, black border included"
+        0.05, "m", 0.001, 10.0, "side of markers without a length of their own, black border included"
     )
-    min_side_px: float = number(8.0, "px", 6.0, 1000.0, "smaller markers are not looked for")
-    min_contrast: float = number(4.0, "1", 1.0, 100.0, "by how much ink is darker than paper [counts]")
+    min_side_px: float = number(8.0, "px", 6.0, 1000.0, "smallest side of markers in the image")
+    min_contrast: float = number(4.0, "1", 1.0, 100.0, "least brightness of paper minus that of ink [counts]")
     tilt_sigma: float = number(
-        0.0, "rad", 0.0, 1.0, "how upright markers stand towards a level camera's mount; 0: any way up"
+        0.0, "rad", 0.0, 1.0, "standard deviation of markers from upright; 0: any orientation"
     )
     ambiguity: float = number(
-        16.0, "1", 0.0, 1e4, "the mirrored pose is told when it fits worse by no more than this chi square"
+        16.0, "1", 0.0, 1e4, "the mirrored pose is published if its chi square is higher by at most this"
     )
 
 
 _ROUGH_PX = 3.0
-"""Distance of the profiles across the sides of candidates."""
+"""Distance of the profiles across the sides of candidates [px]."""
 _MIN_EDGE = 2.0
-"""Contrast of a candidate's sides over `min_contrast`, which counts from the mean and not from dark."""
+"""Least contrast of a candidate's sides over `min_contrast`, which is relative to the local mean."""
 _MAX_CANDIDATES = 8192
-"""Of more, in an image full of texture, the smallest are dropped."""
+"""Bound on the candidates of an image; beyond it the smallest are dropped."""
 _BLOCK = 256
-"""Candidates that are read at once, which bounds the memory that they take."""
+"""Number of candidates that are read at once, to bound memory."""
 _SAME = 0.3
-"""Readings nearer than this share of a marker's diagonal are of the same one."""
+"""Readings closer than this share of a marker's diagonal are the same marker."""
 
 
 @dataclass(frozen=True)
@@ -61,15 +58,15 @@ class Detections:
     """The markers in an image, one row each.
 
     Attributes:
-        family: Code of its family.
-        id: Its id.
-        margin: Weighed bits that could still flip before another reading would be nearer.
-        errors: Weighed bits by which it differs from its id's word.
-        contrast: Light minus dark cells [counts].
+        family: (N,) codes of families.
+        id: (N,) ids.
+        margin: (N,) weighted bits that could flip before another reading would be nearer.
+        errors: (N,) weighted bits by which the cells differ from the word of the id.
+        contrast: (N,) light minus dark cells [counts].
         corners: (N, 4, 2) clockwise from the marker's own upper left [raw px].
-        poses: Its pose and the mirrored one; None without a camera.
-        misfits: Markers whose corners fit no square by far: the camera may not be the calibrated one.
-        dropped: Candidates that could not be read, by reason.
+        poses: Poses and mirrored poses; None without a camera.
+        misfits: Number of markers whose corners do not fit a square: the calibration may be wrong.
+        dropped: Number of candidates that could not be read, by reason.
     """
 
     family: IntArray
@@ -87,7 +84,7 @@ class Detections:
 
 
 class _Markers(NamedTuple):
-    """Candidates that were read, one row each; as `Detections`, with ideal corners and their covariance."""
+    """Decoded candidates, one row each; as `Detections`, with ideal corners and their covariance."""
 
     family: NDArray[Any]
     id: NDArray[Any]
@@ -98,7 +95,7 @@ class _Markers(NamedTuple):
     covariance: NDArray[Any]
 
     def chosen(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> _Markers:
-        """Some of the rows."""
+        """A selection of rows."""
         return _Markers(*(column[rows] for column in self))
 
 
@@ -106,12 +103,12 @@ class MarkerDetector:
     """Finds the markers in use.
 
     Args:
-        settings: Its numbers.
+        settings: Numbers of the detector.
         families: Ids in use of each family in use; None: all of its ids.
-        camera: What takes the images; without one there are no poses, and it has no distortion.
+        camera: The camera; without one there are no poses and no distortion.
         lengths: Sides of markers that differ from `settings.marker_length`, by id [m].
         up: (3,) direction up in the camera frame, for `settings.tilt_sigma`.
-        bodies: Things that carry several markers.
+        bodies: Bodies that carry several markers.
     """
 
     def __init__(
@@ -149,12 +146,12 @@ class MarkerDetector:
         dropped = {"too_many_candidates": surplus, "too_far_off_axis": count - len(quads)}
         blocks = np.split(quads, range(_BLOCK, len(quads), _BLOCK))
         found = [self._read(gray, block, side) for side in self._dictionaries for block in blocks]
-        markers = _best(_joined(found))
+        markers = _best(_Markers(*map(np.concatenate, zip(*found, strict=True))))
         corners = self._camera.to_raw(markers.corners) if self._camera else markers.corners
         return Detections(*markers[:5], corners, *self._poses(markers), dropped)
 
     def _read(self, gray: Gray, quads: FloatArray, side: int) -> _Markers:
-        """The candidates that are markers of so many cells along a side."""
+        """The candidates that are markers of `side` cells along a side."""
         min_contrast, dictionary = self._settings.min_contrast, self._dictionaries[side]
         rough = refine(gray, self._lens, quads, side, _ROUGH_PX)
         corners = rough.corners[rough.contrast >= _MIN_EDGE * min_contrast]
@@ -182,7 +179,7 @@ class MarkerDetector:
         return markers.chosen(fine.contrast > 0.0)
 
     def _poses(self, markers: _Markers) -> tuple[Poses | None, int]:
-        """Poses of all markers, those of bodies together, and how many markers misfit."""
+        """Poses of all markers, jointly for bodies, and the number of misfits."""
         if self._camera is None:
             return None, 0
         default = self._settings.marker_length
@@ -197,13 +194,8 @@ class MarkerDetector:
         return poses, int(is_misfit.sum())
 
 
-def _joined(found: Sequence[_Markers]) -> _Markers:
-    """All rows."""
-    return _Markers(*map(np.concatenate, zip(*found, strict=True)))
-
-
 def _best(markers: _Markers) -> _Markers:
-    """One reading for each place: that with the fewest errors, and of like ones the clearest."""
+    """One reading per place: that with the fewest errors, then the highest contrast."""
     if not len(markers.id):
         return markers
     middle, kept = markers.corners.mean(axis=1), np.zeros(len(markers.id), np.bool_)
@@ -219,7 +211,7 @@ def _diagonals(quads: FloatArray) -> FloatArray:
 
 
 def precompile() -> None:
-    """Let a detector find two markers of one body, which takes every path through the compiled code."""
+    """Compile the detector by finding two markers of one body, which calls all compiled functions."""
     family = family_named("artoolkit_bch_thin")
     image = np.hstack([draw_marker(family, marker_id, margin=4) for marker_id in (1, 2)])
     height, width = image.shape

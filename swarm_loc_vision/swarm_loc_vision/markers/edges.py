@@ -1,6 +1,6 @@
-"""Sub-pixel refinement of corners: lines fitted to the edges of each side, and their intersections.
+"""Sub-pixel refinement of corners: lines are fitted to the edges of each side and intersected.
 
-The spread of the crossings around their line says how sure the line is, and so how sure the corners are.
+The spread of the crossings around their line gives the covariance of the lines and of the corners.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from swarm_loc_vision.markers.sides import fit_sides
 
 _MIN_CROSSINGS = 3
 _MIN_SINE = 0.1
-"""Of the angle between neighbouring sides."""
+"""Least sine of the angle between neighbouring sides."""
 _MIN_SIGMA_PX = 0.004
-"""What a line is unsure of even without noise: print, lens and pixels are not perfect."""
+"""Error of a line without noise, from print, lens and pixels."""
 _NEIGHBOUR_PX3 = 0.25
-"""Over the square of a cell's width [px]: the bias where the next edges blur into the one looked for."""
+"""Over the square of a cell's width [px]: the bias by neighbouring edges that blur into the side."""
 _SHARE_FRESH = 0.5
-"""Crossings a pixel apart share pixels: so much of each one's information is its own."""
+"""Share of independent information of crossings, which share pixels."""
 
 
 class Corners(NamedTuple):
@@ -45,14 +45,14 @@ class Corners(NamedTuple):
 
 
 def refine(image: Gray, lens: FloatArray, quads: FloatArray, cells: int, spacing: float = 1.0) -> Corners:
-    """Move quadrangles onto their edges.
+    """Move quadrangles to their edges.
 
     Args:
         image: (height, width).
         lens: See `camera.Camera`.
         quads: (N, 4, 2) clockwise, dark inside [ideal px].
-        cells: Along a side; a profile looks no further than one cell.
-        spacing: Of the places along a side where the edge is looked for [px].
+        cells: Cells along a side; profiles reach one cell to each side.
+        spacing: Distance of profiles along a side [px].
     """
     corners = quads.copy()
     covariance = np.zeros((len(quads), 8, 8))
@@ -68,12 +68,12 @@ def refine(image: Gray, lens: FloatArray, quads: FloatArray, cells: int, spacing
 
 
 def refine_read(image: Gray, lens: FloatArray, quads: FloatArray, strips: NDArray[np.uint8]) -> Corners:
-    """Move the corners of markers that have been read onto their edges, as exactly as the pixels tell.
+    """Move the corners of decoded markers to their edges by a fit to pixels, see `sides`.
 
     Args:
         image: (height, width).
         lens: See `camera.Camera`.
-        quads: (N, 4, 2) clockwise from each marker's own upper left, nearly right [ideal px].
+        quads: (N, 4, 2) clockwise from each marker's own upper left, within a pixel [ideal px].
         strips: (N, 4, cells) the row of cells behind the border along each side; 1 is white.
     """
     cells = strips.shape[2]
@@ -105,7 +105,7 @@ def _fit(
     covariance: FloatArray,
     contrast: FloatArray,
 ) -> None:
-    """Fit a line to the crossings of each side; the last three as of `sides.fit_sides`."""
+    """Fit a line to the crossings of each side; fills the last three arguments as `sides.fit_sides`."""
     line = np.empty(5)
     for n in range(len(crossings)):
         min_variance = _MIN_SIGMA_PX**2 + (_NEIGHBOUR_PX3 / widths[n] ** 2) ** 2
@@ -122,11 +122,11 @@ def _fit(
 
 @cached_njit
 def _fit_line(crossings: FloatArray, min_variance: float, line: FloatArray) -> float:
-    """Least squares, twice: the second time without what lies far off the first line.
+    """Fit a line by least squares, repeated without outliers.
 
     Args:
         crossings: (M, 3) along, outside, contrast.
-        min_variance: Of the offset, without noise [px^2].
+        min_variance: Variance of the offset without noise [px^2].
         line: (5,) filled with the offset at `along` = 0, the slope, and var, cov, var of both.
 
     Returns:
@@ -172,11 +172,11 @@ def _fit_line(crossings: FloatArray, min_variance: float, line: FloatArray) -> f
 def _intersect(
     corners: FloatArray, ends: FloatArray, of_ends: FloatArray, covariance: FloatArray, contrast: FloatArray
 ) -> None:
-    """Where the lines along the sides of quadrangles meet.
+    """Intersect the lines along the sides of quadrangles.
 
     Args:
         corners: (N, 4, 2) the quadrangles; moved.
-        ends: (N, 8) how far outside each side its line lies at its begin and its end [px].
+        ends: (N, 8) distance of each line outside of its side at the first and the last corner [px].
         of_ends: (N, 8, 8) their covariance [px^2].
         covariance: (N, 8, 8) of the corners, filled.
         contrast: (N,) set to 0 where lines do not meet; such corners stay.
@@ -193,11 +193,11 @@ def _intersect(
 
 @cached_njit
 def _meet(corners: FloatArray, ends: FloatArray, moved: FloatArray, jacobian: FloatArray) -> bool:
-    """Where the lines along the sides of one quadrangle meet.
+    """Intersect the lines along the sides of one quadrangle; False where they do not meet.
 
     Args:
         corners: (4, 2) the quadrangle.
-        ends: (8,) how far outside each side its line lies at its begin and its end.
+        ends: (8,) distance of each line outside of its side at the first and the last corner.
         moved: (4, 2) filled with the new corners.
         jacobian: (8, 8) filled with their derivatives by `ends`.
     """
@@ -223,7 +223,7 @@ def _meet(corners: FloatArray, ends: FloatArray, moved: FloatArray, jacobian: Fl
         u = (rest[a] * normal[k, 1] - rest[k] * normal[a, 1]) / determinant
         v = (normal[a, 0] * rest[k] - normal[k, 0] * rest[a]) / determinant
         moved[k, 0], moved[k, 1] = u, v
-        # a line moved out by 1 shifts the corner along the other line; its ends share in that
+        # moving a line outwards by 1 shifts the corner along the other line, shared by the ends of the line
         for line, other, sign in ((a, k, 1.0), (k, a, -1.0)):
             along = (u - corners[line, 0]) * direction[line, 0] + (v - corners[line, 1]) * direction[line, 1]
             share = along / lengths[line]

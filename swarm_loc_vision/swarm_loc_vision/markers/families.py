@@ -1,7 +1,6 @@
 """Families of square markers: 6 x 6 cells inside a black border, each id a word of 36 bits.
 
-All families share one form, so one decoder reads them: the cells row by row from the upper left, the first
-one in bit 35, 1 is white.
+A word holds the cells row by row from the upper left, the first one in bit 35; 1 is white.
 """
 
 from __future__ import annotations
@@ -22,7 +21,12 @@ _BCH_MASK = 0x8F80B8750
 
 
 def bch_words() -> NDArray[np.uint64]:
-    """(4096,) the 36 cells of each id, row by row, the first one in bit 35; 1 is white."""
+    """(4096,) words of the BCH code of ARToolKitPlus.
+
+    BCH(63, 39), t = 4, over GF(64) with x^6 + x + 1, shortened to (36, 12). A codeword has the remainder in
+    bits 0 to 23 and the id above; a mask inverts some bits so that no id looks plain. Words are at least 9
+    bits apart in one orientation.
+    """
     words = np.arange(_BCH_IDS, dtype=np.uint64) << np.uint64(_BCH_PARITY_BITS)
     remainder = words.copy()
     for bit in range(35, _BCH_PARITY_BITS - 1, -1):
@@ -46,10 +50,10 @@ class Family:
     """One kind of marker.
 
     Attributes:
-        name: As parameters name it.
+        name: Name in parameters.
         code: FAMILY_* of swarm_loc_msgs/MarkerDetection.
         border: Width of the black border [cells].
-        words: (N,) uint64, the cells of id 0, 1, 2 ...
+        words: (N,) words of the ids.
     """
 
     name: str
@@ -89,7 +93,7 @@ def unpacked(words: NDArray[np.uint64]) -> NDArray[np.uint8]:
 
 
 def rotated(words: NDArray[np.uint64], quarters: int) -> NDArray[np.uint64]:
-    """The words (N,) of markers turned counter-clockwise by quarter turns, as they then look."""
+    """The words (N,) of markers after counter-clockwise quarter turns."""
     return packed(np.rot90(unpacked(words), quarters, axes=(1, 2)))
 
 
@@ -106,8 +110,7 @@ def _opencv_words(dictionary: int, *, quarters: int) -> NDArray[np.uint64]:
 def families() -> dict[str, Family]:
     """All families by name.
 
-    OpenCV turns AprilTag's tags by half a turn against the images that AprilTag publishes; here they are
-    upright as published.
+    AprilTags are upright as published; OpenCV has them upside down.
     """
     words = bch_words()
     mip = _opencv_words(cv2.aruco.DICT_ARUCO_MIP_36h12, quarters=0)
@@ -125,7 +128,7 @@ def family_named(name: str) -> Family:
     """The family of a name.
 
     Raises:
-        ValueError: There is none; the message names those that are.
+        ValueError: There is none; the message lists the families.
     """
     known = families()
     if name not in known:
@@ -139,16 +142,13 @@ WHITE = 255
 def draw_marker(
     family: Family, marker_id: int, pixels_per_cell: int = 8, margin: int = 1
 ) -> NDArray[np.uint8]:
-    """A marker as seen by one who faces it upright, inside a white margin.
+    """An image (n, n) of 0 and 255 of an upright marker, n = (family.side + 2 margin) pixels_per_cell.
 
     Args:
-        family: Of which family; it says how wide the black border is.
-        marker_id: Which one.
-        pixels_per_cell: Size of a cell, at least 1 [px].
-        margin: Width of the white margin [cells]; the marker itself fills `family.side` cells.
-
-    Returns:
-        (n, n) of 0 and 255, n = (family.side + 2 margin) pixels_per_cell.
+        family: Family of the marker.
+        marker_id: Its id.
+        pixels_per_cell: Size of a cell [px].
+        margin: Width of the white margin [cells].
 
     Raises:
         ValueError: The family has no such id.

@@ -2,9 +2,8 @@
 
     ./run swarm_loc_vision marker_detector_node --ros-args -r __ns:=/epuck1 -p family:=aruco_mip_36h12
 
-It subscribes to `camera_info`, and to `image_raw` or `image_raw/compressed`, and publishes `detections` with
-the images' own stamps and frames, and `/diagnostics`. Parameters: see
-`doc/marker_detector_node.md`.
+The node subscribes to `camera_info` and to `image_raw` or `image_raw/compressed`, and publishes `detections`
+with the stamps and frames of the images, and `/diagnostics`. Parameters: see `doc/marker_detector_node.md`.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ from swarm_loc_vision.markers.detector import precompile
 from swarm_loc_vision.markers.parameters import DetectorParameters, detector_maker
 
 _MAX_MISFIT_SHARE = 0.1
-"""Of the markers since the last diagnostics; if more fit no square the camera is not the calibrated one."""
+"""Largest share of misfits since the last diagnostics; above it the calibration may be wrong."""
 
 
 class MarkerDetectorNode(CameraNode[DetectorParameters]):
-    """Receives images, lets the core find the markers, publishes."""
+    """Receives images and publishes detections."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("marker_detector", DetectorParameters, **node_arguments)
@@ -49,12 +48,12 @@ class MarkerDetectorNode(CameraNode[DetectorParameters]):
         return self._camera.detect(message)
 
     def figures(self) -> dict[str, str]:
-        """How many markers were found."""
+        """Numbers of markers."""
         camera = self._camera
         return {"markers": str(camera.markers), "markers that fit no square": str(camera.misfits)}
 
     def trouble(self) -> str:
-        """That many of the markers since the last time fit no square."""
+        """A warning if many markers since the last call do not fit a square."""
         camera = self._camera
         markers, misfits = camera.markers - self._told[0], camera.misfits - self._told[1]
         self._told = camera.markers, camera.misfits

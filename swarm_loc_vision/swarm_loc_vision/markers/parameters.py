@@ -1,4 +1,4 @@
-"""Parameters of `marker_detector_node`, and the detector that they describe. No ROS here."""
+"""Parameters of `marker_detector_node`, and the detector that they describe."""
 
 from __future__ import annotations
 
@@ -28,25 +28,25 @@ _LONGEST_M = 10.0
 
 @dataclass(frozen=True)
 class DetectorParameters:
-    """Parameters of `marker_detector_node`; those of the detector itself are its settings."""
+    """Parameters of `marker_detector_node`."""
 
-    image_transport: str = choice("raw", tuple(TRANSPORTS), "how images come: as they are, or as JPEG or PNG")
+    image_transport: str = choice("raw", tuple(TRANSPORTS), "transport: uncompressed images, or JPEG or PNG")
     family: str = choice("artoolkit_bch_thin", tuple(families()), "kind of marker")
-    ids: tuple[str, ...] = texts("ids in use, such as 5 or 0-31; empty: those of swarm_file, or else all")
+    ids: tuple[str, ...] = texts("ids in use, such as 5 or 0-31; empty: those of swarm_file, or all")
     lengths: tuple[str, ...] = texts(
-        "sides that differ from marker_length, such as 100-119:0.08 [m]; not with swarm_file, which has them"
+        "sides that differ from marker_length, such as 100-119:0.08 [m]; not with swarm_file"
     )
     swarm_file: str = text(
         "", "path of the swarm description: ids in use, sizes, faces of robots; empty: none"
     )
-    robot: str = text("", "whose camera it is in swarm_file: its mount says where up is; empty: a level one")
+    robot: str = text("", "robot of the camera in swarm_file, for its mount; empty: a level camera")
     settings: DetectorSettings = field(
         default_factory=DetectorSettings, metadata={"numbers_of": DetectorSettings}
     )
 
 
 def detector_maker(parameters: DetectorParameters) -> CreateDetector:
-    """What makes the detector once the camera is known.
+    """Creates the detector for a camera.
 
     Raises:
         ParameterError: A parameter cannot be used.
@@ -69,7 +69,7 @@ def detector_maker(parameters: DetectorParameters) -> CreateDetector:
 
 
 def _robot(parameters: DetectorParameters, swarm: Swarm) -> Robot | None:
-    """Whose camera it is."""
+    """The robot that carries the camera."""
     if not parameters.robot:
         return None
     if not parameters.swarm_file:
@@ -97,7 +97,7 @@ def _ids(parameters: DetectorParameters, swarm: Swarm, family: Family) -> IntArr
 
 
 def _lengths(parameters: DetectorParameters, swarm: Swarm, family: Family) -> dict[int, float]:
-    """Sides by id: those of the swarm, or those that the parameter says."""
+    """Sides by id, from the swarm or from the parameter."""
     if parameters.lengths and parameters.swarm_file:
         raise ParameterError(
             "parameter lengths cannot be given along with swarm_file, which has the size of each marker."

@@ -1,10 +1,9 @@
 """Planar pose estimation: weighted least squares on the corners of markers, with covariance.
 
-IPPE gives two starts for a plane. Each is refined by weighted least squares on the corners, with the
-knowledge, if there is any, that the marker stands upright. What the corners are unsure of becomes the pose's
-covariance.
+IPPE gives two initial poses of a plane. Each is refined by weighted least squares on the corners, with an
+upright prior if there is one. The covariance of the corners propagates to the pose.
 
-Marker frame: x right and y up as seen by one who faces it, z out of it. Camera frame: x right, y down, z
+Marker frame: x right and y up when facing it, z out of it. Camera frame: x right, y down, z
 forward. Rotations are perturbed from the left, so covariances are about the camera's axes.
 """
 
@@ -22,21 +21,21 @@ from swarm_loc_vision.markers.ippe import two_starts
 
 _ROUNDS = 12
 _STILL = 1e-6
-"""A step whose weighed square is smaller ends the search."""
+"""Weighted square of a step below which the search ends."""
 _NOWHERE = 1e12
 _TRUST = 6.0
-"""The corners' covariance counts like so many degrees of freedom; where corners fit worse than it says, as on
-a marker that is partly covered, the pose is as much less sure. A marker alone has two of its own."""
+"""Degrees of freedom that the covariance of the corners counts for. Where corners fit worse, as on a partly
+covered marker, the covariance of the pose grows. A single marker has two degrees of freedom."""
 _MISFIT = 100.0
-"""Chi square, of two degrees of freedom, above which not the corners' noise is what they do not fit by, but
-their model: a lens that is not the calibrated one, a bent marker."""
+"""Chi square, of two degrees of freedom, above which the model is wrong, not the noise: a lens that is not
+the calibrated one, or a bent marker."""
 _SAME = 1.0 + 2.0 * math.cos(0.05)
-"""Solutions that are turned against each other by less than 0.05 rad are the same one. Multiplied element by
-element, rotations add up to 1 + 2 cos of the angle between them."""
+"""Solutions with less than 0.05 rad between their rotations are the same. The sum of the elementwise product
+of two rotations is 1 + 2 cos of the angle between them."""
 
 
 class Upright(NamedTuple):
-    """Knowledge that something stands upright.
+    """Prior that a body stands upright.
 
     Attributes:
         up: (3,) unit vector in the camera frame.
@@ -48,13 +47,13 @@ class Upright(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """Two solutions for each of N things, the better one first.
+    """Two solutions for each of N markers or bodies, the better one first.
 
     Attributes:
         rotation: (N, 2, 3, 3) to the camera frame.
         position: (N, 2, 3) in the camera frame [m].
         covariance: (N, 2, 6, 6) of position and rotation [m^2, rad^2].
-        chi2: (N, 2) weighed square of what is left of the corners' differences [1]; infinite: no solution.
+        chi2: (N, 2) weighted squares of the corners' residuals; infinite: no solution.
     """
 
     rotation: FloatArray
@@ -64,16 +63,16 @@ class Poses(NamedTuple):
 
 
 class _Sight(NamedTuple):
-    """What is known of the pose of one marker, or of a body with M of them.
+    """Measurements of one marker, or of a body with M markers.
 
     Attributes:
         points: (4 M, 3) corners in the body's frame.
-        pixels: (4 M, 2) where they are seen.
-        weights: (M, 8, 8) of each four.
+        pixels: (4 M, 2) their pixels.
+        weights: (M, 8, 8) inverse covariance of the corners of each marker.
         intrinsics: fx, fy, cx, cy.
-        axis: (3,) of the body, which points up.
+        axis: (3,) axis of the body that points up.
         up: (3,) in the camera frame.
-        tilt_weight: One over the tilt's variance; 0 when nothing is known.
+        tilt_weight: Inverse variance of the tilt; 0: no prior.
     """
 
     points: FloatArray
@@ -98,17 +97,17 @@ def marker_poses(
     intrinsics: FloatArray,
     upright: Upright | None = None,
 ) -> tuple[Poses, NDArray[np.bool_]]:
-    """Both solutions for each marker, or one where both starts lead to the same, and which markers misfit.
+    """Solve for the poses of markers; returns also which markers misfit.
 
-    Where corners fit no square by far, each coordinate is taken for as unsure as plain least squares leaves
-    it, on top of what its covariance says.
+    There is one solution where both initial poses lead to the same. For a misfit, the variance of the
+    residuals of plain least squares is added to the covariance of the corners.
 
     Args:
         corners: (N, 4, 2) clockwise from the marker's own upper left [ideal px].
         covariance: (N, 8, 8) of the corners [px^2].
         lengths: (N,) sides [m].
         intrinsics: (4,) fx, fy, cx, cy [px].
-        upright: Given when the markers' y axes are known to point up.
+        upright: Given if the markers' y axes are known to point up.
     """
     directions = (corners - intrinsics[2:]) / intrinsics[:2]
     points = np.stack([square(length) for length in lengths]) if len(lengths) else np.zeros((0, 4, 3))
@@ -150,19 +149,19 @@ def body_pose(
     positions: FloatArray,
     upright: Upright | None = None,
 ) -> Poses:
-    """The pose of a body whose z axis points up, from several of its markers; the best from all starts.
+    """The pose of a body whose z axis points up, from several of its markers.
 
     Args:
         points: (M, 4, 3) corners in the body's frame [m].
         pixels: (M, 4, 2) in the image [ideal px].
         covariance: (M, 8, 8) of each marker's corners [px^2].
         intrinsics: (4,) fx, fy, cx, cy [px].
-        rotations: (S, 3, 3) to search from.
-        positions: (S, 3) to search from [m].
-        upright: Given when the body is known to stand upright.
+        rotations: (S, 3, 3) initial rotations.
+        positions: (S, 3) initial positions [m].
+        upright: Given if the body is known to stand upright.
 
     Returns:
-        N = 1; the second solution is the best one of another kind, if a start led to one.
+        The best solution, and the best different one, if any; N = 1.
     """
     weights = np.asarray(np.linalg.inv(covariance), np.float64)
     axis, flat = np.array([0.0, 0.0, 1.0]), (points.reshape(-1, 3), pixels.reshape(-1, 2))
@@ -184,7 +183,7 @@ def body_pose(
 
 
 def _tilt(upright: Upright | None) -> tuple[FloatArray, float]:
-    """Up, and the weight of the tilt; 0 when nothing is known."""
+    """Direction up, and the weight of the tilt; 0 without a prior."""
     known = upright or Upright(np.zeros(3), np.inf)
     return np.ascontiguousarray(known.up, float), 1.0 / known.tilt_sigma**2
 
@@ -199,7 +198,7 @@ def _refine_markers(
     tilt_weight: float,
     poses: Poses,
 ) -> None:
-    """Refine both starts of each marker."""
+    """Refine both initial poses of each marker."""
     rotation, position, covariance, chi2 = poses
     axis = np.array([0.0, 1.0, 0.0])
     for n in range(len(corners)):
@@ -211,16 +210,16 @@ def _refine_markers(
 
 @cached_njit
 def _refine(sight: _Sight, rotation: FloatArray, position: FloatArray, covariance: FloatArray) -> float:
-    """Weighted least squares on corners and tilt, Levenberg and Marquardt.
+    """Minimize the weighted squares of corners and tilt by Levenberg-Marquardt.
 
     Args:
-        sight: What is known.
-        rotation: (3, 3) start, and result.
-        position: (3,) likewise.
+        sight: The measurements.
+        rotation: (3, 3) initial value, and result.
+        position: (3,) initial value, and result.
         covariance: (6, 6) filled.
 
     Returns:
-        The weighed square of the differences; infinite without a solution.
+        The sum of squares; infinite without a solution.
     """
     normal, trial_normal = np.empty((6, 6)), np.empty((6, 6))
     slope, trial_slope, step = np.empty(6), np.empty(6), np.empty(6)
@@ -265,7 +264,7 @@ def _refine(sight: _Sight, rotation: FloatArray, position: FloatArray, covarianc
 def _equations(
     sight: _Sight, rotation: FloatArray, position: FloatArray, normal: FloatArray, slope: FloatArray
 ) -> float:
-    """Normal equations (6, 6) and (6,) at a pose, and its cost; infinite where a corner lies behind."""
+    """Fill the normal equations at a pose; returns its cost, infinite where a corner is behind the camera."""
     normal[:] = 0.0
     slope[:] = 0.0
     cost = 0.0
@@ -313,7 +312,7 @@ def _equations(
 
 @cached_njit
 def _add_tilt(sight: _Sight, rotation: FloatArray, normal: FloatArray, slope: FloatArray) -> float:
-    """Add that a body's axis points up: their cross product is zero but for the tilt."""
+    """Add the upright prior: the cross product of the body's axis and up is the tilt."""
     axis, up, tilt_weight = sight.axis, sight.up, sight.tilt_weight
     top = np.empty(3)
     for i in range(3):
@@ -322,7 +321,7 @@ def _add_tilt(sight: _Sight, rotation: FloatArray, normal: FloatArray, slope: Fl
     cost = 0.0
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
-        rest = top[j] * up[k] - top[k] * up[j]  # the turn that would set it upright
+        rest = top[j] * up[k] - top[k] * up[j]  # the rotation to upright
         cost += tilt_weight * rest * rest
         # d(rest) = -(up . top) omega + (omega . up) top: minus that is the Jacobian of the model
         for c in range(3):
@@ -336,7 +335,7 @@ def _add_tilt(sight: _Sight, rotation: FloatArray, normal: FloatArray, slope: Fl
 
 @cached_njit
 def _factorized(normal: FloatArray, damping: float, factor: FloatArray) -> bool:
-    """Lower Cholesky factor (6, 6) of a matrix whose diagonal is raised by a share; False: not positive."""
+    """Lower Cholesky factor (6, 6) of a matrix with a damped diagonal; False: not positive definite."""
     for i in range(6):
         for j in range(i + 1):
             total = normal[i, j] * (1.0 + damping) if i == j else normal[i, j]

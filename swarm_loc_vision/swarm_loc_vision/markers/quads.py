@@ -1,9 +1,9 @@
 """Quadrangle candidates by adaptive thresholding and contour following.
 
-A marker's border is darker than the paper around it. So an image is compared with its local mean, the
-outlines of what is dark are followed, and outlines made of four straight sides are kept. In full resolution
-with a small neighbourhood for small markers and with a large one for those that touch something dark, and in
-half resolution for blurred ones.
+The border of a marker is darker than the paper around it. So pixels are compared with the local mean, the
+outlines of dark areas are followed, and outlines with four straight sides are kept: in full resolution with a
+small neighbourhood for small markers and a large one for those that touch something dark, and in half
+resolution for blurred ones.
 """
 
 from __future__ import annotations
@@ -23,48 +23,48 @@ from swarm_loc_vision.common.images import Gray
 IntArray = NDArray[np.int32]
 
 _MIN_SIDE_PX = 3
-"""Of an image that has an inside."""
+"""Least size of an image with inner pixels."""
 _DARK = 255
 _FOLLOWED = 1
-"""Value of a dark pixel whose left neighbour was seen to be light while an outline was followed."""
+"""Value of a dark pixel on a followed outline whose left neighbour is light."""
 _SAME = 0.15
-"""Quadrangles nearer than this share of their size are the same."""
+"""Quadrangles closer than this share of their size are the same."""
 _NOISE_SIGMAS = 1.25
-"""Fewer, and specks of noise would cost most of the time."""
+"""Least contrast over the noise; with less, specks of noise would take most of the time."""
 _SMOOTHING_PX = 0.5
-"""Standard deviation of the blur that keeps noise from tearing outlines; more would close narrow cells."""
+"""Standard deviation of the blur that keeps outlines connected; more would close narrow cells."""
 _NOISE_ROWS = 16
-"""The noise is measured in every so many rows."""
+"""The noise is measured in every 16th row."""
 _DEVIATION = 0.75
 """Standard deviation of noise, blurred as above, over the median of its second differences."""
 _MIN_AREA = 0.6
-"""Of a quadrangle, over the square of the least side."""
+"""Least area of a quadrangle over the square of the least side."""
 _MIN_COMPACTNESS = 0.008
-"""Area of a quadrangle over the square of its outline: a square seen at 75 degrees has 0.04, a fourth of that
-when a gap leads inside and all around."""
+"""Least area of a quadrangle over the square of its outline. A square seen at 75 degrees has 0.04, and a
+fourth of that if the outline leads through a gap and around the inside."""
 _SLACK_PX, _SLACK = 1.0, 0.05
-"""By how much an outline may leave a side [px], and over its length; light that falls in through a gap of the
-border, or something that lies on it, may take more of the outline away."""
+"""Largest distance of an outline from its side: pixels, and a share of its length. Points farther away, as at
+a gap or at something on the border, are left out."""
 _MIN_SEEN = 0.5
-"""Share of a side that has to be there."""
+"""Least share of a side that the outline follows."""
 _LEFT = 4
-"""Of the eight directions, which count counter-clockwise from the right."""
+"""Index of the direction to the left; the eight directions count counter-clockwise from the right."""
 _LONGEST_OUTLINE = 4
-"""Points of an outline over height plus width of the image."""
+"""Bound on the points of an outline, over height plus width of the image."""
 WINDOWS = ((7, 25), (35,))
-"""Sides of the neighbourhoods that are compared with [px], in full and in half resolution."""
+"""Sides of the neighbourhoods of the local mean [px], in full and in half resolution."""
 
 
 def find_quads(gray: Gray, min_side: float, min_contrast: float) -> FloatArray:
-    """Quadrangles around something dark, in full and in half resolution; those found twice are given once.
+    """Find dark quadrangles in full and in half resolution, without duplicates.
 
     Args:
         gray: (height, width).
-        min_side: Of a quadrangle worth finding [px].
-        min_contrast: By which it is darker than what is around it, noise apart [counts].
+        min_side: Least side of a quadrangle [px].
+        min_contrast: Least difference from the local mean [counts]; raised for noisy images.
 
     Returns:
-        (N, 4, 2) corners, clockwise as one sees it, on the boundary between dark and light [px].
+        (N, 4, 2) corners, clockwise in the image, on the boundary between dark and light [px].
     """
     scaled: MatLike = cv2.GaussianBlur(gray, (3, 3), _SMOOTHING_PX)
     found: list[FloatArray] = []
@@ -84,7 +84,7 @@ def find_quads(gray: Gray, min_side: float, min_contrast: float) -> FloatArray:
 
 
 def _distinct(quads: FloatArray) -> FloatArray:
-    """Without those that lie where an earlier one of the same size lies."""
+    """Remove those at the place and with the size of an earlier one."""
     if not len(quads):
         return quads
     middle = quads.mean(axis=1)
@@ -95,7 +95,7 @@ def _distinct(quads: FloatArray) -> FloatArray:
 
 
 def _dark(gray: MatLike, window: int, contrast: float) -> NDArray[np.uint8]:
-    """255 where an image is darker than around; its frame is light, so that outlines end inside."""
+    """255 where an image is darker than the local mean; its frame is 0, so that outlines stay inside."""
     mean = cv2.blur(gray, (window, window))
     dark = cv2.threshold(cv2.subtract(mean, gray), contrast - 0.5, _DARK, cv2.THRESH_BINARY)[1]
     surplus = -dark.shape[1] % 8
@@ -107,7 +107,7 @@ def _dark(gray: MatLike, window: int, contrast: float) -> NDArray[np.uint8]:
 
 
 def _noise(gray: MatLike) -> float:
-    """Standard deviation of the noise [counts]; second differences hardly see what an image shows."""
+    """Standard deviation of the noise [counts], from second differences, which suppress the image itself."""
     rows = gray[::_NOISE_ROWS].astype(np.int16)
     return _DEVIATION * float(np.median(np.abs(rows[:, :-2] - 2 * rows[:, 1:-1] + rows[:, 2:])))
 
@@ -128,14 +128,14 @@ def _follow(
     min_side: float,
     points: IntArray,
 ) -> FloatArray:
-    """Follow each outline once and keep those that are quadrangles.
+    """Follow each outline once and keep quadrangles.
 
     Args:
-        dark: (height * width) 255 where dark; changed, see `_FOLLOWED`.
+        dark: (height * width) 255 where dark; modified, see `_FOLLOWED`.
         eights: (height, width / 8) the same memory.
-        ahead: (8,) from a pixel to the next one in each of the eight directions.
-        min_side: Of a quadrangle [px].
-        points: Room for an outline; longer ones are no markers.
+        ahead: (8,) offsets of the neighbours of a pixel in the eight directions.
+        min_side: Least side of a quadrangle [px].
+        points: Memory for an outline; longer ones are no markers.
     """
     height, words = eights.shape
     width = 8 * words
@@ -176,11 +176,11 @@ def _outline(dark: NDArray[np.uint8], ahead: NDArray[np.int64], start: int, poin
     Border following of Suzuki and Abe (1985), 8-connected.
 
     Returns:
-        Number of its points; only as many as fit are written, as places in `dark`, into points[:, 0].
+        Number of its points. As many as fit are written to points[:, 0], as indices of `dark`.
     """
     dark[start] = _FOLLOWED
     back = -1
-    for turn in range(1, 8):  # clockwise from the light pixel to the left
+    for turn in range(1, 8):  # clockwise from the light pixel on the left
         direction = (_LEFT - turn) & 7
         if dark[start + ahead[direction]] != 0:
             back = direction
@@ -193,7 +193,7 @@ def _outline(dark: NDArray[np.uint8], ahead: NDArray[np.int64], start: int, poin
         if length < len(points):
             points[length, 0] = here
         length += 1
-        direction = (back + 1) & 7  # counter-clockwise from where it came from
+        direction = (back + 1) & 7  # counter-clockwise from the previous pixel
         while dark[here + ahead[direction]] == 0:
             if direction == _LEFT:
                 dark[here] = _FOLLOWED
@@ -206,12 +206,12 @@ def _outline(dark: NDArray[np.uint8], ahead: NDArray[np.int64], start: int, poin
 
 @cached_njit
 def _quadrangle(points: IntArray, length: int, min_side: float, quad: FloatArray) -> bool:
-    """Whether an outline is a quadrangle around something dark; its corners into `quad`."""
+    """Whether an outline is a dark quadrangle; fills its corners."""
     twice_area = 0
     for i in range(length):
         j = i + 1 if i + 1 < length else 0
         twice_area += points[i, 0] * points[j, 1] - points[j, 0] * points[i, 1]
-    # followed counter-clockwise as seen: negative where v points down; the outlines of holes are positive
+    # counter-clockwise in the image: negative, as v points down; outlines of holes are positive
     if twice_area >= 0:
         return False
     corners = np.empty(4, np.int64)
@@ -223,7 +223,7 @@ def _quadrangle(points: IntArray, length: int, min_side: float, quad: FloatArray
 
 @cached_njit
 def _corner_points(points: IntArray, length: int, corners: NDArray[np.int64]) -> float:
-    """Indices of the four points of an outline that span the largest quadrangle, ascending; its area."""
+    """Fill ascending indices of the four points that span the largest quadrangle; returns its area."""
     mean_u, mean_v = 0.0, 0.0
     for i in range(length):
         mean_u += points[i, 0]
@@ -256,7 +256,7 @@ def _corner_points(points: IntArray, length: int, corners: NDArray[np.int64]) ->
 
 @cached_njit
 def _farthest(points: IntArray, length: int, begin: int, end: int) -> int:
-    """Index of the point farthest outside the chord between two points, on the way from one to the other."""
+    """Index of the point between two points of an outline that is farthest from their chord."""
     du = points[end, 0] - points[begin, 0]
     dv = points[end, 1] - points[begin, 1]
     best, farthest = begin, -1
@@ -273,7 +273,7 @@ def _farthest(points: IntArray, length: int, begin: int, end: int) -> int:
 def _sides(
     points: IntArray, length: int, corners: NDArray[np.int64], min_side: float, quad: FloatArray
 ) -> bool:
-    """Whether an outline is straight between its corners; where the straight lines meet into `quad`.
+    """Whether an outline is straight between its corners; fills the intersections of the sides.
 
     The lines are moved outwards by half a pixel, from the outermost dark pixels to the boundary.
     """
@@ -293,7 +293,7 @@ def _sides(
         for step in range(skip, count - skip + 1):
             i = begin + step if begin + step < length else begin + step - length
             u, v = float(points[i, 0] - points[begin, 0]), float(points[i, 1] - points[begin, 1])
-            if abs(du * v - dv * u) > slack * chord:  # where a gap leads inside
+            if abs(du * v - dv * u) > slack * chord:  # the outline leads through a gap
                 continue
             n += 1
             su += u
@@ -310,7 +310,7 @@ def _sides(
         spread = 0.5 * (suu + svv) - math.hypot(0.5 * (suu - svv), suv)
         if spread > (0.4 + 0.02 * chord) ** 2:
             return False
-        if normal_u * -dv + normal_v * du > 0.0:  # the dark is to the left of the way: outwards is right
+        if normal_u * -dv + normal_v * du > 0.0:  # dark is on the left, outwards is right
             normal_u, normal_v = -normal_u, -normal_v
         lines[k, 0], lines[k, 1] = normal_u, normal_v
         lines[k, 2] = normal_u * (points[begin, 0] + su) + normal_v * (points[begin, 1] + sv) + 0.5

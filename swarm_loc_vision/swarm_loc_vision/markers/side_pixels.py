@@ -1,7 +1,7 @@
 """The pixels around the sides of quadrangles, each given in the frame of its side.
 
-Sides are straight in an image without distortion ("ideal" pixels). The raw pixels next to one are brought
-there by the lens' shift, which is smooth enough to be told by six points of a side.
+Sides are straight in an image without distortion ("ideal" pixels). Raw pixels next to a side are mapped there
+by the shift of the lens, interpolated from six points at the side.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from swarm_loc_vision.common.images import Gray
 from swarm_loc_vision.common.sampling import homographies
 
 REACH_PX, INNER_REACH_PX = 7.0, 3.5
-"""Pixels further from a side, and from where its border ends, than this do not count."""
+"""Largest distance of pixels from a side, and from the inner edge of its border."""
 _MAX_ROWS = 32
-"""Rows or columns of pixels along a side that are looked at, evenly spread over a longer one."""
+"""Bound on the rows or columns of pixels across a side; they are spread evenly over longer sides."""
 _ROOM = 4 * (_MAX_ROWS + 1) * (2 * math.ceil(math.sqrt(2.0) * (REACH_PX + INNER_REACH_PX)) + 4)
 _NODES = 6
-"""Points of a side whose raw pixels are looked up: begin, middle and end on it, and a pixel outside these."""
+"""Points at a side whose shift is computed: start, middle and end on it, and one pixel outside of these."""
 U, V, DU, DV, LENGTH, NEAR, FAR, SHEAR = range(8)
 INNER = 4
 
@@ -33,14 +33,14 @@ class SidePixels(NamedTuple):
     """Pixels near the four sides of N quadrangles.
 
     Attributes:
-        frames: (N, 4, 8) of each side: begin, direction, length, the border's width at both ends [px], and by
-            how much cells shift along it per way inwards.
-        boundaries: (N, 4, cells + 1) way along a side to where cells meet behind the border [px].
-        counts: (N,) pixels of each quadrangle, the first ones of the columns below.
-        side: (N, M) which side is near; INNER more where its border ends.
-        along: (N, M) way along it [px].
-        outside: (N, M) way outside it [px].
-        place: (N, M, 2) from the first corner, over the quadrangle's size.
+        frames: (N, 4, 8) of each side: start, direction, length, width of the border at both ends [px], and
+            shear, the shift of cells along the side per distance inwards.
+        boundaries: (N, 4, cells + 1) distance along a side of the boundaries of cells behind the border [px].
+        counts: (N,) number of pixels of each quadrangle; M is the bound on it.
+        side: (N, M) index of the side; INNER is added for pixels at the inner edge of its border.
+        along: (N, M) distance along the side [px].
+        outside: (N, M) distance outside of the side [px].
+        place: (N, M, 2) position from the first corner, over the size of the quadrangle.
         value: (N, M) brightness.
     """
 
@@ -61,7 +61,7 @@ def side_pixels(image: Gray, lens: FloatArray, quads: FloatArray, cells: int, bo
         image: (height, width).
         lens: See `camera.Camera`.
         quads: (N, 4, 2) clockwise from the marker's own upper left [ideal px].
-        cells: Along a side.
+        cells: Cells along a side.
         border: Width of the border [cells].
     """
     count = len(quads)
@@ -82,7 +82,7 @@ def side_pixels(image: Gray, lens: FloatArray, quads: FloatArray, cells: int, bo
 
 
 def _nodes(quads: FloatArray) -> FloatArray:
-    """(N, 4, _NODES, 2) begin, middle and end of each side of quadrangles (N, 4, 2), and a pixel outside."""
+    """(N, 4, _NODES, 2) start, middle and end of each side of quadrangles (N, 4, 2), and a pixel outside."""
     along = np.roll(quads, -1, axis=1) - quads
     outwards = np.stack([along[..., 1], -along[..., 0]], axis=-1)
     outwards /= np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
@@ -95,7 +95,7 @@ def _nodes(quads: FloatArray) -> FloatArray:
 def _collect(
     image: Gray, quads: FloatArray, planes: FloatArray, shifts: FloatArray, border: int, found: SidePixels
 ) -> None:
-    """Fill `found`; `shifts` (N, 4, _NODES, 2) lead from ideal pixels to raw ones, `planes` from markers."""
+    """Fill `found`; `shifts` (N, 4, _NODES, 2) map ideal to raw pixels, `planes` markers to ideal pixels."""
     warp, back = np.empty((6, 2)), np.empty((2, 2))
     for n in range(len(quads)):
         size = 0.5 * math.hypot(quads[n, 2, 0] - quads[n, 0, 0], quads[n, 2, 1] - quads[n, 0, 1])
@@ -111,7 +111,7 @@ def _collect(
 def _set_frame(
     quad: FloatArray, plane: FloatArray, k: int, border: int, frame: FloatArray, boundaries: FloatArray
 ) -> None:
-    """Fill the frame (8,) of side k and where cells meet behind its border."""
+    """Fill the frame (8,) of side k and the boundaries of cells behind its border."""
     cells = boundaries.size - 1
     u, v = quad[k, 0], quad[k, 1]
     du, dv = quad[(k + 1) % 4, 0] - u, quad[(k + 1) % 4, 1] - v
@@ -138,7 +138,7 @@ def _set_frame(
 
 @cached_njit
 def _place(h: FloatArray, k: int, along: float, depth: float) -> tuple[float, float]:
-    """Ideal pixel of a point of a marker, given along side k and inwards from it."""
+    """Ideal pixel of a point of a marker, given by its place along side k and its depth."""
     x, y = along, depth
     if k == 1:
         x, y = 1.0 - depth, along
@@ -152,7 +152,7 @@ def _place(h: FloatArray, k: int, along: float, depth: float) -> tuple[float, fl
 
 @cached_njit
 def _set_warp(shifts: FloatArray, warp: FloatArray) -> None:
-    """Factors (6, 2) of 1 s s2 d ds ds2 in the shift, s 0 to 1 along the side, d outside it [px]."""
+    """Coefficients (6, 2) of 1 s s2 d ds ds2 in the shift; s 0 to 1 along the side, d outside [px]."""
     for axis in range(2):
         for layer in range(2):
             a, b, c = shifts[3 * layer, axis], shifts[3 * layer + 1, axis], shifts[3 * layer + 2, axis]
@@ -165,7 +165,7 @@ def _set_warp(shifts: FloatArray, warp: FloatArray) -> None:
 
 @cached_njit
 def _shift(warp: FloatArray, axis: int, s: float, d: float) -> float:
-    """The polynomial of `_set_warp`."""
+    """The shift by the polynomial of `_set_warp`."""
     on_line = warp[0, axis] + s * (warp[1, axis] + s * warp[2, axis])
     across = warp[3, axis] + s * (warp[4, axis] + s * warp[5, axis])
     return float(on_line + d * across)
@@ -173,7 +173,7 @@ def _shift(warp: FloatArray, axis: int, s: float, d: float) -> float:
 
 @cached_njit
 def _set_way_back(warp: FloatArray, frame: FloatArray, back: FloatArray) -> bool:
-    """Fill the inverse (2, 2) of how pixels go along and outside the middle of a side, if there is any."""
+    """Fill the inverse Jacobian (2, 2) of raw pixels at the middle of a side; False if it is singular."""
     du, dv, length = frame[DU], frame[DV], frame[LENGTH]
     by_along_u, by_along_v = du + (warp[1, 0] + warp[2, 0]) / length, dv + (warp[1, 1] + warp[2, 1]) / length
     by_outside_u = dv + warp[3, 0] + 0.5 * (warp[4, 0] + 0.5 * warp[5, 0])
@@ -190,7 +190,7 @@ def _set_way_back(warp: FloatArray, frame: FloatArray, back: FloatArray) -> bool
 def _collect_side(
     image: Gray, n: int, k: int, warp: FloatArray, back: FloatArray, size: float, found: SidePixels
 ) -> None:
-    """Collect the pixels near one side, row by row or column by column across it."""
+    """Collect the pixels near one side by rows or columns across it."""
     frame = found.frames[n, k]
     u, v, du, dv, length = frame[U], frame[V], frame[DU], frame[DV], frame[LENGTH]
     begin_u, begin_v = u + warp[0, 0], v + warp[0, 1]
@@ -209,7 +209,7 @@ def _collect_side(
         share = (i - begin) / (end - begin)
         centre = across + slope * (i - begin) + share * (1.0 - share) * bow
         gap = frame[NEAR] + share * (frame[FAR] - frame[NEAR])
-        for inner in range(2 if (i - low) % (2 * stride) == 0 else 1):  # half the rows will do inside
+        for inner in range(2 if (i - low) % (2 * stride) == 0 else 1):  # every other row is enough inside
             middle = centre + inner * inwards * gap
             room = lean * (INNER_REACH_PX if inner else REACH_PX)
             top, bottom = max(math.ceil(middle - room), 0), min(math.floor(middle + room), height - 1)

@@ -1,11 +1,10 @@
 """Least-squares fit of a decoded marker's four sides, its blur and its light to the raw pixels.
 
-Of such an image all is known but few numbers: where the sides lie, how dark ink and how light paper are, how
-the light falls off, and how wide the blur of optics, pixels and motion is, an ellipse. A least-squares fit of
-these to the raw pixels needs no interpolation, which would shift edges along rows or columns by up to a tenth
-of a pixel. The white cells behind the border shine into it where they are hardly wider than the blur; they
-are known from the marker's word. What the pixels leave unsure, blurred ones more than sharp ones, is the
-covariance.
+The image of a decoded marker depends on few unknowns: the sides, the brightness of ink and paper, the
+gradient of the light, and the blur of optics, pixels and motion, an ellipse. Their least-squares fit to raw
+pixels needs no interpolation, which would shift edges along rows or columns by up to a tenth of a pixel. The
+white cells behind the border, known from the word of the marker, are part of the model, because their light
+blurs into the border. The fit gives the covariance, which is larger for blurred markers.
 """
 
 from __future__ import annotations
@@ -35,45 +34,45 @@ from swarm_loc_vision.markers.side_pixels import (
 Bits = NDArray[np.uint8]
 
 _ENDS = 8
-"""Parameters before all others: how far outside each side's line lies at its begin and at its end [px]."""
+"""The first parameters: distance of each line outside of its side at the first and the last corner [px]."""
 _DARK, _CONTRAST, _LIGHT_X, _LIGHT_Y, _BLUR_XX, _BLUR_YY, _BLUR_XY = range(_ENDS, _ENDS + 7)
 _PARAMETERS = _ENDS + 7
 _OF_SIDE = 2 + _PARAMETERS - _ENDS
-"""What a pixel depends on: the two ends of its side, and all that the sides share."""
+"""Parameters of a pixel: the two ends of its side, and those that all sides share."""
 _ROUNDS = 5
 _STILL = 0.2
-"""A round that moves no end of a line by more of its standard deviation is the last."""
+"""Largest motion of an end in the last round, in standard deviations."""
 _FIRST_BLUR, _MIN_BLUR, _MAX_BLUR = 0.45, 0.08, 12.0
 """Variance of the blur [px^2]."""
 _BLUR_FREEDOM = 4.0
-"""Standard deviation of that variance before the image is seen [px^2]."""
+"""Prior standard deviation of that variance [px^2]."""
 _LIGHT_FREEDOM = 0.2
-"""Share by which the light may differ over a marker, likewise."""
+"""Prior standard deviation of the relative difference of light over a marker."""
 _REACH, _MORE_REACH_PX, _MIN_REACH_PX = 2.5, 0.6, 0.75
-"""Of the window around a line, over the blur; more; and at least so much [px]."""
+"""Half width of the window around a line: a multiple of the blur, plus pixels, and a lower bound [px]."""
 _CLEAR = 1.6
-"""Blurs between the window and what is not known: beyond the margin, and behind the first row of cells."""
+"""Distance of the window from unknown areas: beyond the margin, behind the first row of cells [blurs]."""
 _CLEAR_OF_CORNERS = 1.8
 _MAX_SHIFT_PX = 1.5
-"""A corner that ends further from where the search began is none."""
+"""Largest motion of a corner in the fit."""
 _OUTLIER = 4.0
-"""Standard deviations from which a pixel counts less and less."""
+"""Residual above which the weight of a pixel decreases, in standard deviations."""
 _MIN_NOISE = 0.5
-"""Of a pixel, one standard deviation [counts]: rounding, and a little more."""
+"""Lower bound of the standard deviation of a pixel [counts]."""
 _MIN_SIGMA_PX = 0.01
-"""What either end of a line is unsure of even without noise. No blur has quite the shape of a bell: that of a
-shutter or of a disc out of focus shifts edges by about 0.01 px, as they lie in the pixels."""
+"""Error of an end without noise. Blur is not exactly Gaussian: that of a shutter or of a defocused lens
+shifts edges by about 0.01 px, depending on their place in the pixels."""
 _NEIGHBOURS = 0.7
-"""Times blur^3 / cell^2: by how much what lies beyond the next cells shifts a side."""
+"""Times blur^3 / cell^2: shift of a side by light from beyond the next cells."""
 _TABLE_END, _TABLE_STEPS = 5.0, 256.0
 _NORMAL = ndtr(np.arange(-_TABLE_END, _TABLE_END, 1.0 / _TABLE_STEPS))
 _BY_CHANCE, _CLEARLY_WHITE = 3.0, 0.7
-"""Standard deviations by which white cells behind the border may stand aside by chance; which are white."""
+"""Displacement of white cells behind the border by noise [standard deviations]; least whiteness."""
 _ROOT_2PI = math.sqrt(2.0 * math.pi)
 
 
 class _Work(NamedTuple):
-    """What a fit works on: parameters, normal equations, windows at the sides, and gaps behind them."""
+    """Memory of a fit: parameters, normal equations, windows at the sides, and gaps behind them."""
 
     p: FloatArray
     normal: FloatArray
@@ -94,12 +93,12 @@ def fit_sides(
     """Fit the four sides of each marker.
 
     Args:
-        pixels: Near the sides of quadrangles that lie within a pixel of the markers.
+        pixels: Pixels near the sides of quadrangles within a pixel of the markers.
         strips: (N, 4, cells) the row of cells behind the border along each side; 1 is white.
         border: Width of the border [cells].
-        ends: (N, 8) filled with how far outside each side its line lies at its begin and its end [px].
-        covariance: (N, 8, 8) of them, filled [px^2].
-        contrast: (N,) filled with light minus dark [counts]; 0: the marker could not be fitted.
+        ends: (N, 8) filled with the distance of each line outside of its side at both corners [px].
+        covariance: (N, 8, 8) filled with their covariance [px^2].
+        contrast: (N,) filled with light minus dark [counts]; 0: no fit.
     """
     work = _Work(
         np.empty(_PARAMETERS),
@@ -117,7 +116,7 @@ def fit_sides(
 
 @cached_njit
 def _fit(pixels: SidePixels, n: int, strips: Bits, border: int, work: _Work) -> float:
-    """Fit one marker; the contrast, 0: in vain. `work.normal` becomes the covariance of all parameters."""
+    """Fit one marker; returns the contrast, 0: no fit. `work.normal` becomes the covariance."""
     p = work.p
     p[:] = 0.0
     p[_BLUR_XX] = p[_BLUR_YY] = _FIRST_BLUR
@@ -148,10 +147,10 @@ def _fit(pixels: SidePixels, n: int, strips: Bits, border: int, work: _Work) -> 
 
 @cached_njit
 def _add_doubts(frames: FloatArray, border: int, work: _Work) -> None:
-    """Add to the covariance of the ends what the model leaves out.
+    """Add model errors to the covariance of the ends.
 
-    Where the cells behind the border do not stand at their distance from a side, something covers that side,
-    and it may lie as far off.
+    Where the cells behind the border are displaced, something covers the side, which may be displaced as
+    much.
     """
     for k in range(4):
         cell = min(frames[k, NEAR], frames[k, FAR]) / border
@@ -164,10 +163,9 @@ def _add_doubts(frames: FloatArray, border: int, work: _Work) -> None:
 
 @cached_njit
 def _set_gaps(pixels: SidePixels, n: int, strips: Bits, border: int, noise: float, work: _Work) -> None:
-    """By how much more than by chance white cells behind the border stand aside, in `work.gaps` [px].
+    """Set `work.gaps` to the displacement of white cells behind the border beyond noise [px].
 
-    A pixel that is brighter or darker than the fit tells that the edge lies aside; all across an edge add up
-    to by how much.
+    The residuals across an edge add up to its displacement.
     """
     p, counts = work.p, np.zeros(4)
     work.gaps[:] = 0.0
@@ -198,7 +196,7 @@ def _set_gaps(pixels: SidePixels, n: int, strips: Bits, border: int, noise: floa
 
 @cached_njit
 def _inner_reach(frame: FloatArray, border: int, across: float) -> float:
-    """How far from where the border ends pixels tell of it, 0 where too much else is near [px]."""
+    """Range of pixels that depend on the border's inner edge; 0 if other edges are too close [px]."""
     cell = min(frame[NEAR], frame[FAR]) / border
     reach = min(2.0 * across + 1.0, cell - _CLEAR * across, INNER_REACH_PX)
     return reach if reach > across else 0.0
@@ -206,7 +204,7 @@ def _inner_reach(frame: FloatArray, border: int, across: float) -> float:
 
 @cached_njit
 def _set_windows(frames: FloatArray, border: int, work: _Work) -> None:
-    """For each side blur across and along, the window inside and outside, and next to its corners [px]."""
+    """Set for each side blur across and along, window inside, outside, and at its corners [px]."""
     p = work.p
     for k in range(4):
         du, dv = frames[k, DU], frames[k, DV]
@@ -225,7 +223,7 @@ def _set_windows(frames: FloatArray, border: int, work: _Work) -> None:
 def _set_equations(
     pixels: SidePixels, n: int, strips: Bits, border: int, noise: float, work: _Work
 ) -> tuple[float, float]:
-    """Fill the normal equations from the pixels; their weighed number and square of what is left."""
+    """Fill the normal equations from the pixels; returns the sum of weights and of weighted squares."""
     p, jacobian = work.p, np.empty(_OF_SIDE)
     of_side, towards = np.zeros((4, _OF_SIDE, _OF_SIDE)), np.zeros((4, _OF_SIDE))
     total, square = 0.0, 0.0
@@ -273,7 +271,7 @@ def _set_equations(
 
 @cached_njit
 def _white(a: float, along: float, strip: Bits, border: int, boundaries: FloatArray) -> float:
-    """How white the cells behind the border are at a place along a side, blurred, 0 to 1."""
+    """Whiteness, 0 to 1, of the blurred cells behind the border at a place along a side."""
     white, before, last = 0.0, 0, strip.size - border
     for cell in range(border, last + 1):
         here = int(strip[cell]) if cell < last else 0
@@ -285,7 +283,7 @@ def _white(a: float, along: float, strip: Bits, border: int, boundaries: FloatAr
 
 @cached_njit
 def _profile(d: float, gap: float, across: float, white: float) -> tuple[float, float, float]:
-    """Brightness, 0 (ink) to 1 (paper), at a place outside a line, its slope, and its change by log blur."""
+    """Brightness, 0 (ink) to 1 (paper), outside of a line; its derivatives by place and by log of blur."""
     z, back = d / across, (d + gap) / across
     bell, inner = math.exp(-0.5 * z * z) / _ROOT_2PI, white * math.exp(-0.5 * back * back) / _ROOT_2PI
     return _below(z) + white * _below(-back), (bell - inner) / across, back * inner - z * bell
@@ -303,7 +301,7 @@ def _below(z: float) -> float:
 
 @cached_njit
 def _set_levels(work: _Work) -> bool:
-    """Set dark and contrast, which were zero before, to what the first equations say, if they say any."""
+    """Solve the first equations for dark and contrast, initially zero; False if they are singular."""
     p, normal, gradient = work.p, work.normal, work.gradient
     dark, both, light = normal[_DARK, _DARK], normal[_DARK, _CONTRAST], normal[_CONTRAST, _CONTRAST]
     determinant = dark * light - both * both
@@ -316,7 +314,7 @@ def _set_levels(work: _Work) -> bool:
 
 @cached_njit
 def _add_knowledge(noise: float, work: _Work) -> None:
-    """Add what is known before the image is seen: about how wide blurs are, and that light is even."""
+    """Add priors: blur is narrow, light is even."""
     p, normal, gradient = work.p, work.normal, work.gradient
     for i in (_LIGHT_X, _LIGHT_Y):
         weight = (noise / _LIGHT_FREEDOM) ** 2
@@ -330,7 +328,7 @@ def _add_knowledge(noise: float, work: _Work) -> None:
 
 @cached_njit
 def _advance(noise: float, work: _Work) -> float:
-    """Go to the solution, but not too far at once; by how many standard deviations an end moved at most."""
+    """Take a bounded step; returns the largest motion of an end in standard deviations."""
     p, inverse = work.p, work.normal
     moved = 0.0
     for i in range(_PARAMETERS):
@@ -353,7 +351,7 @@ def _advance(noise: float, work: _Work) -> float:
 
 @cached_njit
 def _invert(matrix: FloatArray) -> bool:
-    """Invert a positive definite matrix in place by Gauss and Jordan; False when it is not."""
+    """Invert a positive definite matrix in place by Gauss-Jordan; False if it is not positive definite."""
     size = len(matrix)
     for k in range(size):
         pivot = matrix[k, k]
