@@ -8,7 +8,7 @@ from node_world import Ros
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 
-from swarm_loc_drivers.sim.epuck.camera_output import CameraOutput
+from swarm_loc_drivers.sim.epuck.epuck_world_node import CameraOutput
 from swarm_loc_drivers.sim.render.lens import CameraModel
 
 PIXELS = np.zeros((12, 16), np.uint8)

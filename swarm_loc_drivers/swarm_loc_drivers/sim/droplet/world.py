@@ -208,19 +208,9 @@ class DropletWorld:
         return np.random.default_rng([seed, stream])
 
 
-def trims(direction: int) -> tuple[int, int, int]:
-    """The trims in the robots' memory: two motors walk, three turn."""
-    return _WALK_TRIMS if direction in WALKS else _TURN_TRIMS
-
-
-def length(direction: int) -> int:
-    """The path or turn per 1000 steps in their memory [mm or deg]."""
-    return _WALK_MM if direction in WALKS else _TURN_DEG
-
-
 def nominal_gait(direction: int) -> Gait:
     """The gait by the robot's own calibration."""
-    one = gait(direction, trims(direction), length(direction))
+    one = gait(direction, SimulatedDroplet.trims[direction], SimulatedDroplet.lengths[direction])
     assert one is not None  # noqa: S101 - motors turn in every direction
     return one
 
@@ -233,8 +223,8 @@ class SimulatedDroplet:
         robot: Its index.
     """
 
-    trims = tuple(trims(direction) for direction in DIRECTIONS)
-    lengths = tuple(length(direction) for direction in DIRECTIONS)
+    trims = tuple(_WALK_TRIMS if direction in WALKS else _TURN_TRIMS for direction in DIRECTIONS)
+    lengths = tuple(_WALK_MM if direction in WALKS else _TURN_DEG for direction in DIRECTIONS)
 
     def __init__(self, world: DropletWorld, robot: int) -> None:
         self._world, self._robot = world, robot

@@ -13,13 +13,21 @@ overhead camera, too, under `aerial/`. Images without subscribers are not drawn.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.duration import Duration
+from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
 
+from swarm_loc_drivers.common.calibration_file import CameraCalibration
+from swarm_loc_drivers.common.ros_messages import camera_info_message, image_message, stamp_message
 from swarm_loc_drivers.epuck.hardware import EPUCK_MODELS
-from swarm_loc_drivers.sim.epuck.camera_output import CameraOutput
 from swarm_loc_drivers.sim.epuck.parts import Unanswered
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware
@@ -35,6 +43,47 @@ from swarm_loc_drivers.sim.world_node import WorldNode
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import AnonymousDetectionArray, MarkerDetectionArray
+
+_CAMERA_QOS = QoSProfile(depth=5)
+"""Reliable, so that subscribers can choose: each image, or best effort."""
+
+
+class CameraOutput:
+    """Publishes `image_raw` and `camera_info` of one simulated camera.
+
+    Args:
+        node: Owner of the publishers.
+        robot: Name of the robot, or of the camera's namespace.
+        calibration: Of the camera.
+    """
+
+    def __init__(self, node: Node, robot: str, calibration: CameraCalibration) -> None:
+        self._calibration = calibration
+        self._frame_id = f"{robot}/camera_optical_frame"
+        self._infos = node.create_publisher(CameraInfo, f"{robot}/camera_info", _CAMERA_QOS)
+        self._images = node.create_publisher(Image, f"{robot}/image_raw", _CAMERA_QOS)
+        self._sent_to = self._received_by = 0  # subscribers to camera_info: at the last, at a received one
+
+    def publish(self, stamp_ns: int, draw: Callable[[], NDArray[np.uint8]]) -> bool:
+        """Publish the calibration, and the image if it has subscribers; returns whether it was published.
+
+        Images are held back until all subscribers have a calibration, since they would drop them without.
+
+        Args:
+            stamp_ns: Of the exposure.
+            draw: Makes the image (height, width).
+        """
+        listeners = self._infos.get_subscription_count()
+        if self._infos.wait_for_all_acked(Duration()):
+            self._received_by = self._sent_to
+        header = Header(stamp=stamp_message(stamp_ns), frame_id=self._frame_id)
+        self._infos.publish(camera_info_message(self._calibration, header))
+        self._sent_to = listeners
+        if not self._images.get_subscription_count() or self._received_by < listeners:
+            return False
+        self._images.publish(image_message(draw(), stamp_ns, self._frame_id))
+        return True
+
 
 _AERIAL = "aerial"
 """Namespace of the overhead camera."""
