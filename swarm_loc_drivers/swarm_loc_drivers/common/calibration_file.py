@@ -1,4 +1,4 @@
-"""A camera's calibration as ROS's camera_calibration writes it: the content of sensor_msgs/CameraInfo."""
+"""Camera calibration files as written by ROS's camera_calibration."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class CalibrationFileError(UserError):
-    """A camera's calibration that cannot be used; the message is one sentence."""
+    """A camera calibration that cannot be used; the message is one sentence."""
 
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """What sensor_msgs/CameraInfo says of a camera.
+    """Calibration of a camera: the content of sensor_msgs/CameraInfo.
 
     Attributes:
         width: Columns of the image [px].
         height: Rows [px].
         model: Distortion model.
-        distortion: Its coefficients.
+        distortion: Coefficients of the distortion model.
         matrix: K (9,) row-major [px].
         rectification: R (9,) row-major.
         projection: P (12,) row-major [px].
@@ -46,7 +46,7 @@ def load_calibration(path: Path, width: int, height: int) -> CameraCalibration:
     """Read the calibration of a camera whose images have this size [px].
 
     Raises:
-        CalibrationFileError: It cannot be read, is incomplete, or is that of another size.
+        CalibrationFileError: The file cannot be read, is incomplete, or is for another image size.
     """
     try:
         tree = read_tree(path)
@@ -58,7 +58,7 @@ def load_calibration(path: Path, width: int, height: int) -> CameraCalibration:
 
 
 class _Reader:
-    """Takes values out of one file."""
+    """Reads the values of one file."""
 
     def __init__(self, path: Path, tree: dict[Any, Any]) -> None:
         self._path = path
@@ -102,7 +102,7 @@ class _Reader:
     def _numbers(
         self, key: str, counts: Sequence[int], default: tuple[float, ...] | None = None
     ) -> tuple[float, ...]:
-        """A matrix' data; `default` where the file does not have it."""
+        """The data of a matrix; `default` if the file lacks it."""
         if default is not None and key not in self._tree:
             return default
         value = self._value(key)

@@ -21,21 +21,21 @@ class Link(Protocol):
     """An open link."""
 
     def read(self, timeout_s: float) -> bytes:
-        """Whatever has come, as soon as there is any; empty after a while without any.
+        """Bytes received, as soon as there are any; empty after the timeout.
 
         Raises:
             LinkError: The link is broken.
         """
 
     def write(self, data: bytes) -> None:
-        """Send all of it.
+        """Send all bytes.
 
         Raises:
-            LinkError: The link is broken, or takes nothing.
+            LinkError: The link is broken, or a write timed out.
         """
 
     def close(self) -> None:
-        """End the link."""
+        """Close the link."""
 
 
 @dataclass(frozen=True)
@@ -95,16 +95,16 @@ def open_link(address: Address, baud_rate: int, timeout_s: float) -> Link:
 
 
 _BROKEN = (OSError, TypeError, termios.error)
-"""What pyserial raises when a port hangs up; one that vanishes makes it compare None."""
+"""Errors of pyserial when a port hangs up; it compares None when the port vanishes."""
 
 
 class SerialLink:
-    """An open serial port, 8N1, for this process alone.
+    """An open serial port, 8N1, locked by this process.
 
     Args:
         device: Its path.
         baud_rate: [bit/s].
-        write_timeout_s: After so long a write that is not taken breaks the link.
+        write_timeout_s: Timeout of a write, which breaks the link [s].
 
     Raises:
         LinkError: It cannot be opened.
@@ -146,12 +146,12 @@ _CHUNK = 1 << 16
 
 
 class TcpLink:
-    """A connection to a robot that is the server.
+    """A TCP connection; the robot is the server.
 
     Args:
-        host: Name or number.
+        host: Name or number of the robot.
         port: TCP port.
-        timeout_s: How long connecting, or a write that is not taken, may last.
+        timeout_s: Timeout of connecting, and of a write [s].
 
     Raises:
         LinkError: It cannot be opened.
@@ -188,5 +188,5 @@ class TcpLink:
             raise LinkError(f"{self._name} is broken: {error.strerror or error}") from error
 
     def close(self) -> None:
-        """See `Link.close`: at once, since some robots never close their end."""
+        """See `Link.close`; does not wait, since some robots never close their end."""
         self._socket.close()

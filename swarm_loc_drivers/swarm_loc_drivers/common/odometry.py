@@ -30,14 +30,14 @@ class OdometryState:
 
 
 def carried_on(covariance: FloatArray, dx: float, dy: float) -> FloatArray:
-    """The covariance (3, 3) of a pose after a way (dx, dy): an error of the heading leads aside on it."""
+    """Covariance (3, 3) of a pose after a translation (dx, dy), which a heading error turns sideways."""
     transition = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
     carried: FloatArray = transition @ covariance @ transition.T
     return carried
 
 
 _STEP_VARIANCE = 1.0 / 12.0
-"""Of a counter that has cut off the fraction of a step."""
+"""Variance of the truncation error of a counter [steps^2]."""
 _FORWARD_TURN = np.ix_((0, 2), (0, 2))
 
 
@@ -71,7 +71,7 @@ class WheelGeometry:
 
 
 class DeadReckoning:
-    """Adds up the paths of the wheels, from zero.
+    """Integrates the paths of two wheels to a pose with its covariance, starting at zero.
 
     Args:
         geometry: The wheels.
@@ -86,7 +86,7 @@ class DeadReckoning:
         self._covariance = np.zeros((3, 3))
 
     def advance(self, left: float, right: float) -> None:
-        """Move by the wheels' paths [m], an arc, and add its noise about its middle."""
+        """Move along the arc of the wheels' paths [m]; the noise acts at the middle of the arc."""
         x, y, theta = self._pose
         turn = (right - left) / self._separation
         half = 0.5 * turn
@@ -99,12 +99,12 @@ class DeadReckoning:
         self._covariance += effect @ self._twist_noise(abs(left), abs(right), self._wheel_noise) @ effect.T
 
     def forget_motion(self, reach: float) -> None:
-        """The robot went nobody knows where, its wheels at most so far [m]."""
+        """The motion is unknown; each wheel rolled at most `reach` [m]."""
         turned = min(2.0 * reach / self._separation, math.pi)
         self._covariance += np.diag([reach**2, reach**2, turned**2]) / 3.0
 
     def state(self, stamp_ns: int, left: float, right: float, elapsed_s: float) -> OdometryState:
-        """What is published; `left` and `right` are the wheels' last paths [m], made in `elapsed_s`."""
+        """The current state; `left` and `right` are the wheels' last paths [m], made in `elapsed_s`."""
         cut_off = _STEP_VARIANCE * self._step**2
         (along, _), (_, turned) = self._twist_noise(1.0, 1.0, cut_off).tolist()
         covariance = self._covariance + np.diag([along, along, turned])

@@ -1,4 +1,4 @@
-"""A driver's thread: connects to one robot, anew when the link breaks, and has it stand at the end."""
+"""Thread of a driver: connects to one robot, reconnects after failures, stops the robot at the end."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from swarm_loc_drivers.common.session import Session, SessionError
 
 _MIN_PAUSE_S, _MAX_PAUSE_S = 0.1, 2.0
 MAX_STOP_S = 3.0
-"""A robot that may be running is asked, or sought, for so long before the driver gives up."""
+"""How long the driver tries to stop a robot that may be moving before it gives up."""
 
 
 SomeSession = TypeVar("SomeSession", bound=Session)
 
 
 class RobotDriver(ABC, Generic[SomeSession]):
-    """Talks to one robot until it is asked to stop, and until the robot is known to stand.
+    """Talks to one robot until the driver is stopped and the robot is known to stand.
 
     Args:
-        name: Of the robot's link, for people.
+        name: Name of the robot's link in messages.
 
     Attributes:
-        counts: What happened how often: `connections`, `link_failures`, and what sessions count.
+        counts: `connections`, `link_failures`, and the counts of the sessions.
         trouble: Why there is no connection; "" while there is one.
     """
 
@@ -40,15 +40,15 @@ class RobotDriver(ABC, Generic[SomeSession]):
         self._thread = threading.Thread(target=self._run, name=f"driver of {name}")
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def begin_to_stop(self) -> None:
-        """Have the robot stand and the driver end; `stop` waits for it."""
+        """Begin to stop the robot and the driver; `stop` waits for both."""
         self._stopping.set()
 
     def stop(self) -> None:
-        """Stop the robot and end, also what has not begun."""
+        """Stop the robot and the driver; also before `start`."""
         self.begin_to_stop()
         if self._thread.ident is not None:
             self._thread.join()
@@ -59,15 +59,15 @@ class RobotDriver(ABC, Generic[SomeSession]):
 
     @abstractmethod
     def _begin(self) -> SomeSession:
-        """Begin a conversation over a link that has just been opened."""
+        """Create the session for a link that has just been opened."""
 
     @abstractmethod
     def _step(self, session: SomeSession, link: Link) -> bytes:
-        """Wait a moment for what the robot sends; what to send it."""
+        """Wait briefly for bytes of the robot; the bytes to send."""
 
     @abstractmethod
     def _serve(self, session: SomeSession) -> None:
-        """Hand on what the session has brought."""
+        """Hand on what the session has received."""
 
     def _lose(self, session: SomeSession) -> None:
         """The link is being closed."""
@@ -81,7 +81,7 @@ class RobotDriver(ABC, Generic[SomeSession]):
             except (LinkError, SessionError) as error:
                 self.trouble = str(error)
                 self.counts["link_failures"] += 1
-            except Exception as error:  # a mistake up here: the thread ends, and nobody else would say so
+            except Exception as error:  # a defect of the driver ends the thread: report it
                 self.trouble = f"the driver has failed: {error!r}"
                 raise
             else:
@@ -99,7 +99,7 @@ class RobotDriver(ABC, Generic[SomeSession]):
                 self._stopping.wait(pause_s)
 
     def _converse(self) -> None:
-        """One connection, from its begin to the end of the driver."""
+        """One connection, until the driver is stopped."""
         link = self._open()
         session = self._begin()
         self._may_run = True
@@ -108,7 +108,7 @@ class RobotDriver(ABC, Generic[SomeSession]):
             self._may_run = False
         except (LinkError, SessionError):
             raise
-        except BaseException:  # a robot must not run on because of a mistake up here
+        except BaseException:  # a defect of the driver must not leave the robot moving
             self._stopping.set()
             self._talk(self._begin(), link, lambda _: None)
             raise
@@ -117,7 +117,7 @@ class RobotDriver(ABC, Generic[SomeSession]):
             link.close()
 
     def _talk(self, session: SomeSession, link: Link, serve: Callable[[SomeSession], None]) -> None:
-        """Hand bytes to and fro until the conversation has ended."""
+        """Exchange bytes until the conversation has ended."""
         end_s = math.inf
         while not session.ended:
             if self._stopping.is_set():

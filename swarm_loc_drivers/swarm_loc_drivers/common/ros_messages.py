@@ -26,16 +26,16 @@ ODOMETRY_QOS = QoSProfile(depth=10)
 _TF_QOS = QoSProfile(depth=100)
 
 _FIXED_VARIANCE = 1e-9
-"""Of what the plane fixes: z, roll, pitch; and the least of what a robot does not do."""
+"""Variance of z, roll and pitch, and least variance of all other components."""
 
 
 def stamp_message(stamp_ns: int) -> TimeMessage:
-    """A time [ns] as a message."""
+    """Convert a time [ns] to a message."""
     return Time(nanoseconds=stamp_ns).to_msg()
 
 
 def yaw_quaternion(yaw: float) -> Quaternion:
-    """A rotation about z [rad]."""
+    """Quaternion of a rotation about z [rad]."""
     return Quaternion(z=math.sin(0.5 * yaw), w=math.cos(0.5 * yaw))
 
 
@@ -57,7 +57,7 @@ def odometry_message(state: OdometryState, odom_frame: str, base_frame: str) -> 
 
 
 def odometry_transform(odometry: Odometry) -> TransformStamped:
-    """The transform that the odometry is."""
+    """The transform from the odometry's frame to that of the robot."""
     pose = odometry.pose.pose
     return TransformStamped(
         header=odometry.header,
@@ -72,11 +72,11 @@ class OdometryOutput:
     """Publishes the odometry of one robot.
 
     Args:
-        node: Whose publishers.
-        topic: Of the odometry.
-        odom_frame: The pose is in it.
-        base_frame: The pose is that of it.
-        transforms: Publisher of /tf, None for none.
+        node: Node of the publishers.
+        topic: Topic of the odometry.
+        odom_frame: Frame in which the pose is given.
+        base_frame: Frame whose pose it is.
+        transforms: Publisher of /tf; None publishes no transform.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class OdometryOutput:
 
 
 def transform_publisher(node: Node) -> Publisher:
-    """The publisher of /tf; tf2's listeners know this absolute name, whatever the namespace."""
+    """The publisher of /tf, an absolute name because tf2 listens only there."""
     return node.create_publisher(TFMessage, "/tf", _TF_QOS)
 
 
@@ -109,12 +109,12 @@ def image_message(pixels: NDArray[np.uint8], stamp_ns: int, frame_id: str) -> Im
         encoding="mono8" if pixels.ndim == 2 else "rgb8",
         step=pixels[0].nbytes,
     )
-    message.data = array("B", pixels.tobytes())  # a list would be checked byte by byte
+    message.data = array("B", pixels.tobytes())  # setting a list would check every byte
     return message
 
 
 def camera_info_message(calibration: CameraCalibration, header: Header) -> CameraInfo:
-    """The calibration that goes with an image of this header."""
+    """The calibration as sensor_msgs/CameraInfo, for an image with this header."""
     return CameraInfo(
         header=header,
         height=calibration.height,

@@ -7,10 +7,10 @@ from collections import Counter
 from collections.abc import Callable
 
 STANDING_CLOCK_S = 1.0
-"""A clock that stands still for so long of real time has died; a robot without a watchdog must stop then."""
+"""A clock that stands still for so long of real time counts as dead, and the robot stops [s]."""
 
 MAX_VELOCITY = 1e3
-"""[m/s] and [rad/s]; what is beyond is a mistake of who asks for it."""
+"""[m/s] and [rad/s]; larger velocities are dropped as errors."""
 
 Velocity = tuple[float, float, float]
 """Forward [m/s], to the left [m/s], turning to the left [rad/s]."""
@@ -18,13 +18,13 @@ STILL: Velocity = (0.0, 0.0, 0.0)
 
 
 class VelocityCommand:
-    """Keeps the newest velocity; zero when none has come lately.
+    """Holds the newest velocity; zero after a timeout.
 
     Args:
-        timeout_s: How long a velocity counts.
-        clock: Tells the time [ns]; may be simulated, and 0 is none.
-        counts: Gets `bad_cmd_vel` and `stale_cmd_vel`.
-        steady_s: Tells real time [s].
+        timeout_s: How long a velocity is valid [s].
+        clock: The time [ns]; may be simulated, and 0 means no time.
+        counts: Counts `bad_cmd_vel` and `stale_cmd_vel`.
+        steady_s: Real time [s].
     """
 
     def __init__(
@@ -39,18 +39,18 @@ class VelocityCommand:
         self._counts = counts
         self._steady_s = steady_s
         self._latest: tuple[int, Velocity] | None = None
-        self._expired: tuple[int, Velocity] | None = None  # of `velocity` alone: only `set` writes the newest
+        self._expired: tuple[int, Velocity] | None = None  # by `velocity`; `_latest` by `set`
         self._clock_ran = (0, steady_s())
 
     def set(self, velocity: Velocity) -> None:
-        """A velocity has come; one that is not finite, or absurd, is dropped."""
+        """Take a velocity; one that is not finite or too large is dropped."""
         if not all(abs(component) <= MAX_VELOCITY for component in velocity):
             self._counts["bad_cmd_vel"] += 1
             return
         self._latest = (self._clock(), velocity)
 
     def velocity(self) -> Velocity:
-        """What the robot should do now."""
+        """The velocity to drive now."""
         latest, now_ns = self._latest, self._clock()
         if now_ns != self._clock_ran[0]:
             self._clock_ran = (now_ns, self._steady_s())

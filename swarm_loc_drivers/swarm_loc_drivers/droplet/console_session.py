@@ -1,11 +1,11 @@
-"""Reliable transfer of command lines over a Droplet's console, checked by their echo. No I/O, no clock.
+"""Reliable transfer of command lines over a Droplet's console, verified by their echo, without I/O or clock.
 
-A Droplet that takes part in an infrared exchange does not listen to its console for a sixth of a second,
-and a line of which some characters were lost may be another command. So a line is only ended when its echo
-shows that it arrived whole; else it is taken back and typed anew.
+A Droplet ignores its console for a sixth of a second during an infrared exchange, and a line that has lost
+characters may be another command. So a line is terminated only after its complete echo; otherwise it is
+deleted and typed again.
 
-What takes time is a generator: it yields the time [ns] at which it wants to go on at the latest, and goes on
-whenever something was heard.
+Actions that take time are generators: they yield the time [ns] at which to continue at the latest, and
+continue whenever output arrives.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from swarm_loc_drivers.droplet.protocol import Echo, Said
 
 Result = TypeVar("Result")
 Talk = Generator[int, None, Result]
-"""Yields the time [ns] at which it wants to go on at the latest."""
+"""Yields the time [ns] at which to continue at the latest."""
 
 MARGIN_NS = 15_000_000
-"""How much later than reckoned a robot may be ready: its clock runs by the millisecond."""
+"""Tolerance for the robot's clock, which counts milliseconds [ns]."""
 _TRIES = 8
 _ERASED_AT_ONCE = 7
-"""Each character taken back is answered by three; more at once would be lost on the way."""
+"""Each deleted character is answered by three; more at once would be lost."""
 
 _COUNTED = {
     protocol.Broken: "broken_matrices",
@@ -42,16 +42,16 @@ _COUNTED = {
 
 
 class ConsoleTalk:
-    """One end of the line.
+    """The computer's end of the console.
 
     Args:
-        elements: Emitters, and sensors, of the robots.
-        echo_timeout_ns: How long an echo, or an answer, may take.
-        on_said: Gets every line that the console prints.
-        counts: Gets `lines`, `bad_echoes`, and lines by kind that nobody asked for.
+        elements: Number of emitters and of sensors.
+        echo_timeout_ns: Timeout of an echo or an answer [ns].
+        on_said: Receives every printed line.
+        counts: Counts `lines`, `bad_echoes`, and unrequested lines by kind.
 
     Attributes:
-        now_ns: The time at which something was last heard, or looked.
+        now_ns: Time of the last step [ns].
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class ConsoleTalk:
         self.now_ns = 0
 
     def hear(self, data: bytes, now_ns: int) -> None:
-        """The console has printed this."""
+        """Take output of the console."""
         self.now_ns = now_ns
         for said in self._parser.feed(data, now_ns):
             if isinstance(said.event, Echo):
@@ -80,15 +80,15 @@ class ConsoleTalk:
             self._on_said(said)
 
     def take_output(self) -> bytes:
-        """What is to be sent now."""
+        """Bytes to send now."""
         output = bytes(self._output)
         self._output.clear()
         return output
 
     def until(self, condition: Callable[[], bool], timeout_ns: int | None = None) -> Talk[bool]:
-        """Wait for something; whether it came before the timeout, that of an echo if none is given.
+        """Wait for a condition; whether it holds before the timeout (default: that of an echo).
 
-        Who waits while time jumps back waits no longer: how long it has been is not known.
+        A jump back in time ends the wait, since the elapsed time is unknown.
         """
         begin_ns = self.now_ns
         deadline_ns = begin_ns + (self._timeout_ns if timeout_ns is None else timeout_ns)
@@ -103,10 +103,10 @@ class ConsoleTalk:
         yield from self.until(lambda: False, duration_ns)
 
     def enter(self, line: str) -> Talk[int]:
-        """Type a line and end it; when the robot took it [ns].
+        """Type and terminate a line; the time at which the robot accepted it [ns].
 
         Raises:
-            SessionError: The robot does not echo it, though it was tried again and again.
+            SessionError: The robot does not echo the line in several attempts.
         """
         for _ in range(_TRIES):
             self._output += protocol.typed(line)
@@ -122,9 +122,9 @@ class ConsoleTalk:
         raise SessionError(f"the robot does not echo '{line}'")
 
     def forget_line(self) -> Talk[bool]:
-        """Take back whatever was typed and not ended, no faster than the robot can answer; whether it did.
+        """Delete the unfinished line, no faster than the robot can answer; whether it answered.
 
-        What shows of the line does not tell how much there is: a print-out that falls into an echo ends it.
+        The visible line does not show its true length, since other output may interrupt an echo.
         """
         erased = missed = 0
         while erased < protocol.MAX_LINE:
@@ -135,17 +135,17 @@ class ConsoleTalk:
         return True
 
     def _erase(self, count: int) -> Talk[bool]:
-        """Take back so many characters; whether the robot answers."""
+        """Delete characters; whether the robot answers."""
         answered = self._parser.backspaces + protocol.BACKSPACES_PER_ERASE * count
         self._output += count * protocol.ERASE
         return (yield from self.until(lambda: self._parser.backspaces >= answered))
 
 
 def relay(console: ConsoleTalk, target: int, line: str) -> Talk[int]:
-    """Have another robot take a line, which nobody confirms; when it does if it has heard it [ns].
+    """Send a line to another robot, without confirmation; the time at which it executes the line [ns].
 
     Raises:
-        SessionError: The robot at the cable does not echo it.
+        SessionError: The robot at the cable does not echo the line.
     """
     sent_ns = yield from console.enter(protocol.for_robot(target, line))
     due_ns = sent_ns + message_ns(len(line)) + HANDLING_NS

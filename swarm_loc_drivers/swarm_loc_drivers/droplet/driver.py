@@ -1,4 +1,4 @@
-"""The driver of one Droplet at a cable, and of those that it reaches by infrared. No ROS here."""
+"""Driver of one Droplet at a cable and of those that it reaches by infrared, without ROS."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from swarm_loc_drivers.droplet.odometry import CommandedMotion, MotionNoise
 from swarm_loc_drivers.droplet.session import DropletMover, DropletSession, SessionSettings
 
 OWN = ""
-"""In place of a name: the robot at the cable."""
+"""Name of the robot at the cable."""
 _READ_S, _STOP_READ_S = 0.05, 0.01
-"""At least so often the driver looks at the time and at velocities; more often while robots are stopped."""
+"""Longest wait for bytes in a step, and while robots are stopped [s]."""
 
 
 @dataclass(frozen=True)
 class DropletSettings:
-    """How to reach a robot and what it is to do.
+    """How to reach a robot, and what it does.
 
     Attributes:
         device: Serial port.
-        session: What to talk about.
-        noise: How the robots stray from what they are told.
-        stride_s: How far ahead they are told [s].
+        session: Settings of the session.
+        noise: Noise of commanded motion.
+        stride_s: Duration of a command to move [s].
         relayed: Name -> id of robots without a cable that are driven through this one.
-        relay_loss: Share of the commands to these that are not heard.
-        command_timeout_s: How long a velocity counts [s].
-        odometry_period_s: Between two states [s].
+        relay_loss: Share of lost commands to these robots.
+        command_timeout_s: How long a velocity is valid [s].
+        odometry_period_s: Time between two states [s].
     """
 
     device: str
@@ -48,11 +48,11 @@ class DropletSettings:
 
 @dataclass(frozen=True)
 class DropletListeners:
-    """Who gets what comes of the robots; called in the driver's thread.
+    """Receivers of the robots' data, called in the driver's thread.
 
     Attributes:
-        odometry: Gets names, `OWN` for the robot at the cable, and states.
-        brightness: Gets the robot's own id and its matrices.
+        odometry: Receives names, `OWN` for the robot at the cable, and states.
+        brightness: Receives the id of the robot at the cable and its matrices.
     """
 
     odometry: Callable[[str, OdometryState], None]
@@ -60,12 +60,12 @@ class DropletListeners:
 
 
 class DropletDriver(RobotDriver[DropletSession]):
-    """Drives Droplets in a thread of its own.
+    """Drives Droplets in its own thread.
 
     Args:
-        settings: The robots.
-        listeners: Who gets their data.
-        clock: Tells the time [ns]; may be simulated, and 0 is none.
+        settings: Settings of the robots.
+        listeners: Receivers of their data.
+        clock: The time [ns]; may be simulated, and 0 means no time.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class DropletDriver(RobotDriver[DropletSession]):
         return DropletMover(self._commands[name], motion, settings.stride_s, target, loss)
 
     def set_velocity(self, name: str, velocity: Velocity) -> None:
-        """Have a robot move so from now on."""
+        """Set the velocity of a robot."""
         self._commands[name].set(velocity)
 
     def request_exchanges(self) -> None:
@@ -118,7 +118,7 @@ class DropletDriver(RobotDriver[DropletSession]):
         session.abandon(self._clock())
 
     def _serve(self, session: DropletSession) -> None:
-        """Pass requests on, and tell where the robots are."""
+        """Pass on requests and publish odometry."""
         if not session.connected:
             return
         if self._requested.is_set():

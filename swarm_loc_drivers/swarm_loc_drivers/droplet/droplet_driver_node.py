@@ -31,20 +31,20 @@ from swarm_loc_msgs.msg import BrightnessMatrix
 _BRIGHTNESS_QOS = QoSProfile(depth=50)
 _RATES = ("exchanges", "lines")
 _WRONG = {
-    "bad_cmd_vel": "velocities that were not finite, or absurd",
-    "broken_matrices": "print-outs that were no whole matrix of numbers",
-    "equal_powers": "exchanges as bright at near as at far power; does the firmware obey set_ir?",
-    "firmware_errors": "lines in which the firmware complains",
-    "foreign_receiver": "matrices that another robot must have measured",
+    "bad_cmd_vel": "velocities that were not finite or too large",
+    "broken_matrices": "incomplete matrices",
+    "equal_powers": "exchanges as bright at near as at far power; check that the firmware supports set_ir",
+    "firmware_errors": "errors of the firmware",
+    "foreign_receiver": "matrices that another robot has measured",
     "self_heard": "matrices of a robot that heard itself",
     "silent_sensors": "reports of a sensor that reads nothing",
-    "unknown_commands": "commands that the firmware does not know",
+    "unknown_commands": "commands that are unknown to the firmware",
     "unknown_ids": "matrices of robots that are not among the partners",
 }
 
 
 class DropletDriverNode(RobotDriverNode[DropletParameters]):
-    """Hands velocities to the driver and publishes what it reports."""
+    """Passes velocities to the driver and publishes its data."""
 
     _driver: DropletDriver
 
@@ -68,9 +68,9 @@ class DropletDriverNode(RobotDriverNode[DropletParameters]):
 
     def _on_measure(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self.params.turns or not self.params.partners:
-            response.message = "Nobody is asked: there are no partners, or Droplets take turns."
+            response.message = "No partner is asked: there are none, or Droplets take turns."
         elif self._driver.trouble:
-            response.message = f"Nobody is asked: {self._driver.trouble}"
+            response.message = f"No partner is asked: {self._driver.trouble}"
         else:
             self._driver.request_exchanges()
             response.success = True
@@ -94,7 +94,7 @@ class DropletDriverNode(RobotDriverNode[DropletParameters]):
 
 
 def _relayed_path(robot: str, name: str) -> str:
-    """Where the topics of a robot without a cable are: beside those of the robot at the cable."""
+    """Namespace of a robot without a cable: beside that of the robot at the cable."""
     return "/".join([*robot.split("/")[:-1], name])
 
 

@@ -23,7 +23,7 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 
 class DropletFleetNode(ConfiguredNode[DropletFleetParameters]):
-    """Holds the drivers' nodes."""
+    """Runs the nodes of the drivers."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("droplet_fleet", DropletFleetParameters, **node_arguments)
@@ -61,7 +61,7 @@ class DropletFleetNode(ConfiguredNode[DropletFleetParameters]):
 
 
 def _driver(robot: str, parameters: dict[str, Any]) -> DropletDriverNode:
-    """The node of one robot; the command line's names are for the table's own node only."""
+    """Node of one robot; remappings on the command line apply to the fleet node only."""
     return DropletDriverNode(
         namespace=robot,
         parameter_overrides=[Parameter(name, value=value) for name, value in parameters.items()],

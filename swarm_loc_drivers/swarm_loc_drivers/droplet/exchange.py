@@ -1,8 +1,8 @@
 """Polled exchanges of infrared brightness: a Droplet asks one neighbour after the other to emit.
 
-As in the Droplet paper, the receiver asks a certain robot to emit, and asks anew when nothing came of it.
-What is asked by infrared may be lost on the way, the command to change the power as well: then both matrices
-of an exchange would be equally bright, and neither is used.
+As in the Droplet paper, the receiver asks a robot to emit, and asks again if no matrix arrives. A request by
+infrared may be lost, also the command to change the power: then both matrices of an exchange are equally
+bright, and neither is used.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from swarm_loc_drivers.droplet.hardware import (
 from swarm_loc_drivers.droplet.protocol import Matrix, Said, SendAborted
 
 _BRIGHTER = 1.5
-"""So much brighter in all is the far matrix of a pair than the near one, at any distance up to 30 cm."""
+"""Least ratio of the sums of the far and the near matrix of a pair, at any distance up to 30 cm."""
 _PATIENCE_NS = 100_000_000
-"""So much later than reckoned a matrix may come."""
+"""Tolerance for the arrival of a matrix [ns]."""
 _MAX_SKIPPED = 32
-"""A robot that cannot be reached is asked again at the latest after so many turns."""
+"""Most turns after which an unreachable robot is asked again."""
 _MAX_BACKOFF_S = 0.3
 
 
 class Power(IntEnum):
-    """How bright the emitters shone, numbered as in BrightnessMatrix."""
+    """Power of the emitters, numbered as in BrightnessMatrix."""
 
     FAR = 0
     NEAR = 1
@@ -42,12 +42,12 @@ class Power(IntEnum):
 
 @dataclass(frozen=True)
 class Brightness:
-    """What one robot's sensors read of another one's emitters.
+    """Readings of one robot's sensors for another robot's emitters.
 
     Attributes:
         stamp_ns: Middle of the exchange [ns]; of both powers, where both were measured.
         transmitter: Id of the robot that emitted.
-        power: How bright.
+        power: Power of the emitters.
         readings: (n, n) [count], sensors by emitters.
     """
 
@@ -62,14 +62,14 @@ Publish = Callable[[Brightness], None]
 
 @dataclass(frozen=True)
 class PollingSettings:
-    """How to ask.
+    """Settings of polled exchanges.
 
     Attributes:
-        partners: Ids of whom to ask, in turn.
-        period_s: Between the begins of two exchanges [s]; 0: only on request.
-        retries: How often to ask anew.
-        powers: What to set for FAR and for NEAR; with one of them the power is left as it is.
-        least_brightness: A far matrix without any brighter reading shows nobody [count].
+        partners: Ids of the robots to ask, in turn.
+        period_s: Time between the beginnings of two exchanges [s]; 0: only on request.
+        retries: Number of repeated requests.
+        powers: Powers for FAR and NEAR; with one of them the power is not changed.
+        least_brightness: A far matrix without a brighter reading shows no robot [count].
     """
 
     partners: tuple[int, ...]
@@ -80,26 +80,26 @@ class PollingSettings:
 
 
 class MatrixValidator:
-    """Tells which matrices can be used, and counts the others by reason.
+    """Selects usable matrices, and counts the others by reason.
 
     Args:
-        known: Ids that may emit; empty for any.
-        counts: Gets `no_clock`, `self_heard`, `foreign_receiver`, `unknown_ids`, `overheard`.
+        known: Ids that may emit; empty: any.
+        counts: Counts `no_clock`, `self_heard`, `foreign_receiver`, `unknown_ids`, `overheard`.
     """
 
     def __init__(self, known: Collection[int], counts: Counter[str]) -> None:
         self._known = frozenset(known)
         self._counts = counts
         self.robot: int | None = None
-        """The own id."""
+        """Id of the robot at the cable."""
 
     def transmitter(self, said: Said, matrix: Matrix, asked: int | None) -> int | None:
-        """Who emitted; None if the matrix cannot be used.
+        """Id of the emitting robot; None if the matrix cannot be used.
 
         Args:
-            said: When it was printed.
-            matrix: What was printed.
-            asked: Who was asked to emit, if anybody: old formats do not tell.
+            said: The printed line.
+            matrix: Its matrix.
+            asked: The robot that was asked to emit, if any: old formats lack it.
         """
         emitter = asked if matrix.emitter is None else matrix.emitter
         if not said.stamp_ns:
@@ -119,12 +119,12 @@ class MatrixValidator:
 
 
 def brightness_of(matrix: Matrix, stamp_ns: int, transmitter: int, power: Power) -> Brightness:
-    """A matrix, emitters by sensors, as sensors by emitters."""
+    """Transpose a matrix of emitters by sensors."""
     return Brightness(stamp_ns, transmitter, power, np.array(matrix.brightness, dtype=np.int64).T)
 
 
 def publish_pair(ones: list[Brightness], publish: Publish) -> None:
-    """Publish the matrices of one exchange with one stamp, their middle."""
+    """Publish the matrices of one exchange with their mean stamp."""
     stamp_ns = sum(one.stamp_ns for one in ones) // len(ones)
     for one in ones:
         publish(Brightness(stamp_ns, one.transmitter, one.power, one.readings))
@@ -134,11 +134,11 @@ class PollingExchange:
     """Asks one robot after the other to emit.
 
     Args:
-        console: Of the receiver.
-        settings: How to ask.
-        interlude: Does what cannot wait; whether to go on asking.
-        publish: Gets the matrices of exchanges.
-        counts: Gets `exchanges`, `retries`, `failed_exchanges`, `busy_sends`, `dark_matrices`,
+        console: Console of the receiver.
+        settings: Settings of the exchanges.
+        interlude: Handles urgent work; whether to continue.
+        publish: Receives the matrices of exchanges.
+        counts: Counts `exchanges`, `retries`, `failed_exchanges`, `busy_sends`, `dark_matrices`,
             `equal_powers`, and what the validator counts.
     """
 
@@ -167,12 +167,12 @@ class PollingExchange:
         self._aborted = False
 
     def request(self) -> None:
-        """Have one exchange with every partner soon."""
+        """Request one exchange with every partner."""
         self._skips.clear()
         self._requested = len(self._partners)
 
     def note(self, said: Said) -> None:
-        """The console has printed a line."""
+        """Process a printed line."""
         if isinstance(said.event, SendAborted):
             self._counts["busy_sends"] += 1
             self._aborted = True
@@ -183,15 +183,15 @@ class PollingExchange:
             self._failures[transmitter] = self._skips[transmitter] = 0  # it is in reach
             if transmitter == self._asked:
                 self._answer = said.stamp_ns - PRINTED_AFTER_NS, said.event
-            else:  # nobody here knows how bright it shone
+            else:  # its power is unknown
                 self._counts["overheard"] += 1
 
     def is_quiet(self, _now_ns: int) -> bool:
-        """Whether nobody emits now; when others ask is not known."""
+        """Whether no robot emits now; unknown here, so always true."""
         return True
 
     def is_due(self, now_ns: int) -> bool:
-        """Whether to ask somebody now."""
+        """Whether to ask a partner now."""
         if not self._partners or not now_ns:
             return False
         period_ns = round(self._settings.period_s * 1e9)
@@ -200,7 +200,7 @@ class PollingExchange:
         return self._requested > 0 or (period_ns > 0 and now_ns >= self._due_ns)
 
     def talk(self) -> Talk[None]:
-        """An exchange with the partner whose turn it is."""
+        """Make an exchange with the next partner."""
         self._due_ns = max(self._console.now_ns, self._due_ns) + round(self._settings.period_s * 1e9)
         self._requested = max(0, self._requested - 1)
         partner = self._next_partner()
@@ -220,7 +220,7 @@ class PollingExchange:
         publish_pair(ones, self._publish)
 
     def _next_partner(self) -> int | None:
-        """Whose turn it is, of those that can be reached; None: all others have to wait."""
+        """The next reachable partner; None: all have to wait."""
         for _ in range(len(self._partners)):
             self._partners.rotate(-1)
             partner = self._partners[-1]
@@ -230,13 +230,13 @@ class PollingExchange:
         return None
 
     def _note_failure(self, partner: int) -> None:
-        """Ask a robot that was asked in vain less and less often."""
+        """Ask a robot that does not answer less and less often."""
         self._counts["failed_exchanges"] += 1
         self._failures[partner] += 1
         self._skips[partner] = min(2 ** self._failures[partner] - 1, _MAX_SKIPPED)
 
     def _measure(self, partner: int, power: Power) -> Talk[Brightness | None]:
-        """A matrix of one power; None when all attempts fail, or something else is to be done."""
+        """A matrix of one power; None if all attempts fail or the session ends."""
         for attempt in range(self._settings.retries + 1):
             if not (yield from self._interlude()):
                 return None
@@ -253,7 +253,7 @@ class PollingExchange:
         return None
 
     def _attempt(self, partner: int, power: Power) -> Talk[tuple[int, Matrix] | None]:
-        """Ask once; the middle of the exchange [ns] and the matrix."""
+        """Ask once; returns the middle of the exchange [ns] and the matrix."""
         self._asked, self._answer, self._aborted = partner, None, False
         try:
             if len(self._settings.powers) > 1:
@@ -272,5 +272,5 @@ class PollingExchange:
 
 
 def _differ(near: Brightness, far: Brightness) -> bool:
-    """Whether the far matrix is brighter: else the command to change the power was lost, or ignored."""
+    """Whether the far matrix is brighter; otherwise the command to change the power had no effect."""
     return bool(far.readings.sum() > _BRIGHTER * near.readings.sum())

@@ -11,7 +11,7 @@ BAUD_RATE = 115_200
 ELEMENTS = 6
 RADIUS_M = 0.022
 FULL_POWER = 256
-"""Of the infrared emitters; 0 is dark."""
+"""Power of the infrared emitters; 0 is off."""
 
 TURN_CLOCKWISE, TURN_COUNTERCLOCKWISE = 6, 7
 WALKS = range(6)
@@ -21,18 +21,18 @@ DIRECTIONS = range(8)
 _TICK_S = 1.024e-3
 _ON_TICKS, _OFF_TICKS, _TRIMS_PER_TICK = 20, 40, 32
 _UNCALIBRATED = 0xFFFF - 1000
-"""An EEPROM that was never written holds 0xFFFF; the firmware calls all that is near it uncalibrated."""
+"""An unwritten EEPROM holds 0xFFFF; the firmware treats values near it as uncalibrated."""
 _UNCALIBRATED_WALK_MM, _UNCALIBRATED_TURN_DEG = 600, 2000
-"""What the firmware then reckons with, per 1000 steps."""
+"""Values that the firmware then uses, per 1000 steps."""
 
 
 @dataclass(frozen=True)
 class DropletModel:
-    """How Droplets differ.
+    """Type of a Droplet.
 
     Attributes:
-        name: As users write it.
-        directions: The motions that it can make.
+        name: Name in parameters.
+        directions: Directions in which it can move.
     """
 
     name: str
@@ -41,18 +41,18 @@ class DropletModel:
 
 DROPLET = DropletModel("droplet", tuple(DIRECTIONS))
 AUDIO_DROPLET = DropletModel("audio_droplet", (0, 3, TURN_CLOCKWISE, TURN_COUNTERCLOCKWISE))
-"""It has a speaker in the place of one motor."""
+"""It has a speaker instead of one motor."""
 DROPLET_MODELS = {model.name: model for model in (DROPLET, AUDIO_DROPLET)}
 
 
 class Gait(NamedTuple):
-    """What one step of a direction does.
+    """Motion of one step in a direction.
 
     Attributes:
-        step_s: How long it takes [s].
-        forward: [m].
-        left: [m].
-        turn: To the left [rad].
+        step_s: Duration [s].
+        forward: Path ahead [m].
+        left: Path to the left [m].
+        turn: Turn to the left [rad].
     """
 
     step_s: float
@@ -67,13 +67,13 @@ class Gait(NamedTuple):
 
 
 def gait(direction: int, trims: Sequence[int], per_kilostep: int) -> Gait | None:
-    """The gait of a direction; None where no motor turns.
+    """The gait of a direction; None if no motor turns.
 
     In a step the motors of the direction run one after the other, 20 ticks each and a trim, and pause for 40.
 
     Args:
         direction: 0 to 7.
-        trims: Of the three motors, in 1/32 ticks, signed by their sense of rotation; 0: does not turn.
+        trims: Trims of the three motors [1/32 ticks], signed by the sense of rotation; 0: does not turn.
         per_kilostep: Calibrated path [mm] or turn [deg] of 1000 steps.
     """
     ticks = sum(_ON_TICKS + _OFF_TICKS + abs(trim) / _TRIMS_PER_TICK for trim in trims if trim)
@@ -90,40 +90,40 @@ def gait(direction: int, trims: Sequence[int], per_kilostep: int) -> Gait | None
 
 _MS = 1_000_000
 _BYTE_NS = 2_500_000
-"""As a comment in the firmware has it; ten bits at 3200 baud would be 3.1 ms."""
+"""From a comment in the firmware; ten bits at 3200 baud would be 3.1 ms."""
 _HEADER = 7
 """Sender, checksum, length and flags, target."""
 MAX_MESSAGE = 40
-"""Bytes; who hears of more takes nothing."""
+"""Longest message; receivers reject a longer one [bytes]."""
 
 HANDLING_NS = 5 * _MS
-"""From the last byte of a command until it is obeyed."""
+"""From the last byte of a command until its execution."""
 SET_POWER_DELAY_NS = 10 * _MS
 """From the command to change the power until it has changed."""
 EMIT_DELAY_NS = 5 * _MS
 """From the command to emit until the call."""
 CALL_NS = (_HEADER + 1) * _BYTE_NS
 LEAD_NS = 32 * _MS
-"""From the begin of the call to the first flash."""
+"""From the beginning of the call to the first flash."""
 FLASH_NS, GAP_NS = 16 * _MS, 10 * _MS
 EXCHANGE_NS = LEAD_NS + ELEMENTS * (FLASH_NS + GAP_NS)
-"""From the begin of the call until all robots listen again."""
+"""From the beginning of the call until all robots listen again."""
 PRINT_DELAY_NS = 10 * _MS
 """From the end of the exchange until the matrix is printed."""
 
 
 def message_ns(length: int) -> int:
-    """How long a message of so many bytes lasts [ns]."""
+    """Duration of a message of `length` bytes [ns]."""
     return (_HEADER + length) * _BYTE_NS
 
 
 def flash_ns(emitter: int) -> int:
-    """The middle of an emitter's flash, counted from the begin of the call [ns]."""
+    """Middle of an emitter's flash after the beginning of the call [ns]."""
     return LEAD_NS + emitter * (FLASH_NS + GAP_NS) + FLASH_NS // 2
 
 
 MIDDLE_NS = (flash_ns(0) + flash_ns(ELEMENTS - 1)) // 2
-"""The middle of the measurements, counted from the begin of the call."""
+"""Middle of the measurements after the beginning of the call."""
 PRINTED_AFTER_NS = EXCHANGE_NS + PRINT_DELAY_NS - MIDDLE_NS
 """From the middle of the measurements until the matrix is printed."""
 EMITTED_AFTER_NS = EMIT_DELAY_NS + EXCHANGE_NS + PRINT_DELAY_NS

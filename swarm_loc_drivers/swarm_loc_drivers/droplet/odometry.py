@@ -1,7 +1,7 @@
 """Dead reckoning of a Droplet by its commands alone, with the covariance of its gait.
 
-A Droplet walks by vibrating; what a step does varies from robot to robot and from floor to floor. So the
-uncertainty is a share of the way, and what was perhaps heard, perhaps not, is uncertain as a whole.
+A Droplet walks by vibrating; the effect of a step depends on the robot and the floor. So the uncertainty is a
+share of the path, and a command that may have been lost makes its whole motion uncertain.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from swarm_loc_estimator.common.arrays import FloatArray
 
 _NS = 1e9
 _ALL_OR_NONE = 1.0 / 3.0
-"""Variance in units of the way where the truth is anything from none of it to all, and all is believed."""
+"""Variance in units of the motion if its true share is uniform in [0, 1] and the estimate is 1."""
 
 
 @dataclass(frozen=True)
 class MotionNoise:
-    """How far a robot strays from what it is told.
+    """Noise of commanded motion.
 
     Attributes:
         walk_noise: Variance along and across of a walk per metre [m^2/m].
@@ -37,7 +37,7 @@ class MotionNoise:
 
 @dataclass(frozen=True)
 class _Move:
-    """A command that the robot obeys."""
+    """A command in execution."""
 
     gait: Gait
     steps: float
@@ -48,15 +48,15 @@ class _Move:
         return self.begin_ns + round(self.steps * self.gait.step_s * _NS)
 
     def steps_left(self, stamp_ns: int) -> float:
-        """How many steps are still to be done."""
+        """Number of remaining steps."""
         return min(max(0.0, (self.end_ns - stamp_ns) / (_NS * self.gait.step_s)), self.steps)
 
 
 class CommandedMotion:
-    """Adds up commands.
+    """Integrates commands to a pose.
 
     Args:
-        noise: How the robot errs.
+        noise: Noise of the motion.
     """
 
     def __init__(self, noise: MotionNoise) -> None:
@@ -65,20 +65,20 @@ class CommandedMotion:
         self._covariance = np.zeros((3, 3))
         self._now_ns: int | None = None
         self._move: _Move | None = None
-        self._doubted: tuple[FloatArray, float] | None = None  # all motion since a pose, and its variance
+        self._doubted: tuple[FloatArray, float] | None = None  # start of an uncertain motion, variance
 
     def moving(self, stamp_ns: int) -> bool:
-        """Whether the robot is believed to move at an instant [ns]."""
+        """Whether the robot moves at a time [ns], as estimated."""
         return self._move is not None and stamp_ns < self._move.end_ns
 
     def begin(self, stamp_ns: int, gait: Gait, steps: int, doubt: float = 0.0) -> None:
-        """The robot begins to move; unless it stands, it goes on with what it does.
+        """Begin a motion; a robot that is already moving continues its current motion.
 
         Args:
-            stamp_ns: When [ns].
-            gait: What a step does.
-            steps: How many.
-            doubt: Variance of the way in units of the way: how likely the command was not heard.
+            stamp_ns: Time [ns].
+            gait: Motion of a step.
+            steps: Number of steps.
+            doubt: Variance in units of the motion: the probability that the command was lost.
         """
         self._advance(stamp_ns)
         if not self.moving(stamp_ns):
@@ -87,11 +87,11 @@ class CommandedMotion:
             self._doubted = (self._pose, doubt)
 
     def stop(self, stamp_ns: int, doubt: float = 0.0) -> None:
-        """The robot stands.
+        """Stop the motion.
 
         Args:
-            stamp_ns: When [ns].
-            doubt: How likely the command was not heard, and the robot does all that it was told before.
+            stamp_ns: Time [ns].
+            doubt: Probability that the command was lost and the robot completes its motion.
         """
         move = self._move
         self._advance(stamp_ns)
@@ -102,13 +102,13 @@ class CommandedMotion:
         self._move = None
 
     def lose(self, stamp_ns: int) -> None:
-        """From now on nobody knows whether the robot goes on with what it does."""
+        """From now on it is unknown whether the robot continues its motion."""
         self._advance(stamp_ns)
         self._settle()
         self._doubted = (self._pose, _ALL_OR_NONE)
 
     def state(self, stamp_ns: int) -> OdometryState:
-        """What is believed at an instant [ns]."""
+        """The estimate at a time [ns]."""
         self._advance(stamp_ns)
         twist, noise = np.zeros(3), np.zeros((3, 3))
         if self._move is not None:
@@ -118,12 +118,12 @@ class CommandedMotion:
         return OdometryState(stamp_ns, self._pose, self._whole_covariance(), twist, noise)
 
     def _settle(self) -> None:
-        """What was in doubt stays so uncertain."""
+        """Add the variance of an uncertain motion for good."""
         self._covariance = self._whole_covariance()
         self._doubted = None
 
     def _whole_covariance(self) -> FloatArray:
-        """With what is in doubt."""
+        """Covariance including that of an uncertain motion."""
         if self._doubted is None:
             return self._covariance
         since, share = self._doubted
@@ -132,7 +132,7 @@ class CommandedMotion:
         return self._covariance + share * np.outer(way, way)
 
     def _advance(self, stamp_ns: int) -> None:
-        """Go on to an instant; where time has jumped back the robot stands, and it goes on from there."""
+        """Advance to a time; after a jump back the robot stands and continues from there."""
         before_ns, self._now_ns = self._now_ns, stamp_ns
         if before_ns is None or stamp_ns < before_ns:
             self._move = None
@@ -145,12 +145,12 @@ class CommandedMotion:
             self._move = None
 
     def _step(self, gait: Gait, steps: float) -> None:
-        """Do some steps."""
+        """Advance by steps."""
         way = self._way(gait, steps)
         dx, dy, _ = way
         self._covariance = carried_on(self._covariance, dx, dy)
         walk, _, heading = self._body_noise(gait, steps)
-        # an error of the heading that grows on the way leads aside by half of it, give or take
+        # a heading error that grows along the path displaces the robot sideways by half of it on average
         effect, spread = np.array([-0.5 * dy, 0.5 * dx, 1.0]), np.array([-dy, dx, 0.0])
         self._covariance += np.diag([walk, walk, 0.0])
         self._covariance += heading * (np.outer(effect, effect) + np.outer(spread, spread) / 12.0)
@@ -158,13 +158,13 @@ class CommandedMotion:
         self._pose[2] = (self._pose[2] + math.pi) % (2.0 * math.pi) - math.pi
 
     def _body_noise(self, gait: Gait, steps: float) -> FloatArray:
-        """Variances (3,) of some steps: along, across, heading."""
+        """Variances (3,) of steps: along, across, heading."""
         path, turn = steps * math.hypot(gait.forward, gait.left), steps * abs(gait.turn)
         walk = self._noise.walk_noise * path
         return np.array([walk, walk, self._noise.veer_noise * path + self._noise.turn_noise * turn])
 
     def _way(self, gait: Gait, steps: float) -> FloatArray:
-        """Where some steps lead (3,) from here, in the odometry's frame; the turn is not wrapped."""
+        """Motion (3,) of steps in the odometry's frame; the turn is not wrapped."""
         cos, sin = math.cos(self._pose[2]), math.sin(self._pose[2])
         step = [cos * gait.forward - sin * gait.left, sin * gait.forward + cos * gait.left, gait.turn]
         return steps * np.array(step)

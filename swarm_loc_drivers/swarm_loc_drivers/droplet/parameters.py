@@ -27,19 +27,15 @@ class DropletTraits:
     reply_timeout_s: float = number(0.3, "s", 0.01, 10.0, "how long an echo or an answer may take")
     cmd_vel_timeout_s: float = number(0.5, "s", 0.02, 10.0, "without cmd_vel for so long the robot stops")
     stride_s: float = number(
-        2.0, "s", 0.2, 60.0, "how far ahead a motion is commanded; so long it goes on if the driver dies"
+        2.0, "s", 0.2, 60.0, "duration of a commanded motion, which continues for so long if the driver dies"
     )
     odom_rate: float = number(5.0, "1/s", 0.1, 20.0, "published odometry")
-    walk_noise: float = number(
-        5e-4, "m", 0.0, 1.0, "variance along and across of a walk per metre [m^2/m], of what is believed"
-    )
-    veer_noise: float = number(0.05, "rad^2/m", 0.0, 100.0, "likewise of the heading per metre walked")
-    turn_noise: float = number(0.01, "rad", 0.0, 10.0, "likewise of the heading per radian turned")
-    far_power: int = number(FULL_POWER, "1", 1, FULL_POWER, "of the emitters in far exchanges")
-    near_power: int = number(40, "1", 0, FULL_POWER - 1, "likewise in near ones; 0: only far ones")
-    saturation: int = number(
-        240, "count", 1, 4095, "a reading tells no more from here on: full scale less ambient light"
-    )
+    walk_noise: float = number(5e-4, "m", 0.0, 1.0, "variance along and across of a walk per metre [m^2/m]")
+    veer_noise: float = number(0.05, "rad^2/m", 0.0, 100.0, "variance of the heading per metre walked")
+    turn_noise: float = number(0.01, "rad", 0.0, 10.0, "variance of the heading per radian turned")
+    far_power: int = number(FULL_POWER, "1", 1, FULL_POWER, "power of the emitters in far exchanges")
+    near_power: int = number(40, "1", 0, FULL_POWER - 1, "power in near exchanges; 0: only far ones")
+    saturation: int = number(240, "count", 1, 4095, "readings saturate here: full scale less ambient light")
     turn_s: float = number(1.0, "s", MIN_TURN_S, 60.0, "how long a turn to emit lasts")
     odom_frame: str = text("odom", "the pose is in <robot>/odom_frame", required=True)
     base_frame: str = text("base_link", "the pose is that of <robot>/base_frame", required=True)
@@ -55,9 +51,9 @@ class DropletParameters(DropletTraits):
     exchange_rate: float = number(
         0.5, "1/s", 0.0, 2.0, "exchanges in which a partner is asked to emit; 0: only on request"
     )
-    retries: int = number(5, "1", 0, 100, "how often a partner is asked anew when no matrix comes")
+    retries: int = number(5, "1", 0, 100, "how often a partner is asked again when no matrix arrives")
     least_brightness: int = number(
-        5, "count", 0, 4095, "a far matrix of no brighter reading shows nobody and is asked for anew"
+        5, "count", 0, 4095, "a far matrix without a brighter reading shows no robot and is requested again"
     )
     turns: int = number(
         0,
@@ -70,7 +66,7 @@ class DropletParameters(DropletTraits):
     relayed: tuple[str, ...] = texts(
         "NAME=ID of Droplets without a cable, which are driven by infrared through this one"
     )
-    relay_loss: float = number(0.1, "1", 0.0, 1.0, "share of the commands by infrared that are not heard")
+    relay_loss: float = number(0.1, "1", 0.0, 1.0, "share of commands by infrared that are lost")
 
 
 @dataclass(frozen=True)
@@ -84,15 +80,15 @@ class DropletFleetParameters(DropletTraits):
 
     @property
     def traits(self) -> dict[str, Value]:
-        """The parameters of every robot's driver that stand here."""
+        """Parameters for the driver of every robot."""
         return {one.name: getattr(self, one.name) for one in fields(DropletTraits)}
 
 
 def droplet_settings(parameters: DropletParameters) -> DropletSettings:
-    """What the parameters mean together.
+    """Settings from the parameters.
 
     Raises:
-        ParameterError: One cannot be used, or does not go with another.
+        ParameterError: A parameter is invalid, or conflicts with another one.
     """
     if not parameters.address.startswith("/"):
         raise ParameterError(
@@ -114,7 +110,7 @@ def droplet_settings(parameters: DropletParameters) -> DropletSettings:
 
 
 def _exchanges(parameters: DropletParameters) -> PollingSettings | TdmaSettings:
-    """How brightness is measured."""
+    """Settings of the exchanges."""
     partners = _partners(parameters)
     far, near = parameters.far_power, parameters.near_power
     if near >= far:
@@ -129,7 +125,7 @@ def _exchanges(parameters: DropletParameters) -> PollingSettings | TdmaSettings:
 
 
 def _partners(parameters: DropletParameters) -> tuple[int, ...]:
-    """Ids of whom to ask."""
+    """Ids of the robots to ask."""
     found: list[int] = []
     for one in parameters.partners:
         robot = _id("partners", one)

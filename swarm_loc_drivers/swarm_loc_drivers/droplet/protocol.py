@@ -1,9 +1,9 @@
-"""The Droplet's serial console: lines to type, and what the lines that it prints say. No I/O.
+"""The serial console of a Droplet: command lines and the meaning of printed lines, without I/O.
 
 The console echoes every character and answers the end of a line with CR LF. CR and LF each end a line, so
-exactly one of them may be sent. Everything else is print-outs for people, in the midst of which echoes may
-fall. All matrices have one row per emitter and one column per sensor. Formats are those of the firmware of
-2014, 2016 and 2018 (correlllab/cu-droplet).
+exactly one of them may be sent. All other output is text for people, and echoes may interrupt it. Matrices
+have one row per emitter and one column per sensor. Formats are those of the firmware of 2014, 2016 and 2018
+(correlllab/cu-droplet).
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from swarm_loc_drivers.droplet.hardware import ELEMENTS, FULL_POWER
 
 TERMINATOR = b"\r"
 ERASE = b"\b"
-"""Takes back the last character of the line; the console answers `\\b \\b` even where there is none."""
+"""Deletes the last character of the line; the console answers `\\b \\b` even for an empty line."""
 BACKSPACES_PER_ERASE = 2
 
 MAX_LINE = 63
-"""The line buffer has 64 characters, and one of them ends the text."""
+"""The line buffer has 64 characters, including the terminator."""
 MAX_TARGETED_LINE = 31
-"""A command for a certain other robot is copied into 32 characters without looking."""
+"""A command for another robot is copied to a buffer of 32 characters without a check."""
 MAX_STEPS = 0xFFFF
 
 GET_ID = "get_id"
@@ -37,26 +37,26 @@ _BACKSPACE = 8
 
 
 class CommandError(ValueError):
-    """A line that the console cannot take; the message is one sentence."""
+    """A line that the console does not accept; the message is one sentence."""
 
 
 def move_steps(direction: int, steps: int) -> str:
-    """Move; ignored, though acknowledged, while the robot is moving."""
+    """Move; acknowledged but ignored while the robot is moving."""
     return f"move_steps {direction} {steps}"
 
 
 def set_power(power: int) -> str:
-    """Set how bright the emitters shine, 0 to 256."""
+    """Set the power of the emitters, 0 to 256."""
     if not 0 <= power <= FULL_POWER:
         raise CommandError(f"power {power} must lie in [0, {FULL_POWER}].")
     return f"set_ir {power}"
 
 
 def for_robot(robot: int, line: str) -> str:
-    """Send a line to another robot by infrared, which executes it as if it had been typed there.
+    """Send a line by infrared to another robot, which executes it like a typed one.
 
     Raises:
-        CommandError: It is too long for that.
+        CommandError: The line is too long.
     """
     if len(line) > MAX_TARGETED_LINE:
         raise CommandError(f"'{line}' is too long: another robot takes {MAX_TARGETED_LINE} characters.")
@@ -67,7 +67,7 @@ def typed(line: str) -> bytes:
     """The characters of a line, without its end.
 
     Raises:
-        CommandError: It is empty, too long, or holds what is no printable character.
+        CommandError: The line is empty, too long or not printable.
     """
     if not 0 < len(line) <= MAX_LINE or not line.isascii() or not line.isprintable():
         raise CommandError(f"{line!r} must be 1 to {MAX_LINE} printable ASCII characters.")
@@ -75,45 +75,45 @@ def typed(line: str) -> bytes:
 
 
 class Echo(NamedTuple):
-    """A command that was typed."""
+    """Echo of a typed command."""
 
     line: str
 
 
 class Identity(NamedTuple):
-    """The robot's own id."""
+    """Id of the robot."""
 
     robot: int
 
 
 class MoveStarted(NamedTuple):
-    """A command to move was understood; whether it moves depends on whether it was moving."""
+    """A command to move was accepted; it has no effect if the robot was already moving."""
 
     direction: int
     steps: int
 
 
 class Relayed(NamedTuple):
-    """A line is being sent to another robot; None: to all."""
+    """A line is sent to another robot; None: to all."""
 
     target: int | None
     line: str
 
 
 class SendAborted(NamedTuple):
-    """A message was not sent: infrared is busy."""
+    """A message was not sent because infrared is busy."""
 
     status: int
 
 
 class EmissionFailed(NamedTuple):
-    """The robot should have emitted for others, and was busy."""
+    """The robot did not emit because it was busy."""
 
     status: int
 
 
 class RangeBearing(NamedTuple):
-    """What the robot makes of a matrix: range [m], bearing [rad] and heading [rad] of another one."""
+    """The robot's own estimate of another robot: range [m], bearing [rad] and heading [rad]."""
 
     robot: int
     range_m: float
@@ -125,9 +125,9 @@ class Matrix(NamedTuple):
     """A brightness matrix.
 
     Attributes:
-        emitter: Id of the robot that lit its emitters; None where the format does not tell.
-        receiver: Id of the robot that measured; likewise.
-        brightness: One row per emitter of one count per sensor.
+        emitter: Id of the emitting robot; None if the format lacks it.
+        receiver: Id of the measuring robot; None if the format lacks it.
+        brightness: One row per emitter, one count per sensor.
     """
 
     emitter: int | None
@@ -136,39 +136,39 @@ class Matrix(NamedTuple):
 
 
 class SilentSensor(NamedTuple):
-    """A sensor has read nothing again and again."""
+    """A sensor has repeatedly read nothing."""
 
     sensor: int
 
 
 class MotorTrims(NamedTuple):
-    """Of the three motors when moving in a direction."""
+    """Trims of the three motors in a direction."""
 
     direction: int
     trims: tuple[int, int, int]
 
 
 class StepLength(NamedTuple):
-    """Calibrated path [mm] or turn [deg] per 1000 steps of a direction."""
+    """Calibrated path [mm] or turn [deg] of 1000 steps in a direction."""
 
     direction: int
     per_kilostep: int
 
 
 class Title(NamedTuple):
-    """What stands above a table."""
+    """Title of a table."""
 
     text: str
 
 
 class NotRecognised(NamedTuple):
-    """A command that the firmware does not know."""
+    """A command that is unknown to the firmware."""
 
     word: str
 
 
 class Overflow(NamedTuple):
-    """A line had more characters than the buffer; it was forgotten."""
+    """A line was longer than the buffer and was dropped."""
 
 
 class Complaint(NamedTuple):
@@ -178,13 +178,13 @@ class Complaint(NamedTuple):
 
 
 class Broken(NamedTuple):
-    """What must have been a matrix, and is not whole."""
+    """An incomplete matrix."""
 
     text: str
 
 
 class Unknown(NamedTuple):
-    """Another line, or a longer one than the console prints."""
+    """Any other line."""
 
     text: str
 
@@ -196,11 +196,11 @@ Event = (
 
 
 class Said(NamedTuple):
-    """A line of the console.
+    """A line that the console has printed.
 
     Attributes:
-        stamp_ns: When its first character came.
-        event: What it says.
+        stamp_ns: Arrival of its first character [ns].
+        event: Its meaning.
     """
 
     stamp_ns: int
@@ -264,14 +264,14 @@ _LINES: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Event]], ...] = t
 
 
 class ConsoleParser:
-    """Reads what the console prints, in pieces of any size and after any garbage.
+    """Parses the output of the console, in pieces of any size and after any stray bytes.
 
     Args:
-        elements: Emitters, and sensors, of the robots; other matrices are broken.
+        elements: Number of emitters and of sensors; matrices of another size are broken.
 
     Attributes:
-        partial: The line that has not ended yet, as a terminal would show it.
-        backspaces: How many have come.
+        partial: The unfinished line, as a terminal would show it.
+        backspaces: Number of received backspaces.
     """
 
     def __init__(self, elements: int = ELEMENTS) -> None:
@@ -289,7 +289,7 @@ class ConsoleParser:
         self._rows_stamp_ns = 0
 
     def feed(self, data: bytes, stamp_ns: int) -> list[Said]:
-        """Take bytes that came at `stamp_ns`; what the lines that are complete with them say."""
+        """Take bytes that arrived at `stamp_ns`; the lines that they complete."""
         said: list[Said] = []
         for code in data:
             if code in TERMINATOR + b"\n":
@@ -304,7 +304,7 @@ class ConsoleParser:
         return said
 
     def _line(self, line: str) -> list[Said]:
-        """What a line says; nothing while it is part of a matrix."""
+        """Parse a line; empty while it is part of a matrix."""
         if self._rows is not None:
             return self._line_of_matrix(line, self._rows)
         if line == "{":
@@ -313,7 +313,7 @@ class ConsoleParser:
         return [Said(self._stamp_ns, self._event(line))]
 
     def _line_of_matrix(self, line: str, rows: list[tuple[int, ...]]) -> list[Said]:
-        """Take a line behind an opening brace."""
+        """Parse a line after an opening brace."""
         missing = self._elements - len(rows)
         if missing and (row := self._row.fullmatch(line)):
             *cells, comma = row.groups()
@@ -326,7 +326,7 @@ class ConsoleParser:
         return [Said(self._rows_stamp_ns, Broken("{")), *self._line(line)]
 
     def _event(self, line: str) -> Event:
-        """What a line by itself says."""
+        """Parse a single line."""
         if match := self._named.fullmatch(line):
             emitter, receiver, *cells = match.groups()
             return Matrix(int(emitter, 16), int(receiver, 16), self._square(cells))
@@ -338,6 +338,6 @@ class ConsoleParser:
         return Broken(line) if "{" in line or "}" in line else Unknown(line)
 
     def _square(self, cells: tuple[str, ...] | list[str]) -> tuple[tuple[int, ...], ...]:
-        """Cells row by row."""
+        """Arrange cells in rows."""
         numbers = [int(cell) for cell in cells]
         return tuple(tuple(numbers[k : k + self._elements]) for k in range(0, len(numbers), self._elements))

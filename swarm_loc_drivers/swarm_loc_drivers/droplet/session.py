@@ -1,4 +1,4 @@
-"""A conversation with the Droplet at the cable: who it is, how it walks, what it and others see. No I/O."""
+"""Session with the Droplet at the cable: identity, gaits, motion and brightness, without I/O."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from swarm_loc_drivers.droplet.tdma import TdmaExchange, TdmaSettings
 
 _TRIES = 3
 _IDLE_NS = 20_000_000
-"""While nothing is said, look so often what is to be done."""
+"""Period of checks for new work while the console is silent [ns]."""
 
 
 @dataclass(frozen=True)
 class SessionSettings:
-    """What the conversation is about.
+    """Settings of a session.
 
     Attributes:
-        model: The robot's kind.
-        elements: Emitters, and sensors, of all robots.
-        reply_timeout_s: How long an echo or an answer may take [s].
-        exchanges: How brightness is measured.
+        model: Type of the robot.
+        elements: Number of emitters and of sensors of all robots.
+        reply_timeout_s: Timeout of an echo or an answer [s].
+        exchanges: Method of measuring brightness.
     """
 
     model: DropletModel
@@ -40,18 +40,18 @@ class SessionSettings:
 
 
 class DropletSession:
-    """Talks to one Droplet, from its begin to its end, which may be asked for.
+    """Session with one Droplet.
 
     Args:
-        settings: What about.
-        mover: Of the robot itself.
+        settings: Settings of the session.
+        mover: Mover of the robot itself.
         relayed: Movers of robots without a cable.
-        publish: Gets the matrices of exchanges.
-        counts: Gets what happens how often.
+        publish: Receives the matrices of exchanges.
+        counts: Counts events.
 
     Attributes:
-        ending: Set it to have all robots stand and the conversation end.
-        connected: Whether the robot has said who it is and how it walks.
+        ending: Set it to stop all robots and end the conversation.
+        connected: Whether the robot has sent its id and its gaits.
         ended: Whether the conversation has ended.
     """
 
@@ -87,22 +87,22 @@ class DropletSession:
 
     @property
     def robot(self) -> int:
-        """Its id; 0, which no robot has, until it is known."""
+        """Id of the robot; 0 until it is known."""
         return self._exchanging.validator.robot or 0
 
     def request_exchanges(self) -> None:
-        """Have one exchange with every partner soon."""
+        """Request one exchange with every partner."""
         self._exchanging.request()
 
     def step(self, data: bytes, now_ns: int) -> bytes:
-        """Go on; what to send.
+        """Continue the conversation; the bytes to send.
 
         Args:
-            data: What the console has printed since the last step.
-            now_ns: The time, which may be simulated, stand still or jump back; 0 is none.
+            data: Output of the console since the last step.
+            now_ns: The time, which may be simulated, stand still or jump back; 0 means no time.
 
         Raises:
-            SessionError: The robot does not answer, or not as it must.
+            SessionError: The robot does not answer as it must.
         """
         jumped_back = now_ns < self._console.now_ns
         self._console.hear(data, now_ns)
@@ -114,13 +114,13 @@ class DropletSession:
         return self._console.take_output()
 
     def abandon(self, now_ns: int) -> None:
-        """The link is broken: nobody knows what the robots do."""
+        """The link is broken: the motion of the robots is unknown."""
         if not self.ended:
             for mover in self._movers:
                 mover.motion.lose(now_ns)
 
     def _run(self) -> Talk[None]:
-        yield from self._get_acquainted()
+        yield from self._identify()
         self.connected = True
         while (yield from self._interlude()):
             if self._exchanging.is_due(self._console.now_ns):
@@ -130,8 +130,8 @@ class DropletSession:
         for mover in self._movers:
             yield from mover.stop(self._console)
 
-    def _get_acquainted(self) -> Talk[None]:
-        """Have it stand, and learn who it is and what its steps do."""
+    def _identify(self) -> Talk[None]:
+        """Stop the robot and read its id and its gaits."""
         yield from self._console.forget_line()
         yield from self._mover.stop(self._console)
         yield from self._answered(protocol.GET_ID, lambda: self.robot != 0)
@@ -145,7 +145,7 @@ class DropletSession:
         self._gaits = {direction: one for direction, one in gaits.items() if one is not None}
 
     def _answered(self, line: str, condition: Callable[[], bool]) -> Talk[None]:
-        """Ask for something that the robot must be able to say."""
+        """Send a request until its answer has arrived."""
         for _ in range(_TRIES):
             yield from self._console.enter(line)
             if (yield from self._console.until(condition)):
@@ -153,16 +153,16 @@ class DropletSession:
         raise SessionError(f"the robot does not answer '{line}'")
 
     def _interlude(self) -> Talk[bool]:
-        """Do what cannot wait: tell the robots how to move; whether to go on."""
+        """Send due motion commands; whether to continue."""
         for mover in self._movers:
             now_ns = self._console.now_ns
             waits = self.ending or not self._exchanging.is_quiet(now_ns)
             if not waits and mover.is_due(now_ns, self._gaits):
-                yield from mover.tell(self._console, self._gaits)
+                yield from mover.send(self._console, self._gaits)
         return not self.ending
 
     def _on_said(self, said: Said) -> None:
-        """The console has printed a line."""
+        """Process a printed line."""
         event = said.event
         if isinstance(event, Identity):
             self._exchanging.validator.robot = event.robot
@@ -176,14 +176,14 @@ class DropletSession:
             self._exchanging.note(said)
 
     def _note_move(self, started: MoveStarted) -> None:
-        """The robot was told to move: here, or by infrared."""
+        """A command to move, from here or by infrared."""
         if started != self._mover.asked and started.direction in self._gaits:
             self._counts["foreign_moves"] += 1
             self._mover.motion.begin(self._console.now_ns, self._gaits[started.direction], started.steps)
 
 
 Gaits = Mapping[int, Gait]
-"""Direction -> what a step does, of the directions that a robot can move in."""
+"""Gaits of the directions in which a robot can move."""
 
 _STAND = None
 
@@ -191,8 +191,8 @@ _STAND = None
 def nearest_motion(wanted: Velocity, gaits: Gaits) -> int | None:
     """The direction whose velocity is nearest to the wanted one; None to stand.
 
-    A turn counts by the speed of the robot's edge. Of velocities that are much too fast for a Droplet the
-    direction decides.
+    A turn is weighted by the speed of the robot's edge. For velocities beyond a Droplet's speed the direction
+    decides.
     """
 
     def distance(direction: int | None) -> float:
@@ -208,15 +208,15 @@ def nearest_motion(wanted: Velocity, gaits: Gaits) -> int | None:
 class DropletMover:
     """Moves one Droplet.
 
-    A stride is a command of so many steps that it lasts `stride_s`. While it lasts another command would be
-    acknowledged and ignored, so every stride begins with a stop.
+    A stride is a command of steps that lasts `stride_s`. A command during it would be acknowledged and
+    ignored, so every stride begins with a stop.
 
     Args:
-        command: The velocities to follow.
-        motion: Reckons where the robot goes.
-        stride_s: How far ahead to command [s]; when the driver dies, the robot stops after so long.
+        command: Velocities to follow.
+        motion: Dead reckoning of the robot.
+        stride_s: Duration of a command [s]; if the driver dies, the robot stops after it.
         target: Id of a robot that is reached by infrared; None for the one at the cable.
-        relay_loss: Share of the commands by infrared that are not heard.
+        relay_loss: Share of lost commands by infrared.
     """
 
     def __init__(
@@ -231,20 +231,20 @@ class DropletMover:
         self._command = command
         self._stride_s = stride_s
         self._target = target
-        self._doubt = relay_loss  # believed is all of a way, of which by this share nothing is done
-        self._told: int | None = None
+        self._doubt = relay_loss  # probability that a command was lost
+        self._sent: int | None = None
         self.asked: MoveStarted | None = None
-        """What the robot will say that it was told, the last time."""
+        """The last command to move, which the robot will print."""
 
     def is_due(self, now_ns: int, gaits: Gaits) -> bool:
-        """Whether the robot has to be told something."""
+        """Whether a command is due."""
         wanted = nearest_motion(self._command.velocity(), gaits)
-        if wanted != self._told:
+        if wanted != self._sent:
             return True
         return wanted is not None and not self.motion.moving(now_ns)
 
-    def tell(self, console: ConsoleTalk, gaits: Gaits) -> Talk[None]:
-        """Tell the robot what to do now."""
+    def send(self, console: ConsoleTalk, gaits: Gaits) -> Talk[None]:
+        """Send the current motion."""
         yield from self.stop(console)
         wanted = nearest_motion(self._command.velocity(), gaits)
         if wanted is None:
@@ -253,17 +253,17 @@ class DropletMover:
         steps = min(max(1, round(self._stride_s / gait.step_s)), protocol.MAX_STEPS)
         self.asked = MoveStarted(wanted, steps)
         begin_ns = yield from self._enter(console, protocol.move_steps(wanted, steps))
-        self._told = wanted
+        self._sent = wanted
         self.motion.begin(begin_ns, gait, steps, self._doubt)
 
     def stop(self, console: ConsoleTalk) -> Talk[None]:
-        """Make the robot stand."""
+        """Stop the robot."""
         stamp_ns = yield from self._enter(console, protocol.STOP)
-        self._told = None
+        self._sent = None
         self.motion.stop(stamp_ns, self._doubt)
 
     def _enter(self, console: ConsoleTalk, line: str) -> Talk[int]:
-        """Have the robot take a line; when it did [ns]."""
+        """Send a line to the robot; the time at which it accepts the line [ns]."""
         if self._target is None:
             return (yield from console.enter(line))
         return (yield from relay(console, self._target, line))

@@ -1,8 +1,8 @@
 """Time-division exchanges (TDMA): each Droplet at a cable emits in its time slot, all others measure.
 
-Time is cut into turns, the same for all by the clock that they share. The robot whose turn it is emits at
-near power in the first half of its turn and at far power in the second. So everybody knows by the time how
-bright a matrix is, one emission serves all robots around, and nobody speaks at the same time.
+Time is divided into turns by a clock that all drivers share. In its turn a robot emits at near power in the
+first half and at far power in the second half. So the time of a matrix gives its power, one emission serves
+all robots around, and emissions do not collide.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ from swarm_loc_drivers.droplet.hardware import (
 from swarm_loc_drivers.droplet.protocol import Matrix, Said
 
 _LATEST = 0.5
-"""Later in a half than this share of it no emission begins: it might end in the next one."""
+"""Share of a half after which no emission begins, since it might end in the next half."""
 _LATE_START_NS = 60_000_000
-"""So much later than its half begins an emission usually begins."""
+"""Usual delay of an emission after the beginning of its half [ns]."""
 _LATE_NS = 500_000_000
-"""So long after its turn a matrix may be read."""
+"""Longest delay of a matrix after its turn [ns]."""
 MIN_TURN_S = 4.0 * EMITTED_AFTER_NS * 1e-9
-"""In half of half a turn an emission must be through."""
+"""Shortest turn: an emission must fit into half of its half [s]."""
 
 
 @dataclass(frozen=True)
 class TdmaSettings:
-    """How turns are taken.
+    """Settings of time-division exchanges.
 
     Attributes:
-        turn: Which one is this robot's, from 0 on.
-        turns: How many there are.
-        turn_s: How long each lasts [s].
-        powers: What to set for FAR and for NEAR; with one of them only the second half is used.
-        known: Ids that may emit; empty for any.
+        turn: Turn of this robot, from 0.
+        turns: Number of turns.
+        turn_s: Duration of a turn [s].
+        powers: Powers for FAR and NEAR; with one of them only the second half is used.
+        known: Ids that may emit; empty: any.
     """
 
     turn: int
@@ -58,14 +58,14 @@ class TdmaSettings:
 
 
 class TdmaExchange:
-    """Emits when it is this robot's turn, and knows when others do.
+    """Emits in this robot's turn, and assigns matrices to the turns of others.
 
     Args:
-        console: Of the robot.
-        settings: Whose turn is when.
-        interlude: Does what cannot wait; whether to go on.
-        publish: Gets the matrices of exchanges.
-        counts: Gets `emissions`, `late_turns`, `exchanges`, `half_exchanges`, and what the validator counts.
+        console: Console of the robot.
+        settings: Settings of the turns.
+        interlude: Handles urgent work; whether to continue.
+        publish: Receives the matrices of exchanges.
+        counts: Counts `emissions`, `late_turns`, `exchanges`, `half_exchanges`, and those of the validator.
     """
 
     def __init__(
@@ -88,10 +88,10 @@ class TdmaExchange:
         self._kept: dict[int, Brightness] = {}  # near matrices
 
     def request(self) -> None:
-        """Nobody asks where turns are taken."""
+        """Does nothing: robots are not asked."""
 
     def note(self, said: Said) -> None:
-        """The console has printed a line."""
+        """Process a printed line."""
         if not isinstance(said.event, Matrix):
             return
         transmitter = self.validator.transmitter(said, said.event, None)
@@ -122,27 +122,27 @@ class TdmaExchange:
         publish_pair([one], self._publish)
 
     def is_quiet(self, now_ns: int) -> bool:
-        """Whether nobody emits now: else the robot is deaf, or prints what an echo would break."""
+        """Whether no robot emits now; during an exchange the robot ignores its console or prints a matrix."""
         return now_ns % self._half_ns > EMITTED_AFTER_NS + _LATE_START_NS
 
     def is_due(self, now_ns: int) -> bool:
-        """Whether to emit now, or to wait no longer for the second matrix of an exchange."""
+        """Whether to emit now, or to publish a matrix whose pair is overdue."""
         return now_ns > 0 and (self._is_mine(now_ns) or bool(self._expired(now_ns)))
 
     def _is_mine(self, now_ns: int) -> bool:
-        """Whether this half of a turn is this robot's, and it has not emitted in it."""
+        """Whether this half of a turn is this robot's and still unused."""
         half = now_ns // self._half_ns
         mine = half // 2 % self._settings.turns == self._settings.turn
         lit = len(self._settings.powers) > 1 or half % 2 == 1
         return mine and lit and half != self._emitted
 
     def _expired(self, now_ns: int) -> list[int]:
-        """The robots whose far matrix will not come any more."""
+        """Robots whose far matrix is overdue."""
         latest = (now_ns - _LATE_NS) // (2 * self._half_ns)
         return [robot for robot, near in self._kept.items() if self._turn(near) < latest]
 
     def talk(self) -> Talk[None]:
-        """Publish what came alone, and emit if it is this robot's turn."""
+        """Publish unpaired matrices, and emit in this robot's turn."""
         begin_ns = self._console.now_ns
         for robot in self._expired(begin_ns):
             self._publish_alone(self._kept.pop(robot))
@@ -150,7 +150,7 @@ class TdmaExchange:
             yield from self._emit(begin_ns)
 
     def _emit(self, begin_ns: int) -> Talk[None]:
-        """Emit, once in every half of the turn."""
+        """Emit once in this half of the turn."""
         half = begin_ns // self._half_ns
         self._emitted = half
         if begin_ns % self._half_ns > _LATEST * self._half_ns:

@@ -1,4 +1,4 @@
-"""The driver of one e-puck: keeps the link up, the wheels obedient and the odometry added up. No ROS here."""
+"""Driver of one e-puck: link, wheel commands and odometry, without ROS."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession, EpuckSett
 from swarm_loc_drivers.epuck.wifi_session import WifiSession
 
 _MAX_IDLE_S = 0.5
-"""Without a tick for so long, as when simulated time stands still, the robot is asked all the same."""
+"""Longest wait for a tick, for instance while simulated time stands still; then the robot is asked [s]."""
 _READ_S = 0.02
 
 
 @dataclass(frozen=True)
 class EpuckListeners:
-    """Who gets what the robot measures; called in the driver's thread.
+    """Receivers of the robot's data, called in the driver's thread.
 
     Attributes:
-        odometry: Gets every new state.
-        proximity: Gets stamps [ns] and raw values (8,).
-        image: Gets images.
+        odometry: Receives every new state.
+        proximity: Receives stamps [ns] and raw values (8,).
+        image: Receives images.
     """
 
     odometry: Callable[[OdometryState], None]
@@ -40,12 +40,12 @@ class EpuckListeners:
 
 
 class EpuckDriver(RobotDriver[EpuckSession]):
-    """Drives one robot in a thread of its own.
+    """Drives one robot in its own thread.
 
     Args:
-        settings: The robot.
-        listeners: Who gets its data.
-        clock: Tells the time [ns]; may be simulated, and 0 is none.
+        settings: Settings of the robot.
+        listeners: Receivers of its data.
+        clock: The time [ns]; may be simulated, and 0 means no time.
     """
 
     def __init__(self, settings: EpuckSettings, listeners: EpuckListeners, clock: Callable[[], int]) -> None:
@@ -58,7 +58,7 @@ class EpuckDriver(RobotDriver[EpuckSession]):
         self._tick = threading.Event()
 
     def tick(self) -> None:
-        """It is time to ask the robot, where it has to be asked."""
+        """Request the next reading of a robot that has to be asked."""
         self._tick.set()
 
     def set_velocity(self, velocity: Velocity) -> None:
@@ -105,7 +105,7 @@ class EpuckDriver(RobotDriver[EpuckSession]):
                     self._listeners.odometry(state)
 
     def _speeds(self) -> tuple[int, int]:
-        """What the wheels are told now."""
+        """Commands of the wheels now."""
         speed, _, turn_rate = self._command.velocity()
         left, right = self._settings.model.wheel_commands(self._settings.geometry, speed, turn_rate)
         rate = self._settings.model.rate
@@ -113,5 +113,5 @@ class EpuckDriver(RobotDriver[EpuckSession]):
         return left, right
 
     def _doubt(self) -> None:
-        """Nobody knows what the wheels do."""
+        """The rates of the wheels are unknown."""
         self._odometry.doubt_rates(self._clock(), self._settings.model.max_rate)

@@ -45,18 +45,18 @@ _PROXIMITY_NAMES = tuple(f"ps{sensor}" for sensor in range(len(PROXIMITY_BEARING
 _TF_STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _RATES = ("readings", "images")
 _WRONG = {
-    "bad_cmd_vel": "velocities that were not finite, or absurd",
-    "bad_images": "images of another size or kind than asked for",
-    "counter_restarts": "counters that did not go on, as after a reset",
-    "implausible_counters": "readings that no command could have led to",
-    "missed_replies": "questions that were not answered in time or not whole",
+    "bad_cmd_vel": "velocities that were not finite or too large",
+    "bad_images": "images of another size or kind than requested",
+    "counter_restarts": "discontinuous counters, as after a reset",
+    "implausible_counters": "readings that the commands cannot explain",
+    "missed_replies": "requests without a complete answer in time",
     "reversed_counters": "right wheels counted backwards, as by firmware before December 2018; corrected",
     "time_jumps": "stamps that stepped back",
 }
 
 
 class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
-    """Hands velocities to the driver and publishes what it reports."""
+    """Passes velocities to the driver and publishes its data."""
 
     _driver: EpuckDriver
 
@@ -76,7 +76,7 @@ class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
         self.create_timer(1.0 / parameters.reading_rate, self._driver.tick)
 
     def _advertise(self) -> None:
-        # one topic each: eight at once on one would overrun the few places of a sensor-data queue
+        # one topic each: eight messages at once would overflow a sensor-data queue
         self._proximity = [
             self.create_publisher(Range, f"proximity/{name}", qos_profile_sensor_data)
             for name in _PROXIMITY_NAMES
@@ -84,7 +84,7 @@ class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
         if self._calibration is not None:
             self._image = self.create_publisher(Image, "image_raw", qos_profile_sensor_data)
             self._camera_info = self.create_publisher(CameraInfo, "camera_info", qos_profile_sensor_data)
-        # tf2's listeners know this absolute name, whatever the namespace
+        # an absolute name, because tf2 listens only there
         self._tf_static = self.create_publisher(TFMessage, "/tf_static", _TF_STATIC_QOS)
         sensors = _proximity_transforms(self._now_ns(), self._base_frame, self._prefix)
         self._tf_static.publish(TFMessage(transforms=sensors))
@@ -104,12 +104,12 @@ class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
 
 
 def _proximity_frames(prefix: str) -> list[str]:
-    """Names of the sensors' frames, x out of the sensor."""
+    """Frames of the sensors; x points out of the sensor."""
     return [f"{prefix}{name}" for name in _PROXIMITY_NAMES]
 
 
 def _proximity_transforms(stamp_ns: int, base_frame: str, prefix: str) -> list[TransformStamped]:
-    """Where the proximity sensors sit."""
+    """Transforms of the proximity sensors."""
     header = Header(stamp=stamp_message(stamp_ns), frame_id=base_frame)
     transforms = []
     for frame, bearing in zip(_proximity_frames(prefix), PROXIMITY_BEARINGS, strict=True):
@@ -120,7 +120,7 @@ def _proximity_transforms(stamp_ns: int, base_frame: str, prefix: str) -> list[T
 
 
 def _range_messages(stamp_ns: int, raw: NDArray[np.int64], prefix: str) -> list[Range]:
-    """The proximity sensors' raw values (8,) as ranges, ps0 first."""
+    """Raw proximity values (8,) as ranges, ps0 first."""
     stamp = stamp_message(stamp_ns)
     return [
         Range(

@@ -12,13 +12,13 @@ from swarm_loc_drivers.common.odometry import WheelGeometry
 from swarm_loc_estimator.common.arrays import FloatArray
 
 STEPS_PER_TURN = 1000
-"""20 steps of the motor by a gear of 50:1."""
+"""20 steps of the motor, gear 50:1."""
 
 PROXIMITY_BEARINGS = tuple(math.radians(-d) for d in (17.0, 46.0, 90.0, 151.0, -151.0, -90.0, -46.0, -17.0))
 """Directions of ps0..ps7 in base_link [rad], positive to the left; the robot numbers them clockwise."""
 
 PROXIMITY_RADIUS_M = 0.035
-"""Distance of the proximity sensors from the middle of the robot."""
+"""Distance of the proximity sensors from the centre of the robot."""
 
 _COUNTER_SPAN = 1 << 16
 _AROUND_IMAGE = 11
@@ -27,18 +27,18 @@ _AROUND_IMAGE = 11
 
 @dataclass(frozen=True)
 class EpuckModel:
-    """How one generation turns a commanded speed into steps.
+    """Properties of one generation of robots.
 
     A timer of `timer_hz` makes a step every whole number of its ticks, so few rates are possible at high
-    speeds: an e-puck told 600 steps/s makes 625.
+    speeds: an e-puck makes 625 steps/s on a command of 600.
 
     Attributes:
-        name: As users write it.
-        max_command: Larger commands are clamped silently [steps/s].
+        name: Name in parameters.
+        max_command: Largest command; larger ones are clamped silently [steps/s].
         timer_hz: Frequency of the timer [1/s].
-        answer_buffer: Bytes that an answer by the serial protocol may have; more overrun the robot's memory.
-        largest_setting: Bytes of pixels that the firmware lets a camera be set to.
-        zooms: Those of the camera; of another one the firmware makes the last of these without saying so.
+        answer_buffer: Largest answer in the serial protocol; a longer one overruns the memory [bytes].
+        largest_setting: Largest image that the firmware accepts as a setting [bytes of pixels].
+        zooms: Zooms of the camera; the firmware silently replaces another one by the last of these.
     """
 
     name: str
@@ -50,11 +50,11 @@ class EpuckModel:
 
     @property
     def largest_image(self) -> int:
-        """Bytes of pixels that can be sent, with their header and the speeds around them."""
+        """Largest image that can be sent, with its header and the speeds around it [bytes of pixels]."""
         return self.answer_buffer - _AROUND_IMAGE
 
     def rate(self, command: int) -> float:
-        """The rate [steps/s] that a commanded speed [steps/s] really makes."""
+        """True rate [steps/s] of a commanded speed [steps/s]."""
         speed = min(abs(command), self.max_command)
         if speed == 0:
             return 0.0
@@ -67,11 +67,11 @@ class EpuckModel:
 
     @property
     def max_rate(self) -> float:
-        """The fastest rate [steps/s]."""
+        """Fastest rate [steps/s]."""
         return self.rate(self.max_command)
 
     def command_for(self, rate: float) -> int:
-        """The command [steps/s] whose true rate comes closest to a finite wanted one [steps/s]."""
+        """Command [steps/s] whose true rate is closest to a wanted finite one [steps/s]."""
         wanted = min(abs(rate), self.max_rate)
         candidates = {0, math.floor(wanted), math.ceil(wanted)}
         if wanted >= 1.0:
@@ -102,12 +102,12 @@ def wheel_geometry(wheel_diameter: float, wheel_separation: float) -> WheelGeome
 
 
 def as_counter(steps: int) -> int:
-    """The signed 16-bit counter that a robot sends for its steps."""
+    """Signed 16-bit counter that a robot sends for its steps."""
     return (steps + _COUNTER_SPAN // 2) % _COUNTER_SPAN - _COUNTER_SPAN // 2
 
 
 def unwrapped_difference(before: int, after: int, expected: float) -> int:
-    """Steps between two counters of 16 bits: of all that they allow, the number closest to the expected."""
+    """Steps between two counters of 16 bits: the possible number closest to the expected one."""
     surplus = as_counter(after - before - round(expected))
     return round(expected) + surplus
 
@@ -122,13 +122,13 @@ FIELD_OF_VIEW = 0.26
 
 
 def raw_of_distance(distance_m: ArrayLike) -> FloatArray:
-    """Raw values (...) of a wall at distances (...) [m]; past the table's end that of free space."""
+    """Raw values (...) of a wall at distances (...) [m]; beyond the table the value of free space."""
     raw: FloatArray = np.interp(np.asarray(distance_m, dtype=float), _DISTANCE_M, _RAW)
     return raw
 
 
 def range_of_raw(raw: ArrayLike) -> FloatArray:
-    """Ranges (...) [m] of raw values (...); by REP 117 +inf when nothing is near, -inf when too close."""
+    """Ranges (...) [m] of raw values (...); as in REP 117 +inf for free space, -inf for too close."""
     raw = np.asarray(raw, dtype=float)
     distance = np.interp(raw, _RAW[::-1], _DISTANCE_M[::-1])
     distance = np.where(raw <= _RAW[-1], np.inf, distance)
@@ -139,7 +139,7 @@ Image = NDArray[np.uint8]
 
 
 def decode_rgb565(data: bytes, width: int, height: int) -> Image:
-    """The image (height, width, 3) RGB of 2 * width * height bytes; full scale stays full scale."""
+    """Decode RGB565, high byte first, to an image (height, width, 3) RGB with the full range of 8 bits."""
     pixels = np.frombuffer(data, ">u2").reshape(height, width)
     red, green, blue = pixels >> 11, (pixels >> 5) & 0x3F, pixels & 0x1F
     channels = [(red << 3) | (red >> 2), (green << 2) | (green >> 4), (blue << 3) | (blue >> 2)]
@@ -147,7 +147,7 @@ def decode_rgb565(data: bytes, width: int, height: int) -> Image:
 
 
 def encode_rgb565(image: Image) -> bytes:
-    """The bytes of an image (height, width, 3) RGB."""
+    """Encode an image (height, width, 3) RGB as RGB565 bytes."""
     red, green, blue = np.moveaxis(image.astype(np.uint16), -1, 0)
     pixels: NDArray[np.uint16] = ((red >> 3) << 11) | ((green >> 2) << 5) | (blue >> 3)
     return pixels.astype(">u2").tobytes()

@@ -1,8 +1,8 @@
-"""Dead reckoning by the robot's step counters, with the uncertainty of the wheels' paths.
+"""Wheel odometry of an e-puck from its step counters.
 
-The counters count commanded steps. So between two readings they can only have gone where the commands of that
-time lead; anything else is a reading that lost bytes, or a robot that was switched off and on. After a gap
-between readings some may come that were held up on the way: for a while the whole gap counts.
+The counters count commanded steps, so a change that the commands since the last reading cannot explain means
+that a reading has lost bytes or that the robot has restarted. After a gap between readings, delayed readings
+may arrive: for a while the commands of the whole gap are taken into account.
 """
 
 from __future__ import annotations
@@ -16,17 +16,16 @@ from swarm_loc_drivers.epuck.hardware import as_counter, unwrapped_difference
 Rates = tuple[float, float]
 
 _TIMING_SLACK_S = 0.15
-"""Stamps are those of the computer; the robot may have read its counters so much earlier or later still than
-a session knows."""
+"""Further uncertainty of a stamp, beyond that known to the session: stamps are those of the computer."""
 _DELAY_NS = 500_000_000
-"""A command may take so long to the robot, and a reading so long from it."""
+"""Longest delay of a command to the robot, and of a reading from it."""
 _MIN_PERIOD_NS = 4_000_000
-"""No robot answers so fast: readings that come closer together were held up on the way."""
+"""No robot answers faster: readings that arrive closer together were delayed in transit."""
 _ROUNDING_STEPS = 2
 
 
-class _Told(NamedTuple):
-    """Between which rates [steps/s] the wheels are, left and right, from an instant [ns] on."""
+class _RateLimits(NamedTuple):
+    """Limits of the rates of the left and the right wheel [steps/s] from an instant [ns] on."""
 
     since_ns: int
     slowest: Rates
@@ -34,12 +33,12 @@ class _Told(NamedTuple):
 
 
 class WheelOdometry:
-    """Adds up steps.
+    """Integrates steps to a pose, and checks them against the commands.
 
     Args:
-        geometry: The wheels.
+        geometry: Geometry of the wheels.
         wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
-        counts: Gets `implausible_counters`, `counter_restarts`, `reversed_counters` and `time_jumps`.
+        counts: Counts `implausible_counters`, `counter_restarts`, `reversed_counters` and `time_jumps`.
     """
 
     def __init__(self, geometry: WheelGeometry, wheel_noise: float, counts: Counter[str]) -> None:
@@ -49,31 +48,31 @@ class WheelOdometry:
         self._last: tuple[int, int, int] | None = None
         self._last_doubt_ns = 0
         self._rates: Rates = (0.0, 0.0)
-        self._held: Rates = (0.0, 0.0)  # since the last reading; through a gap the robot goes on with them
-        self._told = deque([_Told(0, self._rates, self._rates)])
+        self._held: Rates = (0.0, 0.0)  # at the last reading; the robot keeps them during a gap
+        self._limits_since = deque([_RateLimits(0, self._rates, self._rates)])
         self._gap_ns = (0, 0)
         self._right_sign = 1
         self._doubtful = False
 
     def note_rates(self, now_ns: int, left: float, right: float) -> None:
-        """The robot is told to turn its wheels at these rates [steps/s] from now on."""
+        """The wheels turn at these commanded rates [steps/s] from now on."""
         self._rates = (left, right)
-        self._note(_Told(now_ns, self._rates, self._rates))
+        self._note(_RateLimits(now_ns, self._rates, self._rates))
 
     def doubt_rates(self, now_ns: int, max_rate: float) -> None:
-        """Until it is told again the wheels may turn at any rate [steps/s] that they can."""
-        self._note(_Told(now_ns, (-max_rate, -max_rate), (max_rate, max_rate)))
+        """The rates are unknown, up to `max_rate` [steps/s], until the next command."""
+        self._note(_RateLimits(now_ns, (-max_rate, -max_rate), (max_rate, max_rate)))
 
-    def _note(self, told: _Told) -> None:
-        newest = self._told[-1]
-        if (told.slowest, told.fastest) != (newest.slowest, newest.fastest):
-            self._told.append(told)
+    def _note(self, limits: _RateLimits) -> None:
+        newest = self._limits_since[-1]
+        if (limits.slowest, limits.fastest) != (newest.slowest, newest.fastest):
+            self._limits_since.append(limits)
 
     def update(self, stamp_ns: int, left: int, right: int, *, doubt_ns: int = 0) -> OdometryState | None:
-        """Take counters of 16 bits, read at a time or so much earlier or later.
+        """Take counters of 16 bits, read at `stamp_ns` with an uncertainty of `doubt_ns`.
 
         Returns:
-            The state, or None when they tell nothing new or cannot be true.
+            The state; None if the reading is too close to the last one or impossible.
         """
         right, last = as_counter(self._right_sign * right), self._last
         if last is None:
@@ -101,7 +100,7 @@ class WheelOdometry:
         elif self._doubtful or has_jumped:
             self._counts["counter_restarts"] += 1
             self._forget_motion(longest_s)
-        else:  # a single one may have lost bytes on the way
+        else:  # a single reading may have lost bytes
             self._counts["implausible_counters"] += 1
             self._doubtful = True
             return None
@@ -109,7 +108,7 @@ class WheelOdometry:
         return self._reckoning.state(stamp_ns, *paths, elapsed_s)
 
     def _steps(self, left: int, right: int, elapsed_s: float, right_sign: int = 1) -> tuple[int, int]:
-        """Steps since the last reading, the closest to what the wheels were told that the counters allow."""
+        """Steps since the last reading: those possible by the counters that are closest to the commands."""
         _, last_left, last_right = self._last or (0, left, right)
         expected_left, expected_right = (rate * elapsed_s for rate in self._held)
         return (
@@ -118,30 +117,30 @@ class WheelOdometry:
         )
 
     def _restart(self, stamp_ns: int, doubt_ns: int, left: int, right: int) -> None:
-        """Count from here."""
+        """Make this the last reading."""
         self._last, self._last_doubt_ns = (stamp_ns, left, right), doubt_ns
         self._held = self._rates
         first_ns, last_ns = self._since_ns(stamp_ns) - _DELAY_NS, stamp_ns + _DELAY_NS
-        while len(self._told) > 1 and not first_ns < self._told[1].since_ns <= last_ns:
-            self._told.popleft()
+        while len(self._limits_since) > 1 and not first_ns < self._limits_since[1].since_ns <= last_ns:
+            self._limits_since.popleft()
         self._doubtful = False
 
     def _since_ns(self, stamp_ns: int) -> int:
-        """Since when what a reading tells may have happened: soon after a gap since that began."""
+        """Start of the time that a reading may cover: soon after a gap, the start of the gap."""
         begin_ns, end_ns = self._gap_ns
         return begin_ns if 0 <= stamp_ns - end_ns <= _DELAY_NS else stamp_ns
 
     def _limits(self) -> tuple[Rates, Rates]:
-        """The slowest and the fastest rates since the last reading; it may also have stood."""
-        slowest = [(0.0, 0.0), *(told.slowest for told in self._told)]
-        fastest = [(0.0, 0.0), *(told.fastest for told in self._told)]
+        """Slowest and fastest rates since the last reading; zero is always possible."""
+        slowest = [(0.0, 0.0), *(one.slowest for one in self._limits_since)]
+        fastest = [(0.0, 0.0), *(one.fastest for one in self._limits_since)]
         return (
             (min(left for left, _ in slowest), min(right for _, right in slowest)),
             (max(left for left, _ in fastest), max(right for _, right in fastest)),
         )
 
     def _possible(self, steps: tuple[int, int], longest_s: float) -> bool:
-        """Whether commands allow so many steps in so long at most; the robot may also have stood."""
+        """Whether the commands allow these steps within `longest_s`."""
         ranges = zip(steps, *self._limits(), strict=True)
         return all(
             slowest * longest_s - _ROUNDING_STEPS <= done <= fastest * longest_s + _ROUNDING_STEPS
@@ -149,12 +148,12 @@ class WheelOdometry:
         )
 
     def _advance(self, left_steps: int, right_steps: int) -> tuple[float, float]:
-        """Move by the wheels' steps; their paths [m]."""
+        """Move by steps of the wheels; returns their paths [m]."""
         left, right = (steps * self._geometry.metres_per_step for steps in (left_steps, right_steps))
         self._reckoning.advance(left, right)
         return left, right
 
     def _forget_motion(self, longest_s: float) -> None:
-        """The robot went nobody knows where, at most as fast as it was told."""
+        """The motion is unknown, at most as fast as commanded."""
         rate = max(abs(rate) for limit in self._limits() for rate in limit)
         self._reckoning.forget_motion(rate * self._geometry.metres_per_step * longest_s)

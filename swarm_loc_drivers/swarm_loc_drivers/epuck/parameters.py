@@ -58,16 +58,18 @@ class EpuckParameters:
     image_width: int = number(
         40, "px", 1, 255, "of images over a serial port; over WiFi they have 160 x 120 px"
     )
-    image_height: int = number(40, "px", 1, 255, "likewise")
-    image_zoom: int = number(4, "1", 1, 8, "likewise, camera pixels per pixel; of an epuck2 1, 2 or 4")
-    image_period_s: float = number(1.0, "s", 0.05, 60.0, "likewise, time between two images")
+    image_height: int = number(40, "px", 1, 255, "of images over a serial port")
+    image_zoom: int = number(
+        4, "1", 1, 8, "camera pixels per pixel over a serial port; of an epuck2 1, 2 or 4"
+    )
+    image_period_s: float = number(1.0, "s", 0.05, 60.0, "time between two images over a serial port")
 
 
 def epuck_settings(parameters: EpuckParameters) -> EpuckSettings:
-    """What the parameters mean together.
+    """Settings from the parameters.
 
     Raises:
-        ParameterError: One cannot be used, or does not go with another.
+        ParameterError: A parameter is invalid, or conflicts with another one.
     """
     address, model = parse_address(parameters.address, epuck_wifi.PORT), EPUCK_MODELS[parameters.model]
     if address.host and model is not EPUCK2:
@@ -88,10 +90,10 @@ def epuck_settings(parameters: EpuckParameters) -> EpuckSettings:
 
 
 def camera_calibration(parameters: EpuckParameters, camera: CameraSettings) -> CameraCalibration:
-    """The calibration of the images that will come.
+    """Calibration of the camera's images.
 
     Raises:
-        ParameterError: There is none, or it cannot be used.
+        ParameterError: The file is not set or cannot be used.
     """
     if not parameters.camera_info_file:
         raise ParameterError(
@@ -104,7 +106,7 @@ def camera_calibration(parameters: EpuckParameters, camera: CameraSettings) -> C
 
 
 def _camera(parameters: EpuckParameters, address: Address, model: EpuckModel) -> CameraSettings:
-    """The size of the images; what does not fit the robot's buffer it would refuse silently."""
+    """Size of the images; the robot would silently refuse one that exceeds its buffer."""
     if address.host:
         return CameraSettings(epuck_wifi.WIDTH, epuck_wifi.HEIGHT, zoom=1, period_s=parameters.image_period_s)
     width, height = parameters.image_width, parameters.image_height

@@ -1,9 +1,9 @@
-"""The serial command set of e-puck and e-puck2 ("advanced sercom"), as far as the driver speaks it.
+"""The serial command set of e-puck and e-puck2 ("advanced sercom"), as far as the driver uses it.
 
 A binary command is the negative of its letter; commands chain, a zero byte ends the chain, and then the
 payloads come back in the order of the requests: no header, no length, no checksum. So every request here asks
-for the commanded speed (E) before and after what it wants. The robot repeats the speeds that it was told:
-that shows that it has understood them, and where its reply begins and ends.
+for the commanded speed (E) before and after its payload. The robot returns the speeds that it has received,
+which confirms them and marks the beginning and the end of the reply.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ ASCII_CAMERA_QUERY = b"I\r"
 def resync(left: int, right: int) -> bytes:
     """Bring the robot from any state back to idle and set the speeds [steps/s]; it answers `speed_reply`.
 
-    The zeros fill up and end a binary command that has lost bytes, the first CR ends a line. It may not come
-    last: after a lone CR the firmware waits for the rest of a line and would swallow binary commands.
+    The zeros complete a binary command that has lost bytes, the first CR ends a line. A lone CR must not come
+    last: the firmware would wait for the rest of a line and drop binary commands.
     """
     return bytes(_MAX_ARGUMENTS) + f"\rD,{left},{right}\rE\r".encode()
 
 
 def speed_reply(left: int, right: int) -> re.Pattern[bytes]:
-    """The end of the answer to `resync`."""
+    """Pattern of the end of the answer to `resync`."""
     return re.compile(rf"e,{left},{right}\r\n".encode())
 
 
 def code(letter: str) -> int:
-    """The binary command of a letter."""
+    """Binary command of a letter."""
     return 256 - ord(letter)
 
 
 class Readings(NamedTuple):
-    """What the driver asks for regularly.
+    """Periodic readings.
 
     Attributes:
         left_counter: Steps of the left wheel, 16 bits, wrapping.
-        right_counter: Likewise of the right wheel.
+        right_counter: Steps of the right wheel, 16 bits, wrapping.
         proximity: Raw values of ps0..ps7.
     """
 
@@ -66,8 +66,8 @@ class Request:
 
     Attributes:
         data: The bytes to send.
-        mark: What the reply begins and ends with.
-        size: Bytes between the marks.
+        mark: Bytes at the beginning and the end of the reply.
+        size: Number of bytes between the marks.
     """
 
     data: bytes
@@ -76,9 +76,9 @@ class Request:
 
 
 def readings_request(left: int, right: int, *, is_new: bool) -> Request:
-    """Ask for counters and proximity of a robot with these speeds [steps/s], and set them if they are new.
+    """Request counters and proximity of a robot with these speeds [steps/s], and set new speeds.
 
-    Each command loses an e-puck part of a step: below 601 steps/s it would be slower for being told again.
+    Setting a speed costs an e-puck part of a step, so repeating it would slow the robot below 601 steps/s.
     """
     request = _request(left, right, "QN", _READINGS.size)
     command = bytes([code("D")]) + request.mark if is_new else b""
@@ -86,7 +86,7 @@ def readings_request(left: int, right: int, *, is_new: bool) -> Request:
 
 
 def image_request(left: int, right: int, width: int, height: int) -> Request:
-    """Ask for an image of RGB565 pixels of a robot with these speeds [steps/s]."""
+    """Request an image of RGB565 pixels of a robot with these speeds [steps/s]."""
     return _request(left, right, "I", _IMAGE_HEADER + 2 * width * height)
 
 
@@ -101,25 +101,25 @@ def camera_setting(width: int, height: int, zoom: int) -> bytes:
 
 
 def decode_readings(body: bytes) -> Readings:
-    """What a reply to `readings_request` says."""
+    """Decode a reply to `readings_request`."""
     left, right, *proximity = _READINGS.unpack(body)
     return Readings(left, right, tuple(proximity))
 
 
 def decode_image(body: bytes, width: int, height: int) -> bytes | None:
-    """The pixels of a reply to `image_request`; None when it is another kind of image."""
+    """The pixels of a reply to `image_request`; None for another kind of image."""
     header, pixels = body[:_IMAGE_HEADER], body[_IMAGE_HEADER:]
     return pixels if header == bytes([RGB565_MODE, width, height]) else None
 
 
 class ReplyParser:
-    """Finds the reply to one request in what comes, in pieces of any size and after any garbage.
+    """Finds the reply to one request in pieces of any size, after any stray bytes.
 
     Args:
-        request: What was asked.
+        request: The request that was sent.
 
     Attributes:
-        skipped: Bytes that did not belong to the reply.
+        skipped: Number of bytes outside the reply.
     """
 
     def __init__(self, request: Request) -> None:
@@ -128,7 +128,7 @@ class ReplyParser:
         self.skipped = 0
 
     def feed(self, data: bytes) -> bytes | None:
-        """Take what came; the reply between its marks once it is complete. What follows it is skipped."""
+        """Take bytes; the body of the reply once it is complete. Bytes after it are skipped."""
         self._buffer += data
         mark, length = self._request.mark, self._request.size + 2 * len(self._request.mark)
         begin = self._buffer.find(mark)

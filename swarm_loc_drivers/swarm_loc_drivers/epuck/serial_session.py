@@ -1,4 +1,4 @@
-"""A conversation with an e-puck by the serial command set: question and answer. No I/O."""
+"""Session with an e-puck over the serial command set: request and reply, without I/O."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from swarm_loc_drivers.epuck.hardware import decode_rgb565
 from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, EpuckSettings, Reading, Speeds
 
 _MAX_MISSED = 5
-"""So many exchanges in a row without an answer, and the link is opened anew."""
+"""Missed replies in a row after which the link is reopened."""
 _NS = 1_000_000_000
 
 
 class SerialSession(TalkSession):
-    """Asks for readings at every step that finds it idle, and for images in between; see `EpuckSession`.
+    """Requests readings at every step that finds it idle, and images in between; see `EpuckSession`.
 
     Args:
-        settings: Of the robot.
-        speeds: Tells what the wheels are to do.
-        doubt: Called when it is not known what the robot has understood.
-        counts: Gets `exchanges`, `missed_replies`, `stray_bytes`, `resyncs`, `bad_images`.
+        settings: Settings of the robot.
+        speeds: Commands of the wheels.
+        doubt: Called when it is unknown which commands the robot has received.
+        counts: Counts `exchanges`, `missed_replies`, `stray_bytes`, `resyncs`, `bad_images`.
     """
 
     def __init__(
@@ -58,11 +58,11 @@ class SerialSession(TalkSession):
         yield from self._resync()
 
     def _speeds(self) -> tuple[int, int]:
-        """What the wheels are to do now; they stand at the begin and at the end."""
+        """Commands of the wheels now; zero before the connection and at the end."""
         return self._wanted_speeds() if self.connected and not self.ending else (0, 0)
 
     def _exchange(self, camera: CameraSettings | None) -> Talk[None]:
-        """Tell the wheels what to do, and take what the robot has measured."""
+        """Send the wheel speeds and take the measurements."""
         speeds = self._speeds()
         is_answered = yield from self._read(speeds)
         if is_answered and camera is not None and self._image_is_due(camera):
@@ -78,7 +78,7 @@ class SerialSession(TalkSession):
         yield from self._resync()
 
     def _read(self, speeds: tuple[int, int]) -> Talk[bool]:
-        """Counters and proximity; taken in the middle between question and answer."""
+        """Read counters and proximity; the stamp is the middle between request and reply."""
         asked_ns = self._now_ns
         body = yield from self._ask(protocol.readings_request(*speeds, is_new=speeds != self._sent))
         if body is None:
@@ -98,7 +98,7 @@ class SerialSession(TalkSession):
         return True
 
     def _take_image(self, speeds: tuple[int, int], camera: CameraSettings) -> Talk[bool]:
-        """An image; the robot takes it when the question arrives."""
+        """Read an image, which the robot takes when the request arrives."""
         asked_ns = self._now_ns
         body = yield from self._ask(protocol.image_request(*speeds, camera.width, camera.height))
         if body is None:
@@ -112,7 +112,7 @@ class SerialSession(TalkSession):
         return True
 
     def _ask(self, request: protocol.Request) -> Talk[bytes | None]:
-        """The body of the reply; None when it does not come in time, or not whole."""
+        """The body of the reply; None if it is late or incomplete."""
         self._counts["stray_bytes"] += len(self._received)
         self._received = b""
         self._output += request.data
@@ -135,7 +135,7 @@ class SerialSession(TalkSession):
         return self._settings.reply_timeout_s + 20.0 * bytes_in_all / self._settings.baud_rate
 
     def _set_camera(self, camera: CameraSettings) -> Talk[None]:
-        """Choose the size of images, and check that the robot has really taken it."""
+        """Set the size of images, and check that the robot has accepted it."""
         setting = protocol.camera_setting(camera.width, camera.height, camera.zoom)
         yield from self._answer(setting, protocol.ASCII_CAMERA_SET)
         answer = yield from self._answer(protocol.ASCII_CAMERA_QUERY, protocol.ASCII_CAMERA_REPLY)

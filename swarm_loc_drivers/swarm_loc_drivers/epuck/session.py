@@ -1,4 +1,4 @@
-"""What the two ways of talking to an e-puck have in common: settings, and what the robot measures."""
+"""Settings and measurements that the serial and the WiFi session of an e-puck share."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from swarm_loc_drivers.common.session import Session
 from swarm_loc_drivers.epuck.hardware import EpuckModel, Image
 
 Speeds = Callable[[], tuple[int, int]]
-"""Tells what the wheels are to do, left and right [steps/s]; called when it is about to be sent."""
+"""Commands for the left and the right wheel [steps/s]; called just before they are sent."""
 
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """The images to ask for.
+    """Images to request.
 
     Attributes:
         width: [px].
@@ -37,18 +37,18 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class EpuckSettings:
-    """How to reach a robot and what it is.
+    """How to reach a robot, and its properties.
 
     Attributes:
-        address: Where it answers; over TCP it is an e-puck2 with the WiFi firmware.
-        model: Its generation.
-        geometry: Its wheels.
+        address: Address; over TCP it is an e-puck2 with the WiFi firmware.
+        model: Generation of the robot.
+        geometry: Geometry of its wheels.
         wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
-        command_timeout_s: How long a velocity counts [s].
+        command_timeout_s: How long a velocity is valid [s].
         baud_rate: Of a serial port [bit/s].
-        reading_period_s: Between two readings over TCP that are used [s]; over serial the ticks decide.
+        reading_period_s: Time between two used readings over TCP [s]; over serial the driver's ticks decide.
         reply_timeout_s: How long an answer may take [s].
-        camera: Which images to ask for, None for none; over TCP they have one size only.
+        camera: Images to request, or None; over TCP they have a fixed size.
     """
 
     address: Address
@@ -68,9 +68,9 @@ class Reading:
 
     Attributes:
         stamp_ns: Acquisition [ns].
-        doubt_ns: It may have been so much earlier or later [ns].
+        doubt_ns: Uncertainty of the stamp in both directions [ns].
         left_counter: Steps of the left wheel, 16 bits, wrapping.
-        right_counter: Likewise of the right wheel.
+        right_counter: Steps of the right wheel, 16 bits, wrapping.
         proximity: (8,) raw values of ps0..ps7.
     """
 
@@ -86,7 +86,7 @@ class CameraImage:
     """An image of the robot's camera.
 
     Attributes:
-        stamp_ns: Exposure, as well as it can be known [ns].
+        stamp_ns: Best estimate of the exposure time [ns].
         pixels: (height, width, 3) RGB.
     """
 
@@ -98,8 +98,8 @@ class EpuckSession(Session, Protocol):
     """A conversation with one e-puck.
 
     Attributes:
-        found: What the robot has measured; whoever takes it empties the list.
-        is_idle: Whether nothing is expected of the robot: the next step asks it.
+        found: Measurements; the reader empties the list.
+        is_idle: Whether no answer is pending: the next step sends a request.
     """
 
     found: list[Reading | CameraImage]

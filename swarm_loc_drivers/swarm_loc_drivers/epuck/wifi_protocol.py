@@ -1,9 +1,9 @@
 """The e-puck2's WiFi stream: commands of 21 bytes one way, images and sensor values the other.
 
-Messages of the robot are an id byte and a payload of fixed length, without checksum. A place in the stream
-counts as the begin of a message when the id is known, the values are such as the sensors can give, and what
-has come behind it may begin a message, too. An image, which can be anything, counts when a message follows
-it and none lies within it.
+A message of the robot is an id byte and a payload of fixed length, without checksum. A position in the stream
+is accepted as the beginning of a message if the id is known, the sensor values are plausible, and the bytes
+behind it can begin a message, too. An image, whose bytes are arbitrary, is accepted if a message follows it
+and none lies within it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ SENSORS_DTYPE = np.dtype(
         ("spare", "u1"),
     ]
 )
-"""The 104 bytes of sensor values."""
+"""Layout of the 104 bytes of sensor values."""
 
 _ADC_MAX = 4095
 _SELECTOR_MAX = 15
@@ -59,7 +59,7 @@ _BAD, _UNDECIDED = 0, -1
 
 @dataclass(frozen=True)
 class Command:
-    """What the robot is told; LEDs and sound stay off.
+    """A command; LEDs and sound stay off.
 
     Attributes:
         left: Speed of the left wheel [steps/s].
@@ -74,7 +74,7 @@ class Command:
     sensors: bool
 
     def encode(self) -> bytes:
-        """The 21 bytes."""
+        """Encode as 21 bytes."""
         streams = _CAMERA_ON * self.camera | _SENSORS_ON * self.sensors
         return _COMMAND.pack(COMMAND_ID, streams, 0, self.left, self.right)
 
@@ -86,7 +86,7 @@ class Message:
     Attributes:
         id: IMAGE_ID, SENSORS_ID or NOTHING_ID.
         payload: Pixels (RGB565), sensor values (SENSORS_DTYPE), or nothing.
-        stamp_ns: When its first byte came [ns].
+        stamp_ns: Arrival of its first byte [ns].
     """
 
     id: int
@@ -101,7 +101,7 @@ class Message:
 
 
 def plausible(payload: bytes) -> bool:
-    """Whether 104 bytes can be sensor values: converters have 12 bits, numbers are finite."""
+    """Whether 104 bytes can be sensor values: 12-bit converters, finite numbers."""
     values: NDArray[np.void] = np.frombuffer(payload, SENSORS_DTYPE)
     (record,) = values
     converted = (record["proximity"], record["ambient"], record["microphones"])
@@ -115,11 +115,11 @@ def plausible(payload: bytes) -> bool:
 
 
 class StreamParser:
-    """Cuts the stream into messages; after lost or foreign bytes it finds the next sensor values.
+    """Splits the stream into messages; after lost or stray bytes it finds the next sensor values.
 
     Attributes:
-        skipped: Bytes that belonged to no message.
-        resyncs: How often messages did not follow each other.
+        skipped: Number of bytes outside messages.
+        resyncs: How often the stream had to be searched for a message.
     """
 
     def __init__(self) -> None:
@@ -132,7 +132,7 @@ class StreamParser:
         self.resyncs = 0
 
     def feed(self, data: bytes, stamp_ns: int) -> list[Message]:
-        """Take bytes that came at `stamp_ns`; the messages that are complete with them."""
+        """Take bytes that arrived at `stamp_ns`; the messages that they complete."""
         self._arrivals.append((self._offset + len(self._buffer), stamp_ns))
         self._buffer += data
         self._drop(0)
@@ -146,7 +146,7 @@ class StreamParser:
         return messages
 
     def _verdict(self) -> int:
-        """Length of the message that the buffer begins with; _BAD if none, _UNDECIDED without more bytes."""
+        """Length of the first message of the buffer; _BAD if none, _UNDECIDED if more bytes are needed."""
         if not self._synced and self._buffer and self._buffer[0] != SENSORS_ID:
             return _BAD
         length = self._length_at(0)
@@ -160,7 +160,7 @@ class StreamParser:
         return length
 
     def _length_at(self, begin: int) -> int:
-        """Length of the message at a place of the buffer, or _BAD or _UNDECIDED."""
+        """Length of the message at a position of the buffer, or _BAD or _UNDECIDED."""
         if begin >= len(self._buffer):
             return _UNDECIDED
         kind = self._buffer[begin]
@@ -174,11 +174,11 @@ class StreamParser:
         return end - begin
 
     def _image_begins_at(self, begin: int) -> bool:
-        """Whether there is the id of an image; waiting for its end would tell no more."""
+        """Whether the byte is the id of an image; its end would give no further evidence."""
         return begin < len(self._buffer) and self._buffer[begin] == IMAGE_ID
 
     def _holds_sensor_values(self) -> bool:
-        """Whether two messages of sensor values in a row lie within an image: then part of it was lost."""
+        """Whether an image contains two consecutive messages of sensor values: then part of it was lost."""
         size = 1 + _SIZES[SENSORS_ID]
         last = min(len(self._buffer), 1 + IMAGE_SIZE) - 2 * size
         candidate = self._buffer.find(SENSORS_ID, max(1, self._searched))
@@ -194,7 +194,7 @@ class StreamParser:
         return False
 
     def _skip_to_candidate(self) -> None:
-        """Drop the first byte, and all until one that sensor values could begin with."""
+        """Drop bytes up to the next possible beginning of sensor values."""
         self.resyncs += self._synced
         self._synced = False
         candidate = self._buffer.find(SENSORS_ID, 1)
@@ -203,13 +203,13 @@ class StreamParser:
         self._drop(dropped)
 
     def _taken(self, length: int) -> Message:
-        """The first message, removed from the buffer."""
+        """Remove the first message from the buffer."""
         message = Message(self._buffer[0], bytes(self._buffer[1:length]), self._arrivals[0][1])
         self._drop(length)
         return message
 
     def _drop(self, count: int) -> None:
-        """Remove the first bytes, and the arrivals that no byte of the buffer came with."""
+        """Remove the first bytes, and the arrivals before those of the remaining bytes."""
         del self._buffer[:count]
         self._offset += count
         self._searched = max(0, self._searched - count)

@@ -1,4 +1,4 @@
-"""A conversation with an e-puck2 by its WiFi stream: the robot talks all the time. No I/O."""
+"""Session with an e-puck2 over its WiFi stream: the robot sends continuously, without I/O."""
 
 from __future__ import annotations
 
@@ -15,39 +15,38 @@ from swarm_loc_drivers.epuck.hardware import decode_rgb565
 from swarm_loc_drivers.epuck.session import CameraImage, EpuckSettings, Reading, Speeds
 
 _REPEAT_S = 0.1
-"""A command is said again after so long, in case the robot has dropped one."""
+"""A command is repeated after so long, since the robot may have dropped it [s]."""
 _JITTER_NS = 50_000_000
-"""By so much the time between two messages may vary."""
+"""Allowed jitter of the time between two messages [ns]."""
 _FIRMWARE_PAUSE_S = 1.5
-"""The firmware pauses for 1 s when its two chips have misunderstood each other. It never closes a connection,
-and there is room for few: so a pause may not cost one."""
+"""The firmware pauses for 1 s after an error between its two chips. It never closes a connection and supports
+few of them, so a pause must not lead to a reconnection."""
 
 
 class _Arrival(NamedTuple):
-    """When a message came, how long after the one before it, and whether it was held up on the way."""
+    """Arrival of a message: time, gap to the previous one, and whether it was delayed in transit."""
 
     stamp_ns: int
     gap_ns: float = math.inf
     is_late: bool = False
 
     def next(self, stamp_ns: int) -> _Arrival:
-        """That of the next message."""
+        """The arrival of the next message."""
         gap_ns = stamp_ns - self.stamp_ns
         return _Arrival(stamp_ns, gap_ns, gap_ns > 2.0 * self.gap_ns + _JITTER_NS)
 
 
 class WifiSession:
-    """Commands and listens; see `EpuckSession`.
+    """Sends commands and receives the stream; see `EpuckSession`.
 
-    What the robot sends it has read when it sent the message of the same kind before: it reads the next
-    values at once into a second buffer, where they wait however long the way to the computer is blocked. So
-    that message's arrival is the stamp. What has none is not used: the first message of a connection, which
-    may be of any age, one that comes late, of which nobody knows where it was held up, and the one behind it.
+    The robot reads new values into a second buffer as soon as it has sent a message, and sends them with the
+    next message of that kind. So the stamp of a message is the arrival of the previous one. Messages without
+    a reliable stamp are not used: the first one of a connection, one that arrives late, and its successor.
 
     Args:
-        settings: Of the robot.
-        speeds: Tells what the wheels are to do.
-        counts: Gets `messages`, `stray_bytes`, `resyncs`.
+        settings: Settings of the robot.
+        speeds: Commands of the wheels.
+        counts: Counts `messages`, `stray_bytes`, `resyncs`.
     """
 
     is_idle = False
@@ -83,7 +82,7 @@ class WifiSession:
         return self._command(steady_s)
 
     def _check_silence(self, is_heard: bool, now_ns: int, steady_s: float) -> None:
-        """Make sure that the robot is there, by real time and by the clock: a simulated one may stand still.
+        """Check that the robot sends, by real time and by the clock, which may be simulated and stand still.
 
         Raises:
             SessionError: It has been silent for too long.
@@ -104,7 +103,7 @@ class WifiSession:
         return messages
 
     def _keep(self, newest: dict[int, protocol.Message]) -> None:
-        """Note what the newest messages of each kind say: of those that come at once the last is fresh."""
+        """Use the newest message of each kind."""
         if protocol.SENSORS_ID in newest:
             message = newest[protocol.SENSORS_ID]
             if self._is_due(message.stamp_ns):
@@ -119,7 +118,7 @@ class WifiSession:
             self.found.append(CameraImage(message.stamp_ns, pixels))
 
     def _is_due(self, stamp_ns: int) -> bool:
-        """Whether a reading is the next to be used; the period is kept on average."""
+        """Whether to use a reading: the mean period of used readings is that of the settings."""
         if self._due_ns - self._period_ns <= stamp_ns < self._due_ns:
             return False
         on_time = 0 <= stamp_ns - self._due_ns < self._period_ns
@@ -127,7 +126,7 @@ class WifiSession:
         return True
 
     def _command(self, steady_s: float) -> bytes:
-        """What the robot is to do, if it has to be told; one that streams nothing knows that it stands."""
+        """The command to send, if any. A robot that is asked to stream nothing has stopped."""
         left, right = self._speeds() if self.connected and not self.ending else (0, 0)
         streams = not self.ending
         command = protocol.Command(left, right, camera=self._camera and streams, sensors=streams)

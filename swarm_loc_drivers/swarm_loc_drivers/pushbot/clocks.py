@@ -7,22 +7,22 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import IntArray
 
 _WINDOW_NS = 2_000_000_000
-"""The least delay of so long counts; crystals drift by less than 0.1 ms meanwhile."""
+"""Window of the smallest delay; the clocks drift by less than 0.1 ms within it."""
 _MAX_AHEAD_US = 250_000
-"""The board keeps 4092 events; none waits for longer than that."""
+"""Longest time that one of the board's 4092 buffered events waits [us]."""
 _LEAK = 1e-4
-"""Of a period, so that a time that has come too late gets right again."""
+"""Share by which periods are shortened, so that a late estimate recovers."""
 _US = 1000
 
 
 class EventClock:
-    """Stamps what the board has timed, by the shortest way that its bytes have lately taken.
+    """Converts times of the board to stamps, by the smallest recent delay of its bytes.
 
-    An event's bytes come late by a part that varies (buffers, wireless link) and never early, so the smallest
-    difference between the two clocks is the truest. The part that is always there stays in the stamps.
+    The bytes of an event arrive with a varying delay (buffers, wireless link), so the smallest difference
+    between the two clocks is the best estimate of their offset. A constant delay remains in the stamps.
 
     Args:
-        span_us: After so long the board's timestamps begin anew [us]; 0: never.
+        span_us: The board's timestamps wrap after so long [us]; 0: never.
     """
 
     def __init__(self, span_us: int) -> None:
@@ -30,14 +30,14 @@ class EventClock:
         self._added_us = 0
         self._last: tuple[int, int] | None = None  # computer [ns], board [us] of the newest event
         self._window_ns = 0
-        self._offsets_ns: list[int] = []  # the least of this window, and of the one before
+        self._offsets_ns: list[int] = []  # the smallest of this window and of the previous one
 
     def stamps(self, time_us: IntArray, now_ns: int) -> IntArray:
         """Stamps (N,) [ns] of events.
 
         Args:
             time_us: (N,) the board's clock, unwrapped [us], N > 0.
-            now_ns: When their bytes came.
+            now_ns: Arrival of their bytes [ns].
         """
         if self._last is not None and now_ns < self._last[0]:
             self._last, self._offsets_ns = None, []  # the computer's clock was set back
@@ -49,7 +49,7 @@ class EventClock:
         return np.minimum(stamps, now_ns)
 
     def _add_missed_wraps(self, first_us: int, now_ns: int) -> None:
-        """Silences longer than the timestamps' span cannot be told from shorter ones by the board's clock."""
+        """Add the wraps of a silence that is longer than the timestamps' span, by the computer's clock."""
         if self._last is None or not self._span_us:
             return
         silence_us = (now_ns - self._last[0]) // _US - (first_us - self._last[1])
@@ -64,14 +64,14 @@ class EventClock:
 
 
 class TickClock:
-    """Times readings that come with an even period.
+    """Stamps wheel readings, which have a constant period.
 
-    Text overtakes events that wait for the wire: where a camera sees more than the wire carries, the event
-    before a reading is up to 50 ms older than it. But no reading is older than that event, nor made before
-    a period has passed since the last one.
+    Text overtakes events in the transmit buffer: if the camera sees more than the link carries, the event
+    before a reading is up to 50 ms older than the reading. But no reading is older than that event, or less
+    than a period after the previous reading.
 
     Args:
-        period_ms: Of readings [ms].
+        period_ms: Period of readings [ms].
     """
 
     def __init__(self, period_ms: int) -> None:
@@ -80,11 +80,11 @@ class TickClock:
         self._event: tuple[int, int] | None = None
 
     def pass_event(self, time_us: int, stamp_ns: int) -> None:
-        """An event has come: its time by the board's clock, not wrapped [us], and its stamp [ns]."""
+        """Note an event: its time by the board's clock, not wrapped [us], and its stamp [ns]."""
         self._event = time_us, stamp_ns
 
     def stamp_ns(self, now_ns: int) -> int:
-        """Stamp of a reading that has come now [ns]; now itself if there was no event yet."""
+        """Stamp of a reading that has just arrived [ns]; `now_ns` before the first event."""
         if self._event is None:
             return now_ns
         event_us, event_ns = self._event

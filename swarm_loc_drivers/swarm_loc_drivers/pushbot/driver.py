@@ -1,4 +1,4 @@
-"""The driver of one PushBot: keeps the link up, the wheels obedient, the odometry added up. No ROS here."""
+"""Driver of one PushBot: link, wheel commands and odometry, without ROS."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from swarm_loc_drivers.pushbot.session import PushbotSession, PushbotSettings
 
 _READ_S = 0.02
 _BATCH_S = 0.002
-"""Bytes are taken no more often than so: each time has its price, however few there are."""
+"""Shortest time between two reads [s]; each read has a fixed cost."""
 
 
 @dataclass(frozen=True)
 class PushbotListeners:
-    """Who gets what the robot measures; called in the driver's thread.
+    """Receivers of the robot's data, called in the driver's thread.
 
     Attributes:
-        odometry: Gets every new state.
-        events: Gets packets of events.
+        odometry: Receives every new state.
+        events: Receives packets of events.
     """
 
     odometry: Callable[[OdometryState], None]
@@ -34,12 +34,12 @@ class PushbotListeners:
 
 
 class PushbotDriver(RobotDriver[PushbotSession]):
-    """Drives one robot in a thread of its own.
+    """Drives one robot in its own thread.
 
     Args:
-        settings: The robot.
-        listeners: Who gets its data.
-        clock: Tells the time [ns]; may be simulated, and 0 is none.
+        settings: Settings of the robot.
+        listeners: Receivers of its data.
+        clock: The time [ns]; may be simulated, and 0 means no time.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class PushbotDriver(RobotDriver[PushbotSession]):
     def _serve(self, session: PushbotSession) -> None:
         found, session.found = session.found, []
         for one in found:
-            if one.stamp_ns <= 0:  # before the clock has come, or began
+            if one.stamp_ns <= 0:  # no clock yet, or a time before its beginning
                 self.counts["no_clock"] += 1
             elif isinstance(one, EventPacket):
                 self.counts["packets"] += 1
@@ -86,6 +86,6 @@ class PushbotDriver(RobotDriver[PushbotSession]):
                 self._listeners.odometry(state)
 
     def _velocities(self) -> tuple[int, int]:
-        """What the wheels are told now."""
+        """Commands of the wheels now."""
         speed, _, turn_rate = self._command.velocity()
         return wheel_velocities(self._settings.geometry, speed, turn_rate)

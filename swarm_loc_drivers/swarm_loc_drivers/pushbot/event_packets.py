@@ -1,4 +1,4 @@
-"""Packets of events: what came in a few milliseconds, encoded once."""
+"""Packets of events: the events of a few milliseconds, encoded once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from swarm_loc_estimator.common.arrays import BoolArray, IntArray
 from swarm_loc_estimator.common.messages.event_encoding import Events, encode_events
 
 MAX_EVENTS = 1 << 16
-"""Of a packet."""
+"""Most events of a packet."""
 
 
 @dataclass(frozen=True)
@@ -20,10 +20,10 @@ class EventPacket:
 
     Attributes:
         stamp_ns: Time of the first event [ns].
-        board_ns: Likewise by the board's own clock [ns].
-        number: Counts the packets of a link.
+        board_ns: The same by the board's own clock [ns].
+        number: Number of the packet on this link.
         data: The events, encoded.
-        count: How many they are.
+        count: Number of events.
     """
 
     stamp_ns: int
@@ -34,10 +34,10 @@ class EventPacket:
 
 
 class EventPackets:
-    """Collects events into packets.
+    """Collects events in packets.
 
     Args:
-        period_s: Of packets [s].
+        period_s: Period of packets [s].
         on_bit: The polarity bit of pixels that became brighter.
     """
 
@@ -49,7 +49,7 @@ class EventPackets:
         self._count = 0
         self._number = 0
         self.ready: list[EventPacket] = []
-        """Whoever takes them empties the list."""
+        """Complete packets; the reader empties the list."""
 
     def add(
         self,
@@ -59,7 +59,7 @@ class EventPackets:
         stamps_ns: IntArray,
         board_us: IntArray,
     ) -> None:
-        """Take events (N,); where their time steps back, or a period is over, a packet ends."""
+        """Take events (N,); a packet ends where the time steps back or a period is over."""
         periods = (stamps_ns - stamps_ns[0]) // self._period_ns
         cuts = np.flatnonzero((stamps_ns[1:] < stamps_ns[:-1]) | (periods[1:] != periods[:-1])) + 1
         for begin, end in zip([0, *cuts], [*cuts, len(x)], strict=True):
@@ -90,12 +90,12 @@ class EventPackets:
             self.flush()
 
     def flush_late(self, now_ns: int) -> None:
-        """End the packet that has begun, when nothing has come to end it."""
+        """Complete the current packet if no later event has done so in time."""
         if self._waiting and not 0 <= now_ns - int(self._waiting[0][3][0]) <= 2 * self._period_ns:
             self.flush()
 
     def flush(self) -> None:
-        """End the packet that has begun."""
+        """Complete the current packet."""
         if not self._waiting:
             return
         x, y, is_on, stamps_ns = (np.concatenate(column) for column in zip(*self._waiting, strict=True))

@@ -1,9 +1,9 @@
 """Parser of a PushBot's bytes: events with their timestamps, and lines of text between them.
 
 An event is `1yyyyyyy pxxxxxxx` and its timestamp, most significant byte first. Text never lies within an
-event: at a boundary a byte below 0x80 begins a line, any other one an event. After lost bytes this rule finds
-a boundary again soon, and until then the timestamps give the wrong events away: events whose time jumps are
-kept only if those that follow confirm them, without rubbish in between.
+event: at a boundary a byte below 0x80 begins a line, any other byte an event. After lost bytes this rule soon
+finds a boundary again. Until then wrong events show by their timestamps: events after a jump of time are kept
+only if the following events confirm it, without invalid bytes in between.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.jit import cached_njit, note_precompiled
 
 CONFIRMATIONS = 8
-"""So many events in a row must agree with a jump of time."""
+"""Consecutive events that confirm a jump of time."""
 MAX_LINE = 256
 """Longer lines are dropped."""
 _MAX_HELD = 1024
-"""Bytes of a jump that wait for confirmation; then it is believed."""
+"""Most bytes that wait for the confirmation of a jump; then it is accepted."""
 _MAX_GAP_US = 250_000
 _MAX_SHORT_GAP_US = 16_384
-"""A longer silence of the camera is a jump of time; the second one holds for timestamps of 16 bits."""
+"""A longer silence of the camera counts as a jump of time; the second value is for 16-bit timestamps."""
 _HIGH, _NEWLINE, _SPACE, _DELETE = 0x80, 0x0A, 0x20, 0x7F
 _COUNTS = ("corrupt_events", "time_jumps", "skipped_bytes", "long_lines")
 _CORRUPT, _JUMPS, _SKIPPED, _LONG = range(4)
@@ -34,7 +34,7 @@ _TIME, _RAW, _STARTED = range(3)
 
 
 class Parsed(NamedTuple):
-    """What a stretch of bytes holds.
+    """Content of a piece of bytes.
 
     Attributes:
         x: (N,) columns of events [px].
@@ -52,11 +52,11 @@ class Parsed(NamedTuple):
 
 
 class EventParser:
-    """Takes bytes in pieces of any size; how they are cut does not change what comes out.
+    """Parses bytes in pieces of any size; the sizes do not affect the result.
 
     Args:
         timestamps: A key of `TIMESTAMPS`.
-        counts: Gets `corrupt_events` (dropped), `time_jumps` (believed), `skipped_bytes` and `long_lines`.
+        counts: Counts `corrupt_events` (dropped), `time_jumps` (accepted), `skipped_bytes` and `long_lines`.
     """
 
     def __init__(self, timestamps: str, counts: Counter[str]) -> None:
@@ -67,11 +67,11 @@ class EventParser:
 
     @property
     def span_us(self) -> int:
-        """After so long the timestamps begin anew [us]; 0: they do not, or there are none."""
+        """Time after which the timestamps wrap [us]; 0: never, or there are none."""
         return 1 << (8 * self._stamp_bytes) if self._stamp_bytes > 0 else 0
 
     def feed(self, data: bytes) -> Parsed:
-        """Take bytes; the events and lines that are complete and sure."""
+        """Take bytes; the events and lines that are complete and confirmed."""
         buffer = np.frombuffer(self._rest + data, np.uint8)
         room = len(buffer) // 2 + 1
         columns = np.empty((3, room), np.uint8)
@@ -97,9 +97,9 @@ def _parse(
     spans: IntArray,
     tally: IntArray,
 ) -> tuple[int, int, int]:  # fmt: skip
-    """Fill columns, times and spans of lines; the bytes used, the numbers of events and of lines."""
+    """Fill columns, times and spans of lines; returns the bytes used and the numbers of events and lines."""
     at, events, lines = 0, 0, 0
-    run_at, run_events, run_lines = -1, 0, 0  # where a jump of time began that is not confirmed yet
+    run_at, run_events, run_lines = -1, 0, 0  # where an unconfirmed jump of time began
     before, tally_before = state.copy(), tally.copy()
     while at < len(data):
         if data[at] < _HIGH:
@@ -112,7 +112,7 @@ def _parse(
                     lines += 1
                 at = end + 1
                 continue
-            if run_at >= 0:  # rubbish: there was no boundary where the events of the run began
+            if run_at >= 0:  # invalid bytes: the events of the run did not begin at a boundary
                 tally[_CORRUPT] += events - run_events
                 events, run_at = run_events, -1
                 state[:] = before
@@ -122,7 +122,7 @@ def _parse(
         size, stamp = _stamp(data, at, stamp_bytes)
         if size == 0:
             break
-        if size < 0:  # a difference without an end
+        if size < 0:  # a time difference without an end
             tally[_SKIPPED] += 2
             at += 2
             continue
@@ -133,7 +133,7 @@ def _parse(
                 events, state[:] = run_events, before
                 elapsed = _elapsed(stamp, state, stamp_bytes)
                 if state[_STARTED] == 0 or not _is_plausible(elapsed, stamp_bytes):
-                    at, lines, run_at = run_at + 1, run_lines, -1  # there was no boundary: look behind it
+                    at, lines, run_at = run_at + 1, run_lines, -1  # no boundary: search behind it
                     tally[_SKIPPED] += 1
                     continue
                 run_at = -1
@@ -160,7 +160,7 @@ def _parse(
 
 @cached_njit
 def _line_end(data: NDArray[np.uint8], at: int) -> tuple[int, int]:
-    """Where a line ends, and 0: not yet, 1: by a newline, 2: by a byte that is no text, 3: it is too long."""
+    """Where a line ends, and 0: incomplete, 1: by a newline, 2: by a byte that is no text, 3: too long."""
     for end in range(at, min(len(data), at + MAX_LINE)):
         byte = data[end]
         if byte == _NEWLINE:
@@ -174,7 +174,7 @@ def _line_end(data: NDArray[np.uint8], at: int) -> tuple[int, int]:
 
 @cached_njit
 def _stamp(data: NDArray[np.uint8], at: int, stamp_bytes: int) -> tuple[int, int]:
-    """Bytes of the event at `at` and its timestamp as sent; 0: it is not complete, -1: it has no end."""
+    """Bytes of the event at `at` and its timestamp as sent; 0: incomplete, -1: without an end."""
     left = len(data) - at - 2
     stamp = 0
     if stamp_bytes >= 0:
@@ -211,6 +211,6 @@ def _is_plausible(elapsed: int, stamp_bytes: int) -> bool:
 
 
 def precompile() -> None:
-    """Parse an event and a line."""
+    """Compile the parser, before the first bytes arrive, by parsing an event and a line."""
     EventParser("16bit", Counter()).feed(b"\xe4\xa5\xe2\x40-S28 1 2\n")
     note_precompiled(precompile)

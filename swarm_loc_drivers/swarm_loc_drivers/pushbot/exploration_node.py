@@ -1,4 +1,4 @@
-"""Drives robots to a mapper's goals and lets them look around there, as a ROS 2 node.
+"""Drives robots to the goals of a mapper and scans there, as a ROS 2 node.
 
     ./run swarm_loc_drivers exploration_node --ros-args -p swarm_file:=swarm.yaml
 
@@ -34,7 +34,7 @@ _QOS = QoSProfile(depth=10)
 
 
 class _Robot:
-    """One robot and what came of it last."""
+    """One robot and its latest messages."""
 
     def __init__(self, settings: StopAndGoSettings) -> None:
         self.motion = StopAndGo(settings)
@@ -63,7 +63,7 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
         self.get_logger().info(f"ready: {len(self._names)} robots of '{chosen.swarm_file}'")
 
     def destroy_node(self) -> None:
-        """Let the robots stand first."""
+        """Stop the robots first."""
         for command in self._commands:
             command.publish(Twist())
         super().destroy_node()
@@ -80,7 +80,7 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
         self._command(index, robot.motion.command(stamp_ns, pose))
 
     def _can_begin(self, name: str) -> bool:
-        """Whether all that make and use a robot's distances are there: nothing it sees is to get lost."""
+        """Whether all nodes that produce and use a robot's distances run, so that none is lost."""
         awaited = [f"{name}/laser", f"{name}/goal", f"{name}/fix"]
         awaited += ["swarm/poses"] if self.params.wait_for_poses else []
         heard = self.count_subscribers(f"{name}/laser") > 1 and self.count_subscribers(f"{name}/odom") > 1
@@ -98,7 +98,7 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
         self._go(self._robots[index])
 
     def _go(self, robot: _Robot) -> None:
-        """Send a robot to its goal, once the fix that belongs to it is here, too."""
+        """Send a robot to its goal once the fix with the same stamp has arrived."""
         if robot.goal is None or robot.fix is None or robot.goal[0] != robot.fix[0]:
             return
         stamp_ns, position = robot.goal

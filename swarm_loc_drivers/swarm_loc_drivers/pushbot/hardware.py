@@ -13,30 +13,30 @@ from swarm_loc_drivers.common.odometry import WheelGeometry
 SENSOR_PX = 128
 """Rows and columns of the event camera."""
 MAX_VELOCITY = 100
-"""Velocities beyond it are clamped silently [1]."""
+"""Largest velocity; larger ones are clamped silently [1]."""
 VELOCITY_PERIOD_S = 0.021
-"""A wheel at velocity v makes v ticks in so long: a counter from 20 to 0, once a millisecond."""
+"""A wheel at velocity v makes v ticks in this time: a counter from 20 to 0, once a millisecond."""
 MAX_TICK_RATE = MAX_VELOCITY / VELOCITY_PERIOD_S
 """[ticks/s]."""
 TICK_SPAN = 1 << 32
 """Wheel ticks are sent as signed integers of 32 bits."""
 BAUD_RATE = 4_000_000
-"""After every reset [bit/s]."""
+"""Baud rate after every reset [bit/s]."""
 
 TIMESTAMPS = {"none": 0, "delta": -1, "16bit": 2, "24bit": 3, "32bit": 4}
-"""Timestamps of events as users name them: bytes of each; -1: difference to the last one, 1 to 4 bytes."""
+"""Names of the timestamps of events and their bytes; -1: difference to the last event, 1 to 4 bytes."""
 
 
 @dataclass(frozen=True)
 class FirmwareGeneration:
-    """What differs between firmwares.
+    """Differences between firmware generations.
 
     Attributes:
-        name: For people.
-        tick_bit: Number of the sensor that the wheel ticks are; tells the generation, see `??S`.
-        formats: Timestamps as users name them -> digit of the command `!E`.
-        sensor_prefix: What `!S+` needs before its mask.
-        has_decay: Whether velocities can be told so that the robot stops by itself when it hears no more.
+        name: Name in messages.
+        tick_bit: Number of the sensor of the wheel ticks; identifies the generation, see `??S`.
+        formats: Names of timestamps -> digit of the command `!E`.
+        sensor_prefix: Characters before the mask of `!S+`.
+        has_decay: Whether velocities decay, so that the robot stops by itself when commands end.
     """
 
     name: str
@@ -64,5 +64,5 @@ def wheel_velocities(geometry: WheelGeometry, speed: float, turn_rate: float) ->
 
 
 def tick_difference(before: int, after: int) -> int:
-    """Ticks from one reading to the next of a counter of 32 bits that wraps."""
+    """Ticks between two readings of a counter of 32 bits that wraps."""
     return (after - before + TICK_SPAN // 2) % TICK_SPAN - TICK_SPAN // 2

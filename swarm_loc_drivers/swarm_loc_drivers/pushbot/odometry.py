@@ -1,4 +1,4 @@
-"""Dead reckoning by the wheel ticks of a PushBot."""
+"""Wheel odometry of a PushBot from its ticks."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from swarm_loc_drivers.pushbot.hardware import MAX_TICK_RATE, tick_difference
 from swarm_loc_drivers.pushbot.session import WheelTicks
 
 _MAX_RATE = 2.0 * MAX_TICK_RATE
-"""No wheel is faster, not even when its controller catches up [ticks/s]."""
+"""Largest rate of a wheel, also while its controller catches up [ticks/s]."""
 _SLACK_S = 0.15
-"""Stamps may be wrong by so much."""
+"""Largest error of a stamp [s]."""
 _MAX_CORRECTION_S = 0.5
-"""So far back stamps step when a shorter way of the bytes is found, or events come behind ticks."""
+"""Stamps step back by at most so much when a smaller delay is found, or events arrive after ticks [s]."""
 
 
 class PushbotOdometry:
-    """Adds up ticks.
+    """Integrates ticks to a pose.
 
-    The wheels may also be turned by hand, so only what no motor can do is refused.
+    The wheels may also be turned by hand, so only readings that no motor can cause are rejected.
 
     Args:
-        geometry: The wheels.
+        geometry: Geometry of the wheels.
         wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
-        counts: Gets `implausible_counters`, `counter_restarts`, `time_jumps` and `corrected_times`.
+        counts: Counts `implausible_counters`, `counter_restarts`, `time_jumps` and `corrected_times`.
     """
 
     def __init__(self, geometry: WheelGeometry, wheel_noise: float, counts: Counter[str]) -> None:
@@ -35,11 +35,11 @@ class PushbotOdometry:
         self._doubtful = False
 
     def restart(self) -> None:
-        """The board begins anew, its ticks at zero; the robot has stood meanwhile."""
+        """The board is reset and its ticks are zero; the robot has not moved in between."""
         self._last = None
 
     def update(self, ticks: WheelTicks) -> OdometryState | None:
-        """Take a reading; the state, or None when it tells nothing new or cannot be true."""
+        """Take a reading; the state, or None if the reading is not newer or is impossible."""
         last = self._last
         if last is None:
             self._last = ticks
@@ -48,7 +48,7 @@ class PushbotOdometry:
             return None
         elapsed_s = (ticks.stamp_ns - last.stamp_ns) * 1e-9
         if -_MAX_CORRECTION_S < elapsed_s < 0.0:
-            self._counts["corrected_times"] += 1  # its way is told with the next reading
+            self._counts["corrected_times"] += 1  # its motion is part of the next reading
             return None
         if elapsed_s < 0.0:
             self._counts["time_jumps"] += 1
@@ -62,7 +62,7 @@ class PushbotOdometry:
         return self._reckoning.state(ticks.stamp_ns, left, right, elapsed_s)
 
     def _distrust(self, ticks: WheelTicks, elapsed_s: float) -> OdometryState | None:
-        """A single reading may have lost bytes; a second one says that the counters have changed."""
+        """A single reading may have lost bytes; a second one shows that the counters have changed."""
         if not self._doubtful:
             self._counts["implausible_counters"] += 1
             self._doubtful = True

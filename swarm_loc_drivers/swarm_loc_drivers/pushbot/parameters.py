@@ -14,9 +14,9 @@ from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, 
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 TCP_PORT = 56000
-"""Of the radio's transparent link."""
+"""TCP port of the radio's transparent link."""
 _MIN_FREQUENCY = 10.0
-"""A light that blinks more slowly is not what a tracker looks for; 0 is off."""
+"""Lowest blink frequency that the tracker detects [Hz]; 0 is off."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,10 @@ class PushbotParameters:
 
 
 def pushbot_settings(parameters: PushbotParameters) -> PushbotSettings:
-    """What the parameters mean together.
+    """Settings from the parameters.
 
     Raises:
-        ParameterError: One cannot be used.
+        ParameterError: A parameter is invalid.
     """
     lights = Lights(
         _frequency("laser_frequency", parameters.laser_frequency),
@@ -90,10 +90,10 @@ class ExplorationParameters:
 
 
 def driven_robots(parameters: ExplorationParameters, swarm: Swarm) -> list[str]:
-    """The names of the robots that are driven, in the order of the description.
+    """Names of the driven robots, in the order of the description.
 
     Raises:
-        ParameterError: One of those wanted is not known.
+        ParameterError: A robot is not in the description.
     """
     known = [robot.name for robot in swarm.robots]
     for name in parameters.robots:

@@ -28,22 +28,22 @@ from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import EventPacket as EventPacketMessage
 
 EVENT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Half a second of packets."""
+"""Holds half a second of packets."""
 _RATES = ("events", "packets", "readings")
 _WRONG = {
-    "bad_cmd_vel": "velocities that were not finite, or absurd",
-    "corrupt_events": "events that were put together wrongly, as after lost bytes",
-    "counter_restarts": "wheel ticks that did not go on",
-    "implausible_counters": "wheel ticks that no motor could have made",
+    "bad_cmd_vel": "velocities that were not finite or too large",
+    "corrupt_events": "wrongly decoded events, as after lost bytes",
+    "counter_restarts": "discontinuous wheel ticks",
+    "implausible_counters": "wheel ticks beyond the motors' speed",
     "long_lines": "lines of text without an end",
     "refused_commands": "commands that the robot did not understand",
-    "skipped_bytes": "bytes that belonged to nothing",
+    "skipped_bytes": "bytes outside events and lines",
     "time_jumps": "times that stepped back or far ahead",
 }
 
 
 class PushbotDriverNode(RobotDriverNode[PushbotParameters]):
-    """Hands velocities to the driver and publishes what it reports."""
+    """Passes velocities to the driver and publishes its data."""
 
     _driver: PushbotDriver
 

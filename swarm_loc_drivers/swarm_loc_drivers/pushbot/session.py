@@ -1,8 +1,8 @@
-"""A conversation with a PushBot: handshake, then a stream of events and wheel ticks. No I/O.
+"""Session with a PushBot: handshake, then a stream of events and wheel ticks, without I/O.
 
-The board is reset first. So its motors stand whatever was before, its clock and its ticks begin at zero, and
-what it says at its start tells that it is one. While it streams it gets a velocity whenever that changes, and
-otherwise so often that a firmware that can stops by itself soon after it hears nothing.
+The board is reset first: this stops its motors, sets its clock and ticks to zero, and its banner identifies
+it. While it streams, a velocity is sent when it changes and repeated before it decays, so a firmware with
+decaying velocities stops the robot by itself soon after the last command.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from swarm_loc_drivers.pushbot.protocol import Lights
 
 @dataclass(frozen=True)
 class PushbotSettings:
-    """How to reach a robot and what it is to do.
+    """How to reach a robot, and what it does.
 
     Attributes:
-        address: Where it answers.
-        baud_rate: Of a serial port [bit/s].
-        geometry: Its wheels.
+        address: Address of the robot.
+        baud_rate: Baud rate of a serial port [bit/s].
+        geometry: Geometry of its wheels.
         wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
-        command_timeout_s: How long a velocity counts [s].
+        command_timeout_s: How long a velocity is valid [s].
         reply_timeout_s: How long an answer, or the next wheel ticks, may take [s].
-        tick_period_s: Between two readings of the wheel ticks [s].
-        timestamps: Of events, a key of `hardware.TIMESTAMPS`; "" for no events at all.
+        tick_period_s: Time between two readings of the wheel ticks [s].
+        timestamps: Timestamps of events, a key of `hardware.TIMESTAMPS`; "" for no events at all.
         on_bit: The polarity bit of pixels that became brighter.
-        packet_period_s: Of packets of events [s].
+        packet_period_s: Period of packets of events [s].
         lights: Frequencies of laser and LEDs.
     """
 
@@ -59,9 +59,9 @@ class WheelTicks:
     """A reading of the wheels' counters.
 
     Attributes:
-        stamp_ns: Acquisition, as well as it can be known [ns].
+        stamp_ns: Best estimate of the acquisition time [ns].
         left: Ticks of the left wheel, 32 bits, wrapping.
-        right: Likewise of the right wheel.
+        right: Ticks of the right wheel, 32 bits, wrapping.
     """
 
     stamp_ns: int
@@ -70,29 +70,29 @@ class WheelTicks:
 
 
 Velocities = Callable[[], tuple[int, int]]
-"""Tells what the wheels are to do, left and right [ticks per 21 ms]; called when it is about to be sent."""
+"""Commands for the left and the right wheel [ticks per 21 ms]; called just before they are sent."""
 
 _BOOT_S = 2.0
-"""So long a board may take to start, besides the time of an answer."""
+"""Time in which a board starts, in addition to that of an answer [s]."""
 _ATTEMPTS = 3
 _REPEAT_S = 0.4
-"""A velocity that does not change is told again after so long; a decaying one holds for a second."""
+"""A constant velocity is repeated after so long; a decaying one holds for a second [s]."""
 
 
 class PushbotSession(TalkSession):
-    """Goes on whenever there are bytes, or time has passed.
+    """Session with one PushBot.
 
     Args:
-        settings: Of the robot.
-        velocities: Tells what the wheels are to do.
-        counts: Gets `events`, `readings`, `refused_commands`, `other_lines`, and those of `EventParser`.
+        settings: Settings of the robot.
+        velocities: Commands of the wheels.
+        counts: Counts `events`, `readings`, `refused_commands`, `other_lines`, and those of `EventParser`.
 
     Attributes:
-        ending: Set it to have the robot stand and the conversation end.
-        connected: Whether the robot has answered and told its wheel ticks.
+        ending: Set it to stop the robot and end the conversation.
+        connected: Whether the robot has answered and sent wheel ticks.
         ended: Whether the conversation has ended; the robot stands.
-        found: What the robot has measured; whoever takes it empties the list.
-        generation: Its firmware, once that is known.
+        found: Measurements; the reader empties the list.
+        generation: Its firmware, once it is known.
     """
 
     def __init__(self, settings: PushbotSettings, velocities: Velocities, counts: Counter[str]) -> None:
@@ -101,7 +101,7 @@ class PushbotSession(TalkSession):
         self.generation: FirmwareGeneration | None = None
         self._settings = settings
         self._velocities = velocities
-        self._told, self._told_s = (0, 0), 0.0
+        self._sent, self._sent_s = (0, 0), 0.0
 
     def _run(self) -> Talk[None]:
         yield from self._answer(protocol.RESET, protocol.BANNER, _BOOT_S)
@@ -111,13 +111,13 @@ class PushbotSession(TalkSession):
         yield from self._answer(self._farewell(), protocol.FORMAT, 0.0)
 
     def _set_up(self) -> Talk[FirmwareGeneration]:
-        """Find out what firmware it is, and have it do what is wanted; it streams at the end."""
+        """Identify the firmware, configure it and start the stream."""
         settings = self._settings
         self._output += protocol.NO_ECHO
         listing = yield from self._answer(protocol.LIST_SENSORS, protocol.LAST_SENSORS, 0.0)
         generation = self.generation = protocol.generation_of(listing.string[: listing.end()])
         if generation is None:
-            raise SessionError("the board's firmware has no wheels: it is not one built for PushBots")
+            raise SessionError("the board's firmware has no wheels: it is not built for PushBots")
         if settings.timestamps:
             yield from self._choose_format(generation, settings.timestamps)
         self._output += protocol.lights(settings.lights) + protocol.BRAKE + protocol.MOTORS_ON
@@ -146,7 +146,7 @@ class PushbotSession(TalkSession):
         raise SessionError(f"the robot does not answer {request.split()[0].decode()}")
 
     def _stream(self, generation: FirmwareGeneration) -> Talk[None]:
-        """Take what it measures, and tell the wheels what to do, until it is to end."""
+        """Take measurements and send velocities until the session ends."""
         settings = self._settings
         parser = EventParser(settings.timestamps or "none", self._counts)
         clock = EventClock(parser.span_us) if settings.timestamps not in ("", "none") else None
@@ -164,11 +164,11 @@ class PushbotSession(TalkSession):
                 if self._take_line(line, readings, generation):
                     ticks_s, self.connected = self._steady_s, True
             if self._steady_s > ticks_s + settings.reply_timeout_s + settings.tick_period_s:
-                raise SessionError("the robot tells no wheel ticks any more")
-            self._tell_velocity(generation)
+                raise SessionError("the robot has stopped sending wheel ticks")
+            self._send_velocity(generation)
 
     def _take_events(self, parsed: Parsed, clock: EventClock | None, packets: EventPackets) -> list[int]:
-        """Stamp and pack events; their stamps [ns], which lines among them get, too."""
+        """Stamp and pack events; their stamps [ns], which time the lines between them."""
         count = len(parsed.x)
         stamps: list[int] = []
         if count:
@@ -187,7 +187,7 @@ class PushbotSession(TalkSession):
         """Take a line; whether it was wheel ticks.
 
         Raises:
-            SessionError: The board has begun anew.
+            SessionError: The board was reset.
         """
         ticks = protocol.wheel_ticks(line, generation)
         if ticks is not None:
@@ -199,21 +199,21 @@ class PushbotSession(TalkSession):
         self._counts["refused_commands" if protocol.is_refusal(line) else "other_lines"] += 1
         return False
 
-    def _tell_velocity(self, generation: FirmwareGeneration) -> None:
-        """Say a velocity that is new, and one that is not before it decays; wheels stand until it answers."""
+    def _send_velocity(self, generation: FirmwareGeneration) -> None:
+        """Send a new velocity, and repeat one before it decays; zero until the robot is connected."""
         wanted = self._velocities() if self.connected else (0, 0)
-        if wanted == self._told and (wanted == (0, 0) or self._steady_s < self._told_s + _REPEAT_S):
+        if wanted == self._sent and (wanted == (0, 0) or self._steady_s < self._sent_s + _REPEAT_S):
             return
         self._output += protocol.velocity(generation, *wanted) if any(wanted) else protocol.BRAKE
-        self._told, self._told_s = wanted, self._steady_s
+        self._sent, self._sent_s = wanted, self._steady_s
 
     def _farewell(self) -> bytes:
-        """Everything off; the answer to the question behind it says that all of it was heard."""
+        """Commands that turn everything off; the answer to the final query confirms all of them."""
         dark = protocol.lights(protocol.Lights(0.0, 0.0))
         off = protocol.EVENTS_OFF + protocol.STOP_SENSORS + protocol.MOTORS_OFF
         return b"\n" + protocol.BRAKE + off + dark + protocol.QUERY_FORMAT
 
 
 def _tick_period_ms(settings: PushbotSettings) -> int:
-    """Between two readings of the wheel ticks [ms]."""
+    """Period of the wheel ticks [ms]."""
     return max(1, round(1e3 * settings.tick_period_s))

@@ -1,7 +1,7 @@
-"""What one robot does between a mapper's goals: it looks around by turning, waits, and drives straight on.
+"""Motion of one robot between the goals of a mapper: it turns to scan, waits, and drives straight.
 
-Everything is steered by odometry. Wheels that slip turn the robot less than odometry says; by how much, the
-headings of two fixes and the odometry between them tell.
+All motion is controlled by odometry. Slipping wheels turn the robot less than odometry reports; the ratio is
+estimated from the headings of two fixes and the odometry between them.
 """
 
 from __future__ import annotations
@@ -20,38 +20,36 @@ from swarm_loc_estimator.common.parameters import number
 from swarm_loc_estimator.common.se2 import wrap_angle
 
 _SLOW_TURN = 0.5 * math.pi
-"""The begin of a first scan, which holds the heading of the whole map [rad]."""
+"""Beginning of the first scan, which defines the heading of the whole map [rad]."""
 _SLOW_SHARE, _FIRST_SHARE = 1.0 / 6.0, 0.5
-"""Of the turn rate: at that begin, and in the rest of a first scan."""
+"""Shares of the turn rate at that beginning and in the rest of the first scan."""
 _GAIN, _MIN_RATE, _MIN_SPEED, _COURSE_GAIN = 2.0, 0.15, 0.04, 1.5
-"""[1/s], [rad/s], [m/s], [1/s]: slower towards the end, but never so slow that wheels do not turn."""
+"""[1/s], [rad/s], [m/s], [1/s]: slower towards the end, but fast enough to turn the wheels."""
 _TURNED, _ARRIVED = 0.01, 0.002
 _MAX_REMEMBERED = 1000
 _MAX_JUMP, _MAX_PAUSE_NS = 0.5, 2_000_000_000
-"""Odometry that goes further [m] at once, or that paused or stepped back for longer, has begun anew."""
+"""Odometry that jumps further [m], or that pauses or steps back for longer, has restarted."""
 _MIN_RATIO_TURN = math.pi
 _LOW_RATIO, _HIGH_RATIO = 0.7, 1.1
 
 
 @dataclass(frozen=True)
 class StopAndGoSettings:
-    """How robots move between goals."""
+    """Motion of robots between goals."""
 
     speed: float = number(0.2, "m/s", 0.0, 2.0, "of drives", above=True)
     turn_rate: float = number(1.0, "rad/s", 0.0, 10.0, "of turns; first scans are slower", above=True)
-    clearance: float = number(0.18, "m", 0.0, 1.0, "a drive ends where the laser is so close to something")
-    patience_s: float = number(
-        5.0, "s", 1.5, 600.0, "without a goal for so long after a scan, the robot looks around again"
-    )
+    clearance: float = number(0.18, "m", 0.0, 1.0, "a drive ends at this distance to an obstacle")
+    patience_s: float = number(5.0, "s", 1.5, 600.0, "time without a goal until the robot scans again")
 
 
 class MapGoal(NamedTuple):
-    """Where a mapper sends a robot.
+    """A goal of a mapper for a robot.
 
     Attributes:
-        stamp_ns: When that was decided.
-        pose: (3,) of the robot in map then.
-        position: (2,) where it should come in map [m].
+        stamp_ns: Time of the decision.
+        pose: (3,) pose of the robot in map at that time.
+        position: (2,) goal in map [m].
     """
 
     stamp_ns: int
@@ -83,16 +81,16 @@ class _Drive:
 
 
 class StopAndGo:
-    """One robot.
+    """Motion of one robot.
 
     Args:
-        settings: How it moves.
+        settings: Parameters of its motion.
 
     Attributes:
-        goals: How many goals it has gone to.
-        halts: How many drives ended because something was in the way.
-        restarts: How often odometry has begun anew.
-        ratio: True turn over turn by odometry, as far as it is known.
+        goals: Number of accepted goals.
+        halts: Number of drives that ended at an obstacle.
+        restarts: Number of restarts of odometry.
+        ratio: Estimated true turn per turn by odometry.
     """
 
     def __init__(self, settings: StopAndGoSettings) -> None:
@@ -101,7 +99,7 @@ class StopAndGo:
         self._begin()
 
     def _begin(self) -> None:
-        """Look around for the first time, and know nothing."""
+        """Reset and begin with the first scan."""
         rate = self._settings.turn_rate
         self.ratio = 1.0
         self._moves: deque[_Turn | _Look | _Drive] = deque(
@@ -115,14 +113,14 @@ class StopAndGo:
         self._is_near = False
 
     def take_distance(self, distance: float) -> None:
-        """The laser has measured a distance ahead [m]; NaN: nothing was seen."""
+        """Take a distance of the laser [m]; NaN: no detection."""
         self._is_near = distance < self._settings.clearance
 
     def take_goal(self, goal: MapGoal) -> bool:
-        """A goal has come: what the robot had still to look at, the mapper does not need.
+        """Take a goal; it replaces the remaining scan.
 
         Returns:
-            Whether it counts; one from before the last one, or before this odometry, does not.
+            Whether the goal is accepted: it must be newer than the last one and within this odometry.
         """
         there = self._odometry_at(goal.stamp_ns)
         if there is None or goal.stamp_ns <= self._goal_ns:
@@ -145,7 +143,7 @@ class StopAndGo:
         return True
 
     def command(self, stamp_ns: int, pose: FloatArray) -> Velocity:
-        """What the robot should do at a time [ns] and pose (3,) by odometry."""
+        """Velocity at a time [ns] and a pose (3,) by odometry."""
         now = self._remember(stamp_ns, pose)
         while self._moves:
             if self._anchor is None:
@@ -160,7 +158,7 @@ class StopAndGo:
         return STILL
 
     def _remember(self, stamp_ns: int, pose: FloatArray) -> FloatArray:
-        """The pose (3,) by odometry with a heading that is not wrapped."""
+        """Record a pose (3,) by odometry; returns it with an unwrapped heading."""
         x, y, theta = (float(value) for value in pose)
         if self._track:
             before_ns, last_x, last_y, last = self._track[-1]
@@ -168,7 +166,7 @@ class StopAndGo:
             if jumps or not -_MAX_PAUSE_NS <= stamp_ns - before_ns <= _MAX_PAUSE_NS:
                 self.restarts += 1
                 self._begin()
-            elif stamp_ns <= before_ns:  # late, as others of a driver whose clock has found a shorter way
+            elif stamp_ns <= before_ns:  # late: the driver's clock has found a smaller delay
                 return np.array(self._track[-1][1:])
             else:
                 theta = last + float(wrap_angle(theta - last))
@@ -178,7 +176,7 @@ class StopAndGo:
         return np.array([x, y, theta])
 
     def _odometry_at(self, stamp_ns: int) -> FloatArray | None:
-        """The pose (3,) by odometry at a time [ns]; None: it is not remembered."""
+        """Pose (3,) by odometry at a time [ns]; None outside the record."""
         if not self._track or not self._track[0][0] <= stamp_ns <= self._track[-1][0]:
             return None
         since_ns = np.array([row[0] - stamp_ns for row in self._track], dtype=float)
@@ -186,14 +184,14 @@ class StopAndGo:
         return np.array([np.interp(0.0, since_ns, column) for column in poses.T])
 
     def _learn_ratio(self, heading: float, by_odometry: float) -> None:
-        """What the headings of two fixes [rad] and the odometry between them tell of the wheels' slip."""
+        """Estimate the wheel slip from the headings of two fixes [rad] and the odometry between them."""
         if self._fixed is not None and abs(turned := by_odometry - self._fixed[1]) > _MIN_RATIO_TURN:
             wrong = float(wrap_angle(heading - self._fixed[0] - self.ratio * turned))
             self.ratio = min(max(self.ratio + wrong / turned, _LOW_RATIO), _HIGH_RATIO)
         self._fixed = (heading, by_odometry)
 
     def _towards(self, move: _Turn | _Look | _Drive, now: FloatArray, begin: FloatArray) -> Velocity | None:
-        """The velocity that a move needs at a pose (3,) by odometry; None: it is done."""
+        """Velocity of a move at a pose (3,) by odometry; None when the move is done."""
         if isinstance(move, _Drive):
             return self._ahead(move, now, begin)
         heading = move.heading if isinstance(move, _Turn) else begin[2] + move.angle

@@ -153,7 +153,7 @@ def test_what_was_relayed_is_in_doubt_by_the_share_of_commands_that_are_lost(los
     command = VelocityCommand(1.0, lambda: START_NS, Counter())
     command.set((0.01, 0.0, 0.0))
     mover = DropletMover(command, motion, 2.0, IDS[1], loss)
-    hold(console, mover.tell(console, GAITS))
+    hold(console, mover.send(console, GAITS))
     console.hear(b"", console.now_ns + SECOND)
     walked = motion.state(console.now_ns)
     # the error is all of the way, or nothing: so its mean square is that share of the way's

@@ -104,7 +104,7 @@ def test_a_robot_that_hears_and_is_not_heard_is_stopped() -> None:
     wire.run(0.5)
     wire.hears = False
     wire.run(0.5)
-    assert wire.errors == ["the robot tells no wheel ticks any more"]
+    assert wire.errors == ["the robot has stopped sending wheel ticks"]
     assert wire.speed == 0.0
 
 
