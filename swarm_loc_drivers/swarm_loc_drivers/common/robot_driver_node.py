@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
 from geometry_msgs.msg import Twist
@@ -11,6 +13,7 @@ from rclpy.qos import QoSProfile
 from swarm_loc_drivers.common.robot_driver import RobotDriver
 from swarm_loc_drivers.common.ros_messages import OdometryOutput, transform_publisher
 from swarm_loc_drivers.common.velocity_command import Velocity
+from swarm_loc_estimator.common.health import PATIENCE_S, Level, Report
 from swarm_loc_estimator.common.node import ConfiguredNode, Stop
 
 _COMMAND_QOS = QoSProfile(depth=1)
@@ -81,6 +84,42 @@ class RobotDriverNode(ConfiguredNode[Parameters]):
             set_velocity((message.linear.x, message.linear.y, message.angular.z))
 
         self.create_subscription(Twist, topic, on_cmd_vel, _COMMAND_QOS)
+
+    def _start_reports(self, address: str, rates: Sequence[str], wrong: Mapping[str, str]) -> None:
+        """Publish counts and rates of the driver once a second, and log errors and changes of the link.
+
+        Args:
+            address: Where the robot answers.
+            rates: Counts whose rates are published, too.
+            wrong: Counts of errors, which the log warns of, and what they mean.
+        """
+        self._address, self._rates, self._wrong = address, rates, wrong
+        self._reported: Counter[str] = Counter()
+        self._reported_s = time.monotonic()
+        self._was_in_trouble = bool(self._driver.trouble)
+        self.start_diagnostics(self._report)
+
+    def _report(self) -> None:
+        trouble, counts = self._driver.trouble, Counter(self._driver.counts)
+        self._log(trouble, counts)
+        now_s = time.monotonic()
+        elapsed_s, self._reported_s = now_s - self._reported_s, now_s
+        values: dict[str, object] = dict(sorted(counts.items()))
+        for name in self._rates:
+            values[f"{name} rate [1/s]"] = f"{(counts[name] - self._reported[name]) / elapsed_s:.4g}"
+        self._reported = counts
+        level, name = Level.ERROR if trouble else Level.OK, f"{self._prefix}{self.get_name()}"
+        self.publish_reports(Report(name, trouble or "connected", level, values, self._address))
+
+    def _log(self, trouble: str, counts: Counter[str]) -> None:
+        # a robot that is being switched on, or a simulation that starts, does not answer at once
+        patience_s = 0.0 if counts["connections"] else PATIENCE_S
+        self.health.warn_of("link", {trouble: trouble} if trouble else {}, patience_s)
+        if self._was_in_trouble and not trouble:
+            self.get_logger().info(f"connected to {self._address}")
+        self._was_in_trouble = bool(trouble)
+        errors = {f"{name}: {meaning}": counts[name] for name, meaning in self._wrong.items()}
+        self.health.warn_of_drops(errors, "errors")
 
     def _now_ns(self) -> int:
         return int(self.get_clock().now().nanoseconds)

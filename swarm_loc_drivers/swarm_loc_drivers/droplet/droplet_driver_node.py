@@ -18,7 +18,6 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from swarm_loc_drivers.common.driver_diagnostics import DriverDiagnostics
 from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
 from swarm_loc_drivers.common.ros_messages import stamp_message
@@ -63,8 +62,7 @@ class DropletDriverNode(RobotDriverNode[DropletParameters]):
             topic = f"/{_relayed_path(robot, name)}/cmd_vel" if name else "cmd_vel"
             self._follow(topic, partial(self._driver.set_velocity, name))
         self.create_service(Trigger, "~/measure", self._on_measure)
-        name, address = f"{self._prefix}{self.get_name()}", settings.device
-        self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
+        self._start_reports(settings.device, _RATES, _WRONG)
 
     def _on_measure(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self.params.turns or not self.params.partners:

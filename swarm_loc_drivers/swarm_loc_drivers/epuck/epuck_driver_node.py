@@ -20,7 +20,6 @@ from sensor_msgs.msg import CameraInfo, Image, Range
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_drivers.common.driver_diagnostics import DriverDiagnostics
 from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
 from swarm_loc_drivers.common.ros_messages import (
     camera_info_message,
@@ -70,8 +69,7 @@ class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
         listeners = EpuckListeners(odometry.publish, self._publish_proximity, self._publish_image)
         self._driver = EpuckDriver(settings, listeners, self._now_ns)
         self._advertise()
-        name, address = f"{self._prefix}{self.get_name()}", str(settings.address)
-        self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
+        self._start_reports(str(settings.address), _RATES, _WRONG)
         self._follow("cmd_vel", self._driver.set_velocity)
         self.create_timer(1.0 / parameters.reading_rate, self._driver.tick)
 

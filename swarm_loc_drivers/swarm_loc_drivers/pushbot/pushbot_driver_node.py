@@ -15,7 +15,6 @@ from typing import Any
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
 
-from swarm_loc_drivers.common.driver_diagnostics import DriverDiagnostics
 from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
 from swarm_loc_drivers.common.ros_messages import stamp_message
 from swarm_loc_drivers.pushbot.driver import PushbotDriver, PushbotListeners
@@ -57,8 +56,7 @@ class PushbotDriverNode(RobotDriverNode[PushbotParameters]):
         self._driver = PushbotDriver(
             settings, PushbotListeners(odometry.publish, self._publish), self._now_ns
         )
-        name, address = f"{self._prefix}{self.get_name()}", str(settings.address)
-        self._diagnostics = DriverDiagnostics(self, self._driver, name, address, _RATES, _WRONG)
+        self._start_reports(str(settings.address), _RATES, _WRONG)
         self._follow("cmd_vel", self._driver.set_velocity)
 
     def _publish(self, packet: EventPacket) -> None:

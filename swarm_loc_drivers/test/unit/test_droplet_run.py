@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.cli.generate_bag import main
+from swarm_loc_drivers.sim.generate_bag import main
 from swarm_loc_drivers.sim.scenarios.droplets import (
     PITCH,
     DropletRun,

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.cli.generate_bag import main
+from swarm_loc_drivers.sim.generate_bag import main
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.messages.cdr import decode_detections, decode_odometry, decode_pose_stamped

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from render_helpers import pixels_of
 
-from swarm_loc_drivers.cli.generate_bag import main
+from swarm_loc_drivers.sim.generate_bag import main
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.renderer import RobotCamera
 from swarm_loc_drivers.sim.scenarios.bags import CAMERA_INFO, COMPRESSED_IMAGE

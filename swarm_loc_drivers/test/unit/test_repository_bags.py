@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.cli.generate_bag import main
+from swarm_loc_drivers.sim.generate_bag import main
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.messages.typestore import typestore
 
