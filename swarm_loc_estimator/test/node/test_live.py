@@ -77,9 +77,9 @@ def test_the_recorder_counts_inputs_by_the_estimators_diagnostics_alone(ros: Ros
             ],
         ),
     ]
-    told = DiagnosticArray(status=own)
-    told.header.stamp = Time(nanoseconds=T0_NS).to_msg()
-    recorder._on_diagnostics(told)
+    message = DiagnosticArray(status=own)
+    message.header.stamp = Time(nanoseconds=T0_NS).to_msg()
+    recorder._on_diagnostics(message)
     recorder._on_diagnostics(DiagnosticArray(status=[DiagnosticStatus(name="watch")]))
 
     assert recorder.taken == {T0_NS: {"alpha/odom": 7, "aerial/detections": 2}}
@@ -94,8 +94,8 @@ def test_poses_come_back_after_the_estimator_was_killed(tmp_path: Path) -> None:
         recorder = graph.recorder
         graph.wait_for(lambda: recorder.inputs > INPUTS, "take in the bag", PATIENCE_S)
         graph.restart(ESTIMATOR)
-        # poses of the killed one may still come, but its diagnostics do not begin anew
-        graph.wait_for(lambda: recorder.inputs < INPUTS, "begin anew", PATIENCE_S)
+        # poses of the killed one may still come, but its counts do not restart
+        graph.wait_for(lambda: recorder.inputs < INPUTS, "restart", PATIENCE_S)
         before = len(recorder.raw)
 
         def tracked_for_a_while() -> bool:

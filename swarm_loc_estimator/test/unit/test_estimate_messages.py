@@ -95,15 +95,15 @@ def test_sightings_come_back_as_they_were(count: int, seed: int) -> None:
         st.tuples(st.integers(0, 3000), st.integers(0, 2), st.integers(-2, 2), st.integers(0, 4)), max_size=40
     )
 )
-def test_of_each_pair_the_newest_measurement_is_told(told: list[tuple[int, int, int, int]]) -> None:
-    told = sorted(told)
-    rows = np.zeros(len(told), dtype=MEASUREMENT_DTYPE)
-    for row, (at_ms, observer, target, _) in zip(rows, told, strict=True):
+def test_of_each_pair_the_newest_measurement_is_published(measured: list[tuple[int, int, int, int]]) -> None:
+    measured = sorted(measured)
+    rows = np.zeros(len(measured), dtype=MEASUREMENT_DTYPE)
+    for row, (at_ms, observer, target, _) in zip(rows, measured, strict=True):
         row["stamp_ns"], row["observer"], row["kind"] = at_ms * 1_000_000, observer, Kind.POLAR
         row["target"], row["landmark"] = (target, 0) if target >= 0 else (-1, -target)
-    verdicts = np.array([verdict for *_, verdict in told], dtype=np.uint8)
-    found = newest_sightings((rows, verdicts, np.ones(len(told))), 3 * SECOND)
-    expected = {(a, b): (at_ms, verdict) for at_ms, a, b, verdict in told if at_ms >= 1000}
+    verdicts = np.array([verdict for *_, verdict in measured], dtype=np.uint8)
+    found = newest_sightings((rows, verdicts, np.ones(len(measured))), 3 * SECOND)
+    expected = {(a, b): (at_ms, verdict) for at_ms, a, b, verdict in measured if at_ms >= 1000}
     pairs = list(zip(found.observer.tolist(), found.target.tolist(), strict=True))
     assert sorted(pairs) == sorted(expected)
     for pair, age_s, verdict, nis in zip(pairs, found.age_s, found.verdict, found.nis, strict=True):
@@ -177,8 +177,8 @@ def test_a_run_is_written_as_mcap(tmp_path: Path) -> None:
         (first, *_) = [bytes(data) for _, _, _, data in bag.messages(["tf"])]
     assert [one.stamp_ns for one in poses] == stamp_ns.tolist()
     assert [one.status.tolist() for one in poses] == [[1, 0], [1, 1], [1, 1]]
-    told: Any = typestore().deserialize_cdr(first, "tf2_msgs/msg/TFMessage")
-    (transform,) = told.transforms
+    transforms: Any = typestore().deserialize_cdr(first, "tf2_msgs/msg/TFMessage")
+    (transform,) = transforms.transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("map", "a/base_link")
 
 

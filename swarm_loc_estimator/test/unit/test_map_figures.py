@@ -62,7 +62,7 @@ def test_two_pushbots_map_more_of_the_hall_in_less_time() -> None:
 
 
 def test_the_estimator_follows_the_mappers_fixes_and_finds_the_slip() -> None:
-    """10 cm on the way, as the fixes were when they were told, and no surer than that."""
+    """10 cm on the way, as the fixes were when published, with a covariance that says so."""
     result = replay(BAGS / "pushbots_two", load_swarm(BAGS / "pushbots_two" / "swarm.yaml"))
     errors = result.overall
     assert np.isfinite(result.poses[-1]).all()

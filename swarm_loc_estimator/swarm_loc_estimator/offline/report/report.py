@@ -219,7 +219,7 @@ def _counters(result: ReplayResult) -> str:
     rows = "".join(
         f"<tr><td>{escape(name)}</td><td>{count}</td></tr>" for name, count in result.counters.items()
     )
-    return f'<h2>Counted</h2><div class="wide"><table><tbody>{rows}</tbody></table></div>' if rows else ""
+    return f'<h2>Counters</h2><div class="wide"><table><tbody>{rows}</tbody></table></div>' if rows else ""
 
 
 _Thing = TypeVar("_Thing")

@@ -117,7 +117,7 @@ def text_report(result: ReplayResult) -> str:
         lines += ["", head, *_columns([list(SELF_CALIBRATED), *robots])]
     lines += ["", self_calibrated_landmarks(result)] if self_calibrated_landmarks(result) else []
     if result.counters:
-        lines += ["", "Counted", *_pairs(result.counters)]
+        lines += ["", "Counters", *_pairs(result.counters)]
     if result.remarks:
         lines += ["", *result.remarks]
     return "\n".join(lines) + "\n"
