@@ -49,25 +49,31 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.timeline.settings import Settings as Settings
 
 _MODULES = {
-    "infrared.brightness": ("expected_brightness",),
-    "mapping.exploration": ("Goal",),
-    "mapping.grid": ("OccupancyMap",),
-    "mapping.mapper": ("SCAN_TURN", "START_TURN", "CooperativeMapper"),
-    "mapping.mapper_feed": ("FixCovariances",),
-    "mapping.messages": ("OCCUPANCY_GRID", "LASER", "LIGHTS", "BadMessageError", "decode_laser"),
-    "mapping.scans": ("UNSEEN", "LightSightings", "Readings"),
-    "offline.metrics": ("Errors", "ErrorSummary"),
-    "offline.replay": ("replay",),
-    "offline.report.report": ("write_report",),
-    "offline.result": ("ReplayResult",),
-    "sensors.camera": ("CONTENT_POSE", "CONTENT_POSE_TWO"),
-    "sensors.messages": ("DetectionRows", "FixRows", "OdometryRows", "RawInputs"),
-    "swarm.swarm": ("Landmark", "Robot", "Swarm"),
-    "swarm.swarm_file": ("load_swarm",),
-    "swarm.swarm_writer": ("save_swarm",),
-    "timeline.estimate": ("Estimate", "Status"),
-    "timeline.estimator": ("Estimator",),
-    "timeline.settings": ("Settings",),
+    "swarm_loc_estimator.infrared.brightness": ("expected_brightness",),
+    "swarm_loc_estimator.mapping.exploration": ("Goal",),
+    "swarm_loc_estimator.mapping.grid": ("OccupancyMap",),
+    "swarm_loc_estimator.mapping.mapper": ("SCAN_TURN", "START_TURN", "CooperativeMapper"),
+    "swarm_loc_estimator.mapping.mapper_feed": ("FixCovariances",),
+    "swarm_loc_estimator.mapping.messages": (
+        "OCCUPANCY_GRID",
+        "LASER",
+        "LIGHTS",
+        "BadMessageError",
+        "decode_laser",
+    ),
+    "swarm_loc_estimator.mapping.scans": ("UNSEEN", "LightSightings", "Readings"),
+    "swarm_loc_estimator.offline.metrics": ("Errors", "ErrorSummary"),
+    "swarm_loc_estimator.offline.replay": ("replay",),
+    "swarm_loc_estimator.offline.report.report": ("write_report",),
+    "swarm_loc_estimator.offline.result": ("ReplayResult",),
+    "swarm_loc_estimator.sensors.camera": ("CONTENT_POSE", "CONTENT_POSE_TWO"),
+    "swarm_loc_estimator.sensors.messages": ("DetectionRows", "FixRows", "OdometryRows", "RawInputs"),
+    "swarm_loc_estimator.swarm.swarm": ("Landmark", "Robot", "Swarm"),
+    "swarm_loc_estimator.swarm.swarm_file": ("load_swarm",),
+    "swarm_loc_estimator.swarm.swarm_writer": ("save_swarm",),
+    "swarm_loc_estimator.timeline.estimate": ("Estimate", "Status"),
+    "swarm_loc_estimator.timeline.estimator": ("Estimator",),
+    "swarm_loc_estimator.timeline.settings": ("Settings",),
 }
 """Module -> the names that it gives to the API; the same as are imported above for type checkers."""
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
@@ -77,7 +83,7 @@ def __getattr__(name: str) -> Any:
     """Load a name of the API, see PEP 562."""
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+    value = getattr(import_module(_MODULE_OF[name]), name)
     globals()[name] = value
     return value
 
