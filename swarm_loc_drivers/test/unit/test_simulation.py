@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_drivers.cli import simulate
+from swarm_loc_drivers.sim import simulate
 from swarm_loc_drivers.sim.droplet.world import DROPLET_WORLDS
 from swarm_loc_drivers.sim.epuck.parts import Unanswered
 from swarm_loc_drivers.sim.simulation import ROBOT_TYPES, SimulationOptions, graph_of, simulated_swarm
