@@ -1,7 +1,7 @@
 """Alignment of a robot's track with the map: the transform on which most constraints agree, if it is unique.
 
-The parts are compiled, because every robot that waits tries again and again, and apart from one another:
-each would be compiled once more inside whatever calls it.
+The parts are compiled because every waiting robot tries repeatedly; they are not inlined, which would
+lengthen compilation.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from swarm_loc_estimator.initialization.constraints import Constraint, Constrain
 
 MIN_CONSTRAINTS = 3
 _AGREE = float(gate_threshold(0.999))
-_AGREE_AT_FIRST = 2.0 * _AGREE  # a hypothesis has the errors of the constraint that it was made from
-_MIN_SHARE = 0.6  # of the constraints must agree with an alignment
-_RIVAL_SHARE = 0.8  # another transform with this share of the best one's support is a rival
+_AGREE_AT_FIRST = 2.0 * _AGREE  # a hypothesis has the errors of its own constraint
+_MIN_SHARE = 0.6  # share of the constraints that must agree with an alignment
+_RIVAL_SHARE = 0.8  # share of the best support from which another transform is a rival
 _MAX_RIVALS = 8
 _APART_M, _APART_RAD = 0.1, 0.1
 HEADING_SIGMA = 0.2
 _POSITION_SIGMA = 0.5
 _REFINEMENTS = 5
-_MARGIN = 1e-6  # so that what is its own is a covariance where next to nothing is
-_PRIOR = 1e-6  # so that what no constraint shows is unsure instead of singular
+_MARGIN = 1e-6  # keeps the robot's own covariance positive definite
+_PRIOR = 1e-6  # keeps the information matrix regular in unobserved directions
 
 
 def align(
     constraints: ConstraintArray, track_noise: FloatArray, heading_sigma: float = HEADING_SIGMA
 ) -> InitialPose | None:
-    """The transform that a robot's constraints (k,) agree on, or None while it is not unique and sure.
+    """The transform on which a robot's constraints (k,) agree; None while it is ambiguous or uncertain.
 
     Args:
         constraints: Of CONSTRAINT_DTYPE, refreshed.
-        track_noise: (3, 3) preintegrated covariance of the track by now.
-        heading_sigma: How sure the heading must be [rad].
+        track_noise: (3, 3) covariance of the track preintegrated until now.
+        heading_sigma: Largest standard deviation of the heading [rad].
     """
     if constraints.size < MIN_CONSTRAINTS:
         return None
@@ -56,22 +56,22 @@ def align(
     transform, covariance, weight = _refined(constraints, hypotheses[best])
     if np.count_nonzero(weight) < enough:
         return None
-    position, heading = _unsureness(constraints, track_noise, weight, transform, covariance)
+    position, heading = _uncertainty(constraints, track_noise, weight, transform, covariance)
     if not (position < _POSITION_SIGMA and heading < heading_sigma):
         return None
     rivals = hypotheses[support >= _RIVAL_SHARE * support[best]]
     limits = (_APART_M + 3.0 * position, _APART_RAD + 3.0 * heading)
     if _is_ambiguous(constraints, transform, rivals, limits):
         return None
-    return _parted(constraints, track_noise, weight, transform, covariance)
+    return _split_errors(constraints, track_noise, weight, transform, covariance)
 
 
 def _is_ambiguous(
     constraints: ConstraintArray, transform: FloatArray, rivals: FloatArray, limits: tuple[float, float]
 ) -> bool:
-    """Whether a rival (of h, 3), refined, differs from a transform (3,) by more than the limits of `_apart`.
+    """Whether any of the rivals (h, 3), once refined, differs from a transform (3,) by more than the limits.
 
-    The one farthest from all that were looked at comes next: what lies near one of them leads to the same.
+    The rival farthest from all examined ones comes next, because near ones converge to the same transform.
     """
     apart = _apart(constraints, transform, rivals, limits)
     for _ in range(_MAX_RIVALS):
@@ -89,9 +89,9 @@ def _is_ambiguous(
 def _apart(
     constraints: ConstraintArray, one: FloatArray, others: FloatArray, limits: tuple[float, float]
 ) -> FloatArray:
-    """How far (h,) others (h, 3) put the constraints' middle from where one transform (3,) does, or turn it.
+    """Differences (h,) of transforms (h, 3) from one (3,), in units of the limits [m, rad].
 
-    In units of the limits [m, rad]; the greater of the two.
+    The larger one of the distance at the centre of the constraints and of the angle.
     """
     x, y = 0.0, 0.0
     for k in range(constraints.size):
@@ -115,7 +115,7 @@ def _refined(constraints: ConstraintArray, begin: FloatArray) -> tuple[FloatArra
 
 @cached_njit
 def _hypotheses(constraints: ConstraintArray) -> FloatArray:
-    """Transforms (h, 3) from each heading shown and each pair of constraints far enough apart."""
+    """Transforms (h, 3) from each measured heading and from each pair of constraints far enough apart."""
     count, h = constraints.size, 0
     out = np.empty((2 * count + count * (count - 1) // 2, 3))
     for k in range(count):
@@ -141,7 +141,7 @@ def _hypotheses(constraints: ConstraintArray) -> FloatArray:
 
 @cached_njit
 def _place(turn: float, lx: float, ly: float, mx: float, my: float, out: FloatArray, h: int) -> int:
-    """Write the transform h with heading `turn` that brings a point of the track to its place on the map."""
+    """Write the transform h with heading `turn` that maps a point of the track to its place on the map."""
     cos, sin = math.cos(turn), math.sin(turn)
     out[h, 0], out[h, 1], out[h, 2] = mx - cos * lx + sin * ly, my - sin * lx - cos * ly, wrap(turn)
     return h + 1
@@ -149,7 +149,7 @@ def _place(turn: float, lx: float, ly: float, mx: float, my: float, out: FloatAr
 
 @cached_njit
 def _drifted(constraints: ConstraintArray, track_noise: FloatArray) -> ConstraintArray:
-    """The constraints (k,), their points on the track less sure by what it has drifted since."""
+    """The constraints (k,) with the drift of the track added to the covariance of their points on it."""
     out, drift = np.empty_like(constraints), np.empty((3, 3))
     for k in range(constraints.size):
         out[k] = constraints[k]
@@ -168,7 +168,7 @@ def _drifted(constraints: ConstraintArray, track_noise: FloatArray) -> Constrain
 def _misses(
     constraint: Constraint, x: float, y: float, cos: float, sin: float
 ) -> tuple[float, float, float, float, float]:
-    """By what a transform misses a constraint's place on the map, x and y, with information xx, xy, yy."""
+    """Residual of a constraint's place on the map, x and y, and its information xx, xy, yy."""
     xx, xy, yy = turned(constraint.local_xx, constraint.local_xy, constraint.local_yy, cos, sin)
     xx, xy, yy = xx + constraint.map_xx, xy + constraint.map_xy, yy + constraint.map_yy
     scale = 1.0 / (xx * yy - xy * xy)
@@ -179,9 +179,9 @@ def _misses(
 
 @cached_njit
 def _turn_off(constraint: Constraint, heading: float) -> float:
-    """By what turn a heading differs from a constraint's, or from the mirrored one; NaN if by much."""
+    """Residual of a heading against a constraint's or its mirrored one, the smaller; NaN beyond 3 sigma."""
     turn, other = wrap(constraint.turn - heading), wrap(constraint.other_turn - heading)
-    if abs(other) < abs(turn):  # NaN, which stands for none shown, is not less
+    if abs(other) < abs(turn):  # false for NaN, which means not measured
         turn = other
     return turn if turn * turn < 9.0 * constraint.turn_variance else math.nan
 
@@ -190,7 +190,7 @@ def _turn_off(constraint: Constraint, heading: float) -> float:
 def _vote(
     constraints: ConstraintArray, transforms: FloatArray
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """How many constraints agree with each transform (h, 3), and how many points and headings of theirs."""
+    """Number of constraints that agree with each transform (h, 3), and of their points and headings."""
     count = transforms.shape[0]
     agreeing, support = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
     for h in range(count):
@@ -216,10 +216,10 @@ def _refine(
 
     Args:
         constraints: (k,).
-        begin: (3,) where to begin.
+        begin: (3,) initial transform.
         transform: (3,) written.
         covariance: (3, 3) written, of its right-invariant error.
-        weight: (k,) written: how sure the points are, zero for those that do not agree.
+        weight: (k,) written: information of the points, zero for those that do not agree.
     """
     information, factor = np.empty((3, 3)), np.empty((3, 3))
     gradient, step = np.empty(3), np.empty(3)
@@ -243,7 +243,7 @@ def _refine(
                 continue
             agreeing += 1
             squared += distance
-            px, py = constraint.map_x - dx, constraint.map_y - dy  # where the transform puts the point
+            px, py = constraint.map_x - dx, constraint.map_y - dy  # the point as transformed
             along, across = (1.0, 0.0, -py), (0.0, 1.0, px)
             for i in range(3):
                 wx, wy = along[i] * xx + across[i] * xy, along[i] * xy + across[i] * yy
@@ -265,18 +265,17 @@ def _refine(
         solve3(factor, gradient, covariance[i])
 
 
-def _parted(
+def _split_errors(
     constraints: ConstraintArray,
     track_noise: FloatArray,
     weight: FloatArray,
     transform: FloatArray,
     covariance: FloatArray,
 ) -> InitialPose:
-    """Part the error of a transform (3,) into its own and that of all those it was located by.
+    """Split the error of a transform (3,) into its own part and those of the robots that it depends on.
 
-    An error of another side moves all that is tied to it, so it enters by the share of the information that
-    its constraints have. What else makes them unsure is their own, and averages out but for the drift of the
-    track since, which counts at its mean by weight (k,).
+    The error of another robot enters with the share of information that its constraints have. Other errors
+    are independent and average out, except the drift of the track, which counts with its weighted mean (k,).
     """
     used = weight > 0.0
     constraints, weight = constraints[used], weight[used]
@@ -303,7 +302,7 @@ def _parted(
 
 
 def _ties(places: FloatArray) -> FloatArray:
-    """How right-invariant errors move points (k, 2), and turn what is there: (k, 3, 3)."""
+    """Jacobians (k, 3, 3) of position and heading at points (k, 2) with respect to right-invariant errors."""
     ties = np.tile(np.eye(3), (len(places), 1, 1))
     ties[:, 0, 2], ties[:, 1, 2] = -places[:, 1], places[:, 0]
     return ties
@@ -316,17 +315,17 @@ def _matrices(constraints: ConstraintArray, side: str) -> FloatArray:
 
 
 @cached_njit
-def _unsureness(
+def _uncertainty(
     constraints: ConstraintArray,
     track_noise: FloatArray,
     weight: FloatArray,
     transform: FloatArray,
     covariance: FloatArray,
 ) -> tuple[float, float]:
-    """How unsure an alignment leaves the constraints' middle [m], the greater of x and y, and the heading.
+    """Standard deviations at the centre of the constraints, the larger of x and y [m], and of the heading.
 
-    What does not average out counts at its mean by weight (k,): the errors of the other sides, as if all
-    erred alike, and the drift of the track since.
+    Errors that do not average out count with their weighted mean (k,): those of other robots, taken as fully
+    correlated, and the drift of the track.
     """
     x, y, total = 0.0, 0.0, 0.0
     whole, drift, carried = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3))

@@ -54,12 +54,12 @@ _MAX_CONSTRAINTS = 20
 
 
 class Waiting(NamedTuple):
-    """A robot that waits to be located, when a sighting of it or by it was made.
+    """A robot without a pose at the time of a sighting by or of it.
 
     Attributes:
         robot: Its index.
         pose: (3,) on its track.
-        covariance: (3, 3) preintegrated by then.
+        covariance: (3, 3) preintegrated until then.
     """
 
     robot: int
@@ -68,14 +68,14 @@ class Waiting(NamedTuple):
 
 
 class OtherSide(NamedTuple):
-    """What a sighting ties a waiting robot to: a robot that is located, a landmark, or the map itself.
+    """The other side of a sighting: a localized robot, a landmark, or the map itself.
 
     Attributes:
         robot: Its index, or NOBODY.
-        landmark: Index of the landmark; -1: it is none.
-        pose: (3,) in `map` at the stamp; by what a landmark is moved from its survey.
-        frame: (3,) where its error acts: T of a robot, the pose of a landmark.
-        noise: (3, 3) covariance that its track has preintegrated by the stamp.
+        landmark: Index of the landmark; -1: none.
+        pose: (3,) in `map` at the stamp; for a landmark, its displacement from the survey.
+        frame: (3,) frame of its error: T of a robot, the pose of a landmark.
+        noise: (3, 3) covariance of its track preintegrated until the stamp.
     """
 
     robot: int
@@ -96,14 +96,14 @@ def with_constraint(
     other: OtherSide,
     window_ns: int,
 ) -> ConstraintArray:
-    """Constraints (k,) and what a newer measurement (1,) tells; of too many, the one least missed goes.
+    """Constraints (k,) and that of a newer measurement (1,); of too many, the most redundant one is dropped.
 
     Args:
         constraints: In order of time; not changed.
-        one: Between the robot and something located.
-        camera: (2,) by how much its sensor is turned to the left besides [rad], and stretches distances.
-        waiting: The side that waits.
-        other: What it was seen by, or saw.
+        one: Between the robot and a localized side.
+        camera: (2,) estimated yaw offset [rad] and scale error of its sensor.
+        waiting: The robot without a pose.
+        other: The localized side.
         window_ns: Age up to which constraints are kept.
     """
     out = np.empty(_MAX_CONSTRAINTS + 1, dtype=CONSTRAINT_DTYPE)
@@ -119,7 +119,7 @@ def with_constraint(
 def _take_over(
     constraints: ConstraintArray, one: MeasurementArray, window_ns: int, out: ConstraintArray
 ) -> int:
-    """Write the constraints (k,) that are not too old beside a measurement (1,); return how many."""
+    """Write the constraints (k,) within the window before a measurement (1,); return their number."""
     count = 0
     for k in range(constraints.size):
         if constraints[k].stamp_ns >= one[0].stamp_ns - window_ns:
@@ -130,9 +130,9 @@ def _take_over(
 
 @cached_njit
 def _thin_out(constraints: ConstraintArray) -> None:
-    """Move the one (of k, in order of time) that leaves the smallest gap, for its age, behind all others.
+    """Move the constraint (of k, in order of time) that leaves the smallest gap for its age to the end.
 
-    Gaps are between constraints of one marker. Old ones thin out; where no marker has three, the oldest goes.
+    Gaps are between constraints of one marker. Where no marker has three constraints, it is the oldest one.
     """
     least, gone = math.inf, 0
     newest_ns = constraints[constraints.size - 1].stamp_ns
@@ -159,7 +159,7 @@ def _thin_out(constraints: ConstraintArray) -> None:
 
 @cached_njit
 def turned(xx: float, xy: float, yy: float, cos: float, sin: float) -> tuple[float, float, float]:
-    """A covariance xx, xy, yy turned by an angle."""
+    """A covariance xx, xy, yy rotated by an angle."""
     across = 2.0 * cos * sin * xy
     return (
         cos * cos * xx - across + sin * sin * yy,
@@ -186,7 +186,7 @@ def _describe(
     other: OtherSide,
     constraints: ConstraintArray,
 ) -> None:
-    """Write the constraint (1,) that a measurement (1,) gives, see `with_constraint`."""
+    """Write the constraint (1,) of a measurement (1,), see `with_constraint`."""
     one, constraint = measurements[0], constraints[0]
     value, covariance, sensor, marker = one.value, one.covariance, one.sensor, one.marker
     sees, track = one.observer == waiting.robot, waiting.pose
@@ -210,7 +210,7 @@ def _describe(
     xx, xy, yy = turned(xx, xy, yy, cos, sin)
     constraint.stamp_ns, constraint.marker_id = one.stamp_ns, one.marker_id
     constraint.other, constraint.landmark = other.robot, other.landmark
-    # what was seen is uncertain where the sensor is: on the track or on the map
+    # the measurement noise acts on the side of the sensor: on the track or on the map
     local, there, sign = (1.0, 0.0, 1.0) if sees else (0.0, 1.0, -1.0)
     constraint.local_x, constraint.local_y = lx + local * x, ly + local * y
     constraint.local_xx, constraint.local_xy, constraint.local_yy = local * xx, local * xy, local * yy
@@ -229,10 +229,10 @@ def _describe(
 
 @cached_njit
 def refreshed(constraints: ConstraintArray, belief: BeliefArrays) -> ConstraintArray:
-    """Constraints (k,) as they would be from what is believed now of the other sides, without robots lost.
+    """Constraints (k,) moved to the present estimates of their other sides, without those of lost robots.
 
-    So all errors of another side, of however many constraints, are those of one frame at one instant: what a
-    robot that is initialized has in common with it.
+    So the errors of another side are the same in all its constraints, and can be shared with the robot that
+    is initialized from them.
     """
     out = np.empty_like(constraints)
     count = 0
@@ -273,7 +273,7 @@ def refreshed(constraints: ConstraintArray, belief: BeliefArrays) -> ConstraintA
 
 @cached_njit
 def _move(constraint: Constraint, frame: FloatArray) -> float:
-    """Move a constraint's place on the map, and its heading, with its frame; return by what turn."""
+    """Move a constraint's place on the map and its heading with its frame; return the rotation."""
     then = constraint.frame
     turn = wrap(frame[2] - then[2])
     cos, sin = math.cos(turn), math.sin(turn)

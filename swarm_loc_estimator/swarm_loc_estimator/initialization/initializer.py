@@ -1,10 +1,10 @@
 """Initialization of robots whose start is unknown: sightings tie their odometry tracks to the map.
 
-Each sighting between a waiting robot and something located says that one point of the robot's track (the
-place where it saw the marker, or its own marker) lies at one point of the map. Two such points give the
-transform in closed form (a rigid alignment); a sighting with heading gives it alone, with a mirrored
-solution it gives two. The transform on which most constraints agree is refined by least squares and accepted
-when it is sure, and when no other one explains the constraints about as well.
+Each sighting between a robot without a pose and a localized side constrains one point of the robot's track
+(the place from which it saw the marker, or its own marker) to one point of the map. Two such points determine
+the transform in closed form (a rigid alignment); a sighting with heading determines it alone, or twice where
+it has a mirrored solution. The transform on which most constraints agree is refined by least squares. It is
+accepted when its covariance is small enough and no other transform explains the constraints about as well.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 
 _INDEPENDENT_NS = 100_000_000
-"""Sightings of one marker that follow each other faster tell the same."""
+"""Sightings of one marker within this time are redundant."""
 _LONGEST_PAUSE_NS = 300_000_000
 _PAUSE_SHARE = 8
-"""After a vain attempt the robot collects more constraints, for an eighth of the time that they span.
+"""After a failed attempt the robot collects constraints for an eighth of the time that they span.
 
 Counted in stamps, so that attempts do not depend on the order of arrival.
 """
@@ -45,7 +45,7 @@ class Initializer:
     Args:
         tracks: The robots' odometry.
         window_s: Age up to which a constraint is used.
-        heading_sigma: How sure the heading of a robot must be that is initialized [rad].
+        heading_sigma: Largest standard deviation of the heading of a robot that is initialized [rad].
     """
 
     def __init__(self, tracks: OdometryTracks, window_s: float, heading_sigma: float = HEADING_SIGMA) -> None:
