@@ -48,7 +48,7 @@ def test_a_click_shows_the_numbers_of_a_robot(page: WatchedPage, swarm: WatchedS
     assert "sightings used" in text
     assert "sightings gated" in text
     wait_for(lambda: swarm.server.selected == {0}, page)
-    swarm.server.tell(
+    swarm.server.send_text(
         {"kind": "report", "robot": 0, "stamp": 1.0, "message": "well", "values": {"a": "b"}}, 0
     )
     page.until("document.getElementById('message').textContent == 'well'")

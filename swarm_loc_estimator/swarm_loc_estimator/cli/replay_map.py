@@ -6,7 +6,7 @@
 The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. The map goes
 to OUT/map.yaml and OUT/map.pgm, a picture of it to OUT/map.png, the robots' stops to OUT/stops.csv. The same
 bag gives the same files, byte for byte. --walls draws a floor plan below the map, a line x0,y0,x1,y1 [m] a
-wall, and tells how far off the map's walls are; ground truth in the bag, how far off the stops are.
+wall, and prints the errors of the map's walls; ground truth in the bag gives the errors of the stops.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ _DESCRIPTIONS = (".yaml", ".yml")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run until Ctrl-C, or until the bag has ended."""
     options = parser().parse_args(arguments)
-    Access(options.address, options.token)  # a wrong address is told before anything starts
+    Access(options.address, options.token)  # a wrong address is refused before anything starts
     return run_graph(watch_nodes(options))
 
 

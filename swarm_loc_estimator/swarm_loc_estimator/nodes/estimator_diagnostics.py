@@ -24,19 +24,19 @@ from swarm_loc_estimator.timeline.fusion import Verdict
 _FULL_LOAD = 0.95
 _IN_MAP = frozenset({InputKind.FIXES, InputKind.AERIAL, InputKind.SWARM_FIXES})
 _PATIENCE_S, _PATIENCE_PERIODS = 10.0, 5.0
-"""An expected input that is silent for longer than so many seconds and of its mean periods may have died."""
+"""An expected input may be silent for so many seconds, and for so many of its mean periods."""
 
 
 @dataclass
 class TickCost:
-    """What the ticks since the last report cost.
+    """Cost of the ticks since the last report.
 
     Attributes:
-        count: How many.
-        sum_s: Together.
-        max_s: The longest.
-        sightings: How many measurements came.
-        shed: How many of them were left out.
+        count: Number of ticks.
+        sum_s: Their total duration [s].
+        max_s: The longest [s].
+        sightings: Number of measurements received.
+        shed: Number of these that were dropped under overload.
     """
 
     count: int = 0
@@ -52,7 +52,7 @@ class TickCost:
         self.max_s = max(self.max_s, seconds)
 
     def note_sightings(self, count: int, shed: int) -> None:
-        """Count measurements, and those of them that were left out."""
+        """Count measurements, and those that were dropped under overload."""
         self.sightings += count
         self.shed += shed
 
@@ -61,7 +61,7 @@ Recent = tuple[MeasurementArray, NDArray[np.uint8], FloatArray]
 
 
 def add_contradictions(reports: Sequence[Report], contradictions: Sequence[Contradiction]) -> None:
-    """Warn of contradictions in the reports of the robots that they are about, the others in the last one."""
+    """Add contradictions to the reports of the robots that they are about, the others to the last report."""
     report_of = {report.name: report for report in reports}
     for one in contradictions:
         report = report_of.get(one.about, reports[-1])
@@ -70,7 +70,7 @@ def add_contradictions(reports: Sequence[Report], contradictions: Sequence[Contr
 
 
 def add_identities(reports: Sequence[Report], identities: Identities | None) -> None:
-    """Tell in the robots' reports (the first ones) which detection of the newest aerial image they are."""
+    """Add to the robots' reports (the first ones) their detections in the newest aerial image."""
     if identities is None:
         return
     columns = zip(identities.place.tolist(), identities.probability.tolist(), strict=True)
@@ -122,12 +122,12 @@ class Diagnostics:
         self._reported_ns: int | None = None
 
     def missing(self) -> list[InputTopic]:
-        """The expected topics on which nothing has come yet."""
+        """Expected topics without any message so far."""
         pairs = zip(self._ingest.topics, self._ingest.statistics, strict=True)
         return [topic for topic, statistics in pairs if topic.expected and not statistics.received]
 
     def missing_text(self) -> str:
-        """The missing topics in words, by cause; "" when there are none."""
+        """One sentence about the missing topics, by cause; "" when there are none."""
         by_cause: dict[str, list[str]] = {}
         for topic in self.missing():
             by_cause.setdefault(self._why_missing(topic), []).append(topic.name)

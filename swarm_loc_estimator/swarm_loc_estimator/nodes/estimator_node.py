@@ -71,17 +71,17 @@ _ORDINARY_DROPS = frozenset(
         *SHED_REASONS,
     }
 )
-"""Late, double or outlying data is a matter of course, and so is light of robots too far or too near; what is
-shed is told in a sentence of its own."""
+"""Drops that are ordinary and not logged: late, duplicate or outlying data and infrared out of range.
+Drops under overload have a warning of their own."""
 
 CreateEstimator = Callable[[Swarm, Settings], Estimator]
 
 
 class EstimatorNode(ConfiguredNode[EstimatorParameters]):
-    """Receives, lets the core estimate once per tick, publishes.
+    """Takes messages, runs the estimator once per tick and publishes the estimate.
 
     Args:
-        create_estimator: Makes the estimator; tests hand in another one.
+        create_estimator: Creates the estimator; tests pass another one.
         node_arguments: Further arguments of `rclpy.node.Node`.
     """
 
@@ -113,11 +113,11 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
-        """Those that an executor handles; the raw ones, the inputs, wait for the ticks."""
+        """Subscriptions that an executor handles; the raw ones, the inputs, are taken by ticks."""
         return (one for one in super().subscriptions if not one.raw)
 
     def _create_thinning(self) -> Thinning:
-        """Large swarms, whose measurements are fused together, lose those of whole periods."""
+        """Thinning by whole fusion periods for large swarms, whose measurements are fused together."""
         robots, settings = len(self._swarm.robots), self._estimator.settings
         is_large = robots >= settings.sparse_from
         return Thinning(robots, round(settings.fusion_period_s * 1e9) if is_large else 0)
@@ -127,13 +127,13 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         return Diagnostics(self._swarm, self._ingest, self.params.odom_frame, self, sole)
 
     def _owned_frames(self) -> list[str]:
-        """The frames whose parent this node alone tells; none where it publishes no transforms."""
+        """The frames whose parent only this node publishes; none without publish_tf."""
         robots = self._swarm.robots if self.params.publish_tf else ()
         return [f"{robot.name}/{self.params.odom_frame}" for robot in robots]
 
     def _start_timers(self) -> None:
         self._ticks = Ticks(self, self.params.tick_period_s, self._on_tick)
-        # what came before time goes back must not seem to come after
+        # messages received before a backward jump must not be stamped after it
         self._jumps_back = self.get_clock().create_jump_callback(
             BACKWARDS, pre_callback=partial(self._receive, self._time_ns)
         )
@@ -153,7 +153,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         self._receive(partial(newest_time_ns, self))
         now_ns = self._time_ns()
         self._estimate, fusing_s = self._estimate_at(now_ns, begin_s)
-        self._say_time_jumps()
+        self._log_time_jumps()
         self._outputs.publish(self._estimate)
         self._outputs.publish_identities(self._estimator.identities)
         self._outputs.publish_sightings(self._estimator, now_ns)
@@ -162,10 +162,10 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         self._shedding.note(busy_s, fusing_s)
 
     def _estimate_at(self, now_ns: int, begin_s: float) -> tuple[Estimate, float]:
-        """Fuse what there is time for; the poses at an instant, and how long fusing took [s].
+        """Fuse within the time budget; returns the poses at an instant and the time that fusing took [s].
 
-        Fusing a large swarm takes longer than a tick: it is spread over several, and rests then. Meanwhile
-        odometry leads on.
+        Fusing a large swarm takes longer than a tick and is spread over several ticks. In between, poses are
+        predicted by odometry.
         """
         is_due = not self._estimator.is_fusing and self._pace.is_due(begin_s, now_ns)
         if is_due:
@@ -183,18 +183,18 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         return int(self.get_clock().now().nanoseconds)
 
     def _receive(self, time_ns: Callable[[], int]) -> None:
-        """Hand what has come to the estimator, or as much of it as there is time for."""
+        """Pass the messages received to the estimator, thinned out under overload."""
         batch = MessageBatch.of(self._inputs.take(time_ns))
         for messages in self._ingest.read(batch):
             thinned = self._thinning.thin(messages, self._shedding.share)
             self._cost.note_sightings(thinned.measurements, thinned.shed)
             self._estimator.receive(thinned.messages)
 
-    def _say_time_jumps(self) -> None:
-        """The estimator itself begins anew when time has jumped back; say so, once per jump."""
+    def _log_time_jumps(self) -> None:
+        """Log each backward jump of the clock, at which the estimator has reset itself."""
         if self._estimator.time_jumps != self._jumps:
             self._jumps = self._estimator.time_jumps
-            self.get_logger().warning("time has jumped back: the estimator begins anew")
+            self.get_logger().warning("clock jumped back; estimator reset")
 
     def _on_diagnostics(self) -> None:
         begin_s = time.perf_counter()
@@ -246,10 +246,10 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._estimator.drop("reset", len(self._inputs.take(self._time_ns)))
         self._estimator.reset()
-        response.success, response.message = True, "All robots begin anew at their configured starts."
-        self.get_logger().info("reset by service: the estimator begins anew")
+        response.success, response.message = True, "All robots restart at their configured poses."
+        self.get_logger().info("estimator reset by service")
         return response
 
 
 main = partial(run_node, "estimator_node", EstimatorNode, leaves_at_once=True)
-"""However many topics there are to give up, also before all are there."""
+"""It has nothing to finish, and destroying many publishers takes long."""

@@ -38,14 +38,14 @@ from swarm_loc_msgs.msg import (
 )
 
 DEPTH = 1000
-"""So many messages of a topic wait for a tick at most: a busy moment as long as the horizon."""
+"""Queue length of a topic, which is emptied at each tick: enough for the horizon."""
 _SHARED_DEPTH = 500
-"""Likewise of a topic with the readings of many robots: its messages are large."""
+"""The same for a topic with the readings of many robots, whose messages are large."""
 _MAX_PER_TAKE = 5000
-"""What a tick may take of all topics, so that none takes long."""
+"""Limit of messages per tick over all topics."""
 _MIN_PER_TOPIC = 100
-"""Of each topic at least so many: what comes within the usual horizon. With less, an estimator that is once
-behind would get ever older data, which cost more to use, and never catch up."""
+"""Least limit per topic: the messages of the usual horizon. With less, an estimator that has fallen behind
+would get ever older data, which cost more to fuse, and never catch up."""
 
 _MESSAGE_CLASSES = {
     InputKind.ODOMETRY: Odometry,
@@ -58,7 +58,7 @@ _MESSAGE_CLASSES = {
     InputKind.SWARM_FIXES: SwarmFixes,
 }
 _LOST = {ReliabilityPolicy.RELIABLE: "overload", ReliabilityPolicy.BEST_EFFORT: "lost"}
-"""Why messages are missing between two others of a publisher."""
+"""Drop reason of messages that are missing in a publisher's sequence."""
 _TF_STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _MAX_FRAME_LENGTH = 64
 """Longer names of foreign frames are cut."""
@@ -69,15 +69,15 @@ _TF = QoSProfile(depth=100)  # what tf2's own broadcaster offers
 
 
 class EstimatorInputs:
-    """All inputs, as raw bytes: building message objects would cost more than estimating.
+    """Takes all inputs as raw bytes: building message objects would cost more than estimating.
 
-    The messages wait in the middleware, which keeps the newest of each topic, and not in the executor, which
-    would enter each of them into a queue without bound. What is missing is known by the publishers' numbers.
+    Messages wait in the middleware, which keeps the newest of each topic, and not in the executor, whose
+    queue is unbounded. Lost messages are detected by the publishers' sequence numbers.
 
     Args:
-        node: Has the subscriptions; no executor may handle them.
+        node: Has the subscriptions, which no executor may handle.
         topics: What to subscribe to; their index is their handle.
-        drop: Is told of messages that went missing: reason and count.
+        drop: Called with reason and count of lost messages.
     """
 
     def __init__(self, node: Node, topics: Sequence[InputTopic], drop: Callable[[str, int], None]) -> None:
@@ -90,11 +90,11 @@ class EstimatorInputs:
         self._subscriptions = [self._subscribe(k, ReliabilityPolicy.RELIABLE) for k in range(len(topics))]
 
     def take(self, time_ns: Callable[[], int]) -> list[tuple[int, bytes, int]]:
-        """Messages as handle, bytes and arrival, in order of arrival; what is too much now comes next time.
+        """Messages as handle, bytes and arrival in order of arrival; those above the limit remain queued.
 
         Args:
-            time_ns: Tells the node's time [ns], asked when they have been taken: asked before, it could be
-                behind their stamps. By simulated time, all arrive then.
+            time_ns: Returns the node's time [ns]. It is called after the messages are taken, since an earlier
+                time could be before their stamps. In simulated time, all arrive at that time.
         """
         taken = []
         for handle, subscription in enumerate(self._subscriptions):
@@ -133,14 +133,14 @@ class EstimatorInputs:
         )
 
     def _follow(self, handle: int, _event: object) -> None:
-        """Subscribe anew, best effort: that hears every publisher, but what is lost is not sent again."""
+        """Subscribe again as best effort, which matches every publisher but gets no retransmissions."""
         before = self._subscriptions[handle]
         if before.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
             return
         self._subscriptions[handle] = self._subscribe(handle, ReliabilityPolicy.BEST_EFFORT)
         self._node.destroy_subscription(before)
         self._node.get_logger().info(
-            f"{self._topics[handle].name} is published best effort: what is lost on the way is not sent again"
+            f"{self._topics[handle].name} is published best effort: lost messages are not sent again"
         )
 
 
@@ -212,7 +212,7 @@ class EstimateOutputs:
         self._sightings = node.create_publisher(SwarmSightings, "swarm/sightings", _RELIABLE)
         self._sightings_ns = 0
         self._identities = node.create_publisher(RobotIdentities, "aerial/identities", _RELIABLE)
-        self._told: Identities | None = None
+        self._published: Identities | None = None
         self._robot_poses = [
             node.create_publisher(PoseWithCovarianceStamped, f"{name}/pose", _RELIABLE)
             for name in (names if parameters.publish_robot_poses and not parameters.shared_topics else [])
@@ -230,7 +230,7 @@ class EstimateOutputs:
         )
         if self._tf is not None and located.any():
             self._tf.publish(self._tf_encoder.encode(e.stamp_ns, located, e.map_to_odom))
-        # a large swarm's single topics cost most of all to publish, and are seldom heard
+        # publishing one topic per robot is the largest cost of a large swarm, and few have subscribers
         heard = [k for k, one in enumerate(self._robot_poses) if located[k] and one.get_subscription_count()]
         if heard:
             stamps_ns = np.full(len(heard), e.stamp_ns)
@@ -239,17 +239,17 @@ class EstimateOutputs:
                 self._robot_poses[robot].publish(message)
 
     def publish_identities(self, identities: Identities | None) -> None:
-        """Publish who is who in the newest aerial image, whenever that changes; late data may change it."""
-        if identities is None or (self._told is not None and _are_equal(identities, self._told)):
+        """Publish the identities in the newest aerial image whenever they change, also by late data."""
+        if identities is None or (self._published is not None and _are_equal(identities, self._published)):
             return
-        self._told = identities
+        self._published = identities
         probability = identities.probability
         self._identities.publish(
             encode_identities(self._frame, identities.stamp_ns, self._names, identities.place, probability)
         )
 
     def publish_sightings(self, estimator: Estimator, now_ns: int) -> None:
-        """Publish what the robots see and what became of it, a few times a second and if somebody listens."""
+        """Publish the robots' measurements and their outcomes, a few times per second if anyone subscribes."""
         if abs(now_ns - self._sightings_ns) < _SIGHTINGS_PERIOD_NS:
             return
         self._sightings_ns = now_ns
@@ -259,7 +259,7 @@ class EstimateOutputs:
 
 
 def _are_equal(one: Identities, other: Identities) -> bool:
-    """Whether both say the same of the same image."""
+    """Whether both have the same contents."""
     if one is other:
         return True
     same = np.array_equal(one.place, other.place) and np.array_equal(one.probability, other.probability)

@@ -3,41 +3,39 @@
 from __future__ import annotations
 
 MIN_SHARE = 0.01
-"""So much is used however busy the node is: with nothing at all, robots would be lost for good."""
+"""Least share, however busy the node is: without any measurements, robots would be lost for good."""
 _WINDOW_S = 0.5
-"""The load is that of so much time at least: fusing comes in bursts."""
+"""Least time over which the load is measured, since fusing comes in bursts."""
 _BUSY = 0.9
-"""A node that is busy for this share of the time and more may not keep up."""
+"""Load above which a node may not keep up."""
 _MAX_WAIT = 0.5
-"""Share of the horizon: data that wait longer to be fused are falling behind, and would soon be too old."""
+"""Share of the horizon; data that wait longer to be fused would soon be too old."""
 _AT_EASE = 0.6
-"""With less, it tries to use more. Between the two, nothing changes."""
+"""Load below which the share grows. Between the two limits it stays."""
 _SMOOTHING = 0.2
-"""Of what fusing takes, which comes in bursts: about five windows count."""
+"""Smoothing factor of the time that fusing takes, an average over about five windows."""
 _AIM = 0.75
 _MIN_CUT, _MAX_CUT = 0.5, 0.125
-"""Factors of the share per window: what the load asks for, within these limits."""
+"""Limits of the factor by which the share is cut per window."""
 _GROWTH = 1.3
-"""Likewise at ease; from the one limit of the load it does not reach the other."""
+"""Growth of the share per window at low load; it is too small to lead from one load limit past the other."""
 _LONGEST_WAIT = 0.25
-"""Share of the horizon that data may wait to be fused; they have come late already."""
+"""Share of the horizon that data may wait to be fused."""
 
 
 class Shedding:
-    """Cuts the share of sightings used while fusing falls behind, and lets it grow again.
+    """Cuts the share of measurements used while fusing falls behind, and lets it grow again.
 
-    A node that is busy for a while and catches up again, as at its start, leaves nothing out.
-
-    Only what fusing takes can be saved by using less. So where it takes no more than its guaranteed share of
-    a core, the node is kept busy by something else, and no more is left out; where it takes less than half of
-    that, less is.
+    A node that is busy for a while and catches up again, as at its start, drops nothing. Using less saves
+    only the time of fusing: where fusing takes no more than its guaranteed share of a core, the share is not cut
+    further; where it takes less than half of that, the share grows.
 
     Args:
         fusion_load: That guaranteed share of a core.
         horizon_s: Data older than this are dropped [s].
 
     Attributes:
-        share: Of the sightings to use, in [MIN_SHARE, 1].
+        share: Share of the measurements to use, in [MIN_SHARE, 1].
     """
 
     def __init__(self, fusion_load: float, horizon_s: float) -> None:
@@ -54,13 +52,15 @@ class Shedding:
         self._handled_s = self._busy_s = self._fusing_s = 0.0
 
     def begin_tick(self, wall_s: float, waited_s: float) -> None:
-        """A tick begins, by a steady clock; data wait to be fused for so long at most, by their own clock."""
+        """Begin a tick at a steady time [s]; data have waited for at most `waited_s` to be fused."""
         if self._ticked_s is None:
             self._ticked_s = self._begin_s = wall_s
         if wall_s - self._begin_s >= _WINDOW_S:
             self._adapt(wall_s - self._begin_s, waited_s)
             self._begin_window(wall_s)
-        self._handled_s += wall_s - self._ticked_s  # what came since the tick before is this one's work
+        self._handled_s += (
+            wall_s - self._ticked_s
+        )  # this tick handles what was received since the previous one
         self._ticked_s = wall_s
 
     def _adapt(self, elapsed_s: float, waited_s: float) -> None:
@@ -71,21 +71,21 @@ class Shedding:
             self.share = min(1.0, _GROWTH * self.share)
         elif is_behind and self._may_cut and fusing_load > self._fusion_load:
             self._may_cut = False
-            cut = _AIM * self._handled_s / self._busy_s  # ticks that become longer have more to do than time
+            cut = _AIM * self._handled_s / self._busy_s  # longer ticks are an overload
             self.share = max(MIN_SHARE, self.share * min(max(cut, _MAX_CUT), _MIN_CUT))
 
     def begin_fusion(self) -> None:
-        """Fusing begins; from here on it is known what the cut before has brought."""
+        """Begin fusing; from now on the effect of the previous cut is known."""
         self._may_cut = True
 
     def note(self, busy_s: float, fusing_s: float = 0.0) -> None:
-        """The node was busy for so long, and with fusing for so much of it."""
+        """Add time for which the node was busy, and for which it was fusing."""
         self._busy_s += busy_s
         self._fusing_s += fusing_s
 
 
 class FusionPace:
-    """Lets fusing take its share of a core and no more, unless data would grow too old meanwhile.
+    """Limits fusing to a share of a core, unless data would grow too old meanwhile.
 
     Args:
         load: Share of a core.
@@ -110,13 +110,13 @@ class FusionPace:
         return not 0 <= now_ns - self._fused_ns < self._longest_ns
 
     def waited_s(self, now_ns: int) -> float:
-        """How long data have waited at most since fusing began last [s]."""
+        """Longest time that data have waited since fusing began last [s]."""
         return 0.0 if self._fused_ns is None else max(0, now_ns - self._fused_ns) * 1e-9
 
     def begin(self, wall_s: float, now_ns: int) -> None:
-        """Fusing begins at these times."""
+        """Record that fusing begins."""
         self._rested_s, self._fused_ns = wall_s, now_ns
 
     def note(self, cpu_s: float) -> None:
-        """It took so much of a core [s], all of it or a part."""
+        """Add the core time that fusing took [s]."""
         self._rested_s += cpu_s / self._load

@@ -1,4 +1,4 @@
-"""Makes one map with many PushBots, as a ROS 2 node.
+"""Builds one map with many PushBots, as a ROS 2 node.
 
     ./run swarm_loc_estimator mapper_node --ros-args -p swarm_file:=swarm.yaml
 
@@ -52,13 +52,13 @@ _MESSAGE_CLASSES = {
 
 
 class MapperNode(ConfiguredNode[MapperParameters]):
-    """Receives, lets the core map, publishes.
+    """Converts the inputs, calls the mapper and publishes its map, goals and fixes.
 
     Args:
         node_arguments: Further arguments of `rclpy.node.Node`.
 
     Attributes:
-        feed: What has come, and what of it was not used.
+        feed: Converts the inputs and counts what was dropped.
     """
 
     def __init__(self, **node_arguments: Any) -> None:
@@ -72,7 +72,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         if not is_precompiled(precompile):
             self.get_logger().info("compiling the mapper for this machine: about half a minute")
         precompile()
-        self._begin_anew()
+        self._clear()
         self._create_publishers()
         for index, robot in enumerate(self._robots):
             for kind in MapperInput if self._frequencies else (MapperInput.ODOMETRY, MapperInput.LASER):
@@ -86,12 +86,12 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self.start_diagnostics(self._on_diagnostics)
         self.get_logger().info(f"ready: {len(self._robots)} robots of '{self.params.swarm_file}'")
 
-    def _begin_anew(self) -> None:
-        """An empty map, and robots that have not joined yet."""
+    def _clear(self) -> None:
+        """Start with an empty map and robots that have not joined yet."""
         self._mapper = CooperativeMapper(self.params.settings)
         self._mapper.background = self._background
         self.feed = MapperFeed(self._robots, self._mapper, self._frequencies)
-        self._told: dict[int, int] = {}
+        self._goal_stamps: dict[int, int] = {}
         self._covariances = [FixCovariances(robot.odometry) for robot in self._robots]
         self._published: OccupancyMap | None = None
 
@@ -108,9 +108,9 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self.feed.add(robot, kind, data)
         number = self.feed.number(robot)
         goal = self._mapper.goal(number) if number is not None else None
-        if number is None or goal is None or self._told.get(robot) == goal.stamp_ns:
+        if number is None or goal is None or self._goal_stamps.get(robot) == goal.stamp_ns:
             return
-        self._told[robot] = goal.stamp_ns
+        self._goal_stamps[robot] = goal.stamp_ns
         frame = self.params.map_frame
         covariance = self._covariances[robot].told(goal, self._mapper.covariance(number))
         self._fixes[robot].publish(fix_message(goal, covariance, frame))
@@ -127,19 +127,19 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self._visitation.publish(visitation_message(occupancy, self._mapper.visits.on(occupancy), header))
 
     def _on_jump(self, _jump: object) -> None:
-        self._begin_anew()
-        self.get_logger().warning("time has jumped back: the map begins anew")
+        self._clear()
+        self.get_logger().warning("clock jumped back; map reset")
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._begin_anew()
+        self._clear()
         response.success, response.message = (
             True,
-            "The map begins anew.",
+            "The map has been reset.",
         )
         return response
 
     def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Solve everything anew and write the map."""
+        """Solve all poses again and write the map."""
         self._mapper.finish()
         try:
             path, image = save_map(self._mapper.occupancy(), Path(self.params.save_map))

@@ -68,7 +68,7 @@ class PlayerParameters:
 
     bag: str = text("", "a rosbag2 folder, or an .mcap or .db3 file", required=True)
     rate: float = number(1.0, "1", 0.01, 1000.0, "bag seconds per second")
-    loop: bool = flag(False, "begin anew at the end, for ever")
+    loop: bool = flag(False, "play again from the beginning at the end, without limit")
     start_offset_s: float = number(0.0, "s", 0.0, 1e9, "how much of the bag's beginning to leave out")
     topics: tuple[str, ...] = texts("topics to play; all when empty")
     wait_for_subscribers: int = number(

@@ -15,7 +15,7 @@ from swarm_loc_estimator.swarm.swarm import StartSigma, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_msgs.srv import SetRobotPose
 
-NO_CLOCK = "use_sim_time is true but no /clock has come"
+NO_CLOCK = "use_sim_time is true but no messages received on /clock"
 
 REFUSALS = {
     "absurd": "the pose must lie within 1000 km of the origin.",
@@ -51,12 +51,12 @@ def planar_pose(pose: PoseWithCovariance, start_sigma: StartSigma) -> tuple[Floa
 
 
 class PoseCommands:
-    """Takes a user's word for the pose of a robot, or lets it wait for a fix.
+    """Sets the pose of a robot as a user asks, or makes it unlocated until the next fix.
 
     Args:
         node: Offers the service and subscribes.
         swarm: The robots.
-        estimator: Is told.
+        estimator: Carries the commands out.
         map_frame: The frame in which poses must be.
         by_topics: Whether there is a topic for each robot beside the service.
     """

@@ -56,7 +56,7 @@ class Access:
         if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
             return f"Pages of '{origin}' may not use this server."
         if self.token and not hmac.compare_digest(token.encode(), self.token.encode()):
-            return "The token is missing or wrong: open the address that was told, with ?token=."
+            return "The token is missing or wrong: open the address that the log shows, with ?token=."
         return ""
 
 

@@ -1,6 +1,6 @@
-"""Frames, the pieces that a page is told: a kind, an instant, and columns of numbers as one binary message.
+"""Frames, the binary messages to the page: a kind, an instant and columns of numbers; and their history.
 
-    uint32 length of the header | header as JSON, blanks up to a multiple of 8 | columns, each likewise padded
+    uint32 length of the header | header as JSON, blanks up to a multiple of 8 | columns, each padded as well
 
 The header names kind and stamp [ms] and lists the columns as name, type and length; all is little-endian.
 """
@@ -32,8 +32,8 @@ class Frame(NamedTuple):
     """One piece.
 
     Attributes:
-        kind: What it tells: "poses", "sightings", "truth", "aerial", "goals" or "map".
-        stamp_ns: When that was so.
+        kind: Its content: "poses", "sightings", "truth", "aerial", "goals" or "map".
+        stamp_ns: Time of the content [ns].
         data: The bytes for the page.
     """
 
@@ -47,7 +47,7 @@ def pack(kind: str, stamp_ns: int, columns: Mapping[str, npt.NDArray[Any]], **ex
 
     Args:
         kind: See `Frame`.
-        stamp_ns: When that was so.
+        stamp_ns: Time of the content [ns].
         columns: By name; each is made flat.
         extra: What else stands in the header.
     """
@@ -74,7 +74,7 @@ def unpack(data: bytes) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
 
 
 def poses_frame(estimate: EstimateMessage) -> Frame:
-    """Where all robots are believed to be; waiting robots have NaN."""
+    """Estimated poses of all robots; those of unlocated robots are NaN."""
     pose, covariance = estimate.pose, estimate.covariance
     single = {
         "theta": pose[:, 2],
@@ -90,7 +90,7 @@ def poses_frame(estimate: EstimateMessage) -> Frame:
 
 
 def sightings_frame(stamp_ns: int, sightings: Sightings) -> Frame:
-    """What each robot sees, and what became of it."""
+    """The robots' measurements and their outcomes."""
     return pack("sightings", stamp_ns, sightings._asdict())
 
 
@@ -110,12 +110,12 @@ def places_frame(
 def aerial_frame(
     stamp_ns: int, position: npt.NDArray[np.float64], known: Mapping[int, tuple[int, float]]
 ) -> Frame:
-    """What an aerial image shows.
+    """Detections of an aerial image.
 
     Args:
         stamp_ns: Of the image.
         position: (n, 2) of its detections in map [m].
-        known: Detection -> the robot that it is believed to be, and the probability of that.
+        known: Detection -> index of the robot and probability of that identity.
     """
     who = [known.get(place, (-1, 0.0)) for place in range(len(position))]
     columns: dict[str, npt.NDArray[Any]] = {
@@ -128,7 +128,7 @@ def aerial_frame(
 
 
 def map_frame(stamp_ns: int, grid: GridMessage) -> Frame:
-    """The map as it is known at an instant."""
+    """The map at an instant."""
     height, width = grid.cells.shape
     shape = {"width": width, "height": height, "resolution": grid.resolution, "origin": grid.origin}
     return pack("map", stamp_ns, {"cells": grid.cells}, **shape)
@@ -151,7 +151,7 @@ class History:
         self._kept_ns: dict[str, int] = {}
 
     def add(self, frame: Frame) -> bool:
-        """Take a frame in; returns whether time has jumped back, which begins the history anew."""
+        """Add a frame; returns whether the clock has jumped back, at which the history is cleared."""
         before = self._newest_of.get(frame.kind)
         jumped = before is not None and frame.kind == "poses" and frame.stamp_ns < before.stamp_ns
         if jumped:
@@ -169,7 +169,7 @@ class History:
         return jumped
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Clear the history."""
         self._frames.clear()
         self._newest_of.clear()
         self._kept_ns.clear()

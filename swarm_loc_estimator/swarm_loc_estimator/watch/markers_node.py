@@ -51,7 +51,7 @@ class MarkersNode(ConfiguredNode[MarkersParameters]):
         self._reader = SwarmPosesReader()
         self._encoder: MarkersEncoder | None = None
         self._period_ns = round(1e9 / self.params.rate)
-        self._told_ns = 0
+        self._sent_ns = 0
         self._newest_ns = 0
         self._seen: tuple[int, Sightings] | None = None
         self._twist: dict[int, tuple[float, float, float]] = {}
@@ -102,10 +102,10 @@ class MarkersNode(ConfiguredNode[MarkersParameters]):
             return
         self._publish_odometry(estimate)
         if (
-            abs(estimate.stamp_ns - self._told_ns) >= self._period_ns
+            abs(estimate.stamp_ns - self._sent_ns) >= self._period_ns
             and self._markers.get_subscription_count()
         ):
-            self._told_ns = estimate.stamp_ns
+            self._sent_ns = estimate.stamp_ns
             self._encoder = self._encoder or MarkersEncoder(self._swarm, estimate.frame_id)
             self._markers.publish(self._encoder.encode(estimate, self._sightings_at(estimate.stamp_ns)))
 

@@ -1,4 +1,4 @@
-"""The page as one text, what it gets before any frame, and a recorded run inside it."""
+"""The page as one text, what it gets first, and a recorded run inside it."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def page(data: str = "") -> str:
     """
     markup, style, script = _parts()
     body, end = markup.split("<!-- data -->")
-    told = f'<script type="application/octet-stream" id="recording">{data}</script>' if data else ""
-    return f"{body.replace('/* style */', style)}{told}<script>{script}</script>{end}"
+    recorded = f'<script type="application/octet-stream" id="recording">{data}</script>' if data else ""
+    return f"{body.replace('/* style */', style)}{recorded}<script>{script}</script>{end}"
 
 
 def content_security_policy() -> str:
@@ -66,7 +66,7 @@ def recording(about: dict[str, Any], frames: Iterable[Frame]) -> str:
     """The text: base64 of gzip of the length of a JSON text, that text, and the frames.
 
     Args:
-        about: What the page is told first, see `about`.
+        about: What the page gets first, see `about`.
         frames: In the order of their stamps.
     """
     head = json.dumps(about).encode()

@@ -1,4 +1,4 @@
-"""What viewers order: reset the estimator, set a pose, drive a robot."""
+"""Commands of the page: reset the estimator, set a pose, drive a robot."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from swarm_loc_msgs.srv import SetRobotPose
 
 _MAX_WAITING = 64
 _DRIVEN_NS = 400_000_000
-"""A robot that is driven stands still after so long without a word."""
+"""A robot that is driven is stopped after so long without a command."""
 
 
 class RobotCommands:
-    """Obeys commands one after the other, in the node's own thread.
+    """Carries out commands one after the other, in the node's thread.
 
     Args:
         node: Calls and publishes.
@@ -31,7 +31,7 @@ class RobotCommands:
         now_ns: A clock that always runs [ns].
 
     Attributes:
-        dropped: Commands that came while too many waited.
+        dropped: Number of commands dropped because too many waited.
     """
 
     def __init__(

@@ -25,7 +25,7 @@ class Places:
     Args:
         kind: Of the frames.
         keeps: Whether a place holds until the next one comes, however old.
-        drop: Is told the reason when a message cannot be used.
+        drop: Called with the reason when a message cannot be used.
     """
 
     def __init__(self, kind: str, drop: Callable[[str], None], *, keeps: bool) -> None:
@@ -33,7 +33,7 @@ class Places:
         self._drop = drop
         self._keeps = keeps
         self._newest: dict[int, tuple[int, tuple[float, float, float]]] = {}
-        self._told_ns = -1
+        self._sent_ns = -1
 
     def take(self, robot: int, data: bytes) -> None:
         """A serialized PoseStamped of a robot."""
@@ -50,21 +50,21 @@ class Places:
     def frame(self) -> Frame | None:
         """All places; None when nothing has come since."""
         newest_ns = max((stamp_ns for stamp_ns, _ in self._newest.values()), default=-1)
-        if newest_ns == self._told_ns:
+        if newest_ns == self._sent_ns:
             return None
-        self._told_ns = newest_ns
+        self._sent_ns = newest_ns
         limit_ns = 0 if self._keeps else newest_ns - _OLD_NS
         shown = {robot: pose for robot, (at_ns, pose) in self._newest.items() if at_ns >= limit_ns}
         return places_frame(self._kind, newest_ns, [*shown], np.array([*shown.values()]).reshape(-1, 3))
 
     def clear(self) -> None:
-        """Forget all of them."""
+        """Clear all places."""
         self._newest.clear()
-        self._told_ns = -1
+        self._sent_ns = -1
 
 
 class AerialNames:
-    """Joins anonymous detections with who they are believed to be, by the stamp of their image.
+    """Joins anonymous detections with their identities, by the stamp of their image.
 
     Args:
         index_of: Robot name -> index.
@@ -75,7 +75,7 @@ class AerialNames:
         self._images: dict[int, AnonymousDetectionArray] = {}
 
     def detections(self, message: AnonymousDetectionArray) -> Frame:
-        """An image, of which nobody is known yet."""
+        """The frame of an image without identities."""
         stamp_ns = nanoseconds(message.header.stamp)
         self._images[stamp_ns] = message
         while len(self._images) > _IMAGES:
@@ -83,7 +83,7 @@ class AerialNames:
         return self._frame(stamp_ns, {})
 
     def identities(self, message: RobotIdentities) -> Frame | None:
-        """Who is who in one of the newest images; None for an older one."""
+        """The frame of one of the newest images with identities; None for an older image."""
         stamp_ns = nanoseconds(message.header.stamp)
         if stamp_ns not in self._images:
             return None
@@ -127,7 +127,7 @@ class NewestMessages:
 
     @property
     def subscriptions(self) -> frozenset[Subscription]:
-        """Those that no executor may handle."""
+        """Subscriptions that no executor may handle."""
         return frozenset(self._subscriptions.values())
 
     def take(self, use: Callable[[int, bytes], None]) -> None:

@@ -1,6 +1,6 @@
-"""The server of the page: HTML once, then frames over a WebSocket, and commands back; in a thread of its own.
+"""The server of the page, in a thread of its own: HTML once, then frames over a WebSocket, and commands back.
 
-Whoever has frames hands them over and goes on: nothing here makes it wait, however slow or many the pages.
+Passing a frame to the server never blocks, however many or slow the pages are.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class ServerLoad(NamedTuple):
         pages: Open now.
         slow: Of these, those for which frames were left out since the last time.
         left_out: Frames left out for pages that were busy with older ones, of all pages so far.
-        texts_left_out: Likewise texts.
+        texts_left_out: Texts left out for the same reason.
         refused: Pages that were not let in so far.
     """
 
@@ -73,11 +73,11 @@ class WatchServer:
     """Serves the page.
 
     Args:
-        about: What pages are told first, see `page.about`.
+        about: What pages get first, see `page.about`.
         access: Where to listen, and who may look.
         port: 0 for any that is free.
         rate: Frames of a kind that a page gets per second, at most.
-        on_command: Is told of commands.
+        on_command: Called with each command.
 
     Raises:
         ServerError: The port is taken, or the address is not this machine's.
@@ -94,7 +94,7 @@ class WatchServer:
         self._viewers: set[Viewer] = set()
         self._gone = LeftOut(0, 0)
         self._refused = 0
-        self._told: dict[int, int] = {}
+        self._known_left_out: dict[int, int] = {}
         self._loop = asyncio.new_event_loop()
         self._runner = web.AppRunner(self._application(), access_log=None, shutdown_timeout=1.0)
         self._listening = threading.Event()
@@ -128,17 +128,17 @@ class WatchServer:
     def load(self) -> ServerLoad:
         """How it gets on; slow pages since the last call."""
         counts = {id(viewer): viewer.left_out for viewer in tuple(self._viewers)}
-        slow = sum(count.frames > self._told.get(key, 0) for key, count in counts.items())
-        self._told = {key: count.frames for key, count in counts.items()}
+        slow = sum(count.frames > self._known_left_out.get(key, 0) for key, count in counts.items())
+        self._known_left_out = {key: count.frames for key, count in counts.items()}
         frames, texts = (sum(parts) for parts in zip(self._gone, *counts.values(), strict=True))
         return ServerLoad(len(counts), slow, frames, texts, self._refused)
 
     def publish(self, frame: Frame) -> None:
-        """Hand a frame over; from any thread."""
+        """Send a frame to the pages; may be called from any thread."""
         self._loop.call_soon_threadsafe(self._take, frame)
 
-    def tell(self, message: dict[str, Any], robot: int | None = None) -> None:
-        """Hand a text over; from any thread.
+    def send_text(self, message: dict[str, Any], robot: int | None = None) -> None:
+        """Send a message to the pages; may be called from any thread.
 
         Args:
             message: For the pages.
@@ -154,7 +154,7 @@ class WatchServer:
 
     def _take(self, frame: Frame) -> None:
         if self._history.add(frame):
-            self._note({"kind": "anew"}, None)
+            self._note({"kind": "reset"}, None)
         for viewer in self._viewers:
             viewer.offer(frame)
 
@@ -240,7 +240,7 @@ class WatchServer:
             await socket.close()
 
     def _on_text(self, viewer: Viewer, text: str) -> None:
-        """A page's word."""
+        """Handle a text that a page has sent."""
         if text == RECEIVED:
             viewer.on_received()
             return
@@ -345,7 +345,7 @@ class Viewer:
             while self._notes:
                 await self._socket.send_str(self._notes.popleft())
             if self._on_the_way >= _MAX_ON_THE_WAY:
-                continue  # its word wakes this up
+                continue  # the page's next text wakes this up
             frames, self._newest = self._newest, {}
             for frame in frames.values():
                 await self._send(frame)

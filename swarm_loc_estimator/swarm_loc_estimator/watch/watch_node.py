@@ -70,9 +70,9 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         self._goals, self._goal_places = self._places("goals", "goal", keeps=True)
         self._commands = RobotCommands(self, self._names, self.params, time.monotonic_ns)
         title = self.params.title or path.resolve().parent.name
-        told = about(self._swarm, title, teleop=self.params.teleop, commands=self.params.commands)
+        first = about(self._swarm, title, teleop=self.params.teleop, commands=self.params.commands)
         access = Access(self.params.address, self.params.token)
-        self.server = WatchServer(told, access, self.params.port, self.params.rate, self._commands.order)
+        self.server = WatchServer(first, access, self.params.port, self.params.rate, self._commands.order)
         self._subscribe()
         self.create_steady_timer(_WORK_S, self._commands.work)
         self.create_steady_timer(_LOOK_S, self._look_around)
@@ -120,7 +120,7 @@ class WatchNode(ConfiguredNode[WatchParameters]):
             return
         self.destroy_subscription(self._map)
         self._map = self.create_subscription(OccupancyGrid, "map", self._on_map, _FLEETING, raw=True)
-        self.get_logger().info("map is not published transient local: it is shown once it comes anew")
+        self.get_logger().info("map is not published transient local: it is shown from its next message on")
 
     def _publish(self, frame: Frame | None) -> None:
         if frame is not None:
@@ -135,7 +135,9 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         if estimate.names != self._names:
             self._drop("swarm/poses", "other_swarm")
             return
-        if estimate.stamp_ns < self._newest_ns:  # time has jumped back, the server begins anew
+        if (
+            estimate.stamp_ns < self._newest_ns
+        ):  # the clock has jumped back, and the server clears its history
             self._truth_places.clear()
             self._goal_places.clear()
         self._newest_ns = estimate.stamp_ns
@@ -161,7 +163,7 @@ class WatchNode(ConfiguredNode[WatchParameters]):
             self._drop("map", "malformed")
 
     def _on_diagnostics(self, data: bytes) -> None:
-        """Tell what is said of the robots that somebody has chosen; to others it costs nothing."""
+        """Forward the diagnostics of the robots that some page has selected."""
         chosen = self.server.selected
         if not chosen:
             return
@@ -172,7 +174,7 @@ class WatchNode(ConfiguredNode[WatchParameters]):
                 values = {pair.key: pair.value for pair in status.values}
                 report = {"robot": robot, "message": status.message, "values": values}
                 stamp_ms = self._newest_ns * 1e-6
-                self.server.tell({"kind": "report", "stamp": stamp_ms, **report}, robot)
+                self.server.send_text({"kind": "report", "stamp": stamp_ms, **report}, robot)
 
     def _look_around(self) -> None:
         """Hear what is published by now, and sightings as long as somebody looks; name what is missing."""
@@ -190,7 +192,7 @@ class WatchNode(ConfiguredNode[WatchParameters]):
             self._heard_s = time.monotonic()
             missing = f"messages received on swarm/poses{self.why_missing('swarm/poses', SWARM_POSES)}"
             self.health.warn("missing", f"no {missing}")
-            self.server.tell({"kind": "said", "text": f"No {missing}.", "ok": False})
+            self.server.send_text({"kind": "said", "text": f"No {missing}.", "ok": False})
 
     def _on_diagnostics_timer(self) -> None:
         self.health.warn_of_drops()

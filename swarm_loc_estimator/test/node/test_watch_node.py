@@ -167,7 +167,7 @@ def test_orders_of_a_page_reach_the_estimator_and_the_robots(
     viewer.order(do="set_pose", robot=1, pose=[3.0, None, 1.0])
     ros.until(lambda: said("A pose is three finite numbers."))
     viewer.order(do="reset")
-    ros.until(lambda: said("All robots begin anew"))
+    ros.until(lambda: said("All robots restart"))
     viewer.order(do="drive", robot=1, ahead=1, left=0)
     ros.until(lambda: bool(driven) and driven[-1].linear.x == 0.0)
     assert [one.linear.x for one in driven if one.linear.x] in ([0.05], []), (

@@ -37,7 +37,7 @@ class Actions {
   }
 
   async reset() {
-    if (await this.ask("Let all robots begin anew at their configured starts?", "Reset")) this.send({ do: "reset" });
+    if (await this.ask("Restart all robots at their configured poses?", "Reset")) this.send({ do: "reset" });
   }
 
   // Press where the robot is, drag to where it looks, let go.

@@ -101,7 +101,7 @@ class App {
     if (note.kind === "about") this.onAbout(note);
     else if (note.kind === "report") this.panel.onReport(note);
     else if (note.kind === "said") this.say(note.text, note.ok);
-    else if (note.kind === "anew") this.store.clear();
+    else if (note.kind === "reset") this.store.clear();
   }
 
   onAbout(about) {
