@@ -249,7 +249,7 @@ class EstimateOutputs:
         )
 
     def publish_sightings(self, estimator: Estimator, now_ns: int) -> None:
-        """Publish the robots' measurements and their outcomes, a few times per second if anyone subscribes."""
+        """Publish the robots' measurements and their outcomes, a few times per second if subscribed to."""
         if abs(now_ns - self._sightings_ns) < _SIGHTINGS_PERIOD_NS:
             return
         self._sightings_ns = now_ns

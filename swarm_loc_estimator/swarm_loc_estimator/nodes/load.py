@@ -27,8 +27,8 @@ class Shedding:
     """Cuts the share of measurements used while fusing falls behind, and lets it grow again.
 
     A node that is busy for a while and catches up again, as at its start, drops nothing. Using less saves
-    only the time of fusing: where fusing takes no more than its guaranteed share of a core, the share is not cut
-    further; where it takes less than half of that, the share grows.
+    only the time of fusing: where fusing takes no more than its guaranteed share of a core, the share is not
+    cut further; where it takes less than half of that, the share grows.
 
     Args:
         fusion_load: That guaranteed share of a core.

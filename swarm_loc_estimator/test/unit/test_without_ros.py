@@ -1,4 +1,9 @@
-"""What is no node works on a machine without ROS."""
+"""Only nodes need ROS; all other modules can be imported without it.
+
+These may need it: modules named `*_node.py`; in the estimator `common/node.py`, all of `nodes/`, `watch/`
+and `offline/live/`, and the command `demo`, which plays into a live graph; in the drivers what publishes for
+nodes, named `*_diagnostics.py`, `*_messages.py`, `*_output.py` or `*_steering.py`.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +16,8 @@ IMPORT_ALL_WITHOUT_ROS = """
 import importlib, pathlib, re, sys
 
 WITH_ROS = re.compile(
-    r"common\\.(node|health)$|\\.(nodes|live|watch)\\.|_node$|_(output|messages|diagnostics)$"
-    r"|cli\\.(demo|watch)$|truth_steering$"
+    r"_node$|^swarm_loc_estimator\\.(common\\.node$|nodes\\.|watch\\.|offline\\.live\\.|cli\\.demo$)"
+    r"|^swarm_loc_drivers\\..*_(diagnostics|messages|output|steering)$"
 )
 
 class NoRos:
