@@ -25,7 +25,7 @@ from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE_TWO, CONTENT_POSITION
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.robot_ir import IrMethod, RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrMethod, RobotIr
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, OdometryModel, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings

@@ -22,8 +22,9 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit, reassociated_njit
 from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.infrared.curves import AngleCurve, TabulatedCurve, curve_at, distance_at
+from swarm_loc_estimator.infrared.curves import curve_at, distance_at
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform
+from swarm_loc_estimator.swarm.ir_curves import AngleCurve, TabulatedCurve
 
 _NEGLIGIBLE = 16.0
 """Poses whose costs are higher by this are left out."""

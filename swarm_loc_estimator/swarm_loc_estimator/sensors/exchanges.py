@@ -12,7 +12,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.sensors.messages import BrightnessRows
-from swarm_loc_estimator.swarm.robot_ir import RobotIr
+from swarm_loc_estimator.swarm.ir_board import RobotIr
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 

@@ -24,8 +24,7 @@ from swarm_loc_estimator.infrared.solution import IrEstimator, IrSolutions, Outc
 from swarm_loc_estimator.sensors.exchanges import ExchangeKey, MatrixScreening, Readings
 from swarm_loc_estimator.sensors.messages import NO_MEASUREMENTS, BrightnessRows
 from swarm_loc_estimator.sensors.validation import REJECT_REASONS, reject_reasons
-from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
-from swarm_loc_estimator.swarm.robot_ir import IrMethod
+from swarm_loc_estimator.swarm.ir_board import IrMethod, IrPlatform, PairGains
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 _METHODS: dict[IrMethod, Callable[[IrPlatform], IrEstimator]] = {

@@ -1,15 +1,17 @@
-"""Read infrared boards from YAML, packaged ones by name: config/ir/*.yaml of this package show the format."""
+"""Read and write infrared boards as YAML; config/ir/*.yaml of this package show the format."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number_specs
-from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree, shown
-from swarm_loc_estimator.infrared.curves import (
+from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree, shown, tree_text
+from swarm_loc_estimator.swarm.ir_board import POWERS, IrPlatform
+from swarm_loc_estimator.swarm.ir_curves import (
     Amplitude,
     AngleCurve,
     IrPlatformError,
@@ -17,7 +19,6 @@ from swarm_loc_estimator.infrared.curves import (
     PowerPiece,
     TabulatedCurve,
 )
-from swarm_loc_estimator.swarm.ir_board import POWERS, IrPlatform
 from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
 
 FILE_VERSION = 1
@@ -62,6 +63,30 @@ def load_ir_platform(name: str, folder: Path | None = None) -> IrPlatform:
         return _Reader(path, IrPlatformFileError).platform(read_tree(path))
     except YamlTreeError as error:
         raise IrPlatformFileError(str(error)) from error
+
+
+def save_ir_platform(platform: IrPlatform, path: Path, comment: str = "") -> None:
+    """Write a board that `load_ir_platform` reads back equal.
+
+    Args:
+        platform: What to write.
+        path: The file; replaced when it exists, its folder created when missing.
+        comment: Lines that say where the numbers come from.
+    """
+    laws = dict(zip(platform.powers, platform.amplitudes, strict=True))
+    tree = {
+        "fileversion": FILE_VERSION,
+        "angles": list(platform.angles),
+        "sensor": _curve_tree(platform.sensor),
+        "emitter": _curve_tree(platform.emitter),
+        "powers": {name: _number_tree(law, Amplitude) for name, law in laws.items()},
+        **_number_tree(platform, IrPlatform),
+    }
+    text = "".join(f"# {line}\n" for line in comment.splitlines()) + tree_text(tree)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)
 
 
 class _Reader(TreeChecks):
@@ -128,3 +153,20 @@ class _Reader(TreeChecks):
             return cls(**arguments)
         except IrPlatformError as error:
             raise IrPlatformFileError(f"{self._path}: {prefix}{error}") from error
+
+
+def _curve_tree(curve: TabulatedCurve | PowerCurve) -> dict[str, object]:
+    """A curve as a table or in pieces."""
+    if isinstance(curve, TabulatedCurve):
+        return {"angles": list(curve.angles), "values": list(curve.values)}
+    pieces: list[dict[str, object]] = [
+        {"below": piece.below, "terms": [list(term) for term in piece.terms]} for piece in curve.pieces
+    ]
+    del pieces[-1]["below"]
+    return {"pieces": pieces}
+
+
+def _number_tree(holder: IrPlatform | Amplitude, cls: type) -> dict[str, object]:
+    """The numbers of a dataclass."""
+    names = number_specs(cls)
+    return {field.name: getattr(holder, field.name) for field in fields(cls) if field.name in names}

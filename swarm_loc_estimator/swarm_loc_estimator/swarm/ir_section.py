@@ -11,10 +11,9 @@ from typing import Any
 
 from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.common.yaml_tree import Tree
-from swarm_loc_estimator.infrared.curves import IrPlatformError
 from swarm_loc_estimator.swarm.board_file import IrPlatformFileError, load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform
-from swarm_loc_estimator.swarm.robot_ir import IrMethod, RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrGains, IrMethod, IrPlatform, RobotIr
+from swarm_loc_estimator.swarm.ir_curves import IrPlatformError
 from swarm_loc_estimator.swarm.tree_checks import TreeChecks, nearest
 
 _NUMBERS = number_specs(RobotIr)

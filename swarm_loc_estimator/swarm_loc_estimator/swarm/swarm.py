@@ -17,8 +17,8 @@ from swarm_loc_estimator.common.parameters import number
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
+    from swarm_loc_estimator.swarm.ir_board import RobotIr
     from swarm_loc_estimator.swarm.motion_response import MotionResponse
-    from swarm_loc_estimator.swarm.robot_ir import RobotIr
 
 Pose2 = tuple[float, float, float]
 """x [m], y [m], heading [rad]."""

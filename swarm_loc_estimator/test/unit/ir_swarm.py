@@ -17,8 +17,7 @@ from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.sensors.messages import BrightnessRows, FixRows, OdometryRows, RawInputs
 from swarm_loc_estimator.sensors.topics import InputKind
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains
-from swarm_loc_estimator.swarm.robot_ir import RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, StartSigma, Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator

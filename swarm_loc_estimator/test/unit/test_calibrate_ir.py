@@ -20,8 +20,7 @@ from swarm_loc_estimator.common.messages.encoders import encode_brightness, enco
 from swarm_loc_estimator.common.messages.typestore import BRIGHTNESS, POSE_STAMPED
 from swarm_loc_estimator.offline.calibration.infrared.gains import MIN_EXCHANGES
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains
-from swarm_loc_estimator.swarm.robot_ir import RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm

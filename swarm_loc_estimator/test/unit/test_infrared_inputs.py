@@ -16,8 +16,7 @@ from swarm_loc_estimator.infrared.solution import IrSolutions, Outcome
 from swarm_loc_estimator.sensors import infrared as brightness_sightings
 from swarm_loc_estimator.sensors.infrared import BrightnessConverter
 from swarm_loc_estimator.sensors.messages import BrightnessRows, chosen
-from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
-from swarm_loc_estimator.swarm.robot_ir import IrMethod, RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrMethod, IrPlatform, PairGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 POSES = np.array([[0.0, 0.0, 0.3], [0.14, 0.08, -1.2], [-0.05, 0.1, 2.0]])

@@ -27,11 +27,11 @@ from bench.droplet.cramer_rao import information
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.cost import Pair, cost_of, new_scratch
-from swarm_loc_estimator.infrared.curves import TabulatedCurve
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.solution import IrEstimator, Outcome, ReadingsError
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains
+from swarm_loc_estimator.swarm.ir_curves import TabulatedCurve
 
 ALIKE = MaximumLikelihood(droplet())
 DIFFERING = MaximumLikelihood(droplet(0.1))

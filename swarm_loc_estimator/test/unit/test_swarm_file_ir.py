@@ -8,8 +8,7 @@ import pytest
 
 from swarm_loc_estimator.swarm import board_file as ir_platform_file
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrGains
-from swarm_loc_estimator.swarm.robot_ir import IrMethod, RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrGains, IrMethod, RobotIr
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm

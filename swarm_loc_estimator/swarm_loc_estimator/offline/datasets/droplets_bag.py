@@ -31,8 +31,7 @@ from swarm_loc_estimator.offline.datasets.droplets import (
 )
 from swarm_loc_estimator.sensors.topics import InputKind
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrPlatform
-from swarm_loc_estimator.swarm.robot_ir import RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, RobotIr
 from swarm_loc_estimator.swarm.swarm import Pose2, RandomWalk, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 

@@ -25,8 +25,7 @@ from swarm_loc_estimator.offline.calibration.infrared.dead_elements import Eleme
 from swarm_loc_estimator.offline.calibration.infrared.gains import exchanges_of
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.offline.recorded_bag import Progress
-from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains
-from swarm_loc_estimator.swarm.robot_ir import RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 MAX_RANGE = 0.3

@@ -17,8 +17,8 @@ from scipy.optimize import least_squares
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.infrared.curves import Amplitude, TabulatedCurve
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
+from swarm_loc_estimator.swarm.ir_curves import Amplitude, TabulatedCurve
 
 _KNOTS = np.radians([0, 15, 30, 40, 50, 60, 70, 80, 90, 110, 135, 180])
 _TABLE = np.radians(np.arange(0, 181, 10))

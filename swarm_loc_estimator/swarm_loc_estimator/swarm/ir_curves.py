@@ -1,0 +1,212 @@
+"""Response curves of sensors, emitters and distance: the models S, E and A of a board.
+
+Angle curves are data, either pieces of sums of powers, as the Droplet paper prints (19) and (20), or a table.
+Both are sampled once into cubic pieces whose joints are exact, so that the search evaluates either in the
+same few nanoseconds, with the exact one-sided slopes at a kink.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.parameters import number, number_specs
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+_CELLS = 128
+"""Cubics per piece: the curves of the Droplet are met to 2e-6."""
+_TABLE_CELLS = 720
+"""Cubics over the whole turn for a measured curve, which has no kinks: half a degree each."""
+_JOINT = 0.01
+"""The largest jump at a joint, relative to the curve's maximum; a rounded joint as printed has 1e-4."""
+
+
+class IrPlatformError(ValueError):
+    """A platform that contradicts itself; the message is one sentence with key and value."""
+
+
+def check_numbers(holder: DataclassInstance, prefix: str = "") -> None:
+    """Refuse numbers of a dataclass that are out of the range given beside their default.
+
+    Raises:
+        IrPlatformError: One is.
+    """
+    for name, spec in number_specs(type(holder)).items():
+        value = getattr(holder, name)
+        if not spec.allows(value):
+            raise IrPlatformError(f"{prefix}{name} is {value:g} but must lie in {spec.range_text}.")
+
+
+class CurveTable(NamedTuple):
+    """A curve over [-pi, pi] as compiled code reads it.
+
+    Attributes:
+        edges: (P + 1,) where the pieces meet [rad].
+        per_radian: (P,) how many cells of a piece one radian has.
+        cubics: (P, cells, 4) coefficients by the share of the cell passed, constant first.
+    """
+
+    edges: FloatArray
+    per_radian: FloatArray
+    cubics: FloatArray
+
+    @classmethod
+    def of(cls, edges: FloatArray, cubics: FloatArray) -> CurveTable:
+        """From where pieces meet, and their cubics."""
+        return cls(edges, cubics.shape[1] / np.diff(edges), cubics)
+
+
+@dataclass(frozen=True)
+class PowerPiece:
+    """A sum of powers of the angle's size, up to some size.
+
+    Attributes:
+        below: Where the next piece begins [rad]; pi for the last.
+        terms: Pairs (coefficient, exponent) of coefficient * |angle|^exponent.
+    """
+
+    below: float
+    terms: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class PowerCurve:
+    """A symmetric curve in pieces, such as eqs (19) and (20) of the Droplet paper.
+
+    Raises:
+        IrPlatformError: Pieces do not ascend to pi, do not meet, or are not finite and positive.
+    """
+
+    pieces: tuple[PowerPiece, ...]
+
+    def __post_init__(self) -> None:
+        ends = [0.0, *(piece.below for piece in self.pieces)]
+        if any(not low < high for low, high in itertools.pairwise(ends)) or ends[-1] != math.pi:
+            raise IrPlatformError(f"pieces end at {ends[1:]} rad but must ascend from 0 to pi.")
+        table = self.table()
+        _check(table)
+        highest = float(table.cubics[..., 0].max())
+        for left, right in itertools.pairwise(self.pieces):
+            before, after = (float(_powers(p.terms, np.array(left.below))[0]) for p in (left, right))
+            if abs(before - after) > _JOINT * highest:
+                raise IrPlatformError(
+                    f"pieces do not meet at {left.below:g} rad, where they are {before:.4g} and {after:.4g}."
+                )
+
+    def table(self) -> CurveTable:
+        """The curve as compiled code reads it."""
+        edges = np.array([0.0, *(piece.below for piece in self.pieces)])
+        half = [
+            _cubics(*_powers(piece.terms, np.linspace(begin, piece.below, _CELLS + 1)), piece.below - begin)
+            for begin, piece in self._spans()
+        ]
+        mirror = [cubics[::-1] @ _BACKWARDS for cubics in half[::-1]]
+        return CurveTable.of(np.concatenate([-edges[:0:-1], edges]), np.array([*mirror, *half]))
+
+    def _spans(self) -> list[tuple[float, PowerPiece]]:
+        """Where each piece begins, and the piece."""
+        begins = [0.0, *(piece.below for piece in self.pieces[:-1])]
+        return list(zip(begins, self.pieces, strict=True))
+
+
+@dataclass(frozen=True)
+class TabulatedCurve:
+    """A curve measured at angles, joined without overshoot; it need not be symmetric.
+
+    Attributes:
+        angles: (K,) ascending, within [-pi, pi] [rad]; beyond its ends the curve stays as it is there.
+        values: (K,) at these angles, not negative [1].
+
+    Raises:
+        IrPlatformError: Sizes do not fit, angles do not ascend, or values are not finite and positive.
+    """
+
+    angles: tuple[float, ...]
+    values: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.angles) < 2 or len(self.angles) != len(self.values):
+            raise IrPlatformError(
+                f"table has {len(self.angles)} angles and {len(self.values)} values but must have as many of"
+                " both, at least two."
+            )
+        ascends = all(a < b for a, b in itertools.pairwise(self.angles))
+        if not ascends or self.angles[0] < -math.pi or self.angles[-1] > math.pi:
+            raise IrPlatformError(f"angles are {list(self.angles)} but must ascend within [-pi, pi] rad.")
+        _check(self.table())
+
+    def table(self) -> CurveTable:
+        """The curve as compiled code reads it."""
+        curve = PchipInterpolator(self.angles, self.values)
+        at = np.linspace(-math.pi, math.pi, _TABLE_CELLS + 1)
+        within = np.clip(at, self.angles[0], self.angles[-1])
+        slopes = np.where(at == within, curve.derivative()(within), 0.0)
+        return CurveTable.of(at[[0, -1]], _cubics(curve(within), slopes, 2.0 * math.pi)[None])
+
+
+AngleCurve = PowerCurve | TabulatedCurve
+
+
+@dataclass(frozen=True)
+class Amplitude:
+    """How bright an aligned pair is at a distance r: scale / (r + offset)^exponent + background.
+
+    Eq. (21) of the Droplet paper has a pole at 3 cm, so it is no model of what is nearer. Closer than
+    `nearest` the curve goes on along its tangent, which keeps it finite and monotonic.
+
+    Raises:
+        IrPlatformError: The pole is not nearer than `nearest`.
+    """
+
+    scale: float = number(1.4, "count m^exponent", 0.0, 1e9, "brightness at a distance of 1 m", above=True)
+    offset: float = number(0.0, "m", -1.0, 1.0, "added to the distance")
+    exponent: float = number(2.0, "1", 0.0, 10.0, "how fast brightness falls", above=True)
+    background: float = number(0.0, "count", -1e6, 1e6, "added to every reading before S and E")
+    nearest: float = number(0.0, "m", 0.0, 1.0, "closest distance of the law, nearer it is linear")
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+        if self.nearest + self.offset <= 0.0:
+            raise IrPlatformError(
+                f"nearest is {self.nearest:g} m but must be beyond the pole at {-self.offset:g} m."
+            )
+
+
+def _powers(terms: tuple[tuple[float, float], ...], size: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Values and slopes of a sum of powers."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = sum((c * size**e for c, e in terms), np.zeros_like(size))
+        slope = sum((c * e * size ** (e - 1.0) for c, e in terms if e != 0.0), np.zeros_like(size))
+    return value, slope
+
+
+_BACKWARDS = np.array(
+    [[1.0, 0.0, 0.0, 0.0], [1.0, -1.0, 0.0, 0.0], [1.0, -2.0, 1.0, 0.0], [1.0, -3.0, 3.0, -1.0]]
+)
+"""A row of coefficients by t times this: the same cubic by 1 - t."""
+
+
+def _cubics(values: FloatArray, slopes: FloatArray, length: float) -> FloatArray:
+    """(cells, 4) cubics through equidistant values with these slopes."""
+    if not (np.isfinite(values).all() and np.isfinite(slopes).all()):
+        raise IrPlatformError("curve is not finite everywhere within [-pi, pi] rad.")
+    width = length / (len(values) - 1)
+    v0, v1, s0, s1 = values[:-1], values[1:], width * slopes[:-1], width * slopes[1:]
+    return np.stack([v0, s0, 3.0 * (v1 - v0) - 2.0 * s0 - s1, 2.0 * (v0 - v1) + s0 + s1], axis=-1)
+
+
+def _check(table: CurveTable) -> None:
+    """Refuse a curve that is negative somewhere or dark everywhere."""
+    values = table.cubics[..., 0]
+    if values.min() < 0.0:
+        raise IrPlatformError(f"curve falls to {values.min():.4g} but must not be negative.")
+    if values.max() <= 0.0:
+        raise IrPlatformError("curve is zero everywhere.")
