@@ -30,7 +30,7 @@ from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.closed_form import ClosedForm
 from swarm_loc_estimator.infrared.gains import Exchanges, estimate_gains
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.solution import IrEstimator, IrSolutions, Outcome
+from swarm_loc_estimator.infrared.solution import IrEstimator, IrOutcome, IrSolutions
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
 
@@ -68,7 +68,7 @@ class Errors:
     @classmethod
     def of(cls, solutions: IrSolutions, poses: FloatArray) -> Errors:
         """Of solutions for true poses (k, 3)."""
-        found = solutions.outcomes == Outcome.FOUND
+        found = solutions.outcomes == IrOutcome.FOUND
         errors = solutions.poses[found] - poses[found]
         errors[:, 1:] = wrap_angle(errors[:, 1:])
         solved = np.linalg.solve(solutions.covariances[found], errors[..., None])[..., 0]

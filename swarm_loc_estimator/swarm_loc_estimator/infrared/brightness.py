@@ -100,9 +100,9 @@ class _Ways(NamedTuple):
 @cached_njit
 def _predict_all(model: IrModel, poses: FloatArray, readings: FloatArray, slopes: FloatArray) -> None:
     """All poses."""
-    room = np.empty((WAY_ROWS, model.angles.size**2))
+    work = np.empty((WAY_ROWS, model.angles.size**2))
     for k in range(poses.shape[0]):
-        predict_brightness(model, poses[k, 0], poses[k, 1], poses[k, 2], room, readings[k], slopes[k])
+        predict_brightness(model, poses[k, 0], poses[k, 1], poses[k, 2], work, readings[k], slopes[k])
 
 
 @norefcount_njit
@@ -111,15 +111,15 @@ def predict_brightness(
     distance: float,
     bearing: float,
     heading: float,
-    room: FloatArray,
+    work: FloatArray,
     readings: FloatArray,
     slopes: FloatArray,
 ) -> None:
     """Write readings (modes * n * n,) and their slopes (3, modes * n * n) of one pose.
 
-    The room to work in is (WAY_ROWS, n * n).
+    The workspace is (WAY_ROWS, n * n).
     """
-    r = room
+    r = work
     ways = _Ways(
         r[0],
         r[1],

@@ -22,10 +22,10 @@ from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.curves import curve_at, distance_at
-from swarm_loc_estimator.infrared.solution import DARKEST, IrSolutions, Outcome, checked
+from swarm_loc_estimator.infrared.solution import DARKEST, IrOutcome, IrSolutions, checked
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 
-_FOUND, _TOO_WEAK, _UNDETERMINED = int(Outcome.FOUND), int(Outcome.TOO_WEAK), int(Outcome.UNDETERMINED)
+_FOUND, _TOO_WEAK, _UNDETERMINED = int(IrOutcome.FOUND), int(IrOutcome.TOO_WEAK), int(IrOutcome.UNDETERMINED)
 _FAINTEST = 15.0
 """The brightest reading must be brighter than this [sigma]; far robots would seem near for noise alone."""
 _CLEAR = 0.05
@@ -34,7 +34,7 @@ _LEVELS, _SAMPLES = 32, 300
 """Ranges for which errors are tabulated, and poses at each."""
 _FEWEST, _CORE = 30, 0.99
 """So many must have ended near such a range, and this share of them makes the covariance."""
-_LASTING = 0.95
+_SYSTEMATIC = 0.95
 """The share of errors that is the same the next time, by the form or by the gains: nearly all."""
 _SIGMA_STEP = 0.02
 """Errors are tabulated for elements that differ by multiples of this."""
@@ -61,12 +61,12 @@ class ClosedForm:
         values, known, limits = checked(self._platform, readings, gains, saturation)
         solutions = IrSolutions.none(len(values))
         _solve_all(self._platform.model, values, known, limits, solutions.poses, solutions.outcomes)
-        found = np.flatnonzero(solutions.outcomes == Outcome.FOUND)
+        found = np.flatnonzero(solutions.outcomes == IrOutcome.FOUND)
         steps = np.ceil(np.sqrt(0.5 * np.sum(known.sigma[found] ** 2, axis=-1)) / _SIGMA_STEP).astype(int)
         for step in np.unique(steps):
             of_step = found[steps == step]
             solutions.covariances[of_step] = self._covariances(solutions.poses[of_step, 0], int(step))
-        solutions.systematic_share[found] = _LASTING
+        solutions.systematic_share[found] = _SYSTEMATIC
         return solutions
 
     def _covariances(self, ranges: FloatArray, step: int) -> FloatArray:

@@ -40,7 +40,7 @@ class Costs(NamedTuple):
 
 @cached_njit
 def new_costs(readings: int) -> Costs:
-    """Room for so many readings."""
+    """Memory for so many readings."""
     return Costs(np.empty(readings), np.empty(readings), np.empty(readings, np.int64), np.empty(2, np.int64))
 
 
@@ -73,8 +73,8 @@ class Pair(NamedTuple):
     farthest: float
 
 
-class Scratch(NamedTuple):
-    """Room to work in; P unknowns are the log-gains of n sensors and n emitters, if sought, and the pose.
+class CostWorkspace(NamedTuple):
+    """Memory of one search; the P unknowns are the log-gains of n sensors and n emitters, if sought, and a pose.
 
     The pose comes last, so that the last rows of the Hessian's factor are those of the pose alone.
 
@@ -93,7 +93,7 @@ class Scratch(NamedTuple):
         step: (P,).
         tally: (3,) squares of what is left of priors and of the readings that are no outliers, the degrees of
             freedom of these, and squares of what is left of all.
-        lasting: (3, 3) the part of the information on the pose by whose noise it errs the same every time.
+        systematic: (3, 3) the part of the information on the pose by whose noise it errs the same every time.
         of_gains: (3,) the part of the pose's variances that is the unknown gains'.
         root: (3, 3) inverse of the pose's part of the factor, lower triangle.
         first_root: (3, 3) likewise at a minimum.
@@ -112,17 +112,17 @@ class Scratch(NamedTuple):
     factor: FloatArray
     step: FloatArray
     tally: FloatArray
-    lasting: FloatArray
+    systematic: FloatArray
     of_gains: FloatArray
     root: FloatArray
     first_root: FloatArray
 
 
 @cached_njit
-def new_scratch(modes: int, n: int, gains: bool) -> Scratch:
-    """Room for a platform, with or without gains to seek."""
+def new_cost_workspace(modes: int, n: int, gains: bool) -> CostWorkspace:
+    """Memory for a platform, with or without gains to seek."""
     size, readings = 3 + 2 * n if gains else 3, modes * n * n
-    return Scratch(
+    return CostWorkspace(
         np.empty((WAY_ROWS, n * n)),
         np.empty(readings),
         np.empty((3, readings)),
@@ -160,7 +160,7 @@ def with_stray_light(model: IrModel, readings: FloatArray) -> IrModel:
         model.amplitudes,
         model.saturation,
         noise,
-        ReadingErrors(noise, e.relative, e.lasting, e.blocked, e.bright),
+        ReadingErrors(noise, e.relative, e.systematic, e.blocked, e.bright),
         model.stray,
         model.scale,
     )
@@ -170,7 +170,7 @@ def with_stray_light(model: IrModel, readings: FloatArray) -> IrModel:
 def write_costs(errors: ReadingErrors, pair: Pair) -> None:
     """Write `Pair.costs` for readings that err like this."""
     costs, squared, others = pair.costs, 0, 0
-    one_by_one = errors.bright < math.inf or errors.lasting > 0.0
+    one_by_one = errors.bright < math.inf or errors.systematic > 0.0
     for f in range(pair.kinds.size):
         costs.per_sigma[f], costs.most[f] = 0.0, math.inf
         if pair.kinds[f] == MISSING:
@@ -189,12 +189,12 @@ def write_costs(errors: ReadingErrors, pair: Pair) -> None:
 
 @norefcount_njit
 def cost_of(
-    model: IrModel, pair: Pair, at: FloatArray, room: Scratch, gradient: FloatArray, hessian: FloatArray
+    model: IrModel, pair: Pair, at: FloatArray, work: CostWorkspace, gradient: FloatArray, hessian: FloatArray
 ) -> float:
     """The cost at some place; writes its gradient and Hessian there."""
     size, sought = at.size, at.size > 3
-    predict_brightness(model, at[size - 3], at[size - 2], at[size - 1], room.ways, room.expected, room.slopes)
-    _write_factors(pair, at, room.factors)
+    predict_brightness(model, at[size - 3], at[size - 2], at[size - 1], work.ways, work.expected, work.slopes)
+    _write_factors(pair, at, work.factors)
     for p in range(size):
         gradient[p] = 0.0
         for q in range(p + 1):
@@ -202,13 +202,13 @@ def cost_of(
     of_prior = _add_prior(pair, at, gradient, hessian) if sought else 0.0
     cost, costs = of_prior, pair.costs
     cost += _squares(
-        room.expected, room.factors, pair.cut, costs.per_sigma, costs.most, room.pulls, room.weights
+        work.expected, work.factors, pair.cut, costs.per_sigma, costs.most, work.pulls, work.weights
     )
-    room.tally[0], room.tally[1], room.tally[2] = 2.0 * cost, costs.counts[0] - 3.0, 2.0 * (cost - of_prior)
-    cost += _add_others(model.errors, pair, room)
-    _add_by_pose(room.pulls, room.weights, room.slopes[0], room.slopes[1], room.slopes[2], gradient, hessian)
+    work.tally[0], work.tally[1], work.tally[2] = 2.0 * cost, costs.counts[0] - 3.0, 2.0 * (cost - of_prior)
+    cost += _add_others(model.errors, pair, work)
+    _add_by_pose(work.pulls, work.weights, work.slopes[0], work.slopes[1], work.slopes[2], gradient, hessian)
     if sought:
-        _add_by_gains(pair.sensor.size, room, gradient, hessian)
+        _add_by_gains(pair.sensor.size, work, gradient, hessian)
     return cost
 
 
@@ -251,16 +251,16 @@ def _squares(
 
 
 @norefcount_njit
-def _add_others(errors: ReadingErrors, pair: Pair, room: Scratch) -> float:
+def _add_others(errors: ReadingErrors, pair: Pair, work: CostWorkspace) -> float:
     """What other readings cost besides what they were taken for; corrects the derivatives and the tally."""
-    total, tally, costs = 0.0, room.tally, pair.costs
+    total, tally, costs = 0.0, work.tally, pair.costs
     for p in range(3):
         for q in range(3):
-            room.lasting[p, q] = 0.0
+            work.systematic[p, q] = 0.0
     for k in range(costs.counts[1]):
         f = costs.others[k]
-        factor, kind = room.factors[f], pair.kinds[f]
-        expected = factor * room.expected[f]
+        factor, kind = work.factors[f], pair.kinds[f]
+        expected = factor * work.expected[f]
         taken = min(costs.per_sigma[f] * (expected - pair.cut[f]), costs.most[f])
         if costs.per_sigma[f] > 0.0:  # dark, and may be blocked where it is expected to be brighter
             if taken < 0.0:
@@ -268,16 +268,16 @@ def _add_others(errors: ReadingErrors, pair: Pair, room: Scratch) -> float:
             tally[0], tally[1] = tally[0] - taken * taken, tally[1] - 1.0
             if taken < costs.most[f]:
                 continue
-        cost, pull, weight, sure, lasting, square = reading_cost(
+        cost, pull, weight, sure, systematic, square = reading_cost(
             errors, kind, pair.cut[f], pair.stable[f], expected
         )
         total += cost - 0.5 * taken * taken
         tally[2] += square - taken * taken
         if sure:
             tally[0], tally[1] = tally[0] + 2.0 * cost, tally[1] + (1.0 if kind == MEASURED else 0.0)
-        room.pulls[f], room.weights[f] = factor * pull, factor * factor * weight
-        if lasting > 0.0:
-            _add_lasting(lasting * room.weights[f], room.slopes[:, f], room.lasting)
+        work.pulls[f], work.weights[f] = factor * pull, factor * factor * weight
+        if systematic > 0.0:
+            _add_systematic(systematic * work.weights[f], work.slopes[:, f], work.systematic)
     return total
 
 
@@ -306,14 +306,14 @@ def _add_by_pose(
 
 
 @norefcount_njit
-def _add_by_gains(n: int, room: Scratch, gradient: FloatArray, hessian: FloatArray) -> None:
+def _add_by_gains(n: int, work: CostWorkspace, gradient: FloatArray, hessian: FloatArray) -> None:
     """Add the derivatives by log-gains; by its sensor's and its emitter's a reading has the same slope."""
-    expected, pulls, slopes, x = room.expected, room.pulls, room.slopes, gradient.size - 3
+    expected, pulls, slopes, x = work.expected, work.pulls, work.slopes, gradient.size - 3
     for w in range(n * n):
         i, j = w // n, n + w % n
         pull, both, by_r, by_b, by_h = 0.0, 0.0, 0.0, 0.0, 0.0
         for f in range(w, expected.size, n * n):
-            weight = room.weights[f] * expected[f]
+            weight = work.weights[f] * expected[f]
             pull += pulls[f] * expected[f]
             both += weight * expected[f]
             by_r += weight * slopes[0, f]
@@ -348,8 +348,8 @@ def _add_prior(pair: Pair, at: FloatArray, gradient: FloatArray, hessian: FloatA
 
 
 @norefcount_njit
-def _add_lasting(weight: float, slopes: FloatArray, lasting: FloatArray) -> None:
+def _add_systematic(weight: float, slopes: FloatArray, systematic: FloatArray) -> None:
     """Add a reading whose noise has a part that is the same every time."""
     for p in range(3):
         for q in range(3):
-            lasting[p, q] += weight * slopes[p] * slopes[q]
+            systematic[p, q] += weight * slopes[p] * slopes[q]

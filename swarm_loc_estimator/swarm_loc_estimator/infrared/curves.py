@@ -32,7 +32,7 @@ def curves_at(
     Args:
         table: Of the curve.
         angles: Of any size; wrapped when it returns [rad].
-        piece: (k,) room for the pieces of the curve that the angles are in.
+        piece: (k,) workspace for the pieces of the curve that the angles are in.
         values: (k,) written.
         slopes: (k,) written [1/rad].
     """

@@ -20,7 +20,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.infrared.brightness import expected_with_slopes
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.solution import DARKEST, Outcome
+from swarm_loc_estimator.infrared.solution import DARKEST, IrOutcome
 from swarm_loc_estimator.swarm.ir_board import GAIN_RANGE, IrGains, IrPlatform, PairGains
 
 Progress = Callable[[str], None]
@@ -166,7 +166,7 @@ def _poses(
     solutions = estimator.solve(exchanges.readings, pairs, exchanges.saturation)
     known = _known(exchanges)
     sure = (solutions.odds < _MAX_ODDS) & (solutions.misfits < _MAX_MISFIT)
-    found = solutions.outcomes == Outcome.FOUND
+    found = solutions.outcomes == IrOutcome.FOUND
     used = np.asarray(found & (known | sure))
     if not used.any():
         raise GainsError(f"None of {len(used)} exchanges determines a pose.")

@@ -21,14 +21,14 @@ from swarm_loc_estimator.infrared.cost import Pair, with_stray_light, write_cost
 from swarm_loc_estimator.infrared.reading_cost import DARK, MEASURED
 from swarm_loc_estimator.infrared.search import (
     TABLE_STARTS,
-    Room,
+    Workspace,
     classify,
     compress_readings,
-    new_room,
+    new_workspace,
     pose_covariance,
     search,
 )
-from swarm_loc_estimator.infrared.solution import IrSolutions, Outcome, checked, no_solutions
+from swarm_loc_estimator.infrared.solution import IrOutcome, IrSolutions, checked, no_solutions
 from swarm_loc_estimator.infrared.start_table import (
     StartTable,
     add_spread,
@@ -74,7 +74,7 @@ _WORTH_WEIGHING = 8.0
 _NO_MINIMUM = np.full(4, math.inf)
 _EXACT = 1e-4
 """The own sigma of gains of which only the common part is unsure."""
-_FOUND, _TOO_WEAK, _TOO_FEW, _UNDETERMINED, _MISFIT = (int(outcome) for outcome in Outcome)
+_FOUND, _TOO_WEAK, _TOO_FEW, _UNDETERMINED, _MISFIT = (int(outcome) for outcome in IrOutcome)
 
 
 class MaximumLikelihood:
@@ -113,14 +113,14 @@ class Models(NamedTuple):
 
 @cached_njit
 def _solve_all(models: Models, readings: FloatArray, gains: PairGains, saturation: FloatArray) -> IrSolutions:
-    """All pairs, first those of known gains, then the others, each kind with room of its own."""
+    """All pairs, first those of known gains, then the others, each kind with a workspace of its own."""
     out = no_solutions(len(readings))
     for known in (True, False):
         some = [k for k in range(len(readings)) if known == (gains.sigma[k].max() == 0.0)]
         if len(some) > 0:
-            room = new_room(models.table, saturation.shape[1], gains.sensor.shape[1], known)
+            work = new_workspace(models.table, saturation.shape[1], gains.sensor.shape[1], known)
             for k in some:
-                _solve_at(models, readings, gains, saturation, room, out, k)
+                _solve_at(models, readings, gains, saturation, work, out, k)
     return out
 
 
@@ -130,27 +130,27 @@ def _solve_at(
     readings: FloatArray,
     gains: PairGains,
     saturation: FloatArray,
-    room: Room,
+    work: Workspace,
     out: IrSolutions,
     k: int,
 ) -> None:
     """One pair."""
     pair = Pair(
         readings[k],
-        room.cut,
-        room.stable,
-        room.kinds,
-        room.exact,
+        work.cut,
+        work.stable,
+        work.kinds,
+        work.exact,
         gains.sensor[k],
         gains.emitter[k],
-        room.prior,
+        work.prior,
         models.table.ranges[0],
         2.0 * models.table.ranges[-1],
     )
-    _write_prior(gains.sigma[k], pair.sensor.size, room.prior)
+    _write_prior(gains.sigma[k], pair.sensor.size, work.prior)
     exact = with_stray_light(models.exact, pair.readings)
     soft = with_stray_light(models.blurred, pair.readings)
-    out.outcomes[k] = _solve_one(Models(exact, soft, models.table), saturation[k], pair, room, out, k)
+    out.outcomes[k] = _solve_one(Models(exact, soft, models.table), saturation[k], pair, work, out, k)
 
 
 @norefcount_njit
@@ -163,7 +163,7 @@ def _write_prior(sigma: FloatArray, n: int, prior: FloatArray) -> None:
 
 @norefcount_njit
 def _solve_one(
-    models: Models, saturation: FloatArray, pair: Pair, room: Room, out: IrSolutions, k: int
+    models: Models, saturation: FloatArray, pair: Pair, work: Workspace, out: IrSolutions, k: int
 ) -> int:
     """One pair; returns the outcome."""
     measured, saturated, bright = classify(models.exact, saturation, pair)
@@ -174,14 +174,14 @@ def _solve_one(
     if bright < measured + faintest * math.sqrt(2.0 * measured):
         return _TOO_WEAK
     write_costs(models.exact.errors, pair)
-    _find_minima(models, pair, room, measured)
+    _find_minima(models, pair, work, measured)
     if two_sided:
-        _weigh_minima(models.exact, pair, room)
-    best, other = room.minima[0], room.minima[1]
-    covariance, odds = room.covariance, math.exp(best[3] - other[3])
-    determined = pose_covariance(models.exact, pair, room.best, room.full, covariance)
-    misfit = room.full.tally[0] / max(room.full.tally[1], 1.0)
-    if _unexplained(models.exact, pair, room, bright / (measured + saturated)):
+        _weigh_minima(models.exact, pair, work)
+    best, other = work.minima[0], work.minima[1]
+    covariance, odds = work.covariance, math.exp(best[3] - other[3])
+    determined = pose_covariance(models.exact, pair, work.best, work.full, covariance)
+    misfit = work.full.tally[0] / max(work.full.tally[1], 1.0)
+    if _unexplained(models.exact, pair, work, bright / (measured + saturated)):
         return _MISFIT
     if not determined:
         return _UNDETERMINED
@@ -191,12 +191,12 @@ def _solve_one(
             apart = _apart(best, other, p) * _apart(best, other, q) if share > 0.0 else 0.0
             covariance[p, q] = models.exact.scale * max(misfit, 1.0) * covariance[p, q] + share * apart
     if two_sided:
-        if add_spread(models.table, room.start, best, covariance) > _WIDEST_OF_ALL**2:
+        if add_spread(models.table, work.start, best, covariance) > _WIDEST_OF_ALL**2:
             return _UNDETERMINED
     elif max(covariance[1, 1], covariance[2, 2]) > models.exact.scale * _WIDEST * _WIDEST:
         return _UNDETERMINED
     out.misfits[k], out.odds[k] = misfit, odds
-    assign(out.systematic_share[k], room.full.of_gains)
+    assign(out.systematic_share[k], work.full.of_gains)
     assign_matrix(out.covariances[k], covariance)
     for p in range(3):
         out.poses[k, p] = best[p]
@@ -206,29 +206,29 @@ def _solve_one(
 
 
 @norefcount_njit
-def _weigh_minima(model: IrModel, pair: Pair, room: Room) -> None:
+def _weigh_minima(model: IrModel, pair: Pair, work: Workspace) -> None:
     """Judge the two minima by the probability around them, not its density; writes the better one first.
 
     A pose that takes most readings for outliers can fit the few others in a tiny region only.
     """
-    best, other, at = room.minima[0], room.minima[1], room.full.at
+    best, other, at = work.minima[0], work.minima[1], work.full.at
     if not other[3] - best[3] < _WORTH_WEIGHING or not pose_covariance(
-        model, pair, room.best, room.full, room.covariance
+        model, pair, work.best, work.full, work.covariance
     ):
         return
-    best[3] -= _log_volume(room.covariance)
-    cost = search(model, pair, other, _STILL, room.full, _NO_MINIMUM)
-    found = room.found
+    best[3] -= _log_volume(work.covariance)
+    cost = search(model, pair, other, _STILL, work.full, _NO_MINIMUM)
+    found = work.found
     assign(found, at)
-    if not pose_covariance(model, pair, found, room.full, room.covariance):
+    if not pose_covariance(model, pair, found, work.full, work.covariance):
         return
     for p in range(3):
         other[p] = wrap(found[at.size - 3 + p]) if p > 0 else found[at.size - 3]
-    other[3] = cost - _log_volume(room.covariance)
+    other[3] = cost - _log_volume(work.covariance)
     if other[3] < best[3]:
         for p in range(4):
             best[p], other[p] = other[p], best[p]
-        assign(room.best, found)
+        assign(work.best, found)
 
 
 @norefcount_njit
@@ -242,9 +242,9 @@ def _log_volume(covariance: FloatArray) -> float:
 
 
 @norefcount_njit
-def _unexplained(model: IrModel, pair: Pair, room: Room, bright: float) -> bool:
+def _unexplained(model: IrModel, pair: Pair, work: Workspace, bright: float) -> bool:
     """Whether a pose leaves most of what was read, mean square `bright`, unexplained."""
-    tally = room.full.tally
+    tally = work.full.tally
     if model.errors.bright == math.inf:
         misfit = tally[0] / max(tally[1], 1.0)
         return bool(misfit - 1.0 > (1.0 - _EXPLAINED) * max(bright - 1.0, 0.0))
@@ -263,65 +263,65 @@ def _apart(a: FloatArray, b: FloatArray, p: int) -> float:
 
 
 @norefcount_njit
-def _find_minima(models: Models, pair: Pair, room: Room, measured: int) -> None:
+def _find_minima(models: Models, pair: Pair, work: Workspace, measured: int) -> None:
     """Search from all starts that are worth it; writes the best minimum of all and another one."""
-    room.minima[:, 3] = math.inf
+    work.minima[:, 3] = math.inf
     reached = 0
-    for s in range(_list_starts(models, pair, room)):
-        reached = _search_from(models, pair, room, room.starts[s], reached)
-    first, start = room.first, room.starts[0]
-    assign(first, room.starts[1])
+    for s in range(_list_starts(models, pair, work)):
+        reached = _search_from(models, pair, work, work.starts[s], reached)
+    first, start = work.first, work.starts[0]
+    assign(first, work.starts[1])
     for aside in range(_ASIDE.shape[0]):
         of_second = aside < _OF_SECOND
-        if _in_doubt(room, reached, measured) or (of_second and room.full.at.size > 3):  # gains are sought
-            origin = room.minima[0] if of_second else first
+        if _in_doubt(work, reached, measured) or (of_second and work.full.at.size > 3):  # gains are sought
+            origin = work.minima[0] if of_second else first
             for p in range(3):
                 start[p] = origin[p] + _ASIDE[aside, p]
-            reached = _search_from(models, pair, room, start, reached)
-    if _in_doubt(room, reached, measured) and models.exact.errors.blocked < math.inf:
+            reached = _search_from(models, pair, work, start, reached)
+    if _in_doubt(work, reached, measured) and models.exact.errors.blocked < math.inf:
         dark = compress(models.exact, DARK * models.exact.noise)
-        blocked = find_starts(models.table, room.pattern, room.present, dark, room.start, room.starts)
+        blocked = find_starts(models.table, work.pattern, work.present, dark, work.start, work.starts)
         for s in range(min(blocked, TABLE_STARTS)):
-            reached = _search_from(models, pair, room, room.starts[s], reached)
+            reached = _search_from(models, pair, work, work.starts[s], reached)
 
 
 @norefcount_njit
-def _in_doubt(room: Room, reached: int, measured: int) -> bool:
+def _in_doubt(work: Workspace, reached: int, measured: int) -> bool:
     """Whether the best minimum may not be the best of all: reached but once, or it fits badly."""
-    return reached < 2 or 2.0 * room.minima[0, 3] > _SUSPICIOUS * (measured - 3)
+    return reached < 2 or 2.0 * work.minima[0, 3] > _SUSPICIOUS * (measured - 3)
 
 
 @norefcount_njit
-def _search_from(models: Models, pair: Pair, room: Room, start: FloatArray, reached: int) -> int:
+def _search_from(models: Models, pair: Pair, work: Workspace, start: FloatArray, reached: int) -> int:
     """Search from a start, keep where it ends; how often the best minimum was reached, before and now."""
-    at, best = room.full.at, room.minima[0, 3]
-    cost = search(models.exact, pair, start, _STILL, room.full, room.minima[0])
-    if _keep(room.minima, at[at.size - 3 :], cost):
-        assign(room.best, at)
+    at, best = work.full.at, work.minima[0, 3]
+    cost = search(models.exact, pair, start, _STILL, work.full, work.minima[0])
+    if _keep(work.minima, at[at.size - 3 :], cost):
+        assign(work.best, at)
     if abs(cost - best) < _SAME:
         return reached + 1
     return 1 if cost < best else reached
 
 
 @norefcount_njit
-def _list_starts(models: Models, pair: Pair, room: Room) -> int:
+def _list_starts(models: Models, pair: Pair, work: Workspace) -> int:
     """Write poses to begin at; returns how many.
 
     First where the soft model's search ends, then the best of the table, then others that fit there nearly as
     well. More are in `_ASIDE`, and at last those for readings of which some are blocked.
     """
-    compress_readings(models.exact, pair, room.pattern, room.present)
-    starts, found = room.starts, room.starts[1 : 1 + TABLE_STARTS]
+    compress_readings(models.exact, pair, work.pattern, work.present)
+    starts, found = work.starts, work.starts[1 : 1 + TABLE_STARTS]
     outliers = math.inf if models.exact.errors.bright < math.inf else -math.inf
-    count = 1 + find_starts(models.table, room.pattern, room.present, outliers, room.start, found)
-    _search_blurred(models.blurred, pair, room, found[0])
+    count = 1 + find_starts(models.table, work.pattern, work.present, outliers, work.start, found)
+    _search_blurred(models.blurred, pair, work, found[0])
     while starts[count - 1, 3] > _WORSE * starts[1, 3]:
         count -= 1
     return count
 
 
 @norefcount_njit
-def _search_blurred(model: IrModel, pair: Pair, room: Room, start: FloatArray) -> None:
+def _search_blurred(model: IrModel, pair: Pair, work: Workspace, start: FloatArray) -> None:
     """Write where the soft model's search ends as the first start."""
     p = pair
     soft = Pair(
@@ -329,7 +329,7 @@ def _search_blurred(model: IrModel, pair: Pair, room: Room, start: FloatArray) -
         p.cut,
         p.stable,
         p.kinds,
-        room.soft,
+        work.soft,
         p.sensor,
         p.emitter,
         p.prior,
@@ -337,9 +337,9 @@ def _search_blurred(model: IrModel, pair: Pair, room: Room, start: FloatArray) -
         p.farthest,
     )
     write_costs(model.errors, soft)
-    search(model, soft, start, _LOOSE, room.plain, room.minima[0])
+    search(model, soft, start, _LOOSE, work.plain, work.minima[0])
     for c in range(3):
-        room.starts[0, c] = room.plain.at[c]
+        work.starts[0, c] = work.plain.at[c]
 
 
 @norefcount_njit

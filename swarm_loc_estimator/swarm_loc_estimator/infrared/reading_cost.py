@@ -78,7 +78,7 @@ def reading_cost(
     if kind == SATURATED:
         cost, pull, weight = _of_saturated(slope, more)
         return cost, pull, weight, True, 0.0, 0.0
-    lasting = errors.lasting * (1.0 - (errors.noise * slope) ** 2) if errors.lasting > 0.0 else 0.0
+    systematic = errors.systematic * (1.0 - (errors.noise * slope) ** 2) if errors.systematic > 0.0 else 0.0
     limit = math.inf
     if more < 0.0:
         limit = errors.bright
@@ -92,8 +92,8 @@ def reading_cost(
             cost, pull, weight = _of_bright(errors, reading - expected, cost, pull, weight)
         else:
             cost, pull, weight = _of_outlier(cost, pull, weight, limit)
-        return cost, pull, weight, near and two_sided, lasting, square
-    return cost, pull, weight, True, lasting, square
+        return cost, pull, weight, near and two_sided, systematic, square
+    return cost, pull, weight, True, systematic, square
 
 
 @cached_njit

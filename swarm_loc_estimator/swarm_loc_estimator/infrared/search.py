@@ -16,15 +16,22 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit
 from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.common.small_matrix import assign_matrix
-from swarm_loc_estimator.infrared.cost import Costs, Pair, Scratch, cost_of, new_costs, new_scratch
+from swarm_loc_estimator.infrared.cost import (
+    Costs,
+    CostWorkspace,
+    Pair,
+    cost_of,
+    new_cost_workspace,
+    new_costs,
+)
 from swarm_loc_estimator.infrared.reading_cost import MEASURED, MISSING, SATURATED, stabilized
 from swarm_loc_estimator.infrared.solution import DARKEST
 from swarm_loc_estimator.infrared.start_table import (
     Float32Array,
-    StartRoom,
     StartTable,
+    StartWorkspace,
     compress,
-    new_start_room,
+    new_start_workspace,
 )
 from swarm_loc_estimator.swarm.ir_board import IrModel
 
@@ -32,8 +39,8 @@ TABLE_STARTS = 3
 """How many starts are taken of the table at most."""
 
 
-class Room(NamedTuple):
-    """Room to work in.
+class Workspace(NamedTuple):
+    """Memory of one search, reused for all pairs.
 
     Attributes:
         plain: To search the pose only.
@@ -52,9 +59,9 @@ class Room(NamedTuple):
         covariance: (3, 3) of its pose.
     """
 
-    plain: Scratch
-    full: Scratch
-    start: StartRoom
+    plain: CostWorkspace
+    full: CostWorkspace
+    start: StartWorkspace
     starts: FloatArray
     pattern: Float32Array
     present: Float32Array
@@ -72,15 +79,15 @@ class Room(NamedTuple):
 
 
 @cached_njit
-def new_room(table: StartTable, modes: int, n: int, known: bool) -> Room:
-    """Room for one platform, with gains known or not."""
-    plain = new_scratch(modes, n, False)
-    full = plain if known else new_scratch(modes, n, True)
+def new_workspace(table: StartTable, modes: int, n: int, known: bool) -> Workspace:
+    """Memory for one platform, with gains known or not."""
+    plain = new_cost_workspace(modes, n, False)
+    full = plain if known else new_cost_workspace(modes, n, True)
     readings = modes * n * n
-    return Room(
+    return Workspace(
         plain,
         full,
-        new_start_room(table),
+        new_start_workspace(table),
         np.empty((1 + TABLE_STARTS, 4)),
         np.empty(readings, np.float32),
         np.empty(readings, np.float32),
@@ -164,7 +171,7 @@ _AROUND = (
 
 @norefcount_njit
 def search(
-    model: IrModel, pair: Pair, start: FloatArray, still: float, room: Scratch, known: FloatArray
+    model: IrModel, pair: Pair, start: FloatArray, still: float, work: CostWorkspace, known: FloatArray
 ) -> float:
     """Go down from a start (range, bearing, heading, ...) to a minimum; returns its cost.
 
@@ -172,25 +179,25 @@ def search(
     known (4,), range, bearing, heading, and the cost that is returned then; infinite: none is.
 
     The cost is half the weighed sum of squares, of readings and priors, and minus the logarithms of the
-    probabilities of saturated readings. `room.at` has the minimum.
+    probabilities of saturated readings. `work.at` has the minimum.
     """
-    at, size, gradients, hessians = room.at, room.at.size, room.gradients, room.hessians
+    at, size, gradients, hessians = work.at, work.at.size, work.gradients, work.hessians
     for p in range(size - 3):
         at[p] = 0.0
     for p in range(3):
         at[size - 3 + p] = start[p]
     best, damping, growth = 0, _FIRST_DAMPING, 2.0
-    cost = cost_of(model, pair, at, room, gradients[best], hessians[best])
+    cost = cost_of(model, pair, at, work, gradients[best], hessians[best])
     for _ in range(_ROUNDS):
-        promise = _step(pair, room, gradients[best], hessians[best], damping)
+        promise = _step(pair, work, gradients[best], hessians[best], damping)
         if promise < still:
             break
-        now = cost_of(model, pair, room.trial, room, gradients[1 - best], hessians[1 - best])
+        now = cost_of(model, pair, work.trial, work, gradients[1 - best], hessians[1 - best])
         gain = (cost - now) / promise
         if gain > 1e-3:
             best, cost = 1 - best, now
             for p in range(size):
-                at[p] = room.trial[p]
+                at[p] = work.trial[p]
             if known[3] < math.inf and now < known[3] + 1.0 and _beside(known, at):
                 return float(min(now, known[3]))
             damping, growth = damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 2.0
@@ -210,15 +217,17 @@ def _beside(known: FloatArray, at: FloatArray) -> bool:
 
 
 @norefcount_njit
-def _step(pair: Pair, room: Scratch, gradient: FloatArray, hessian: FloatArray, damping: float) -> float:
+def _step(
+    pair: Pair, work: CostWorkspace, gradient: FloatArray, hessian: FloatArray, damping: float
+) -> float:
     """Write the next trial; returns by how much the quadratic model lowers the cost there."""
-    step, size = room.step, room.step.size
-    distance = room.at[size - 3]
+    step, size = work.step, work.step.size
+    distance = work.at[size - 3]
     # where the range is at its limit and would go beyond, it stays
     held = (distance <= pair.nearest and gradient[size - 3] > 0.0) or (
         distance >= pair.farthest and gradient[size - 3] < 0.0
     )
-    while not _factorize(hessian, damping, room.factor, held):
+    while not _factorize(hessian, damping, work.factor, held):
         damping = max(10.0 * damping, _FIRST_DAMPING)
         if damping > _MAX_DAMPING:
             return 0.0
@@ -226,7 +235,7 @@ def _step(pair: Pair, room: Scratch, gradient: FloatArray, hessian: FloatArray, 
         step[p] = -gradient[p]
     if held:
         step[size - 3] = 0.0
-    _solve(room.factor, step)
+    _solve(work.factor, step)
     shorter = 1.0
     for p in (size - 2, size - 1):
         shorter = min(shorter, _LONGEST_TURN / max(abs(step[p]), 1e-12))
@@ -238,8 +247,8 @@ def _step(pair: Pair, room: Scratch, gradient: FloatArray, hessian: FloatArray, 
         bend += 0.5 * hessian[p, p] * step[p] * step[p]
         for q in range(p):
             bend += hessian[p, q] * step[p] * step[q]
-        room.trial[p] = room.at[p] + step[p]
-    room.trial[size - 3] = min(max(room.trial[size - 3], pair.nearest), pair.farthest)
+        work.trial[p] = work.at[p] + step[p]
+    work.trial[size - 3] = min(max(work.trial[size - 3], pair.nearest), pair.farthest)
     return -slope - bend
 
 
@@ -286,82 +295,82 @@ def _solve(factor: FloatArray, vector: FloatArray) -> None:
 
 @norefcount_njit
 def pose_covariance(
-    model: IrModel, pair: Pair, at: FloatArray, room: Scratch, covariance: FloatArray
+    model: IrModel, pair: Pair, at: FloatArray, work: CostWorkspace, covariance: FloatArray
 ) -> bool:
     """Write the pose's covariance (3, 3) at a minimum (P,); whether the readings determine the pose.
 
     It is the mean of the inverse information there and around: beyond a kink of the curves, readings may tell
-    much less of the pose. `room.tally` is that of the minimum, `room.of_gains` there the share of the
+    much less of the pose. `work.tally` is that of the minimum, `work.of_gains` there the share of the
     gains, and of other noise that is the same every time.
     """
-    hessian = room.hessians[0]
-    cost_of(model, pair, at, room, room.gradients[0], hessian)
-    squares, freedom, all_squares = room.tally
-    if not _invert(hessian, room):
+    hessian = work.hessians[0]
+    cost_of(model, pair, at, work, work.gradients[0], hessian)
+    squares, freedom, all_squares = work.tally
+    if not _invert(hessian, work):
         return False
-    _write_share_of_gains(pair, room)
-    _add_square(room.root, covariance, 1.0 / (1.0 + len(_AROUND)), 0.0)
-    root, x = room.first_root, at.size - 3
-    assign_matrix(root, room.root)
+    _write_share_of_gains(pair, work)
+    _add_square(work.root, covariance, 1.0 / (1.0 + len(_AROUND)), 0.0)
+    root, x = work.first_root, at.size - 3
+    assign_matrix(root, work.root)
     for direction in _AROUND:
         for p in range(at.size):
-            room.trial[p] = at[p]
+            work.trial[p] = at[p]
         for p in range(3):
             for q in range(p, 3):
-                room.trial[x + p] += _AWAY * root[q, p] * direction[q]
-        room.trial[x] = max(room.trial[x], pair.nearest)
-        cost_of(model, pair, room.trial, room, room.gradients[0], hessian)
-        if not _invert(hessian, room):
+                work.trial[x + p] += _AWAY * root[q, p] * direction[q]
+        work.trial[x] = max(work.trial[x], pair.nearest)
+        cost_of(model, pair, work.trial, work, work.gradients[0], hessian)
+        if not _invert(hessian, work):
             return False
-        _add_square(room.root, covariance, 1.0 / (1.0 + len(_AROUND)), 1.0)
-    room.tally[0], room.tally[1], room.tally[2] = squares, freedom, all_squares
+        _add_square(work.root, covariance, 1.0 / (1.0 + len(_AROUND)), 1.0)
+    work.tally[0], work.tally[1], work.tally[2] = squares, freedom, all_squares
     return True
 
 
 @norefcount_njit
-def _write_share_of_gains(pair: Pair, room: Scratch) -> None:
+def _write_share_of_gains(pair: Pair, work: CostWorkspace) -> None:
     """Write which share of the pose's variances, by the factor, comes from errors of the gains.
 
     With the inverse Hessian C and the prior weight W of the gains, the pose errs by -C_pose,gains W times
     their errors.
     """
-    x, n, row = room.at.size - 3, pair.sensor.size, room.step
+    x, n, row = work.at.size - 3, pair.sensor.size, work.step
     for p in range(3):
-        room.of_gains[p] = 0.0
+        work.of_gains[p] = 0.0
         if x == 0:
-            room.of_gains[p] = _share_of_lasting(room, p)
+            work.of_gains[p] = _systematic_share(work, p)
             continue
         for q in range(row.size):
             row[q] = 1.0 if q == x + p else 0.0
-        _solve(room.factor, row)
+        _solve(work.factor, row)
         for side in range(2):
             squares, total = 0.0, 0.0
             for q in range(side * n, side * n + n):
                 squares += row[q] * row[q]
                 total += row[q]
             part = pair.prior[side, 0] * (squares - pair.prior[side, 1] * total * total)
-            room.of_gains[p] += part / row[x + p]
+            work.of_gains[p] += part / row[x + p]
 
 
 @norefcount_njit
-def _share_of_lasting(room: Scratch, p: int) -> float:
+def _systematic_share(work: CostWorkspace, p: int) -> float:
     """Which share of a pose's variance, by the factor, comes from noise that is the same every time."""
-    row, part = room.step, 0.0
+    row, part = work.step, 0.0
     for q in range(3):
         row[q] = 1.0 if q == p else 0.0
-    _solve(room.factor, row)
+    _solve(work.factor, row)
     for a in range(3):
         for b in range(3):
-            part += row[a] * room.lasting[a, b] * row[b]
+            part += row[a] * work.systematic[a, b] * row[b]
     return float(part / row[p])
 
 
 @norefcount_njit
-def _invert(information: FloatArray, room: Scratch) -> bool:
+def _invert(information: FloatArray, work: CostWorkspace) -> bool:
     """Write the inverse of the pose's part of the information's factor; whether there is one."""
-    if not _factorize(information, 0.0, room.factor, False):
+    if not _factorize(information, 0.0, work.factor, False):
         return False
-    factor, root, x = room.factor, room.root, information.shape[0] - 3
+    factor, root, x = work.factor, work.root, information.shape[0] - 3
     for p in range(3):
         root[p, p] = 1.0 / factor[x + p, x + p]
     root[1, 0] = -factor[x + 1, x] * root[0, 0] * root[1, 1]

@@ -16,7 +16,7 @@ DARKEST = -6.0
 """What a sensor reads below is no light, and counts as missing [sigma]."""
 
 
-class Outcome(IntEnum):
+class IrOutcome(IntEnum):
     """Whether there is a pose, or the reason why there is none."""
 
     FOUND = 0
@@ -32,7 +32,7 @@ class IrSolutions(NamedTuple):
     Attributes:
         poses: (k, 3).
         covariances: (k, 3, 3).
-        outcomes: (k,) of `Outcome`.
+        outcomes: (k,) of `IrOutcome`.
         alternatives: (k, 3) the second-best pose where it is nearly as likely, else NaN.
         odds: (k,) its likelihood relative to the best one's, in [0, 1].
         systematic_share: (k, 3) share of each variance that is the unknown gains' and the same every time.

@@ -33,7 +33,7 @@ _BESIDE = 1.5
 
 
 @cached_njit
-def add_spread(table: StartTable, room: StartRoom, pose: FloatArray, covariance: FloatArray) -> float:
+def add_spread(table: StartTable, work: StartWorkspace, pose: FloatArray, covariance: FloatArray) -> float:
     """Add to a pose's covariance (3, 3) what other poses that are likely make it uncertain by.
 
     Where robots stand is as likely everywhere in the plane. Ranges are spaced as a geometric series, so each
@@ -41,23 +41,23 @@ def add_spread(table: StartTable, room: StartRoom, pose: FloatArray, covariance:
 
     Args:
         table: Of the platform.
-        room: Whose costs are those of the readings.
+        work: Whose costs are those of the readings.
         pose: (3,) range [m], bearing, heading [rad].
         covariance: Added to.
 
     Returns:
         The larger of the mean squares by which bearing and heading of all poses differ from this one's.
     """
-    size, least = table.angles.size, room.costs.min()
+    size, least = table.angles.size, work.costs.min()
     step = 2.0 * math.pi / size
     near = _BESIDE * math.log(table.ranges[1] / table.ranges[0])
     total, all_b, all_h = 0.0, 0.0, 0.0
     rr, rb, rh, bb, bh, hh = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for d in range(room.costs.shape[0]):
+    for d in range(work.costs.shape[0]):
         b, h = wrap(table.angles[d // size] - pose[1]), wrap(table.angles[d % size] - pose[2])
         beside = max(abs(b), abs(h)) < _BESIDE * step
         for k in range(table.ranges.size):
-            above = room.costs[d, k] - least
+            above = work.costs[d, k] - least
             if above > _NEGLIGIBLE:
                 continue
             weight = table.ranges[k] ** 2 * math.exp(-above)
@@ -118,8 +118,8 @@ class StartTable(NamedTuple):
     totals: Float32Array
 
 
-class StartRoom(NamedTuple):
-    """Room to look for starts in.
+class StartWorkspace(NamedTuple):
+    """Memory for the search for starts.
 
     Attributes:
         misfit: (D * D,).
@@ -135,10 +135,10 @@ class StartRoom(NamedTuple):
 
 
 @cached_njit
-def new_start_room(table: StartTable) -> StartRoom:
-    """Room for one table."""
+def new_start_workspace(table: StartTable) -> StartWorkspace:
+    """Memory for one table."""
     directions, levels = table.totals.shape
-    return StartRoom(
+    return StartWorkspace(
         np.empty(directions, np.float32),
         np.empty(directions, np.int64),
         np.empty(levels, np.float32),
@@ -192,7 +192,7 @@ def find_starts(
     pattern: Float32Array,
     present: Float32Array,
     dark: float,
-    room: StartRoom,
+    work: StartWorkspace,
     starts: FloatArray,
 ) -> int:
     """Write the best poses to begin at, best first, each the best of its neighbours; returns how many.
@@ -203,35 +203,35 @@ def find_starts(
         present: (modes * n * n,) 1 where there is a reading, else 0.
         dark: Readings darker than this, by `compress`, may be blocked ones; how bright they are in all then
             does not tell the range, and all ranges are tried; infinite: any may be blocked or too bright.
-        room: To work in.
+        work: To work in.
         starts: (S, 4) range, bearing, heading, and how badly they fit.
     """
     total, count = np.float32(0.0), np.float32(0.0)
     for f in range(pattern.size):
         total += present[f] * pattern[f]
         count += present[f]
-    for d in range(room.misfit.size):
+    for d in range(work.misfit.size):
         patterns = table.patterns[d]
         if dark == math.inf:
-            level, costs = 0, room.costs[d]
+            level, costs = 0, work.costs[d]
             for k in range(costs.size):
                 costs[k] = _cost_with_outliers(patterns[k], pattern, present)
                 if costs[k] < costs[level]:
                     level = k
-            room.level[d], room.misfit[d] = level, costs[level]
+            work.level[d], work.misfit[d] = level, costs[level]
             continue
         if dark > -math.inf:
-            room.level[d], room.misfit[d] = _best_level(patterns, pattern, present, np.float32(dark))
+            work.level[d], work.misfit[d] = _best_level(patterns, pattern, present, np.float32(dark))
             continue
         if count == pattern.size:
             level = _level(table.totals[d], total)
         else:
-            for k in range(room.totals.size):
-                room.totals[k] = _sum_of_present(patterns[k], present)
-            level = _level(room.totals, total)
-        room.level[d] = level
-        room.misfit[d] = _misfit(patterns[level], pattern, present, np.float32(dark))
-    return _best_minima(table, room, starts)
+            for k in range(work.totals.size):
+                work.totals[k] = _sum_of_present(patterns[k], present)
+            level = _level(work.totals, total)
+        work.level[d] = level
+        work.misfit[d] = _misfit(patterns[level], pattern, present, np.float32(dark))
+    return _best_minima(table, work, starts)
 
 
 @norefcount_njit
@@ -305,9 +305,9 @@ def _cost_with_outliers(
 
 
 @norefcount_njit
-def _best_minima(table: StartTable, room: StartRoom, starts: FloatArray) -> int:
+def _best_minima(table: StartTable, work: StartWorkspace, starts: FloatArray) -> int:
     """The directions that no neighbour betters, the best `starts` of them."""
-    misfit, size, found = room.misfit, table.angles.size, 0
+    misfit, size, found = work.misfit, table.angles.size, 0
     for b in range(size):
         for h in range(size):
             here = misfit[b * size + h]
@@ -321,7 +321,7 @@ def _best_minima(table: StartTable, room: StartRoom, starts: FloatArray) -> int:
                 for c in range(4):
                     starts[place, c] = starts[place - 1, c]
                 place -= 1
-            starts[place, 0] = table.ranges[room.level[b * size + h]]
+            starts[place, 0] = table.ranges[work.level[b * size + h]]
             starts[place, 1], starts[place, 2], starts[place, 3] = table.angles[b], table.angles[h], here
     return found
 

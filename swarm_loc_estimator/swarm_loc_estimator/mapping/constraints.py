@@ -214,7 +214,7 @@ class NormalEquations:
         self._rows.append(rows[both])
         self._columns.append(columns[both])
 
-    def solve(self) -> tuple[FloatArray, Factor]:
+    def solve(self) -> tuple[FloatArray, NormalFactor]:
         """The step (u,), zero where an unknown is not free, and the factor that gives covariances."""
         diagonal = np.arange(self._size)
         values = np.concatenate([*self._values, np.full(self._size, _DAMPING)])
@@ -226,10 +226,10 @@ class NormalEquations:
         )
         step = np.zeros(len(self._free))
         step[self._free] = factor.solve(self._gradient)
-        return step, Factor(factor, self._place)
+        return step, NormalFactor(factor, self._place)
 
 
-class Factor:
+class NormalFactor:
     """The factor of normal equations.
 
     Args:

@@ -27,7 +27,7 @@ from swarm_loc_estimator.mapping.localization import (
 from swarm_loc_estimator.mapping.pose_graph import PoseGraph
 from swarm_loc_estimator.mapping.scans import LightSightings, Readings, turn_ratio
 from swarm_loc_estimator.mapping.settings import MapperSettings
-from swarm_loc_estimator.mapping.stops import MIN_TURN, MotionTracker, Stop
+from swarm_loc_estimator.mapping.stops import MIN_TURN, MotionTracker, ScanStop
 
 START_TURN = 4.5 * math.pi
 """Turn by odometry of a whole first scan: a quarter, slowly, to hold the heading; then two turns [rad]."""
@@ -67,7 +67,7 @@ class _Track:
     prior: FloatArray
     prior_sigma: FloatArray
     motion: MotionTracker = field(default_factory=MotionTracker)
-    stop: Stop | None = None
+    stop: ScanStop | None = None
     node: int | None = None
     is_known: bool = False
     passes: bool = False
@@ -127,7 +127,7 @@ class CooperativeMapper:
             elif run.arrives:
                 self._drive(track, run.readings.odometry[:1])
             if run.arrives:
-                track.stop, track.is_known = Stop(run.readings.odometry[0]), False
+                track.stop, track.is_known = ScanStop(run.readings.odometry[0]), False
             if run.stands and track.stop is not None:
                 track.stop.extend(run.readings)
                 track.last = run.readings.odometry[-1]
@@ -209,7 +209,7 @@ class CooperativeMapper:
         if track.node is not None:
             self.visits.add(self._driven(track, odometry)[:, :2])
 
-    def _look(self, robot: int, track: _Track, stop: Stop) -> None:
+    def _look(self, robot: int, track: _Track, stop: ScanStop) -> None:
         """Take a stop into the graph once the robot has looked around."""
         around = min(2.02 * math.pi / (1.0 - self.graph.slip[robot]), SCAN_TURN - _TURN_TOLERANCE)
         if not track.is_known:
@@ -241,7 +241,7 @@ class CooperativeMapper:
             track.path = math.dist(stop.arrival[:2], stop.departure[:2])
         track.stop, track.is_known = None, False
 
-    def _note_visit(self, robot: int, track: _Track, stop: Stop) -> None:
+    def _note_visit(self, robot: int, track: _Track, stop: ScanStop) -> None:
         """Note where a robot stood until now, for lights that it saw and others saw of it."""
         if track.node is not None:
             begin_ns, end_ns = int(stop.stamp_ns[stop.begin]), int(stop.stamp_ns[-1])
@@ -257,7 +257,7 @@ class CooperativeMapper:
             self.graph.set_scan(track.node, turn, stop.inverse[stop.begin :])
             self._map = None
 
-    def _enter(self, robot: int, track: _Track, stop: Stop, count: int) -> None:
+    def _enter(self, robot: int, track: _Track, stop: ScanStop, count: int) -> None:
         """Make a node of the first readings of a stop, or several of a first scan, and align them."""
         self.counters["scans"] += 1
         self._map = None
@@ -302,7 +302,7 @@ class CooperativeMapper:
             ]
         )
 
-    def _enter_first(self, robot: int, track: _Track, stop: Stop, count: int) -> None:
+    def _enter_first(self, robot: int, track: _Track, stop: ScanStop, count: int) -> None:
         """Make nodes of the parts of a first scan: what was seen first holds the heading at the start."""
         turn, inverse = stop.turn[:count], stop.inverse[:count]
         furthest = np.maximum.accumulate(np.abs(turn))
@@ -330,7 +330,7 @@ class CooperativeMapper:
         self.graph.starts.update(nodes)
         align_start(self.graph, nodes, track.prior_sigma)
 
-    def _choose_goal(self, robot: int, track: _Track, stop: Stop) -> None:
+    def _choose_goal(self, robot: int, track: _Track, stop: ScanStop) -> None:
         """Decide where a robot goes next."""
         node = track.node
         if node is None:

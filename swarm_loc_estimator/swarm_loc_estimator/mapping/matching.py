@@ -201,7 +201,7 @@ class Lattice(NamedTuple):
     turn_step: float
 
 
-class Found(NamedTuple):
+class BestOffset(NamedTuple):
     """The best offset.
 
     Attributes:
@@ -215,7 +215,7 @@ class Found(NamedTuple):
     other: float
 
 
-def search_offsets(scans: Scans, parts: IntArray, against: IntArray, lattice: Lattice) -> Found:
+def search_offsets(scans: Scans, parts: IntArray, against: IntArray, lattice: Lattice) -> BestOffset:
     """Search the offset that moves stops (p,), as one body around the first of them, to fit others (q,)."""
     scores = np.zeros(_shape(lattice))
     for k in parts:
@@ -229,7 +229,7 @@ def search_offsets(scans: Scans, parts: IntArray, against: IntArray, lattice: La
     apart = np.hypot(cells[:, None] - best[1], cells[None, :] - best[2]) * lattice.step > _APART_M
     other = float(scores[:, apart].max()) if apart.any() else 0.0
     count = len(parts)
-    return Found(offset, float(scores[best]) / count, other / count)
+    return BestOffset(offset, float(scores[best]) / count, other / count)
 
 
 def _shape(lattice: Lattice) -> tuple[int, int, int]:

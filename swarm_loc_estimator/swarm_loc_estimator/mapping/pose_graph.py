@@ -10,7 +10,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.mapping import constraints as model
-from swarm_loc_estimator.mapping.constraints import STOP_UNKNOWNS, Factor, NormalEquations
+from swarm_loc_estimator.mapping.constraints import STOP_UNKNOWNS, NormalEquations, NormalFactor
 from swarm_loc_estimator.mapping.matching import Scans, agreement, match_pairs
 from swarm_loc_estimator.mapping.scans import Beams, Lines, fit_lines, no_beams, no_lines, set_beams
 from swarm_loc_estimator.mapping.settings import MapperSettings
@@ -125,7 +125,7 @@ class PoseGraph:
         self._turned_all = np.zeros(64)
         self._fitted_ratio = np.ones(64)
         self._beams, self._lines = no_beams(64), no_lines(64)
-        self._factor: Factor
+        self._factor: NormalFactor
         self._factored = -1
 
     @property
@@ -254,7 +254,7 @@ class PoseGraph:
         variances = np.maximum(np.diag(cov), 0.0)
         return math.sqrt(max(variances[:2])), math.sqrt(variances[2])
 
-    def _factor_of_all(self) -> Factor:
+    def _factor_of_all(self) -> NormalFactor:
         if self._factored != self.count:
             self.solve(1)
         return self._factor

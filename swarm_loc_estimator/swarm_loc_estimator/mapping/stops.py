@@ -29,7 +29,7 @@ _MAX_SPEED, _MAX_STEP, _MAX_RATE, _MAX_TURN = 3.0, 0.05, 20.0, 0.3
 """Odometry that goes further than such a speed or rate allows has begun anew [m/s], [m], [rad/s], [rad]."""
 
 
-class Stop:
+class ScanStop:
     """Where a robot stands, or stood.
 
     Args:
@@ -83,7 +83,7 @@ class Stop:
         """Turn by odometry at which its node begins [rad]."""
         return float(self.turn[self.begin - 1]) if self.begin else 0.0
 
-    def split(self, around: float) -> Stop | None:
+    def split(self, around: float) -> ScanStop | None:
         """Cut off what came since it became a node as another stop, if it turned by `around` [rad] then."""
         if not self.looked or self.looked == len(self.turn):
             return None
@@ -91,7 +91,7 @@ class Stop:
         if np.abs(self.turn[self.looked :] - before).max() < around:
             return None
         heading = wrap_angle(self.arrival[2] + before)
-        other = Stop(np.array([*self.arrival[:2], heading]))
+        other = ScanStop(np.array([*self.arrival[:2], heading]))
         other.departure, other.sigma = self.departure, self.sigma
         other.turn = self.turn[self.looked :] - before
         other.stamp_ns, other.inverse = self.stamp_ns[self.looked :], self.inverse[self.looked :]
@@ -177,7 +177,7 @@ def _labels(stamp_ns: IntArray, odometry: FloatArray, state: FloatArray, before_
 
 @cached_njit
 def _completed(stamp_ns: IntArray, turn: FloatArray, full: float) -> int:
-    """See `Stop.completed`."""
+    """See `ScanStop.completed`."""
     furthest, rest_turn, rest_ns = 0.0, math.inf, 0
     for k in range(len(turn)):
         furthest = max(furthest, abs(turn[k]))

@@ -20,7 +20,7 @@ from swarm_loc_estimator.filter.gating import gate_threshold
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, Kind, MeasurementArray
 from swarm_loc_estimator.infrared.closed_form import ClosedForm
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.solution import IrEstimator, IrSolutions, Outcome
+from swarm_loc_estimator.infrared.solution import IrEstimator, IrOutcome, IrSolutions
 from swarm_loc_estimator.sensors.exchanges import ExchangeKey, MatrixScreening, Readings
 from swarm_loc_estimator.sensors.messages import NO_MEASUREMENTS, BrightnessRows
 from swarm_loc_estimator.sensors.validation import REJECT_REASONS, reject_reasons
@@ -182,8 +182,8 @@ def _fates(exchanges: Iterable[_Exchange]) -> Counter[str]:
 
 def _reason(outcome: int, readings: FloatArray, saturation: FloatArray) -> str:
     """Why readings (modes, n, n), of saturation (modes,), gave no pose, "" if they did."""
-    if outcome == Outcome.FOUND:
+    if outcome == IrOutcome.FOUND:
         return ""
     if np.all(np.isnan(readings) | (readings >= saturation[:, None, None])):
         return "ir_saturated"
-    return f"ir_{Outcome(outcome).name.lower()}"
+    return f"ir_{IrOutcome(outcome).name.lower()}"

@@ -38,14 +38,14 @@ class ReadingErrors(NamedTuple):
     Attributes:
         noise: Of every reading, one standard deviation [count].
         relative: By how much a reading is off besides, relative to its expectation [1].
-        lasting: The share of this in variance that is the same every time.
+        systematic: The share of this in variance that is the same every time.
         blocked: The scale on which the cost of a reading that may be blocked ends; infinite: none is.
         bright: Likewise of one that may be too bright.
     """
 
     noise: float
     relative: float
-    lasting: float
+    systematic: float
     blocked: float
     bright: float
 

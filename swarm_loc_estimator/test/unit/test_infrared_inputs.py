@@ -12,7 +12,7 @@ from ir_swarm import DROPLET, T0, Light, brightness_rows, calibrated, exchange
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
-from swarm_loc_estimator.infrared.solution import IrSolutions, Outcome
+from swarm_loc_estimator.infrared.solution import IrOutcome, IrSolutions
 from swarm_loc_estimator.sensors import infrared as brightness_sightings
 from swarm_loc_estimator.sensors.infrared import BrightnessConverter
 from swarm_loc_estimator.sensors.messages import BrightnessRows, chosen
@@ -259,7 +259,7 @@ class Ambiguous:
         assert saturation is not None
         k = len(readings)
         solutions = IrSolutions.none(k)
-        solutions.outcomes[:] = Outcome.FOUND
+        solutions.outcomes[:] = IrOutcome.FOUND
         solutions.poses[:] = [0.1, 0.2, 0.3]
         solutions.covariances[:] = np.eye(3)
         solutions.alternatives[0] = [0.11, 2.0, -1.0]

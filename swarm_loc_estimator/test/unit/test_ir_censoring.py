@@ -17,11 +17,11 @@ from bench.droplet.cramer_rao import information
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.closed_form import ClosedForm
-from swarm_loc_estimator.infrared.cost import cost_of, new_scratch
+from swarm_loc_estimator.infrared.cost import cost_of, new_cost_workspace
 from swarm_loc_estimator.infrared.gains import Exchanges, estimate_gains
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.reading_cost import SATURATED
-from swarm_loc_estimator.infrared.solution import IrEstimator, Outcome, ReadingsError
+from swarm_loc_estimator.infrared.solution import IrEstimator, IrOutcome, ReadingsError
 from swarm_loc_estimator.swarm.ir_board import PairGains
 
 LIMIT = 240.0
@@ -61,12 +61,12 @@ def test_the_cost_is_that_of_the_likelihood_with_tails_integrated(seed: int) -> 
     """Also where saturated readings are expected below the limit."""
     pose = random_poses(1, seed, low=0.1, high=0.13)
     readings = cut_readings(pose, seed)[0]
-    pair, room = pair_of(NEVER_BLOCKED.model, readings, LIMIT), new_scratch(2, 6, False)
+    pair, work = pair_of(NEVER_BLOCKED.model, readings, LIMIT), new_cost_workspace(2, 6, False)
     assert (pair.kinds == SATURATED).any()
     rng = np.random.default_rng(seed)
     for scale in (0.0, 0.003, 0.01, 0.03):
         at = pose[0] + scale * np.array([0.1, 1.0, 1.0]) * rng.standard_normal(3)
-        cost = cost_of(NEVER_BLOCKED.model, pair, at, room, room.gradients[0], room.hessians[0])
+        cost = cost_of(NEVER_BLOCKED.model, pair, at, work, work.gradients[0], work.hessians[0])
         assert cost == pytest.approx(surprise(at, readings), rel=1e-6, abs=1e-4)
 
 
@@ -91,7 +91,7 @@ def test_errors_are_those_of_the_bound_and_honest(centimetres: int) -> None:
     poses = random_poses(1500, centimetres, low=0.01 * centimetres, high=0.01 * centimetres)
     readings = cut_readings(poses, centimetres)
     solutions = ALIKE.solve(readings, None, limits(readings))
-    assert np.all(solutions.outcomes == Outcome.FOUND)
+    assert np.all(solutions.outcomes == IrOutcome.FOUND)
     errors = pose_errors(solutions.poses, poses)
     ends_there = replace(droplet(), saturation=LIMIT)
     bound = np.mean(np.diagonal(np.linalg.inv(information(ends_there, poses)), axis1=1, axis2=2), axis=0)
@@ -109,8 +109,8 @@ def test_that_a_reading_is_saturated_tells_something() -> None:
     readings = cut_readings(poses, 31)
     censored = ALIKE.solve(readings, None, limits(readings))
     dropped = ALIKE.solve(np.where(readings >= LIMIT, np.nan, readings))
-    assert np.all(censored.outcomes == Outcome.FOUND)
-    found = dropped.outcomes == Outcome.FOUND
+    assert np.all(censored.outcomes == IrOutcome.FOUND)
+    found = dropped.outcomes == IrOutcome.FOUND
     for axis in range(3):
         variances = [solutions.covariances[found, axis, axis] for solutions in (censored, dropped)]
         assert np.mean(variances[0]) < 0.95 * np.mean(variances[1])
@@ -138,7 +138,7 @@ def test_the_closed_form_takes_the_power_that_does_not_saturate() -> None:
     near_only = readings.copy()
     near_only[:, 0] = np.nan
     told, near = estimator.solve(readings, None, limits(readings)), estimator.solve(near_only)
-    dazzled = (near.outcomes == Outcome.FOUND) & (readings[:, 0] >= LIMIT).any(axis=(1, 2))
+    dazzled = (near.outcomes == IrOutcome.FOUND) & (readings[:, 0] >= LIMIT).any(axis=(1, 2))
     assert np.mean(dazzled) > 0.8
     np.testing.assert_array_equal(told.poses[dazzled], near.poses[dazzled])
     ignorant = estimator.solve(np.minimum(readings, 254.0))
@@ -170,7 +170,7 @@ def test_a_limit_far_below_the_platforms_is_as_good_as_a_platform_that_ends_ther
     readings = np.minimum(readings_of(droplet(), poses, 35), 120.0)
     told = ALIKE.solve(readings, None, limits(readings, 120.0))
     made_so = MaximumLikelihood(replace(droplet(), saturation=120.0)).solve(readings)
-    assert np.mean(told.outcomes == Outcome.FOUND) > 0.99
+    assert np.mean(told.outcomes == IrOutcome.FOUND) > 0.99
     sigmas = np.sqrt(np.diagonal(made_so.covariances, axis1=1, axis2=2))
     apart = np.abs(pose_errors(told.poses, made_so.poses)) / sigmas
     assert np.mean(apart.max(axis=1) < 0.1) > 0.98

@@ -8,7 +8,7 @@ from ir_world import ANGLES, RHO, droplet, emitter_20, random_poses, readings_of
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.closed_form import ClosedForm
-from swarm_loc_estimator.infrared.solution import IrEstimator, Outcome
+from swarm_loc_estimator.infrared.solution import IrEstimator, IrOutcome
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.ir_board import IrGains, PairGains
 
@@ -150,7 +150,7 @@ def test_any_number_of_elements_will_do() -> None:
     platform = load_ir_platform("epuck_twelve")
     poses = random_poses(300, 10, low=0.15, high=0.5)
     solutions = ClosedForm(platform).solve(readings_of(platform, poses, 10))
-    assert np.all(solutions.outcomes == Outcome.FOUND)
+    assert np.all(solutions.outcomes == IrOutcome.FOUND)
     assert np.all(mean_errors(solutions.poses, poses) < [2.0, 5.0, 6.0])
 
 
@@ -159,11 +159,11 @@ def test_what_holds_no_pose_gives_none() -> None:
     dark, blinding = np.zeros((1, 2, 6, 6)), np.full((1, 2, 6, 6), 255.0)
     missing, negative = np.full((1, 2, 6, 6), np.nan), np.full((1, 2, 6, 6), -200.0)
     solutions = ClosedForm(platform).solve(np.concatenate([dark, blinding, missing, negative]))
-    assert [Outcome(outcome) for outcome in solutions.outcomes] == [
-        Outcome.TOO_WEAK,
-        Outcome.UNDETERMINED,
-        Outcome.TOO_WEAK,
-        Outcome.TOO_WEAK,
+    assert [IrOutcome(outcome) for outcome in solutions.outcomes] == [
+        IrOutcome.TOO_WEAK,
+        IrOutcome.UNDETERMINED,
+        IrOutcome.TOO_WEAK,
+        IrOutcome.TOO_WEAK,
     ]
     assert np.isnan(solutions.poses).all()
     assert np.isnan(solutions.covariances).all()

@@ -11,7 +11,7 @@ from ir_world import droplet, pair_of, random_poses, readings_of
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_with_slopes
-from swarm_loc_estimator.infrared.cost import Pair, Scratch, cost_of, new_scratch
+from swarm_loc_estimator.infrared.cost import CostWorkspace, Pair, cost_of, new_cost_workspace
 from swarm_loc_estimator.infrared.reading_cost import MEASURED, MISSING, SATURATED, reading_cost
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.ir_board import IrModel
@@ -20,7 +20,7 @@ PLATFORMS = {
     "blocked": droplet(),
     "never blocked": replace(droplet(), blocked_share=0.0),
     "relative": replace(droplet(), relative_noise=0.1),
-    "lasting": replace(droplet(), relative_noise=0.05, curve_sigma=0.1),
+    "systematic": replace(droplet(), relative_noise=0.05, curve_sigma=0.1),
     "bright": load_ir_platform("droplet_2016"),
 }
 
@@ -28,9 +28,9 @@ PLATFORMS = {
 def one_by_one(
     model: IrModel, pair: Pair, bright: FloatArray, slopes: FloatArray
 ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Cost, gradient (3,), Hessian (3, 3), tally (3,) and lasting information (3, 3), reading by reading."""
+    """Cost, gradient (3,), Hessian (3, 3), tally (3,), systematic information (3, 3), by reading."""
     total, gradient, tally = 0.0, np.zeros(3), np.array([0.0, -3.0, 0.0])
-    hessian, lasting = np.zeros((2, 3, 3))
+    hessian, systematic = np.zeros((2, 3, 3))
     for f in np.flatnonzero(pair.kinds != MISSING):
         cost, pull, weight, sure, share, square = reading_cost(
             model.errors, pair.kinds[f], pair.cut[f], pair.stable[f], bright[f]
@@ -39,15 +39,15 @@ def one_by_one(
         total += cost
         gradient += pull * slopes[f]
         hessian += weight * both
-        lasting += share * weight * both
+        systematic += share * weight * both
         tally += [2.0 * cost * sure, sure and pair.kinds[f] == MEASURED, square]
-    return total, gradient, hessian, tally, lasting
+    return total, gradient, hessian, tally, systematic
 
 
-def costs_at(model: IrModel, pair: Pair, pose: FloatArray) -> tuple[float, Scratch]:
+def costs_at(model: IrModel, pair: Pair, pose: FloatArray) -> tuple[float, CostWorkspace]:
     """By `cost_of`."""
-    room = new_scratch(model.amplitudes.shape[0], model.angles.size, False)
-    return cost_of(model, pair, pose, room, room.gradients[0], room.hessians[0]), room
+    work = new_cost_workspace(model.amplitudes.shape[0], model.angles.size, False)
+    return cost_of(model, pair, pose, work, work.gradients[0], work.hessians[0]), work
 
 
 @pytest.mark.parametrize("name", PLATFORMS)
@@ -68,9 +68,9 @@ def test_the_cost_is_the_sum_over_readings(name: str, away: float) -> None:
         wanted = one_by_one(
             model, pair, (factor * bright[0]).ravel(), (factor[..., None] * slopes[0]).reshape(-1, 3)
         )
-        cost, room = costs_at(model, pair, at)
-        hessian = np.tril(room.hessians[0]) + np.tril(room.hessians[0], -1).T
-        found = (cost, room.gradients[0], hessian, room.tally, room.lasting)
+        cost, work = costs_at(model, pair, at)
+        hessian = np.tril(work.hessians[0]) + np.tril(work.hessians[0], -1).T
+        found = (cost, work.gradients[0], hessian, work.tally, work.systematic)
         for one, other in zip(map(np.asarray, found), map(np.asarray, wanted), strict=True):
             np.testing.assert_allclose(one, other, atol=1e-9 * max(float(np.abs(other).max()), 1.0))
 

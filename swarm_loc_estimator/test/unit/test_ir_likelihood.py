@@ -26,9 +26,9 @@ from ir_world import (
 from bench.droplet.cramer_rao import information
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.infrared.cost import Pair, cost_of, new_scratch
+from swarm_loc_estimator.infrared.cost import Pair, cost_of, new_cost_workspace
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.solution import IrEstimator, Outcome, ReadingsError
+from swarm_loc_estimator.infrared.solution import IrEstimator, IrOutcome, ReadingsError
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains
 from swarm_loc_estimator.swarm.ir_curves import TabulatedCurve
@@ -42,7 +42,7 @@ def test_errors_are_those_of_the_cramer_rao_bound_and_the_covariance_says_so(cen
     """Also at 12 to 15 cm, where one start from the closed form ends in wrong minima."""
     poses = random_poses(1500, centimetres, low=0.01 * centimetres, high=0.01 * centimetres)
     solutions = ALIKE.solve(readings_of(droplet(), poses, centimetres))
-    assert np.all(solutions.outcomes == Outcome.FOUND)
+    assert np.all(solutions.outcomes == IrOutcome.FOUND)
     errors = pose_errors(solutions.poses, poses)
     bound = np.mean(np.diagonal(np.linalg.inv(information(droplet(), poses)), axis1=1, axis2=2), axis=0)
     assert np.all(np.sqrt(np.mean(errors**2, axis=0) / bound) < 1.1)
@@ -62,7 +62,7 @@ def test_elements_that_differ_by_an_unknown_amount_are_in_the_covariance(centime
     errors = pose_errors(honest.poses, poses)
     assert 2.0 < np.mean(nees(errors, honest.covariances)) < 5.0
     assert np.mean(np.abs(errors[:, 0])) < np.mean(np.abs(honest.poses[:, 0] * 0.05)) + 0.002
-    found = naive.outcomes == Outcome.FOUND
+    found = naive.outcomes == IrOutcome.FOUND
     over_sure = nees(pose_errors(naive.poses, poses)[found], naive.covariances[found])
     assert np.mean(over_sure) > 30.0  # the test above is one
 
@@ -95,7 +95,7 @@ def test_readings_that_are_missing_are_left_out() -> None:
     readings = readings_of(droplet(), poses, 3)
     readings[np.random.default_rng(3).random(readings.shape) < 0.3] = np.nan
     solutions = ALIKE.solve(readings)
-    found = solutions.outcomes == Outcome.FOUND
+    found = solutions.outcomes == IrOutcome.FOUND
     assert np.mean(found) > 0.97  # of some, all that was bright is missing
     assert 2.5 < np.mean(nees(pose_errors(solutions.poses, poses), solutions.covariances)[found]) < 5.0
 
@@ -107,7 +107,7 @@ def test_one_power_alone_will_do(left_out: int) -> None:
     readings = readings_of(droplet(), poses, 4)
     readings[:, left_out] = np.nan
     solutions = ALIKE.solve(readings)
-    found = solutions.outcomes == Outcome.FOUND
+    found = solutions.outcomes == IrOutcome.FOUND
     assert np.mean(found) > 0.97
     errors = pose_errors(solutions.poses, poses)[found]
     assert np.mean(np.abs(errors[:, 0])) < 0.003
@@ -120,7 +120,7 @@ def test_saturated_readings_count_as_at_least_that() -> None:
     readings = readings_of(platform, poses, 6)
     right = ALIKE.solve(readings)
     at_their_word = MaximumLikelihood(replace(platform, saturation=256.0)).solve(readings)
-    found = at_their_word.outcomes == Outcome.FOUND
+    found = at_their_word.outcomes == IrOutcome.FOUND
     assert np.mean(np.abs(right.poses[:, 0] - 0.1)) < 0.001
     assert not found.any() or np.mean(np.abs(at_their_word.poses[found, 0] - 0.1)) > 0.01
 
@@ -146,7 +146,7 @@ def test_the_share_that_lasts_is_what_exchanges_with_other_noise_have_in_common(
     poses = random_poses(4000, 18, low=0.12, high=0.24)
     gains = differing_gains(len(poses), 6, 0.1, 18)
     once, again = (DIFFERING.solve(readings_of(droplet(), poses, seed, gains)) for seed in (18, 19))
-    found = (once.outcomes == Outcome.FOUND) & (again.outcomes == Outcome.FOUND)
+    found = (once.outcomes == IrOutcome.FOUND) & (again.outcomes == IrOutcome.FOUND)
     one, other = (pose_errors(s.poses, poses)[found] for s in (once, again))
     variances = np.diagonal(once.covariances[found], axis1=1, axis2=2)
     core = (np.abs(one) < 4.0 * np.sqrt(variances)).all(axis=1) & (other**2 < 16.0 * variances).all(axis=1)
@@ -156,7 +156,7 @@ def test_the_share_that_lasts_is_what_exchanges_with_other_noise_have_in_common(
     assert (once.systematic_share[found] > 0.0).all()
     assert (once.systematic_share[found] <= 1.0).all()
     exact = MaximumLikelihood(droplet()).solve(readings_of(droplet(), poses[:50], 18))
-    assert (exact.systematic_share[exact.outcomes == Outcome.FOUND] == 0.0).all()
+    assert (exact.systematic_share[exact.outcomes == IrOutcome.FOUND] == 0.0).all()
 
 
 def with_a_robot_between(poses: FloatArray, seed: int) -> tuple[FloatArray, FloatArray]:
@@ -188,7 +188,7 @@ def test_a_robot_between_that_blocks_some_of_the_light_does_not_mislead() -> Non
         mean = []
         for estimator in (DIFFERING, unaware):
             solutions = estimator.solve(readings[some])
-            found = solutions.outcomes == Outcome.FOUND
+            found = solutions.outcomes == IrOutcome.FOUND
             errors = pose_errors(solutions.poses, poses[some])[found]
             mean.append(np.mean(nees(errors, solutions.covariances[found])))
         assert mean[0] < limit
@@ -227,7 +227,7 @@ def test_any_number_of_elements_at_any_angles_will_do(name: str) -> None:
     platform = platforms[name]
     poses = random_poses(500, 10, low=0.12, high=0.25)
     solutions = MaximumLikelihood(platform).solve(readings_of(platform, poses, 10))
-    found = solutions.outcomes == Outcome.FOUND
+    found = solutions.outcomes == IrOutcome.FOUND
     assert np.mean(found) > 0.95
     errors = pose_errors(solutions.poses, poses)[found]
     assert np.median(np.abs(errors[:, 0])) < 0.005
@@ -256,9 +256,9 @@ def test_pairs_do_not_depend_on_each_other() -> None:
 
 def cost_at(pair: Pair, at: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     """Cost, gradient and Hessian."""
-    room = new_scratch(2, 6, at.size > 3)
-    gradient, hessian = room.gradients[0], room.hessians[0]
-    cost = cost_of(droplet().model, pair, at, room, gradient, hessian)
+    work = new_cost_workspace(2, 6, at.size > 3)
+    gradient, hessian = work.gradients[0], work.hessians[0]
+    cost = cost_of(droplet().model, pair, at, work, gradient, hessian)
     return cost, gradient.copy(), np.tril(hessian) + np.tril(hessian, -1).T
 
 
@@ -295,15 +295,15 @@ def test_what_holds_no_pose_gives_none_and_says_why() -> None:
     one_sensor[0, 0, 0] = mostly_missing[0, 0, 0]
     nonsense = np.random.default_rng(12).uniform(0.0, 250.0, (1, 2, 6, 6))
     cases = {
-        Outcome.TOO_WEAK: [bad(0.0), np.random.default_rng(13).standard_normal((1, 2, 6, 6))],
-        Outcome.TOO_FEW: [bad(np.nan), bad(-200.0), bad(-np.inf), one_sensor],
-        Outcome.UNDETERMINED: [bad(255.0), bad(1e9)],
-        Outcome.MISFIT: [nonsense],
+        IrOutcome.TOO_WEAK: [bad(0.0), np.random.default_rng(13).standard_normal((1, 2, 6, 6))],
+        IrOutcome.TOO_FEW: [bad(np.nan), bad(-200.0), bad(-np.inf), one_sensor],
+        IrOutcome.UNDETERMINED: [bad(255.0), bad(1e9)],
+        IrOutcome.MISFIT: [nonsense],
     }
     for outcome, matrices in cases.items():
         for estimator in (ALIKE, DIFFERING):
             solutions = estimator.solve(np.concatenate(matrices))
-            assert [Outcome(one) for one in solutions.outcomes] == [outcome] * len(matrices)
+            assert [IrOutcome(one) for one in solutions.outcomes] == [outcome] * len(matrices)
             assert np.isnan(solutions.poses).all()
             assert np.isnan(solutions.covariances).all()
 
@@ -326,7 +326,7 @@ ANY_READING = st.one_of(
 def test_no_readings_whatsoever_give_a_pose_that_is_not_finite(readings: FloatArray, known: bool) -> None:
     estimator: IrEstimator = ALIKE if known else DIFFERING
     solutions = estimator.solve(readings)
-    if solutions.outcomes[0] == Outcome.FOUND:
+    if solutions.outcomes[0] == IrOutcome.FOUND:
         assert np.isfinite(solutions.poses).all()
         assert 0.04 < solutions.poses[0, 0] < 2.0
         np.testing.assert_array_equal(solutions.poses[0, 1:], wrapped(solutions.poses[0, 1:]))

@@ -7,10 +7,10 @@ import pytest
 from ir_world import nees, pair_of, pose_errors, random_poses, readings_of
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.cost import cost_of, new_scratch
+from swarm_loc_estimator.infrared.cost import cost_of, new_cost_workspace
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.solution import Outcome
-from swarm_loc_estimator.infrared.start_table import add_spread, new_start_room
+from swarm_loc_estimator.infrared.solution import IrOutcome
+from swarm_loc_estimator.infrared.start_table import add_spread, new_start_workspace
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 
 BOARD = load_ir_platform("droplet_2016")
@@ -34,7 +34,7 @@ def with_faults(poses: FloatArray, seed: int) -> FloatArray:
 def test_dark_emitters_and_light_from_elsewhere_do_not_mislead(seed: int) -> None:
     poses = random_poses(600, seed, low=0.06, high=0.18)
     solutions = ESTIMATOR.solve(with_faults(poses, seed))
-    found = solutions.outcomes == Outcome.FOUND
+    found = solutions.outcomes == IrOutcome.FOUND
     assert np.mean(found) > 0.85
     errors = pose_errors(solutions.poses[found], poses[found])
     assert np.mean(nees(errors, solutions.covariances[found]) > _CHI_SQUARE_99) < 0.03
@@ -43,11 +43,11 @@ def test_dark_emitters_and_light_from_elsewhere_do_not_mislead(seed: int) -> Non
 
 def test_covariances_say_of_the_same_direction_at_another_range() -> None:
     table = ESTIMATOR._models.table
-    room = new_start_room(table)
-    room.costs[:] = 100.0
-    room.costs[3 * table.angles.size + 5, [2, 10]] = 0.0
+    work = new_start_workspace(table)
+    work.costs[:] = 100.0
+    work.costs[3 * table.angles.size + 5, [2, 10]] = 0.0
     pose, covariance = np.array([table.ranges[10], table.angles[3], table.angles[5]]), np.zeros((3, 3))
-    add_spread(table, room, pose, covariance)
+    add_spread(table, work, pose, covariance)
     near, far = table.ranges[2], table.ranges[10]
     weight = near**2 / (near**2 + far**2)
     assert covariance[0, 0] == pytest.approx(weight * (far - near) ** 2, rel=1e-5)
@@ -57,14 +57,14 @@ def test_covariances_say_of_the_same_direction_at_another_range() -> None:
 def test_noise_alone_is_no_robot() -> None:
     noise = BOARD.noise * np.random.default_rng(4).standard_normal((500, 1, 6, 6))
     outcomes = ESTIMATOR.solve(noise).outcomes
-    assert np.mean(outcomes == Outcome.FOUND) < 0.01
+    assert np.mean(outcomes == IrOutcome.FOUND) < 0.01
 
 
 def test_covariances_say_of_other_poses_that_are_likely() -> None:
     """Faint robots, of which bearing or heading is often another one."""
     poses = random_poses(600, 5, low=0.2, high=0.3)
     solutions = ESTIMATOR.solve(with_faults(poses, 5))
-    found = solutions.outcomes == Outcome.FOUND
+    found = solutions.outcomes == IrOutcome.FOUND
     errors = pose_errors(solutions.poses[found], poses[found])
     assert np.mean(nees(errors, solutions.covariances[found]) > _CHI_SQUARE_99) < 0.05
 
@@ -74,11 +74,11 @@ def test_the_costs_gradient_is_its_slope_also_of_outliers(seed: int) -> None:
     pose = random_poses(1, seed, low=0.08, high=0.16)
     readings = np.roll(with_faults(pose, seed)[0], 1, axis=1)  # most are outliers now
     model = BOARD.model
-    pair, room = pair_of(model, readings, 1e9), new_scratch(1, 6, False)
+    pair, work = pair_of(model, readings, 1e9), new_cost_workspace(1, 6, False)
 
     def cost_at(at: FloatArray) -> tuple[float, FloatArray]:
-        cost = cost_of(model, pair, at, room, room.gradients[0], room.hessians[0])
-        return cost, room.gradients[0].copy()
+        cost = cost_of(model, pair, at, work, work.gradients[0], work.hessians[0])
+        return cost, work.gradients[0].copy()
 
     _, gradient = cost_at(pose[0])
     for p in range(3):

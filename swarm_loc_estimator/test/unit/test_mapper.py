@@ -15,7 +15,7 @@ from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, CooperativeMapper
 from swarm_loc_estimator.mapping.scans import LightSightings, Readings
 from swarm_loc_estimator.mapping.settings import MapperSettings
-from swarm_loc_estimator.mapping.stops import MotionTracker, Stop
+from swarm_loc_estimator.mapping.stops import MotionTracker, ScanStop
 
 START = (1.0, 1.0, 0.3)
 KNOWN = np.full(3, 1e-3)
@@ -215,7 +215,7 @@ def test_stops_are_told_from_drives() -> None:
 
 
 def test_a_rest_ends_a_look_around() -> None:
-    stop = Stop(np.zeros(3))
+    stop = ScanStop(np.zeros(3))
     count = 120
     odometry = np.zeros((count, 3))
     odometry[:, 2] = np.minimum(0.02 * np.arange(count), 0.8)
@@ -226,7 +226,7 @@ def test_a_rest_ends_a_look_around() -> None:
 
 
 def test_a_stop_without_end_is_bounded() -> None:
-    stop = Stop(np.zeros(3))
+    stop = ScanStop(np.zeros(3))
     for k in range(20):
         stop.extend(Readings(np.arange(1000) + 1000 * k, np.zeros((1000, 3)), np.ones(1000), 0.016))
     assert len(stop.turn) <= 4096

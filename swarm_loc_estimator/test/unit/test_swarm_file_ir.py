@@ -13,7 +13,7 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
-PACKAGED_DROPLET = Path(ir_platform_file.__file__).parents[2] / "config" / "ir" / "droplet.yaml"
+PACKAGED_DROPLET = Path(ir_platform_file.__file__).parents[1] / "config" / "ir" / "droplet.yaml"
 IR = """\
 fileversion: 1
 types:

@@ -14,7 +14,7 @@ from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.gains import Exchanges
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.solution import Outcome
+from swarm_loc_estimator.infrared.solution import IrOutcome
 from swarm_loc_estimator.offline.calibration.infrared.board_fit import (
     BoardModel,
     BoardReadings,
@@ -268,7 +268,7 @@ def errors_of(model: BoardModel, data: BoardReadings, *, known: bool = True) -> 
     )
     yaw = model.truth_yaw
     truth = turned(data.poses, yaw[data.receiver], yaw[data.transmitter])
-    found = solutions.outcomes == Outcome.FOUND
+    found = solutions.outcomes == IrOutcome.FOUND
     errors = solutions.poses[found] - truth[found]
     errors[:, 1:] = wrap_angle(errors[:, 1:])
     solved = np.linalg.solve(solutions.covariances[found], errors[..., None])[..., 0]
