@@ -74,7 +74,7 @@ class Pair(NamedTuple):
 
 
 class CostWorkspace(NamedTuple):
-    """Memory of one search; the P unknowns are the log-gains of n sensors and n emitters, if sought, and a pose.
+    """Memory of a search; its P unknowns are the log-gains of sensors and emitters, if sought, and the pose.
 
     The pose comes last, so that the last rows of the Hessian's factor are those of the pose alone.
 
