@@ -96,7 +96,7 @@ def measure(
     joined = BoardReadings(
         *(np.concatenate(columns) for columns in zip(*(one.clear for one in fit), strict=True))
     )
-    near = joined.chosen(joined.poses[:, 0] < MAX_RANGE)
+    near = joined.select(joined.poses[:, 0] < MAX_RANGE)
     said = ProgressLine(f"test on {', '.join(one.name for one in test)}")
     said("fitting")
     done = calibrate_board(load_ir_platform("droplet_2016"), near, robots)
@@ -104,7 +104,7 @@ def measure(
     for one in test:
         data = one.clear
         within = (data.poses[:, 0] > RANGES[0]) & (data.poses[:, 0] < RANGES[1])
-        data = without_dead(done.model.platform, data, robots)[1].chosen(within)
+        data = without_dead(done.model.platform, data, robots)[1].select(within)
         add(done, data, results)
     print()
     return done

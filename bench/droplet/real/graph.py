@@ -143,7 +143,7 @@ def _gains(done: BoardCalibration, place: int) -> IrGains | None:
 
 def can_be_seen(recorded: Recorded, names: list[str]) -> set[str]:
     """Receivers, and who lit its emitters several times near one of them with nobody in between."""
-    near = recorded.clear.chosen(recorded.clear.poses[:, 0] < REACH_M)
+    near = recorded.clear.select(recorded.clear.poses[:, 0] < REACH_M)
     often = np.bincount(near.transmitter, minlength=len(names)) >= MIN_EXCHANGES
     often[near.receiver] = True
     return {names[place] for place in np.flatnonzero(often)}

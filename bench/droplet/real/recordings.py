@@ -57,7 +57,7 @@ def read_folder(folder: Path, names: list[str], work: Path) -> list[Recorded]:
             f" {' '.join(done.remarks)}"
         )
         data = _numbered(board, swarm, names)
-        recordings.append(Recorded(path.stem, bag, swarm, data, data.chosen(board.clear)))
+        recordings.append(Recorded(path.stem, bag, swarm, data, data.select(board.clear)))
     return recordings
 
 

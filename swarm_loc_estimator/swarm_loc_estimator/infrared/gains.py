@@ -65,15 +65,9 @@ class Exchanges(NamedTuple):
     saturation: FloatArray
     poses: FloatArray
 
-    def chosen(self, rows: NDArray[np.bool_]) -> Exchanges:
-        """Those that are marked (k,)."""
-        return Exchanges(
-            self.receiver[rows],
-            self.transmitter[rows],
-            self.readings[rows],
-            self.saturation[rows],
-            self.poses[rows],
-        )
+    def select(self, rows: NDArray[np.bool_]) -> Exchanges:
+        """Those of some rows, which are marked (k,)."""
+        return Exchanges(*(column[rows] for column in self))
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ from ir_world import droplet, random_poses
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.gains import Exchanges
-from swarm_loc_estimator.offline.calibration.infrared.gain_validation import helpful_gains
-from swarm_loc_estimator.offline.calibration.infrared.held_out import (
+from swarm_loc_estimator.offline.calibration.infrared.gain_validation import (
     ALIKE,
     GAINS,
     UNKNOWN,
     held_out_likelihoods,
+    helpful_gains,
 )
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains

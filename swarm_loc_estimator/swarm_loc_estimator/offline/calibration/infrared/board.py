@@ -54,7 +54,7 @@ class BoardRecording:
     @property
     def to_fit(self) -> BoardReadings:
         """Those that a board is fitted to."""
-        return self.data.chosen(self.clear & (self.data.poses[:, 0] < MAX_RANGE))
+        return self.data.select(self.clear & (self.data.poses[:, 0] < MAX_RANGE))
 
 
 def read_board(recording: Recording, swarm: Swarm) -> BoardRecording:
@@ -71,7 +71,7 @@ def read_board(recording: Recording, swarm: Swarm) -> BoardRecording:
             " a board cannot be calibrated without <robot>/ground_truth."
         )
     one = group.exchanges
-    data = BoardReadings(one.receiver, one.transmitter, one.readings[:, 0], one.poses, stamp_ns).chosen(known)
+    data = BoardReadings(one.receiver, one.transmitter, one.readings[:, 0], one.poses, stamp_ns).select(known)
     clear = _clear(recording, swarm, group.robots, data, _BODIES * group.platform.radius)
     return BoardRecording(group.platform, group.robots, data, clear)
 
@@ -308,7 +308,7 @@ def _cross_validated(start: IrPlatform, data: BoardReadings, robots: int) -> dic
     blocks = _blocks(data)
     for block in range(BLOCKS):
         held = blocks == block
-        model, others = fit_board(start, data.chosen(~held), robots), data.chosen(held)
+        model, others = fit_board(start, data.select(~held), robots), data.select(held)
         for stray, by_gains in parts.items():
             strayed = replace(model, platform=replace(model.platform, stray_noise=stray))
             for known, found in by_gains.items():

@@ -64,15 +64,9 @@ class BoardReadings(NamedTuple):
     poses: FloatArray
     stamp_ns: NDArray[np.int64]
 
-    def chosen(self, rows: NDArray[np.bool_]) -> BoardReadings:
-        """Those that are marked (k,)."""
-        return BoardReadings(
-            self.receiver[rows],
-            self.transmitter[rows],
-            self.readings[rows],
-            self.poses[rows],
-            self.stamp_ns[rows],
-        )
+    def select(self, rows: NDArray[np.bool_]) -> BoardReadings:
+        """Those of some rows, which are marked (k,)."""
+        return BoardReadings(*(column[rows] for column in self))
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,7 @@ def find_reading_limits(platform: IrPlatform, robots: int, exchanges: Exchanges)
     for robot in range(robots):
         own = firsts & (exchanges.receiver == robot)
         if own.any():
-            tops, emitters = _tops(exchanges.chosen(own))
+            tops, emitters = _tops(exchanges.select(own))
             saturation[robot] = [_pile(tops[:, i], emitters[:, i], alarm) for i in range(platform.n)]
     noise = _noise(platform, robots, _repeats(exchanges, saturation))
     return ReadingLimits(saturation, noise[0], noise[1])
