@@ -25,8 +25,7 @@ from swarm_loc_drivers.sim.worlds import WorldError, start_of
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text, texts
-from swarm_loc_estimator.swarm.ir_board import IrPlatform
-from swarm_loc_estimator.swarm.ir_board import RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, RobotIr
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
