@@ -66,7 +66,7 @@ class _Ways(NamedTuple):
 
     Attributes:
         x, y: (W,) from sensor to emitter in the receiver's frame [m].
-        length, direction: (W,) likewise [m], [rad].
+        length, direction: (W,) polar coordinates of that vector [m], [rad].
         emitter_x, emitter_y: (W,) the emitter's direction in the receiver's frame.
         at_sensor, at_emitter: (W,) the angles of incidence, and to the emitter's axis [rad].
         piece: (W,) of the curves.

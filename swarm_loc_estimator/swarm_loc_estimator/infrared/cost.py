@@ -1,8 +1,8 @@
 """The negative log likelihood of readings, with gradient and Hessian by pose and gains.
 
-What is sought is the pose and, where elements differ by an unknown amount, every sensor's and emitter's
-log-gain, which has a prior. Most readings just have the square of their distance from expectation, in sigmas:
-these are taken in loops that are vectorized. The others are taken one by one, by `reading_cost`.
+The unknowns are the pose and, where gains are unknown, the log-gain of every sensor and emitter, which has a
+prior. Most readings cost the square of their residual in sigmas: vectorized loops add them up. The others
+are evaluated one by one, by `reading_cost`.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Pair(NamedTuple):
 
     Attributes:
         readings: (F,) [count].
-        cut: (F,) likewise, cut at saturation; 0 where MISSING.
+        cut: (F,) readings cut at saturation; 0 where MISSING.
         stable: (F,) these by `stabilized` [sigma].
         kinds: (F,) MISSING, MEASURED or SATURATED.
         costs: What they cost.
@@ -81,22 +81,22 @@ class CostWorkspace(NamedTuple):
     Attributes:
         ways: (WAY_ROWS, n * n) to predict brightness.
         expected: (F,) without gains.
-        slopes: (3, F) likewise.
+        slopes: (3, F) their derivatives by the pose, without gains.
         pulls: (F,) what slopes are multiplied by for the gradient.
         weights: (F,) what products of slopes are multiplied by for the Hessian.
         at: (P,) the best so far.
         trial: (P,).
         factors: (F,) products of a sensor's and an emitter's gain.
         gradients: (2, P) of the cost at the best so far, or at the trial.
-        hessians: (2, P, P) likewise, by Gauss-Newton; lower triangles.
+        hessians: (2, P, P) of the cost at the same places, by Gauss-Newton; lower triangles.
         factor: (P, P) lower triangle.
         step: (P,).
         tally: (3,) squares of what is left of priors and of the readings that are no outliers, the degrees of
             freedom of these, and squares of what is left of all.
         systematic: (3, 3) the part of the information on the pose by whose noise it errs the same every time.
-        of_gains: (3,) the part of the pose's variances that is the unknown gains'.
+        of_gains: (3,) the part of the pose's variances that comes from unknown gains.
         root: (3, 3) inverse of the pose's part of the factor, lower triangle.
-        first_root: (3, 3) likewise at a minimum.
+        first_root: (3, 3) that inverse at a minimum.
     """
 
     ways: FloatArray

@@ -1,10 +1,10 @@
 """Calibration of the gains of sensors and emitters from brightness matrices.
 
-All gains and the relative pose of every exchange are sought together by Gauss-Newton, each pose eliminated
-from its own readings, and so is the ambient light that a sensor did not subtract. Without known poses, what
-all gains of a robot have in common is told from range only by near robots, whose pattern depends on it; far
-ones with brighter elements just seem nearer. The result says how unsure it is. Known poses determine it, but
-for a factor between sensors and emitters, which cancels.
+Gauss-Newton estimates all gains and the relative pose of every exchange together; each pose, and the ambient
+light that a sensor did not subtract, is eliminated from its own readings. Without known poses, only near
+robots separate the common part of a robot's gains from range, since their pattern depends on it; far robots
+with brighter elements just appear nearer. `IrGains.common_sigma` has this uncertainty. Known poses determine
+the common part except for a factor between sensors and emitters, which cancels.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ POSE_SIGMA = (0.0005, 0.005, 0.005)
 _BACKGROUND = 0.5
 """How much of the ambient light a sensor may read besides, one standard deviation [sigma of a reading]."""
 _SEARCH_SIGMA = 0.02
-"""How unsure gains are taken to be while poses are searched with them."""
+"""Sigma of gains while poses are searched with them."""
 _MAX_ODDS = 0.05
 _MAX_MISFIT = 3.0
 """Exchanges whose second-best pose is likelier, or that fit worse, are left out; where most fit worse though
@@ -44,7 +44,7 @@ _WORST = 5.0
 """Exchanges whose residuals' mean square is above the median by more than this factor are left out."""
 _LONGEST_STEP = 0.3
 _MIN_SIGMA = 0.003
-"""Gains are never called surer than this."""
+"""Smallest sigma of gains that is reported."""
 
 
 class Exchanges(NamedTuple):
@@ -79,7 +79,7 @@ class GainsFit:
             they would be less sure than that.
         used: (k,) which exchanges were used.
         before: (k, modes, n, n) residuals with all gains 1, in sigmas; NaN where a reading was not used.
-        after: Likewise with the gains.
+        after: (k, modes, n, n) those residuals with the gains.
     """
 
     gains: tuple[IrGains, ...]
@@ -89,7 +89,7 @@ class GainsFit:
 
 
 class GainsError(ValueError):
-    """Exchanges that tell nothing of gains; the message is one sentence."""
+    """Exchanges that do not determine gains; the message is one sentence."""
 
 
 def estimate_gains(
@@ -101,7 +101,7 @@ def estimate_gains(
         platform: Of all robots; its `element_sigma` is by how much elements may differ.
         robots: How many there are.
         exchanges: What they read.
-        progress: Called with a word on what is being done.
+        progress: Called with the name of each step.
 
     Raises:
         GainsError: Elements cannot differ, the platform's curves do not hold, or no exchange can be used.
@@ -133,10 +133,10 @@ def _pairs(exchanges: Exchanges, logs: FloatArray, sigma: float) -> PairGains:
 
 
 def _check_curves(estimator: MaximumLikelihood, exchanges: Exchanges, unknown: PairGains) -> None:
-    """Refuse to blame elements where most exchanges fit no pose whatsoever, however elements differ.
+    """Refuse to estimate gains where most exchanges fit no pose, whatever the gains.
 
     Raises:
-        GainsError: So it is.
+        GainsError: Most exchanges do not fit.
     """
     misfits = estimator.solve(exchanges.readings, unknown, exchanges.saturation).misfits
     found = misfits[np.isfinite(misfits)]

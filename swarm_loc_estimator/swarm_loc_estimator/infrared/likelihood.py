@@ -1,8 +1,8 @@
 """Maximum likelihood estimate of the relative pose of two robots, from all readings of all powers.
 
-The search of `search` starts at the poses of `start_table`, so that no wrong minimum is found. The inverse
-information is the covariance, grown where readings fit worse than the platform's noise allows. Elements'
-unknown gains are sought along, so that the covariance contains them.
+`search` starts at the poses of `start_table`, so that no wrong minimum is found. The inverse
+information is the covariance, inflated where readings fit worse than the platform's noise allows. Unknown
+gains are estimated together with the pose, so that the covariance contains them.
 """
 
 from __future__ import annotations
@@ -51,15 +51,15 @@ _FEWEST = 9
 _FAINTEST = 6.0
 """Readings must be brighter than noise by so many sigmas of the sum of their squares."""
 _FAINTEST_OF_OUTLIERS = 3.0
-"""Likewise where the probability of all poses is known besides; noise alone then gives none."""
+"""That limit where the probability of all poses is computed as well, so that noise alone gives no pose."""
 _EXPLAINED = 0.5
 """The share of what is read, in squares, that a pose must explain."""
 _EXPLAINED_OF_OUTLIERS = 0.2
-"""Likewise where readings may be blocked or too bright."""
+"""That share where readings may be blocked or too bright."""
 _WIDEST = 1.0
 """A bearing or heading less sure than this, by the best minimum alone, is open [rad]."""
 _WIDEST_OF_ALL = 0.9
-"""Likewise by the probability of all poses."""
+"""That limit by the probability of all poses."""
 _APART = 0.1
 """Two minima farther apart than this, in bearing, heading [rad] or relative in range, are two poses."""
 _AROUND = [(b, h) for b in (-0.2, 0.0, 0.2) for h in (-0.2, 0.0, 0.2) if b or h]

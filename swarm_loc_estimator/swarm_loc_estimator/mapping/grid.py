@@ -14,13 +14,13 @@ from swarm_loc_estimator.mapping.matching import Scans
 from swarm_loc_estimator.mapping.scans import BINS, LINE, POINT, UNKNOWN, Lines
 
 _FREE_STEP, _HIT_STEP = 0.25, 0.9
-"""Log odds that one ray tells."""
+"""Change of the log odds of a cell by one ray."""
 _POINT_HIT = 0.25
-"""Share of that where something came back but no line could be told."""
+"""Share of `_HIT_STEP` where a reflection was seen but no line could be fitted."""
 _FREE_RANGE_SHARE = 0.76
 """Where nothing came back, space is free to this share of the range."""
 _SHARP_M = 0.03
-"""A wall that is known worse than this tells less of a cell."""
+"""A wall whose sigma is larger than this raises the log odds of its cell less."""
 
 
 @cached_njit
@@ -79,7 +79,7 @@ def _draw_free(
 CELL = 0.02
 """Size of a cell, that of the PushBot paper [m]."""
 LOG_ODDS_CAP = 5.0
-"""No cell gets surer than this, for or against."""
+"""Largest log odds of a cell, both ways."""
 _OCCUPIED, _FREE = 0.45, -0.2
 
 

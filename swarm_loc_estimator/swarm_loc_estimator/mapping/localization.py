@@ -1,4 +1,4 @@
-"""Where a scan was made: alignment with the map, loop closure, lights of other robots."""
+"""Localization of scans: alignment with the map, loop closure, bearings of other robots' lights."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _START_TARGETS, _MIN_START_OVERLAP = 8, 0.08
 _FINAL_TARGETS, _MIN_FINAL_OVERLAP = 9, 0.35
 _GATE = 0.06
 _MAX_SHIFT, _MAX_SHIFT_PER_METRE, _MAX_TURN = 0.10, 0.08, math.radians(5.0)
-"""A scan that alignment moves further than odometry can be wrong is left where odometry put it."""
+"""A scan that alignment moves by more than the error of odometry keeps the pose by odometry."""
 _SOLVE_ALL_EVERY = 4
-"""At every stop it is worse: a closed ring then gets half as precise again."""
+"""Solving at every stop is worse: errors of a closed ring grow by half."""
 _RECENT = 8
 _START_SEARCH = Lattice(0.3, 0.05, math.radians(12.0), math.radians(1.5))
 _START_RADIUS, _START_AGAINST, _MIN_START_SCORE = 2.5, 48, 0.35
@@ -52,7 +52,7 @@ def align(graph: PoseGraph, stop: int, path: float) -> bool:
 
 
 def _align_alone(graph: PoseGraph, stop: int, path: float) -> bool:
-    """Move the newest stop only, and back again where that cannot be."""
+    """Align the newest stop only; restore it where the shift exceeds the limits."""
     predicted, slip = graph.states[stop].copy(), graph.slip.copy()
     graph.solve(4, [stop], _GATE)
     shift, turn = np.hypot(*(graph.states[stop] - predicted)[:2]), graph.states[stop, 2] - predicted[2]
@@ -69,19 +69,21 @@ def align_start(graph: PoseGraph, parts: Sequence[int], sigma: FloatArray) -> No
     Args:
         graph: Is changed.
         parts: The newest stops, all at one place.
-        sigma: (3,) how well that is known. Where older scans would move it further than four of these, they
-            are not believed, and the robot is left where it was said to be.
+        sigma: (3,) standard deviation of that place. Where older scans would move the robot by more than four
+            of these, they are ignored, and the robot keeps the pose that it was given.
     """
     away = graph.distances(parts[0])
     others = [one for one in np.argsort(away, kind="stable") if one < parts[0] and away[one] < _START_RADIUS]
-    told, states, slip = graph.states[parts[0]].copy(), graph.states.copy(), graph.slip.copy()
+    given, states, slip = graph.states[parts[0]].copy(), graph.states.copy(), graph.slip.copy()
     if others:
         against = np.array(others[:_START_AGAINST])
         found = search_offsets(graph.scans, np.array(parts), against, _START_SEARCH)
         if found.score > _MIN_START_SCORE:
             graph.states[parts, :3] += found.offset
     _match_parts(graph, parts, 0)
-    if (np.abs(graph.states[parts[0], :3] - told[:3]) > _MAX_START_SIGMAS * sigma + _LEAST_START_SHIFT).any():
+    if (
+        np.abs(graph.states[parts[0], :3] - given[:3]) > _MAX_START_SIGMAS * sigma + _LEAST_START_SHIFT
+    ).any():
         graph.states[:], graph.slip = states, slip
         for one, targets in graph.targets.items():
             graph.targets[one] = [other for other in targets if (one in parts) == (other in parts)]
@@ -100,7 +102,7 @@ def _match_parts(graph: PoseGraph, parts: Sequence[int], oldest: int) -> None:
 
 
 def align_all(graph: PoseGraph) -> None:
-    """Align all scans anew with all their beams: the final solution."""
+    """Align all scans with all their beams: the final solution."""
     for stop in range(graph.count):
         graph.targets[stop] = graph.neighbours(stop, _FINAL_TARGETS, _MIN_FINAL_OVERLAP)
     graph.solve(5, stride=1)
@@ -122,7 +124,7 @@ _LOOP_GATE = 0.05
 def close_loop(graph: PoseGraph, stop: int) -> bool:
     """Tie the newest stop to old ones nearby that nothing connects it with; whether it was tied.
 
-    The whole graph is solved anew then.
+    The whole graph is solved afterwards.
     """
     if graph.count < _MIN_STOPS:
         return False
@@ -163,7 +165,7 @@ def tie(graph: PoseGraph, stop: int, pose: FloatArray, against: list[int]) -> No
 
 
 def refine(graph: PoseGraph, stop: int, against: list[int]) -> bool:
-    """Align a stop with others only, without odometry; whether it fits and is held in all directions."""
+    """Align a stop with others only, without odometry; whether it fits and is fully determined."""
     fit, H = 0.0, np.zeros((8, 8))
     for _ in range(4):
         H, g, fit = np.zeros((8, 8)), np.zeros(8), 0.0
@@ -198,7 +200,7 @@ _LEAST_SIGMA = math.radians(1.0)
 
 @dataclass(frozen=True)
 class Visit:
-    """When a robot stood where.
+    """A robot's stay at a stop.
 
     Attributes:
         node: Number of its stop in the graph.
@@ -232,20 +234,20 @@ class LightBook:
             self._pending.append((robot, target, stamp_ns, bearing))
 
     def note_visit(self, robot: int, visit: Visit) -> None:
-        """A robot has left where it stood."""
+        """Record a stop that a robot has left."""
         self._visits.setdefault(robot, deque(maxlen=_MAX_VISITS)).append(visit)
 
     def forget_node(self, node: int) -> None:
-        """The number of a stop is given to another one."""
+        """Remove a node's visits, as when its number is reused for another stop."""
         for robot, visits in self._visits.items():
             self._visits[robot] = deque((one for one in visits if one.node != node), maxlen=_MAX_VISITS)
 
     def note_time(self, robot: int, stamp_ns: int) -> None:
-        """Where a robot stood until a time is known."""
+        """All stops of a robot until this time are recorded."""
         self._until_ns[robot] = stamp_ns
 
     def settle(self, graph: PoseGraph) -> None:
-        """Give the graph the bearings that are known now; one for each pair of stops."""
+        """Add the bearings whose stops are known by now to the graph, one for each pair of stops."""
         found: dict[tuple[int, int], list[float]] = defaultdict(list)
         for _ in range(len(self._pending)):
             one = self._pending.popleft()

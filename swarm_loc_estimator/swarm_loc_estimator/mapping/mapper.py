@@ -39,7 +39,7 @@ _TURN_TOLERANCE = 0.03
 _PART_SIGMA = np.array([0.002, 0.002, 0.002])
 _LEAST_SIGMA = 0.003
 _LOST_SIGMA, _CHECK_EVERY = 0.15, 4
-"""A robot that is less sure of its position [m] goes home: to an old stop nearby."""
+"""A robot whose position has a larger sigma [m] goes home: to an old stop nearby."""
 _RESTART_SIGMA = np.array([0.10, 0.10, math.radians(5.0)])
 _HOME_AGE, _HOME_RADIUS, _AT_HOME = 10, 4.0, 0.5
 
@@ -61,7 +61,7 @@ class _Track:
         path: Driven since it left the node [m].
         target: (2,) where it wants to be in the end [m].
         goal: Its next stop.
-        home: (2,) where it goes to be sure of its position again [m].
+        home: (2,) old stop where it goes to reduce its position sigma [m].
     """
 
     prior: FloatArray
@@ -86,11 +86,11 @@ class CooperativeMapper:
         settings: Noise and limits.
 
     Attributes:
-        settings: Likewise.
+        settings: Noise and limits.
         graph: The stops.
         visits: Where robots have been.
-        counters: How often what has happened.
-        background: A map from before, below what the stops draw.
+        counters: Event -> how often it happened.
+        background: An earlier map, drawn below the stops.
         begin_ns: Stop in the graph -> its first reading [ns].
     """
 
@@ -123,7 +123,7 @@ class CooperativeMapper:
             if run.arrives or not run.stands:
                 self._depart(robot, track)
             if run.jumps:
-                track = self._begin_anew(robot, track)
+                track = self._restart_track(robot, track)
             elif run.arrives:
                 self._drive(track, run.readings.odometry[:1])
             if run.arrives:
@@ -136,8 +136,8 @@ class CooperativeMapper:
                 self._drive(track, run.readings.odometry)
                 self._lights.note_time(robot, int(run.readings.stamp_ns[-1]))
 
-    def _begin_anew(self, robot: int, track: _Track) -> _Track:
-        """Odometry has begun anew, as when a driver was restarted: the robot is about where it was last."""
+    def _restart_track(self, robot: int, track: _Track) -> _Track:
+        """Restart a robot's track near its last pose after a jump of odometry, as of a restarted driver."""
         self.counters["odometry_restarts"] += 1
         pose = self.pose(robot)
         fresh = _Track(track.prior, track.prior_sigma) if pose is None else _Track(pose, _RESTART_SIGMA)
@@ -180,14 +180,14 @@ class CooperativeMapper:
         return 0.0 if stop is None or not self._tracks[robot].is_known else stop.turn[-1] - stop.begin_turn
 
     def occupancy(self) -> OccupancyMap:
-        """The map as the stops stand now."""
+        """The map by the present poses of the stops."""
         if self._map is None:
             limit = self.settings.max_cells
             self._map = draw_map(self.graph.scans, self.graph.count, limit, self.background)
         return self._map
 
     def finish(self) -> None:
-        """Solve everything anew with all beams."""
+        """Solve the whole graph with all beams."""
         for track in self._tracks.values():
             self._update_scan(track)
         align_all(self.graph)
@@ -204,7 +204,7 @@ class CooperativeMapper:
         if track.last is not None:
             steps = np.diff(np.vstack([track.last, odometry])[:, :2], axis=0)
             paths = np.concatenate([[track.path], np.hypot(steps[:, 0], steps[:, 1])])
-            track.path = float(np.cumsum(paths)[-1])  # the same whoever cuts the readings
+            track.path = float(np.cumsum(paths)[-1])  # independent of how readings are split
         track.last = odometry[-1]
         if track.node is not None:
             self.visits.add(self._driven(track, odometry)[:, :2])
@@ -224,7 +224,7 @@ class CooperativeMapper:
             self._look(robot, track, again)
 
     def _depart(self, robot: int, track: _Track) -> None:
-        """A robot leaves where it stood."""
+        """End the stop of a robot that leaves."""
         stop, track.stop = track.stop, None
         if stop is None or not len(stop.turn):
             return
@@ -250,7 +250,7 @@ class CooperativeMapper:
             self._lights.settle(self.graph)
 
     def _update_scan(self, track: _Track) -> None:
-        """Give the newest stop all readings made there."""
+        """Set all readings made at the newest stop as its scan."""
         stop = track.stop
         if stop is not None and track.is_known and track.node is not None:
             turn = stop.turn[stop.begin :] - stop.begin_turn
@@ -356,7 +356,7 @@ class CooperativeMapper:
         track.goal = Goal(number, hop, there, int(stop.stamp_ns[stop.looked - 1]), pose)
 
     def _look_for_home(self, track: _Track, node: int) -> None:
-        """Send a robot that has become unsure of its position to where it was sure."""
+        """Send a robot with a large position sigma back to an old stop nearby."""
         graph = self.graph
         if track.home is not None and math.dist(track.home, graph.states[node, :2]) < _AT_HOME:
             track.home = None

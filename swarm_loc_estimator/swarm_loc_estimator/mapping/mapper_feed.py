@@ -25,25 +25,25 @@ from swarm_loc_estimator.odometry.preintegration import MODEL_DTYPE
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot
 
 _LEAST_SIGMA = np.array([0.02, 0.02, 0.01])
-"""Errors of the map that all fixes share are no noise: no fix is told better than this [m, m, rad]."""
+"""Smallest sigma of a fix, for the errors of the map that all fixes share [m, m, rad]."""
 _OPTIMISM = 2.5
-"""Variances over what the graph says: wheels slip unevenly during a scan, which it takes for rigid."""
+"""Factor on variances of the graph, which takes scans for rigid while wheels slip unevenly."""
 _LEAST_SIGMA_MOVED = 0.003
 _LEAST_NEW = 0.02
-"""Share of what the mapper knows that each fix counts for at least, however little it adds."""
+"""Least share of the mapper's information that a fix carries."""
 
 
 class FixCovariances:
     """Covariances of the fixes of one robot, one after the other.
 
-    What is wrong with a map is wrong with all poses in it, so successive fixes err alike. Whoever fuses them
-    as independent takes the same scans into account again and again. So each is told with the information by
-    which the mapper's pose exceeds that of the fix before carried on by odometry (what is known to both is
-    subtracted, as in the information graphs of Chong, Mori and Chang, "Distributed multitarget multisensor
-    tracking", 1990): together they make as sure as the mapper is.
+    An error of the map shifts all poses in it, so successive fixes have correlated errors, and a filter that
+    fuses them as independent counts the same scans several times. Each fix therefore carries only the
+    information by which the mapper's pose exceeds that of the fix before, propagated by odometry (the common
+    information is subtracted, as in the information graphs of Chong, Mori and Chang, "Distributed multitarget
+    multisensor tracking", 1990). All fixes together have the information of the mapper.
 
-    The odometry is that of whoever fuses the fixes: the coarser it takes that to be, the more it has
-    forgotten of the fix before.
+    The odometry model is that of the filter that fuses the fixes: the larger its noise, the less of the
+    fix before remains.
 
     Args:
         odometry: Of the robot, as the swarm description has it.
@@ -53,8 +53,8 @@ class FixCovariances:
         self._odometry: Any = np.array(astuple(odometry), MODEL_DTYPE)[()]  # as the compiled code takes it
         self._last: tuple[Goal, FloatArray] | None = None
 
-    def told(self, goal: Goal, covariance: FloatArray) -> FloatArray:
-        """Covariance (3, 3) to be told of the newest fix.
+    def next_covariance(self, goal: Goal, covariance: FloatArray) -> FloatArray:
+        """Covariance (3, 3) to publish with the newest fix.
 
         Args:
             goal: With pose and stamp.
@@ -62,7 +62,7 @@ class FixCovariances:
         """
         now = pose_covariance(covariance)
         before, self._last = self._last, (goal, now)
-        if before is None or goal.number == 1:  # the first, or the first since odometry began anew
+        if before is None or goal.number == 1:  # the first, or the first since odometry restarted
             return now
         known = self._carried_on(*before, goal)
         return _new_alone(now, known)
@@ -90,23 +90,23 @@ def pose_covariance(covariance: FloatArray) -> FloatArray:
 
 
 def _new_alone(now: FloatArray, known: FloatArray) -> FloatArray:
-    """The covariance (3, 3) that turns what was known (3, 3) into what is known now (3, 3)."""
+    """Covariance (3, 3) of a measurement that turns the covariance `known` (3, 3) into `now` (3, 3)."""
     root = np.linalg.cholesky(now)
     inverse = np.linalg.inv(root)
     ratio, axes = np.linalg.eigh(inverse @ known @ inverse.T)  # of variances: known over now
     new = np.maximum(1.0 - 1.0 / ratio, _LEAST_NEW)
     basis = root @ axes
-    told = (basis / new) @ basis.T
-    symmetric: FloatArray = 0.5 * (told + told.T)
+    whole = (basis / new) @ basis.T
+    symmetric: FloatArray = 0.5 * (whole + whole.T)
     return symmetric
 
 
 MAX_WAITING = 500
-"""Of either kind: what is older than so many is dropped."""
+"""Odometry messages, and distances, that wait at most; older ones are dropped."""
 MAX_GAP_NS = 500_000_000
 """Odometry is not interpolated over longer gaps."""
 _SIGMAS = 301
-"""Of so many distances the median sigma counts."""
+"""The sigma is the median of so many distances."""
 
 
 class ReadingPairer:
@@ -168,7 +168,7 @@ class ReadingPairer:
         return Readings(np.array(stamps, dtype=np.int64), np.array(poses), np.array(inverses), self._sigma())
 
     def _sigma(self) -> float:
-        """Standard deviation of an inverse distance as usual lately: a dim spot is no measure of others."""
+        """Standard deviation of an inverse distance, the median of recent ones; NaN without any."""
         return float(np.median(self._sigmas)) if self._sigmas else math.nan
 
     def _pose_at(self, stamp_ns: int) -> FloatArray | None:
@@ -212,7 +212,7 @@ class MapperInputError(UserError):
 
 
 class MapperFeed:
-    """Gives the mapper what comes; a robot joins with its first reading.
+    """Decodes messages and passes them to the mapper; a robot joins with its first reading.
 
     Args:
         robots: Those that may come.
@@ -276,7 +276,7 @@ class MapperFeed:
         return self._number.get(robot)
 
     def missing(self) -> Iterator[str]:
-        """Topics from which nothing has come that the mapper cannot do without."""
+        """Required topics without a message so far."""
         for index, robot in enumerate(self._robots):
             for kind in (MapperInput.ODOMETRY, MapperInput.LASER):
                 if not self.received[index, kind]:
@@ -323,7 +323,7 @@ class MapperFeed:
             self._mapper.add_lights(self._number[robot], sightings)
 
     def _seen(self, frequency: float) -> int | None:
-        """The robot whose LEDs blink so; None: no one's, or those of several."""
+        """The robot whose LEDs have this frequency [Hz]; None: no robot, or several."""
         near = [
             index
             for hz, index in self._light_of

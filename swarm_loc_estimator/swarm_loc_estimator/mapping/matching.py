@@ -19,7 +19,7 @@ from swarm_loc_estimator.mapping.scans import BINS, LINE, Beams, Lines
 CAUCHY = 6.0
 """Square of the scale of the Cauchy loss, in variances."""
 MIN_MATCHED = 30
-"""A pair of stops with fewer matched beams tells nothing."""
+"""A pair of stops with fewer matched beams is not used."""
 _MIN_INCIDENCE = 0.15
 _MIN_DISTANCE = 0.05
 _ROUGHNESS = 0.004
@@ -28,16 +28,16 @@ _GATE_VARIANCES = 16.0
 _RANGE_SIGMAS = 2.5
 
 OFF, UNUSABLE, FIT = 0, 1, 2
-"""A beam: not on the line that it should meet; cannot tell; on it."""
+"""A beam: off the line that it should meet; not comparable; on the line."""
 
 
 class Scans(NamedTuple):
-    """All that matching needs to know of stops.
+    """Stops, as matching needs them.
 
     Attributes:
         states: (k, 4) x [m], y [m], theta [rad] on arrival, true turn over turn by odometry.
         beams: What was seen.
-        lines: What that tells.
+        lines: Fitted to the beams.
         max_range: Beyond this nothing comes back [m].
     """
 
@@ -101,10 +101,10 @@ def agreement(scans: Scans, k: int, j: int, gate: float, stride: int) -> tuple[i
     for i in range(0, scans.beams.counts[k], stride):
         if scans.beams.inverse[k, i] <= 0.0:
             continue
-        fate, residual, variance, _, _, _, _ = beam_residual(scans, k, i, j, gate)
-        if fate != UNUSABLE:
+        status, residual, variance, _, _, _, _ = beam_residual(scans, k, i, j, gate)
+        if status != UNUSABLE:
             tried += 1
-        if fate == FIT:
+        if status == FIT:
             matched += 1
             loss += math.log(1.0 + residual * residual / variance / CAUCHY)
     return matched, tried, loss
@@ -123,10 +123,10 @@ def accumulate(
     for i in range(0, scans.beams.counts[k], stride):
         if scans.beams.inverse[k, i] <= 0.0:
             continue
-        fate, residual, variance, per_metre, nx, ny, m = beam_residual(scans, k, i, j, gate)
-        if fate != UNUSABLE:
+        status, residual, variance, per_metre, nx, ny, m = beam_residual(scans, k, i, j, gate)
+        if status != UNUSABLE:
             tried += 1
-        if fate != FIT:
+        if status != FIT:
             continue
         matched += 1
         distance = (scans.beams.inverse[k, i] - residual) / per_metre
@@ -268,9 +268,9 @@ def _score(scans: Scans, k: int, against: IntArray, stride: int) -> float:
             continue
         best, can_tell = 0.0, False
         for j in against:
-            fate, residual, variance, _, _, _, _ = beam_residual(scans, k, i, j, 0.0)
-            can_tell = can_tell or fate != UNUSABLE
-            if fate == FIT:
+            status, residual, variance, _, _, _, _ = beam_residual(scans, k, i, j, 0.0)
+            can_tell = can_tell or status != UNUSABLE
+            if status == FIT:
                 best = max(best, 1.0 - math.log(1.0 + residual * residual / variance / CAUCHY))
         good += best
         tried += can_tell

@@ -54,12 +54,12 @@ class ConstraintLists:
         return len(self._bearings)
 
     def remove_stop(self, stop: int) -> None:
-        """Forget everything that says something of a stop."""
+        """Remove all constraints on a stop."""
         for rows in (self._priors, self._departures, self._ties, self._bearings):
             rows[:] = [one for one in rows if stop not in one[:2]]
 
     def remove_departure_to(self, stop: int) -> None:
-        """Forget how a robot came to a stop, as when it was carried there."""
+        """Remove the odometry to a stop, as when the robot was carried there."""
         self._departures[:] = [one for one in self._departures if one[1] != stop]
 
     def linearised(self, states: FloatArray) -> Iterator[model.Linearised]:
@@ -84,10 +84,10 @@ def _arrays(rows: list[_Row]) -> tuple[IntArray, IntArray, FloatArray]:
 
 
 _REFIT_RATIO = 0.0006
-"""Lines are fitted anew when the ratio of turns has changed by more."""
+"""Lines are fitted again when the ratio of turns has changed by more."""
 _MIN_RATIO_SIGMA = 0.0013
 _MATCH_WEIGHT, _START_WEIGHT = 0.3, 1.5
-"""Of all matches of a stop together: beams of a pair share the errors of one scan."""
+"""Total weight of the matches of a stop: beams of a pair share the errors of one scan."""
 _SMALL_STEP = (1e-3, 1e-3, 5e-4)
 MATCH_GATE = 0.03
 """Beams further off a line do not belong to it, in the final solution [m]."""
@@ -101,7 +101,7 @@ class PoseGraph:
         settings: Of the mapper.
 
     Attributes:
-        settings: Likewise.
+        settings: Of the mapper.
         count: Number of stops.
         states: (capacity, 4) x [m], y [m], theta on arrival [rad], true turn over turn by odometry.
         robot: (capacity,) whose stop it is.
@@ -156,7 +156,7 @@ class PoseGraph:
         return k
 
     def reuse_stop(self, stop: int, pose: FloatArray, sigma: float) -> None:
-        """Forget a stop, and let its number be that of a new one of the same robot; see `add_stop`."""
+        """Replace a stop by a new one of the same robot, with its number; see `add_stop`."""
         self.constraints.remove_stop(stop)
         self.targets = {
             one: [other for other in others if other != stop]
@@ -207,7 +207,7 @@ class PoseGraph:
         return found
 
     def match_both_ways(self, stop: int, limit: int = 10) -> None:
-        """Let the targets of a stop be matched against it, too."""
+        """Match the targets of a stop against it, too."""
         for other in self.targets[stop]:
             back = self.targets.setdefault(other, [])
             if stop not in back and len(back) < limit:
@@ -248,7 +248,7 @@ class PoseGraph:
         return self._factor_of_all().covariance(STOP_UNKNOWNS * stop + np.arange(3))
 
     def relative_sigma(self, stop: int, other: int) -> tuple[float, float]:
-        """How well the position [m] and heading [rad] of a stop relative to another are known."""
+        """Standard deviations of a stop's position [m] and heading [rad] relative to another."""
         index = np.concatenate([STOP_UNKNOWNS * one + np.arange(3) for one in (stop, other)])
         cov = self._factor_of_all().covariance(index, np.hstack([np.eye(3), -np.eye(3)]))
         variances = np.maximum(np.diag(cov), 0.0)
@@ -260,7 +260,7 @@ class PoseGraph:
         return self._factor
 
     def _apply(self, step: FloatArray) -> bool:
-        """Change the estimate; whether hardly anything has moved."""
+        """Apply a step; whether it is below `_SMALL_STEP` for all stops."""
         count = self.count
         change = step[: STOP_UNKNOWNS * count].reshape(-1, STOP_UNKNOWNS)
         self.states[:count] += change
@@ -292,7 +292,7 @@ class PoseGraph:
             equations.add_blocks(unknowns.reshape(-1, 8), squares, gradient)
 
     def _grow(self) -> None:
-        """Double the room."""
+        """Double the capacity."""
         self.states, self.robot = _doubled(self.states), _doubled(self.robot)
         self.turned, self._turned_all = _doubled(self.turned), _doubled(self._turned_all)
         self._fitted_ratio = _doubled(self._fitted_ratio)
@@ -301,5 +301,5 @@ class PoseGraph:
 
 
 def _doubled(array: Any) -> Any:
-    """An array with as much room again behind."""
+    """An array with as many zeros appended."""
     return np.concatenate([array, np.zeros_like(array)])

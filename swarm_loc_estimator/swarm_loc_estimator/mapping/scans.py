@@ -76,7 +76,7 @@ class Beams(NamedTuple):
 
 
 def no_beams(capacity: int) -> Beams:
-    """Room for the beams of so many stops."""
+    """Memory for the beams of so many stops."""
     shape = (capacity, MAX_BEAMS)
     return Beams(np.zeros(shape), np.zeros(shape), np.zeros(capacity, dtype=np.int64), np.ones(capacity))
 
@@ -111,7 +111,7 @@ class Lines(NamedTuple):
     Attributes:
         kind: (k, BINS) `UNKNOWN`, `FREE`, `POINT` or `LINE`.
         a: (k, BINS) normal over distance, along x [1/m].
-        b: (k, BINS) likewise along y [1/m].
+        b: (k, BINS) normal over distance, along y [1/m].
         distance: (k, BINS) along the direction [m].
         variance: (k, BINS) of the line's inverse distance along the direction [1/m^2].
         turn: (k, BINS) turn by odometry at which the robot looked there [rad].
@@ -128,7 +128,7 @@ class Lines(NamedTuple):
 
 
 def no_lines(capacity: int) -> Lines:
-    """Room for the lines of so many stops."""
+    """Memory for the lines of so many stops."""
     shape = (capacity, BINS)
     a, b, distance, variance, turn = np.zeros((5, *shape))
     return Lines(np.zeros(shape, dtype=np.int8), a, b, distance, variance, turn, np.zeros(shape, dtype=bool))

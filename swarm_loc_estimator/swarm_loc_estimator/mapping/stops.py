@@ -26,24 +26,24 @@ _REST_NS, _REST_TURN = 1_000_000_000, 0.01
 """A robot that turns less than this in such a time rests [rad]."""
 _DRIVES, _STANDS, _ARRIVES, _JUMPS = 0, 1, 2, 3
 _MAX_SPEED, _MAX_STEP, _MAX_RATE, _MAX_TURN = 3.0, 0.05, 20.0, 0.3
-"""Odometry that goes further than such a speed or rate allows has begun anew [m/s], [m], [rad/s], [rad]."""
+"""Odometry that moves by more than these rates allow has restarted [m/s], [m], [rad/s], [rad]."""
 
 
 class ScanStop:
-    """Where a robot stands, or stood.
+    """A place where a robot stands, or stood.
 
     Args:
         arrival: (3,) pose by odometry when it came.
 
     Attributes:
-        arrival: Likewise.
+        arrival: (3,) pose by odometry when it came.
         departure: (3,) pose by odometry at the last reading.
         stamp_ns: (n,) of its readings.
         turn: (n,) turn by odometry since it came [rad].
         inverse: (n,) inverse distances [1/m].
-        sigma: Of an inverse distance; of no meaning before something was seen [1/m].
+        sigma: Of an inverse distance; undefined before a reflection was seen [1/m].
         begin: How many of the readings belong to nodes before the one that this stop is.
-        looked: How many there were when it became a node; 0: it is none.
+        looked: How many there were when it became a node; 0: it is not one.
         total: How many there were in all.
     """
 
@@ -60,7 +60,7 @@ class ScanStop:
         headings = np.concatenate([self.departure[2:], readings.odometry[:, 2]])
         turned = self.turn[-1:] if len(self.turn) else np.zeros(1)
         steps = np.concatenate([turned, wrap_angle(np.diff(headings))])
-        self.turn = np.concatenate([self.turn, np.cumsum(steps)[1:]])  # the same whoever cuts the readings
+        self.turn = np.concatenate([self.turn, np.cumsum(steps)[1:]])  # independent of how readings are split
         self.stamp_ns = np.concatenate([self.stamp_ns, readings.stamp_ns])
         self.inverse = np.concatenate([self.inverse, readings.inverse])
         self.departure = readings.odometry[-1]
@@ -118,7 +118,7 @@ class Run(NamedTuple):
     Attributes:
         stands: Whether the robot stands.
         arrives: Whether it has just come.
-        jumps: Whether odometry has begun anew, by which nothing is known of the way here.
+        jumps: Whether odometry has restarted, so that the motion to this place is unknown.
         readings: These.
     """
 
@@ -129,7 +129,7 @@ class Run(NamedTuple):
 
 
 class MotionTracker:
-    """Tells standing from driving for one robot."""
+    """Separates standing from driving for one robot."""
 
     def __init__(self) -> None:
         self._state = np.full(6, np.nan)  # anchor x, y; before x, y; whether it stands; heading before

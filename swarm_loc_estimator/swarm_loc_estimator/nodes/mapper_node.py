@@ -112,7 +112,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
             return
         self._goal_stamps[robot] = goal.stamp_ns
         frame = self.params.map_frame
-        covariance = self._covariances[robot].told(goal, self._mapper.covariance(number))
+        covariance = self._covariances[robot].next_covariance(goal, self._mapper.covariance(number))
         self._fixes[robot].publish(fix_message(goal, covariance, frame))
         self._goals[robot].publish(goal_message(goal, frame))
 

@@ -1,8 +1,8 @@
 """Brightness matrices to relative measurements, one per exchange of two robots.
 
-The matrices of all powers of one exchange share their stamp. What has come of an exchange is used at once,
-and when more of it comes, the measurement made of less is replaced by one made of all. So nothing waits, the
-order of arrival does not matter, and of a matrix that is lost only what it would have told is missing.
+The matrices of all powers of one exchange share their stamp. Those received so far are used at once; when
+another one arrives, a measurement from all of them replaces the earlier one. So nothing waits, the order of
+arrival does not matter, and a lost matrix costs only its own information.
 """
 
 from __future__ import annotations

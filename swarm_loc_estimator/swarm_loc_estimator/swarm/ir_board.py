@@ -1,4 +1,4 @@
-"""Infrared boards as data: where elements sit, how they see, shine and err.
+"""Infrared boards as data: arrangement, curves and errors of the elements.
 
 The sensor and the emitter of one number sit side by side, on a circle about the origin of base_link, both
 looking outwards. Any number of them from three on.
@@ -33,14 +33,14 @@ _TOGETHER = 1e-3
 
 
 class ReadingErrors(NamedTuple):
-    """How readings err, numbers alone: whole models are dear to hand on for every reading.
+    """Errors of readings, as numbers only, since passing a whole model for every reading is slow.
 
     Attributes:
         noise: Of every reading, one standard deviation [count].
-        relative: By how much a reading is off besides, relative to its expectation [1].
+        relative: Standard deviation besides, relative to the expectation [1].
         systematic: The share of this in variance that is the same every time.
         blocked: The scale on which the cost of a reading that may be blocked ends; infinite: none is.
-        bright: Likewise of one that may be too bright.
+        bright: That scale for a reading that may be too bright.
     """
 
     noise: float
@@ -60,7 +60,7 @@ class IrModel(NamedTuple):
         sensor: The curve S.
         emitter: The curve E.
         amplitudes: (modes, 5) the fields of `Amplitude`.
-        saturation: A reading tells no more from here on [count].
+        saturation: Readings at or above are only lower bounds [count].
         noise: Of every reading, one standard deviation [count].
         errors: How readings err.
         stray: Noise besides, relative to the brightest reading of an exchange.
@@ -195,13 +195,13 @@ class IrPlatform:
 
 @dataclass(frozen=True)
 class IrGains:
-    """What is known of one robot's elements: a sensor reads so much more, an emitter shines so much brighter.
+    """Gains of one robot's elements relative to its platform.
 
     Attributes:
         sensor: (n,) factors of the sensors [1].
         emitter: (n,) factors of the emitters [1].
         dead_sensors: Numbers of sensors whose readings mean nothing.
-        dead_emitters: Likewise of emitters.
+        dead_emitters: Numbers of emitters whose light means nothing.
 
     Raises:
         IrPlatformError: A factor is not in [0.05, 20], sizes differ, or there is no such element.
@@ -246,7 +246,7 @@ class PairGains(NamedTuple):
 
     Attributes:
         sensor: (k, n) of each receiver's sensors; NaN: dead, what it reads means nothing.
-        emitter: (k, n) of each transmitter's emitters; NaN: likewise.
+        emitter: (k, n) of each transmitter's emitters; NaN: dead.
         sigma: (k, 4) own and common sigma of the receiver's sensors, then of the transmitter's emitters.
     """
 
@@ -290,7 +290,7 @@ class RobotIr:
         estimator: How what it reads becomes a pose.
         gains: What is known of its elements; None: never calibrated.
         dead_sensors: Numbers of sensors whose readings mean nothing.
-        dead_emitters: Likewise of emitters.
+        dead_emitters: Numbers of emitters whose light means nothing.
     """
 
     id: int
@@ -306,6 +306,6 @@ class RobotIr:
 
     @property
     def believed_gains(self) -> IrGains:
-        """The gains to reckon with."""
+        """The gains to use: those described, or unknown ones, with the dead elements."""
         gains = self.gains or IrGains.unknown(self.platform)
         return replace(gains, dead_sensors=self.dead_sensors, dead_emitters=self.dead_emitters)

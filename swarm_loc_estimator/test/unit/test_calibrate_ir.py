@@ -122,7 +122,7 @@ def test_gains_come_out_within_their_sigmas_and_are_written(
     assert all(f"\n{name} " in shown for name in "abc")
     assert "of 300 exchanges used" in shown
     assert re.search(r"\na, by sensor: saturation \[count\] \[((255|-) ?){6}\]\n", shown)
-    saturated = re.search(r"\nexchanges tell where (\d+) of 18 sensors saturate, and the noise of 0\n", shown)
+    saturated = re.search(r"\nsaturation determined for (\d+) of 18 sensors, noise for 0\n", shown)
     assert saturated
     assert int(saturated[1]) >= 6
     assert "saturate lower" not in shown

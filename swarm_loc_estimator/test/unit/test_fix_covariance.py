@@ -28,17 +28,17 @@ def fused(known: FloatArray, told: FloatArray) -> FloatArray:
 
 
 def test_the_first_fix_is_told_as_the_mapper_knows_it() -> None:
-    told = FixCovariances(USUAL).told(goal(1), STOP)
+    told = FixCovariances(USUAL).next_covariance(goal(1), STOP)
     np.testing.assert_allclose(told, pose_covariance(STOP))
 
 
 def test_a_fix_that_adds_nothing_hardly_counts() -> None:
     fixes = FixCovariances(STILL)
-    before = fixes.told(goal(1), STOP)
-    again = fixes.told(goal(2), STOP)
+    before = fixes.next_covariance(goal(1), STOP)
+    again = fixes.next_covariance(goal(2), STOP)
     assert (np.diag(again) > 5.0 * np.diag(before)).all()
     for number in range(3, 10):  # whoever fuses them all is hardly surer than by the first alone
-        before = fused(before, fixes.told(goal(number), STOP))
+        before = fused(before, fixes.next_covariance(goal(number), STOP))
     assert (np.diag(before) > 0.6 * np.diag(pose_covariance(STOP))).all()
 
 
@@ -47,8 +47,8 @@ def test_a_fix_counts_the_more_the_coarser_the_odometry_is() -> None:
     told = []
     for noise in (1e-6, 2e-4, 2e-2):
         fixes = FixCovariances(OdometryModel(wheel_separation=0.085, wheel_noise=noise))
-        fixes.told(goal(1), STOP)
-        told.append(fixes.told(goal(2, 0.5), STOP)[2, 2])
+        fixes.next_covariance(goal(1), STOP)
+        told.append(fixes.next_covariance(goal(2, 0.5), STOP)[2, 2])
     now = pose_covariance(STOP)[2, 2]
     assert told[0] > told[1] > told[2] > now
     assert told[2] < 1.05 * now
@@ -56,16 +56,16 @@ def test_a_fix_counts_the_more_the_coarser_the_odometry_is() -> None:
 
 def test_a_closed_loop_counts_in_full() -> None:
     fixes = FixCovariances(USUAL)
-    fixes.told(goal(1), 400.0 * STOP)
-    closed = fixes.told(goal(2, 0.5), STOP)
+    fixes.next_covariance(goal(1), 400.0 * STOP)
+    closed = fixes.next_covariance(goal(2, 0.5), STOP)
     np.testing.assert_allclose(np.diag(closed), np.diag(pose_covariance(STOP)), rtol=0.2)
 
 
 def test_after_odometry_has_begun_anew_a_fix_counts_in_full() -> None:
     fixes = FixCovariances(STILL)
-    fixes.told(goal(1), STOP)
-    fixes.told(goal(2), STOP)
-    np.testing.assert_allclose(fixes.told(goal(1), STOP), pose_covariance(STOP))
+    fixes.next_covariance(goal(1), STOP)
+    fixes.next_covariance(goal(2), STOP)
+    np.testing.assert_allclose(fixes.next_covariance(goal(1), STOP), pose_covariance(STOP))
 
 
 @given(arrays(float, (3, 3), elements=ELEMENTS), arrays(float, (3, 3), elements=ELEMENTS), st.floats(-2, 2))
@@ -73,8 +73,8 @@ def test_what_is_told_is_a_covariance_and_never_less_than_the_mapper_has(
     first: FloatArray, second: FloatArray, x: float
 ) -> None:
     fixes = FixCovariances(USUAL)
-    fixes.told(goal(1), first @ first.T)
-    told = fixes.told(goal(2, x), second @ second.T)
+    fixes.next_covariance(goal(1), first @ first.T)
+    told = fixes.next_covariance(goal(2, x), second @ second.T)
     now = pose_covariance(second @ second.T)
     assert (told == told.T).all()
     scale = np.abs(told).max()

@@ -32,7 +32,7 @@ def compiled_late() -> list[str]:
         number = feed.number(index)
         goal = None if number is None else mapper.goal(number)
         if number is not None and goal is not None:
-            FixCovariances(robot.odometry).told(goal, mapper.covariance(number))
+            FixCovariances(robot.odometry).next_covariance(goal, mapper.covariance(number))
         mapper.visits.on(mapper.occupancy())
     return compiled_since(before)
 

@@ -131,7 +131,7 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
         if goal is None:
             return
         goals[robot].append(goal)
-        covariances[robot].append(published[robot].told(goal, mapper.covariance(robot)))
+        covariances[robot].append(published[robot].next_covariance(goal, mapper.covariance(robot)))
         stamp_ns = BEGIN_NS + goal.stamp_ns
         if not maps or stamp_ns >= max(maps) + _MAP_PERIOD_NS:
             maps[stamp_ns] = _encode_map(stamp_ns, mapper.occupancy())

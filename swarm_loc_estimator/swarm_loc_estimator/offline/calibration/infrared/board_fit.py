@@ -1,8 +1,8 @@
 """Fit what an infrared board is, from exchanges of robots whose relative poses are known.
 
-Sought are the amplitude law, the symmetric curves of sensors and emitters as tables, and by how much the
-heading of each robot's ground truth is off. Readings are compared on the scale on which their noise is one,
-outliers count up to a limit, and second differences of the curves' logarithms are held small.
+The unknowns are the amplitude law, the symmetric curves of sensors and emitters as tables, and the offset of
+each robot's heading in ground truth. Readings are compared on the scale on which their noise is one, a robust
+loss limits outliers, and second differences of the curves' logarithms are regularized.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _GAIN_SIGMA, _MIN_SPREAD = 0.25, 0.01
 _MIN_MEASURED = 100
 """Sensors of robots that measured in fewer exchanges have no gains."""
 _LIMIT = 2.0
-"""Outliers count as residuals of so many sigmas do at most."""
+"""Largest residual of an outlier after the robust loss [sigma]."""
 _DIM = 3.0
 """Readings within so many sigmas of the median show the noise, for most elements do not face each other."""
 _LIT = 8.0
@@ -128,8 +128,8 @@ def turned(poses: FloatArray, receiver_yaw: FloatArray, transmitter_yaw: FloatAr
 def noise_floor(data: BoardReadings) -> float:
     """Robust standard deviation of readings where there is no light [count].
 
-    By the differences of one element's readings in successive exchanges of a receiver, in both of which it is
-    dark: so what an amplifier is off, and drifts by, is no noise.
+    It is computed from the differences of one element's dark readings in successive exchanges of a receiver,
+    so that the offset and drift of an amplifier do not count.
     """
     middle = float(np.nanmedian(data.readings))
     limit = _DIM * max(_TO_SIGMA * float(np.nanmedian(np.abs(data.readings - middle))), 0.5)
@@ -144,7 +144,7 @@ def noise_floor(data: BoardReadings) -> float:
 
 
 class _Problem:
-    """The least squares of one platform's noise."""
+    """The least-squares problem for a platform with fixed noise."""
 
     def __init__(self, platform: IrPlatform, data: BoardReadings, robots: int, *, gains: bool) -> None:
         self._platform, self._data, self._robots = platform, data, robots
@@ -189,7 +189,7 @@ class _Problem:
         return self._angles(turned(data.poses, yaw[data.receiver], yaw[data.transmitter]))
 
     def _angles(self, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Likewise of relative poses (k, 3)."""
+        """Distances and angles, as `angles` returns them, at relative poses (k, 3)."""
         rho, ahead = self._platform.radius, np.array(self._platform.angles)
         distance, bearing, heading = poses.T
         at = ahead + heading[:, None]
@@ -217,12 +217,12 @@ class _Problem:
         return np.where(self._known, more, np.nan)
 
     def residuals(self, unknowns: FloatArray) -> FloatArray:
-        """Of readings, each with a limit, and of what is held small."""
+        """Residuals of readings, each with a limit, and of the regularization."""
         limited = _limited(np.nan_to_num(self.scatter(unknowns)))[0]
         return np.concatenate([limited.ravel(), self._held(unknowns)])
 
     def slopes(self, unknowns: FloatArray) -> FloatArray:
-        """Of the residuals by the unknowns."""
+        """Jacobian of the residuals."""
         data, count, n = self._data, len(_KNOTS) - 1, self._platform.n
         law, sensor, emitter, yaw = self.parts(unknowns)
         distance, (alpha, beta) = self.angles(yaw)
@@ -254,7 +254,7 @@ class _Problem:
         return np.concatenate([columns.reshape(unknowns.size, -1).T, self._held_slopes(unknowns)])
 
     def _held_slopes(self, unknowns: FloatArray) -> FloatArray:
-        """Of what is held small; by differences, since it is cheap."""
+        """Jacobian of the regularization, by differences, since it is cheap."""
         here, slopes = self._held(unknowns), []
         for k in range(unknowns.size):
             ahead = unknowns.copy()
@@ -263,7 +263,7 @@ class _Problem:
         return np.stack(slopes, axis=1)
 
     def _held(self, unknowns: FloatArray) -> FloatArray:
-        """What is held small."""
+        """Residuals of the regularization and the priors."""
         law, sensor, emitter, yaw = self.parts(unknowns)
         held = [self._bend @ sensor, self._bend @ emitter, yaw / _YAW_SIGMA]
         held += [
@@ -329,5 +329,5 @@ def _with_noise(platform: IrPlatform, problem: _Problem, unknowns: FloatArray) -
 
 
 def _robust_sigma(values: FloatArray) -> float:
-    """Standard deviation about zero of the many, whatever the few are."""
+    """Robust standard deviation about zero, by the median."""
     return float(_TO_SIGMA * np.median(np.abs(values)))

@@ -1,12 +1,12 @@
-"""Find sensors and emitters that are dead or shaded, from what robots read of each other alone.
+"""Find sensors and emitters that are dead or shaded, from the robots' readings of each other alone.
 
-Between a robot's bright elements a dead one stands out, wherever the other robot is: no pose explains what
-the two beside it show. Each element is judged by the likelihood ratio of exchanges between two hypotheses,
-that it gives about all of its light and that it gives a third of it or less. If the first holds, the ratio is
-beyond 1 / p with a probability of p at most (Markov's inequality), so p / elements is demanded of each: the
-probability that any is named falsely is p (Wald's sequential test). In any one geometry of a pair something
-in between may darken the whole of an element's light, which is allowed for with the board's share of blocked
-readings; so a few geometries say little, however often they were measured.
+A dead element stands out between bright ones wherever the other robot is, since no pose explains the readings
+of its neighbours. Each element is tested by the likelihood ratio of two hypotheses: it gives about all of its
+light, or a third of it or less. Under the first, the ratio exceeds 1 / p with a probability of at most p
+(Markov's inequality). Each element is tested at p / elements, so the probability of any false alarm is p
+(Wald's sequential test). In any one geometry of a pair an obstacle may block all light of an element, which
+is modelled by the board's share of blocked readings; so a few geometries carry little evidence, however often
+they were measured.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from swarm_loc_estimator.offline.calibration.infrared.element_likelihood import 
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
 FALSE_ALARM = 0.01
-"""Probability that any element is named falsely."""
+"""Probability of a false alarm for any element."""
 _LOST, _WHOLE_SHARES = slice(0, 3), slice(3, None)
 """Shares of light of elements that are dead or shaded, and of others."""
 _SAME_GEOMETRY = 1.5
 """Directions within so many steps of the grid are the same geometry."""
 _BRIGHT = 10.0
-"""Exchanges whose brightest reading is below tell nothing: out of reach, or out of sight [sigma]."""
+"""Exchanges whose brightest reading is below are not used: out of reach, or out of sight [sigma]."""
 _MIN_BLOCKED = 0.05
 """Geometries in which something is in between, where the board says that fewer readings are blocked."""
 
@@ -46,7 +46,7 @@ _MIN_SIGMA = 0.05
 
 @dataclass(frozen=True)
 class ElementVerdicts:
-    """What became of each element.
+    """The verdict on each element.
 
     Attributes:
         dead: (2, robots, n) sensors and emitters that are dead or shaded.
@@ -60,7 +60,7 @@ class ElementVerdicts:
 
     @property
     def undecided(self) -> BoolArray:
-        """(2, robots, n) those of which there are not enough exchanges."""
+        """(2, robots, n) elements with too few exchanges for a verdict."""
         return ~self.dead & ~self.works
 
     def numbers(self, robot: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -89,10 +89,10 @@ def find_dead_elements(platform: IrPlatform, robots: int, exchanges: Exchanges) 
     dead = np.zeros((2, robots, n), dtype=np.bool_)
     shares, scores = np.ones((2, robots, n)), np.zeros((2, robots, n))
     enough = math.log(dead.size / FALSE_ALARM)
-    told = element_likelihoods(platform, readings, saturation)
+    likelihoods = element_likelihoods(platform, readings, saturation)
     judged = np.ones((2, robots), dtype=np.bool_)
     while judged.any():
-        _score(platform, robot_of, told, judged, scores, shares)
+        _score(platform, robot_of, likelihoods, judged, scores, shares)
         scores[dead] = -math.inf
         best = scores.max(axis=2, keepdims=True)
         named = (best > enough) & (best - scores < -math.log(FALSE_ALARM))
@@ -100,7 +100,7 @@ def find_dead_elements(platform: IrPlatform, robots: int, exchanges: Exchanges) 
         changed = named[0, robot_of[0]].any(axis=1) | named[1, robot_of[1]].any(axis=1)
         readings[dead[0, robot_of[0]]] = np.nan
         np.swapaxes(readings, 1, 2)[dead[1, robot_of[1]]] = np.nan
-        told.log[changed], told.directions[changed] = element_likelihoods(
+        likelihoods.log[changed], likelihoods.directions[changed] = element_likelihoods(
             platform, readings[changed], saturation[changed]
         )
         judged = np.zeros((2, robots), dtype=np.bool_)
@@ -118,16 +118,16 @@ def _bright(platform: IrPlatform, exchanges: Exchanges) -> BoolArray:
 def _score(
     platform: IrPlatform,
     robot_of: NDArray[np.int64],
-    told: ElementLikelihoods,
+    likelihoods: ElementLikelihoods,
     wanted: BoolArray,
     scores: FloatArray,
     shares: FloatArray,
 ) -> None:
     """Write log likelihood ratios and likeliest shares (2, robots, n), of robots `wanted` (2, robots)."""
-    geometry = _geometries(robot_of, told.directions, _SAME_GEOMETRY * direction_step(platform))
+    geometry = _geometries(robot_of, likelihoods.directions, _SAME_GEOMETRY * direction_step(platform))
     for side, robot in zip(*np.nonzero(wanted), strict=True):
         rows = np.flatnonzero(robot_of[side] == robot)
-        logs = told.log[rows, side]
+        logs = likelihoods.log[rows, side]
         whole, lost = _by_hypothesis(logs, geometry[rows], max(platform.blocked_share, _MIN_BLOCKED))
         weight = _log_prior(platform)
         scores[side, robot] = _log_sum(lost, np.full(lost.shape[-1], -math.log(lost.shape[-1])))

@@ -1,9 +1,9 @@
 """Likelihood of exchanges by the share of its light that one element still gives, over all poses.
 
-Where two robots stood is not known, so the likelihood is marginalized over a grid of relative poses. Of each
-sensor of the receiver and each emitter of the transmitter it is told for a few shares of its light, all
-other elements being as the board has them. Readings are compared on the scale on which their noise is one;
-any may be blocked, or lit from elsewhere, as the board says.
+The relative pose is unknown, so the likelihood is marginalized over a grid of relative poses. It is computed
+for a few shares of the light of each sensor of the receiver and each emitter of the transmitter, with all
+other elements as the board describes them. Readings are compared on the scale on which their noise is one;
+any may be blocked, or lit from elsewhere, at the rates of the board.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ Float32Array = NDArray[np.float32]
 
 
 class ElementLikelihoods(NamedTuple):
-    """What exchanges say of their elements.
+    """Likelihoods of the elements of exchanges.
 
     Attributes:
         log: (k, 2, n, S) log likelihood by the share, of `SHARES`, of the receiver's sensors and the
@@ -67,7 +67,7 @@ def element_likelihoods(
     Args:
         platform: The board of both robots.
         readings: (k, n, n) [count] at full power, [sensor, emitter]; NaN where not measured or left out.
-        saturation: (k,) from where on they tell no more [count].
+        saturation: (k,) of each exchange [count].
     """
     count, n = len(readings), platform.n
     poses, light, log_prior = _grid(platform)

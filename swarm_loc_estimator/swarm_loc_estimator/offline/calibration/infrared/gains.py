@@ -51,13 +51,13 @@ class BoardGroup:
 
 @dataclass(frozen=True)
 class BoardFit:
-    """What became of one kind of board.
+    """The calibration of one kind of board.
 
     Attributes:
         group: Who, and what was read.
         fit: Gains, by place in the group's `robots`.
-        elements: Which elements are dead or shaded, likewise; they are not used.
-        limits: Where their sensors saturate and how noisy they are, likewise.
+        elements: Which elements are dead or shaded, by place; they are not used.
+        limits: Where their sensors saturate and how noisy they are, by place.
         helps: (robots,) whether a robot's gains help in blocks of time that they were not estimated from.
     """
 
@@ -76,11 +76,11 @@ class BoardFit:
 
 @dataclass(frozen=True)
 class InfraredCalibration:
-    """Everything that a calibration of infrared boards gives.
+    """Result of a calibration of infrared boards.
 
     Attributes:
         swarm: With the gains and dead elements that were found.
-        boards: How they came about, kind by kind.
+        boards: The fit of each kind of board.
         remarks: What could not be used or calibrated, one sentence each.
     """
 
@@ -97,7 +97,7 @@ def calibrate_infrared(
     Args:
         recording: With brightness matrices.
         swarm: Whose; gains that it has are forgotten.
-        progress: Called now and then with the share done and what is being done.
+        progress: Called with the share done and the name of the step.
         with_truth: Whether ground truth is used, where there is some.
 
     Raises:
@@ -141,7 +141,7 @@ def rms(residuals: FloatArray) -> float:
 
 
 class _Share:
-    """Progress of one of several fits, told in words that come an unknown number of times."""
+    """Progress of one of several fits, which reports an unknown number of steps."""
 
     def __init__(self, progress: Progress, number: int, count: int) -> None:
         self._progress, self._begin, self._left = progress, number / count, 1.0 / count
@@ -156,7 +156,7 @@ def _fit(group: BoardGroup, limits: ReadingLimits, progress: _Share) -> BoardFit
 
     Raises:
         CalibrationError: There are too few exchanges.
-        GainsError: They tell nothing.
+        GainsError: They do not determine gains.
     """
     count = len(group.exchanges.receiver)
     if count < MIN_EXCHANGES:

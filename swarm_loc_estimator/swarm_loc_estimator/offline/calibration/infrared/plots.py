@@ -66,29 +66,27 @@ def dead_lines(elements: ElementVerdicts, names: list[str]) -> list[str]:
 
 
 def _limits(board: BoardFit, names: list[str]) -> list[str]:
-    """A line per robot with what exchanges tell of saturation and noise, and of how many sensors they do."""
+    """A line per robot with saturation and noise by sensor, and one with how many sensors were determined."""
     limits, lines = board.limits, []
-    told = (
+    columns = (
         ("saturation [count]", limits.saturation + board.group.platform.dark_level, 0),
         ("noise [count]", limits.noise, 2),
         ("relative noise [%]", 100.0 * limits.relative_noise, 1),
     )
     for place, name in enumerate(names):
         said = [
-            f"{what} {_told(values[place], digits)}"
-            for what, values, digits in told
+            f"{what} {_bracketed(values[place], digits)}"
+            for what, values, digits in columns
             if np.isfinite(values[place]).any()
         ]
         if said:
             lines.append(f"{name}, by sensor: {', '.join(said)}")
     saturated, noisy = (int(np.isfinite(part).sum()) for part in (limits.saturation, limits.noise))
-    lines.append(
-        f"exchanges tell where {saturated} of {limits.noise.size} sensors saturate, and the noise of {noisy}"
-    )
+    lines.append(f"saturation determined for {saturated} of {limits.noise.size} sensors, noise for {noisy}")
     return lines
 
 
-def _told(values: FloatArray, digits: int) -> str:
+def _bracketed(values: FloatArray, digits: int) -> str:
     """Numbers in brackets, a dash where there is none."""
     return f"[{' '.join(f'{value:.{digits}f}' if np.isfinite(value) else '-' for value in values)}]"
 

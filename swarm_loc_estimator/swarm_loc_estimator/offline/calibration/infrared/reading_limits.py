@@ -1,4 +1,4 @@
-"""Find where sensors saturate and how they are noisy, from what robots read of each other alone.
+"""Find the saturation and noise of sensors from the robots' readings of each other alone.
 
 Neither poses nor curves are used, for a board's curves may be what is wrong.
 
@@ -9,8 +9,8 @@ it is that so many lie there by chance. A sensor that saturates piles them up.
 
 Noise: what one pair reads twice in a row differs by the noise of both readings, while the two stand. Robots
 that moved in between change readings in proportion (their range), and towards neighbouring sensors (bearing)
-and emitters (heading). These three directions are told apart from all others by an F test, whatever the scale
-of the noise; what lies in the other directions is noise.
+and emitters (heading). An F test separates these three directions from all others, whatever the scale of the
+noise; changes in the other directions are noise.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _SAME = 0.2
 _CLEAR_OF_TOP = 0.9
 """Readings above this share of saturation are not asked for noise."""
 _BRIGHT = 10.0
-"""Pairs whose brightest reading is below tell not whether they stand [sigma of a change]."""
+"""Pairs whose brightest reading is below are not tested for standing [sigma of a change]."""
 _MAX_CHANGE = 0.3
 """Pairs whose readings changed by more, besides noise, have moved: relative, root of the sum of squares."""
 _MOTIONS, _MOVED = 3, 0.05
@@ -48,12 +48,12 @@ _MIN_STANDING = 0.2
 """Where a smaller share of exchanges passes for standing, robots moved all the time, and it is by chance."""
 _MIN_READINGS = 60
 """Differences of a sensor, for its noise."""
-_MIN_TOLD = 0.2
-"""Changes of which motion may explain all but this share tell nothing of noise."""
+_MIN_FREE = 0.2
+"""Changes of which motion may explain all but this share are not used for noise."""
 _TRIM, _TRIMMED = 3.0, 0.9733
 """Differences beyond so many sigmas are outliers; the variance of the others, relative."""
 _MAX_UNSURE = 0.03
-"""Relative noise is told where it would be seen if it were so large, or is twice as large as it is unsure."""
+"""Relative noise is reported where it would be detected at this size, or is twice its own sigma."""
 _ROUNDS, _FIT_ROUNDS = 4, 30
 _TINY = 1e-300
 _FIRST_RELATIVE, _LEAST_NOISE = 0.03, 0.3
@@ -66,7 +66,7 @@ _LEAST_RELATIVE = 0.05
 
 @dataclass(frozen=True)
 class ReadingLimits:
-    """What exchanges say of the sensors' limits; NaN where they do not say it.
+    """Saturation and noise of sensors; NaN where exchanges do not determine them.
 
     Attributes:
         saturation: (robots, n) where readings pile up [count], what is read in the dark taken off.
@@ -80,7 +80,7 @@ class ReadingLimits:
 
     @property
     def typical_noise(self) -> tuple[float, float]:
-        """Medians of noise [count] and relative noise of the sensors that tell it; NaN where none does."""
+        """Medians of noise [count] and relative noise over sensors; NaN where none is known."""
         return _median_of_known(self.noise), _median_of_known(self.relative_noise)
 
 
@@ -89,9 +89,9 @@ class _Repeats(NamedTuple):
 
     Attributes:
         receiver: (p,).
-        change: (p, n, n) by how much readings changed [count]; 0 where one of the two tells nothing.
+        change: (p, n, n) by how much readings changed [count]; 0 where one of the two is unusable.
         level: (p, n, n) their mean.
-        known: (p, n, n) whether both tell something.
+        known: (p, n, n) whether both are usable.
     """
 
     receiver: NDArray[np.int64]
@@ -163,7 +163,7 @@ def _median_of_known(values: FloatArray) -> float:
 
 
 def _first_of_geometries(exchanges: Exchanges) -> BoolArray:
-    """(k,) which exchanges are the first of their pair in a geometry: repeated ones tell nothing new."""
+    """(k,) which exchanges are the first of their pair in a geometry."""
     first = np.zeros(len(exchanges.receiver), dtype=np.bool_)
     readings = np.nan_to_num(exchanges.readings[:, 0])
     for rows in _rows_of_pairs(exchanges):
@@ -211,7 +211,7 @@ def _pile(tops: FloatArray, emitters: NDArray[np.int64], alarm: float) -> float:
 
 
 def _repeats(exchanges: Exchanges, saturation: FloatArray) -> _Repeats:
-    """All exchanges in a row, without readings near saturation, told or found."""
+    """All exchanges in a row, without readings near saturation, as described or found."""
     rows = _rows_of_pairs(exchanges)
     one, other = (np.concatenate([part[s] for part in rows]) for s in (slice(None, -1), slice(1, None)))
     first, second = exchanges.readings[one, 0], exchanges.readings[other, 0]
@@ -236,10 +236,10 @@ def _noise(platform: IrPlatform, robots: int, repeats: _Repeats) -> FloatArray:
             for part, start in zip(found, (dark, _FIRST_RELATIVE), strict=True)
         )
         sigma = math.sqrt(2.0) * np.hypot(own, relative * np.maximum(repeats.level, 0.0))
-        noise, told = _unexplained(repeats, sigma, order)
+        noise, determined = _unexplained(repeats, sigma, order)
         for robot, i in np.ndindex(robots, platform.n):
             rows = repeats.receiver == robot
-            there = told[rows, i]
+            there = determined[rows, i]
             found[:, robot, i] = _fitted(repeats.level[rows, i][there], noise[rows, i][there], dark)
     return found
 
@@ -247,7 +247,7 @@ def _noise(platform: IrPlatform, robots: int, repeats: _Repeats) -> FloatArray:
 def _unexplained(
     repeats: _Repeats, sigma: FloatArray, order: NDArray[np.int64]
 ) -> tuple[FloatArray, BoolArray]:
-    """What no motion explains of the changes, as noise of one reading (p, n, n), and where that is told.
+    """What no motion explains of the changes, as noise of one reading (p, n, n), and where it is determined.
 
     Args:
         repeats: What was read twice.
@@ -263,9 +263,9 @@ def _unexplained(
     rest = change - np.einsum("pcw,pw->pc", basis, along)
     stands = _stands(repeats, sigma, np.sum(along**2, axis=1), np.sum(rest**2, axis=1))
     free = 1.0 - np.sum(basis**2, axis=-1)
-    told = repeats.known.reshape(flat) & (free > _MIN_TOLD) & stands[:, None]
-    noise = rest / np.sqrt(2.0 * np.maximum(free, _MIN_TOLD)) * sigma.reshape(flat)
-    return noise.reshape(sigma.shape), told.reshape(sigma.shape)
+    determined = repeats.known.reshape(flat) & (free > _MIN_FREE) & stands[:, None]
+    noise = rest / np.sqrt(2.0 * np.maximum(free, _MIN_FREE)) * sigma.reshape(flat)
+    return noise.reshape(sigma.shape), determined.reshape(sigma.shape)
 
 
 def _motions(level: FloatArray, order: NDArray[np.int64]) -> list[FloatArray]:
