@@ -67,7 +67,7 @@ class Exchanges(NamedTuple):
 
     def select(self, rows: NDArray[np.bool_]) -> Exchanges:
         """Those of some rows, which are marked (k,)."""
-        return Exchanges(*(column[rows] for column in self))
+        return Exchanges._make(column[rows] for column in self)
 
 
 @dataclass(frozen=True)

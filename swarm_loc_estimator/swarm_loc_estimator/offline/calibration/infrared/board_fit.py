@@ -66,7 +66,7 @@ class BoardReadings(NamedTuple):
 
     def select(self, rows: NDArray[np.bool_]) -> BoardReadings:
         """Those of some rows, which are marked (k,)."""
-        return BoardReadings(*(column[rows] for column in self))
+        return BoardReadings._make(column[rows] for column in self)
 
 
 @dataclass(frozen=True)
