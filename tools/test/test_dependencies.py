@@ -73,10 +73,14 @@ def test_of_the_estimator_others_import_only_common_swarm_and_the_public_api(nam
                 assert allowed.fullmatch(node.module or ""), f"{path} imports {node.module}"
 
 
-@pytest.mark.parametrize("robot", ["epuck", "droplet", "pushbot"])
-def test_a_driver_loads_neither_the_filter_nor_what_pages_and_plots_need(robot: str) -> None:
-    module = f"swarm_loc_drivers.{robot}.{robot}_driver_node"
+@pytest.mark.parametrize(
+    "node",
+    ["epuck.epuck_driver", "droplet.droplet_driver", "droplet.droplet_fleet", "pushbot.pushbot_driver"],
+)
+def test_a_driver_loads_neither_the_filter_nor_what_pages_and_plots_need(node: str) -> None:
+    module = f"swarm_loc_drivers.{node}_node"
     command = [sys.executable, "-c", f"import sys, {module}; print(*sys.modules)"]
     loaded = set(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
     assert module in loaded
-    assert not {"aiohttp", "matplotlib", "swarm_loc_estimator.filter"} & loaded
+    unwanted = {"aiohttp", "matplotlib", "swarm_loc_estimator.filter", "swarm_loc_estimator.timeline"}
+    assert not unwanted & loaded

@@ -48,7 +48,6 @@ from typing import TYPE_CHECKING, Any
 
 from swarm_loc_estimator.common.parameters import UserError, number_specs
 from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
-from swarm_loc_estimator.filter.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.ir_section import IrSection, Values
 from swarm_loc_estimator.swarm.motion_response import MotionResponse, MotionResponseError
 from swarm_loc_estimator.swarm.swarm import (
@@ -186,7 +185,7 @@ class _Loader(TreeChecks):
             raise self.said(f"robots names {len(named)} robots but must name at most {MAX_ROBOTS}")
         robots = tuple(self._robot(name, tree, defaults, types) for name, tree in named)
         landmarks = self._landmarks(sections.get("landmarks", {}), sections.get("defaults", {}))
-        states = ParameterTable.of(robots, landmarks).filter_size
+        states = _state_count(robots, landmarks)
         if states > MAX_STATES:
             raise self.said(
                 f"what has a sigma makes a filter of {states} states but must make at most {MAX_STATES}"
@@ -337,3 +336,19 @@ def _said(layers: Iterable[_Layer], section: str) -> Values | None:
             said = layer.sections[section]
             values = None if said is None else {**(values or {}), **said}
     return values
+
+
+def _state_count(robots: tuple[Robot, ...], landmarks: tuple[Landmark, ...]) -> int:
+    """States of the filter: three per pose and per estimated landmark, one per parameter with a sigma."""
+    sigmas = [
+        sigma
+        for robot in robots
+        for sigma in (
+            robot.odometry.turn_bias_sigma,
+            robot.odometry.distance_scale_sigma,
+            robot.odometry.turn_scale_sigma,
+            *((robot.camera.yaw_sigma, robot.sensor.distance_scale_sigma) if robot.camera else ()),
+        )
+    ]
+    estimated: int = sum(mark.is_estimated for mark in landmarks)
+    return 3 * (len(robots) + estimated) + sum(1 for sigma in sigmas if sigma > 0.0)
