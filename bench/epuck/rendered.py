@@ -16,8 +16,12 @@ from sensor_msgs.msg import Image
 from bench.graph.listener import TYPE_OF, Listener, Say
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.cdr import DetectionArrayMessage, decode_detections
-from swarm_loc_estimator.common.messages.encoders import UNKNOWN_COVARIANCE, encode_detections
+from swarm_loc_estimator.common.messages.detections import (
+    DetectionArrayMessage,
+    decode_detections,
+    encode_detections,
+)
+from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE
 from swarm_loc_estimator.offline.live.graph import LiveGraph, cpu_seconds
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Swarm

@@ -10,13 +10,13 @@ import numpy as np
 from swarm_loc_drivers.sim.run import SimulatedRun
 from swarm_loc_drivers.sim.scenarios.bags import Stream, as_detections, truth_stream, write_streams
 from swarm_loc_estimator.common.arrays import IntArray
-from swarm_loc_estimator.common.messages.shared import (
+from swarm_loc_estimator.common.messages.definitions import SWARM_DETECTIONS, SWARM_ODOMETRY
+from swarm_loc_estimator.common.messages.detections import (
     SharedHead,
     encode_shared_detections,
     encode_shared_numbers,
     swarm_key,
 )
-from swarm_loc_estimator.common.messages.typestore import SWARM_DETECTIONS, SWARM_ODOMETRY
 
 PERIOD_NS = 10_000_000
 """All that arrives within this goes out together, at its end."""

@@ -17,7 +17,8 @@ from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
 from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.cdr import decode_detections, decode_odometry
+from swarm_loc_estimator.common.messages.detections import decode_detections
+from swarm_loc_estimator.common.messages.poses import decode_odometry
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 from swarm_loc_estimator.offline.live.graph import LiveGraph, read_poses
 from swarm_loc_estimator.swarm.swarm import Swarm

@@ -23,10 +23,11 @@ from bench.mrclam.sets import import_set
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.common.bags.cut import copy_beginning
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.messages.cdr import decode_odometry, nanoseconds
-from swarm_loc_estimator.common.messages.planar import yaw_of
+from swarm_loc_estimator.common.bags.writer import typestore
+from swarm_loc_estimator.common.messages.cdr import nanoseconds
+from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY
+from swarm_loc_estimator.common.messages.poses import decode_odometry, yaw_of
 from swarm_loc_estimator.common.messages.streams import DetectionReader, PoseReader
-from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY, typestore
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

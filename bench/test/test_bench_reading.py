@@ -9,7 +9,7 @@ import pytest
 
 from bench.peers import reading
 from swarm_loc_estimator.common.bags.cut import copy_beginning
-from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY
+from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY
 
 
 @pytest.fixture

@@ -10,8 +10,12 @@ import pytest
 
 from bench.epuck.views import Views
 from swarm_loc_drivers.sim.epuck.world import Exposure
-from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE, DetectionArrayMessage, decode_detections
-from swarm_loc_estimator.common.messages.encoders import encode_detections
+from swarm_loc_estimator.common.messages.detections import (
+    DETECTION_DTYPE,
+    DetectionArrayMessage,
+    decode_detections,
+    encode_detections,
+)
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm

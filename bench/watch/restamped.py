@@ -17,8 +17,8 @@ from rclpy.qos import QoSProfile
 
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.messages.cdr import ENCAPSULATION, SECOND_NS
-from swarm_loc_estimator.common.messages.cdr_writer import STAMP_SIZE, stamp_bytes
-from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY
+from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY
+from swarm_loc_estimator.common.messages.poses import STAMP_SIZE, stamp_bytes
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
 _CLASSES = {ODOMETRY: Odometry, DETECTIONS: MarkerDetectionArray}

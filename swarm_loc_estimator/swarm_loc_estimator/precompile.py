@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from swarm_loc_estimator.common.jit import note_precompiled
-from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
-from swarm_loc_estimator.common.messages.encoders import (
+from swarm_loc_estimator.common.messages.detections import (
+    DETECTION_DTYPE,
     encode_brightness,
     encode_detections,
-    encode_fix,
-    encode_odometry,
 )
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometry
 from swarm_loc_estimator.filter.calibration_states import ParameterTable
 from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS, record_pair
 from swarm_loc_estimator.filter.integrity.fault_detection import is_elsewhere

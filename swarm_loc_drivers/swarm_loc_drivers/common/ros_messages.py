@@ -20,7 +20,7 @@ from tf2_msgs.msg import TFMessage
 
 from swarm_loc_drivers.common.calibration_file import CameraCalibration
 from swarm_loc_drivers.common.odometry import OdometryState
-from swarm_loc_estimator.common.messages.planar import PLANE
+from swarm_loc_estimator.common.messages.poses import PLANE
 
 ODOMETRY_QOS = QoSProfile(depth=10)
 _TF_QOS = QoSProfile(depth=100)

@@ -24,7 +24,7 @@ from swarm_loc_drivers.pushbot.stop_and_go import MapGoal, StopAndGo, StopAndGoS
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.health import Report, drop_values, listed
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
-from swarm_loc_estimator.common.messages.planar import yaw_of
+from swarm_loc_estimator.common.messages.poses import yaw_of
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_msgs.msg import LaserDistance

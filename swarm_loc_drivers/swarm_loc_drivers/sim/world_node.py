@@ -16,7 +16,7 @@ from rosgraph_msgs.msg import Clock
 from swarm_loc_drivers.common.ros_messages import stamp_message
 from swarm_loc_drivers.sim.link_host import FirmwareHost
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.encoders import encode_pose_stamped
+from swarm_loc_estimator.common.messages.poses import encode_pose_stamped
 from swarm_loc_estimator.common.node import ConfiguredNode, Parameters, Stop
 from swarm_loc_estimator.common.parameters import ParameterError
 

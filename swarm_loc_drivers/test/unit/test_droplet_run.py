@@ -17,7 +17,8 @@ from swarm_loc_drivers.sim.scenarios.droplets import (
 )
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.messages.cdr import decode_brightness, decode_fix
+from swarm_loc_estimator.common.messages.detections import decode_brightness
+from swarm_loc_estimator.common.messages.poses import decode_fix
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.swarm.ir_board import PairGains
 from swarm_loc_estimator.swarm.swarm_file import load_swarm

@@ -8,7 +8,8 @@ import pytest
 from swarm_loc_drivers.sim.generate_bag import main
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.messages.cdr import decode_detections, decode_odometry, decode_pose_stamped
+from swarm_loc_estimator.common.messages.detections import decode_detections
+from swarm_loc_estimator.common.messages.poses import decode_odometry, decode_pose_stamped
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 

@@ -17,7 +17,7 @@ from swarm_loc_drivers.sim.scenarios.eight_images import FAMILY, simulate_eight_
 from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.messages.typestore import typestore
+from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.swarm.swarm import Landmark
 from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import family_named

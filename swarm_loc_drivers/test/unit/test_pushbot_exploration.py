@@ -26,8 +26,8 @@ from swarm_loc_drivers.sim.scenarios.pushbot_bag import PushbotBagSettings, writ
 from swarm_loc_estimator.cli.replay_map import main as replay_map
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.event_encoding import decode_events
-from swarm_loc_estimator.common.messages.typestore import typestore
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_vision.events.parameters import LightSource, TrackerSettings

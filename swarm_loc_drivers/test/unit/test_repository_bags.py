@@ -10,7 +10,7 @@ import pytest
 
 from swarm_loc_drivers.sim.generate_bag import main
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.messages.typestore import typestore
+from swarm_loc_estimator.common.bags.writer import typestore
 
 BAGS = Path(__file__).parents[3] / "bags"
 SIMULATED = [

@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Collection
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.messages.cdr import ENCAPSULATION, MAX_PADDING, CdrError
-from swarm_loc_estimator.common.messages.planar import yaw_of
-from swarm_loc_estimator.common.messages.typestore import MESSAGE_PACKAGE, typestore
+from swarm_loc_estimator.common.messages.cdr import CdrError, decode, nanoseconds
+from swarm_loc_estimator.common.messages.definitions import LASER, LIGHTS, OCCUPANCY_GRID
+from swarm_loc_estimator.common.messages.poses import planar_pose
 from swarm_loc_estimator.common.parameters import ParameterError
 
-OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 MAX_CELLS = 4_000_000
 """A larger map is none of a swarm's."""
-_NANOSECONDS = 1_000_000_000
-_SIZE = struct.Struct("<fII")
-_ORIGIN = struct.Struct("<7d")
 
 
 class GridMessage(NamedTuple):
@@ -42,51 +37,20 @@ class GridMessage(NamedTuple):
 
 
 def decode_occupancy_grid(data: bytes) -> GridMessage:
-    """Read a nav_msgs/OccupancyGrid of little-endian CDR.
+    """Read a nav_msgs/OccupancyGrid.
 
     Raises:
         CdrError: The bytes are not one, or its numbers cannot be those of a map.
     """
-    try:
-        return _decode_grid(data)
-    except (struct.error, UnicodeDecodeError, ValueError) as error:
-        raise CdrError(f"no OccupancyGrid: {error}.") from error
-
-
-def _decode_grid(data: bytes) -> GridMessage:
-    if bytes(data[:2]) != b"\x00\x01":
-        raise CdrError("encapsulation is not plain little-endian CDR.")
-    seconds, nanoseconds, length = struct.unpack_from("<iII", data, ENCAPSULATION)
-    begin = ENCAPSULATION + 12
-    frame_id = bytes(data[begin : begin + length]).rstrip(b"\x00").decode()
-    at = _aligned(begin + length, 4) + 8  # behind the time at which the map was loaded
-    resolution, width, height = _SIZE.unpack_from(data, at)
-    at = _aligned(at + _SIZE.size, 8)
-    x, y, _, qx, qy, qz, qw = _ORIGIN.unpack_from(data, at)
-    at += _ORIGIN.size
-    (count,) = struct.unpack_from("<I", data, at)
-    origin = (x, y, yaw_of(qx, qy, qz, qw))
-    if not 0 < count <= MAX_CELLS or count != width * height:
-        raise CdrError(f"a map of {width} x {height} cells has {count} of them.")
-    if not (resolution > 0.0 and all(map(math.isfinite, (resolution, *origin)))):
+    message = decode(data, OCCUPANCY_GRID)
+    header, about, cells = message.header, message.info, message.data
+    origin = planar_pose(about.origin)
+    if not 0 < cells.size <= MAX_CELLS or cells.size != about.width * about.height:
+        raise CdrError(f"a map of {about.width} x {about.height} cells has {cells.size} of them.")
+    if not (about.resolution > 0.0 and all(map(math.isfinite, (about.resolution, *origin)))):
         raise CdrError("the place of a map is not finite.")
-    if not 0 <= len(data) - (at + 4 + count) <= MAX_PADDING:
-        raise CdrError(f"{len(data)} bytes are not those of a map of {count} cells.")
-    cells = np.frombuffer(data, np.int8, count, at + 4).reshape(height, width)
-    return GridMessage(seconds * _NANOSECONDS + nanoseconds, frame_id, resolution, origin, cells)
-
-
-def _aligned(offset: int, alignment: int) -> int:
-    """The next offset at which a number of so many bytes may stand."""
-    return offset + -(offset - ENCAPSULATION) % alignment
-
-
-LASER = f"{MESSAGE_PACKAGE}/msg/LaserDistance"
-LIGHTS = f"{MESSAGE_PACKAGE}/msg/LightBearingArray"
-
-
-class BadMessageError(ValueError):
-    """Bytes that are no whole message of the type."""
+    cells = cells.reshape(about.height, about.width)
+    return GridMessage(nanoseconds(header.stamp), header.frame_id, about.resolution, origin, cells)
 
 
 class LaserMessage(NamedTuple):
@@ -111,40 +75,24 @@ def decode_laser(data: bytes) -> LaserMessage:
     """Read a swarm_loc_msgs/LaserDistance.
 
     Raises:
-        BadMessageError: The bytes are not one.
+        CdrError: The bytes are not one.
     """
-    message = _decoded(data, LASER)
-    return LaserMessage(
-        _stamp_ns(message), float(message.distance), float(message.sigma), float(message.v_px)
-    )
+    message = decode(data, LASER)
+    return LaserMessage(nanoseconds(message.header.stamp), message.distance, message.sigma, message.v_px)
 
 
 def decode_lights(data: bytes) -> list[LightMessage]:
     """Read a swarm_loc_msgs/LightBearingArray: those lights whose numbers are finite.
 
     Raises:
-        BadMessageError: The bytes are not one.
+        CdrError: The bytes are not one.
     """
-    message = _decoded(data, LIGHTS)
-    stamp_ns = _stamp_ns(message)
-    lights = [
-        LightMessage(
-            stamp_ns, float(one.frequency), float(one.bearing), math.sqrt(max(0.0, one.covariance[0]))
-        )
-        for one in message.lights
-    ]
-    return [one for one in lights if all(math.isfinite(value) for value in one)]
-
-
-def _decoded(data: bytes, message_type: str) -> Any:
-    try:
-        return typestore().deserialize_cdr(data, message_type)
-    except Exception as error:  # the reader raises whatever its generated code meets
-        raise BadMessageError(f"no {message_type}: {error}") from error
-
-
-def _stamp_ns(message: Any) -> int:
-    return int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
+    message = decode(data, LIGHTS)
+    lights, stamp_ns = message.lights, nanoseconds(message.header.stamp)
+    columns = lights["frequency"], lights["bearing"], np.sqrt(np.maximum(0.0, lights["covariance"][:, 0]))
+    is_finite = np.isfinite(columns).all(axis=0)
+    rows = zip(*(column[is_finite].tolist() for column in columns), strict=True)
+    return [LightMessage(stamp_ns, *row) for row in rows]
 
 
 def led_frequencies(entries: Collection[str], robots: Collection[str]) -> dict[str, float]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import note_precompiled
-from swarm_loc_estimator.common.messages.planar import yaw_of
+from swarm_loc_estimator.common.messages.poses import yaw_of
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, START_TURN, CooperativeMapper
 from swarm_loc_estimator.mapping.matching import Lattice, search_offsets

@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.planar import PLANE, yaw_of
+from swarm_loc_estimator.common.messages.poses import PLANE, yaw_of
 from swarm_loc_estimator.swarm.swarm import StartSigma, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_msgs.srv import SetRobotPose

@@ -11,14 +11,22 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.encoders import encode_pose_stamped
-from swarm_loc_estimator.common.messages.estimates import EstimateMessage
-from swarm_loc_estimator.common.messages.markers import MarkersEncoder
-from swarm_loc_estimator.common.messages.outputs import SwarmPosesEncoder, TransformsEncoder
-from swarm_loc_estimator.common.messages.typestore import MARKERS, POSE_STAMPED, SWARM_POSES, TRANSFORMS
+from swarm_loc_estimator.common.messages.definitions import (
+    MARKERS,
+    OCCUPANCY_GRID,
+    POSE_STAMPED,
+    SWARM_POSES,
+    TRANSFORMS,
+)
+from swarm_loc_estimator.common.messages.estimates import (
+    EstimateMessage,
+    SwarmPosesEncoder,
+    TransformsEncoder,
+)
+from swarm_loc_estimator.common.messages.poses import encode_pose_stamped
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.mapping.messages import OCCUPANCY_GRID
 from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.watch.markers import MarkersEncoder
 
 _MAP = "map"
 

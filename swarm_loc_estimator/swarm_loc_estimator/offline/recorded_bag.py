@@ -10,8 +10,9 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.reader import BagReader, BagTopic
-from swarm_loc_estimator.common.messages.cdr import CdrError, decode_pose_stamped
+from swarm_loc_estimator.common.messages.cdr import CdrError
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
 from swarm_loc_estimator.common.messages.streams import PoseReader
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.messages import decode_occupancy_grid

@@ -15,17 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.cdr import (
+from swarm_loc_estimator.common.messages.detections import (
     ANONYMOUS_DTYPE,
     AnonymousMessage,
     BrightnessMessage,
-    FixMessage,
     decode_anonymous,
     decode_brightness,
-    decode_fix,
-    decode_odometry,
 )
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.poses import FixMessage, decode_fix, decode_odometry
 from swarm_loc_estimator.common.messages.streams import DetectionReader, EachReader, PoseReader
 from swarm_loc_estimator.sensors.messages import (
     AerialRows,

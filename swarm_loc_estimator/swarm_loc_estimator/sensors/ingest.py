@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_estimator.common.messages.detections import swarm_key
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.messages.shared import swarm_key
 from swarm_loc_estimator.sensors.channels import CHANNELS, Known
 from swarm_loc_estimator.sensors.messages import RawInputs, in_order_of_arrival
 from swarm_loc_estimator.sensors.shared_channels import SHARED_CHANNELS

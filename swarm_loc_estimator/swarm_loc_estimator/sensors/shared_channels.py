@@ -10,13 +10,14 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import IntArray
-from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE, CdrError
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.messages.shared import (
+from swarm_loc_estimator.common.messages.cdr import CdrError
+from swarm_loc_estimator.common.messages.detections import (
+    DETECTION_DTYPE,
     SharedMessage,
     decode_shared_detections,
     decode_shared_numbers,
 )
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.sensors.channels import FOREIGN_FRAME, CreateChannel, Known, Read, has_heading
 from swarm_loc_estimator.sensors.messages import (
     NO_DETECTIONS,

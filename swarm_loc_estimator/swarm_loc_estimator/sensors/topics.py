@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from swarm_loc_estimator.common.messages.typestore import (
+from swarm_loc_estimator.common.messages.definitions import (
     ANONYMOUS_DETECTIONS,
     BRIGHTNESS,
     DETECTIONS,

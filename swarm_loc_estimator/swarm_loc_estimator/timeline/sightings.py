@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_estimator.common.messages.cdr import CdrError, decode, encode, nanoseconds
+from swarm_loc_estimator.common.messages.definitions import SWARM_SIGHTINGS
 from swarm_loc_estimator.filter.measurement_model import Command, MeasurementArray
 from swarm_loc_estimator.timeline.fusion import Verdict
 
@@ -59,3 +61,22 @@ def newest_sightings(
         np.where(computed, nis[kept], np.nan).astype(np.float32),
         ((now_ns - rows["stamp_ns"][kept]) * 1e-9).astype(np.float32),
     )
+
+
+def encode_sightings(frame_id: str, stamp_ns: int, sightings: Sightings) -> bytes:
+    """Serialize one swarm_loc_msgs/SwarmSightings."""
+    header = {"stamp": stamp_ns, "frame_id": frame_id}
+    return encode({"header": header, **sightings._asdict()}, SWARM_SIGHTINGS)
+
+
+def decode_sightings(data: bytes) -> tuple[int, Sightings]:
+    """Stamp [ns] and columns of a serialized SwarmSightings.
+
+    Raises:
+        CdrError: It is not a whole one, or its columns differ in length.
+    """
+    message = decode(data, SWARM_SIGHTINGS)
+    header, *columns = vars(message).values()
+    if len({len(column) for column in columns}) != 1:
+        raise CdrError("the columns of the sightings differ in length.")
+    return nanoseconds(header.stamp), Sightings(*columns)

@@ -9,7 +9,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from swarm_loc_estimator.common.messages.cdr import CdrError, decode_pose_stamped, nanoseconds
+from swarm_loc_estimator.common.messages.cdr import CdrError, nanoseconds
+from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
 from swarm_loc_estimator.watch.frames import Frame, aerial_frame, places_frame
 from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities
 

@@ -31,8 +31,8 @@ from typing_extensions import Self
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.launch import executable_path
-from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
-from swarm_loc_estimator.common.messages.encoders import encode_detections, encode_odometry
+from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, encode_detections
+from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.common.node import end_at_task_errors
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE
 from swarm_loc_msgs.msg import MarkerDetectionArray, SwarmPose, SwarmPoses

@@ -6,8 +6,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from node_world import STEP_NS, T0_NS, TRUE_POSES, Robots, Ros, newest_status, stamp_ns, values_of
 
-from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DTYPE
-from swarm_loc_estimator.common.messages.encoders import encode_anonymous
+from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, encode_anonymous
 from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities
 
 

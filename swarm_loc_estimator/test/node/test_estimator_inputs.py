@@ -16,7 +16,8 @@ from rclpy.publisher import Publisher
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
-from swarm_loc_estimator.common.messages.encoders import encode_brightness, encode_fix
+from swarm_loc_estimator.common.messages.detections import encode_brightness
+from swarm_loc_estimator.common.messages.poses import encode_fix
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 from swarm_loc_estimator.swarm.board_file import load_ir_platform

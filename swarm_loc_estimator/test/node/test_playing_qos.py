@@ -10,8 +10,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import QosDurability, QosReliability, QosTime
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from swarm_loc_estimator.common.bags.writer import RELIABLE
-from swarm_loc_estimator.common.messages.typestore import ODOMETRY, typestore
+from swarm_loc_estimator.common.bags.writer import RELIABLE, typestore
+from swarm_loc_estimator.common.messages.definitions import ODOMETRY
 
 BEST_EFFORT = RELIABLE._replace(reliability=QosReliability.BEST_EFFORT, deadline=QosTime(0, 500_000_000))
 LATCHED = RELIABLE._replace(durability=QosDurability.TRANSIENT_LOCAL, depth=1)

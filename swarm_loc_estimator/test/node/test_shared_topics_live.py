@@ -22,7 +22,7 @@ from node_world import (
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
-from swarm_loc_estimator.common.messages.shared import (
+from swarm_loc_estimator.common.messages.detections import (
     SharedHead,
     encode_shared_detections,
     encode_shared_numbers,

@@ -10,7 +10,7 @@ from core_world import Plan, World, simulate
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DTYPE
+from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE
 
 SIGMA, HEADING_SIGMA = 0.01, 0.1
 _STEP_NS = 50_000_000

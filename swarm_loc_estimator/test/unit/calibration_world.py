@@ -11,7 +11,7 @@ import numpy as np
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.offline.calibration.recording import Recording

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DTYPE, DETECTION_DTYPE
+from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, DETECTION_DTYPE
 from swarm_loc_estimator.sensors.messages import (
     AerialRows,
     DetectionRows,

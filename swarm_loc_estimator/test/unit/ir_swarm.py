@@ -12,7 +12,8 @@ import numpy as np
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.encoders import encode_brightness, encode_fix, encode_odometry
+from swarm_loc_estimator.common.messages.detections import encode_brightness
+from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometry
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.sensors.messages import BrightnessRows, FixRows, OdometryRows, RawInputs
 from swarm_loc_estimator.sensors.topics import InputKind

@@ -10,10 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DTYPE, CdrError, decode_anonymous
-from swarm_loc_estimator.common.messages.encoders import encode_anonymous, encode_identities
+from swarm_loc_estimator.common.bags.writer import typestore
+from swarm_loc_estimator.common.messages.cdr import CdrError
+from swarm_loc_estimator.common.messages.definitions import ANONYMOUS_DETECTIONS, ROBOT_IDENTITIES
+from swarm_loc_estimator.common.messages.detections import (
+    ANONYMOUS_DTYPE,
+    decode_anonymous,
+    encode_anonymous,
+    encode_identities,
+)
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.messages.typestore import ANONYMOUS_DETECTIONS, ROBOT_IDENTITIES, typestore
 from swarm_loc_estimator.sensors.channels import MAX_ANONYMOUS
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.messages import RawInputs

@@ -17,9 +17,9 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from swarm_loc_estimator.common.bags.reader import BagError, BagReader, BagTopic, RawMessage
-from swarm_loc_estimator.common.bags.writer import RELIABLE, BagWriter
+from swarm_loc_estimator.common.bags.writer import RELIABLE, BagWriter, typestore
+from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch, merge_streams
-from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY, typestore
 
 if TYPE_CHECKING:
     from pathlib import Path

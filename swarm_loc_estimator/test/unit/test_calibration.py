@@ -13,8 +13,7 @@ from calibration_world import World, record, robot
 
 from swarm_loc_estimator.cli.calibrate import main
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.typestore import typestore
+from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.offline.calibration.fit import Options, calibrate, fit_models
 from swarm_loc_estimator.offline.calibration.motion import (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
+from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.filter.measurement_model import NOBODY, Kind, MeasurementArray
 from swarm_loc_estimator.sensors.camera import SightingConverter
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, SensorModel, Swarm

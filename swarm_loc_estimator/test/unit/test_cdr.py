@@ -1,4 +1,4 @@
-"""Reading CDR bytes: agrees with the type store's serializer, and refuses whatever is not a whole message."""
+"""Reading and writing CDR agree with the type store of `rosbags`; what is not a whole message is refused."""
 
 from __future__ import annotations
 
@@ -12,19 +12,26 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.common.messages import cdr
-from swarm_loc_estimator.common.messages.encoders import (
-    encode_detections,
-    encode_odometry,
-    encode_pose_stamped,
-)
-from swarm_loc_estimator.common.messages.typestore import (
+from swarm_loc_estimator.common.bags.writer import typestore
+from swarm_loc_estimator.common.messages.cdr import CdrError, decode
+from swarm_loc_estimator.common.messages.cdr import encode as our_encode
+from swarm_loc_estimator.common.messages.definitions import (
     DETECTION,
     DETECTIONS,
+    NUMBERS,
     ODOMETRY,
     POSE_STAMPED,
-    encode,
-    typestore,
+    SEQUENCE,
+    DefinitionsNotFoundError,
+    fields_of,
+    known_types,
+)
+from swarm_loc_estimator.common.messages.detections import decode_detections, encode_detections
+from swarm_loc_estimator.common.messages.poses import (
+    decode_odometry,
+    decode_pose_stamped,
+    encode_odometry,
+    encode_pose_stamped,
 )
 
 FINITE = st.floats(-1e6, 1e6)
@@ -32,6 +39,69 @@ ANGLE = st.floats(-3.1, 3.1)
 NAMES = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=17)
 STAMPS = st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9 + 999_999_999)
 TYPES = typestore().types
+
+
+def encode(message: Any, message_type: str) -> bytes:
+    """The bytes of a message as `rosbags` writes them."""
+    return bytes(typestore().serialize_cdr(message, message_type))
+
+
+def theirs(field: Any) -> tuple[str, int, bool]:
+    """Type, size and whether it is an array, of a field as `rosbags` describes it."""
+    kind, about = field
+    if kind.name == "NAME":
+        return about, 1, False
+    if kind.name == "BASE":
+        return NUMBERS.get(about[0], about[0]), 1, False
+    (element, size) = about
+    return theirs(element)[0], SEQUENCE if kind.name == "SEQUENCE" else size, True
+
+
+@pytest.mark.parametrize("message_type", known_types())
+def test_definitions_are_those_of_ros(message_type: str) -> None:
+    _, fields = typestore().fielddefs[message_type]
+    assert [tuple(field) for field in fields_of(message_type)] == [(n, *theirs(one)) for n, one in fields]
+
+
+def some_message(message_type: str, random: np.random.Generator) -> dict[str, Any]:
+    """A message whose numbers, texts and lengths are drawn."""
+
+    def value(kind: str) -> Any:
+        if kind == "string":
+            return "é" * int(random.integers(0, 6))
+        return random.integers(0, 2) if kind in NUMBERS.values() else some_message(kind, random)
+
+    return {
+        field.name: [
+            value(field.type) for _ in range(field.size if field.size >= 0 else random.integers(0, 4))
+        ]
+        if field.is_array
+        else value(field.type)
+        for field in fields_of(message_type)
+    }
+
+
+@pytest.mark.parametrize("message_type", known_types())
+@given(seed=st.integers(0, 2**32), little_endian=st.booleans())
+def test_every_type_is_written_and_read_as_by_the_type_store(
+    message_type: str, seed: int, little_endian: bool
+) -> None:
+    data = our_encode(some_message(message_type, np.random.default_rng(seed)), message_type)
+    message = typestore().deserialize_cdr(data, message_type)
+    assert encode(message, message_type) == data
+    sent = bytes(typestore().serialize_cdr(message, message_type, little_endian=little_endian))
+    found = decode(sent, message_type)
+    assert our_encode(found, message_type) == data
+    for length in range(len(sent)):
+        with pytest.raises(CdrError):
+            decode(sent[:length], message_type)
+
+
+def test_unknown_fields_and_types_are_named() -> None:
+    with pytest.raises(KeyError, match="has no frame"):
+        our_encode({"frame": "map"}, "std_msgs/msg/Header")
+    with pytest.raises(DefinitionsNotFoundError, match="std_msgs/msg/Nothing is not defined"):
+        decode(bytes([0, 1, 0, 0]), "std_msgs/msg/Nothing")
 
 
 def header(stamp_ns: int, frame_id: str) -> Any:
@@ -93,9 +163,9 @@ def pose_bytes() -> bytes:
 
 
 CASES = [
-    (odometry_bytes, cdr.decode_odometry),
-    (pose_bytes, cdr.decode_pose_stamped),
-    (detections_bytes, cdr.decode_detections),
+    (odometry_bytes, decode_odometry),
+    (pose_bytes, decode_pose_stamped),
+    (detections_bytes, decode_detections),
 ]
 
 
@@ -129,7 +199,7 @@ def test_odometry_agrees_with_the_serializer(
 ) -> None:
     data = encode(odometry_object(stamp, frames, pose, twist), ODOMETRY)
     for raw in (data, swap_simple(data, [(4, 2), (0, 1), (0, 1), (8, 85)])):
-        message = cdr.decode_odometry(raw)
+        message = decode_odometry(raw)
         assert (message.stamp_ns, message.frame_id, message.child_frame_id) == (stamp, *frames)
         assert message.pose == pytest.approx(pose, abs=1e-12)
         assert message.twist == twist
@@ -140,7 +210,7 @@ def test_odometry_agrees_with_the_serializer(
 def test_pose_agrees_with_the_serializer(stamp: int, frame: str, pose: tuple[float, float, float]) -> None:
     data = encode(TYPES[POSE_STAMPED](header(stamp, frame), pose_object(*pose)), POSE_STAMPED)
     for raw in (data, swap_simple(data, [(4, 2), (0, 1), (8, 7)])):
-        message = cdr.decode_pose_stamped(raw)
+        message = decode_pose_stamped(raw)
         assert (message.stamp_ns, message.frame_id) == (stamp, frame)
         assert message.pose == pytest.approx(pose, abs=1e-12)
 
@@ -148,7 +218,7 @@ def test_pose_agrees_with_the_serializer(stamp: int, frame: str, pose: tuple[flo
 @given(stamp=STAMPS, frame=NAMES, count=st.integers(0, 5))
 def test_detections_agree_with_the_serializer(stamp: int, frame: str, count: int) -> None:
     objects = [detection_object(k) for k in range(count)]
-    message = cdr.decode_detections(encode(TYPES[DETECTIONS](header(stamp, frame), objects), DETECTIONS))
+    message = decode_detections(encode(TYPES[DETECTIONS](header(stamp, frame), objects), DETECTIONS))
     assert (message.stamp_ns, message.frame_id, len(message.detections)) == (stamp, frame, count)
     for row, thing in zip(message.detections, objects, strict=True):
         assert (row["id"], row["family"], row["content"]) == (thing.id, thing.family, thing.content)
@@ -169,9 +239,7 @@ def test_big_endian_detections() -> None:
     for frame in ("ab", "abcdef"):
         little = detections_bytes(3, frame)
         big = swap_simple(little, [(4, 2), (0, 1), (4, 1), *one, *one, *one])
-        np.testing.assert_array_equal(
-            cdr.decode_detections(big).detections, cdr.decode_detections(little).detections
-        )
+        np.testing.assert_array_equal(decode_detections(big).detections, decode_detections(little).detections)
 
 
 @pytest.mark.parametrize(("make", "decode"), CASES)
@@ -179,7 +247,7 @@ def test_cut_off_anywhere_is_one_error(make: Any, decode: Any) -> None:
     data = make()
     decode(data)
     for length in range(len(data)):
-        with pytest.raises(cdr.CdrError):
+        with pytest.raises(CdrError):
             decode(data[:length])
 
 
@@ -187,7 +255,7 @@ def test_cut_off_anywhere_is_one_error(make: Any, decode: Any) -> None:
 def test_padding_is_taken_and_more_is_refused(make: Any, decode: Any) -> None:
     data = make()
     assert decode(data + bytes(3)).stamp_ns == 5
-    with pytest.raises(cdr.CdrError, match="more than the message has"):
+    with pytest.raises(CdrError, match="more than the message has"):
         decode(data + bytes(8))
 
 
@@ -197,22 +265,22 @@ def test_damaged_bytes_never_raise_anything_else(make: Any, decode: Any, data: s
     raw = bytearray(make())
     for _ in range(data.draw(st.integers(1, 4))):
         raw[data.draw(st.integers(0, min(len(raw) - 1, 80)))] = data.draw(st.integers(0, 255))
-    with suppress(cdr.CdrError):
+    with suppress(CdrError):
         decode(bytes(raw))
 
 
 def test_wrong_encapsulation_and_stamp_are_named() -> None:
     data = odometry_bytes()
-    with pytest.raises(cdr.CdrError, match="00030000 is not plain CDR"):
-        cdr.decode_odometry(b"\0\3\0\0" + data[4:])
-    with pytest.raises(cdr.CdrError, match="1000000000 nanoseconds"):
-        cdr.decode_odometry(data[:8] + struct.pack("<I", 10**9) + data[12:])
+    with pytest.raises(CdrError, match="00030000 is not plain CDR"):
+        decode_odometry(b"\0\3\0\0" + data[4:])
+    with pytest.raises(CdrError, match="1000000000 nanoseconds"):
+        decode_odometry(data[:8] + struct.pack("<I", 10**9) + data[12:])
 
 
 def test_zero_quaternion_has_no_heading() -> None:
     raw = bytearray(pose_bytes())
     raw[-32:] = bytes(32)
-    assert math.isnan(cdr.decode_pose_stamped(bytes(raw)).pose[2])
+    assert math.isnan(decode_pose_stamped(bytes(raw)).pose[2])
 
 
 @odometry_fields
@@ -245,4 +313,4 @@ def test_many_poses_are_what_the_serializer_writes(
 @given(frame=NAMES, count=st.integers(0, 4))
 def test_detections_are_what_the_serializer_writes(frame: str, count: int) -> None:
     data = detections_bytes(count, frame)
-    assert encode_detections(frame, 5, cdr.decode_detections(data).detections) == data
+    assert encode_detections(frame, 5, decode_detections(data).detections) == data

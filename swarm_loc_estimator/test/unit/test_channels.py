@@ -10,10 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.common.messages.cdr import CdrError, decode_brightness, decode_fix
-from swarm_loc_estimator.common.messages.encoders import encode_brightness, encode_fix, encode_odometry
+from swarm_loc_estimator.common.bags.writer import typestore
+from swarm_loc_estimator.common.messages.cdr import CdrError
+from swarm_loc_estimator.common.messages.definitions import BRIGHTNESS, POSE_WITH_COVARIANCE
+from swarm_loc_estimator.common.messages.detections import decode_brightness, encode_brightness
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.messages.typestore import BRIGHTNESS, POSE_WITH_COVARIANCE, typestore
+from swarm_loc_estimator.common.messages.poses import decode_fix, encode_fix, encode_odometry
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.messages import RawInputs
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm

@@ -13,22 +13,22 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
 from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.estimates import (
-    EstimateMessage,
-    SwarmPosesReader,
-    decode_sightings,
-    encode_sightings,
-)
-from swarm_loc_estimator.common.messages.markers import MarkersEncoder, ellipses
-from swarm_loc_estimator.common.messages.outputs import SwarmPosesEncoder
-from swarm_loc_estimator.common.messages.typestore import MARKERS, MESSAGE_PACKAGE, typestore
+from swarm_loc_estimator.common.messages.definitions import MARKERS, MESSAGE_PACKAGE
+from swarm_loc_estimator.common.messages.estimates import EstimateMessage, SwarmPosesEncoder, SwarmPosesReader
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, Kind
 from swarm_loc_estimator.offline.export import write_mcap
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.fusion import Verdict
-from swarm_loc_estimator.timeline.sightings import Sightings, newest_sightings
+from swarm_loc_estimator.timeline.sightings import (
+    Sightings,
+    decode_sightings,
+    encode_sightings,
+    newest_sightings,
+)
+from swarm_loc_estimator.watch.markers import MarkersEncoder, ellipses
 
 SECOND = 1_000_000_000
 VIEWERS = Path(__file__).parents[2] / "viewers"

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
-from swarm_loc_estimator.common.messages.encoders import encode_detections, encode_odometry
+from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, encode_detections
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE
 from swarm_loc_estimator.nodes.estimator_diagnostics import Diagnostics, Recent, TickCost, load_report
 from swarm_loc_estimator.sensors.ingest import Ingest

@@ -9,20 +9,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.common.messages.cdr import (
+from swarm_loc_estimator.common.bags.writer import typestore
+from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY, POSE_STAMPED
+from swarm_loc_estimator.common.messages.detections import (
     DETECTION_DTYPE,
     decode_detections,
+    encode_detections,
+)
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.poses import (
     decode_odometry,
     decode_pose_stamped,
-)
-from swarm_loc_estimator.common.messages.encoders import (
-    encode_detections,
     encode_odometry,
     encode_pose_stamped,
 )
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.messages.streams import DetectionReader, PoseReader
-from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED, typestore
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.topics import InputKind
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm

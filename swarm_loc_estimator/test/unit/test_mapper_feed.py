@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.encoders import UNKNOWN_COVARIANCE, encode_odometry
-from swarm_loc_estimator.common.messages.typestore import encode, typestore
+from swarm_loc_estimator.common.bags.writer import typestore
+from swarm_loc_estimator.common.messages.definitions import LASER
+from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
-from swarm_loc_estimator.mapping.messages import LASER
 from swarm_loc_estimator.swarm.swarm import Robot
 
 STEP_NS = 20_000_000
@@ -28,18 +28,20 @@ def odometry(stamp_ns: int, pose: FloatArray) -> bytes:
 
 def laser(stamp_ns: int) -> bytes:
     types: Any = typestore().types
-    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=stamp_ns)
-    return encode(
-        types[LASER](
-            header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="a/base_link"),
-            distance=DISTANCE,
-            sigma=SIGMA,
-            u_px=0.0,
-            v_px=0.0,
-            covariance=np.zeros(4),
-            events=1,
-        ),
-        LASER,
+    stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
+    return bytes(
+        typestore().serialize_cdr(
+            types[LASER](
+                header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="a/base_link"),
+                distance=DISTANCE,
+                sigma=SIGMA,
+                u_px=0.0,
+                v_px=0.0,
+                covariance=np.zeros(4),
+                events=1,
+            ),
+            LASER,
+        )
     )
 
 

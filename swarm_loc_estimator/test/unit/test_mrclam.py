@@ -11,7 +11,8 @@ import pytest
 from swarm_loc_estimator.cli.import_mrclam import main
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.messages.cdr import decode_detections, decode_odometry, decode_pose_stamped
+from swarm_loc_estimator.common.messages.detections import decode_detections
+from swarm_loc_estimator.common.messages.poses import decode_odometry, decode_pose_stamped
 from swarm_loc_estimator.offline.datasets.mrclam import MrclamError, integrate, read_dataset
 from swarm_loc_estimator.swarm.swarm import Face
 from swarm_loc_estimator.swarm.swarm_file import load_swarm

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 from compiled_code import compiled_since, printed_by_process, signatures
 
-from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.messages.shared import (
+from swarm_loc_estimator.common.messages.detections import (
+    DETECTION_DTYPE,
     SharedHead,
     encode_shared_detections,
     encode_shared_numbers,
     swarm_key,
 )
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.precompile import precompile
 from swarm_loc_estimator.sensors.ingest import Ingest

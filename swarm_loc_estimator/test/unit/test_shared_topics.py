@@ -11,23 +11,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.arrays import IntArray
-from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE, CdrError
-from swarm_loc_estimator.common.messages.encoders import encode_detections, encode_fix, encode_odometry
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.messages.shared import (
+from swarm_loc_estimator.common.bags.writer import typestore
+from swarm_loc_estimator.common.messages.cdr import CdrError
+from swarm_loc_estimator.common.messages.definitions import SWARM_DETECTIONS, SWARM_FIXES, SWARM_ODOMETRY
+from swarm_loc_estimator.common.messages.detections import (
+    DETECTION_DTYPE,
     SharedHead,
     decode_shared_detections,
     decode_shared_numbers,
+    encode_detections,
     encode_shared_detections,
     encode_shared_numbers,
     swarm_key,
 )
-from swarm_loc_estimator.common.messages.typestore import (
-    SWARM_DETECTIONS,
-    SWARM_FIXES,
-    SWARM_ODOMETRY,
-    typestore,
-)
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometry
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.messages import RawInputs
 from swarm_loc_estimator.sensors.topics import InputKind, live_topics

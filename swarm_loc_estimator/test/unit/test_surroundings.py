@@ -15,17 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
 from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.encoders import (
-    UNKNOWN_COVARIANCE,
-    encode_odometry,
-    encode_pose_stamped,
-)
+from swarm_loc_estimator.common.messages.definitions import OCCUPANCY_GRID, ODOMETRY, POSE_STAMPED
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.messages.typestore import ODOMETRY, POSE_STAMPED, encode, typestore
+from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry, encode_pose_stamped
 from swarm_loc_estimator.identification.memory import Identities
-from swarm_loc_estimator.mapping.messages import MAX_CELLS, OCCUPANCY_GRID, decode_occupancy_grid
+from swarm_loc_estimator.mapping.messages import MAX_CELLS, decode_occupancy_grid
 from swarm_loc_estimator.offline.export import write_mcap
 from swarm_loc_estimator.offline.recorded_bag import MapReader
 from swarm_loc_estimator.offline.replay import AerialImages, replay
@@ -56,7 +52,7 @@ def grid_bytes(
         ),
         data=cells.reshape(-1),
     )
-    return encode(message, OCCUPANCY_GRID)
+    return bytes(typestore().serialize_cdr(message, OCCUPANCY_GRID))
 
 
 @given(st.integers(1, 9), st.integers(1, 9), st.text("abé/", max_size=7), st.integers(0, 2**31 * SECOND - 1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.common.messages.encoders import encode_pose_stamped
+from swarm_loc_estimator.common.messages.poses import encode_pose_stamped
 from swarm_loc_estimator.offline.recorded_bag import read_truth
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 

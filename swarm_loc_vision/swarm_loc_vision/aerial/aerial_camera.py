@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DTYPE, nanoseconds
-from swarm_loc_estimator.common.messages.encoders import encode_anonymous
+from swarm_loc_estimator.common.messages.cdr import nanoseconds
+from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, encode_anonymous
 from swarm_loc_vision.aerial.detector import AerialDetections, AerialDetector
 from swarm_loc_vision.aerial.ground_camera import GroundCamera
 from swarm_loc_vision.aerial.ground_control import NO_GROUND, Ground, GroundControl

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator import LASER, BadMessageError, decode_laser
+from swarm_loc_estimator import decode_laser
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.messages.cdr import CdrError, decode_odometry
-from swarm_loc_estimator.common.messages.typestore import ODOMETRY
+from swarm_loc_estimator.common.messages.cdr import CdrError
+from swarm_loc_estimator.common.messages.definitions import LASER, ODOMETRY
+from swarm_loc_estimator.common.messages.poses import decode_odometry
 from swarm_loc_vision.laser.fit import CalibrationError, Drive
 
 _MAX_SAMPLES = 100_000
@@ -113,7 +114,7 @@ def _take(drive: WallDrive, data: bytes, *, is_laser: bool) -> bool:
             drive.take_row(seen.stamp_ns, seen.row)
             return math.isfinite(seen.row)
         odometry = decode_odometry(data)
-    except (CdrError, BadMessageError):
+    except CdrError:
         return False
     if not all(map(math.isfinite, odometry.pose)):
         return False

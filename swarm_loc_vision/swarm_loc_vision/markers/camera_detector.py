@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator import CONTENT_POSE, CONTENT_POSE_TWO
-from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE, nanoseconds
-from swarm_loc_estimator.common.messages.encoders import encode_detections
+from swarm_loc_estimator.common.messages.cdr import nanoseconds
+from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, encode_detections
 from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, GrayOf
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.detector import Detections, MarkerDetector

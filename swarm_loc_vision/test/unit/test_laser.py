@@ -12,10 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.encoders import UNKNOWN_COVARIANCE, encode_odometry
-from swarm_loc_estimator.common.messages.typestore import ODOMETRY, encode, typestore
-from swarm_loc_estimator.mapping.messages import LASER
+from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
+from swarm_loc_estimator.common.messages.definitions import LASER, ODOMETRY
+from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_vision.laser.calibration import (
     LaserCalibration,
     LaserFileError,
@@ -248,9 +247,9 @@ def write_drive(folder: Path, one: Drive, robot: str = "a") -> None:
                 events=9,
             )
             bag.write(f"{robot}/odom", at_ns, data)
-            bag.write(f"{robot}/laser", at_ns, encode(message, LASER))
+            bag.write(f"{robot}/laser", at_ns, bytes(typestore().serialize_cdr(message, LASER)))
             if rest_ns == 0:
-                bag.write(f"{robot}/laser", at_ns, encode(message, LASER)[:20])
+                bag.write(f"{robot}/laser", at_ns, bytes(typestore().serialize_cdr(message, LASER))[:20])
                 bag.write(f"{robot}/odom", at_ns, data[:20])
 
 

@@ -26,7 +26,7 @@ from swarm_loc_drivers.sim.droplet.world import (
     make_droplet_world,
 )
 from swarm_loc_drivers.sim.world_node import WorldNode
-from swarm_loc_estimator.common.messages.planar import planar_covariance
+from swarm_loc_estimator.common.messages.poses import planar_covariance
 from swarm_loc_estimator.common.node import run_node
 
 _FIX_QOS = QoSProfile(depth=10)

@@ -20,25 +20,26 @@ from swarm_loc_estimator import CONTENT_POSE
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
-from swarm_loc_estimator.common.messages.encoders import (
-    UNKNOWN_COVARIANCE,
-    encode_anonymous,
-    encode_brightness,
-    encode_detections,
-    encode_fix,
-    encode_odometry,
-    encode_pose_stamped,
-)
-from swarm_loc_estimator.common.messages.typestore import (
+from swarm_loc_estimator.common.messages.cdr import encode
+from swarm_loc_estimator.common.messages.definitions import (
     ANONYMOUS_DETECTIONS,
     BRIGHTNESS,
     DETECTIONS,
     ODOMETRY,
     POSE_STAMPED,
     POSE_WITH_COVARIANCE,
-    encode,
-    typestore,
+)
+from swarm_loc_estimator.common.messages.detections import (
+    DETECTION_DTYPE,
+    encode_anonymous,
+    encode_brightness,
+    encode_detections,
+)
+from swarm_loc_estimator.common.messages.poses import (
+    UNKNOWN_COVARIANCE,
+    encode_fix,
+    encode_odometry,
+    encode_pose_stamped,
 )
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
@@ -270,34 +271,28 @@ def _fixes(run: DropletRun, robot: int) -> Stream:
     return Stream(f"{run.swarm.robots[robot].name}/fix", POSE_WITH_COVARIANCE, stamps_ns, data)
 
 
-def message_header(stamp_ns: int, frame: str) -> Any:
-    """A std_msgs/Header."""
-    types = typestore().types
-    stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 1_000_000_000))
-    return types["std_msgs/msg/Header"](stamp, frame)
+def message_header(stamp_ns: int, frame: str) -> dict[str, Any]:
+    """A std_msgs/Header to encode."""
+    return {"stamp": stamp_ns, "frame_id": frame}
 
 
-def _image(header: Any, image: NDArray[np.uint8]) -> bytes:
+def _image(header: dict[str, Any], image: NDArray[np.uint8]) -> bytes:
     """A grey image as sensor_msgs/CompressedImage."""
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    kind = typestore().types[COMPRESSED_IMAGE]
-    return encode(kind(header, "mono8; jpeg compressed mono8", data.reshape(-1)), COMPRESSED_IMAGE)
+    message = {"header": header, "format": "mono8; jpeg compressed mono8", "data": data}
+    return encode(message, COMPRESSED_IMAGE)
 
 
-def _info(header: Any, calibration: CameraCalibration) -> bytes:
+def _info(header: dict[str, Any], calibration: CameraCalibration) -> bytes:
     """The calibration as sensor_msgs/CameraInfo."""
-    types = typestore().types
-    message = types[CAMERA_INFO](
-        header,
-        calibration.height,
-        calibration.width,
-        calibration.model,
-        np.array(calibration.distortion),
-        np.array(calibration.matrix),
-        np.array(calibration.rectification),
-        np.array(calibration.projection),
-        binning_x=0,
-        binning_y=0,
-        roi=types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, do_rectify=False),
-    )
+    message = {
+        "header": header,
+        "height": calibration.height,
+        "width": calibration.width,
+        "distortion_model": calibration.model,
+        "d": calibration.distortion,
+        "k": calibration.matrix,
+        "r": calibration.rectification,
+        "p": calibration.projection,
+    }
     return encode(message, CAMERA_INFO)

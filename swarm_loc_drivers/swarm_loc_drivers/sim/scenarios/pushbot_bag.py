@@ -31,9 +31,6 @@ from swarm_loc_drivers.sim.pushbot.optics import (
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.scenarios.bags import Stream, message_header, write_streams
 from swarm_loc_estimator import (
-    LASER,
-    LIGHTS,
-    OCCUPANCY_GRID,
     CooperativeMapper,
     FixCovariances,
     Goal,
@@ -43,20 +40,22 @@ from swarm_loc_estimator import (
 )
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.encoders import (
+from swarm_loc_estimator.common.messages.cdr import encode
+from swarm_loc_estimator.common.messages.definitions import (
+    LASER,
+    LIGHTS,
+    MESSAGE_PACKAGE,
+    OCCUPANCY_GRID,
+    ODOMETRY,
+    POSE_STAMPED,
+    POSE_WITH_COVARIANCE,
+)
+from swarm_loc_estimator.common.messages.event_encoding import ENCODING, Events, encode_events
+from swarm_loc_estimator.common.messages.poses import (
     UNKNOWN_COVARIANCE,
     encode_fix,
     encode_odometry,
     encode_pose_stamped,
-)
-from swarm_loc_estimator.common.messages.event_encoding import ENCODING, Events, encode_events
-from swarm_loc_estimator.common.messages.typestore import (
-    MESSAGE_PACKAGE,
-    ODOMETRY,
-    POSE_STAMPED,
-    POSE_WITH_COVARIANCE,
-    encode,
-    typestore,
 )
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, StartSigma, Swarm
 
@@ -207,7 +206,6 @@ def _laser(name: str, readings: list[Readings], built: LaserOptics) -> Stream:
     stamp_ns = BEGIN_NS + np.concatenate([one.stamp_ns for one in readings])
     inverse = np.concatenate([one.inverse for one in readings])
     sigma = readings[0].sigma
-    message = typestore().types[LASER]
     data = []
     for at_ns, value in zip(stamp_ns.tolist(), inverse.tolist(), strict=True):
         seen = value > 0.0
@@ -216,15 +214,15 @@ def _laser(name: str, readings: list[Readings], built: LaserOptics) -> Stream:
         column, row = built.spot(distance - CAMERA_X_M) if seen else (math.nan, math.nan)
         data.append(
             encode(
-                message(
-                    header=message_header(at_ns, f"{name}/base_link"),
-                    distance=distance,
-                    sigma=sigma * distance**2,
-                    u_px=column,
-                    v_px=row,
-                    covariance=np.array([pixel, 0.0, 0.0, pixel]),
-                    events=int(seen),
-                ),
+                {
+                    "header": message_header(at_ns, f"{name}/base_link"),
+                    "distance": distance,
+                    "sigma": sigma * distance**2,
+                    "u_px": column,
+                    "v_px": row,
+                    "covariance": [pixel, 0.0, 0.0, pixel],
+                    "events": seen,
+                },
                 LASER,
             )
         )
@@ -232,26 +230,24 @@ def _laser(name: str, readings: list[Readings], built: LaserOptics) -> Stream:
 
 
 def _lights(name: str, sightings: list[LightSightings]) -> list[Stream]:
-    light, array = (typestore().types[one] for one in (f"{MESSAGE_PACKAGE}/msg/LightBearing", LIGHTS))
     stamps: list[int] = []
     data: list[bytes] = []
     for part in sightings:
         for at_ns in np.unique(part.stamp_ns).tolist():
             lights = [
-                light(
-                    frequency=led_hz(int(part.target[k])),
-                    bearing=float(part.bearing[k]),
-                    elevation=0.0,
-                    covariance=np.diag([float(part.sigma[k]) ** 2] * 2).ravel(),
-                    u_px=math.nan,
-                    v_px=math.nan,
-                    events=1,
-                )
+                {
+                    "frequency": led_hz(int(part.target[k])),
+                    "bearing": part.bearing[k],
+                    "covariance": np.diag([part.sigma[k] ** 2] * 2),
+                    "u_px": math.nan,
+                    "v_px": math.nan,
+                    "events": 1,
+                }
                 for k in np.flatnonzero(part.stamp_ns == at_ns)
             ]
             stamps.append(BEGIN_NS + at_ns)
             header = message_header(BEGIN_NS + at_ns, f"{name}/base_link")
-            data.append(encode(array(header=header, lights=lights), LIGHTS))
+            data.append(encode({"header": header, "lights": lights}, LIGHTS))
     return [Stream(f"{name}/lights", LIGHTS, np.array(stamps, dtype=np.int64), data)] if data else []
 
 
@@ -298,33 +294,28 @@ def _events(names: list[str], poses: FloatArray, cameras: HallSight) -> list[Str
 
 
 def _encode_packet(name: str, stamp_ns: int, number: int, events: Events) -> bytes:
-    message = typestore().types[EVENTS](
-        header=message_header(stamp_ns, f"{name}/event_camera_optical_frame"),
-        height=SENSOR_PX,
-        width=SENSOR_PX,
-        seq=number,
-        time_base=stamp_ns,
-        encoding=ENCODING,
-        is_bigendian=False,
-        events=np.frombuffer(encode_events(events), np.uint8),
-    )
+    message = {
+        "header": message_header(stamp_ns, f"{name}/event_camera_optical_frame"),
+        "height": SENSOR_PX,
+        "width": SENSOR_PX,
+        "seq": number,
+        "time_base": stamp_ns,
+        "encoding": ENCODING,
+        "events": encode_events(events),
+    }
     return encode(message, EVENTS)
 
 
 def _encode_map(stamp_ns: int, occupancy: OccupancyMap) -> bytes:
     """The map as the mapper's node publishes it: -1 unknown, else the probability of an obstacle [%]."""
-    types = typestore().types
-    cells = np.ascontiguousarray(np.round(occupancy.percent).astype(np.int8).T)
-    point, turn = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Quaternion"]
-    header = message_header(stamp_ns, "map")
+    cells = np.round(occupancy.percent).astype(np.int8).T
     x, y = map(float, occupancy.corner)
-    origin = types["geometry_msgs/msg/Pose"](position=point(x, y, 0.0), orientation=turn(0.0, 0.0, 0.0, 1.0))
-    about = types["nav_msgs/msg/MapMetaData"](
-        map_load_time=header.stamp,
-        resolution=occupancy.cell,
-        width=cells.shape[1],
-        height=cells.shape[0],
-        origin=origin,
-    )
-    message = types[OCCUPANCY_GRID](header=header, info=about, data=cells.ravel())
+    about = {
+        "map_load_time": stamp_ns,
+        "resolution": occupancy.cell,
+        "width": cells.shape[1],
+        "height": cells.shape[0],
+        "origin": {"position": {"x": x, "y": y}, "orientation": {"w": 1.0}},
+    }
+    message = {"header": message_header(stamp_ns, "map"), "info": about, "data": cells}
     return encode(message, OCCUPANCY_GRID)

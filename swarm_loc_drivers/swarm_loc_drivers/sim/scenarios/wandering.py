@@ -17,7 +17,7 @@ from swarm_loc_drivers.sim.scenarios.eight import ARENA, STEP_NS, EightSettings,
 from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DTYPE
+from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 PERIOD_NS = 500_000_000

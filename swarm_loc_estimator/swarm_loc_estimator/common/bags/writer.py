@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
 
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
@@ -22,10 +23,11 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from typing_extensions import Self
 
 from swarm_loc_estimator.common.bags.bag_file import BagError
-from swarm_loc_estimator.common.messages.typestore import typestore
+from swarm_loc_estimator.common.messages.definitions import MESSAGE_PACKAGE, message_folder
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 
     from rosbags.interfaces import Connection
     from rosbags.rosbag2.writer import StorageWriter
+    from rosbags.typesys.store import Typestore
 
 _FOREVER = QosTime(sec=9223372036, nsec=854775807)
 RELIABLE = Qos(
@@ -49,6 +52,22 @@ RELIABLE = Qos(
 """Odometry, detections and estimates: reliable, small depth."""
 LATCHED = RELIABLE._replace(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
 """A map: who subscribes later gets the newest."""
+
+
+@lru_cache(maxsize=1)
+def typestore() -> Typestore:
+    """The message types of ROS 2 Jazzy and of this workspace, as `rosbags` holds them.
+
+    Raises:
+        DefinitionsNotFoundError: The workspace's `.msg` files are not there.
+    """
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types: dict[str, Any] = {}
+    for path in sorted(message_folder().glob("*.msg")):
+        name = f"{MESSAGE_PACKAGE}/msg/{path.stem}"
+        types.update(get_types_from_msg(path.read_text(encoding="utf-8"), name))
+    store.register(types)
+    return store
 
 
 class _McapStorage:

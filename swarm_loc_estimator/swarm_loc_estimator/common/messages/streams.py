@@ -17,19 +17,15 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.messages.cdr import (
+from swarm_loc_estimator.common.messages.cdr import ENCAPSULATION, MAX_PADDING, SECOND_NS, CdrError
+from swarm_loc_estimator.common.messages.detections import (
     DETECTION_DTYPE,
     DETECTION_GAP,
-    ENCAPSULATION,
-    MAX_PADDING,
-    CdrError,
     DetectionArrayMessage,
-    OdometryMessage,
-    PoseMessage,
     decode_detections,
 )
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.messages.planar import yaw_of
+from swarm_loc_estimator.common.messages.poses import OdometryMessage, PoseMessage, yaw_of
 
 BytesArray = NDArray[np.uint8]
 
@@ -49,7 +45,6 @@ class StampedMessage(Protocol):
 Message = TypeVar("Message", bound=StampedMessage)
 
 _LITTLE_ENDIAN = b"\x00\x01"
-_NANOSECONDS = 1_000_000_000
 _NAMES = ENCAPSULATION + 8
 """Offset of the first frame name's length, behind the stamp."""
 _DETECTION_SIZE = DETECTION_DTYPE.itemsize
@@ -334,14 +329,14 @@ def _is_alike(batch: MessageBatch, k: int, models: _Models) -> bool:
     for i in range(end - _NAMES):
         if data[offset + _NAMES + i] != models.names[topic, i]:
             return False
-    return bool(_word(data, offset + ENCAPSULATION + 4, 4) < _NANOSECONDS)
+    return bool(_word(data, offset + ENCAPSULATION + 4, 4) < SECOND_NS)
 
 
 @cached_njit
 def _stamp_ns(data: BytesArray, offset: int) -> int:
     """The stamp of the message at an offset [ns]."""
     seconds = np.int64(np.int32(np.uint32(_word(data, offset + ENCAPSULATION, 4))))
-    stamp_ns: int = seconds * _NANOSECONDS + np.int64(_word(data, offset + ENCAPSULATION + 4, 4))
+    stamp_ns: int = seconds * SECOND_NS + np.int64(_word(data, offset + ENCAPSULATION + 4, 4))
     return stamp_ns
 
 

@@ -19,8 +19,9 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.encoders import encode_brightness, encode_fix, encode_pose_stamped
-from swarm_loc_estimator.common.messages.typestore import POSE_STAMPED
+from swarm_loc_estimator.common.messages.definitions import POSE_STAMPED
+from swarm_loc_estimator.common.messages.detections import encode_brightness
+from swarm_loc_estimator.common.messages.poses import encode_fix, encode_pose_stamped
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.offline.datasets.droplets import (
     CameraPose,

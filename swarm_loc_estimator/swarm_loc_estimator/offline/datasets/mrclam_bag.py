@@ -11,14 +11,9 @@ import numpy.typing as npt
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.cdr import DETECTION_DTYPE
-from swarm_loc_estimator.common.messages.encoders import (
-    UNKNOWN_COVARIANCE,
-    encode_detections,
-    encode_odometry,
-    encode_pose_stamped,
-)
-from swarm_loc_estimator.common.messages.typestore import DETECTIONS, ODOMETRY, POSE_STAMPED
+from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY, POSE_STAMPED
+from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, encode_detections
+from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry, encode_pose_stamped
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.offline.datasets.mrclam import MAX_TRUTH_GAP_NS, Dataset, RobotLog, integrate
 from swarm_loc_estimator.sensors.camera import CONTENT_POSITION

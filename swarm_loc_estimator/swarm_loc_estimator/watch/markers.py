@@ -5,14 +5,15 @@ Robots are points of one list in the colours of their status, headings, 95 % ell
 
 from __future__ import annotations
 
-import struct
-from typing import NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.common.messages.cdr_writer import CdrWriter, stamp_bytes
+from swarm_loc_estimator.common.messages.cdr import encode
+from swarm_loc_estimator.common.messages.definitions import MARKERS
 from swarm_loc_estimator.common.messages.estimates import EstimateMessage
 from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
 from swarm_loc_estimator.timeline.sightings import Sightings
@@ -69,7 +70,7 @@ class MarkersEncoder:
         self._faces = _faces(swarm.landmarks, self._size)
 
     def encode(self, estimate: EstimateMessage, sightings: Sightings | None = None) -> bytes:
-        """The message for poses and what was seen; what it does not hold any more is deleted."""
+        """The message for poses and sightings; it deletes all markers before it."""
         located: BoolArray = ~np.isnan(estimate.pose[:, 0])
         pose, size = estimate.pose[located], self._size
         colours = _COLOURS[np.minimum(estimate.status[located], len(_COLOURS) - 1)]
@@ -105,51 +106,33 @@ class MarkersEncoder:
         return [_Marker("names", TEXT, size, at[None], _inked(at[None]), name, k) for k, (name, at) in pairs]
 
     def _message(self, stamp_ns: int, markers: list[_Marker]) -> bytes:
-        writer = CdrWriter()
-        writer.count(1 + len(markers))
-        self._add(writer, stamp_ns, _Marker("", CUBE_LIST, (0.0,) * 3, _NONE, _NONE), _DELETE_ALL)
-        for marker in markers:
-            self._add(writer, stamp_ns, marker, 0)
-        return writer.message()
-
-    def _add(self, writer: CdrWriter, stamp_ns: int, marker: _Marker, action: int) -> None:
-        """One visualization_msgs/Marker, field by field."""
-        is_text = marker.kind == TEXT
-        at = marker.points[0] if is_text else np.zeros(3)
-        points, colours = (_NONE, _NONE) if is_text else (marker.points, marker.colours)
-        writer.raw(4, stamp_bytes(np.array([stamp_ns])).tobytes())
-        writer.text(self._frame_id)
-        writer.text(marker.name)
-        writer.raw(4, struct.pack("<iii", marker.number, marker.kind, action))
-        writer.raw(8, struct.pack("<7d", *at, 0.0, 0.0, 0.0, 1.0))
-        writer.raw(8, struct.pack("<3d", *marker.scale))
-        writer.raw(4, struct.pack("<4f", *_INK))
-        writer.raw(4, bytes(8))  # lifetime: until the next
-        writer.raw(1, bytes(1))
-        _add_rows(writer, points, "<f8")
-        _add_rows(writer, colours, "<f4")
-        writer.text("")  # no texture
-        writer.raw(4, bytes(8))
-        writer.text("")
-        writer.text("")
-        writer.count(0)
-        writer.count(0)
-        writer.text(marker.text)
-        writer.text("")  # no mesh
-        writer.text("")
-        writer.count(0)
-        writer.raw(1, bytes(1))
+        header = {"stamp": stamp_ns, "frame_id": self._frame_id}
+        delete_all = {"header": header, "action": _DELETE_ALL}
+        return encode(
+            {"markers": [delete_all, *({"header": header, **_fields(one)} for one in markers)]}, MARKERS
+        )
 
 
-_NONE = np.zeros((0, 3))
+def _fields(marker: _Marker) -> dict[str, Any]:
+    """The fields of a visualization_msgs/Marker; those left out are zero, so that it lasts until the next."""
+    position, points, colours = np.zeros(3), marker.points, marker.colours
+    if marker.kind == TEXT:
+        position, points, colours = marker.points[0], marker.points[:0], marker.colours[:0]
+    return {
+        "ns": marker.name,
+        "id": marker.number,
+        "type": marker.kind,
+        "pose": {"position": _vector(position), "orientation": {"w": 1.0}},
+        "scale": _vector(marker.scale),
+        "color": dict(zip("rgba", _INK, strict=True)),
+        "points": points,
+        "colors": colours,
+        "text": marker.text,
+    }
 
 
-def _add_rows(writer: CdrWriter, rows: FloatArray, kind: str) -> None:
-    """A sequence of points or colours."""
-    writer.count(len(rows))
-    if len(rows):
-        data = np.ascontiguousarray(rows, dtype=kind)
-        writer.raw(data.itemsize, data.tobytes())
+def _vector(numbers: Iterable[float]) -> dict[str, float]:
+    return dict(zip("xyz", numbers, strict=True))
 
 
 def _lines(name: str, scale: tuple[float, float, float], points: FloatArray) -> _Marker:

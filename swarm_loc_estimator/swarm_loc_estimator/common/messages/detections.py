@@ -1,0 +1,277 @@
+"""Detections, brightness matrices and messages with the readings of many robots, all of swarm_loc_msgs."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.messages.cdr import (
+    SECOND_NS,
+    CdrError,
+    Rows,
+    decode,
+    encode,
+    nanoseconds,
+    renamed,
+    row_dtype,
+    stamp_rows,
+)
+from swarm_loc_estimator.common.messages.definitions import (
+    ANONYMOUS_DETECTION,
+    ANONYMOUS_DETECTIONS,
+    BRIGHTNESS,
+    DETECTION,
+    DETECTIONS,
+    ROBOT_IDENTITIES,
+    SWARM_DETECTIONS,
+    SWARM_FIXES,
+    SWARM_ODOMETRY,
+)
+
+DETECTION_DTYPE = renamed(
+    row_dtype(DETECTION),
+    id=(),
+    family=(),
+    content=(),
+    id_margin=(),
+    corners_px=(4, 2),
+    position=(3,),
+    orientation=(4,),
+    covariance=(6, 6),
+    alternative_position=(3,),
+    alternative_orientation=(4,),
+    alternative_ratio=(),
+)
+"""One swarm_loc_msgs/MarkerDetection as it lies in little-endian CDR; quaternions are x, y, z, w.
+
+It begins 4 bytes behind a multiple of 8; where the first of a message does not, see `DETECTION_GAP`.
+"""
+DETECTION_GAP = DETECTION_DTYPE.fields["corners_px"][1]  # type: ignore[index]  # it has fields
+"""A detection that starts at a multiple of 8 has 4 bytes of padding here, before its first double."""
+
+ANONYMOUS_DTYPE = renamed(
+    row_dtype(ANONYMOUS_DETECTION), x=(), y=(), theta=(), covariance=(3, 3), u_px=(), v_px=()
+)
+"""A swarm_loc_msgs/AnonymousDetection as it lies in little-endian CDR, at a multiple of 8 bytes."""
+
+
+class DetectionArrayMessage(NamedTuple):
+    """swarm_loc_msgs/MarkerDetectionArray: `detections` has dtype `DETECTION_DTYPE`."""
+
+    stamp_ns: int
+    frame_id: str
+    detections: Rows
+
+
+class AnonymousMessage(NamedTuple):
+    """swarm_loc_msgs/AnonymousDetectionArray: `detections` has dtype `ANONYMOUS_DTYPE`."""
+
+    stamp_ns: int
+    frame_id: str
+    detections: Rows
+
+
+class BrightnessMessage(NamedTuple):
+    """swarm_loc_msgs/BrightnessMatrix, see there; `readings` (k,) need not have the promised size."""
+
+    stamp_ns: int
+    frame_id: str
+    receiver: int
+    transmitter: int
+    n: int
+    readings: NDArray[np.int32]
+    power: int
+    saturation: int
+
+
+class SharedMessage(NamedTuple):
+    """Readings (n,) of many robots.
+
+    Attributes:
+        stamp_ns: When the message was sent.
+        frame_id: Frame of all readings.
+        swarm: Which swarm's indices these are, see `swarm_key`.
+        robot: (n,) indices as sent.
+        reading_ns: (n,) when each was acquired; -1 where the stamp has a second and more of nanoseconds.
+        columns: (n, k) numbers of each, or (n,) detections.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    swarm: int
+    robot: IntArray
+    reading_ns: IntArray
+    columns: tuple[NDArray[Any], ...]
+
+
+class SharedHead(NamedTuple):
+    """The beginning of a message of many robots; see `SharedMessage`."""
+
+    stamp_ns: int
+    frame_id: str
+    swarm: int
+    robot: IntArray
+    reading_ns: IntArray
+
+
+def decode_detections(data: bytes) -> DetectionArrayMessage:
+    """Read a swarm_loc_msgs/MarkerDetectionArray.
+
+    Returns:
+        Stamp, frame and a new array of `DETECTION_DTYPE`.
+
+    Raises:
+        CdrError: The bytes are not one whole message.
+    """
+    message = decode(data, DETECTIONS)
+    rows = message.detections.view(DETECTION_DTYPE)
+    return DetectionArrayMessage(nanoseconds(message.header.stamp), message.header.frame_id, rows)
+
+
+def decode_anonymous(data: bytes) -> AnonymousMessage:
+    """Read a swarm_loc_msgs/AnonymousDetectionArray.
+
+    Raises:
+        CdrError: The bytes are not one whole message.
+    """
+    message = decode(data, ANONYMOUS_DETECTIONS)
+    rows = message.detections.view(ANONYMOUS_DTYPE)
+    return AnonymousMessage(nanoseconds(message.header.stamp), message.header.frame_id, rows)
+
+
+def decode_brightness(data: bytes) -> BrightnessMessage:
+    """Read a swarm_loc_msgs/BrightnessMatrix.
+
+    Raises:
+        CdrError: The bytes are not one whole message.
+    """
+    message = decode(data, BRIGHTNESS)
+    header, *values = vars(message).values()
+    return BrightnessMessage(nanoseconds(header.stamp), header.frame_id, *values)
+
+
+def encode_detections(frame_id: str, stamp_ns: int, detections: Rows) -> bytes:
+    """Serialize one swarm_loc_msgs/MarkerDetectionArray from (n,) detections of `DETECTION_DTYPE`."""
+    header = {"stamp": stamp_ns, "frame_id": frame_id}
+    return encode({"header": header, "detections": detections}, DETECTIONS)
+
+
+def encode_anonymous(frame_id: str, stamp_ns: int, detections: Rows) -> bytes:
+    """Serialize one swarm_loc_msgs/AnonymousDetectionArray from (n,) detections of `ANONYMOUS_DTYPE`."""
+    header = {"stamp": stamp_ns, "frame_id": frame_id}
+    return encode({"header": header, "detections": detections}, ANONYMOUS_DETECTIONS)
+
+
+def encode_identities(
+    frame_id: str, stamp_ns: int, names: Sequence[str], place: IntArray, probability: FloatArray
+) -> bytes:
+    """Serialize one swarm_loc_msgs/RobotIdentities.
+
+    Args:
+        frame_id: Frame of the aerial detections.
+        stamp_ns: Of the image.
+        names: N robots.
+        place: (N,) which detection each is; -1: not known.
+        probability: (N,) of that.
+    """
+    columns = zip(names, place.tolist(), probability.tolist(), strict=True)
+    identities = [{"name": name, "detection": which, "probability": sure} for name, which, sure in columns]
+    header = {"stamp": stamp_ns, "frame_id": frame_id}
+    return encode({"header": header, "identities": identities}, ROBOT_IDENTITIES)
+
+
+def encode_brightness(
+    frame_id: str,
+    stamp_ns: int,
+    pair: tuple[int, int],
+    readings: NDArray[Any],
+    power: int = 0,
+    saturation: int = 0,
+) -> bytes:
+    """Serialize one swarm_loc_msgs/BrightnessMatrix.
+
+    Args:
+        frame_id: base_link of the receiver.
+        stamp_ns: Middle of the exchange.
+        pair: Ids of receiver and transmitter.
+        readings: (n, n) [count], [sensor, emitter].
+        power: Index of the power mode.
+        saturation: The reading at and above which a sensor is saturated [count]; 0: not known.
+    """
+    message = {
+        "header": {"stamp": stamp_ns, "frame_id": frame_id},
+        "receiver": pair[0],
+        "transmitter": pair[1],
+        "n": len(readings),
+        "readings": readings,
+        "power": power,
+        "saturation": saturation,
+    }
+    return encode(message, BRIGHTNESS)
+
+
+def swarm_key(names: Iterable[str]) -> int:
+    """The number by which swarms differ whose robots are not the same, or not in the same order."""
+    return zlib.crc32("".join(f"{name}\n" for name in names).encode())
+
+
+def decode_shared_numbers(data: bytes, widths: tuple[int, ...]) -> SharedMessage:
+    """Read a swarm_loc_msgs/SwarmOdometry or SwarmFixes.
+
+    Args:
+        data: The serialized message.
+        widths: How many numbers a reading has in each column.
+
+    Raises:
+        CdrError: The bytes are not one whole message, or its columns differ in length.
+    """
+    message = decode(data, SWARM_ODOMETRY if len(widths) == 1 else SWARM_FIXES)
+    columns = [message.pose] if len(widths) == 1 else [message.pose, message.covariance]
+    for column, width in zip(columns, widths, strict=True):
+        if column.size != width * message.robot.size:
+            raise CdrError(f"a column has {column.size} numbers in place of {width * message.robot.size}.")
+    return _shared(message, *(one.reshape(-1, w).copy() for one, w in zip(columns, widths, strict=True)))
+
+
+def decode_shared_detections(data: bytes) -> SharedMessage:
+    """Read a swarm_loc_msgs/SwarmDetections.
+
+    Raises:
+        CdrError: The bytes are not one whole message, or its columns differ in length.
+    """
+    message = decode(data, SWARM_DETECTIONS)
+    if message.detections.size != message.robot.size:
+        raise CdrError(f"a column has {message.detections.size} detections in place of {message.robot.size}.")
+    return _shared(message, message.detections.view(DETECTION_DTYPE))
+
+
+def _shared(message: Any, *columns: NDArray[Any]) -> SharedMessage:
+    stamps = message.stamp
+    if stamps.size != message.robot.size:
+        raise CdrError("there are not as many stamps as robots.")
+    reading_ns = stamps["sec"].astype(np.int64) * SECOND_NS + stamps["nanosec"]
+    reading_ns[stamps["nanosec"] >= SECOND_NS] = -1
+    robot = message.robot.astype(np.int64)
+    stamp_ns, frame_id = nanoseconds(message.header.stamp), message.header.frame_id
+    return SharedMessage(stamp_ns, frame_id, message.swarm, robot, reading_ns, columns)
+
+
+def encode_shared_numbers(head: SharedHead, *columns: FloatArray) -> bytes:
+    """Serialize a SwarmOdometry from poses (n, 3), or SwarmFixes from these and covariances (n, 9)."""
+    message = _written(head) | dict(zip(("pose", "covariance"), columns, strict=False))
+    return encode(message, SWARM_ODOMETRY if len(columns) == 1 else SWARM_FIXES)
+
+
+def encode_shared_detections(head: SharedHead, detections: Rows) -> bytes:
+    """Serialize a SwarmDetections from (n,) detections of `DETECTION_DTYPE`."""
+    return encode(_written(head) | {"detections": detections}, SWARM_DETECTIONS)
+
+
+def _written(head: SharedHead) -> dict[str, Any]:
+    header = {"stamp": head.stamp_ns, "frame_id": head.frame_id}
+    return {"header": header, "swarm": head.swarm, "robot": head.robot, "stamp": stamp_rows(head.reading_ns)}

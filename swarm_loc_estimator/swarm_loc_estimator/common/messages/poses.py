@@ -1,0 +1,212 @@
+"""Poses of the plane as ROS messages: nav_msgs/Odometry and the stamped poses of geometry_msgs."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_estimator.common.messages.cdr import ENCAPSULATION, decode, encode, nanoseconds, stamp_rows
+from swarm_loc_estimator.common.messages.definitions import ODOMETRY, POSE_STAMPED, POSE_WITH_COVARIANCE
+
+POSE_DOUBLES = 7
+"""Numbers of a geometry_msgs/Pose: position and quaternion."""
+PLANE = np.ix_((0, 1, 5), (0, 1, 5))
+"""Where x, y and yaw stand in a 6x6 covariance."""
+UNKNOWN_COVARIANCE = np.diag([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+"""6x6; a negative first element says that the sender does not know (the convention of sensor_msgs)."""
+STAMP_SIZE = 8
+_COVARIANCE = POSE_DOUBLES + np.arange(36).reshape(6, 6)[PLANE].ravel()
+"""Where a planar covariance stands behind a pose."""
+
+
+class OdometryMessage(NamedTuple):
+    """The part of nav_msgs/Odometry that the estimator uses.
+
+    Attributes:
+        stamp_ns: Acquisition time.
+        frame_id: Frame of the pose.
+        child_frame_id: Frame of the twist.
+        pose: (x [m], y [m], yaw [rad]); yaw is NaN when the quaternion is zero.
+        twist: (vx [m/s], vy [m/s], yaw rate [rad/s]).
+        covariance: 3x3, of x, y, yaw, as published.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    child_frame_id: str
+    pose: tuple[float, float, float]
+    twist: tuple[float, float, float]
+    covariance: FloatArray
+
+
+class PoseMessage(NamedTuple):
+    """A geometry_msgs/PoseStamped in the plane: pose is (x [m], y [m], yaw [rad])."""
+
+    stamp_ns: int
+    frame_id: str
+    pose: tuple[float, float, float]
+
+
+class FixMessage(NamedTuple):
+    """A geometry_msgs/PoseWithCovarianceStamped in the plane.
+
+    Attributes:
+        stamp_ns: When the robot was there.
+        frame_id: Frame of the pose.
+        pose: (x [m], y [m], yaw [rad]); yaw is NaN when the quaternion is zero.
+        covariance: 3x3, of x, y, yaw, as published.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    pose: tuple[float, float, float]
+    covariance: FloatArray
+
+
+@cached_njit
+def yaw_of(x: float, y: float, z: float, w: float) -> float:
+    """The yaw [rad] of a quaternion, which need not be normalised; NaN if all are zero."""
+    sine, cosine = 2.0 * (w * z + x * y), w * w + x * x - y * y - z * z
+    return math.atan2(sine, cosine) if sine != 0.0 or cosine != 0.0 else math.nan
+
+
+def planar_pose(pose: Any) -> tuple[float, float, float]:
+    """X [m], y [m] and yaw [rad] of a geometry_msgs/Pose."""
+    turn = pose.orientation
+    return pose.position.x, pose.position.y, yaw_of(turn.x, turn.y, turn.z, turn.w)
+
+
+def decode_odometry(data: bytes) -> OdometryMessage:
+    """Read a nav_msgs/Odometry.
+
+    Raises:
+        CdrError: The bytes are not one whole message.
+    """
+    message = decode(data, ODOMETRY)
+    header, pose, twist = message.header, message.pose, message.twist.twist
+    return OdometryMessage(
+        nanoseconds(header.stamp),
+        header.frame_id,
+        message.child_frame_id,
+        planar_pose(pose.pose),
+        (twist.linear.x, twist.linear.y, twist.angular.z),
+        pose.covariance.reshape(6, 6)[PLANE],
+    )
+
+
+def decode_pose_stamped(data: bytes) -> PoseMessage:
+    """Read a geometry_msgs/PoseStamped.
+
+    Raises:
+        CdrError: The bytes are not one whole message.
+    """
+    message = decode(data, POSE_STAMPED)
+    return PoseMessage(nanoseconds(message.header.stamp), message.header.frame_id, planar_pose(message.pose))
+
+
+def decode_fix(data: bytes) -> FixMessage:
+    """Read a geometry_msgs/PoseWithCovarianceStamped.
+
+    Raises:
+        CdrError: The bytes are not one whole message.
+    """
+    message = decode(data, POSE_WITH_COVARIANCE)
+    header, pose = message.header, message.pose
+    covariance = pose.covariance.reshape(6, 6)[PLANE]
+    return FixMessage(nanoseconds(header.stamp), header.frame_id, planar_pose(pose.pose), covariance)
+
+
+def position_and_quaternion(poses: FloatArray) -> FloatArray:
+    """(N, 7) x, y, z [m] and quaternion x, y, z, w of planar poses (N, 3)."""
+    columns = np.zeros((len(poses), POSE_DOUBLES))
+    columns[:, :2] = poses[:, :2]
+    columns[:, 5] = np.sin(poses[:, 2] / 2.0)
+    columns[:, 6] = np.cos(poses[:, 2] / 2.0)
+    return columns
+
+
+def planar_covariance(x: float, y: float, yaw: float) -> FloatArray:
+    """6x6 covariance from three variances; z, roll and pitch, which the plane fixes, get a tiny one."""
+    return np.diag([x, y, 1e-9, 1e-9, 1e-9, yaw])
+
+
+def encode_odometry(
+    frame_id: str,
+    child_frame_id: str,
+    stamp_ns: IntArray,
+    pose: FloatArray,
+    twist: FloatArray,
+    covariance: FloatArray,
+    twist_covariance: FloatArray,
+) -> list[bytes]:
+    """Serialize nav_msgs/Odometry of one robot.
+
+    Args:
+        frame_id: Frame of the pose, `<robot>/odom`.
+        child_frame_id: Frame of the twist, `<robot>/base_link`.
+        stamp_ns: (N,) acquisition times.
+        pose: (N, 3) x [m], y [m], yaw [rad].
+        twist: (N, 3) vx [m/s], vy [m/s], yaw rate [rad/s].
+        covariance: (6, 6) of the pose, the same in all.
+        twist_covariance: (6, 6) of the twist, the same in all.
+
+    Returns:
+        N messages.
+    """
+    numbers = np.zeros((len(stamp_ns), POSE_DOUBLES + 36 + 6 + 36))
+    numbers[:, :POSE_DOUBLES] = position_and_quaternion(pose)
+    numbers[:, 7:43] = covariance.reshape(36)
+    numbers[:, [43, 44, 48]] = twist
+    numbers[:, 49:] = twist_covariance.reshape(36)
+    model = {"header": {"frame_id": frame_id}, "child_frame_id": child_frame_id}
+    return _copies(encode(model, ODOMETRY), stamp_ns, numbers)
+
+
+def encode_pose_stamped(frame_id: str, stamp_ns: IntArray, pose: FloatArray) -> list[bytes]:
+    """Serialize geometry_msgs/PoseStamped; arguments as for `encode_odometry`."""
+    model = encode({"header": {"frame_id": frame_id}}, POSE_STAMPED)
+    return _copies(model, stamp_ns, position_and_quaternion(pose))
+
+
+def encode_poses(frame_id: str, stamp_ns: IntArray, pose: FloatArray, covariance: FloatArray) -> list[bytes]:
+    """Serialize geometry_msgs/PoseWithCovarianceStamped of the plane.
+
+    Args:
+        frame_id: Frame of the poses, `map`.
+        stamp_ns: (N,) when the robots were there.
+        pose: (N, 3) x [m], y [m], yaw [rad].
+        covariance: (N, 3, 3) of them.
+
+    Returns:
+        N messages.
+    """
+    numbers = np.zeros((len(pose), POSE_DOUBLES + 36))
+    numbers[:, :POSE_DOUBLES] = position_and_quaternion(pose)
+    numbers[:, POSE_DOUBLES:] = planar_covariance(0.0, 0.0, 0.0).reshape(36)
+    numbers[:, _COVARIANCE] = covariance.reshape(-1, 9)
+    return _copies(encode({"header": {"frame_id": frame_id}}, POSE_WITH_COVARIANCE), stamp_ns, numbers)
+
+
+def encode_fix(frame_id: str, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike) -> bytes:
+    """Serialize one pose (3,) with its covariance (3, 3), as `encode_poses` does."""
+    one = (np.array([value], dtype=float) for value in (pose, covariance))
+    return encode_poses(frame_id, np.array([stamp_ns]), *one)[0]
+
+
+def stamp_bytes(stamp_ns: IntArray) -> NDArray[np.uint8]:
+    """(n, 8) bytes of stamps (n,), as builtin_interfaces/Time has them."""
+    return stamp_rows(stamp_ns).view(np.uint8).reshape(-1, STAMP_SIZE)
+
+
+def _copies(model: bytes, stamp_ns: IntArray, numbers: FloatArray) -> list[bytes]:
+    """Copies (N,) of a message with other stamps (N,) in the header, and other doubles (N, k) at the end."""
+    rows = np.tile(np.frombuffer(model, np.uint8), (len(stamp_ns), 1))
+    rows[:, ENCAPSULATION : ENCAPSULATION + STAMP_SIZE] = stamp_bytes(stamp_ns)
+    rows[:, -8 * numbers.shape[1] :] = np.ascontiguousarray(numbers, dtype="<f8").view(np.uint8)
+    joined = rows.tobytes()
+    return [joined[begin : begin + len(model)] for begin in range(0, len(joined), len(model))]
