@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
-from swarm_loc_estimator.common.bags.cut import copy_beginning
+from swarm_loc_estimator.common.bags.writer import copy_beginning
 from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.offline.datasets.mrclam import read_dataset
 from swarm_loc_estimator.offline.datasets.mrclam_bag import Delay, convert

@@ -19,10 +19,6 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.mapping.mapper import START_TURN as START_TURN
     from swarm_loc_estimator.mapping.mapper import CooperativeMapper as CooperativeMapper
     from swarm_loc_estimator.mapping.mapper_feed import FixCovariances as FixCovariances
-    from swarm_loc_estimator.mapping.messages import LASER as LASER
-    from swarm_loc_estimator.mapping.messages import LIGHTS as LIGHTS
-    from swarm_loc_estimator.mapping.messages import OCCUPANCY_GRID as OCCUPANCY_GRID
-    from swarm_loc_estimator.mapping.messages import BadMessageError as BadMessageError
     from swarm_loc_estimator.mapping.messages import decode_laser as decode_laser
     from swarm_loc_estimator.mapping.scans import UNSEEN as UNSEEN
     from swarm_loc_estimator.mapping.scans import LightSightings as LightSightings
@@ -54,13 +50,7 @@ _MODULES = {
     "swarm_loc_estimator.mapping.grid": ("OccupancyMap",),
     "swarm_loc_estimator.mapping.mapper": ("SCAN_TURN", "START_TURN", "CooperativeMapper"),
     "swarm_loc_estimator.mapping.mapper_feed": ("FixCovariances",),
-    "swarm_loc_estimator.mapping.messages": (
-        "OCCUPANCY_GRID",
-        "LASER",
-        "LIGHTS",
-        "BadMessageError",
-        "decode_laser",
-    ),
+    "swarm_loc_estimator.mapping.messages": ("decode_laser",),
     "swarm_loc_estimator.mapping.scans": ("UNSEEN", "LightSightings", "Readings"),
     "swarm_loc_estimator.offline.metrics": ("Errors", "ErrorSummary"),
     "swarm_loc_estimator.offline.replay": ("replay",),

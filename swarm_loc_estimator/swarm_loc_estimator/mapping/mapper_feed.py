@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.cdr import CdrError, decode_odometry
-from swarm_loc_estimator.common.messages.typestore import ODOMETRY
+from swarm_loc_estimator.common.messages.cdr import CdrError
+from swarm_loc_estimator.common.messages.definitions import LASER, LIGHTS, ODOMETRY
+from swarm_loc_estimator.common.messages.poses import decode_odometry
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.se2 import between, compose, exp, log
 from swarm_loc_estimator.filter.process_noise import OdometryStep, add_step_noise
 from swarm_loc_estimator.mapping.exploration import Goal
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, CooperativeMapper
-from swarm_loc_estimator.mapping.messages import LASER, LIGHTS, BadMessageError, decode_laser, decode_lights
+from swarm_loc_estimator.mapping.messages import decode_laser, decode_lights
 from swarm_loc_estimator.mapping.scans import UNSEEN, LightSightings, Readings
 from swarm_loc_estimator.odometry.preintegration import MODEL_DTYPE
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot
@@ -256,7 +257,7 @@ class MapperFeed:
         self.received[robot, kind] += 1
         try:
             self._readers[kind](robot, data)
-        except (CdrError, BadMessageError):
+        except CdrError:
             self.drops["bad_message"] += 1
             return
         readings = self._pairers[robot].ready()

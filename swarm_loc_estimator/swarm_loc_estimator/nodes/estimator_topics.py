@@ -16,15 +16,15 @@ from rosgraph_msgs.msg import Clock
 from tf2_msgs.msg import TFMessage
 
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
-from swarm_loc_estimator.common.messages.encoders import encode_identities, encode_poses
-from swarm_loc_estimator.common.messages.estimates import encode_sightings
-from swarm_loc_estimator.common.messages.outputs import SwarmPosesEncoder, TransformsEncoder
+from swarm_loc_estimator.common.messages.detections import encode_identities
+from swarm_loc_estimator.common.messages.estimates import SwarmPosesEncoder, TransformsEncoder
+from swarm_loc_estimator.common.messages.poses import encode_poses
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.topics import InputKind, InputTopic
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
-from swarm_loc_estimator.timeline.sightings import newest_sightings
+from swarm_loc_estimator.timeline.sightings import encode_sightings, newest_sightings
 from swarm_loc_msgs.msg import (
     AnonymousDetectionArray,
     BrightnessMatrix,

@@ -25,7 +25,7 @@ from std_srvs.srv import Trigger
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of, listed
 from swarm_loc_estimator.common.jit import is_precompiled
-from swarm_loc_estimator.common.messages.planar import PLANE, planar_covariance
+from swarm_loc_estimator.common.messages.poses import PLANE, planar_covariance
 from swarm_loc_estimator.common.node import BACKWARDS, ConfiguredNode, run_node
 from swarm_loc_estimator.mapping.exploration import Goal
 from swarm_loc_estimator.mapping.grid import CELL, OccupancyMap

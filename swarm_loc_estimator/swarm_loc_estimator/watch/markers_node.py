@@ -18,15 +18,20 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from visualization_msgs.msg import MarkerArray
 
-from swarm_loc_estimator.common.messages.cdr import CdrError, decode_odometry
-from swarm_loc_estimator.common.messages.encoders import UNKNOWN_COVARIANCE, encode_odometry
-from swarm_loc_estimator.common.messages.estimates import EstimateMessage, SwarmPosesReader, decode_sightings
-from swarm_loc_estimator.common.messages.markers import MarkersEncoder
-from swarm_loc_estimator.common.messages.planar import PLANE, planar_covariance
+from swarm_loc_estimator.common.messages.cdr import CdrError
+from swarm_loc_estimator.common.messages.estimates import EstimateMessage, SwarmPosesReader
+from swarm_loc_estimator.common.messages.poses import (
+    PLANE,
+    UNKNOWN_COVARIANCE,
+    decode_odometry,
+    encode_odometry,
+    planar_covariance,
+)
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_estimator.nodes.parameters import MarkersParameters
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.timeline.sightings import Sightings
+from swarm_loc_estimator.timeline.sightings import Sightings, decode_sightings
+from swarm_loc_estimator.watch.markers import MarkersEncoder
 from swarm_loc_msgs.msg import SwarmPoses, SwarmSightings
 
 _LOOK_S = 0.5

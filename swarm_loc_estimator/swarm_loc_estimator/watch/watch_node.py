@@ -26,12 +26,13 @@ from rclpy.subscription import Subscription
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of
 from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.estimates import SwarmPosesReader, decode_sightings
-from swarm_loc_estimator.common.messages.typestore import SWARM_POSES
+from swarm_loc_estimator.common.messages.definitions import SWARM_POSES
+from swarm_loc_estimator.common.messages.estimates import SwarmPosesReader
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
 from swarm_loc_estimator.nodes.parameters import WatchParameters
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.timeline.sightings import decode_sightings
 from swarm_loc_estimator.watch.access import Access
 from swarm_loc_estimator.watch.frames import Frame, map_frame, poses_frame, sightings_frame
 from swarm_loc_estimator.watch.page import about

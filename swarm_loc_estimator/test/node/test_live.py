@@ -13,7 +13,7 @@ from node_world import T0_NS, Ros
 from rclpy.time import Time
 
 from swarm_loc_estimator.cli.demo import main
-from swarm_loc_estimator.common.bags.cut import copy_beginning
+from swarm_loc_estimator.common.bags.writer import copy_beginning
 from swarm_loc_estimator.common.launch import GraphOptions, graph_nodes
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.offline.live.graph import LiveError, LiveGraph, Recorder

@@ -69,7 +69,7 @@ def test_fewer_messages_than_the_statistics_tell_are_told(tmp_path: Path) -> Non
     path.write_bytes(data)
     found, losses = read(path)
     assert len(found) == 59
-    assert losses == ["x.mcap: it holds 59 messages, but its statistics tell of 60."]
+    assert losses == ["x.mcap: it holds 59 messages, but its statistics count 60."]
 
 
 def test_a_message_shorter_than_its_head_is_told(tmp_path: Path) -> None:

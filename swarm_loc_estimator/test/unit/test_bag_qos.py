@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from rosbags.interfaces import QosDurability, QosReliability
 
-from swarm_loc_estimator.common.bags.qos import offered_qos
+from swarm_loc_estimator.common.bags.reader import offered_qos
 
 FOREVER = {"sec": 9223372036, "nsec": 854775807}
 NEW = {

@@ -12,7 +12,7 @@ from core_world import MOUNT, SENSOR, Plan, World, lasting_errors, simulate
 
 from swarm_loc_estimator.cli.replay import main
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.bags.cut import copy_beginning
+from swarm_loc_estimator.common.bags.writer import copy_beginning
 from swarm_loc_estimator.offline.report.table import SELF_CALIBRATED
 from swarm_loc_estimator.sensors.camera import SightingConverter
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.common.bags.cut import copy_beginning
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.bags.writer import BagWriter, copy_beginning
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 

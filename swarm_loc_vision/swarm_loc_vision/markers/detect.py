@@ -13,15 +13,11 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import struct
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-from rosbags.serde import SerdeError
 
 from swarm_loc_estimator.common.bags.bag_file import BagError, BagTopic
 from swarm_loc_estimator.common.bags.reader import BagReader
@@ -35,7 +31,8 @@ from swarm_loc_estimator.common.command_line import (
     parameters_of,
     swarm_beside,
 )
-from swarm_loc_estimator.common.messages.typestore import DETECTIONS, typestore
+from swarm_loc_estimator.common.messages.cdr import CdrError, decode
+from swarm_loc_estimator.common.messages.definitions import DETECTIONS
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.common.camera import CameraError
 from swarm_loc_vision.common.images import TRANSPORTS, ImageError, Transport
@@ -46,8 +43,6 @@ CreateCamera = Callable[[str, Transport], CameraDetector]
 Progress = Callable[[float, str], None]
 
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-_NOT_A_MESSAGE = (SerdeError, struct.error, ValueError)
-"""Errors of the type store for bytes that are not a whole message."""
 
 
 class ImageBag:
@@ -133,8 +128,8 @@ def _spaces(topics: Sequence[BagTopic], name: str, message_type: str) -> list[st
 def _detected(camera: CameraDetector, kind: str, data: bytes) -> bytes | None:
     """The detections of an image message; None: it was dropped and counted."""
     try:
-        message: Any = typestore().deserialize_cdr(data, kind)
-    except _NOT_A_MESSAGE:
+        message = decode(data, kind)
+    except CdrError:
         camera.images += 1
         camera.drops["corrupt"] += 1
         return None
@@ -147,8 +142,8 @@ def _detected(camera: CameraDetector, kind: str, data: bytes) -> bytes | None:
 def _calibrate(camera: CameraDetector, data: bytes) -> None:
     """Use a calibration; `trouble` of the camera says why it cannot be used."""
     try:
-        message: Any = typestore().deserialize_cdr(data, _CAMERA_INFO)
-    except _NOT_A_MESSAGE:
+        message = decode(data, _CAMERA_INFO)
+    except CdrError:
         camera.drops["corrupt calibration"] += 1
         return
     with suppress(CameraError):

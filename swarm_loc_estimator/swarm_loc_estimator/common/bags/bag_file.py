@@ -29,14 +29,14 @@ class BagTopic(NamedTuple):
     type: str
 
 
-class Losses(list[str]):
-    """What could not be read of a file, one sentence each, said once however often the file is read."""
+class ReadErrors(list[str]):
+    """One sentence for each thing that could not be read of a file, each once however often it is read."""
 
     def __init__(self, file: str) -> None:
         super().__init__()
         self._file = file
 
-    def say(self, sentence: str) -> None:
+    def add(self, sentence: str) -> None:
         """Add a sentence about the file."""
         sentence = f"{self._file}: {sentence}"
         if sentence not in self:
@@ -59,7 +59,7 @@ class BagFile(Protocol):
         """First and last log time; (0, 0) without messages."""
 
     @property
-    def losses(self) -> Losses:
+    def losses(self) -> ReadErrors:
         """What could not be read; more may come while reading."""
 
     @property
@@ -67,7 +67,7 @@ class BagFile(Protocol):
         """Share of the file that was read, 0 to 1."""
 
     def batches(self, number_of: Mapping[BagTopic, int]) -> Iterator[MessageBatch]:
-        """The messages of some topics in order of log time, numbered as told."""
+        """The messages of some topics in order of log time, numbered by `number_of`."""
 
     def close(self) -> None:
         """Close the file."""

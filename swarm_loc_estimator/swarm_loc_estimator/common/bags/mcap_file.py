@@ -1,9 +1,12 @@
-"""MCAP files, whole or cut off, in order of log time and faster than the libraries' readers.
+"""MCAP files, whole or cut off, in order of log time.
 
-The file's top-level records are walked once when it is opened: each chunk tells its time range in its head,
-so a file that a crash left without the index at its end is read like any other; where there is an index, the
-heads are held against it. Chunks are then loaded one after another in order of time; only those that overlap
-are in memory together.
+The top-level records are walked once when a file is opened. The head of each chunk has its time range, so a
+file that a crash left without the index at its end is read like any other; an index is compared with the
+heads. Chunks are then loaded in order of time; only those that overlap are in memory together.
+
+The libraries' readers fail on cut files and take longer: 1.8 us (`rosbags`) and 5.6 us (`mcap`) a message,
+where this one takes 0.16 us (`make bench-reading`, odometry). The library `mcap` parses all records but
+chunks and messages.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema, Statistics
 
 from swarm_loc_estimator.common.arrays import IntArray
-from swarm_loc_estimator.common.bags.bag_file import MAX_LOG_NS, BagError, BagTopic, Losses
+from swarm_loc_estimator.common.bags.bag_file import MAX_LOG_NS, BagError, BagTopic, ReadErrors
 from swarm_loc_estimator.common.bags.mcap_records import (
     MAGIC,
     MESSAGE_HEAD,
@@ -67,7 +70,7 @@ class McapFile:
         self._whole = False
         self._bytes_read = 0
         self._skipped: Counter[str] = Counter()
-        self.losses = Losses(path.name)
+        self.losses = ReadErrors(path.name)
         self.message_count = 0
         if path.exists() and not path.is_file():
             raise BagError(f"{path} is no file.")  # to open a pipe would wait for ever
@@ -107,7 +110,7 @@ class McapFile:
         self._file = -1
 
     def batches(self, number_of: Mapping[BagTopic, int]) -> Iterator[MessageBatch]:
-        """The messages of some topics in order of log time, numbered as told."""
+        """The messages of some topics in order of log time, numbered by `number_of`."""
         self._bytes_read = 0
         self._skipped.clear()
         count = 0
@@ -117,7 +120,7 @@ class McapFile:
             waiting[chunk.offset] = self._load(chunk, number_of).in_order_of_time()
             count += waiting[chunk.offset].size
             yield _take_before(following, waiting)
-        self._say_skipped(count)
+        self._report_skipped(count)
 
     # Opening
 
@@ -127,25 +130,25 @@ class McapFile:
         if os.pread(self._file, len(MAGIC), 0) != MAGIC:
             raise BagError(f"{self._path} is empty." if size == 0 else f"{self._path} is no MCAP file.")
         end = self._walk_file(size)
-        told = self._statistics
+        statistics = self._statistics
         times = [(chunk.first_ns, chunk.last_ns) for chunk in self._chunks if not chunk.is_run]
         contradicted = self._whole and bool(self._index) and sorted(times) != sorted(self._index)
         absurd = any(chunk.last_ns > MAX_LOG_NS for chunk in self._chunks)
         trusted = self._whole and not contradicted and not absurd
-        if trusted and told and len(self._channels) >= told.channel_count:
-            self.message_count = told.message_count
+        if trusted and statistics and len(self._channels) >= statistics.channel_count:
+            self.message_count = statistics.message_count
         else:
             self._count()
         if contradicted:
-            self.losses.say("its chunks are not what its index tells: one of both is damaged.")
+            self.losses.add("its chunks and its index disagree: one of them is damaged.")
         if not self._whole:
-            self.losses.say(
+            self.losses.add(
                 f"it was cut off at byte {end} of {size}: the {self.message_count} messages before that"
                 " were kept, what was written behind them is lost."
             )
 
     def _walk_file(self, size: int) -> int:
-        """Note all chunks, topics and statistics; returns the offset behind the last whole record."""
+        """Record all chunks, topics and statistics; return the offset behind the last whole record."""
         offset = len(MAGIC)
         while offset + RECORD.size <= size:
             head: tuple[int, int] = RECORD.unpack(os.pread(self._file, RECORD.size, offset))
@@ -165,7 +168,7 @@ class McapFile:
         return offset
 
     def _note(self, opcode: int, begin: int, length: int) -> None:
-        """Remember what a top-level record says."""
+        """Record a top-level record."""
         if opcode == Opcode.CHUNK:
             self._note_chunk(begin, length, whole=True)
         elif opcode == Opcode.MESSAGE:
@@ -174,17 +177,17 @@ class McapFile:
             self._define(opcode, os.pread(self._file, length, begin))
 
     def _note_chunk(self, begin: int, length: int, *, whole: bool) -> None:
-        """Remember a chunk; of one that was cut off, what is there."""
+        """Record a chunk; of one that was cut off, the part that is there."""
         chunk = parse_chunk(os.pread(self._file, min(length, _CHUNK_HEAD), begin), begin, length, whole=whole)
         if chunk:
             self._chunks.append(chunk)
         elif whole:
-            self.losses.say(f"the head of the chunk at byte {begin} is damaged.")
+            self.losses.add(f"the head of the chunk at byte {begin} is damaged.")
 
     def _note_message(self, begin: int, length: int) -> None:
-        """Messages outside chunks: neighbours form a run that is read like a chunk."""
+        """Record a message outside chunks: neighbours form a run that is read like a chunk."""
         if length < MESSAGE_HEAD:
-            self.losses.say(f"the message at byte {begin} is damaged.")
+            self.losses.add(f"the message at byte {begin} is damaged.")
             return
         log_ns = int.from_bytes(os.pread(self._file, 8, begin + 6), "little")
         offset, end = begin - RECORD.size, begin + length
@@ -214,10 +217,10 @@ class McapFile:
             else:
                 self._statistics = Statistics.read(stream)
         except (McapError, struct.error, UnicodeDecodeError, ValueError):
-            self.losses.say("a damaged record that names a topic, or counts messages, was skipped.")
+            self.losses.add("a damaged record that names a topic, or counts messages, was skipped.")
 
     def _count(self) -> None:
-        """Count by reading: only the messages themselves know their topics and times for sure."""
+        """Count the messages by reading them, where heads and statistics cannot be trusted."""
         for chunk in self._chunks:
             messages = self._load(chunk, None)
             self.message_count += messages.size
@@ -233,19 +236,19 @@ class McapFile:
         try:
             data = unpack(stored, chunk)
         except (zstandard.ZstdError, RuntimeError, ValueError) as error:
-            self.losses.say(f"the chunk at byte {chunk.offset} is damaged ({error}).")
+            self.losses.add(f"the chunk at byte {chunk.offset} is damaged ({error}).")
             return MessageBatch.of([])
         if not chunk.is_run and len(data) > chunk.size:
-            self.losses.say(f"the chunk at byte {chunk.offset} holds more than its {chunk.size} bytes.")
+            self.losses.add(f"the chunk at byte {chunk.offset} holds more than its {chunk.size} bytes.")
             data = data[: chunk.size]
         elif chunk.whole and len(data) < chunk.size:
-            self.losses.say(f"the chunk at byte {chunk.offset} holds {len(data)} of {chunk.size} bytes.")
+            self.losses.add(f"the chunk at byte {chunk.offset} holds {len(data)} of {chunk.size} bytes.")
         elif chunk.whole and chunk.checksum and zlib.crc32(data) != chunk.checksum:
-            self.losses.say(f"the chunk at byte {chunk.offset} is damaged, its checksum is wrong.")
+            self.losses.add(f"the chunk at byte {chunk.offset} is damaged, its checksum is wrong.")
             return MessageBatch.of([])
         messages, end = self._walk_chunk(data, number_of)
         if chunk.whole and end != len(data):
-            self.losses.say(f"the chunk at byte {chunk.offset} is damaged behind its byte {end}.")
+            self.losses.add(f"the chunk at byte {chunk.offset} is damaged behind its byte {end}.")
         return messages
 
     def _walk_chunk(self, data: bytes, number_of: Mapping[BagTopic, int] | None) -> tuple[MessageBatch, int]:
@@ -276,16 +279,16 @@ class McapFile:
             numbers[channel] = 0 if number_of is None else number_of.get(topic, UNWANTED)
         return numbers
 
-    def _say_skipped(self, count: int) -> None:
-        """Say what became of messages that were not among those that were read, behind the last of these."""
+    def _report_skipped(self, count: int) -> None:
+        """Report messages that were skipped, after the last one was read."""
         if self._skipped["unknown"]:
-            self.losses.say(f"{self._skipped['unknown']} messages of no known topic were skipped.")
+            self.losses.add(f"{self._skipped['unknown']} messages of no known topic were skipped.")
         if self._skipped["untimed"]:
-            self.losses.say(f"{self._skipped['untimed']} messages whose log time cannot be were skipped.")
+            self.losses.add(f"{self._skipped['untimed']} messages whose log time cannot be were skipped.")
         found = count + self._skipped.total()
         if self._statistics and not self.losses and found != self._statistics.message_count:
-            self.losses.say(
-                f"it holds {found} messages, but its statistics tell of {self._statistics.message_count}."
+            self.losses.add(
+                f"it holds {found} messages, but its statistics count {self._statistics.message_count}."
             )
 
 

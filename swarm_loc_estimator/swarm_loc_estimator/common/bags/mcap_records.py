@@ -67,7 +67,7 @@ class Chunk:
     is_run: bool = False
 
 
-class Found(NamedTuple):
+class MessageScan(NamedTuple):
     """How far the messages of a chunk were read.
 
     Attributes:
@@ -126,7 +126,7 @@ def unpack(stored: bytes, chunk: Chunk) -> bytes:
 @cached_njit
 def find_messages(
     data: NDArray[np.uint8], begin: int, numbers: IntArray, columns: IntArray, count: int
-) -> Found:
+) -> MessageScan:
     """Note the messages from an offset on up to a record that is none, or is not whole.
 
     Args:
@@ -156,7 +156,7 @@ def find_messages(
             columns[3, count] = length - MESSAGE_HEAD
             count += 1
         offset += _RECORD_HEAD + length
-    return Found(count, others, unknown, untimed, offset)
+    return MessageScan(count, others, unknown, untimed, offset)
 
 
 @cached_njit

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from rosbags.rosbag2 import ReaderError
+from rosbags.rosbag2.metadata import parse_qos
 from typing_extensions import Self
 
 from swarm_loc_estimator.common.bags.bag_file import BagError, BagFile, BagTopic, RawMessage
 from swarm_loc_estimator.common.bags.mcap_file import McapFile
-from swarm_loc_estimator.common.bags.qos import offered_qos
 from swarm_loc_estimator.common.bags.sqlite_file import SqliteFile
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch, merge_streams
 from swarm_loc_estimator.common.yaml_tree import YamlTreeError, read_tree
@@ -185,3 +186,21 @@ def _part_number(path: Path) -> tuple[int, str]:
     """Parts are numbered without leading zeros: bag_10 comes behind bag_9."""
     number = path.stem.rpartition("_")[2]
     return (int(number) if number.isdecimal() else 0, path.name)
+
+
+def offered_qos(metadata: dict[str, Any]) -> dict[str, list[Qos]]:
+    """The profiles of each topic's publishers, by its name without the leading slash.
+
+    Args:
+        metadata: What stands below `rosbag2_bagfile_information`; topics that are not described as they
+            should be have no profiles.
+    """
+    topics = metadata.get("topics_with_message_count")
+    profiles: dict[str, list[Qos]] = {}
+    for topic in topics if isinstance(topics, list) else []:
+        try:
+            about = topic["topic_metadata"]
+            profiles[str(about["name"]).lstrip("/")] = parse_qos(about["offered_qos_profiles"])
+        except (AttributeError, KeyError, ReaderError, TypeError):
+            continue
+    return profiles

@@ -1,4 +1,4 @@
-"""Many serialized messages at once: one buffer, and columns that say where in it each one lies."""
+"""Many serialized messages at once: one buffer, and columns with the place of each message in it."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def merged(parts: Sequence[MessageBatch]) -> MessageBatch:
     sizes = np.cumsum([0, *(part.data.size for part in parts)]).tolist()
     offsets = [part.offset + begin for part, begin in zip(parts, sizes, strict=False)]
     data = np.concatenate([part.data for part in parts])
-    data.flags.writeable = False  # as all others are: compiled code tells them apart
+    data.flags.writeable = False  # as all others are: compiled code depends on it
     return MessageBatch(
         data,
         np.concatenate([part.topic for part in parts]),

@@ -1,9 +1,9 @@
 """Decode the messages of many topics at once, in compiled code.
 
-Frame names and byte order hardly ever change from one message of a topic to the next. So they are compared
-with those of the last message that the complete reader of `cdr` has read, and only the numbers are taken;
-a message that differs goes to the complete reader. That is 0.1 us a message instead of 25 us, which decides
-how many robots one process can listen to and how fast a bag replays.
+Frame names and byte order hardly ever change from one message of a topic to the next. They are compared with
+those of the last message that `cdr` has decoded, and only the numbers are read; a message that differs is
+decoded by `cdr`. That takes 0.1 us a message instead of 20 us, which decides how many robots one process can
+listen to and how fast a bag replays.
 """
 
 from __future__ import annotations
@@ -281,7 +281,7 @@ def _read_poses(batch: MessageBatch, models: _Models, k: int, stamp_ns: IntArray
 def _scan_detections(
     batch: MessageBatch, models: _Models, k: int, stamp_ns: IntArray, count: IntArray, begin: IntArray
 ) -> int:
-    """Write stamps, counts and where the detections begin (n,) from message k on, likewise."""
+    """Write stamps, counts and first offsets (n,) from message k on; return the first that is not alike."""
     while k < batch.offset.size:
         offset, length, start = batch.offset[k], batch.length[k], models.start[batch.topic[k]]
         if length < start or not _is_alike(batch, k, models):
