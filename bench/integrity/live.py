@@ -39,7 +39,7 @@ class _Live:
     listener: Listener
     nodes: frozenset[str]
 
-    def go_on(self, duration_s: float, without: str = "") -> None:
+    def has_budget(self, duration_s: float, without: str = "") -> None:
         """Wait for simulated time; `without` names a node that is down."""
         until_ns = self.listener.now_ns + round(duration_s * 1e9)
         self.graph.wait_for(
@@ -60,7 +60,7 @@ def _driver_restart(live: _Live, away_s: float) -> float:
         kept[robot, "detections"],
     )
     live.graph.kill(driver)
-    live.go_on(away_s, without=driver)
+    live.has_budget(away_s, without=driver)
     driven, received = len(odometry), len(images)
     live.graph.restart(driver)
     live.graph.wait_for(lambda: len(odometry) > driven, "send odometry again", _PATIENCE_S)
@@ -78,7 +78,7 @@ def _estimator_restart_moved(live: _Live, away_s: float) -> float:
     """Kill the estimator; then the robots are not at their starts. Repaired with its first poses."""
     raw = live.graph.recorder.raw
     live.graph.kill(_ESTIMATOR)
-    live.go_on(away_s, without=_ESTIMATOR)
+    live.has_budget(away_s, without=_ESTIMATOR)
     received = len(raw)
     live.graph.restart(_ESTIMATOR)
     live.graph.wait_for(lambda: len(raw) > received, "publish poses again", _PATIENCE_S)
@@ -115,11 +115,11 @@ def run_live(name: str, seed: int, folder: Path, say: Say) -> Score:
         listener = Listener(graph, names)
         live = _Live(graph, listener, frozenset(node.full_name for node in nodes))
         begin_ns = listener.wait_until_they_drive(say)
-        live.go_on(_BEFORE_S)
+        live.has_budget(_BEFORE_S)
         say(f"breaks for {away_s:.1f} s")
         repaired_s = LIVE_SCENARIOS[name](live, away_s)
         say("repaired")
-        live.go_on(_AFTER_S)
+        live.has_budget(_AFTER_S)
     return scored(_estimated(listener, swarm, begin_ns), repaired_s - begin_ns * 1e-9)
 
 

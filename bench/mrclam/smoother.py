@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.filter.calibration_states import TURN_BIAS
 from swarm_loc_estimator.filter.measurement_model import (
     MeasurementArray,
     MeasurementColumns,
-    innovation,
     predict_one,
+    write_innovation,
 )
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.offline.calibration.recording import Recording
 from swarm_loc_estimator.offline.metrics import Errors, compare
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.sensors.validation import InputValidator
+from swarm_loc_estimator.sensors.conversion import InputConverter
+from swarm_loc_estimator.swarm.calibration_states import TURN_BIAS
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -109,9 +109,10 @@ def _smooth(recording: Recording, online: ReplayResult) -> Mapping[str, Errors]:
 
 def _tracks_and_measurements(recording: Recording, swarm: Swarm) -> tuple[OdometryTracks, MeasurementArray]:
     """All odometry, calibrated, and all sightings of known markers (m,)."""
-    valid = InputValidator(swarm, Settings()).validate(recording.messages)
+    valid = InputConverter(swarm, Settings()).convert(recording.messages)
     tracks = OdometryTracks(swarm.robots)
-    tracks.extend(valid.odometry.robot, valid.odometry.stamp_ns, valid.odometry.pose)
+    driven = valid.rows["odometry"]
+    tracks.extend(driven.robot, driven.stamp_ns, driven.pose)
     return tracks, valid.measurements
 
 
@@ -293,7 +294,7 @@ class _Sighting:
         poses = np.array([*((pose.x(), pose.y(), pose.theta()) for pose in found), unmoved])
         value, jacobian, error = np.zeros(3), np.zeros((3, 5)), np.zeros(3)
         predict_one(self._columns, self._k, poses[0], poses[1], (0.0, 0.0), value, jacobian)
-        innovation(self._columns, self._k, self._columns.value[self._k], value, error)
+        write_innovation(self._columns, self._k, self._columns.value[self._k], value, error)
         if jacobians is not None:
             signs = (-1.0, 1.0)
             for place, pose in enumerate(found):

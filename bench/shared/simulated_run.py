@@ -13,7 +13,10 @@ from swarm_loc_drivers.sim.scenarios.bags import as_detections
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.replay import ListedSchedule, Runner
-from swarm_loc_estimator.sensors.messages import DetectionRows, OdometryRows, RawInputs, chosen
+from swarm_loc_estimator.sensors.camera import DetectionRows
+from swarm_loc_estimator.sensors.odometry import OdometryRows
+from swarm_loc_estimator.sensors.registry import Batch
+from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.timeline.estimator import Estimator
 
 if TYPE_CHECKING:
@@ -54,7 +57,7 @@ def run_core(run: SimulatedRun, tick_ns: NDArray[np.int64], settings: Settings) 
     return CoreResult(cpu_s, result.poses, result.covariances)
 
 
-def inputs_between(run: SimulatedRun, tick_ns: NDArray[np.int64]) -> list[RawInputs]:
+def inputs_between(run: SimulatedRun, tick_ns: NDArray[np.int64]) -> list[Batch]:
     """The inputs that arrived between the previous tick and each tick."""
     rows, frames = run.odometry, run.frames
     names = ("robot", "stamp_ns", "arrival_ns")
@@ -68,7 +71,8 @@ def inputs_between(run: SimulatedRun, tick_ns: NDArray[np.int64]) -> list[RawInp
     for now_ns in tick_ns.tolist():
         ends = [int(np.searchsorted(p.arrival_ns, now_ns, side="right")) for p in (odometry, seen)]
         first, second = (slice(a, b) for a, b in zip(begin, ends, strict=True))
-        parts.append(RawInputs(now_ns, now_ns, chosen(odometry, first), chosen(seen, second)))
+        part = {"odometry": chosen(odometry, first), "detections": chosen(seen, second)}
+        parts.append(Batch(now_ns, now_ns, part))
         begin = ends
     return parts
 

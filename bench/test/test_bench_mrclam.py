@@ -24,7 +24,8 @@ from bench.mrclam.sets import (
 from bench.shared.common import save_plot, write_figures
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.offline.calibration.recording import Recording
-from swarm_loc_estimator.sensors.messages import NO_ODOMETRY, DetectionRows
+from swarm_loc_estimator.sensors.camera import DetectionRows
+from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, SensorModel, Swarm
 
 SWARM = Swarm(

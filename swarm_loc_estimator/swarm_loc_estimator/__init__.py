@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.offline.result import ReplayResult as ReplayResult
     from swarm_loc_estimator.sensors.camera import CONTENT_POSE as CONTENT_POSE
     from swarm_loc_estimator.sensors.camera import CONTENT_POSE_TWO as CONTENT_POSE_TWO
-    from swarm_loc_estimator.sensors.messages import DetectionRows as DetectionRows
-    from swarm_loc_estimator.sensors.messages import FixRows as FixRows
-    from swarm_loc_estimator.sensors.messages import OdometryRows as OdometryRows
-    from swarm_loc_estimator.sensors.messages import RawInputs as RawInputs
+    from swarm_loc_estimator.sensors.camera import DetectionRows as DetectionRows
+    from swarm_loc_estimator.sensors.fix import FixRows as FixRows
+    from swarm_loc_estimator.sensors.odometry import OdometryRows as OdometryRows
+    from swarm_loc_estimator.sensors.registry import Batch as Batch
     from swarm_loc_estimator.swarm.swarm import Landmark as Landmark
     from swarm_loc_estimator.swarm.swarm import Robot as Robot
     from swarm_loc_estimator.swarm.swarm import Swarm as Swarm
@@ -56,8 +56,10 @@ _MODULES = {
     "swarm_loc_estimator.offline.replay": ("replay",),
     "swarm_loc_estimator.offline.report.report": ("write_report",),
     "swarm_loc_estimator.offline.result": ("ReplayResult",),
-    "swarm_loc_estimator.sensors.camera": ("CONTENT_POSE", "CONTENT_POSE_TWO"),
-    "swarm_loc_estimator.sensors.messages": ("DetectionRows", "FixRows", "OdometryRows", "RawInputs"),
+    "swarm_loc_estimator.sensors.camera": ("CONTENT_POSE", "CONTENT_POSE_TWO", "DetectionRows"),
+    "swarm_loc_estimator.sensors.fix": ("FixRows",),
+    "swarm_loc_estimator.sensors.odometry": ("OdometryRows",),
+    "swarm_loc_estimator.sensors.registry": ("Batch",),
     "swarm_loc_estimator.swarm.swarm": ("Landmark", "Robot", "Swarm"),
     "swarm_loc_estimator.swarm.swarm_file": ("load_swarm",),
     "swarm_loc_estimator.swarm.swarm_writer": ("save_swarm",),

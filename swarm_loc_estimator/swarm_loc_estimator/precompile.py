@@ -14,7 +14,6 @@ from swarm_loc_estimator.common.messages.detections import (
 )
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometry
-from swarm_loc_estimator.filter.calibration_states import ParameterTable
 from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS, record_pair
 from swarm_loc_estimator.filter.integrity.fault_detection import is_elsewhere
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns
@@ -24,6 +23,7 @@ from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE_TWO, CONTENT_POSITION
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.ir_board import IrMethod, RobotIr
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, OdometryModel, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator

@@ -118,7 +118,9 @@ def test_counts_in_diagnostics_exist(page: Path) -> None:
     words = set(
         re.findall(r"\w+", "\n".join(map(text_of, (ROOT / package / package).rglob("*.py")) if said else ""))
     )
-    kinds = {name: re.sub(r"^(?:ir|odometry)_", "", name) for name in said}  # prefixes are put before them
+    kinds = {
+        name: re.sub(r"^(?:ir|odometry|shed)_", "", name) for name in said
+    }  # prefixes are put before them
     missing = {name for name, kind in kinds.items() if not {name, kind, kind.upper()} & words}
     assert missing == set()
 

@@ -9,7 +9,6 @@ from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.small_matrix import assign
 from swarm_loc_estimator.filter import prediction
 from swarm_loc_estimator.filter.belief import BeliefArrays, to_map
-from swarm_loc_estimator.filter.calibration_states import CAMERA_SCALE, CAMERA_YAW
 from swarm_loc_estimator.filter.innovation import (
     InnovationBatch,
     body_columns,
@@ -27,6 +26,7 @@ from swarm_loc_estimator.filter.integrity.fault_detection import assess, is_set_
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, has_kernel
 from swarm_loc_estimator.odometry.look_up import look_up, look_up_pose, new_sample
 from swarm_loc_estimator.odometry.preintegration import Preintegrated, TrackArrays
+from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YAW
 
 
 @cached_njit
@@ -127,7 +127,7 @@ def assess_all(
     belief: BeliefArrays,
     limits: LossLimits,
     looks: tuple[FloatArray, FloatArray, IntArray],
-    passed: BoolArray,
+    accepted: BoolArray,
 ) -> BoolArray:
     """Assess all measurements (m,); return which robots and landmarks (N + L,) are contradicted.
 
@@ -135,27 +135,27 @@ def assess_all(
     count as evidence nor are excluded.
     """
     contradicted = np.zeros(belief.integrity.doubt.size, dtype=np.bool_)
-    for k in range(passed.size):
+    for k in range(accepted.size):
         if not has_kernel(measurements, k):
             continue
         look = (looks[0][k], (looks[1][k, 0], looks[1][k, 1]), looks[2][k])
         source = assess(measurements, k, belief, limits.max_doubt, look)
         if source >= 0:
             contradicted[source] = True
-        passed[k] &= not is_set_aside(measurements, k, belief)
+        accepted[k] &= not is_set_aside(measurements, k, belief)
     return contradicted
 
 
 @cached_njit
-def confirm_all(measurements: MeasurementColumns, belief: BeliefArrays, passed: BoolArray) -> BoolArray:
+def confirm_all(measurements: MeasurementColumns, belief: BeliefArrays, accepted: BoolArray) -> BoolArray:
     """Compare all measurements (m,) with assumed poses; return which robots (N,) they refute.
 
     Measurements of models without a kernel confirm poses, but refute none.
     """
     lost = np.zeros(belief.tracked.size, dtype=np.bool_)
-    for k in range(passed.size):
-        if passed[k] or has_kernel(measurements, k):
-            robot = confirm(measurements, k, belief, passed[k])
+    for k in range(accepted.size):
+        if accepted[k] or has_kernel(measurements, k):
+            robot = confirm(measurements, k, belief, accepted[k])
             if robot >= 0:
                 lost[robot] = True
     return lost
@@ -163,12 +163,12 @@ def confirm_all(measurements: MeasurementColumns, belief: BeliefArrays, passed: 
 
 @cached_njit
 def count_all_gated(
-    measurements: MeasurementColumns, belief: BeliefArrays, passed: BoolArray, limits: LossLimits
+    measurements: MeasurementColumns, belief: BeliefArrays, accepted: BoolArray, limits: LossLimits
 ) -> BoolArray:
     """Count the gated of all measurements (m,); return whether each robot (N,) has had too many in a row."""
     lost = np.zeros(belief.tracked.size, dtype=np.bool_)
-    for k in range(passed.size):
-        robot = count_gated(measurements, k, belief, passed[k], limits)
+    for k in range(accepted.size):
+        robot = count_gated(measurements, k, belief, accepted[k], limits)
         if robot >= 0:
             lost[robot] = True
     return lost

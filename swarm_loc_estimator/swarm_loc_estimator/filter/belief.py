@@ -9,7 +9,7 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.se2_scalar import composed, moved_by_twist, wrap
-from swarm_loc_estimator.filter.calibration_states import PARAMETERS, ParameterTable
+from swarm_loc_estimator.swarm.calibration_states import PARAMETERS, ParameterTable
 
 NEVER_NS = np.iinfo(np.int64).min
 
@@ -69,7 +69,7 @@ class BeliefArrays(NamedTuple):
     transform: FloatArray
     covariance: FloatArray
     marginal: FloatArray
-    driven: FloatArray
+    transition: FloatArray
     parameter: FloatArray
     landmark: FloatArray
     table: ParameterTable
@@ -82,12 +82,13 @@ class BeliefArrays(NamedTuple):
     pair_robot: IntArray
     pair_stamp_ns: IntArray
     pair_history: FloatArray
+    is_dense: bool
 
 
 @cached_njit
 def own_covariance(belief: BeliefArrays, robot: int) -> FloatArray:
     """The covariance, to be changed in place, in which `own_columns` are those of a robot."""
-    if belief.covariance.shape[0] > 0:
+    if belief.is_dense:
         return belief.covariance
     own: FloatArray = belief.marginal[robot]
     return own
@@ -97,7 +98,7 @@ def own_covariance(belief: BeliefArrays, robot: int) -> FloatArray:
 def own_column(belief: BeliefArrays, robot: int, which: int) -> int:
     """A column of `own_covariance`: of the robot's pose, or, from 3 on, of its parameters; -1: has none."""
     column: int = 3 * robot + which if which < 3 else belief.table.column[robot, which - 3]
-    if belief.covariance.shape[0] == 0 and column >= 0:
+    if not belief.is_dense and column >= 0:
         column = which
     return column
 
@@ -106,7 +107,7 @@ def own_column(belief: BeliefArrays, robot: int, which: int) -> int:
 def covariance_within(belief: BeliefArrays, column: int, i: int, j: int) -> float:
     """A number of the covariance (3, 3) of the body whose first column is given."""
     whole, own = belief.covariance, belief.marginal
-    within: float = whole[column + i, column + j] if whole.shape[0] > 0 else own[column // 3, i, j]
+    within: float = whole[column + i, column + j] if belief.is_dense else own[column // 3, i, j]
     return within
 
 
@@ -114,7 +115,7 @@ def covariance_within(belief: BeliefArrays, column: int, i: int, j: int) -> floa
 def own_within(belief: BeliefArrays, robot: int, i: int, j: int) -> float:
     """A number of the covariance of a robot's pose and parameters, by `own_column`."""
     whole, own = belief.covariance, belief.marginal
-    if whole.shape[0] > 0:
+    if belief.is_dense:
         within: float = whole[own_column(belief, robot, i), own_column(belief, robot, j)]
         return within
     alone: float = own[robot, i, j]

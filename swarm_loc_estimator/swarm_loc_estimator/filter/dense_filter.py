@@ -10,9 +10,9 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.small_matrix import assign_matrix, cholesky3, solve3
-from swarm_loc_estimator.filter.calibration_states import DRIVES, ParameterTable
 from swarm_loc_estimator.filter.inversion import inverse, invert
 from swarm_loc_estimator.filter.joint_filter import Robots
+from swarm_loc_estimator.swarm.calibration_states import DRIVES, ParameterTable
 
 
 class DenseFilter:
@@ -22,43 +22,43 @@ class DenseFilter:
         size: Number of columns; each starts with unit variance, independent.
     """
 
-    sequential = True
+    is_dense = True
 
     def __init__(self, size: int) -> None:
         self.covariance: FloatArray = np.eye(size)
         self.marginal: FloatArray = np.zeros((0, 3, 3))
-        self.driven: FloatArray = np.zeros((0, 4, DRIVES))
+        self.transition: FloatArray = np.zeros((0, 4, DRIVES))
 
     def copy(self) -> DenseFilter:
         """An independent copy."""
         other = DenseFilter.__new__(DenseFilter)
         other.covariance, other.marginal = self.covariance.copy(), self.marginal
-        other.driven = self.driven
+        other.transition = self.transition
         return other
 
-    def place(self, columns: IntArray, covariance: FloatArray) -> None:
+    def set_prior(self, columns: IntArray, covariance: FloatArray) -> None:
         """Give the columns (k,) this covariance (k, k), independent of the rest, whatever was known."""
         self.covariance[columns, :] = 0.0
         self.covariance[:, columns] = 0.0
         self.covariance[columns[:, None], columns[None, :]] = covariance
 
-    def place_bodies(self, bodies: IntArray, covariances: FloatArray) -> None:
+    def set_body_priors(self, bodies: IntArray, covariances: FloatArray) -> None:
         """Likewise the columns of bodies (k,), each with a covariance (k, 3, 3) of its own."""
         for body, covariance in zip(bodies.tolist(), covariances, strict=True):
-            self.place(3 * body + np.arange(3), covariance)
+            self.set_prior(3 * body + np.arange(3), covariance)
 
     def add(self, columns: IntArray, covariance: FloatArray) -> None:
         """Add a covariance (k, k) to that of columns (k,): their errors are larger than was known."""
         self.covariance[columns[:, None], columns[None, :]] += covariance
 
-    def grow(self, table: ParameterTable) -> None:
+    def append_columns(self, table: ParameterTable) -> None:
         """Append the columns that a table has more, without error as yet: they are placed next."""
         size = self.covariance.shape[0]
         grown = np.zeros((table.filter_size, table.filter_size))
         grown[:size, :size] = self.covariance
         self.covariance = grown
 
-    def relate(self, columns: IntArray, others: IntArray, mapping: FloatArray) -> None:
+    def correlate(self, columns: IntArray, others: IntArray, mapping: FloatArray) -> None:
         """Add the errors of other columns (m,), mapped by (k, m), to those of independent columns (k,)."""
         common = mapping @ self.covariance[others]
         added = common[:, others] @ mapping.T
@@ -71,7 +71,7 @@ class DenseFilter:
         covariance: FloatArray = self.covariance[np.ix_(columns, columns)]
         return covariance
 
-    def relate_pairs(self, columns: IntArray, robots: Robots, across: FloatArray) -> None:
+    def prepare_update(self, columns: IntArray, robots: Robots, cross_covariance: FloatArray) -> None:
         """Leave all as it is: `covariance` has every pair."""
 
     def update(

@@ -11,7 +11,6 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
 from swarm_loc_estimator.filter.belief import BeliefArrays, covariance_within, own_within
-from swarm_loc_estimator.filter.calibration_states import CAMERA_SCALE, CAMERA_YAW
 from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS, use_mean
 from swarm_loc_estimator.filter.gating import position_distance, soften_heading, squared_distance
 from swarm_loc_estimator.filter.integrity.fault_detection import (
@@ -20,9 +19,10 @@ from swarm_loc_estimator.filter.integrity.fault_detection import (
     small_variances,
 )
 from swarm_loc_estimator.filter.integrity.noise_inflation import add_hidden_noise, stamp_variance
-from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, innovation, predict_one
+from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, predict_one, write_innovation
 from swarm_loc_estimator.odometry.look_up import rate_at
 from swarm_loc_estimator.odometry.preintegration import TrackArrays
+from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YAW
 
 DEPENDS_ON = 8
 """Filter columns that a measurement depends on: both bodies, observer first, yaw and scale of the camera."""
@@ -34,17 +34,17 @@ class Scratch(NamedTuple):
     Attributes:
         predicted: (3,) value.
         other: (3,) innovation of the alternative.
-        chain: (3, 5) Jacobian of the value, see `measurement_model.predict`.
-        difference: (3, 3) covariance of xi_target - xi_observer.
-        expected: (3, 3) covariance of the innovation.
+        value_jacobian: (3, 5) Jacobian of the value, see `measurement_model.predict`.
+        relative_covariance: (3, 3) covariance of xi_target - xi_observer.
+        innovation_covariance: (3, 3) covariance of the innovation.
         variances: (3,) of the predicted value.
     """
 
     predicted: FloatArray
     other: FloatArray
-    chain: FloatArray
-    difference: FloatArray
-    expected: FloatArray
+    value_jacobian: FloatArray
+    relative_covariance: FloatArray
+    innovation_covariance: FloatArray
     variances: FloatArray
 
 
@@ -54,7 +54,7 @@ class InnovationBatch(NamedTuple):
     Attributes:
         pose: (m, 2, 3) observers and targets in `map` at the stamps, or by what a landmark is moved.
         motion: (m, 3) how fast xi_target - xi_observer changes by driving [1/s], see `relative_motion`.
-        across: (m, 3, 5) covariance of the observer's error with the target's, and of the target's with those
+        cross_covariance: (m, 3, 5) of the observer's error with the target's, and of the target's with those
             of yaw and scale of the observer's camera.
         columns: (m, DEPENDS_ON) what each depends on.
         jacobian: (m, 3, DEPENDS_ON) of the innovation.
@@ -64,13 +64,13 @@ class InnovationBatch(NamedTuple):
         distance: (m,) squared Mahalanobis distance of the position, small errors left out.
         whitened: (m, 2) position innovation over its standard deviation, likewise.
         cause: (m,) what may explain the innovation, see `integrity.cause_of`.
-        passed: (m,) whether the gate lets it through.
+        accepted: (m,) whether the gate lets it through.
         nis: (m,) normalised innovation squared.
     """
 
     pose: FloatArray
     motion: FloatArray
-    across: FloatArray
+    cross_covariance: FloatArray
     columns: IntArray
     jacobian: FloatArray
     innovation: FloatArray
@@ -79,7 +79,7 @@ class InnovationBatch(NamedTuple):
     distance: FloatArray
     whitened: FloatArray
     cause: IntArray
-    passed: BoolArray
+    accepted: BoolArray
     nis: FloatArray
 
 
@@ -126,54 +126,66 @@ def evaluate(
         measurements: (m,).
         k: Which one.
         belief: Not changed.
-        batch: Its `pose` and `motion` are read, all others written; `across` is read, too, unless the whole
-            covariance is at hand.
+        batch: Its `pose` and `motion` are read, all others written; of a sparse filter `cross_covariance` is
+            read, too.
         row: Where in the batch.
         scratch: Written.
     """
-    columns, jacobian, difference = batch.columns[row], batch.jacobian[row], batch.innovation[row]
+    columns, jacobian, innovation = batch.columns[row], batch.jacobian[row], batch.innovation[row]
     pose, motion, noise = batch.pose[row], batch.motion[row], batch.noise[row]
     bodies = body_columns(measurements, k, belief)
     camera, camera_columns = _camera(belief, measurements.observer[k])
-    predicted, chain, s, variances = scratch.predicted, scratch.chain, scratch.expected, scratch.variances
-    predict_one(measurements, k, pose[0], pose[1], camera, predicted, chain)
-    _write_jacobian(chain, bodies, camera_columns, columns, jacobian)
+    predicted, value_jacobian, s, variances = (
+        scratch.predicted,
+        scratch.value_jacobian,
+        scratch.innovation_covariance,
+        scratch.variances,
+    )
+    predict_one(measurements, k, pose[0], pose[1], camera, predicted, value_jacobian)
+    _write_jacobian(value_jacobian, bodies, camera_columns, columns, jacobian)
     assign_matrix(noise, measurements.covariance[k])
     add_hidden_noise(measurements, k, belief, noise)
     of_stamp = stamp_variance(measurements, k, belief)
     if of_stamp > 0.0:
-        _add_stamp_noise(chain, motion, of_stamp, noise)
+        _add_stamp_noise(value_jacobian, motion, of_stamp, noise)
     assign_matrix(s, noise)
-    if belief.covariance.shape[0] > 0:
-        _read_across(belief.covariance, bodies, camera_columns, batch.across[row])
-    _add_uncertainty(belief, (bodies, camera_columns), chain, batch.across[row], scratch.difference, s)
+    if belief.is_dense:
+        _read_cross_covariance(belief.covariance, bodies, camera_columns, batch.cross_covariance[row])
+    _add_uncertainty(
+        belief,
+        (bodies, camera_columns),
+        value_jacobian,
+        batch.cross_covariance[row],
+        scratch.relative_covariance,
+        s,
+    )
     for i in range(3):
         variances[i] = s[i, i] - noise[i, i]
-    innovation(measurements, k, measurements.value[k], predicted, difference)
+    write_innovation(measurements, k, measurements.value[k], predicted, innovation)
     if measurements.has_alternative[k]:
         other = scratch.other
-        innovation(measurements, k, measurements.alternative[k], predicted, other)
-        if squared_distance(other, s) < squared_distance(difference, s):
-            assign(difference, other)
-    batch.passed[row] = position_distance(difference, s) <= measurements.gate[k]
+        write_innovation(measurements, k, measurements.alternative[k], predicted, other)
+        if squared_distance(other, s) < squared_distance(innovation, s):
+            assign(innovation, other)
+    batch.accepted[row] = position_distance(innovation, s) <= measurements.gate[k]
     small = small_variances(measurements.kind[k], predicted)
-    batch.distance[row] = position_distance(difference, s, small)
+    batch.distance[row] = position_distance(innovation, s, small)
     for i in range(2):
-        batch.whitened[row, i] = difference[i] / math.sqrt(s[i, i] + small[i])
-    batch.cause[row] = cause_of(measurements.kind[k], difference, predicted)
+        batch.whitened[row, i] = innovation[i] / math.sqrt(s[i, i] + small[i])
+    batch.cause[row] = cause_of(measurements.kind[k], innovation, predicted)
     if measurements.has_heading[k]:
         before = (noise[0, 2], noise[1, 2], noise[2, 2])
-        soften_heading(difference, s, noise)
+        soften_heading(innovation, s, noise)
         for i in range(3):
             s[i, 2] += noise[i, 2] - before[i]
             if i < 2:
                 s[2, i] = s[i, 2]
-    batch.nis[row] = squared_distance(difference, s)
+    batch.nis[row] = squared_distance(innovation, s)
     scale = noise_of_frequent_looks(measurements, k, belief)
     for i in range(3):
         for j in range(3):
             noise[i, j] *= scale
-    use_mean(measurements, k, belief, (pose, predicted, variances), difference, noise, batch.pair[row])
+    use_mean(measurements, k, belief, (pose, predicted, variances), innovation, noise, batch.pair[row])
 
 
 @inlined_njit
@@ -225,7 +237,7 @@ def _camera(belief: BeliefArrays, observer: int) -> tuple[tuple[float, float], t
 
 @inlined_njit
 def _write_jacobian(
-    chain: FloatArray,
+    value_jacobian: FloatArray,
     bodies: tuple[int, int],
     camera_columns: tuple[int, int],
     columns: IntArray,
@@ -238,27 +250,37 @@ def _write_jacobian(
     for j in range(3):
         columns[j], columns[3 + j] = max(bodies[0], 0) + j, max(bodies[1], 0) + j
         for i in range(3):
-            jacobian[i, j] = -chain[i, j] if bodies[0] >= 0 else 0.0
-            jacobian[i, 3 + j] = chain[i, j] if bodies[1] >= 0 else 0.0
+            jacobian[i, j] = -value_jacobian[i, j] if bodies[0] >= 0 else 0.0
+            jacobian[i, 3 + j] = value_jacobian[i, j] if bodies[1] >= 0 else 0.0
     for j in range(2):
         columns[6 + j] = max(camera_columns[j], 0)
         for i in range(3):
-            jacobian[i, 6 + j] = chain[i, 3 + j] if camera_columns[j] >= 0 else 0.0
+            jacobian[i, 6 + j] = value_jacobian[i, 3 + j] if camera_columns[j] >= 0 else 0.0
 
 
 @inlined_njit
-def _add_stamp_noise(chain: FloatArray, motion: FloatArray, variance: float, noise: FloatArray) -> None:
+def _add_stamp_noise(
+    value_jacobian: FloatArray, motion: FloatArray, variance: float, noise: FloatArray
+) -> None:
     """Add to `noise` (3, 3) what a stamp of such variance does to a value that changes by `motion` (3,)."""
-    change = (_along(chain, 0, motion), _along(chain, 1, motion), _along(chain, 2, motion))
+    change = (
+        _along(value_jacobian, 0, motion),
+        _along(value_jacobian, 1, motion),
+        _along(value_jacobian, 2, motion),
+    )
     for i in range(3):
         for j in range(3):
             noise[i, j] += variance * change[i] * change[j]
 
 
 @inlined_njit
-def _along(chain: FloatArray, row: int, motion: FloatArray) -> float:
+def _along(value_jacobian: FloatArray, row: int, motion: FloatArray) -> float:
     """How fast a component of the value changes."""
-    speed: float = chain[row, 0] * motion[0] + chain[row, 1] * motion[1] + chain[row, 2] * motion[2]
+    speed: float = (
+        value_jacobian[row, 0] * motion[0]
+        + value_jacobian[row, 1] * motion[1]
+        + value_jacobian[row, 2] * motion[2]
+    )
     return speed
 
 
@@ -273,8 +295,10 @@ def body_columns(measurements: MeasurementColumns, k: int, belief: BeliefArrays)
 
 
 @inlined_njit
-def _read_across(p: FloatArray, bodies: tuple[int, int], camera: tuple[int, int], out: FloatArray) -> None:
-    """Write the covariances `across` (3, 5) of one measurement; those of nobody do not matter."""
+def _read_cross_covariance(
+    p: FloatArray, bodies: tuple[int, int], camera: tuple[int, int], out: FloatArray
+) -> None:
+    """Write `cross_covariance` (3, 5) of one measurement; undefined where a side is missing."""
     o, t = max(bodies[0], 0), max(bodies[1], 0)
     for i in range(3):
         for j in range(3):
@@ -287,21 +311,21 @@ def _read_across(p: FloatArray, bodies: tuple[int, int], camera: tuple[int, int]
 def _add_uncertainty(
     belief: BeliefArrays,
     columns: tuple[tuple[int, int], tuple[int, int]],
-    chain: FloatArray,
-    across: FloatArray,
-    difference: FloatArray,
+    value_jacobian: FloatArray,
+    cross_covariance: FloatArray,
+    relative: FloatArray,
     s: FloatArray,
 ) -> None:
-    """Add H P H^T (3, 3), eq. (13) of the e-puck paper, where H is `chain` (3, 5) by xi_target - xi_observer.
+    """Add H P H^T (3, 3), eq. (13) of the e-puck paper, where H is `value_jacobian`.
 
-    The difference is taken first: a third of the work.
+    The covariance of xi_target - xi_observer is taken first: a third of the work.
 
     Args:
         belief: Not changed.
         columns: First of the observer and of the target, and those of the camera's parameters; -1: none.
-        chain: (3, 5).
-        across: (3, 5) covariances of the observer, the target and the camera, see `InnovationBatch`.
-        difference: (3, 3) written: scratch.
+        value_jacobian: (3, 5).
+        cross_covariance: (3, 5) of the observer, the target and the camera, see `InnovationBatch`.
+        relative: (3, 3) workspace.
         s: (3, 3) added to.
     """
     bodies, camera = columns
@@ -309,34 +333,34 @@ def _add_uncertainty(
     of_observer, of_target = 1.0 if bodies[0] >= 0 else 0.0, 1.0 if bodies[1] >= 0 else 0.0
     for i in range(3):
         for j in range(3):
-            both = of_target * of_observer * (across[j, i] + across[i, j])
+            both = of_target * of_observer * (cross_covariance[j, i] + cross_covariance[i, j])
             of_t, of_o = covariance_within(belief, t, i, j), covariance_within(belief, o, i, j)
-            difference[i, j] = of_target * of_t + of_observer * of_o - both
+            relative[i, j] = of_target * of_t + of_observer * of_o - both
     for i in range(3):
-        x, y, z = _turned(chain, i, difference)
+        x, y, z = _turned(value_jacobian, i, relative)
         for j in range(3):
-            s[i, j] = s[i, j] + x * chain[j, 0] + y * chain[j, 1] + z * chain[j, 2]
+            s[i, j] = s[i, j] + x * value_jacobian[j, 0] + y * value_jacobian[j, 1] + z * value_jacobian[j, 2]
     for k in range(2):
         if camera[k] >= 0:
             for a in range(3):
                 own = own_within(belief, o // 3, a, 3 + CAMERA_YAW + k)
-                difference[a, 0] = of_target * across[a, 3 + k] - of_observer * own
+                relative[a, 0] = of_target * cross_covariance[a, 3 + k] - of_observer * own
             for i in range(3):
-                beside = chain[i, 0] * difference[0, 0] + chain[i, 1] * difference[1, 0]
-                beside += chain[i, 2] * difference[2, 0]
+                beside = value_jacobian[i, 0] * relative[0, 0] + value_jacobian[i, 1] * relative[1, 0]
+                beside += value_jacobian[i, 2] * relative[2, 0]
                 for other in range(2):  # its own variance, and its covariance with the other parameter
                     if camera[other] >= 0:
                         both = own_within(belief, o // 3, 3 + CAMERA_YAW + other, 3 + CAMERA_YAW + k)
-                        beside += 0.5 * chain[i, 3 + other] * both
+                        beside += 0.5 * value_jacobian[i, 3 + other] * both
                 for j in range(3):
-                    s[i, j] += beside * chain[j, 3 + k]
-                    s[j, i] += beside * chain[j, 3 + k]
+                    s[i, j] += beside * value_jacobian[j, 3 + k]
+                    s[j, i] += beside * value_jacobian[j, 3 + k]
 
 
 @inlined_njit
-def _turned(chain: FloatArray, row: int, matrix: FloatArray) -> tuple[float, float, float]:
-    """The product of the first three columns of a row of `chain` and a matrix (3, 3)."""
-    a, b, c = chain[row, 0], chain[row, 1], chain[row, 2]
+def _turned(value_jacobian: FloatArray, row: int, matrix: FloatArray) -> tuple[float, float, float]:
+    """The product of the first three columns of a row of `value_jacobian` and a matrix (3, 3)."""
+    a, b, c = value_jacobian[row, 0], value_jacobian[row, 1], value_jacobian[row, 2]
     return (
         a * matrix[0, 0] + b * matrix[1, 0] + c * matrix[2, 0],
         a * matrix[0, 1] + b * matrix[1, 1] + c * matrix[2, 1],

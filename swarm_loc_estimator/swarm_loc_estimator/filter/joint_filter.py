@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.filter.calibration_states import ParameterTable
+from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 
 
 class Robots(NamedTuple):
@@ -30,11 +30,11 @@ class JointFilter(Protocol):
 
     Attributes:
         covariance: (n, n) of all columns; (0, 0) where only parts of it are kept. Predictions write to it.
-        sequential: Whether measurements may also be used one by one, by `dense/sequential_update.py`.
+        is_dense: Whether it keeps the whole covariance; measurements may then be used one by one, too.
     """
 
     covariance: FloatArray
-    sequential: bool
+    is_dense: bool
 
     @property
     def marginal(self) -> FloatArray:
@@ -45,7 +45,7 @@ class JointFilter(Protocol):
         """
 
     @property
-    def driven(self) -> FloatArray:
+    def transition(self) -> FloatArray:
         """(robots, 4, DRIVES) how predictions have moved errors since the last update, besides by noise.
 
         Those of a pose by those of the parameters of its motion (3, DRIVES), and what is left of the latter
@@ -55,35 +55,35 @@ class JointFilter(Protocol):
     def copy(self) -> JointFilter:
         """An independent copy."""
 
-    def place(self, columns: IntArray, covariance: FloatArray) -> None:
+    def set_prior(self, columns: IntArray, covariance: FloatArray) -> None:
         """Give columns (k,) this covariance (k, k), independent of the rest, whatever was known.
 
         They are those of one body, or of parameters, independent of each other.
         """
 
-    def place_bodies(self, bodies: IntArray, covariances: FloatArray) -> None:
+    def set_body_priors(self, bodies: IntArray, covariances: FloatArray) -> None:
         """Likewise the columns of bodies (k,), each with a covariance (k, 3, 3) of its own."""
 
     def add(self, columns: IntArray, covariance: FloatArray) -> None:
         """Add a covariance (k, k) to that of columns (k,) as of `block`: errors are larger than was known."""
 
-    def grow(self, table: ParameterTable) -> None:
+    def append_columns(self, table: ParameterTable) -> None:
         """Append the columns that a table has more, without error as yet: they are placed next."""
 
-    def relate(self, columns: IntArray, others: IntArray, mapping: FloatArray) -> None:
+    def correlate(self, columns: IntArray, others: IntArray, mapping: FloatArray) -> None:
         """Add the errors of other columns (m,), mapped by (k, m), to those of columns (k,) just placed."""
 
     def block(self, columns: IntArray) -> FloatArray:
         """Covariance (k, k) of columns (k,): of one body, or of one robot's parameters."""
 
-    def relate_pairs(self, columns: IntArray, robots: Robots, across: FloatArray) -> None:
+    def prepare_update(self, columns: IntArray, robots: Robots, cross_covariance: FloatArray) -> None:
         """Prepare an update, and write covariances of what its measurements (m,) depend on.
 
         Args:
             columns: (m, 3) the first columns of observers, targets and observers' cameras; -1: there is none.
             robots: Where all are.
-            across: (m, 3, 5) written, unless `covariance` has them: of the observers' errors with the
-                targets', and of these with those of the cameras.
+            cross_covariance: (m, 3, 5) written, unless `covariance` has it: of the observers' errors with
+                the targets', and of these with those of the cameras.
         """
 
     def update(
@@ -91,7 +91,7 @@ class JointFilter(Protocol):
     ) -> FloatArray:
         """Use measurements (m,) with independent errors at once; return the correction (n,) of all columns.
 
-        `relate_pairs` comes before each update.
+        `prepare_update` comes before each update.
 
         Args:
             columns: (m, c) what each depends on, the two bodies' first; a column may be named twice.

@@ -13,7 +13,7 @@ absolute fix has no observer (S is the identity).
 
 With right-invariant errors X = exp(xi) X_hat the chain depends on xi_target - xi_observer only, so one
 Jacobian (3 x 3) serves both robots, with opposite signs. Two more columns are for the sensor's own yaw and
-scale, see CAMERA_YAW and CAMERA_SCALE of filter/calibration_states.py.
+scale, see CAMERA_YAW and CAMERA_SCALE of swarm/calibration_states.py.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ def _predict_built_in(one: MeasurementArray, observer: FloatArray, target: Float
 
 def _innovation_built_in(one: MeasurementArray, predicted: FloatArray) -> FloatArray:
     out = np.empty(3)
-    innovation(MeasurementColumns.of(one), 0, one["value"][0], predicted, out)
+    write_innovation(MeasurementColumns.of(one), 0, one["value"][0], predicted, out)
     return out
 
 
@@ -290,7 +290,7 @@ def predict_one(
 
 
 @inlined_njit
-def innovation(
+def write_innovation(
     measurements: MeasurementColumns, k: int, measured: FloatArray, predicted: FloatArray, out: FloatArray
 ) -> None:
     """Write measured minus predicted (3,), angles wrapped, zero for a heading that was not measured.

@@ -35,7 +35,7 @@ def evaluate_by_records(
         tracks: Odometry.
         belief: Predicted.
         joint: Its filter, prepared for an update with these measurements.
-        batch: (m,) its `pose` and, of a sparse filter, `across` are read, the rest is written.
+        batch: (m,) its `pose` and, of a sparse filter, `cross_covariance` are read, the rest is written.
     """
     for k in np.flatnonzero(measurements["kind"] > POLAR).tolist():
         _evaluate(measurements[k : k + 1], k, tracks, belief, joint, batch)
@@ -65,12 +65,12 @@ def _evaluate(
             slope += jacobian @ _motion(tracks, sides[i], stamp_ns, batch.pose[k, i])
     noise += one["stamp_variance"][0] * np.outer(slope, slope)
     jacobian = batch.jacobian[k, :count, :6]
-    s = jacobian @ _covariance(columns, belief, joint, batch.across[k]) @ jacobian.T + noise
+    s = jacobian @ _covariance(columns, belief, joint, batch.cross_covariance[k]) @ jacobian.T + noise
     innovation = model.innovation(one, predicted.value)
     gated = slice(model.degrees_of_freedom)
     batch.noise[k, :count, :count], batch.innovation[k, :count] = noise, innovation
     batch.distance[k] = innovation[gated] @ np.linalg.solve(s[gated, gated], innovation[gated])
-    batch.passed[k] = batch.distance[k] <= one["gate"][0]
+    batch.accepted[k] = batch.distance[k] <= one["gate"][0]
     batch.nis[k] = innovation @ np.linalg.solve(s, innovation)
     batch.whitened[k], batch.cause[k] = 0.0, 0
 
@@ -85,7 +85,7 @@ def _columns(one: MeasurementArray, belief: BeliefArrays) -> tuple[int, int]:
 
 
 def _covariance(
-    columns: tuple[int, int], belief: BeliefArrays, joint: JointFilter, across: FloatArray
+    columns: tuple[int, int], belief: BeliefArrays, joint: JointFilter, cross_covariance: FloatArray
 ) -> FloatArray:
     """Covariance (6, 6) of the errors of observer and target; zero for one without columns."""
     covariance = np.zeros((6, 6))
@@ -94,7 +94,7 @@ def _covariance(
             covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = joint.block(first + _BODY)
     if min(columns) >= 0:
         o, t = columns
-        shared = belief.covariance[o : o + 3, t : t + 3] if joint.sequential else across[:, :3]
+        shared = belief.covariance[o : o + 3, t : t + 3] if joint.is_dense else cross_covariance[:, :3]
         covariance[:3, 3:], covariance[3:, :3] = shared, shared.T
     return covariance
 

@@ -1,7 +1,7 @@
 """Prediction of one robot along its odometry track.
 
 A robot's pose is X = T O with the track O. Between two instants T gathers noise, and drifts with the
-parameters z of the robot's motion (`filter/calibration_states.py`):
+parameters z of the robot's motion (`swarm/calibration_states.py`):
 
     T <- T exp((D2 - D1) z) = exp(A z) T,    P <- F P F^T + Ad(T) (G2 - G1) Ad(T)^T,    A = Ad(T) (D2 - D1).
 
@@ -28,8 +28,8 @@ from swarm_loc_estimator.filter.belief import (
     own_column,
     own_covariance,
 )
-from swarm_loc_estimator.filter.calibration_states import DRIVES, TURN_BIAS
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.swarm.calibration_states import DRIVES, TURN_BIAS
 
 
 class _Drift(NamedTuple):
@@ -66,7 +66,7 @@ def predict(belief: BeliefArrays, robot: int, to: Preintegrated, scratch: FloatA
     whole, own, first = belief.covariance, belief.marginal, 3 * robot
     for i in range(3):
         for j in range(3):
-            if whole.shape[0] > 0:
+            if belief.is_dense:
                 whole[first + i, first + j] += scratch[0, i, j]
             else:
                 own[robot, i, j] += scratch[0, i, j]
@@ -220,8 +220,8 @@ def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
         for a in range(count):
             for j in range(size):
                 rows[i, j] += weight[i, a] * p[columns[a], j]
-    if belief.covariance.shape[0] == 0:
-        _note_driven(belief, robot, drift)
+    if not belief.is_dense:
+        _note_transition(belief, robot, drift)
     bias = own_column(belief, robot, 3 + TURN_BIAS)
     if bias >= 0:
         belief.parameter[robot, TURN_BIAS] *= drift.left
@@ -240,15 +240,15 @@ def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
 
 
 @cached_njit
-def _note_driven(belief: BeliefArrays, robot: int, drift: _Drift) -> None:
+def _note_transition(belief: BeliefArrays, robot: int, drift: _Drift) -> None:
     """Note how the drift changes the covariance of the pose's error with those of others."""
-    driven = belief.driven[robot]
+    transition = belief.transition[robot]
     for m in range(DRIVES):
         if belief.table.column[robot, m] >= 0:
             for i in range(3):
-                driven[i, m] += drift.drive[i, m] * driven[3, m]
+                transition[i, m] += drift.drive[i, m] * transition[3, m]
     if belief.table.column[robot, TURN_BIAS] >= 0:
-        driven[3, TURN_BIAS] *= drift.left
+        transition[3, TURN_BIAS] *= drift.left
 
 
 @cached_njit

@@ -80,18 +80,18 @@ def update_in_order(
         contradicted = assess(measurements, k, belief, limits.max_doubt, look)
         if contradicted >= 0:
             return k, CONTRADICTED, contradicted
-        passed, nis[k] = batch.passed[0] and not is_set_aside(measurements, k, belief), batch.nis[0]
-        verdicts[k] = USED if passed else GATED
-        contradicted = confirm(measurements, k, belief, passed)
+        accepted, nis[k] = batch.accepted[0] and not is_set_aside(measurements, k, belief), batch.nis[0]
+        verdicts[k] = USED if accepted else GATED
+        contradicted = confirm(measurements, k, belief, accepted)
         if contradicted >= 0:
             return k + 1, LOST, contradicted
-        if passed:
+        if accepted:
             noise, jacobian = batch.noise[0], batch.jacobian[0]
             record_pair(measurements, k, belief, batch.pair[0])
             correct(
                 belief, update_one(belief.covariance, batch.columns[0], jacobian, batch.innovation[0], noise)
             )
-        lost = count_gated(measurements, k, belief, passed, limits)
+        lost = count_gated(measurements, k, belief, accepted, limits)
         if lost >= 0:
             return k + 1, LOST, lost
     return measurements.stamp_ns.size, FINISHED, -1

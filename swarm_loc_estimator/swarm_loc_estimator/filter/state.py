@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import error_covariance
 from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
-from swarm_loc_estimator.filter.calibration_states import PARAMETERS, ParameterTable
 from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS
 from swarm_loc_estimator.filter.dense_filter import DenseFilter
 from swarm_loc_estimator.filter.integrity.fault_detection import new_integrity
@@ -19,6 +18,7 @@ from swarm_loc_estimator.filter.joint_filter import JointFilter
 from swarm_loc_estimator.filter.measurement_model import NOBODY
 from swarm_loc_estimator.identification.memory import IdentityMemory
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.swarm.calibration_states import PARAMETERS, ParameterTable
 
 _DOUBTED_POSE_SIGMA = (0.02, 0.02, 0.03)
 """By how much less certain the pose of a contradicted robot becomes [m], [m], [rad]."""
@@ -74,7 +74,7 @@ class SwarmState:
 
     Attributes:
         transform: (N, 3) T, from `map` to the frame of the robot's odometry track.
-        parameter: (N, PARAMETERS) see `filter/calibration_states.py`.
+        parameter: (N, PARAMETERS) see `swarm/calibration_states.py`.
         landmark: (L, 3) by what each landmark is moved from its surveyed place, in `map`.
         filter: Covariance of the errors: robot i has columns 3i..3i+2 for its pose, right-invariant, and
             those of the table for its parameters; landmarks have those of the table.
@@ -85,7 +85,7 @@ class SwarmState:
         last_fix_ns: (N,) newest accepted measurement tied to a landmark or an absolute fix.
         integrity: What the newest measurements say of all this.
         contradicted_ns: (N + L,) when each robot and landmark was contradicted last; NEVER_NS: never.
-        all_opened: Whether everything was, at once.
+        all_augmented: Whether everything was, at once.
         pair_robot: (N, pairs) whom each has measured; -1: nobody.
         pair_stamp_ns: (N, pairs) when last.
         pair_history: (N, pairs, PAIR_ROWS, 3) what was measured, see `correlated_noise.py`.
@@ -102,7 +102,7 @@ class SwarmState:
         landmarks = table.survey_column.size
         self.landmark: FloatArray = np.zeros((landmarks, 3))
         self.filter: JointFilter = DenseFilter(table.filter_size) if joint is None else joint
-        self._place_described()
+        self._set_described_priors()
         self.predicted_to_ns: NDArray[np.int64] = np.zeros(robots, dtype=np.int64)
         self.preintegrated_covariance: FloatArray = np.zeros((robots, 3, 3))
         self.preintegrated_jacobian: FloatArray = np.zeros((robots, 3, 3))
@@ -111,7 +111,7 @@ class SwarmState:
         self.last_fix_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
         self.integrity = new_integrity(robots, landmarks)
         self.contradicted_ns: IntArray = np.full(robots + landmarks, NEVER_NS)
-        self.all_opened = False
+        self.all_augmented = False
         self.pair_robot: NDArray[np.int64] = np.full((robots, pairs), -1)
         self.pair_stamp_ns: NDArray[np.int64] = np.full((robots, pairs), NEVER_NS)
         self.pair_history: FloatArray = np.zeros((robots, pairs, PAIR_ROWS, 3))
@@ -124,7 +124,7 @@ class SwarmState:
         other = SwarmState.__new__(SwarmState)
         for name, value in vars(self).items():
             # a table never changes; the arrays inside `constraints` are replaced, never written to
-            setattr(other, name, value if name in {"_table", "integrity", "all_opened"} else value.copy())
+            setattr(other, name, value if name in {"_table", "integrity", "all_augmented"} else value.copy())
         other.integrity = IntegrityArrays(*(column.copy() for column in self.integrity))
         return other
 
@@ -134,7 +134,7 @@ class SwarmState:
             self.transform,
             self.filter.covariance,
             self.filter.marginal,
-            self.filter.driven,
+            self.filter.transition,
             self.parameter,
             self.landmark,
             self._table,
@@ -147,6 +147,7 @@ class SwarmState:
             self.pair_robot,
             self.pair_stamp_ns,
             self.pair_history,
+            self.filter.is_dense,
         )
 
     def is_known(self, side: int) -> bool:
@@ -166,14 +167,14 @@ class SwarmState:
         self.start(np.array([robot]), Starts(*(np.array([one]) for one in alone)), confirmations)
         others = (initial.columns[:, None] + np.arange(3)).reshape(-1)
         mapping = initial.shares.transpose(1, 0, 2).reshape(3, -1)
-        self.filter.relate(robot_columns(np.array([robot]))[0], others, mapping)
+        self.filter.correlate(robot_columns(np.array([robot]))[0], others, mapping)
 
     def start(self, robots: IntArray, starts: Starts, confirmations: int = 0) -> None:
         """Take robots (k,) into the estimate whose errors are their own, see `initialize`."""
         for robot in robots[self.tracked[robots]].tolist():
             self._forget_pairs(robot)
         self.transform[robots] = starts.transform
-        self._isolate(robots, starts.covariance)
+        self._decorrelate(robots, starts.covariance)
         self.predicted_to_ns[robots] = starts.stamp_ns
         self.preintegrated_covariance[robots] = starts.preintegrated_covariance
         self.preintegrated_jacobian[robots] = starts.preintegrated_jacobian
@@ -183,15 +184,15 @@ class SwarmState:
         for robot in robots.tolist():
             self.constraints.pop(robot, None)
 
-    def lose(self, robot: int) -> None:
+    def deinitialize(self, robot: int) -> None:
         """Take the robot out of the estimate; it waits for a fix."""
-        self._isolate(np.array([robot]), np.eye(3)[None])
+        self._decorrelate(np.array([robot]), np.eye(3)[None])
         self._forget_pairs(robot)
         self.tracked[robot] = False
         self.start_pending[robot] = False
         self._trust(np.array([robot]), 0)
 
-    def open(self, source: int, pose: FloatArray) -> None:
+    def augment(self, source: int, pose: FloatArray) -> None:
         """Estimate what a contradicted robot or landmark was described by, or estimate it anew.
 
         Args:
@@ -204,25 +205,25 @@ class SwarmState:
         if source < robots:
             self.integrity.evidence[source] = 0.0
         if source >= robots:
-            self._open_landmark(source - robots)
+            self._augment_landmark(source - robots)
             return
         before = self._table.column[source]
         self._use_table(self._table.with_robot(source))
         columns, variances = self._table.column[source], self._table.sigma[source] ** 2
         again, new = before >= 0, (before < 0) & (columns >= 0)
         self.filter.add(columns[again], np.diag(variances[again]))
-        self.filter.place(columns[new], np.diag(variances[new]))
+        self.filter.set_prior(columns[new], np.diag(variances[new]))
         doubt = error_covariance(pose, np.diag(np.square(_DOUBTED_POSE_SIGMA)))
         self.filter.add(robot_columns(np.array([source]))[0], doubt)
 
-    def open_all(self, poses: FloatArray) -> None:
+    def augment_all(self, poses: FloatArray) -> None:
         """Estimate everything that may be estimated anew, since what is believed rests on what is not so.
 
         Args:
             poses: (N, 3) of the robots in `map`, which stay where they are believed to be.
         """
         robots, landmarks = self.tracked.size, self.landmark.shape[0]
-        self.all_opened = True
+        self.all_augmented = True
         table = self._table
         for robot in range(robots):
             table = table.with_robot(robot)
@@ -232,33 +233,33 @@ class SwarmState:
         self.parameter[:], self.landmark[:] = 0.0, 0.0
         sigma = np.diag(np.square(_REOPENED_POSE_SIGMA))
         covariances = np.where(self.tracked[:, None, None], error_covariance(poses, sigma), np.eye(3))
-        self.filter.place_bodies(np.arange(robots), covariances)
-        self._place_described()
+        self.filter.set_body_priors(np.arange(robots), covariances)
+        self._set_described_priors()
         self.integrity.doubt[:], self.integrity.evidence[:] = 0.0, 0.0
         doubt_noise(self.integrity)
 
     def _use_table(self, table: ParameterTable) -> None:
         """Go on with more columns."""
-        self.filter.grow(table)
+        self.filter.append_columns(table)
         self._table = table
 
-    def _open_landmark(self, landmark: int) -> None:
+    def _augment_landmark(self, landmark: int) -> None:
         """Estimate a landmark, or estimate it anew."""
         is_new = self.landmark_column(landmark) < 0
         self._use_table(self._table.with_landmark(landmark))
         columns = self.landmark_column(landmark) + np.arange(3)
         if is_new:
-            self.filter.place(columns, self._table.survey[landmark])
+            self.filter.set_prior(columns, self._table.survey[landmark])
         else:
             self.filter.add(columns, self._table.survey[landmark])
 
-    def _place_described(self) -> None:
+    def _set_described_priors(self) -> None:
         """Let all that is estimated besides poses be as certain as it is described."""
         estimated = self._table.column >= 0
-        self.filter.place(self._table.column[estimated], np.diag(self._table.sigma[estimated] ** 2))
+        self.filter.set_prior(self._table.column[estimated], np.diag(self._table.sigma[estimated] ** 2))
         for first, survey in zip(self._table.survey_column, self._table.survey, strict=True):
             if first >= 0:
-                self.filter.place(first + np.arange(3), survey)
+                self.filter.set_prior(first + np.arange(3), survey)
 
     def _trust(self, robots: IntArray, confirmations: int) -> None:
         """Forget what was held against robots (k,) that begin anew."""
@@ -274,13 +275,13 @@ class SwarmState:
         for gone in (self.pair_robot == robot, np.s_[robot]):
             self.pair_robot[gone], self.pair_stamp_ns[gone] = -1, NEVER_NS
 
-    def _isolate(self, robots: IntArray, covariances: FloatArray) -> None:
+    def _decorrelate(self, robots: IntArray, covariances: FloatArray) -> None:
         """Give poses (k,) covariances (k, 3, 3); what was learned of the robots' sensors stays."""
         known = robots[self.tracked[robots]]  # what is estimated of others has nothing to do with anything
         for robot in known[(self._table.column[known] >= 0).any(axis=1)].tolist():
             columns = self._table.column[robot, self._table.column[robot] >= 0]
-            self.filter.place(columns, np.diag(np.diag(self.filter.block(columns))))
-        self.filter.place_bodies(robots, covariances)
+            self.filter.set_prior(columns, np.diag(np.diag(self.filter.block(columns))))
+        self.filter.set_body_priors(robots, covariances)
 
     def parameter_sigma(self, robot: int) -> FloatArray:
         """Standard deviations (PARAMETERS,) of a robot's parameters; zero of those not estimated."""

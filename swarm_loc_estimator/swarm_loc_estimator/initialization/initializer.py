@@ -12,7 +12,6 @@ from __future__ import annotations
 import numpy as np
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.filter.calibration_states import CAMERA_SCALE, CAMERA_YAW
 from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED
 from swarm_loc_estimator.filter.measurement_model import NOBODY, MeasurementArray
 from swarm_loc_estimator.filter.prediction import new_scratch, predict
@@ -28,6 +27,7 @@ from swarm_loc_estimator.initialization.constraints import (
 )
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YAW
 
 _INDEPENDENT_NS = 100_000_000
 """Sightings of one marker within this time are redundant."""
@@ -62,7 +62,7 @@ class Initializer:
         observer, target, now_ns = int(one["observer"][0]), int(one["target"][0]), int(one["stamp_ns"][0])
         knows_observer, knows_target = state.is_known(observer), state.is_known(target)
         robot, other = (target, observer) if knows_observer else (observer, target)
-        if knows_observer == knows_target or not self._tracks.begun(robot, now_ns):
+        if knows_observer == knows_target or not self._tracks.has_started(robot, now_ns):
             return False
         old = state.constraints.get(robot, NO_CONSTRAINTS)
         same = old[(old["marker_id"] == one["marker_id"][0]) & (old["other"] == other)]

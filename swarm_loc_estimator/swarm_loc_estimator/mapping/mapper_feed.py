@@ -17,12 +17,12 @@ from swarm_loc_estimator.common.messages.definitions import LASER, LIGHTS, ODOME
 from swarm_loc_estimator.common.messages.poses import decode_odometry
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.se2 import between, compose, exp, log
-from swarm_loc_estimator.filter.process_noise import OdometryStep, add_step_noise
 from swarm_loc_estimator.mapping.exploration import Goal
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, CooperativeMapper
 from swarm_loc_estimator.mapping.messages import decode_laser, decode_lights
 from swarm_loc_estimator.mapping.scans import UNSEEN, LightSightings, Readings
 from swarm_loc_estimator.odometry.preintegration import MODEL_DTYPE
+from swarm_loc_estimator.odometry.process_noise import OdometryStep, add_step_noise
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot
 
 _LEAST_SIGMA = np.array([0.02, 0.02, 0.01])

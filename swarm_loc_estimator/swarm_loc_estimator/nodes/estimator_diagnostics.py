@@ -15,14 +15,13 @@ from swarm_loc_estimator.common.health import Level, Report, drop_values, level_
 from swarm_loc_estimator.filter.measurement_model import MeasurementArray
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
-from swarm_loc_estimator.sensors.topics import InputKind, InputTopic
+from swarm_loc_estimator.sensors.registry import InputTopic
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.contradictions import Contradiction
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
 from swarm_loc_estimator.timeline.fusion import Verdict
 
 _FULL_LOAD = 0.95
-_IN_MAP = frozenset({InputKind.FIXES, InputKind.AERIAL, InputKind.SWARM_FIXES})
 _PATIENCE_S, _PATIENCE_PERIODS = 10.0, 5.0
 """An expected input may be silent for so many seconds, and for so many of its mean periods."""
 
@@ -215,7 +214,7 @@ class Diagnostics:
         if silent_s > _patience_s(topic, robot, statistics):
             troubles.append(f"{topic.name} is silent for {silent_s:.1f} s")
         map_frame = self._ingest.map_frame
-        if topic.kind in _IN_MAP and found != map_frame:
+        if topic.kind.in_map and found != map_frame:
             troubles.append(f"{topic.name} is in frame '{found}' but must be in '{map_frame}'")
         odom_frame = f"{robot.name}/{self._odom_frame}" if robot is not None else self._odom_frame
         if topic.kind.rows == "odometry" and found != odom_frame:
@@ -305,7 +304,7 @@ def merged(reports: Sequence[Report], name: str) -> Report:
 
 def _patience_s(topic: InputTopic, robot: Robot | None, statistics: InputStatistics) -> float:
     """How long an input may be silent; detectors and infrared boards have periods of their own."""
-    if topic.kind is InputKind.ODOMETRY and robot is not None:
+    if topic.kind.name == "odometry" and robot is not None:
         return robot.odometry.timeout_s
     if topic.kind.of_each and not topic.expected:
         return math.inf

@@ -47,7 +47,7 @@ from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.nodes.set_pose import NO_CLOCK, PoseCommands
 from swarm_loc_estimator.precompile import precompile
 from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.topics import live_topics
+from swarm_loc_estimator.sensors.registry import live_topics
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
@@ -173,7 +173,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
             self._shedding.begin_fusion()
         begin_cpu_s, begin_fusing_s = time.thread_time(), time.perf_counter()
         fuse, end_cpu_s = is_due or self._estimator.is_fusing, begin_cpu_s + self.params.tick_period_s
-        estimate = self._estimator.tick(now_ns, fuse=fuse, go_on=lambda: time.thread_time() < end_cpu_s)
+        estimate = self._estimator.tick(now_ns, fuse=fuse, has_budget=lambda: time.thread_time() < end_cpu_s)
         if not fuse:
             return estimate, 0.0
         self._pace.note(time.thread_time() - begin_cpu_s)

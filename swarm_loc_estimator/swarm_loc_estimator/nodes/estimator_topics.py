@@ -21,7 +21,7 @@ from swarm_loc_estimator.common.messages.estimates import SwarmPosesEncoder, Tra
 from swarm_loc_estimator.common.messages.poses import encode_poses
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
-from swarm_loc_estimator.sensors.topics import InputKind, InputTopic
+from swarm_loc_estimator.sensors.registry import InputTopic
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.sightings import encode_sightings, newest_sightings
@@ -48,14 +48,14 @@ _MIN_PER_TOPIC = 100
 would get ever older data, which cost more to fuse, and never catch up."""
 
 _MESSAGE_CLASSES = {
-    InputKind.ODOMETRY: Odometry,
-    InputKind.DETECTIONS: MarkerDetectionArray,
-    InputKind.BRIGHTNESS: BrightnessMatrix,
-    InputKind.FIXES: PoseWithCovarianceStamped,
-    InputKind.AERIAL: AnonymousDetectionArray,
-    InputKind.SWARM_ODOMETRY: SwarmOdometry,
-    InputKind.SWARM_DETECTIONS: SwarmDetections,
-    InputKind.SWARM_FIXES: SwarmFixes,
+    "odometry": Odometry,
+    "detections": MarkerDetectionArray,
+    "brightness": BrightnessMatrix,
+    "fixes": PoseWithCovarianceStamped,
+    "aerial": AnonymousDetectionArray,
+    "swarm_odometry": SwarmOdometry,
+    "swarm_detections": SwarmDetections,
+    "swarm_fixes": SwarmFixes,
 }
 _LOST = {ReliabilityPolicy.RELIABLE: "overload", ReliabilityPolicy.BEST_EFFORT: "lost"}
 """Drop reason of messages that are missing in a publisher's sequence."""
@@ -124,7 +124,7 @@ class EstimatorInputs:
     def _subscribe(self, handle: int, reliability: ReliabilityPolicy) -> Subscription:
         topic = self._topics[handle]
         return self._node.create_subscription(
-            _MESSAGE_CLASSES[topic.kind],
+            _MESSAGE_CLASSES[topic.kind.name],
             topic.name,
             lambda _: None,
             QoSProfile(depth=_SHARED_DEPTH if topic.kind.stands_for else DEPTH, reliability=reliability),

@@ -10,8 +10,8 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
-from swarm_loc_estimator.filter.process_noise import add_silence
 from swarm_loc_estimator.odometry.preintegration import TrackArrays
+from swarm_loc_estimator.odometry.process_noise import add_dropout_noise
 
 
 class OdometrySample(NamedTuple):
@@ -59,7 +59,7 @@ def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample,
         out.raw[k].fill(0.0)
         out.covariance[k].fill(0.0)
         out.jacobian[k].fill(0.0)
-        out.silence_s[k] = 0.0 if tracks.stands[robot] else math.inf
+        out.silence_s[k] = 0.0 if tracks.is_stationary[robot] else math.inf
         for i in range(3):  # of a random walk only the differences between instants count
             out.covariance[k, i, i] = tracks.walk[robot, i // 2] * (1e-9 * stamp_ns)
         return
@@ -78,7 +78,7 @@ def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample,
     silence_ns = max(0, stamp_ns - tracks.stamp_ns[robot, row])
     unknown = silence_ns > model.timeout_s * 1e9
     out.silence_s[k] = silence_s = silence_ns * 1e-9
-    add_silence(model, silence_s, unknown, pose, rate, out.covariance[k])
+    add_dropout_noise(model, silence_s, unknown, pose, rate, out.covariance[k])
 
 
 @inlined_njit

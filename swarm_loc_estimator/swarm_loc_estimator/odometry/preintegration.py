@@ -13,9 +13,9 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.common.small_matrix import add_scaled, assign, assign_matrix
-from swarm_loc_estimator.filter.process_noise import (
+from swarm_loc_estimator.odometry.process_noise import (
     OdometryStep,
-    add_silence,
+    add_dropout_noise,
     add_step_jacobian,
     add_step_noise,
 )
@@ -71,7 +71,7 @@ class TrackArrays(NamedTuple):
         response_turn_rate: (N, W) turn rates likewise.
         begin_ns: (N,) instant of the very first row.
         begin_pose: (N, 3) the pose there, where nothing is preintegrated yet.
-        stands: (N,) whether the robot has no odometry: its track never leaves the origin.
+        is_stationary: (N,) whether the robot has no odometry: its track never leaves the origin.
         walk: (N, 2) variances per second of its position [m^2/s] and heading [rad^2/s] then.
     """
 
@@ -91,7 +91,7 @@ class TrackArrays(NamedTuple):
     response_turn_rate: FloatArray
     begin_ns: IntArray
     begin_pose: FloatArray
-    stands: NDArray[np.bool_]
+    is_stationary: NDArray[np.bool_]
     walk: FloatArray
 
 
@@ -229,10 +229,10 @@ def _add_unknown(
         at: The pose and the rate.
         covariance: (3, 3) added to.
     """
-    add_silence(model, unknown_s[1], True, at[0], at[1], covariance)
+    add_dropout_noise(model, unknown_s[1], True, at[0], at[1], covariance)
     if unknown_s[0] > 0.0:  # it has grown so far already
         known = np.zeros((3, 3))
-        add_silence(model, unknown_s[0], True, at[0], at[1], known)
+        add_dropout_noise(model, unknown_s[0], True, at[0], at[1], known)
         add_scaled(covariance, known, -1.0)
 
 

@@ -67,7 +67,7 @@ class OdometryTracks:
         self._response = _stacked([robot.response or _IDEAL for robot in robots])
         names = MODEL_DTYPE.names or ()
         self._model = np.array([tuple(getattr(m, name) for name in names) for m in models], dtype=MODEL_DTYPE)
-        self._stands = np.array([robot.stands for robot in robots], dtype=bool)
+        self._is_stationary = np.array([robot.stands for robot in robots], dtype=bool)
         walks = [robot.random_walk for robot in robots]
         self._walk = np.array([(walk.position, walk.heading) for walk in walks]).reshape(-1, 2)
         self._delay_ns = np.array([round(m.delay_s * 1e9) for m in models], dtype=np.int64)
@@ -80,22 +80,22 @@ class OdometryTracks:
         self.arrays = self._allocated(_FIRST_CAPACITY)
 
     @property
-    def reach_ns(self) -> int:
+    def lookback_ns(self) -> int:
         """How far before its stamp a row may change look-ups."""
         timeout_ns = np.ceil(self._model["timeout_s"] * 1e9).astype(np.int64)
         return int(np.max(timeout_ns - np.minimum(0, self._delay_ns), initial=0))
 
-    def begun(self, robots: IntArray | int, stamps_ns: IntArray | int) -> BoolArray:
+    def has_started(self, robots: IntArray | int, stamps_ns: IntArray | int) -> BoolArray:
         """Whether the odometry of robots (k,) has begun by instants (k,); those without have always stood."""
         arrays = self.arrays
         begun = (arrays.filled[robots] > 0) & (arrays.begin_ns[robots] <= stamps_ns)
-        return np.asarray(begun | self._stands[robots])
+        return np.asarray(begun | self._is_stationary[robots])
 
-    def walks(self, robots: IntArray | int) -> BoolArray:
+    def is_random_walk(self, robots: IntArray | int) -> BoolArray:
         """Whether robots (k,) walk at random, without odometry."""
         return np.asarray(self._walk[robots].any(axis=-1))
 
-    def contradict_themselves(self, now_ns: int) -> BoolArray:
+    def has_conflicting_sources(self, now_ns: int) -> BoolArray:
         """Whether the odometry of each robot (N,) has jumped again and again of late."""
         arrays, robots = self.arrays, np.arange(self._robots)
         before_last_ns = arrays.jump_ns[robots, np.maximum(arrays.filled - 1, 0), 1]
@@ -171,7 +171,7 @@ class OdometryTracks:
             response_turn_rate=self._response[2],
             begin_ns=np.zeros(self._robots, dtype=np.int64),
             begin_pose=np.zeros((self._robots, 3)),
-            stands=self._stands,
+            is_stationary=self._is_stationary,
             walk=self._walk,
         )
         for name in _ROWS:  # so that the system finds the memory now, and not when data are there

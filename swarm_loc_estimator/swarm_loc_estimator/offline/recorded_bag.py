@@ -19,8 +19,7 @@ from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
 from swarm_loc_estimator.offline.result import RecordedMap
 from swarm_loc_estimator.offline.spool import Spool
 from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.messages import RawInputs
-from swarm_loc_estimator.sensors.topics import InputKind
+from swarm_loc_estimator.sensors.registry import Batch, kinds
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 Progress = Callable[[float, str], None]
@@ -52,7 +51,7 @@ class BagSummary:
     goals: Mapping[str, Trajectory] = field(default_factory=dict)
 
 
-def read_bag(bag: Path, swarm: Swarm, take: Callable[[RawInputs], None], progress: Progress) -> BagSummary:
+def read_bag(bag: Path, swarm: Swarm, take: Callable[[Batch], None], progress: Progress) -> BagSummary:
     """Read a bag once.
 
     Args:
@@ -99,8 +98,8 @@ def _missing(ingest: Ingest) -> list[str]:
 
 def _strangers(topics: Iterable[BagTopic], ingest: Ingest) -> list[str]:
     """One sentence if the bag holds inputs of robots that the swarm does not have."""
-    kinds = {kind.topic: kind.message_type for kind in InputKind}
-    names = [t.name for t in topics if kinds.get(t.name.rpartition("/")[2]) == t.type]
+    types = {kind.topic: kind.message_type for kind in kinds().values()}
+    names = [t.name for t in topics if types.get(t.name.rpartition("/")[2]) == t.type]
     strange = sorted(set(names) - set(ingest.handle_of))
     return [f"No robot of the swarm description has the topics {', '.join(strange)}."] if strange else []
 

@@ -22,8 +22,9 @@ from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.offline.recorded_bag import Progress, read_bag, unwatched
 from swarm_loc_estimator.offline.result import AerialImage, ReplayResult
 from swarm_loc_estimator.offline.spool import Spool
+from swarm_loc_estimator.sensors.aerial import AerialRows
 from swarm_loc_estimator.sensors.ingest import MAX_PAUSE_NS
-from swarm_loc_estimator.sensors.messages import AerialRows, RawInputs
+from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
@@ -174,17 +175,17 @@ class Runner:
         self._images = AerialImages() if keep_sightings else None
         self._filled = 0
 
-    def take(self, inputs: RawInputs) -> None:
+    def take(self, inputs: Batch) -> None:
         """Feed inputs, and do all ticks that are due until the last of them."""
         self._schedule.begin(inputs.begin_ns)
         if self._images is not None:
-            self._images.add(inputs.aerial)
+            self._images.add(inputs["aerial"])
         stamps_ns = self._schedule.due(inputs.end_ns)
-        parts = self._estimator.validate(inputs).until_each(np.array(stamps_ns, dtype=np.int64))
+        parts = self._estimator.convert(inputs).until_each(np.array(stamps_ns, dtype=np.int64))
         for now_ns in stamps_ns:
-            self._estimator.add(next(parts))
+            self._estimator.receive(next(parts))
             self._tick(now_ns)
-        self._estimator.add(next(parts))
+        self._estimator.receive(next(parts))
 
     def finish(self, last_ns: int) -> None:
         """Do the ticks after the last inputs of a recording that ends at `last_ns`."""

@@ -1,261 +1,113 @@
-"""Anonymous detections of aerial images: whose they are, by where robots are or by how they moved.
-
-An image is looked at as a whole, at its stamp, when the timeline comes to it; when older data come, it is
-looked at again. So who is who does not depend on the order of arrival.
-"""
+"""Anonymous detections of robots in aerial images; `timeline/aerial_images.py` finds out who is who."""
 
 from __future__ import annotations
 
-import math
 from collections import Counter
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
-from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.filter.gating import gate_threshold
-from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED, note_missed, note_seen
-from swarm_loc_estimator.filter.integrity.fault_detection import is_contradicted
-from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
-from swarm_loc_estimator.filter.state import InitialPose, SwarmState
-from swarm_loc_estimator.identification.anchors import Scale
-from swarm_loc_estimator.identification.assignment import (
-    AMBIGUOUS,
-    UNSEEN,
-    Assignment,
-    assign,
-    log_ratios,
+from swarm_loc_estimator.common.messages.definitions import ANONYMOUS_DETECTIONS
+from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, AnonymousMessage, decode_anonymous
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.streams import EachReader, MessageColumns
+from swarm_loc_estimator.filter.measurement_model import NOBODY, Kind
+from swarm_loc_estimator.sensors.fix import about_robots, take_out_headings
+from swarm_loc_estimator.sensors.sensor import (
+    NO_ROWS,
+    Converter,
+    InputKind,
+    Known,
+    Measured,
+    Sensor,
+    SensorSettings,
 )
-from swarm_loc_estimator.identification.chain import ChainModel, Chains, Identity
-from swarm_loc_estimator.identification.memory import Identities, Outcome
-from swarm_loc_estimator.identification.picture import Picture, TrackPoint, gathered_between
-from swarm_loc_estimator.odometry.preintegration import Preintegrated
-from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.timeline.estimate import estimate_at
-from swarm_loc_estimator.timeline.settings import Settings
 
-_GATE = float(gate_threshold(0.9999))
-_MAX_FREE = 200
-"""With more detections that nobody has than this, nobody looks for itself among them."""
-_MOVED = 6.0
-"""By so many standard deviations a robot must have moved, or turned by half as many, to be looked for."""
-_MAX_DRIFT_M, _MAX_DRIFT_RAD = 0.3, 0.5
-"""What its own track may have drifted between two images; more, and a robot begins anew."""
-_DOUBT_SHARE = 0.1
-"""A robot that is believed to be elsewhere, but not seen there, must be so much surer: that is rare."""
-_MAX_DOUBT = 9.0
-"""As doubtful a robot becomes that may have left the view: not told as tracked, but not lost either."""
-_HEADING_SIGMA = 0.2
-"""An answer with a heading less sure than this is none."""
+FOREIGN_FRAME = "aerial_frame"
+"""Why an aerial image is dropped whose detections are not in `map`."""
+TOO_MANY = "aerial_too_many"
+"""Why an aerial image with more detections than MAX_ANONYMOUS is dropped: it shows something else."""
+MAX_ANONYMOUS = 2000
+_UNKNOWN_VARIANCE = -1.0
+"""First element of the covariance of a detection whose sender does not know it."""
 
 
-class PictureFusion:
-    """Finds out who is who in aerial images.
+class AerialRows(NamedTuple):
+    """Anonymous detections of aerial images, a row per detection (d,).
 
-    Args:
-        swarm: Whose robots are seen.
-        settings: How sure an answer must be, what is assumed of images, when a robot is lost.
-        tracks: The robots' odometry.
+    Attributes:
+        robot: (d,) -1: they are about the whole swarm.
+        stamp_ns: (d,) exposure times.
+        number: (d,) of each in its message.
+        pose: (d, 3) x [m], y [m], heading [rad] in `map`; heading NaN: not measured.
+        covariance: (d, 3, 3) of it; a first element of -1: not known.
+        arrival_ns: (d,).
     """
 
-    def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks) -> None:
-        self._tracks = tracks
-        self._settings = settings
-        self._moves = np.array([not robot.stands for robot in swarm.robots], dtype=bool)
-        self._timeout_s = np.array([robot.odometry.timeout_s for robot in swarm.robots])
-        self._miss = min(3.0, -math.log1p(-settings.aerial_detection_probability))
-        self._model = ChainModel(
-            detection_probability=settings.aerial_detection_probability,
-            scale=Scale(1.0, settings.aerial_scale_sigma),
-            scale_drift=settings.aerial_scale_drift,
-        )
-
-    def assigned(self, state: SwarmState, image: MeasurementArray) -> Assignment:
-        """Which detections (n,) of an image are robots that are localized, of all robots (N,)."""
-        stamp_ns = int(image["stamp_ns"][0])
-        picture = picture_of(image)
-        estimate = estimate_at(state, self._tracks.arrays, self._timeout_s, stamp_ns)
-        robots = np.flatnonzero(state.tracked)
-        poses, covariances = estimate.poses[robots], estimate.covariances[robots]
-        state.images.see(picture.pose[:, :2], stamp_ns)
-        ratios = log_ratios(poses, covariances, picture, _log_density(picture), _GATE)
-        found = assign(ratios, self._settings.aerial_detection_probability, self._settings.aerial_probability)
-        sigma = np.sqrt(np.maximum(covariances[:, 0, 0], covariances[:, 1, 1]))
-        unseen, in_view = found.place == UNSEEN, state.images.is_in_view(poses[:, :2], 3.0 * sigma)
-        before_ns = state.images.newest.stamp_ns if state.images.newest is not None else stamp_ns
-        unseen &= state.last_fix_ns[robots] <= before_ns  # nothing else has confirmed its place since
-        for robot in robots[unseen & in_view].tolist():
-            self._miss_robot(state, robot)
-        strangers = int(np.sum(found.robot == UNSEEN)) - int(np.sum(~state.tracked & self._moves))
-        for robot in robots[unseen & ~in_view].tolist() if strangers > 0 else ():
-            # it may have left the view, or be who nobody else is
-            note_missed(state.integrity, robot, min(self._miss, _MAX_DOUBT - state.integrity.doubt[robot]))
-        place = np.full(state.tracked.size, UNSEEN)
-        probability = np.zeros(state.tracked.size)
-        place[robots], probability[robots] = found.place, found.probability
-        known = found.robot >= 0
-        robot = np.where(known, robots[np.where(known, found.robot, 0)] if robots.size else 0, found.robot)
-        state.images.newest = Identities(
-            stamp_ns, np.where(place >= 0, _numbers(image, place), -1), probability
-        )
-        return Assignment(place, robot, probability)
-
-    def _miss_robot(self, state: SwarmState, robot: int) -> None:
-        """Hold against a robot that it is not where it should be seen."""
-        unconfirmed = state.integrity.confirmations[robot] < CONFIRMED
-        doubt = note_missed(state.integrity, robot, self._miss)
-        if unconfirmed or doubt >= self._settings.max_doubt:
-            state.lose(robot)
-
-    def identify(self, state: SwarmState, image: MeasurementArray, assignment: Assignment) -> bool:
-        """Let robots that are not localized, or not where they should be, look for themselves in an image.
-
-        Args:
-            state: Changed in place.
-            image: (n,) detections, all of one image.
-            assignment: Of the robots that are.
-
-        Returns:
-            Whether there were such robots.
-        """
-        images, stamp_ns = state.images, int(image["stamp_ns"][0])
-        looking = self._moves & (~state.tracked | (assignment.place == UNSEEN))
-        for robot in [robot for robot in images.chains if not looking[robot]]:
-            if assignment.place[robot] != AMBIGUOUS:
-                del images.chains[robot]
-        free = np.flatnonzero(assignment.robot < 0)
-        claims: dict[int, Identity] = {}
-        for robot in np.flatnonzero(looking).tolist():
-            outcome, claim = self._look(state, robot, image[free])
-            if claim is not None:
-                claims[robot] = claim
-            else:
-                images.outcomes[outcome] += 1
-        taken = Counter(claim.place for claim in claims.values())
-        for robot, claim in claims.items():
-            agreed = taken[claim.place] == 1
-            images.outcomes[Outcome.ANSWERED if agreed else Outcome.CONFLICT] += 1
-            if agreed:
-                self._initialize(state, robot, stamp_ns, claim)
-        self._tell(state, image[free], looking, claims, taken)
-        return bool(looking.any())
-
-    def _look(
-        self, state: SwarmState, robot: int, image: MeasurementArray
-    ) -> tuple[Outcome, Identity | None]:
-        """Let a robot look for itself among detections (n,) that nobody has."""
-        stamp_ns = int(image["stamp_ns"][0]) if image.size else 0
-        if not image.size:
-            return Outcome.UNDECIDED, None
-        if image.size > _MAX_FREE:
-            return Outcome.CROWDED, None
-        if not self._tracks.begun(robot, stamp_ns):
-            return Outcome.NO_ODOMETRY, None
-        sample = self._tracks.at(np.array([robot]), np.array([stamp_ns]))
-        if sample.silence_s[0] > self._timeout_s[robot]:
-            state.images.chains.pop(robot, None)
-            return Outcome.NO_ODOMETRY, None
-        point, picture = TrackPoint(sample.pose[0], sample.covariance[0]), picture_of(image)
-        chains = state.images.chains.get(robot)
-        if chains is None or chains.point is None or _has_drifted(chains.point, point):
-            chains = Chains(self._model)
-        elif not _has_moved(chains.point, point, picture):
-            return Outcome.NOT_MOVED, None
-        state.images.chains[robot] = chains = chains.advanced(picture, point, stamp_ns)
-        answer = chains.answer() if chains.images > 1 else None
-        believed = bool(state.tracked[robot]) and not is_contradicted(state.integrity, robot)
-        sure = answer is not None and self._is_sure(answer, is_believed=believed)
-        return Outcome.UNDECIDED, answer if sure else None
-
-    def _is_sure(self, answer: Identity, *, is_believed: bool) -> bool:
-        """Whether an answer may be given."""
-        x, y, heading = np.sqrt(np.diag(answer.covariance)).tolist()
-        settings = self._settings
-        doubt = (1.0 - settings.aerial_probability) * (_DOUBT_SHARE if is_believed else 1.0)
-        certain = 1.0 - answer.probability <= doubt
-        return certain and max(x, y) < settings.lost_sigma and heading < _HEADING_SIGMA
-
-    def _initialize(self, state: SwarmState, robot: int, stamp_ns: int, claim: Identity) -> None:
-        """Take a robot into the estimate where it has found itself; later images have to confirm it."""
-        track = self._tracks.at(np.array([robot]), np.array([stamp_ns]))
-        at = Preintegrated(stamp_ns, track.covariance[0], track.jacobian[0])
-        transform = se2.compose(claim.pose, se2.inverse(track.pose[0]))
-        state.initialize(
-            robot, InitialPose(transform, se2.error_covariance(claim.pose, claim.covariance)), at
-        )
-        state.last_fix_ns[robot] = stamp_ns
-        state.images.chains.pop(robot, None)
-
-    def _tell(
-        self,
-        state: SwarmState,
-        image: MeasurementArray,
-        looking: np.typing.NDArray[np.bool_],
-        claims: dict[int, Identity],
-        taken: Counter[int],
-    ) -> None:
-        """Note what robots that look for themselves found among detections (n,)."""
-        newest = state.images.newest
-        if newest is None or not looking.any():
-            return
-        place, probability = newest.place.copy(), newest.probability.copy()
-        for robot in np.flatnonzero(looking).tolist():
-            claim = claims.get(robot)
-            if claim is not None and taken[claim.place] == 1:
-                place[robot], probability[robot] = int(image["marker_id"][claim.place]), claim.probability
-            else:
-                chains = state.images.chains.get(robot)
-                place[robot] = -1
-                best = chains.probabilities.max(initial=0.0) if chains is not None else 0.0
-                probability[robot] = min(float(best), self._settings.aerial_probability)
-        state.images.newest = newest._replace(place=place, probability=probability)
+    robot: IntArray
+    stamp_ns: IntArray
+    number: IntArray
+    pose: FloatArray
+    covariance: FloatArray
+    arrival_ns: IntArray
 
 
-def relieve_seen(state: SwarmState, robots: IntArray) -> None:
-    """Count for robots (k,) that they were seen where they are believed to be."""
-    for robot in robots.tolist():
-        note_seen(state.integrity, robot)
+NO_AERIAL = AerialRows(NO_ROWS, NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros((0, 3, 3)), NO_ROWS)
 
 
-def picture_of(image: MeasurementArray) -> Picture:
-    """The detections (n,) of an image without all else."""
-    return Picture(image["value"], image["covariance"], image["has_heading"].astype(bool))
+def _columns(
+    found: MessageColumns[AnonymousMessage], batch: MessageBatch, robot: IntArray, known: Known
+) -> tuple[AerialRows, Mapping[str, int]]:
+    messages = found.messages
+    foreign = np.array([m.frame_id != known.map_frame for m in messages], dtype=bool)
+    too_many = np.array([m.detections.size > MAX_ANONYMOUS for m in messages], dtype=bool) & ~foreign
+    kept = np.flatnonzero(~foreign & ~too_many)
+    sizes = [messages[k].detections.size for k in kept]
+    detections = np.concatenate([np.zeros(0, ANONYMOUS_DTYPE), *(messages[k].detections for k in kept)])
+    rows = AerialRows(
+        robot=np.repeat(robot[found.valid][kept], sizes),
+        stamp_ns=np.repeat(found.stamp_ns[found.valid][kept], sizes),
+        number=np.concatenate([np.zeros(0, dtype=np.int64), *(np.arange(size) for size in sizes)]),
+        pose=np.column_stack([detections["x"], detections["y"], detections["theta"]]).astype(float),
+        covariance=detections["covariance"].astype(float),
+        arrival_ns=np.repeat(batch.log_ns[found.valid][kept], sizes),
+    )
+    dropped = {FOREIGN_FRAME: int(foreign.sum()), TOO_MANY: int(too_many.sum())}
+    return rows, dropped
 
 
-def as_fixes(image: MeasurementArray, robots: IntArray) -> MeasurementArray:
-    """Detections (k,) as absolute measurements of the robots (k,) that they are."""
-    fixes: MeasurementArray = image.copy()
-    fixes["kind"], fixes["target"], fixes["marker_id"] = Kind.CARTESIAN, robots, 0
-    return fixes
+def _create_converter(_swarm: Swarm, settings: SensorSettings, _drops: Counter[str]) -> Converter:
+    sigma, heading_sigma = settings.aerial_position_sigma, settings.aerial_heading_sigma
+    noise = np.diag(np.square([sigma, sigma, heading_sigma]))
+
+    def convert(rows: AerialRows) -> Measured:
+        shown = about_robots(NOBODY, rows.stamp_ns, rows.pose, rows.covariance, Kind.ANONYMOUS)
+        shown["marker_id"] = rows.number
+        shown["covariance"][rows.covariance[:, 0, 0] == _UNKNOWN_VARIANCE] = noise
+        take_out_headings(shown, np.isnan(rows.pose[:, 2]))
+        return Measured(shown, rows.arrival_ns)
+
+    return convert
 
 
-def _numbers(image: MeasurementArray, places: IntArray) -> IntArray:
-    """The numbers in their message of detections at some places (k,); any where a place is negative."""
-    numbers: IntArray = image["marker_id"][np.maximum(places, 0)]
-    return numbers
-
-
-def _log_density(picture: Picture) -> float:
-    """Of detections over what they cover [1/m^2]."""
-    extent = np.ptp(picture.pose[:, :2], axis=0)
-    sigma = math.sqrt(float(picture.variance.max()))
-    return math.log(len(picture.pose) / float(np.prod(np.maximum(extent, 100.0 * sigma))))
-
-
-def _has_moved(before: TrackPoint, now: TrackPoint, picture: Picture) -> bool:
-    """Whether a robot has moved, or turned where headings are shown, by more than noise could."""
-    gathered = gathered_between(before, now)
-    variance = 2.0 * float(picture.variance.min()) + max(gathered[0, 0], gathered[1, 1])
-    if np.hypot(*(now.pose[:2] - before.pose[:2])) ** 2 > _MOVED**2 * variance:
-        return True
-    if not picture.has_heading.any():
-        return False
-    variance = 2.0 * float(picture.covariance[picture.has_heading, 2, 2].min()) + gathered[2, 2]
-    return bool((now.pose[2] - before.pose[2]) ** 2 > (0.5 * _MOVED) ** 2 * variance)
-
-
-def _has_drifted(before: TrackPoint, now: TrackPoint) -> bool:
-    """Whether a track tells next to nothing of how a robot has moved since a point."""
-    drift: FloatArray = np.diag(gathered_between(before, now))
-    return bool(max(drift[0], drift[1]) > _MAX_DRIFT_M**2 or drift[2] > _MAX_DRIFT_RAD**2)
+AERIAL = Sensor(
+    "aerial",
+    NO_AERIAL,
+    (
+        InputKind(
+            "aerial",
+            "aerial/detections",
+            ANONYMOUS_DETECTIONS,
+            lambda n, _: EachReader(n, decode_anonymous),
+            _columns,
+            of_each=False,
+            in_map=True,
+        ),
+    ),
+    _create_converter,
+    unit=("robot", "stamp_ns"),  # a part of an image would say that robots are missing
+)
+"""The sensor, see `registry.SENSORS`."""

@@ -8,6 +8,8 @@ the mount's pitch and roll taken out.
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
@@ -17,29 +19,68 @@ from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
+from swarm_loc_estimator.common.messages.definitions import DETECTIONS as MESSAGE_TYPE
+from swarm_loc_estimator.common.messages.definitions import SWARM_DETECTIONS
+from swarm_loc_estimator.common.messages.detections import (
+    DETECTION_DTYPE,
+    SharedMessage,
+    decode_shared_detections,
+)
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.streams import DetectionColumns, DetectionReader
 from swarm_loc_estimator.common.small_matrix import assign
-from swarm_loc_estimator.filter.gating import gate_threshold
 from swarm_loc_estimator.filter.measurement_model import (
     MEASUREMENT_DTYPE,
+    MODELS,
     NOBODY,
     POLAR,
+    Kind,
     MeasurementArray,
     MeasurementColumns,
 )
-from swarm_loc_estimator.swarm.swarm import CameraMount, Face, SensorModel, Swarm
+from swarm_loc_estimator.sensors.sensor import (
+    NO_ROWS,
+    Converter,
+    InputKind,
+    Known,
+    Measured,
+    Sensor,
+    SensorSettings,
+)
+from swarm_loc_estimator.sensors.shared_topics import shared_kind
+from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Robot, SensorModel, Swarm
 
 CONTENT_POSITION = 1
 """Detection content: position only (MarkerDetection.CONTENT_POSITION)."""
 CONTENT_POSE = 2
 """Detection content: position and orientation."""
 CONTENT_POSE_TWO = 3
-"""Detection content: likewise, with a mirrored second solution."""
+"""Detection content: position and orientation, with a mirrored second solution."""
 
-_FATES = ("measured", "unknown_id", "own_marker", "no_camera", "bad_content", "non_finite", "absurd")
-_MEASURED, _UNKNOWN_ID, _OWN_MARKER, _NO_CAMERA, _BAD_CONTENT, _NON_FINITE, _ABSURD = range(len(_FATES))
+_OUTCOMES = ("measured", "unknown_id", "own_marker", "no_camera", "bad_content", "non_finite", "absurd")
+_MEASURED, _UNKNOWN_ID, _OWN_MARKER, _NO_CAMERA, _BAD_CONTENT, _NON_FINITE, _ABSURD = range(len(_OUTCOMES))
 _MAX_DISTANCE_M = 1e3
 _FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _SENSOR_DTYPE = np.dtype([(f.name, np.float64) for f in fields(SensorModel)])
+
+
+class DetectionRows(NamedTuple):
+    """What cameras saw, a row per detection (d,).
+
+    Attributes:
+        robot: (d,) index of the robot that carries the camera.
+        stamp_ns: (d,) exposure times.
+        detection: (d,) structured, see `SightingConverter.convert`.
+        arrival_ns: (d,).
+    """
+
+    robot: IntArray
+    stamp_ns: IntArray
+    detection: NDArray[np.void]
+    arrival_ns: IntArray
+
+
+NO_DETECTIONS = DetectionRows(NO_ROWS, NO_ROWS, np.zeros(0, dtype=DETECTION_DTYPE), NO_ROWS)
 
 
 @dataclass(frozen=True)
@@ -111,7 +152,7 @@ class SightingConverter:
             mount=np.array([[m.x, m.y, m.yaw] for m in mounts]).reshape(-1, 3),
             level=np.array(tilts).reshape(-1, 3, 3),
             sensor=np.array(sensors, dtype=_SENSOR_DTYPE),
-            gate=gate_threshold([robot.sensor.gate_probability for robot in swarm.robots]),
+            gate=MODELS[Kind.POLAR].gate([robot.sensor.gate_probability for robot in swarm.robots]),
         )
         owners = sorted(swarm.owner_of.items())
         markers = [owner.marker for _, owner in owners]
@@ -136,27 +177,27 @@ class SightingConverter:
         measurements = np.zeros(robots.size, dtype=MEASUREMENT_DTYPE)
         measurements["stamp_ns"] = stamps_ns
         measurements["received_from"] = measurements["observer"] = robots
-        fates = np.zeros(robots.size, dtype=np.int64)
+        outcomes = np.zeros(robots.size, dtype=np.int64)
         _convert_all(
             _Detections(*(detections[name] for name in _Detections._fields)),
             self._cameras,
             self._markers,
             MeasurementColumns.views(measurements),
             measurements["marker_id"],
-            fates,
+            outcomes,
         )
-        counts = np.bincount(fates, minlength=len(_FATES)).tolist()
-        dropped = {_FATES[fate]: counts[fate] for fate in range(1, len(_FATES)) if counts[fate]}
-        measured: NDArray[np.bool_] = fates == _MEASURED
+        counts = np.bincount(outcomes, minlength=len(_OUTCOMES)).tolist()
+        dropped = {_OUTCOMES[k]: counts[k] for k in range(1, len(_OUTCOMES)) if counts[k]}
+        measured: NDArray[np.bool_] = outcomes == _MEASURED
         measurements = measurements[measured]
         self._note_stamp_variance(measurements)
         return Conversion(measurements, measured, dropped)
 
     def _note_stamp_variance(self, measurements: MeasurementArray) -> None:
-        """Say how unsure the stamps are.
+        """Write the variance of the stamps.
 
-        All that a picture shows shares the error of its stamp. Told of each alone, times their number, it is
-        not taken for smaller than it is by who takes them for independent.
+        All measurements of an image share the error of its stamp. The filter takes errors as independent, so
+        each gets the variance times their number.
         """
         variance = np.square(self._cameras.sensor["time_sigma_s"])[measurements["observer"]]
         if variance.any():
@@ -172,15 +213,15 @@ def _convert_all(
     markers: _Markers,
     out: MeasurementColumns,
     marker_id: IntArray,
-    fates: IntArray,
+    outcomes: IntArray,
 ) -> None:
     """Fill the measurements (d,), whose stamps and observers are there, and say what became of each."""
     position, other_position = np.empty(3), np.empty(3)
-    for k in range(fates.size):
+    for k in range(outcomes.size):
         robot = out.observer[k]
         place = min(np.searchsorted(markers.id, detections.id[k]), markers.id.size - 1)
-        fates[k] = _fate(detections, k, cameras, markers, robot, place)
-        if fates[k] != _MEASURED:
+        outcomes[k] = _outcome(detections, k, cameras, markers, robot, place)
+        if outcomes[k] != _MEASURED:
             continue
         sensor, level, marker = cameras.sensor[robot], cameras.level[robot], markers.pose[place]
         marker_id[k] = markers.id[place]
@@ -189,7 +230,7 @@ def _convert_all(
         assign(out.sensor[k], cameras.mount[robot])
         out.gate[k] = cameras.gate[robot]
         out.marker[k, 0], out.marker[k, 1] = marker[0], marker[1]
-        _levelled(level, detections.position[k], position)
+        _to_level_frame(level, detections.position[k], position)
         _scale(position, 1.0 / sensor.distance_scale)
         if detections.content[k] == CONTENT_POSITION or math.isnan(marker[2]):
             out.kind[k] = POLAR
@@ -202,7 +243,7 @@ def _convert_all(
         out.value[k, 2] = _face_heading(level, detections.orientation[k])
         if detections.content[k] == CONTENT_POSE_TWO:
             out.has_alternative[k] = 1
-            _levelled(level, detections.alternative_position[k], other_position)
+            _to_level_frame(level, detections.alternative_position[k], other_position)
             _scale(other_position, 1.0 / sensor.distance_scale)
             out.alternative[k, 0], out.alternative[k, 1] = other_position[0], other_position[1]
             out.alternative[k, 2] = _face_heading(level, detections.alternative_orientation[k])
@@ -212,7 +253,7 @@ def _convert_all(
 
 
 @inlined_njit
-def _fate(
+def _outcome(
     detections: _Detections, k: int, cameras: _Cameras, markers: _Markers, robot: int, place: int
 ) -> int:
     """Whether detection k, of the marker that may be at `place`, becomes a measurement, or why not."""
@@ -253,7 +294,7 @@ def _is_rotation(quaternion: FloatArray) -> bool:
 
 
 @cached_njit
-def _levelled(level: FloatArray, optical: FloatArray, out: FloatArray) -> None:
+def _to_level_frame(level: FloatArray, optical: FloatArray, out: FloatArray) -> None:
     """Write a vector (3,) of the optical frame in the level axes forward, left, up of the camera."""
     for i in range(3):
         out[i] = level[i, 0] * optical[0] + level[i, 1] * optical[1] + level[i, 2] * optical[2]
@@ -273,7 +314,7 @@ def _face_heading(level: FloatArray, quaternion: FloatArray) -> float:
     out_of_face, axes = np.empty(3), np.empty(3)
     out_of_face[0], out_of_face[1] = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x)
     out_of_face[2] = w * w - x * x - y * y + z * z
-    _levelled(level, out_of_face, axes)
+    _to_level_frame(level, out_of_face, axes)
     return math.atan2(axes[1], axes[0])
 
 
@@ -313,3 +354,45 @@ def _pose_noise(sensor: SensorModel, level: FloatArray, published: FloatArray, n
     noise[0, 0] += sensor.residual_position_sigma**2
     noise[1, 1] += sensor.residual_position_sigma**2
     noise[2, 2] += sensor.residual_heading_sigma**2
+
+
+def _columns(
+    found: DetectionColumns, batch: MessageBatch, robot: IntArray, _known: Known
+) -> tuple[DetectionRows, Mapping[str, int]]:
+    columns = (robot, found.stamp_ns, batch.log_ns)
+    robots, stamps_ns, arrivals_ns = (np.repeat(column, found.count) for column in columns)
+    return DetectionRows(robots, stamps_ns, found.detection, arrivals_ns), {}
+
+
+def _shared_rows(message: SharedMessage, arrival_ns: IntArray) -> DetectionRows:
+    return DetectionRows(message.robot, message.reading_ns, message.columns[0], arrival_ns)
+
+
+def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: Counter[str]) -> Converter:
+    converter = SightingConverter(swarm)
+
+    def convert(rows: DetectionRows) -> Measured:
+        found = converter.convert(rows.robot, rows.stamp_ns, rows.detection)
+        drops.update(found.dropped)
+        return Measured(found.measurements, rows.arrival_ns[found.measured])
+
+    return convert
+
+
+def _has_camera(robot: Robot) -> bool:
+    return robot.camera is not None
+
+
+_OWN = InputKind(
+    "detections", "detections", MESSAGE_TYPE, lambda n, _: DetectionReader(n), _columns, _has_camera
+)
+_SHARED = shared_kind(
+    _OWN, "swarm/detections", SWARM_DETECTIONS, decode_shared_detections, _shared_rows, NO_DETECTIONS
+)
+DETECTIONS = Sensor(
+    "detections",
+    NO_DETECTIONS,
+    (_OWN, _SHARED),
+    _create_converter,
+)
+"""The sensor, see `registry.SENSORS`."""

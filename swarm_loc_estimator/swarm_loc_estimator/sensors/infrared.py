@@ -8,24 +8,34 @@ arrival does not matter, and a lost matrix costs only its own information.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.gating import gate_threshold
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, Kind, MeasurementArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.messages.definitions import BRIGHTNESS as MESSAGE_TYPE
+from swarm_loc_estimator.common.messages.detections import BrightnessMessage, decode_brightness
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.streams import EachReader, MessageColumns
+from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MODELS, Kind, MeasurementArray
 from swarm_loc_estimator.infrared.closed_form import ClosedForm
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.solution import IrEstimator, IrOutcome, IrSolutions
-from swarm_loc_estimator.sensors.exchanges import ExchangeKey, MatrixScreening, Readings
-from swarm_loc_estimator.sensors.messages import NO_MEASUREMENTS, BrightnessRows
+from swarm_loc_estimator.sensors.sensor import (
+    NO_MEASUREMENTS,
+    NO_ROWS,
+    Change,
+    InputKind,
+    Known,
+    Sensor,
+)
 from swarm_loc_estimator.sensors.validation import REJECT_REASONS, reject_reasons
-from swarm_loc_estimator.swarm.ir_board import IrMethod, IrPlatform, PairGains
-from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.ir_board import IrMethod, IrPlatform, PairGains, RobotIr
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 _METHODS: dict[IrMethod, Callable[[IrPlatform], IrEstimator]] = {
     IrMethod.LIKELIHOOD: MaximumLikelihood,
@@ -33,16 +43,128 @@ _METHODS: dict[IrMethod, Callable[[IrPlatform], IrEstimator]] = {
 }
 
 
-class Change(NamedTuple):
-    """What new matrices change.
+class BrightnessRows(NamedTuple):
+    """Brightness matrices (b,), as `swarm_loc_msgs/BrightnessMatrix` has them.
 
     Attributes:
-        added: (m,) measurements to use from now on.
-        withdrawn: (w,) measurements given before that no longer hold.
+        robot: (b,) index of the robot on whose topic each came.
+        stamp_ns: (b,) middle of the exchange, the same for all power modes of one.
+        receiver: (b,) id of the robot that measured.
+        transmitter: (b,) id of the robot that lit its emitters.
+        n: (b,) sensors, and emitters.
+        power: (b,) index of the power mode.
+        saturation: (b,) the reading from which on a sensor tells no more [count]; 0: that of the platform.
+        readings: (b,) of arrays (k,) [count], row-major [sensor, emitter]; k should be n * n.
+        arrival_ns: (b,).
     """
 
-    added: MeasurementArray
-    withdrawn: MeasurementArray
+    robot: IntArray
+    stamp_ns: IntArray
+    receiver: IntArray
+    transmitter: IntArray
+    n: IntArray
+    power: IntArray
+    saturation: IntArray
+    readings: NDArray[np.object_]
+    arrival_ns: IntArray
+
+
+NO_BRIGHTNESS = BrightnessRows(*(NO_ROWS,) * 7, np.zeros(0, dtype=object), NO_ROWS)
+
+
+class Matrix(NamedTuple):
+    """What was read at one power.
+
+    Attributes:
+        light: (n, n) [count], [sensor, emitter], what is read in the dark taken off.
+        saturation: Light of it or more tells only that it was at least so bright.
+    """
+
+    light: FloatArray
+    saturation: float
+
+
+Readings = dict[int, Matrix]
+"""Of an exchange, by power."""
+
+
+class ExchangeKey(NamedTuple):
+    """Which exchange; robots are indices into the swarm."""
+
+    stamp_ns: int
+    receiver: int
+    transmitter: int
+
+
+class MatrixScreening:
+    """Looks through the matrices of a swarm's infrared boards.
+
+    Args:
+        swarm: Whose.
+
+    Attributes:
+        boards: Robot -> its board; robots without one are missing.
+        dropped: Reason -> how many matrices could not be used.
+    """
+
+    def __init__(self, swarm: Swarm) -> None:
+        self.boards: dict[int, RobotIr] = {
+            k: robot.ir for k, robot in enumerate(swarm.robots) if robot.ir is not None
+        }
+        self.dropped: Counter[str] = Counter()
+        self._robot_of = {ir.id: robot for robot, ir in self.boards.items()}
+
+    def key_of(self, rows: BrightnessRows, k: int) -> ExchangeKey | None:
+        """The exchange of matrix k; None, and counted, when the matrix cannot be used whatever else comes."""
+        fault = self._fault(rows, k)
+        if fault:
+            self.dropped[fault] += 1
+            return None
+        transmitter = self._robot_of[int(rows.transmitter[k])]
+        return ExchangeKey(int(rows.stamp_ns[k]), int(rows.robot[k]), transmitter)
+
+    def add(self, rows: BrightnessRows, k: int, readings: Readings) -> None:
+        """Put matrix k to others of its exchange; of two for one power the same one counts in any order."""
+        platform, sent = self.boards[int(rows.robot[k])].platform, float(rows.saturation[k])
+        counts = rows.readings[k].reshape(platform.n, platform.n).astype(np.float64)
+        limit = min(sent, platform.saturation) if sent > 0.0 else platform.saturation
+        matrix = Matrix(counts - platform.dark_level, limit - platform.dark_level)
+        power = int(rows.power[k])
+        if power in readings:
+            self.dropped["duplicate"] += 1
+            matrix = min(matrix, readings[power], key=lambda one: (one.light.tobytes(), one.saturation))
+        readings[power] = matrix
+
+    def together(self, robot: int, exchanges: list[Readings]) -> tuple[FloatArray, FloatArray]:
+        """Readings (k, modes, n, n) of exchanges of a robot's board, NaN where not measured, and saturation.
+
+        Saturation is (k, modes).
+        """
+        platform = self.boards[robot].platform
+        whole = np.full((len(exchanges), len(platform.amplitudes), platform.n, platform.n), np.nan)
+        saturation = np.full(whole.shape[:2], platform.saturation)
+        for k, exchange in enumerate(exchanges):
+            for power, matrix in exchange.items():
+                whole[k, power], saturation[k, power] = matrix
+        return whole, saturation
+
+    def _fault(self, rows: BrightnessRows, k: int) -> str:
+        """Why matrix k cannot be used; "" if it can."""
+        receiver, transmitter = (self._robot_of.get(int(ids[k])) for ids in (rows.receiver, rows.transmitter))
+        ir = self.boards.get(int(rows.robot[k]))
+        if ir is None:
+            return "no_ir"
+        if receiver is None or transmitter is None:
+            return "ir_unknown_id"
+        if receiver != rows.robot[k]:
+            return "ir_wrong_receiver"
+        if transmitter == receiver:
+            return "ir_hears_itself"
+        if self.boards[transmitter].platform != ir.platform:
+            return "ir_other_board"
+        if rows.n[k] != ir.platform.n or rows.readings[k].size != ir.platform.n**2:
+            return "ir_wrong_size"
+        return "" if rows.power[k] < len(ir.platform.amplitudes) else "ir_unknown_power"
 
 
 @dataclass
@@ -52,12 +174,12 @@ class _Exchange:
     Attributes:
         readings: Its matrices.
         measurement: (1,) as it is used, (0,) when there is none.
-        fate: Why there is none.
+        fault: Why there is none.
     """
 
     readings: Readings = field(default_factory=dict)
     measurement: MeasurementArray = field(default_factory=NO_MEASUREMENTS.copy)
-    fate: str = ""
+    fault: str = ""
 
 
 @lru_cache(maxsize=64)
@@ -76,7 +198,9 @@ class BrightnessConverter:
     def __init__(self, swarm: Swarm) -> None:
         self._validator = MatrixScreening(swarm)
         self._ir = self._validator.boards
-        self._gate = {robot: float(gate_threshold(ir.gate_probability)) for robot, ir in self._ir.items()}
+        self._gate = {
+            robot: float(MODELS[Kind.POLAR].gate(ir.gate_probability)) for robot, ir in self._ir.items()
+        }
         self._dropped: Counter[str] = Counter()
         self._measured = 0
         self._exchanges: dict[ExchangeKey, _Exchange] = {}
@@ -86,12 +210,17 @@ class BrightnessConverter:
     @property
     def drops(self) -> Counter[str]:
         """Matrices not used, by reason; what still comes of their exchanges may make them useful."""
-        return self._validator.dropped + self._dropped + _fates(self._exchanges.values())
+        return self._validator.dropped + self._dropped + _faults(self._exchanges.values())
 
     @property
     def measured(self) -> int:
         """Exchanges that gave a measurement, since the last `restart`."""
         return self._measured + sum(exchange.measurement.size for exchange in self._exchanges.values())
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What was used since the last `restart`, by name."""
+        return {"infrared exchanges measured": self.measured}
 
     def forget_before(self, oldest_ns: int) -> None:
         """Let go of the exchanges before an instant: nothing more comes of them."""
@@ -121,7 +250,7 @@ class BrightnessConverter:
     def _forget(self, keys: Iterable[ExchangeKey]) -> None:
         """Let go of exchanges."""
         gone = [self._exchanges.pop(key) for key in keys]
-        self._dropped += _fates(gone)
+        self._dropped += _faults(gone)
         self._measured += sum(exchange.measurement.size for exchange in gone)
 
     def _alike(self, keys: Iterable[ExchangeKey]) -> Iterable[list[ExchangeKey]]:
@@ -143,10 +272,10 @@ class BrightnessConverter:
         faults = reject_reasons(measurements)
         changed = []
         for k, exchange in enumerate(exchanges):
-            exchange.fate = (
+            exchange.fault = (
                 _reason(int(solutions.outcomes[k]), readings[k], limits[k]) or REJECT_REASONS[faults[k]]
             )
-            measurement = NO_MEASUREMENTS if exchange.fate else measurements[k : k + 1]
+            measurement = NO_MEASUREMENTS if exchange.fault else measurements[k : k + 1]
             if measurement.tobytes() != exchange.measurement.tobytes():
                 changed.append((exchange, measurement))
         return changed
@@ -171,12 +300,12 @@ class BrightnessConverter:
         return measurements
 
 
-def _fates(exchanges: Iterable[_Exchange]) -> Counter[str]:
+def _faults(exchanges: Iterable[_Exchange]) -> Counter[str]:
     """How many matrices of exchanges were not used, by reason."""
     counts: Counter[str] = Counter()
     for exchange in exchanges:
-        if exchange.fate:
-            counts[exchange.fate] += len(exchange.readings)
+        if exchange.fault:
+            counts[exchange.fault] += len(exchange.readings)
     return counts
 
 
@@ -187,3 +316,52 @@ def _reason(outcome: int, readings: FloatArray, saturation: FloatArray) -> str:
     if np.all(np.isnan(readings) | (readings >= saturation[:, None, None])):
         return "ir_saturated"
     return f"ir_{IrOutcome(outcome).name.lower()}"
+
+
+def _columns(
+    found: MessageColumns[BrightnessMessage], batch: MessageBatch, robot: IntArray, _known: Known
+) -> tuple[BrightnessRows, Mapping[str, int]]:
+    messages = found.messages
+    readings = np.empty(len(messages), dtype=object)
+    for k, message in enumerate(messages):
+        readings[k] = message.readings
+
+    def column(name: str) -> IntArray:
+        return np.array([getattr(message, name) for message in messages], dtype=np.int64)
+
+    rows = BrightnessRows(
+        robot=robot[found.valid],
+        stamp_ns=found.stamp_ns[found.valid],
+        receiver=column("receiver"),
+        transmitter=column("transmitter"),
+        n=column("n"),
+        power=column("power"),
+        saturation=column("saturation"),
+        readings=readings,
+        arrival_ns=batch.log_ns[found.valid],
+    )
+    return rows, {}
+
+
+def _has_ir(robot: Robot) -> bool:
+    return robot.ir is not None
+
+
+BRIGHTNESS = Sensor(
+    "brightness",
+    NO_BRIGHTNESS,
+    (
+        InputKind(
+            "brightness",
+            "brightness",
+            MESSAGE_TYPE,
+            lambda n, _: EachReader(n, decode_brightness),
+            _columns,
+            _has_ir,
+        ),
+    ),
+    create_accumulator=BrightnessConverter,
+    unit=("robot", "stamp_ns", "transmitter"),
+    keeps_units=True,
+)
+"""The sensor, see `registry.SENSORS`."""

@@ -1,7 +1,6 @@
 """Decode the raw messages of all inputs to columns, the same for a live node and for replay.
 
-What the inputs of a swarm are stands in `topics.py`, how each kind is read in `channels.py`. Bytes that are
-no message of the topic's type are counted and go no further.
+Bytes that are no message of the topic's type are counted and go no further.
 """
 
 from __future__ import annotations
@@ -18,10 +17,8 @@ from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.messages.detections import swarm_key
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.sensors.channels import CHANNELS, Known
-from swarm_loc_estimator.sensors.messages import RawInputs, in_order_of_arrival
-from swarm_loc_estimator.sensors.shared_channels import SHARED_CHANNELS
-from swarm_loc_estimator.sensors.topics import InputKind, InputTopic, input_topics
+from swarm_loc_estimator.sensors.registry import Batch, InputTopic, input_topics, kinds
+from swarm_loc_estimator.sensors.sensor import Known, in_order_of_arrival
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 MAX_PAUSE_NS = 3_600_000_000_000
@@ -123,15 +120,15 @@ class Ingest:
         self.map_frame = map_frame
         self.handle_of: Mapping[str, int] = {topic.name: handle for handle, topic in enumerate(self.topics)}
         self._robot = np.array([topic.robot for topic in self.topics], dtype=np.int64)
-        place = {kind: number for number, kind in enumerate(InputKind)}
-        self._kind = np.array([place[topic.kind] for topic in self.topics], dtype=np.int64)
-        known = Known(map_frame, len(swarm.robots), swarm_key(robot.name for robot in swarm.robots))
-        create = {**CHANNELS, **SHARED_CHANNELS}
-        self._channels = {kind: create[kind](len(self.topics), known) for kind in InputKind}
+        self._kinds = [*kinds().values()]
+        place = {kind.name: number for number, kind in enumerate(self._kinds)}
+        self._kind = np.array([place[topic.kind.name] for topic in self.topics], dtype=np.int64)
+        self._known = Known(map_frame, len(swarm.robots), swarm_key(robot.name for robot in swarm.robots))
+        self._readers = [kind.create_reader(len(self.topics), self._known) for kind in self._kinds]
         self._counted = np.zeros(len(self.topics), dtype=_STATISTICS_DTYPE)
         self.statistics = [InputStatistics(self._counted[k : k + 1]) for k in range(len(self.topics))]
 
-    def read(self, batch: MessageBatch) -> Iterator[RawInputs]:
+    def read(self, batch: MessageBatch) -> Iterator[Batch]:
         """Read messages, numbered as `topics`, in order of arrival.
 
         Yields:
@@ -145,30 +142,33 @@ class Ingest:
 
     def received(self) -> dict[str, int]:
         """Messages so far by kind of topic, such as `<robot>/odom`; kinds of which none came are missing."""
-        kinds = np.bincount(self._kind, weights=self._counted["received"], minlength=len(InputKind))
-        counts = {kind.pattern: int(kinds[number]) for number, kind in enumerate(InputKind)}
+        received = np.bincount(self._kind, weights=self._counted["received"], minlength=len(self._kinds))
+        counts = {kind.pattern: int(received[number]) for number, kind in enumerate(self._kinds)}
         return {topic: count for topic, count in counts.items() if count}
 
     def frame_id(self, handle: int) -> str:
         """Frame of the newest message on a topic, "" before the first."""
-        return self._channels[self.topics[handle].kind].frame_id(handle)
+        frame_ids: list[str] = self._readers[self._kind[handle]].frame_ids
+        return frame_ids[handle]
 
-    def _read_forwards(self, batch: MessageBatch) -> RawInputs:
-        kinds = self._kind[batch.topic]
-        present = np.bincount(kinds, minlength=len(InputKind))
+    def _read_forwards(self, batch: MessageBatch) -> Batch:
+        of_message = self._kind[batch.topic]
+        present = np.bincount(of_message, minlength=len(self._kinds))
         rows: dict[str, Any] = {}
         dropped: Counter[str] = Counter()
-        for number, (kind, channel) in enumerate(self._channels.items()):
+        for number, (kind, reader) in enumerate(zip(self._kinds, self._readers, strict=True)):
             if not present[number]:
                 continue
-            part = batch if present[number] == batch.size else batch.chosen(kinds == number)
-            read = channel.read(part, self._robot[part.topic])
-            _count(self._counted, part.topic, part.log_ns, read.stamp_ns, read.valid)
+            part = batch if present[number] == batch.size else batch.chosen(of_message == number)
+            found = reader.read(part)
+            _count(self._counted, part.topic, part.log_ns, found.stamp_ns, found.valid)
+            read, unused = kind.columns_of(found, part, self._robot[part.topic], self._known)
             # the same may come of each robot alone and of many together
             before = rows.get(kind.rows)
-            rows[kind.rows] = read.rows if before is None else in_order_of_arrival([before, read.rows])
-            dropped.update(read.dropped, bad_message=int(np.sum(~read.valid)))
-        return RawInputs(int(batch.log_ns[0]), int(batch.log_ns[-1]), dropped=+dropped, **rows)
+            rows[kind.rows] = read if before is None else in_order_of_arrival([before, read])
+            dropped.update(unused)
+            dropped["bad_message"] += int(np.sum(~found.valid))
+        return Batch(int(batch.log_ns[0]), int(batch.log_ns[-1]), rows, +dropped)
 
 
 @cached_njit

@@ -33,7 +33,7 @@ class ConfiguredStarts:
         A robot that walks at random is left out: the time since which it has walked is not known.
         """
         robots = np.flatnonzero(state.start_pending)
-        ready = robots[~self._tracks.walks(robots) & self._may_start(state, robots, stamp_ns)]
+        ready = robots[~self._tracks.is_random_walk(robots) & self._may_start(state, robots, stamp_ns)]
         if ready.size:
             state = state.copy()
             self._initialize(state, ready, np.full(ready.size, stamp_ns))
@@ -49,11 +49,11 @@ class ConfiguredStarts:
     def _may_start(self, state: SwarmState, robots: IntArray, stamps_ns: IntArray | int) -> BoolArray:
         """Whether robots (k,) may start at configured poses: their odometry has begun by instants (k,)."""
         pending: BoolArray = state.start_pending[robots] & self._has_start[robots]
-        return pending & self._tracks.begun(robots, stamps_ns)
+        return pending & self._tracks.has_started(robots, stamps_ns)
 
     def _initialize(self, state: SwarmState, robots: IntArray, stamps_ns: IntArray) -> None:
         """Where their tracks begin; or, if they walk at random, with the first measurements about them."""
-        tracks, start, walks = self._tracks.arrays, self._start[robots], self._tracks.walks(robots)
+        tracks, start, walks = self._tracks.arrays, self._start[robots], self._tracks.is_random_walk(robots)
         transform = se2.compose(start, se2.inverse(tracks.begin_pose[robots]))
         error = se2.error_covariance(start, self._start_variance[robots][:, :, None] * np.eye(3))
         begun_ns = np.where(walks, stamps_ns, tracks.begin_ns[robots])

@@ -50,7 +50,7 @@ def contradictions(
         now_ns: The instant.
     """
     names = [robot.name for robot in swarm.robots] + [f"landmark {mark.id}" for mark in swarm.landmarks]
-    jumping = np.flatnonzero(tracks.contradict_themselves(now_ns)).tolist()
+    jumping = np.flatnonzero(tracks.has_conflicting_sources(now_ns)).tolist()
     robots = np.flatnonzero(state.tracked).tolist()
     denied = [robot for robot in robots if is_contradicted(state.integrity, robot)]
     contradicted = np.flatnonzero(state.contradicted_ns > NEVER_NS).tolist()

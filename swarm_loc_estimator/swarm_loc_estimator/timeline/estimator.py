@@ -12,21 +12,19 @@ from swarm_loc_estimator.filter.belief import NEVER_NS
 from swarm_loc_estimator.filter.measurement_model import NO_MODEL, Command, MeasurementArray
 from swarm_loc_estimator.identification.memory import Identities, Outcome
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.sensors.infrared import BrightnessConverter
-from swarm_loc_estimator.sensors.messages import OdometryRows, RawInputs, ValidInputs, joined
-from swarm_loc_estimator.sensors.validation import (
-    REJECT_REASONS,
-    InputValidator,
-    about_robots,
-    reject_reasons,
-)
+from swarm_loc_estimator.sensors.conversion import InputConverter
+from swarm_loc_estimator.sensors.fix import about_robots
+from swarm_loc_estimator.sensors.odometry import ODOMETRY, OdometryRows
+from swarm_loc_estimator.sensors.registry import Batch, Measurements
+from swarm_loc_estimator.sensors.sensor import joined
+from swarm_loc_estimator.sensors.validation import REJECT_REASONS, reject_reasons
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.contradictions import Contradiction, contradictions
 from swarm_loc_estimator.timeline.estimate import Estimate, Status, estimate_at
 from swarm_loc_estimator.timeline.fusion import Fusion, Verdict
 from swarm_loc_estimator.timeline.self_calibration import learned, learns
 from swarm_loc_estimator.timeline.settings import Settings
-from swarm_loc_estimator.timeline.timeline import GoOn, Timeline
+from swarm_loc_estimator.timeline.timeline import HasBudget, Timeline
 
 __all__ = ["Estimate", "Estimator", "Status"]
 
@@ -47,12 +45,15 @@ class Estimator:
         self.settings = (settings or Settings()).resolved_for(swarm)
         self._timeout_s = np.array([robot.odometry.timeout_s for robot in swarm.robots])
         self._tracks = OdometryTracks(swarm.robots)
-        self._validator = InputValidator(swarm, self.settings)
-        self._brightness = BrightnessConverter(swarm)
+        self._converter = InputConverter(swarm, self.settings)
         self._fusion = Fusion(swarm, self.settings, self._tracks)
         grouped_s = self.settings.state_period_s + self.settings.fusion_period_s
-        self._reach_ns = self._tracks.reach_ns + round(0.5e9 * grouped_s)  # used so far from their stamps
-        self._timeline = Timeline(self.settings, self._fusion.step, self._fusion.new_state(), self._reach_ns)
+        self._lookback_ns = self._tracks.lookback_ns + round(
+            0.5e9 * grouped_s
+        )  # used so far from their stamps
+        self._timeline = Timeline(
+            self.settings, self._fusion.step, self._fusion.new_state(), self._lookback_ns
+        )
         self._horizon_ns = round(self.settings.horizon_s * 1e9)
         self._jump_back_ns = round(self.settings.jump_back_s * 1e9)
         self.time_jumps = 0
@@ -65,17 +66,12 @@ class Estimator:
     def reset(self) -> None:
         """Forget all data and begin anew with the configured starts; the counters go on."""
         self.drop("reset", sum(rows.robot.size for rows in self._odometry) + self._timeline.waiting)
-        self._validator.drops.update(self._timeline_drops())
+        self._converter.drops.update(self._timeline_drops())
         self._tracks.clear()
         self._timeline.restart(self._fusion.new_state())
-        self._brightness.restart()
+        for accumulator in self._converter.accumulators.values():
+            accumulator.restart()
         self._begin()
-
-    def receive(self, messages: RawInputs) -> None:
-        """Take in messages; when they show that time has jumped back, begin anew with them."""
-        self._check_clock(messages.begin_ns)
-        self._check_clock(messages.end_ns)
-        self.add(self.validate(messages))
 
     @property
     def note(self) -> str:
@@ -89,19 +85,25 @@ class Estimator:
             " sparse one."
         )
 
-    def validate(self, messages: RawInputs) -> ValidInputs:
-        """Turn messages into what can be used of them, and count the rest; nothing is taken in yet."""
-        return self._validator.validate(messages)
+    def convert(self, batch: Batch) -> Measurements:
+        """Convert readings to measurements, to be received in parts; invalid ones are counted."""
+        return self._converter.convert(batch)
 
-    def add(self, arrivals: ValidInputs) -> None:
-        """Take in what has arrived since the last tick, in order of arrival."""
-        if arrivals.odometry.robot.size:
-            self._odometry.append(arrivals.odometry)
+    def receive(self, inputs: Batch | Measurements) -> None:
+        """Add what has arrived since the last tick; if it shows that the clock jumped back, reset first."""
+        self._check_clock(inputs.begin_ns)
+        self._check_clock(inputs.end_ns)
+        arrivals = self.convert(inputs) if isinstance(inputs, Batch) else inputs
         self._timeline.add(arrivals.measurements)
-        if arrivals.brightness.robot.size:
-            change = self._brightness.take(arrivals.brightness)
-            self._timeline.add(change.added)
-            self._timeline.withdraw(change.withdrawn)
+        for name, rows in arrivals.rows.items():
+            if not rows.robot.size:
+                continue
+            if name == ODOMETRY.name:
+                self._odometry.append(rows)
+            else:
+                change = self._converter.accumulators[name].take(rows)
+                self._timeline.add(change.added)
+                self._timeline.withdraw(change.withdrawn)
 
     def set_pose(self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike) -> str:
         """Set a robot to a pose (3,) in `map` with covariance (3, 3), whatever was believed.
@@ -114,7 +116,7 @@ class Estimator:
         command = about_robots(robot, stamp_ns, np.array([pose]), np.array([covariance]), NO_MODEL)
         command["command"] = Command.SET_POSE
         fault = REJECT_REASONS[reject_reasons(command)[0]] or (
-            "" if self._tracks.begun(robot, stamp_ns) else "not_localized"
+            "" if self._tracks.has_started(robot, stamp_ns) else "not_localized"
         )
         if fault:
             self.drop(fault)
@@ -131,12 +133,14 @@ class Estimator:
     def drop(self, reason: str, count: int = 1) -> None:
         """Count data that could not even be handed in."""
         if count:
-            self._validator.drops[reason] += count
+            self._converter.drops[reason] += count
 
     @property
     def drops(self) -> dict[str, int]:
         """Data not used, by reason, since construction."""
-        total = self._validator.drops + self._brightness.drops + Counter(self._timeline_drops())
+        total = self._converter.drops + Counter(self._timeline_drops())
+        for accumulator in self._converter.accumulators.values():
+            total += accumulator.drops
         return {reason: count for reason, count in sorted(total.items()) if count}
 
     @property
@@ -149,8 +153,9 @@ class Estimator:
         """What was used since the last reset, by name."""
         others = {
             "constraints kept": int(self._timeline.verdict_counts()[Verdict.CONSTRAINT]),
-            "infrared exchanges measured": self._brightness.measured,
         }
+        for accumulator in self._converter.accumulators.values():
+            others |= accumulator.counters
         outcomes = self._timeline.state.images.outcomes
         others |= {f"identities {one.name.lower().replace('_', ' ')}": int(outcomes[one]) for one in Outcome}
         return {"measurements used": self.used} | {name: count for name, count in others.items() if count}
@@ -180,22 +185,23 @@ class Estimator:
     @property
     def is_fusing(self) -> bool:
         """Whether some of what the last `tick` began to fuse was left to the next ones."""
-        return self._timeline.is_under_way
+        return self._timeline.is_busy
 
-    def tick(self, now_ns: int, *, fuse: bool = True, go_on: GoOn = lambda: True) -> Estimate:
+    def tick(self, now_ns: int, *, fuse: bool = True, has_budget: HasBudget = lambda: True) -> Estimate:
         """Use all that has arrived and give the poses at `now_ns`; measurements wait unless `fuse`.
 
-        Fusing stops where `go_on` says that there is no time for another step, and goes on at the next tick;
-        until it is done, odometry leads on from what was known before it began.
+        Fusing stops when `has_budget` returns False, and continues at the next tick. Until then poses are
+        predicted by odometry from the state before.
         """
         newest_ns = self._check_clock(now_ns)
         oldest_ns = newest_ns - self._horizon_ns
-        self._tracks.trim(oldest_ns, self._timeline.oldest_due_ns(oldest_ns) - 2 * self._reach_ns)
+        self._tracks.trim(oldest_ns, self._timeline.oldest_due_ns(oldest_ns) - 2 * self._lookback_ns)
         if self._odometry:
             self._use_odometry()
         if fuse:
-            self._timeline.advance(newest_ns, go_on)
-            self._brightness.forget_before(oldest_ns)
+            self._timeline.advance(newest_ns, has_budget)
+            for accumulator in self._converter.accumulators.values():
+                accumulator.forget_before(oldest_ns)
         return self._estimate(now_ns)
 
     def _check_clock(self, now_ns: int) -> int:

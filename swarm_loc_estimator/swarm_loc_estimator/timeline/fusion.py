@@ -20,7 +20,6 @@ from swarm_loc_estimator.filter.batch_update import (
     related_columns,
 )
 from swarm_loc_estimator.filter.belief import correct
-from swarm_loc_estimator.filter.calibration_states import ParameterTable
 from swarm_loc_estimator.filter.correlated_noise import at_first, record_constraint, record_pair
 from swarm_loc_estimator.filter.dense_filter import update_one
 from swarm_loc_estimator.filter.innovation import InnovationBatch, new_batch
@@ -42,9 +41,10 @@ from swarm_loc_estimator.identification.assignment import AMBIGUOUS
 from swarm_loc_estimator.initialization.initializer import Initializer
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.sensors.aerial import PictureFusion, as_fixes, relieve_seen
-from swarm_loc_estimator.sensors.messages import chosen
+from swarm_loc_estimator.sensors.sensor import chosen
+from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline.aerial_images import PictureFusion, as_fixes, relieve_seen
 from swarm_loc_estimator.timeline.configured_starts import ConfiguredStarts
 from swarm_loc_estimator.timeline.scheduling import middle_of_period
 from swarm_loc_estimator.timeline.settings import Settings
@@ -135,7 +135,7 @@ class Fusion:
     ) -> None:
         """Fuse measurements that name their robots."""
         measured = measurements["command"] == Command.NONE
-        if state.filter.sequential:
+        if state.filter.is_dense:
             if self._period_ns and measurements.size >= self._policy.batch_from and measured.all():
                 self._fuse_together(state, measurements, verdicts, nis)
             else:
@@ -180,10 +180,10 @@ class Fusion:
             if reason == sequential_update.FINISHED:
                 return
             if reason == sequential_update.LOST:
-                state.lose(robot)
+                state.deinitialize(robot)
                 continue
             if reason == sequential_update.CONTRADICTED:
-                self._open(state, robot, int(measurements["stamp_ns"][k]))
+                self._augment(state, robot, int(measurements["stamp_ns"][k]))
                 continue
             one = measurements[k : k + 1]
             if one["command"][0] != Command.NONE:
@@ -211,17 +211,17 @@ class Fusion:
         batch, lost = self._predict(state, fields, int(one["stamp_ns"][0]))
         if lost.any():
             return Verdict.OPEN
-        belief, passed = state.arrays(), batch.passed
+        belief, accepted = state.arrays(), batch.accepted
         evaluate_by_records(one, self._tracks.arrays, belief, state.filter, batch)
         nis[:] = batch.nis
-        gone = confirm_all(fields, belief, passed)
-        if passed[0]:
+        gone = confirm_all(fields, belief, accepted)
+        if accepted[0]:
             evaluated = batch.columns[0], batch.jacobian[0], batch.innovation[0], batch.noise[0]
             correct(belief, update_one(belief.covariance, *evaluated))
-        gone |= count_all_gated(fields, belief, passed, self._limits)
+        gone |= count_all_gated(fields, belief, accepted, self._limits)
         for robot in np.flatnonzero(gone).tolist():
-            state.lose(robot)
-        return Verdict.USED if passed[0] else Verdict.GATED
+            state.deinitialize(robot)
+        return Verdict.USED if accepted[0] else Verdict.GATED
 
     def _fuse_together(
         self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
@@ -280,7 +280,7 @@ class Fusion:
         batch, lost = new_batch(fields.stamp_ns.size), np.zeros(state.tracked.size + 1, dtype=bool)
         predict_all(fields, stamp_ns, self._tracks.arrays, state.arrays(), self._limits, batch, lost[:-1])
         for robot in np.flatnonzero(lost):
-            state.lose(int(robot))
+            state.deinitialize(int(robot))
         return batch, lost
 
     def _update(
@@ -294,30 +294,30 @@ class Fusion:
             fields: (m,) the same as columns.
             batch: (m,) with poses and motion.
         """
-        belief, passed, newest_ns = state.arrays(), batch.passed, int(fields.stamp_ns[-1])
-        state.filter.relate_pairs(
-            related_columns(fields, belief), self._robots(state, newest_ns), batch.across
+        belief, accepted, newest_ns = state.arrays(), batch.accepted, int(fields.stamp_ns[-1])
+        state.filter.prepare_update(
+            related_columns(fields, belief), self._robots(state, newest_ns), batch.cross_covariance
         )
         evaluate_all(fields, belief, batch)
         evaluate_by_records(rows, self._tracks.arrays, belief, state.filter, batch)
         looks = (batch.distance, batch.whitened, batch.cause)
-        contradicted = assess_all(fields, belief, self._limits, looks, passed)
-        lost = confirm_all(fields, belief, passed)
+        contradicted = assess_all(fields, belief, self._limits, looks, accepted)
+        lost = confirm_all(fields, belief, accepted)
         systematic = (fields.systematic_share > 0.0).any(axis=1)
-        for k in np.flatnonzero(passed & systematic).tolist():
+        for k in np.flatnonzero(accepted & systematic).tolist():
             record_pair(fields, k, belief, batch.pair[k])
-        if passed.any():
-            used = slice(None) if passed.all() else passed
+        if accepted.any():
+            used = slice(None) if accepted.all() else accepted
             evaluated = (batch.jacobian[used], batch.innovation[used], batch.noise[used])
             correction = state.filter.update(batch.columns[used], *evaluated)
             belief = state.arrays()  # the filter may have new ones
             correct(belief, correction)
-        lost |= count_all_gated(fields, belief, passed, self._limits)
+        lost |= count_all_gated(fields, belief, accepted, self._limits)
         for robot in np.flatnonzero(lost):
-            state.lose(int(robot))
+            state.deinitialize(int(robot))
         for source in np.flatnonzero(contradicted).tolist():
-            self._open(state, source, newest_ns)
-        return np.where(passed, Verdict.USED, Verdict.GATED).astype(np.uint8), batch.nis
+            self._augment(state, source, newest_ns)
+        return np.where(accepted, Verdict.USED, Verdict.GATED).astype(np.uint8), batch.nis
 
     def _robots(self, state: SwarmState, stamp_ns: int) -> Robots:
         """Where all robots are at an instant."""
@@ -339,27 +339,31 @@ class Fusion:
             record_constraint(MeasurementColumns.of(one), 0, state.arrays(), tracks)
         return Verdict.CONSTRAINT
 
-    def _open(self, state: SwarmState, source: int, stamp_ns: int) -> None:
+    def _augment(self, state: SwarmState, source: int, stamp_ns: int) -> None:
         """Estimate what a contradicted robot or landmark was described by, or locate the robot anew."""
         robots = state.tracked.size
         if source < robots and is_elsewhere(state.integrity, source):
-            state.lose(source)
+            state.deinitialize(source)
             return
         poses = self._poses(state, stamp_ns)
         state.contradicted_ns[source] = stamp_ns
         lately = np.sum(state.contradicted_ns > stamp_ns - _CONTRADICTED_WITHIN_NS)
-        if lately < _CONTRADICTED_DESCRIPTION or state.all_opened or robots > self._policy.reopen_all_up_to:
-            state.open(source, poses[min(source, robots - 1)])
+        if (
+            lately < _CONTRADICTED_DESCRIPTION
+            or state.all_augmented
+            or robots > self._policy.reopen_all_up_to
+        ):
+            state.augment(source, poses[min(source, robots - 1)])
         else:
-            state.open_all(poses)
+            state.augment_all(poses)
 
     def _apply_command(self, state: SwarmState, command: MeasurementArray) -> Verdict:
         """Set the pose of a robot or forget it, as the command (1,) says."""
         robot, stamp_ns = int(command["target"][0]), int(command["stamp_ns"][0])
         if command["command"][0] == Command.FORGET:
-            state.lose(robot)
+            state.deinitialize(robot)
             return Verdict.USED
-        if not self._tracks.begun(robot, stamp_ns):
+        if not self._tracks.has_started(robot, stamp_ns):
             return Verdict.NOT_LOCALIZED
         track = self._tracks.at(command["target"], command["stamp_ns"])
         pose, covariance = command["value"][0], command["covariance"][0]

@@ -8,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.filter.calibration_states import (
+from swarm_loc_estimator.filter.integrity.noise_inflation import with_hidden_noise
+from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.swarm.calibration_states import (
     CAMERA_SCALE,
     CAMERA_YAW,
     DISTANCE_SCALE,
@@ -16,8 +18,6 @@ from swarm_loc_estimator.filter.calibration_states import (
     TURN_SCALE,
     ParameterTable,
 )
-from swarm_loc_estimator.filter.integrity.noise_inflation import with_hidden_noise
-from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 
 

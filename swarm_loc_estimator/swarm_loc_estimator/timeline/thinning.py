@@ -14,13 +14,15 @@ many. There all sightings of some periods are used and none of the others: perio
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import IntArray
-from swarm_loc_estimator.sensors.messages import AerialRows, BrightnessRows, RawInputs, chosen
+from swarm_loc_estimator.sensors.registry import SENSORS, Batch
+from swarm_loc_estimator.sensors.sensor import Sensor, chosen
 from swarm_loc_estimator.timeline.scheduling import end_of_period
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
@@ -30,14 +32,8 @@ _SILVER = np.uint64(0x6A09E667F3BCC909)
 
 _WHOLE = 2.0**64
 
-_REASONS = {
-    "detections": "shed_detections",
-    "brightness": "shed_brightness",
-    "fixes": "shed_fixes",
-    "aerial": "shed_aerial",
-}
-"""Kinds of input, and the reason that a drop is counted by."""
-SHED_REASONS = frozenset(_REASONS.values())
+SHED_REASONS = frozenset(f"shed_{sensor.name}" for sensor in SENSORS.values() if sensor.unit is not None)
+"""Why readings are left out, by sensor."""
 
 
 class Thinned(NamedTuple):
@@ -49,7 +45,7 @@ class Thinned(NamedTuple):
         shed: How many of them were left out.
     """
 
-    messages: RawInputs
+    messages: Batch
     measurements: int
     shed: int
 
@@ -68,12 +64,13 @@ class Thinning:
     def __init__(self, robots: int, period_ns: int = 0) -> None:
         self._period_ns = period_ns
         self._sources_of_kind = robots + 1  # the last one is the swarm, whose number is -1
-        self._number = np.zeros(len(_REASONS) * self._sources_of_kind, dtype=np.uint64)
+        self._sensors = [sensor for sensor in SENSORS.values() if sensor.unit is not None]
+        self._number = np.zeros(len(self._sensors) * self._sources_of_kind, dtype=np.uint64)
         self._exchanges: dict[tuple[int, ...], bool] = {}
 
-    def thin(self, messages: RawInputs, share: float) -> Thinned:
+    def thin(self, messages: Batch, share: float) -> Thinned:
         """Use a share of all measurements, in (0, 1]."""
-        units = [_units(getattr(messages, kind)) for kind in _REASONS]
+        units = [_units(sensor, messages[sensor.name]) for sensor in self._sensors]
         sources = [
             k * self._sources_of_kind + one.robot % self._sources_of_kind for k, one in enumerate(units)
         ]
@@ -81,17 +78,17 @@ class Thinning:
             used = self._in_periods(np.concatenate([one.stamp_ns for one in units]), share)
         else:
             used = self._used(np.concatenate(sources), share)
-        rows: dict[str, Any] = {}
+        rows = dict(messages.rows)
         shed: dict[str, int] = {}
-        for kind, one, mine in zip(
-            _REASONS, units, np.split(used, np.cumsum([s.size for s in sources[:-1]])), strict=True
+        for sensor, one, mine in zip(
+            self._sensors, units, np.split(used, np.cumsum([s.size for s in sources[:-1]])), strict=True
         ):
             self._decide_as_before(one.exchange, mine)
             if not mine.all():
-                rows[kind] = chosen(getattr(messages, kind), mine[one.of_row])
-                shed[_REASONS[kind]] = int(np.sum(~mine))
-        dropped = {**messages.dropped, **shed}
-        return Thinned(messages._replace(dropped=dropped, **rows), used.size, sum(shed.values()))
+                rows[sensor.name] = chosen(messages[sensor.name], mine[one.of_row])
+                shed[f"shed_{sensor.name}"] = int(np.sum(~mine))
+        left = replace(messages, rows=rows, dropped={**messages.dropped, **shed})
+        return Thinned(left, used.size, sum(shed.values()))
 
     def _in_periods(self, stamp_ns: IntArray, share: float) -> NDArray[np.bool_]:
         """Whether to use measurements (u,) with stamps (u,) [ns]: those of some periods."""
@@ -148,15 +145,12 @@ class _Units(NamedTuple):
     exchange: Sequence[tuple[int, ...]] = ()
 
 
-def _units(rows: tuple[NDArray[Any], ...]) -> _Units:
-    """An infrared exchange, an aerial image, else a row."""
-    if isinstance(rows, BrightnessRows):
-        keys = np.column_stack([rows.robot, rows.stamp_ns, rows.transmitter])
-    elif isinstance(rows, AerialRows):
-        keys = np.column_stack([rows.robot, rows.stamp_ns])
-    else:
-        robot, stamp_ns = rows[:2]
-        return _Units(robot, stamp_ns, np.arange(robot.size))
+def _units(sensor: Sensor, rows: Any) -> _Units:
+    """What of a sensor's readings is used or left out together: those alike in `unit`, else each alone."""
+    if not sensor.unit:
+        return _Units(rows.robot, rows.stamp_ns, np.arange(rows.robot.size))
+    keys = np.column_stack([getattr(rows, name) for name in sensor.unit])
     found, of_row = np.unique(keys, axis=0, return_inverse=True)
-    exchanges = [tuple(key) for key in found.tolist()] if isinstance(rows, BrightnessRows) else []
-    return _Units(found[:, 0], found[:, 1], of_row.reshape(-1), exchanges)
+    exchanges = [tuple(key) for key in found.tolist()] if sensor.keeps_units else []
+    robot, stamp_ns = (found[:, sensor.unit.index(name)] for name in ("robot", "stamp_ns"))
+    return _Units(robot, stamp_ns, of_row.reshape(-1), exchanges)

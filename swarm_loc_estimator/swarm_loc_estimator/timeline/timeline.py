@@ -23,7 +23,7 @@ from swarm_loc_estimator.timeline.scheduling import end_of_period, middle_of_per
 from swarm_loc_estimator.timeline.settings import Settings
 
 Step = Callable[[SwarmState, MeasurementArray, NDArray[np.uint8], FloatArray], None]
-GoOn = Callable[[], bool]
+HasBudget = Callable[[], bool]
 """Whether there is time for another step."""
 
 _CHECKPOINTS = 40
@@ -46,29 +46,29 @@ class Timeline:
         settings: Horizon, and how stamps are grouped into steps.
         step: Fuses the measurements of one step into a state, see `Fusion.step`.
         state: Where to begin.
-        reach_ns: How far before its stamp late odometry may change what measurements meant, and they may
+        lookback_ns: How far before its stamp late odometry may change what measurements meant, and they may
             count; they are kept so much longer than the horizon.
 
     Attributes:
         state: The newest of which all is computed.
-        is_under_way: Whether steps are left to compute of what the last `advance` began.
+        is_busy: Whether steps are left to compute of what the last `advance` began.
     """
 
-    def __init__(self, settings: Settings, step: Step, state: SwarmState, reach_ns: int) -> None:
+    def __init__(self, settings: Settings, step: Step, state: SwarmState, lookback_ns: int) -> None:
         self._step = step
         self._horizon_ns = round(settings.horizon_s * 1e9)
         self._state_period_ns = round(settings.state_period_s * 1e9)
         self._fusion_period_ns = round(settings.fusion_period_s * 1e9)
         waits = self._fusion_period_ns and state.tracked.size >= settings.policy.delay_from
         self._fusion_delay_ns = round(settings.fusion_delay_s * 1e9) if waits else None
-        self._kept_ns = self._horizon_ns + reach_ns
+        self._kept_ns = self._horizon_ns + lookback_ns
         self._spacing_ns = self._kept_ns // _CHECKPOINTS
         self.restart(state)
 
     def restart(self, state: SwarmState) -> None:
         """Drop all measurements and go on from `state`."""
         self.state = self._ahead = state
-        self.is_under_way = False
+        self.is_busy = False
         self._head_key = _BEFORE_ALL
         self._checkpoints = [_Checkpoint(_BEFORE_ALL, state.copy())]
         self._new: list[MeasurementArray] = []
@@ -132,14 +132,13 @@ class Timeline:
         """How many measurements got each verdict since the start (len(Verdict),)."""
         return self.settled + np.bincount(self.verdicts, minlength=len(Verdict))
 
-    def advance(self, now_ns: int, go_on: GoOn = lambda: True) -> None:
+    def advance(self, now_ns: int, has_budget: HasBudget = lambda: True) -> None:
         """Compute all steps that new or changed data touch, and let go of what lies beyond the horizon.
 
-        A period of a large swarm waits for `fusion_delay_s` after its end, until most of it has come. Where
-        `go_on` says after a step that there is no time for another one, the rest is left to the next calls,
-        and what has come since waits until that is done.
+        A large swarm fuses a period `fusion_delay_s` after its end, when most of it has arrived. When
+        `has_budget` returns False after a step, the rest is left to the next calls; new data wait till then.
         """
-        if not self.is_under_way:
+        if not self.is_busy:
             if self._new:
                 self._merge(now_ns - self._horizon_ns)
             if self._withdrawn:
@@ -148,8 +147,8 @@ class Timeline:
                 self._go_back(self._key(self._redo_from_ns))
                 self._redo_from_ns = None
         due_ns = _AFTER_ALL if self._fusion_delay_ns is None else now_ns - self._fusion_delay_ns
-        self.is_under_way = not self._compute(due_ns, go_on)
-        if not self.is_under_way:
+        self.is_busy = not self._compute(due_ns, has_budget)
+        if not self.is_busy:
             self.state = self._ahead
             self._forget_before(self._key(self.oldest_due_ns(now_ns - self._kept_ns)))
 
@@ -206,7 +205,7 @@ class Timeline:
             self._head_key = self._checkpoints[-1].key
             self._ahead = self._checkpoints[-1].state.copy()
 
-    def _compute(self, due_ns: int, go_on: GoOn) -> bool:
+    def _compute(self, due_ns: int, has_budget: HasBudget) -> bool:
         """Do the steps that end until `due_ns`, as long as there is time; whether all of them are done."""
         buffer, begin = self._buffer, self._count_until(self._head_key)
         while begin < len(buffer):
@@ -220,7 +219,7 @@ class Timeline:
             if key - max(self._checkpoints[-1].key, -(2**62)) >= self._spacing_ns:
                 self._checkpoints.append(_Checkpoint(key, self._ahead.copy()))
             begin = end
-            if begin < len(buffer) and not go_on():
+            if begin < len(buffer) and not has_budget():
                 return False
         return True
 
@@ -264,10 +263,10 @@ def _first_touched(
     for k in range(np.searchsorted(stamps_ns, earliest_ns, side="right"), stamps_ns.size):
         if observers[k] < 0 and targets[k] < 0:
             return k
-        reach_ns = stamps_ns[k]
+        lookback_ns = stamps_ns[k]
         if period_ns:
-            reach_ns = max(reach_ns, middle_of_period(stamps_ns[k], period_ns))
+            lookback_ns = max(lookback_ns, middle_of_period(stamps_ns[k], period_ns))
         for robot in (observers[k], targets[k]):
-            if robot >= 0 and reach_ns > changed_from_ns[robot]:
+            if robot >= 0 and lookback_ns > changed_from_ns[robot]:
                 return k
     return stamps_ns.size

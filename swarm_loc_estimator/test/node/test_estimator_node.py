@@ -32,10 +32,10 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.health import Health
 from swarm_loc_estimator.nodes.estimator_diagnostics import TickCost
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
-from swarm_loc_estimator.sensors.messages import RawInputs
+from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.timeline.estimator import Estimate
 from swarm_loc_estimator.timeline.settings import Settings
-from swarm_loc_estimator.timeline.timeline import GoOn
+from swarm_loc_estimator.timeline.timeline import HasBudget
 from swarm_loc_msgs.msg import SwarmPose
 from swarm_loc_msgs.srv import SetRobotPose
 
@@ -284,11 +284,11 @@ class StandIn:
         self.note = ""
         self.settings = Settings()
 
-    def receive(self, messages: RawInputs) -> None:
+    def receive(self, messages: Batch) -> None:
         """Remember whose and when."""
-        assert not messages.detections.robot.size
+        assert not messages["detections"].robot.size
         assert not messages.dropped
-        rows = messages.odometry
+        rows = messages["odometry"]
         assert np.all(rows.arrival_ns >= rows.stamp_ns)
         self.odometry += zip(rows.robot.tolist(), rows.stamp_ns.tolist(), strict=True)
 
@@ -296,10 +296,10 @@ class StandIn:
         """Nothing may go missing."""
         assert not count, reason
 
-    def tick(self, now_ns: int, *, fuse: bool, go_on: GoOn) -> Estimate:
+    def tick(self, now_ns: int, *, fuse: bool, has_budget: HasBudget) -> Estimate:
         """Always the same."""
         assert fuse
-        assert go_on()
+        assert has_budget()
         poses = np.array([[1.0, 2.0, 0.5], [np.nan, np.nan, np.nan]])
         covariances = np.tile(np.eye(3), (2, 1, 1))
         return Estimate(now_ns, poses, covariances, poses, np.array([1, 0], np.uint8), np.array([0.25, -1.0]))

@@ -15,9 +15,9 @@ from nav_msgs.msg import Odometry
 from node_world import TRUE_POSES, Ros, detection_bytes, odometry_bytes, overrides, sight
 
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
-from swarm_loc_estimator.sensors.messages import RawInputs
+from swarm_loc_estimator.sensors.registry import Batch, Measurements
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
-from swarm_loc_estimator.timeline.timeline import GoOn
+from swarm_loc_estimator.timeline.timeline import HasBudget
 from swarm_loc_msgs.msg import MarkerDetectionArray, SwarmPose, SwarmPoses
 
 PERIOD_S = 0.05
@@ -35,19 +35,19 @@ class SlowEstimator(Estimator):
         self.odometry = 0
         self._waiting = 0
 
-    def receive(self, messages: RawInputs) -> None:
+    def convert(self, messages: Batch) -> Measurements:
         """Count what comes."""
-        self._waiting += messages.detections.robot.size
-        self.taken += np.bincount(messages.detections.robot, minlength=self.taken.size)
-        self.odometry += messages.odometry.robot.size
-        super().receive(messages)
+        self._waiting += messages["detections"].robot.size
+        self.taken += np.bincount(messages["detections"].robot, minlength=self.taken.size)
+        self.odometry += messages["odometry"].robot.size
+        return super().convert(messages)
 
-    def tick(self, now_ns: int, *, fuse: bool = True, go_on: GoOn = lambda: True) -> Estimate:
+    def tick(self, now_ns: int, *, fuse: bool = True, has_budget: HasBudget = lambda: True) -> Estimate:
         """Fuse slowly."""
         if fuse:
             time.sleep(self.cost_s * self._waiting)
             self._waiting = 0
-        return super().tick(now_ns, fuse=fuse, go_on=go_on)
+        return super().tick(now_ns, fuse=fuse, has_budget=has_budget)
 
 
 @contextmanager

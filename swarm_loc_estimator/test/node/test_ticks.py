@@ -52,7 +52,7 @@ def test_what_comes_with_a_time_that_waits_to_be_handled_is_not_of_the_future(
     due_ns = robots.run(T0_NS, 4) + STEP_NS
     later_ns = due_ns + SECOND
 
-    def go_on(_jump: object) -> None:
+    def has_budget(_jump: object) -> None:
         """Between the time that makes a tick due and the tick, time and robots go on."""
         if node.get_clock().now().nanoseconds == due_ns:
             robots.tell_time(later_ns)
@@ -61,7 +61,7 @@ def test_what_comes_with_a_time_that_waits_to_be_handled_is_not_of_the_future(
             robots.wait_until_told()
             robots.wait_until_received()
 
-    jumps = node.get_clock().create_jump_callback(_EACH_CHANGE, post_callback=go_on)
+    jumps = node.get_clock().create_jump_callback(_EACH_CHANGE, post_callback=has_budget)
     robots.tell_time(due_ns)
     ros.until(lambda: stamp_ns(robots.poses[-1]) == later_ns)
     jumps.unregister()

@@ -15,7 +15,8 @@ from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.offline.calibration.recording import Recording
-from swarm_loc_estimator.sensors.messages import DetectionRows, OdometryRows
+from swarm_loc_estimator.sensors.camera import DetectionRows
+from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, Swarm
 
 SECOND = 1_000_000_000

@@ -5,19 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, DETECTION_DTYPE
-from swarm_loc_estimator.sensors.messages import (
-    AerialRows,
-    DetectionRows,
-    FixRows,
-    OdometryRows,
-    RawInputs,
-)
+from swarm_loc_estimator.sensors.aerial import AerialRows
+from swarm_loc_estimator.sensors.camera import DetectionRows
+from swarm_loc_estimator.sensors.fix import FixRows
+from swarm_loc_estimator.sensors.odometry import OdometryRows
+from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.timeline.estimator import Estimator
 
 SECOND = 10**9
@@ -68,7 +67,7 @@ def give_fix(
         covariance=np.array([covariance], dtype=float),
         arrival_ns=np.array([now_ns]),
     )
-    estimator.receive(RawInputs(now_ns, now_ns, fixes=fix))
+    estimator.receive(Batch.of(now_ns, now_ns, fixes=fix))
 
 
 @dataclass(frozen=True)
@@ -90,20 +89,19 @@ def give(estimator: Estimator, arrivals: Sequence[tuple[int, Event]]) -> None:
     """Hand in messages (arrival, event) in order of their arrivals, as a node does at a tick."""
     moved = [(e.robot, e.stamp_ns, now_ns, e.pose) for now_ns, e in arrivals if e.pose is not None]
     seen = [(e.robot, e.stamp_ns, now_ns) for now_ns, e in arrivals for _ in range(e.detections.size)]
-    messages = RawInputs(arrivals[0][0], arrivals[-1][0])
+    rows: dict[str, Any] = {}
     if moved:
         *columns, poses = zip(*moved, strict=True)
         robot, stamp_ns, arrival_ns = np.array(columns, dtype=np.int64)
-        odometry = OdometryRows(robot, stamp_ns, np.array(poses, dtype=float), arrival_ns)
-        messages = messages._replace(odometry=odometry)
+        rows["odometry"] = OdometryRows(robot, stamp_ns, np.array(poses, dtype=float), arrival_ns)
     if seen:
         robot, stamp_ns, arrival_ns = np.array(list(zip(*seen, strict=True)), dtype=np.int64)
         detections = joined([event.detections for _, event in arrivals])
-        messages = messages._replace(detections=DetectionRows(robot, stamp_ns, detections, arrival_ns))
+        rows["detections"] = DetectionRows(robot, stamp_ns, detections, arrival_ns)
     images = [(now_ns, event) for now_ns, event in arrivals if event.aerial.size]
     if images:
-        messages = messages._replace(aerial=_aerial_rows(images))
-    estimator.receive(messages)
+        rows["aerial"] = _aerial_rows(images)
+    estimator.receive(Batch(arrivals[0][0], arrivals[-1][0], rows))
 
 
 def _aerial_rows(images: Sequence[tuple[int, Event]]) -> AerialRows:

@@ -9,7 +9,7 @@ from core_world import World
 
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.fusion import Verdict
-from swarm_loc_estimator.timeline.timeline import GoOn
+from swarm_loc_estimator.timeline.timeline import HasBudget
 
 
 def play(
@@ -17,7 +17,7 @@ def play(
     events: Iterable[tuple[int, Event]],
     ticks_ns: Iterable[int],
     resting_ns: Container[int] = (),
-    go_on: GoOn = lambda: True,
+    has_budget: HasBudget = lambda: True,
 ) -> list[Estimate]:
     """Hand in events (arrival, event) as they arrive, and tick, not fusing at some; return all estimates."""
     waiting = sorted(events, key=lambda pair: pair[0])
@@ -28,7 +28,7 @@ def play(
             k += 1
         if k > begin:
             give(estimator, waiting[begin:k])
-        estimates.append(estimator.tick(now_ns, fuse=now_ns not in resting_ns, go_on=go_on))
+        estimates.append(estimator.tick(now_ns, fuse=now_ns not in resting_ns, has_budget=has_budget))
     return estimates
 
 

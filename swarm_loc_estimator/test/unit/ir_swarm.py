@@ -15,8 +15,11 @@ from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.detections import encode_brightness
 from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometry
 from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.sensors.messages import BrightnessRows, FixRows, OdometryRows, RawInputs
-from swarm_loc_estimator.sensors.topics import InputKind
+from swarm_loc_estimator.sensors.fix import FixRows
+from swarm_loc_estimator.sensors.infrared import BrightnessRows
+from swarm_loc_estimator.sensors.odometry import OdometryRows
+from swarm_loc_estimator.sensors.registry import Batch, kinds
+from swarm_loc_estimator.sensors.sensor import InputKind
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, StartSigma, Swarm
@@ -42,6 +45,8 @@ WALK = OdometryModel(
     turn_rate_change=0.02,
 )
 """Of a robot that walks as it is told to, more or less."""
+
+KINDS = kinds()
 
 
 @dataclass(frozen=True)
@@ -204,12 +209,12 @@ def exchange(
     ]
 
 
-def messages(events: Sequence[Event], arrivals_ns: Sequence[int]) -> RawInputs:
+def messages(events: Sequence[Event], arrivals_ns: Sequence[int]) -> Batch:
     """Events as messages that arrived at some instants, not decreasing."""
     pairs = list(zip(events, arrivals_ns, strict=True))
     moves = [(e, at) for e, at in pairs if isinstance(e, Move)]
     places = [(e, at) for e, at in pairs if isinstance(e, Place)]
-    return RawInputs(
+    return Batch.of(
         arrivals_ns[0],
         arrivals_ns[-1],
         odometry=OdometryRows(
@@ -279,7 +284,7 @@ def write_bag(run: Run, folder: Path, arrivals: Sequence[tuple[int, Event]]) -> 
     """A bag of messages with their arrivals, its swarm description beside them."""
     with BagWriter(folder) as writer:
         for robot in run.swarm.robots:
-            for kind in (InputKind.ODOMETRY, InputKind.BRIGHTNESS, InputKind.FIXES):
+            for kind in (KINDS["odometry"], KINDS["brightness"], KINDS["fixes"]):
                 writer.add_topic(f"{robot.name}/{kind.topic}", kind.message_type)
         for log_ns, event in sorted(arrivals, key=lambda pair: pair[0]):
             kind, data = encoded(event, run.swarm.robots[event.robot].name)
@@ -294,9 +299,9 @@ def encoded(event: Event, name: str) -> tuple[InputKind, bytes]:
         unknown, frames = np.zeros((6, 6)), (f"{name}/odom", f"{name}/base_link")
         stamp_ns, still = column([event.stamp_ns]), np.zeros((1, 3))
         data = encode_odometry(*frames, stamp_ns, event.pose[None], still, unknown, unknown)
-        return InputKind.ODOMETRY, data[0]
+        return KINDS["odometry"], data[0]
     if isinstance(event, Place):
-        return InputKind.FIXES, encode_fix("map", event.stamp_ns, event.pose, np.diag(FIX_SIGMA**2))
+        return KINDS["fixes"], encode_fix("map", event.stamp_ns, event.pose, np.diag(FIX_SIGMA**2))
     pair = (event.robot + 1, event.transmitter + 1)
     frame = f"{name}/base_link"
-    return InputKind.BRIGHTNESS, encode_brightness(frame, event.stamp_ns, pair, event.readings, event.power)
+    return KINDS["brightness"], encode_brightness(frame, event.stamp_ns, pair, event.readings, event.power)

@@ -20,9 +20,9 @@ from swarm_loc_estimator.common.messages.detections import (
     encode_identities,
 )
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.sensors.channels import MAX_ANONYMOUS
+from swarm_loc_estimator.sensors.aerial import MAX_ANONYMOUS
 from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.messages import RawInputs
+from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 NAMES = st.sampled_from(["", "a", "map", "ab/base_link", "r\u00f6"])
@@ -37,7 +37,7 @@ def detections(count: int, seed: int = 1) -> NDArray[np.void]:
     return out
 
 
-def read(*messages: tuple[bytes, int]) -> tuple[RawInputs, Ingest]:
+def read(*messages: tuple[bytes, int]) -> tuple[Batch, Ingest]:
     ingest = Ingest(Swarm((Robot("a"), Robot("b"))))
     handle = ingest.handle_of["aerial/detections"]
     (found,) = ingest.read(MessageBatch.of([(handle, data, at) for data, at in messages]))
@@ -82,7 +82,7 @@ def test_images_become_rows_and_those_that_cannot_be_used_are_counted() -> None:
         (encode_anonymous("map", 5, detections(1, 2)), 15),
     ]
     found, ingest = read(*images)
-    rows = found.aerial
+    rows = found["aerial"]
     assert rows.stamp_ns.tolist() == [1, 1, 5]
     assert rows.number.tolist() == [0, 1, 0]
     assert rows.arrival_ns.tolist() == [10, 10, 15]

@@ -165,7 +165,7 @@ def test_fusing_a_few_steps_at_each_tick_gives_the_same(
     arrivals = [(event.stamp_ns + int(rng.uniform(0, late_s) * SECOND), event) for event in world.events]
     at_ns = ticks(T0, T0 + 6 * SECOND, 0.09)
     in_parts = Estimator(world.swarm, chosen)
-    estimates = play(in_parts, arrivals, at_ns, go_on=lambda: bool(rng.uniform() < part))
+    estimates = play(in_parts, arrivals, at_ns, has_budget=lambda: bool(rng.uniform() < part))
     assert all(np.isfinite(one.poses[one.status != Status.WAITING]).all() for one in estimates)
     for _ in range(2):  # what was begun, then what has come since
         last = in_parts.tick(at_ns[-1])
@@ -181,10 +181,10 @@ def test_poses_are_given_while_fusing_takes_several_ticks() -> None:
     late = [sighting(world, t, 0.1 * t) for t in (0.31, 0.51, 0.71, 0.91)]
     arrivals = [(T0 + SECOND + 1, event) for event in late]
     before = estimator.tick(T0 + SECOND).covariances
-    (estimate,), ticked = play(estimator, arrivals, [T0 + SECOND + 1], go_on=lambda: False), 1
+    (estimate,), ticked = play(estimator, arrivals, [T0 + SECOND + 1], has_budget=lambda: False), 1
     while estimator.is_fusing:
         np.testing.assert_allclose(estimate.covariances, before, rtol=1e-6)
-        estimate, ticked = estimator.tick(T0 + SECOND + 1, go_on=lambda: False), ticked + 1
+        estimate, ticked = estimator.tick(T0 + SECOND + 1, has_budget=lambda: False), ticked + 1
     assert ticked > 2
     assert np.trace(estimate.covariances[0, :2, :2]) < 0.999 * np.trace(before[0, :2, :2])
 

@@ -17,7 +17,7 @@ from swarm_loc_estimator.common.messages.detections import decode_brightness, en
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.messages.poses import decode_fix, encode_fix, encode_odometry
 from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.messages import RawInputs
+from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
 
@@ -34,7 +34,7 @@ def big_endian(data: bytes, message_type: str) -> bytes:
     return bytes(store.serialize_cdr(message, message_type, little_endian=False))
 
 
-def read(*messages: tuple[str, bytes, int]) -> tuple[RawInputs, Ingest]:
+def read(*messages: tuple[str, bytes, int]) -> tuple[Batch, Ingest]:
     """Messages by topic and arrival."""
     ingest = Ingest(SWARM)
     batch = MessageBatch.of([(ingest.handle_of[topic], data, at) for topic, data, at in messages])
@@ -111,15 +111,15 @@ def test_every_kind_of_input_comes_in_columns_of_its_own() -> None:
         ("b/brightness", matrices[1], T0 + 14),
         ("b/fix", encode_fix("odom", T0 + 5, (1.0, 2.0, 3.0), COVARIANCE), T0 + 15),
     )
-    assert found.odometry.robot.tolist() == [0]
-    rows = found.brightness
+    assert found["odometry"].robot.tolist() == [0]
+    rows = found["brightness"]
     assert [rows.robot.tolist(), rows.arrival_ns.tolist()] == [[0, 1], [T0 + 10, T0 + 14]]
     assert [rows.stamp_ns.tolist(), rows.receiver.tolist()] == [[T0 + 2, T0 + 3], [3, 3]]
     assert [rows.transmitter.tolist(), rows.n.tolist(), rows.power.tolist()] == [[4, 4], [2, 3], [2, 3]]
     assert rows.saturation.tolist() == [9, 9]
     assert [readings.tolist() for readings in rows.readings] == [[2] * 4, [3] * 9]
-    assert [found.fixes.robot.tolist(), found.fixes.stamp_ns.tolist()] == [[1], [T0 + 5]]
-    np.testing.assert_allclose(found.fixes.pose, [[1.0, 2.0, 3.0]])
+    assert [found["fixes"].robot.tolist(), found["fixes"].stamp_ns.tolist()] == [[1], [T0 + 5]]
+    np.testing.assert_allclose(found["fixes"].pose, [[1.0, 2.0, 3.0]])
     assert found.dropped == {"bad_message": 1, "fix_frame": 1}
     assert ingest.frame_id(ingest.handle_of["b/fix"]) == "odom"
     assert ingest.statistics[ingest.handle_of["b/brightness"]].malformed == 1
@@ -133,7 +133,7 @@ def test_every_kind_of_input_comes_in_columns_of_its_own() -> None:
 def test_the_variance_of_its_heading_says_whether_a_fix_has_one(variance: float, measured: bool) -> None:
     data = encode_fix("map", T0, (1.0, 2.0, 3.0), np.diag([1e-4, 1e-4, variance]))
     found, _ = read(("b/fix", data, T0))
-    assert math.isfinite(found.fixes.pose[0, 2]) == measured
+    assert math.isfinite(found["fixes"].pose[0, 2]) == measured
 
 
 def test_fixes_locate_robots_that_stand_and_robots_that_drive() -> None:

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.calibration_states import ParameterTable
 from swarm_loc_estimator.filter.correlated_noise import (
     PAIR_ROWS,
     record_constraint,
@@ -28,6 +27,7 @@ from swarm_loc_estimator.filter.measurement_model import (
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.odometry.look_up import new_sample
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.ir_board import RobotIr
 from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
@@ -263,7 +263,7 @@ def test_a_pair_is_forgotten_when_either_robot_is_lost_or_others_take_its_place(
     for lost in (0, 1):
         state = pairs()
         used(state, Exchange(1.0), SURE)
-        state.lose(lost)
+        state.deinitialize(lost)
         np.testing.assert_allclose(noise_of(state, Exchange(1.0), SURE), new)
     state = pairs(places=2)
     for transmitter, stamp_ns in ((1, 1), (2, 2), (3, 3)):

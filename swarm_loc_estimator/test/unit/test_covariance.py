@@ -124,7 +124,7 @@ def test_placing_makes_columns_independent() -> None:
     dense.covariance = covariance(rng, 9)
     before = dense.copy().covariance
     block = covariance(rng, 3)
-    dense.place(np.arange(3, 6), block)
+    dense.set_prior(np.arange(3, 6), block)
     np.testing.assert_array_equal(dense.covariance[3:6, 3:6], block)
     assert not dense.covariance[3:6, :3].any()
     assert not dense.covariance[6:, 3:6].any()

@@ -8,10 +8,10 @@ from core_messages import SECOND, T0
 from core_run import play, ticks
 from core_world import Plan, simulate
 
-from swarm_loc_estimator.filter.calibration_states import ParameterTable
 from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.filter.state import SwarmState
-from swarm_loc_estimator.sensors.validation import about_robots
+from swarm_loc_estimator.sensors.fix import about_robots
+from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.swarm import Robot
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Settings
@@ -37,7 +37,7 @@ def test_what_is_to_be_fused_again_is_not_forgotten_while_fusing_takes_several_t
     timeline.invalidate(np.array([T0]))
     for k in range(10):
         timeline.advance(int(stamp_ns[-1]) + k * SECOND, lambda: False)
-    assert not timeline.is_under_way
+    assert not timeline.is_busy
     assert stepped == 2 * stamp_ns.tolist()
 
 
@@ -56,7 +56,7 @@ def test_odometry_is_there_for_all_that_is_left_to_fuse_however_long_that_takes(
         estimator = Estimator(world.swarm, chosen)
         play(estimator, [one for one in arrivals if one[0] < begin_ns], before)
         left = [one for one in arrivals if one[0] >= begin_ns]
-        return estimator, play(estimator, left, after, go_on=lambda: at_once)[-1]
+        return estimator, play(estimator, left, after, has_budget=lambda: at_once)[-1]
 
     (whole, at_once), (in_parts, last) = run(at_once=True), run(at_once=False)
     assert not in_parts.is_fusing

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from core_messages import SECOND, T0, give_fix
 
-from swarm_loc_estimator.filter.calibration_states import ParameterTable
 from swarm_loc_estimator.filter.integrity.divergence import LossLimits, count_gated
 from swarm_loc_estimator.filter.integrity.fault_detection import is_contradicted
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, NOBODY, MeasurementColumns
 from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.swarm import RandomWalk, Robot, Swarm
 from swarm_loc_estimator.timeline.contradictions import Contradicted
 from swarm_loc_estimator.timeline.estimator import Estimator, Status

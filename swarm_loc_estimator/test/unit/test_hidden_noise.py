@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.filter.calibration_states import ParameterTable
 from swarm_loc_estimator.filter.integrity.noise_inflation import (
     MAX_UNITS,
     add_hidden_noise,
@@ -21,6 +20,7 @@ from swarm_loc_estimator.filter.measurement_model import (
     MeasurementColumns,
 )
 from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, SensorModel
 
 ROBOTS = (Robot("one", camera=CameraMount()), Robot("two", camera=CameraMount()))

@@ -14,8 +14,8 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.infrared.solution import IrOutcome, IrSolutions
 from swarm_loc_estimator.sensors import infrared as brightness_sightings
-from swarm_loc_estimator.sensors.infrared import BrightnessConverter
-from swarm_loc_estimator.sensors.messages import BrightnessRows, chosen
+from swarm_loc_estimator.sensors.infrared import BrightnessConverter, BrightnessRows
+from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.ir_board import IrMethod, IrPlatform, PairGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 

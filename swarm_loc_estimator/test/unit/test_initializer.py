@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.belief import BeliefArrays
-from swarm_loc_estimator.filter.calibration_states import ParameterTable
 from swarm_loc_estimator.filter.measurement_model import (
     MEASUREMENT_DTYPE,
     NOBODY,
@@ -34,6 +33,7 @@ from swarm_loc_estimator.initialization.constraints import (
 )
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot
 
 SEEDS = st.integers(0, 10**6)

@@ -16,7 +16,7 @@ from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementColumn
 from swarm_loc_estimator.filter.state import InitialPose
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.sensors.validation import about_robots
+from swarm_loc_estimator.sensors.fix import about_robots
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.fusion import Fusion

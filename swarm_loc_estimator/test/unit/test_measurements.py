@@ -15,8 +15,8 @@ from swarm_loc_estimator.filter.measurement_model import (
     Kind,
     MeasurementArray,
     MeasurementColumns,
-    innovation,
     predict,
+    write_innovation,
 )
 
 WHO = {"landmark": (0, NOBODY), "surveyed": (0, NOBODY), "robot": (0, 1), "fix": (NOBODY, 1)}
@@ -202,7 +202,7 @@ def test_innovations_wrap_angles_and_leave_out_headings_not_measured(
 ) -> None:
     one = measurement("landmark", kind, np.zeros(3), np.zeros(3), has_heading)
     out = np.empty(3)
-    innovation(MeasurementColumns.of(one), 0, np.array(measured), np.array(predicted_value), out)
+    write_innovation(MeasurementColumns.of(one), 0, np.array(measured), np.array(predicted_value), out)
     np.testing.assert_allclose(out, expected, atol=1e-12)
 
 

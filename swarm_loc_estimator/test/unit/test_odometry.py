@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.calibration_states import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
 from swarm_loc_estimator.odometry.look_up import OdometrySample, look_up_pose
 from swarm_loc_estimator.odometry.tracks import OdometryTracks, TrackChange
+from swarm_loc_estimator.swarm.calibration_states import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
 from swarm_loc_estimator.swarm.swarm import OdometryModel, RandomWalk, Robot
 
 PLAIN = OdometryModel(wheel_separation=0.1, wheel_noise=1e-4)
@@ -143,8 +143,8 @@ def test_a_step_sideways_is_calibrated_like_one_ahead(course: float) -> None:
 
 def test_a_robot_without_odometry_stands_for_ever() -> None:
     track = OdometryTracks([Robot("still", stands=True), Robot("silent")])
-    assert track.begun(0, T0)
-    assert not track.begun(1, T0)
+    assert track.has_started(0, T0)
+    assert not track.has_started(1, T0)
     sample = track.at(np.array([0, 1]), np.array([T0, T0]))
     assert not sample.pose[0].any()
     assert not sample.covariance[0].any()
@@ -154,8 +154,8 @@ def test_a_robot_without_odometry_stands_for_ever() -> None:
 
 def test_a_robot_without_odometry_may_walk_at_random() -> None:
     track = OdometryTracks([Robot("still", stands=True), Robot("odd", stands=True, random_walk=WALK)])
-    assert track.begun(1, T0)
-    assert [track.walks(robot) for robot in (0, 1)] == [False, True]
+    assert track.has_started(1, T0)
+    assert [track.is_random_walk(robot) for robot in (0, 1)] == [False, True]
     stamps = np.array([T0, T0 + 3_000_000_000])
     sample = track.at(np.array([1, 1]), stamps)
     assert not sample.pose.any()
@@ -321,11 +321,11 @@ def test_calibration_scales_and_delays_the_motion() -> None:
 
 def test_a_track_begins_with_its_earliest_row_even_when_that_comes_late() -> None:
     track = tracks()
-    assert not track.begun(0, T0 + SECOND)
+    assert not track.has_started(0, T0 + SECOND)
     feed(track, np.array([T0 + STEP_NS]), np.array([[0.01, 0.0, 0.0]]))
-    assert not track.begun(0, T0)
+    assert not track.has_started(0, T0)
     feed(track, np.array([T0]), np.array([[0.004, 0.0, 0.0]]))
-    assert track.begun(0, T0)
+    assert track.has_started(0, T0)
     np.testing.assert_allclose(track.arrays.begin_pose[0], [0.004, 0.0, 0.0])
     np.testing.assert_allclose(look(track, T0 - SECOND).pose[0], [0.004, 0.0, 0.0])
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import struct
+from collections import Counter
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -13,8 +16,9 @@ from core_world import Plan, World, simulate
 from scipy.stats import chi2
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter import measurement_model
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.streams import EachReader, MessageColumns
 from swarm_loc_estimator.filter.measurement_model import (
     MEASUREMENT_DTYPE,
     MODELS,
@@ -22,7 +26,20 @@ from swarm_loc_estimator.filter.measurement_model import (
     MeasurementArray,
     MeasurementModel,
     Prediction,
+    register,
 )
+from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.registry import SENSORS
+from swarm_loc_estimator.sensors.sensor import (
+    NO_ROWS,
+    Converter,
+    InputKind,
+    Known,
+    Measured,
+    Sensor,
+    SensorSettings,
+)
+from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.scheduling import Policy
 from swarm_loc_estimator.timeline.settings import Settings
@@ -39,30 +56,79 @@ def predict_range(one: MeasurementArray, observer: FloatArray, target: FloatArra
 
 
 RANGE = MeasurementModel("range", 100, 1, predict_range, lambda one, value: one["value"][0, :1] - value)
+LAYOUT = struct.Struct("<qqd")
 
 
-def ranges(world: World, seed: int, outliers: float = 0.0) -> MeasurementArray:
-    """Ranges (m,) of all robots to two anchors and to the next robot, five times a second."""
-    rng, rows = np.random.default_rng([seed, 9]), []
+class Range(NamedTuple):
+    """A message: a distance to a robot, or to anchor a as -1 - a."""
+
+    stamp_ns: int
+    target: int
+    distance: float
+    frame_id: str = ""
+
+
+class RangeRows(NamedTuple):
+    """Ranges (k,) in columns."""
+
+    robot: IntArray
+    stamp_ns: IntArray
+    target: IntArray
+    distance: FloatArray
+    arrival_ns: IntArray
+
+
+def columns(
+    found: MessageColumns[Range], batch: MessageBatch, robot: IntArray, _known: Known
+) -> tuple[RangeRows, dict[str, int]]:
+    target, distance = np.array([(one.target, one.distance) for one in found.messages]).T
+    return RangeRows(robot, found.stamp_ns, target.astype(np.int64), distance, batch.log_ns), {}
+
+
+def create_converter(swarm: Swarm, _settings: SensorSettings, _drops: Counter[str]) -> Converter:
+    anchors = np.array([(mark.x, mark.y, 0.0) for mark in swarm.landmarks])
+
+    def convert(rows: RangeRows) -> Measured:
+        out, anchor = np.zeros(rows.robot.size, dtype=MEASUREMENT_DTYPE), -1 - rows.target
+        out["stamp_ns"], out["kind"], out["gate"] = rows.stamp_ns, RANGE.number, RANGE.gate(0.999)
+        out["observer"], out["target"] = rows.robot, np.maximum(rows.target, NOBODY)
+        out["landmark"] = np.maximum(anchor + 1, 0)
+        out["marker"] = np.where(rows.target[:, None] < 0, anchors[anchor], 0.0)
+        out["value"][:, 0], out["covariance"] = rows.distance, np.diag([SIGMA_M**2, 1.0, 1.0])
+        return Measured(out, rows.arrival_ns)
+
+    return convert
+
+
+RANGES = Sensor(
+    "ranges",
+    RangeRows(NO_ROWS, NO_ROWS, NO_ROWS, np.zeros(0), NO_ROWS),
+    (
+        InputKind(
+            "ranges",
+            "ranges",
+            "my_msgs/msg/Range",
+            lambda n, _: EachReader(n, lambda data: Range(*LAYOUT.unpack(data))),
+            columns,
+        ),
+    ),
+    create_converter,
+)
+
+
+def ranges(world: World, seed: int, outliers: float = 0.0) -> list[tuple[int, Range]]:
+    """Ranges of all robots to two anchors and to the next robot, five times a second."""
+    rng, found = np.random.default_rng([seed, 9]), []
     robots = len(world.swarm.robots)
+    places = {-1 - a: (world.swarm.landmarks[a].x, world.swarm.landmarks[a].y) for a in (0, 3)}
     for k in range(4, world.stamp_ns.size, 4):
         for robot in range(robots):
-            for anchor in (0, 3, None):
-                one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
-                one["stamp_ns"], one["kind"], one["gate"] = world.stamp_ns[k], RANGE.number, RANGE.gate(0.999)
-                one["observer"] = one["received_from"] = robot
-                one["target"], one["covariance"] = NOBODY, np.diag([SIGMA_M**2, 1.0, 1.0])
-                other = world.truth[k, (robot + 1) % robots]
-                if anchor is None:
-                    one["target"] = (robot + 1) % robots
-                else:
-                    mark = world.swarm.landmarks[anchor]
-                    one["landmark"], one["marker"] = anchor + 1, (mark.x, mark.y, 0.0)
-                    other = one["marker"][0]
-                distance = np.hypot(*(other - world.truth[k, robot])[:2]) + rng.normal(0.0, SIGMA_M)
-                one["value"][0, 0] = distance + (1.0 if rng.uniform() < outliers else 0.0)
-                rows.append(one)
-    return np.concatenate(rows)
+            for target in (-1, -4, (robot + 1) % robots):
+                there = places[target] if target < 0 else world.truth[k, target, :2]
+                distance = np.hypot(*(there - world.truth[k, robot, :2])) + rng.normal(0.0, SIGMA_M)
+                distance += 1.0 if rng.uniform() < outliers else 0.0
+                found.append((robot, Range(int(world.stamp_ns[k]), target, float(distance))))
+    return found
 
 
 IN_ORDER = Settings(fusion_period_s=0.0)
@@ -73,8 +139,8 @@ ALL = pytest.mark.parametrize("settings", [IN_ORDER, TOGETHER, SPARSE], ids=["or
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measurement_model, "MODELS", MODELS)
     monkeypatch.setitem(MODELS, RANGE.number, RANGE)
+    monkeypatch.setitem(SENSORS, RANGES.name, RANGES)
 
 
 def world_of(seed: int) -> World:
@@ -83,19 +149,26 @@ def world_of(seed: int) -> World:
 
 
 def run(
-    world: World, measured: MeasurementArray, settings: Settings, late_s: float = 0.0
+    world: World, measured: list[tuple[int, Range]], settings: Settings, late_s: float = 0.0
 ) -> tuple[Estimator, list[Estimate]]:
-    """A world with ranges that come late by up to so much, in any order."""
-    rng, estimator = np.random.default_rng(0), Estimator(world.swarm, settings)
-    arrivals_ns = measured["stamp_ns"] + (rng.uniform(0.0, late_s, measured.size) * SECOND).astype(np.int64)
-    order = np.argsort(arrivals_ns, kind="stable")
-    measured, arrivals_ns = measured[order], arrivals_ns[order]
+    """A world with ranges, all of which are late by up to so much."""
+    rng, estimator, ingest = np.random.default_rng(0), Estimator(world.swarm, settings), Ingest(world.swarm)
     events = [(e.stamp_ns + int(rng.uniform(0.0, late_s) * SECOND), e) for e in world.events]
-    estimates, begin_ns = [], T0
+    messages = [
+        (
+            ingest.handle_of[f"{world.swarm.robots[robot].name}/ranges"],
+            LAYOUT.pack(*one[:3]),
+            one.stamp_ns + int(rng.uniform(0.0, late_s) * SECOND),
+        )
+        for robot, one in measured
+    ]
+    messages.sort(key=lambda message: message[2])
+    estimates, begin_ns = [], T0 - 1
     for now_ns in ticks(T0, int(world.stamp_ns[-1]) + 2 * SECOND, 0.25):
-        estimator._timeline.add(measured[(arrivals_ns > begin_ns) & (arrivals_ns <= now_ns)])
-        here = [(t, e) for t, e in events if begin_ns < t <= now_ns or t == now_ns == T0]
-        estimates += play(estimator, here, [now_ns])
+        batch = MessageBatch.of([one for one in messages if begin_ns < one[2] <= now_ns])
+        for part in ingest.read(batch):
+            estimator.receive(part)
+        estimates += play(estimator, [(t, e) for t, e in events if begin_ns < t <= now_ns], [now_ns])
         begin_ns = now_ns
     return estimator, estimates
 
@@ -119,7 +192,7 @@ def test_ranges_make_poses_better_and_the_errors_stay_as_large_as_the_covariance
         assert settled(estimator)["USED"] > 900
         squared.append(nees(error, covariance).mean(axis=0))
         with_ranges.append(np.square(error[..., :2]).mean())
-        error, _ = errors(world, run(world, ranges(world, seed)[:0], settings)[1])
+        error, _ = errors(world, run(world, [], settings)[1])
         without.append(np.square(error[..., :2]).mean())
     assert np.sqrt(np.mean(with_ranges)) < 0.4 * np.sqrt(np.mean(without))
     samples = np.size(squared)
@@ -132,7 +205,7 @@ def test_late_and_shuffled_ranges_give_the_same(settings: Settings) -> None:
     world = world_of(910)
     measured = ranges(world, 1)
     expected = run(world, measured, settings)[1][-1]
-    found = run(world, np.random.default_rng(3).permutation(measured), settings, late_s=1.5)[1][-1]
+    found = run(world, measured, settings, late_s=1.5)[1][-1]
     np.testing.assert_allclose(found.poses, expected.poses, atol=1e-9)
     np.testing.assert_allclose(found.covariances, expected.covariances, atol=1e-9)
 
@@ -171,4 +244,4 @@ def test_jacobians_of_all_models_agree_with_finite_differences(number: int, seed
 
 def test_a_number_stands_for_one_model() -> None:
     with pytest.raises(ValueError, match="the number 100 of the measurement model 'range' is not free"):
-        measurement_model.register(RANGE)
+        register(RANGE)

@@ -22,7 +22,7 @@ from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.precompile import precompile
 from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.messages import RawInputs
+from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
@@ -82,13 +82,13 @@ def run(
     estimator, begun_ns = Estimator(swarm, settings), list[int]()
     thinning, ingest = Thinning(len(swarm.robots)), Ingest(swarm)
 
-    def take(inputs: RawInputs) -> None:
+    def take(inputs: Batch) -> None:
         begun_ns.append(inputs.begin_ns)
         if inputs.begin_ns - begun_ns[0] > SPAN_NS:
             raise EnoughError
-        rows = inputs.odometry
+        rows = inputs["odometry"]
         turned = type(rows)(*(column[::-1].copy() for column in rows))
-        inputs = inputs._replace(odometry=turned) if late else inputs
+        inputs = replace(inputs, rows={**inputs.rows, "odometry": turned}) if late else inputs
         if relayed:
             inputs = thinning.thin(shared(inputs, ingest, swarm), 0.5).messages
         estimator.receive(inputs)
@@ -99,16 +99,16 @@ def run(
     _quietly(lambda: read_bag(bag, swarm, take, unwatched))
 
 
-def shared(inputs: RawInputs, ingest: Ingest, swarm: Swarm) -> RawInputs:
+def shared(inputs: Batch, ingest: Ingest, swarm: Swarm) -> Batch:
     """The same by topics that all robots share."""
     key, now_ns = swarm_key(robot.name for robot in swarm.robots), inputs.end_ns
     odometry, seen = (
         SharedHead(now_ns, "odom", key, rows.robot, rows.stamp_ns)
-        for rows in (inputs.odometry, inputs.detections)
+        for rows in (inputs["odometry"], inputs["detections"])
     )
-    seen_detections = inputs.detections.detection if seen.robot.size else np.zeros(0, DETECTION_DTYPE)
+    seen_detections = inputs["detections"].detection if seen.robot.size else np.zeros(0, DETECTION_DTYPE)
     messages = {
-        "swarm/odom": encode_shared_numbers(odometry, inputs.odometry.pose),
+        "swarm/odom": encode_shared_numbers(odometry, inputs["odometry"].pose),
         "swarm/detections": encode_shared_detections(seen, seen_detections),
     }
     batch = MessageBatch.of([(ingest.handle_of[name], data, now_ns) for name, data in messages.items()])

@@ -5,16 +5,16 @@ import pytest
 from core_messages import SECOND, T0
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.filter.calibration_states import (
+from swarm_loc_estimator.filter.prediction import new_scratch, predict, write_predicted
+from swarm_loc_estimator.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.swarm.calibration_states import (
     DISTANCE_SCALE,
     TURN_BIAS,
     TURN_SCALE,
     ParameterTable,
 )
-from swarm_loc_estimator.filter.prediction import new_scratch, predict, write_predicted
-from swarm_loc_estimator.filter.state import InitialPose, SwarmState
-from swarm_loc_estimator.odometry.preintegration import Preintegrated
-from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot
 
 BIAS_SIGMA, DISTANCE_SIGMA, TURN_SIGMA, BIAS_TIME_S = 0.005, 0.01, 0.005, 20.0
@@ -76,8 +76,8 @@ def test_an_error_of_the_pose_is_not_changed_by_how_the_odometry_errs() -> None:
     """Right-invariant, it moves the whole path alike; else what moves everything would seem observed."""
     tracks, state = drive(0.1, 0.4, 4.0)
     state.parameter[0] = [0.1, 0.2, -0.2, 0.0, 0.0]
-    state.filter.place(np.arange(6, 9), 1e-18 * np.eye(3))
-    state.filter.place(np.arange(3), np.diag([1.0, 2.0, 3.0]))
+    state.filter.set_prior(np.arange(6, 9), 1e-18 * np.eye(3))
+    state.filter.set_prior(np.arange(3), np.diag([1.0, 2.0, 3.0]))
     other, error = state.copy(), np.array([0.3, -0.5, 0.7])
     other.transform[0] = se2.compose(se2.exp(error), state.transform[0])
     for seconds in np.linspace(0.1, 4.0, 40):
@@ -118,7 +118,7 @@ def test_the_spread_is_that_of_sampled_motion() -> None:
         twist = np.column_stack([along, np.zeros(samples), turning + bias]) * dt
         true = se2.compose(true, se2.exp(twist))
         bias = kept * bias + np.sqrt(1.0 - kept**2) * BIAS_SIGMA * rng.standard_normal(samples)
-    state.filter.place(np.arange(3), 1e-12 * np.eye(3))
+    state.filter.set_prior(np.arange(3), 1e-12 * np.eye(3))
     to(state, tracks, seconds)
     track = tracks.at(np.array([0]), np.array([T0 + round(seconds * 1e9)])).pose[0]
     pose = se2.compose(state.transform[0], track)
@@ -144,7 +144,7 @@ def test_losing_a_robot_keeps_what_was_learned_of_its_sensors_and_not_how_that_d
     to(state, tracks, 1.0)
     assert state.filter.covariance[:3, 6:].any()
     learned, variance = state.parameter[0].copy(), np.diag(state.filter.covariance)[6:].copy()
-    state.lose(0)
+    state.deinitialize(0)
     assert not state.filter.covariance[:3, 6:].any()
     np.testing.assert_array_equal(state.parameter[0], learned)
     np.testing.assert_array_equal(np.diag(state.filter.covariance)[6:], variance)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from swarm_loc_estimator.offline.replay import ListedSchedule, PeriodicSchedule, Runner
-from swarm_loc_estimator.sensors.messages import OdometryRows, RawInputs
+from swarm_loc_estimator.sensors.odometry import OdometryRows
+from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 
@@ -44,7 +45,7 @@ def test_what_arrives_at_a_tick_counts_at_the_next_one() -> None:
     stamps_ns = np.array([SECOND // 2, SECOND])
     pose = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]])
     odometry = OdometryRows(np.zeros(2, dtype=np.int64), stamps_ns, pose, stamps_ns)
-    runner.take(RawInputs(int(stamps_ns[0]), int(stamps_ns[1]), odometry))
+    runner.take(Batch.of(int(stamps_ns[0]), int(stamps_ns[1]), odometry=odometry))
     runner.finish(int(stamps_ns[1]))
     result = runner.result("two", (0, SECOND), {}, {})
     assert result.stamp_ns.tolist() == [SECOND, 2 * SECOND]

@@ -27,8 +27,7 @@ from swarm_loc_estimator.common.messages.detections import (
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometry
 from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.messages import RawInputs
-from swarm_loc_estimator.sensors.topics import InputKind, live_topics
+from swarm_loc_estimator.sensors.registry import Batch, live_topics
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 SWARM = Swarm(tuple(Robot(name) for name in "abc"))
@@ -48,7 +47,7 @@ def markers(count: int) -> np.ndarray[Any, np.dtype[np.void]]:
     return rows
 
 
-def read(*messages: tuple[str, bytes]) -> RawInputs:
+def read(*messages: tuple[str, bytes]) -> Batch:
     """What comes of messages by topic, one after the other."""
     ingest = Ingest(SWARM)
     rows = [(ingest.handle_of[topic], data, 10 + k) for k, (topic, data) in enumerate(messages)]
@@ -110,15 +109,15 @@ def test_a_message_of_many_says_what_each_would_have_said_alone() -> None:
     ]
     one, other = read(*own), read(*shared)
     for name in ("odometry", "detections", "fixes"):
-        for mine, theirs in zip(getattr(one, name)[:-1], getattr(other, name)[:-1], strict=True):
+        for mine, theirs in zip(one[name][:-1], other[name][:-1], strict=True):
             if mine.dtype.names:
                 assert mine.dtype == theirs.dtype
                 for field in mine.dtype.names:  # not the bytes between them, which may be any
                     np.testing.assert_array_equal(mine[field], theirs[field])
             else:
                 np.testing.assert_allclose(mine, theirs, atol=1e-15)
-    assert np.isnan(other.fixes.pose[1, 2])
-    assert other.odometry.arrival_ns.tolist() == [10, 10]
+    assert np.isnan(other["fixes"].pose[1, 2])
+    assert other["odometry"].arrival_ns.tolist() == [10, 10]
     assert not other.dropped
 
 
@@ -126,8 +125,8 @@ def test_readings_of_both_layouts_come_in_order_of_arrival() -> None:
     alone = encode_detections("eye", 3, markers(1))
     together = encode_shared_detections(head([1, 2], [1, 2]), markers(2))
     inputs = read(("swarm/detections", together), ("a/detections", alone), ("swarm/detections", together))
-    assert inputs.detections.robot.tolist() == [1, 2, 0, 1, 2]
-    assert inputs.detections.arrival_ns.tolist() == [10, 10, 11, 12, 12]
+    assert inputs["detections"].robot.tolist() == [1, 2, 0, 1, 2]
+    assert inputs["detections"].arrival_ns.tolist() == [10, 10, 11, 12, 12]
 
 
 def test_bad_readings_are_left_out_and_counted_and_the_others_stay() -> None:
@@ -137,9 +136,9 @@ def test_bad_readings_are_left_out_and_counted_and_the_others_stay() -> None:
     ]
     data[at + 4 + 2 * 8 + 4 : at + 4 + 3 * 8] = (10**9).to_bytes(4, "little")  # of the third stamp
     inputs = read(("swarm/odom", bytes(data)))
-    assert inputs.odometry.robot.tolist() == [0, 2]
-    assert inputs.odometry.stamp_ns.tolist() == [1, 4]
-    assert inputs.odometry.pose.tolist() == [[0.0, 1.0, 2.0], [9.0, 10.0, 11.0]]
+    assert inputs["odometry"].robot.tolist() == [0, 2]
+    assert inputs["odometry"].stamp_ns.tolist() == [1, 4]
+    assert inputs["odometry"].pose.tolist() == [[0.0, 1.0, 2.0], [9.0, 10.0, 11.0]]
     assert inputs.dropped == {"unknown_robot": 1, "bad_stamp": 1}
 
 
@@ -157,7 +156,7 @@ def test_indices_of_another_swarm_and_foreign_frames_are_refused(
     columns = [np.zeros((2, 3)), *([np.zeros((2, 9))] if topic == "swarm/fixes" else [])]
     inputs = read((topic, encode_shared_numbers(head([0, 1], [1, 2], frame_id, swarm), *columns)))
     assert inputs.dropped == ({reason: 2} if reason else {})
-    assert inputs.odometry.robot.size + inputs.fixes.robot.size == (0 if reason else 2)
+    assert inputs["odometry"].robot.size + inputs["fixes"].robot.size == (0 if reason else 2)
 
 
 def test_names_and_their_order_make_the_key() -> None:
@@ -189,7 +188,7 @@ def test_no_bytes_bring_the_reader_down(noise: bytes, cut: int, n: int) -> None:
     for data in (noise, whole[:cut] + noise, whole[: len(whole) - cut], numbers_of(n)[:cut] + noise):
         for kind in ("swarm/odom", "swarm/detections", "swarm/fixes"):
             inputs = read((kind, data))
-            assert inputs.odometry.robot.size <= n
+            assert inputs["odometry"].robot.size <= n
             assert set(inputs.dropped) <= {
                 "bad_message",
                 "other_swarm",
@@ -208,11 +207,11 @@ def test_a_live_estimator_listens_to_few_topics_where_they_are_shared() -> None:
     blind = Swarm(tuple(replace(robot, camera=None) for robot in SWARM.robots))
     for swarm, expected in ((SWARM, [True, True]), (blind, [True, False])):
         topics = live_topics(swarm, shared=True)
-        assert {topic.kind for topic in topics} == {
-            InputKind.AERIAL,
-            InputKind.SWARM_ODOMETRY,
-            InputKind.SWARM_DETECTIONS,
-            InputKind.SWARM_FIXES,
+        assert {topic.kind.name for topic in topics} == {
+            "aerial",
+            "swarm_odometry",
+            "swarm_detections",
+            "swarm_fixes",
         }
         assert [t.expected for t in topics if t.kind.topic in ("swarm/odom", "swarm/detections")] == expected
 
@@ -223,5 +222,5 @@ def test_a_robot_cannot_flood_the_memory_of_all() -> None:
     one_robots = encode_shared_numbers(head(0 * many, many), np.zeros((1001, 3)))
     both_robots = encode_shared_numbers(head(many[:1000] % 2, many[:1000]), np.zeros((1000, 3)))
     inputs = read(("swarm/odom", one_robots), ("swarm/odom", both_robots))
-    assert inputs.odometry.robot.size == 1000
+    assert inputs["odometry"].robot.size == 1000
     assert inputs.dropped == {"shared_too_many": 1001}

@@ -7,12 +7,12 @@ import pytest
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import error_covariance
-from swarm_loc_estimator.filter.calibration_states import CAMERA_YAW, ParameterTable
 from swarm_loc_estimator.filter.dense_filter import DenseFilter
 from swarm_loc_estimator.filter.joint_filter import Robots
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW, ParameterTable
 from swarm_loc_estimator.swarm.swarm import CameraMount, Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
@@ -37,14 +37,14 @@ class Both:
         """Give a body a pose of its own."""
         pose = np.append(self.places[body], 0.3)
         for one in self.filters:
-            one.place(3 * body + np.arange(3), error_covariance(pose, covariance))
+            one.set_prior(3 * body + np.arange(3), error_covariance(pose, covariance))
 
     def relate(self, body: int, others: IntArray) -> None:
         """Let a body err as others do on average, too."""
         columns = (3 * others[:, None] + np.arange(3)).reshape(-1)
         mapping = np.tile(np.eye(3) / others.size, others.size)
         for one in self.filters:
-            one.relate(3 * body + np.arange(3), columns, mapping)
+            one.correlate(3 * body + np.arange(3), columns, mapping)
 
     def predict(self, scale: float = 1.0) -> None:
         """Let all bodies drive."""
@@ -72,12 +72,12 @@ class Both:
         robots = Robots(self.places, self.active)
         dense, sparse = self.filters
         related = np.zeros((count, 3, 5))
-        sparse.relate_pairs(np.column_stack([first, np.full(count, -1)]), robots, related)
-        across = related[:, :, :3]
+        sparse.prepare_update(np.column_stack([first, np.full(count, -1)]), robots, related)
+        cross_covariance = related[:, :, :3]
         for k in np.flatnonzero((pairs >= 0).all(axis=1)).tolist():
-            across[k] -= dense.covariance[columns[k, :3, None], columns[k, 3:6]]
+            cross_covariance[k] -= dense.covariance[columns[k, :3, None], columns[k, 3:6]]
         corrections = [one.update(columns, jacobian, innovation, noise) for one in self.filters]
-        return corrections[0], corrections[1], across
+        return corrections[0], corrections[1], cross_covariance
 
     def marginals(self) -> tuple[FloatArray, FloatArray]:
         """Covariances (n, 3, 3) of poses by either filter."""
@@ -121,10 +121,10 @@ def test_with_a_full_pattern_it_is_exact(seed: int) -> None:
         pairs = rng.choice(np.flatnonzero(both.active), (20, 2))
         pairs = pairs[pairs[:, 0] != pairs[:, 1]]
         pairs[0] = -1, rng.choice(np.flatnonzero(both.active))
-        dense, sparse, across = both.update(pairs)
+        dense, sparse, cross_covariance = both.update(pairs)
         kept = np.repeat(both.active, 3)
         np.testing.assert_allclose(sparse[kept], dense[kept], atol=1e-11)
-        np.testing.assert_allclose(across, 0.0, atol=1e-11)
+        np.testing.assert_allclose(cross_covariance, 0.0, atol=1e-11)
         exact, nearly = both.marginals()
         np.testing.assert_allclose(nearly, exact, rtol=1e-7, atol=1e-13)
 
@@ -150,7 +150,7 @@ def test_a_copy_goes_its_own_way() -> None:
     other = sparse.copy()
     robots = Robots(both.places, both.active)
     first = 3 * pairs[:10]
-    other.relate_pairs(np.column_stack([first, np.full(10, -1)]), robots, np.zeros((10, 3, 5)))
+    other.prepare_update(np.column_stack([first, np.full(10, -1)]), robots, np.zeros((10, 3, 5)))
     jacobian, noise = np.tile(np.hstack([-np.eye(3), np.eye(3)]), (10, 1, 1)), np.tile(np.eye(3), (10, 1, 1))
     columns = (first[:, :, None] + np.arange(3)).reshape(10, 6)
     other.update(columns, jacobian, np.ones((10, 3)), 1e-6 * noise)
@@ -165,18 +165,18 @@ def test_what_is_contradicted_is_estimated() -> None:
     for robot in range(2):
         state.initialize(robot, InitialPose(np.array([robot, 0.0, 0.0]), START), Preintegrated.begin(0))
     before = state.filter.block(np.arange(3))
-    state.open(0, np.zeros(3))
+    state.augment(0, np.zeros(3))
     assert np.linalg.eigvalsh(state.filter.block(np.arange(3)) - before).min() > 1e-4
     assert (state.parameter_sigma(0)[1:] > 0.01).all()
     assert not state.parameter_sigma(1).any()
-    state.open(2, np.zeros(3))
+    state.augment(2, np.zeros(3))
     column, yaw = state.landmark_column(0), int(state.arrays().table.column[0, CAMERA_YAW])
     assert np.linalg.eigvalsh(state.landmark_covariance(0)).min() > 1e-5
     assert isinstance(state.filter, SparseFilter)
     related = np.array([[0, column, yaw], [0, 3, yaw]])
-    across = np.ones((2, 3, 5))
-    state.filter.relate_pairs(related, Robots(np.zeros((2, 2)), state.tracked), across)
-    np.testing.assert_allclose(across, 0.0, atol=1e-12)
+    cross_covariance = np.ones((2, 3, 5))
+    state.filter.prepare_update(related, Robots(np.zeros((2, 2)), state.tracked), cross_covariance)
+    np.testing.assert_allclose(cross_covariance, 0.0, atol=1e-12)
     jacobian = np.zeros((1, 3, 8))
     jacobian[0, :, :3], jacobian[0, :, 3:6] = -np.eye(3), np.eye(3)
     jacobian[0, 2, 6] = 1.0

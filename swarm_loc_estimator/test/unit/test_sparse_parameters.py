@@ -11,18 +11,18 @@ import pytest
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.filter.batch_update import related_columns
-from swarm_loc_estimator.filter.calibration_states import (
-    CAMERA_SCALE,
-    CAMERA_YAW,
-    DRIVES,
-    ParameterTable,
-)
 from swarm_loc_estimator.filter.joint_filter import Robots
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns
 from swarm_loc_estimator.filter.prediction import new_scratch, predict
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.swarm.calibration_states import (
+    CAMERA_SCALE,
+    CAMERA_YAW,
+    DRIVES,
+    ParameterTable,
+)
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Landmark,
@@ -97,7 +97,7 @@ class Both:
         """Use a measurement of each pair (m, 2), N + l being landmark l; return the sparse filter's gaps.
 
         Returns:
-            Gaps of the corrections by the dense filter's columns, and of the covariances `across` (m, 3, 5).
+            Gaps of the corrections by the dense filter's columns, and of `cross_covariance` (m, 3, 5).
         """
         robots = len(self.poses)
         fields = np.zeros(len(pairs), MEASUREMENT_DTYPE)
@@ -111,8 +111,8 @@ class Both:
         dense, sparse = (state.filter for state in self.states)
         assert isinstance(sparse, SparseFilter)
         tracked = self.states[1].tracked
-        across = np.zeros((len(pairs), 3, 5))
-        sparse.relate_pairs(related[1], Robots(self.poses[:, :2], tracked.copy()), across)
+        cross_covariance = np.zeros((len(pairs), 3, 5))
+        sparse.prepare_update(related[1], Robots(self.poses[:, :2], tracked.copy()), cross_covariance)
         gaps = []
         for k, (observer, target, _) in enumerate(related[0].tolist()):
             exact = np.zeros((3, 5))
@@ -121,8 +121,8 @@ class Both:
                 camera = self.states[0].arrays().table.column[pairs[k, 0], CAMERA_YAW:]
                 for c in np.flatnonzero(camera >= 0):
                     exact[:, 3 + c] = dense.covariance[target : target + 3, camera[c]]
-                    gaps.append(across[k, :, 3 + c] - exact[:, 3 + c])
-                gaps.append((across[k, :, :3] - exact[:, :3]).reshape(-1))
+                    gaps.append(cross_covariance[k, :, 3 + c] - exact[:, 3 + c])
+                gaps.append((cross_covariance[k, :, :3] - exact[:, :3]).reshape(-1))
         corrections = []
         for state, first in zip(self.states, related, strict=True):
             table = state.arrays().table
@@ -184,10 +184,10 @@ def play(both: Both, step: int) -> tuple[FloatArray, FloatArray]:
     if step in (8, 20):
         for state in both.states:
             for source in {8: (0,), 20: (6, 7, 8)}[step]:
-                state.open(source, both.poses[source % 6])
+                state.augment(source, both.poses[source % 6])
     if step == 12:
         for state in both.states:
-            state.lose(2)
+            state.deinitialize(2)
     if step == 16:
         both.start(2, np.array([0, 3]))
     there = np.flatnonzero(both.states[0].tracked)
@@ -201,9 +201,9 @@ def test_with_one_calibrated_robot_it_is_exact(kind: Robot, seed: int) -> None:
     """The pattern is full: that robot's parameters depend on nothing but poses in it."""
     both = Both(6, seed, (kind, *5 * [Robot("")]))
     for step in range(30):
-        correction, across = play(both, step)
+        correction, cross_covariance = play(both, step)
         np.testing.assert_allclose(correction, 0.0, atol=1e-12)
-        np.testing.assert_allclose(across, 0.0, atol=1e-12)
+        np.testing.assert_allclose(cross_covariance, 0.0, atol=1e-12)
         both.assert_equal(1e-9)
 
 
@@ -223,5 +223,5 @@ def test_before_the_first_update_moves_are_exact() -> None:
     both = Both(6, 1)
     for _ in range(2):
         both.drive()
-        _, across = both.update(np.array(list(itertools.permutations(range(6), 2))))
-        np.testing.assert_allclose(across, 0.0, atol=1e-12)
+        _, cross_covariance = both.update(np.array(list(itertools.permutations(range(6), 2))))
+        np.testing.assert_allclose(cross_covariance, 0.0, atol=1e-12)

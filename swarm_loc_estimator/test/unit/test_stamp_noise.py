@@ -13,12 +13,12 @@ from core_world import Plan, World, simulate
 from scipy.stats import chi2
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.calibration_states import ParameterTable
 from swarm_loc_estimator.filter.innovation import relative_motion
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns, predict
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.camera import SightingConverter
+from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,

@@ -26,7 +26,7 @@ from swarm_loc_estimator.offline.export import write_mcap
 from swarm_loc_estimator.offline.recorded_bag import MapReader
 from swarm_loc_estimator.offline.replay import AerialImages, replay
 from swarm_loc_estimator.offline.report.report import recorded
-from swarm_loc_estimator.sensors.messages import AerialRows
+from swarm_loc_estimator.sensors.aerial import AerialRows
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.watch.frames import unpack
 

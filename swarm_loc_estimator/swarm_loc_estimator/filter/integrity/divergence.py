@@ -42,13 +42,13 @@ class LossLimits(NamedTuple):
 
 
 @inlined_njit
-def confirm(measurements: MeasurementColumns, k: int, belief: BeliefArrays, passed: bool) -> int:
+def confirm(measurements: MeasurementColumns, k: int, belief: BeliefArrays, accepted: bool) -> int:
     """Check measurement k against assumed poses; return a robot that is kidnapped, or -1."""
     observer, target = measurements.observer[k], measurements.target[k]
     known = belief.integrity.confirmations
     knows_observer = observer < 0 or known[observer] >= CONFIRMED
     knows_target = target < 0 or known[target] >= CONFIRMED
-    if passed:
+    if accepted:
         if knows_observer and target >= 0:
             _count_confirmation(belief.integrity, target, measurements.stamp_ns[k])
         if knows_target and observer >= 0:
@@ -101,7 +101,7 @@ def note_seen(state: IntegrityArrays, robot: int) -> None:
 
 @inlined_njit
 def count_gated(
-    measurements: MeasurementColumns, k: int, belief: BeliefArrays, passed: bool, limits: LossLimits
+    measurements: MeasurementColumns, k: int, belief: BeliefArrays, accepted: bool, limits: LossLimits
 ) -> int:
     """Count fixes and gated measurements; return a robot with too many gated in a row, or -1.
 
@@ -113,16 +113,16 @@ def count_gated(
         if side >= 0:
             source = source_of(measurements, k, belief) if side == observer else observer
             now_ns = measurements.stamp_ns[k]
-            if passed:
+            if accepted:
                 state.gated_in_a_row[side] = 0
             elif state.gated_source[side] != source or now_ns - state.gated_ns[side] > _GATED_AGAIN_NS:
                 state.gated_in_a_row[side] += 1
                 state.gated_source[side], state.gated_ns[side] = source, now_ns
             if state.gated_in_a_row[side] >= limits.gated_in_a_row:
                 lost = side
-    if observer < 0 and not passed and _is_off_its_fixes(state, target, measurements.stamp_ns[k]):
+    if observer < 0 and not accepted and _is_off_its_fixes(state, target, measurements.stamp_ns[k]):
         lost = target
-    if passed and (observer < 0 or target < 0):
+    if accepted and (observer < 0 or target < 0):
         fixed = max(observer, target)
         state.gated_fixes[fixed] = 0
         belief.last_fix_ns[fixed] = max(belief.last_fix_ns[fixed], measurements.stamp_ns[k])

@@ -17,9 +17,9 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
-from swarm_loc_estimator.filter.calibration_states import CAMERA_YAW
 from swarm_loc_estimator.filter.integrity.noise_inflation import raise_hidden_noise
 from swarm_loc_estimator.filter.measurement_model import POLAR, MeasurementColumns
+from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW
 
 _ASIDE, _MAX_EVIDENCE = 10.0, 15.0
 """Evidence from which a pair is excluded, and its maximum."""

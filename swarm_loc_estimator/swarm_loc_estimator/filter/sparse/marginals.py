@@ -8,10 +8,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.filter.calibration_states import BLOCKS, DRIVES
 from swarm_loc_estimator.filter.sparse.factor import Derived
 from swarm_loc_estimator.filter.sparse.parameters import Groups, Moves
 from swarm_loc_estimator.filter.sparse.translation_adjoint import translation_adjoints
+from swarm_loc_estimator.swarm.calibration_states import BLOCKS, DRIVES
 
 _DRIVEN = slice(3, 3 + DRIVES)
 
@@ -25,7 +25,7 @@ class Marginals:
     Attributes:
         groups: Which bodies have blocks of parameters.
         current: (n, w, w) see `JointFilter.marginal`.
-        driven: (robots, 4, DRIVES) see `JointFilter.driven`.
+        transition: (robots, 4, DRIVES) see `JointFilter.transition`.
     """
 
     def __init__(self, groups: Groups) -> None:
@@ -34,7 +34,7 @@ class Marginals:
         self.current: FloatArray = np.zeros((count, width, width))
         self.current[:, :3, :3] = np.eye(3)
         self._settled = self.current.copy()
-        self.driven = _undriven(groups)
+        self.transition = _no_transition(groups)
 
     def copy(self) -> Marginals:
         """An independent copy."""
@@ -43,29 +43,29 @@ class Marginals:
         vars(other).update(arrays | {"groups": self.groups})
         return other
 
-    def grow(self, groups: Groups) -> None:
+    def append_columns(self, groups: Groups) -> None:
         """Append bodies or blocks, without error."""
-        self.groups, driven = groups, _undriven(groups)
-        driven[: len(self.driven)] = self.driven
-        self.current, self._settled, self.driven = (
+        self.groups, transition = groups, _no_transition(groups)
+        transition[: len(self.transition)] = self.transition
+        self.current, self._settled, self.transition = (
             _enlarged(self.current, groups),
             _enlarged(self._settled, groups),
-            driven,
+            transition,
         )
 
-    def place(self, bodies: IntArray, own: IntArray, covariances: FloatArray) -> None:
+    def set_prior(self, bodies: IntArray, own: IntArray, covariances: FloatArray) -> None:
         """Give columns (c,) of bodies (k,) covariances (k, c, c), independent of their other columns."""
         for known in (self.current, self._settled):
             known[bodies[:, None], own], known[bodies[:, None], :, own] = 0.0, 0.0
             known[bodies[:, None, None], own[:, None], own] = covariances
         if own[0] < 3:
-            self.driven[bodies[bodies < len(self.driven)], :3] = 0.0
+            self.transition[bodies[bodies < len(self.transition)], :3] = 0.0
 
     def settle(self, bodies: IntArray) -> None:
         """Take the present marginals of bodies (k,) as those of the newest factor."""
         self._settled[bodies] = self.current[bodies]
-        robots = bodies[bodies < len(self.driven)]
-        self.driven[robots, :3], self.driven[robots, 3] = 0.0, 1.0
+        robots = bodies[bodies < len(self.transition)]
+        self.transition[robots, :3], self.transition[robots, 3] = 0.0, 1.0
 
     def within(self, bodies: IntArray) -> Iterator[tuple[tuple[slice, slice], IntArray, IntArray, IntArray]]:
         """Pairs of parts of bodies (k,); a part is the body or one of its blocks.
@@ -76,7 +76,7 @@ class Marginals:
         parts = range(self.current.shape[1] // 3)
         first = np.arange(bodies.size)
         yield (slice(3), slice(3)), first, bodies, bodies
-        robots = np.flatnonzero(bodies < len(self.driven))
+        robots = np.flatnonzero(bodies < len(self.transition))
         member = self.groups.member[bodies[robots]]
         for row, column in itertools.product(parts, parts):
             there = (member[:, row] >= 0) & (member[:, column] >= 0)
@@ -96,18 +96,18 @@ class Marginals:
             translation_adjoints(places[bodies]),
         )
         moves = Moves(np.full(count, -1), np.zeros((count, 3, 3)), np.ones((count, 3)))
-        if len(self.driven):
-            of_robots = np.flatnonzero(bodies < len(self.driven))
+        if len(self.transition):
+            of_robots = np.flatnonzero(bodies < len(self.transition))
             robots, own = bodies[of_robots], np.arange(3, 3 + DRIVES)
-            driven, blocks = self.driven[robots], self.groups.member[robots, 1]
+            transition, blocks = self.transition[robots], self.groups.member[robots, 1]
             follow = np.tile(np.eye(before.shape[1]), (bodies.size, 1, 1))
-            follow[of_robots, :3, _DRIVEN] = driven[:, :3]
-            follow[of_robots[:, None], own, own] = driven[:, 3]
+            follow[of_robots, :3, _DRIVEN] = transition[:, :3]
+            follow[of_robots[:, None], own, own] = transition[:, 3]
             before = follow @ before @ follow.transpose(0, 2, 1)
-            moved = driven[:, :3].any(axis=(1, 2))
+            moved = transition[:, :3].any(axis=(1, 2))
             moves.beside[robots[moved]] = blocks[moved]
-            moves.gain[robots] = adjoint[of_robots] @ driven[:, :3]
-            moves.left[blocks[blocks >= 0]] = driven[blocks >= 0, 3]
+            moves.gain[robots] = adjoint[of_robots] @ transition[:, :3]
+            moves.left[blocks[blocks >= 0]] = transition[blocks >= 0, 3]
         noise = self.current[bodies] - before
         noise[:, :3] = adjoint @ noise[:, :3]
         noise[:, :, :3] = noise[:, :, :3] @ adjoint.transpose(0, 2, 1)
@@ -126,7 +126,7 @@ def _enlarged(known: FloatArray, groups: Groups) -> FloatArray:
     return out
 
 
-def _undriven(groups: Groups) -> FloatArray:
+def _no_transition(groups: Groups) -> FloatArray:
     """The identity transition; for no robot where there are no parameters."""
     robots = len(groups.member) if _width(groups) > 3 else 0
     return np.tile(np.vstack([np.zeros((3, DRIVES)), np.ones(DRIVES)]), (robots, 1, 1))

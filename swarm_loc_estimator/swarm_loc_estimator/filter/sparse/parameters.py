@@ -16,9 +16,9 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.filter.calibration_states import BLOCKS, DRIVES, ParameterTable
 from swarm_loc_estimator.filter.sparse.dissection import Order
 from swarm_loc_estimator.filter.sparse.symbolic import Pattern
+from swarm_loc_estimator.swarm.calibration_states import BLOCKS, DRIVES, ParameterTable
 
 
 class Groups(NamedTuple):

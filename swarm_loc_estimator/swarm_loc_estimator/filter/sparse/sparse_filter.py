@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.filter.calibration_states import BLOCKS, ParameterTable
 from swarm_loc_estimator.filter.joint_filter import Robots
 from swarm_loc_estimator.filter.sparse import low_rank_correction as copies
 from swarm_loc_estimator.filter.sparse.elimination import Prior, eliminate
@@ -39,6 +38,7 @@ from swarm_loc_estimator.filter.sparse.translation_adjoint import (
     summed,
     translation_adjoints,
 )
+from swarm_loc_estimator.swarm.calibration_states import BLOCKS, ParameterTable
 
 _COPIES = 64
 _COPIED_SHARE = 4
@@ -75,7 +75,7 @@ class SparseFilter:
         table: Columns in blocks; each starts independent, with unit variance.
     """
 
-    sequential = False
+    is_dense = False
 
     def __init__(self, table: ParameterTable) -> None:
         count = table.filter_size // 3
@@ -105,26 +105,26 @@ class SparseFilter:
         return self._marginals.current
 
     @property
-    def driven(self) -> FloatArray:
+    def transition(self) -> FloatArray:
         """See `JointFilter`."""
-        return self._marginals.driven
+        return self._marginals.transition
 
     @property
     def _groups(self) -> Groups:
         """The blocks of each body."""
         return self._marginals.groups
 
-    def place(self, columns: IntArray, covariance: FloatArray) -> None:
+    def set_prior(self, columns: IntArray, covariance: FloatArray) -> None:
         """Give columns (k,) this covariance (k, k), independent of all others."""
         if columns.size and self._groups.part[columns[0] // 3]:
             blocks, variances = columns // 3, np.diag(covariance)
             for block in np.unique(blocks).tolist():
                 here = blocks == block
-                self._place_parameters(columns[here], variances[here])
+                self._set_parameter_priors(columns[here], variances[here])
         elif columns.size:
-            self.place_bodies(columns[:1] // 3, covariance[None])
+            self.set_body_priors(columns[:1] // 3, covariance[None])
 
-    def _place_parameters(self, columns: IntArray, variances: FloatArray) -> None:
+    def _set_parameter_priors(self, columns: IntArray, variances: FloatArray) -> None:
         """Give parameters (k,) of one block these variances; its other parameters do not change."""
         (robot, own), block = self._groups.columns(columns), columns[:1] // 3
         spread, kept = np.ones(3), np.ones(3)
@@ -136,14 +136,14 @@ class SparseFilter:
             others, gain, spread = self._number[block], np.diag(kept), np.zeros(3)
         spread[columns % 3] = variances
         self._append(block, [Derived(others, gain, np.diag(spread))])
-        self._marginals.place(np.array([robot]), own, np.diag(variances)[None])
+        self._marginals.set_prior(np.array([robot]), own, np.diag(variances)[None])
 
-    def place_bodies(self, bodies: IntArray, covariances: FloatArray) -> None:
+    def set_body_priors(self, bodies: IntArray, covariances: FloatArray) -> None:
         """Give bodies (k,) covariances (k, 3, 3), each independent of all others."""
         self._place[bodies] = centres(covariances)
         own = carried(self._place[bodies], covariances)
         self._append(bodies, [Derived(_NOBODY, np.zeros((0, 3)), one) for one in own])
-        self._marginals.place(bodies, np.arange(3), covariances)
+        self._marginals.set_prior(bodies, np.arange(3), covariances)
 
     def _append(self, bodies: IntArray, derived: Sequence[Derived]) -> None:
         """Append new bodies (k,)."""
@@ -161,15 +161,15 @@ class SparseFilter:
             body, own = self._groups.columns(columns)
             self.marginal[body, own[:, None], own] += covariance
 
-    def grow(self, table: ParameterTable) -> None:
+    def append_columns(self, table: ParameterTable) -> None:
         """Append the additional columns of a table, without error; their prior is set next."""
         more = table.filter_size // 3 - self._number.size
-        self._marginals.grow(Groups.of(table))
+        self._marginals.append_columns(Groups.of(table))
         self._place = np.concatenate([self._place, np.zeros((more, 2))])
         self._number = np.concatenate([self._number, np.full(more, -1)])
         self._ordering = None
 
-    def relate(self, columns: IntArray, others: IntArray, mapping: FloatArray) -> None:
+    def correlate(self, columns: IntArray, others: IntArray, mapping: FloatArray) -> None:
         """Add the errors of other bodies' columns (m,), mapped by (3, m), to those of a body just appended.
 
         Until the next update its marginal assumes that the other bodies have the same error.
@@ -191,14 +191,14 @@ class SparseFilter:
         self._append(columns[:1] // 3, [Derived(self._number[bodies], gain, placed.spread)])
         more = carried(-self._place[[body]], (common @ common.T)[None])
         own = self.marginal[[body], :3, :3] + more
-        self._marginals.place(np.array([body]), np.arange(3), own)
+        self._marginals.set_prior(np.array([body]), np.arange(3), own)
 
     def _take_in(self, body: int) -> None:
         """Append a body with the changes of its error since the newest factor, for others to share."""
         noise, moves = self._marginals.since(np.array([body]), self._place)
         if not noise.any() and moves.beside[body] < 0:
             return
-        is_robot = body < len(self.driven)
+        is_robot = body < len(self.transition)
         blocks = self._groups.member[body] if is_robot else np.array([body] + BLOCKS * [-1])
         numbers = np.where(blocks >= 0, self._number[blocks], -1)
         derived = derived_by(
@@ -216,21 +216,21 @@ class SparseFilter:
         covariance: FloatArray = self.marginal[body][np.ix_(own, own)]
         return covariance
 
-    def relate_pairs(self, columns: IntArray, robots: Robots, across: FloatArray) -> None:
+    def prepare_update(self, columns: IntArray, robots: Robots, cross_covariance: FloatArray) -> None:
         """Write the covariances between the bodies of measurements (m,), before an update with them.
 
         Args:
             columns: (m, 3) first columns of observers, targets and observers' cameras; -1: none.
             robots: Positions of all robots.
-            across: (m, 3, 5) written: covariances of observers with targets, and of targets with cameras;
+            cross_covariance: (m, 3, 5) written: of observers with targets, and of targets with cameras;
                 undefined where there is none.
         """
         tied = (columns[:, :2] >= 0).all(axis=1)
         bodies = columns // 3
         prepared = self._prepare(bodies[tied, :2], robots)
-        across[tied, :, :3] = self._about_map(prepared.covariance_of, *bodies[tied, :2].T)
+        cross_covariance[tied, :, :3] = self._about_map(prepared.covariance_of, *bodies[tied, :2].T)
         seen = (columns[:, 1:] >= 0).all(axis=1)
-        across[seen, :, 3:] = self._about_map(prepared.covariance_of, *bodies[seen, 1:].T)[:, :, :2]
+        cross_covariance[seen, :, 3:] = self._about_map(prepared.covariance_of, *bodies[seen, 1:].T)[:, :, :2]
 
     def _prepare(self, pairs: IntArray, robots: Robots) -> _Prepared:
         """Compute the covariances of a pattern that contains pairs (k, 2)."""
@@ -312,7 +312,7 @@ class SparseFilter:
     ) -> FloatArray:
         """Use many measurements with independent errors at once; return the correction (n,) of all columns.
 
-        Their pairs must have been passed to `relate_pairs` before.
+        Their pairs must have been accepted to `prepare_update` before.
 
         Args:
             columns: (m, c) columns that each depends on, those of the two bodies first.
@@ -321,7 +321,7 @@ class SparseFilter:
             noise: (m, 3, 3) covariance of the measurement.
         """
         if self._prepared is None:
-            raise RuntimeError("call relate_pairs before update")
+            raise RuntimeError("call prepare_update before update")
         (pattern, prior, shares, active), self._prepared = self._prepared, None
         measured = summed(information_of(columns, jacobian, innovation, noise, self._place))
         self._factor = eliminate(pattern, prior, measured)

@@ -24,7 +24,7 @@ from swarm_loc_estimator.offline.calibration.robust import (
     spread,
 )
 from swarm_loc_estimator.sensors.camera import SightingConverter
-from swarm_loc_estimator.sensors.messages import chosen
+from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, SensorModel, Swarm
 
 DENSE_GAP_NS = 200_000_000

@@ -21,7 +21,7 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.offline.calibration.camera import DENSE_GAP_NS
 from swarm_loc_estimator.offline.calibration.robust import ridge
-from swarm_loc_estimator.sensors.messages import chosen
+from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
 from swarm_loc_estimator.swarm.swarm import OdometryModel
 

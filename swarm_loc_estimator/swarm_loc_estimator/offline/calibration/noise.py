@@ -22,7 +22,7 @@ from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 from swarm_loc_estimator.offline.calibration.recording import Recording, rerun
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.sensors.messages import chosen
+from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.swarm import OdometryModel, SensorModel, Swarm
 
 TICK_S = 1.0

@@ -17,20 +17,13 @@ from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, in
 from swarm_loc_estimator.offline.recorded_bag import Progress, read_bag, unwatched
 from swarm_loc_estimator.offline.replay import PeriodicSchedule, Runner
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.sensors.messages import (
-    NO_BRIGHTNESS,
-    NO_DETECTIONS,
-    NO_FIXES,
-    NO_ODOMETRY,
-    BrightnessRows,
-    DetectionRows,
-    FixRows,
-    OdometryRows,
-    RawInputs,
-    chosen,
-    joined,
-)
-from swarm_loc_estimator.sensors.validation import InputValidator
+from swarm_loc_estimator.sensors.camera import NO_DETECTIONS, DetectionRows
+from swarm_loc_estimator.sensors.conversion import InputConverter
+from swarm_loc_estimator.sensors.fix import NO_FIXES, FixRows
+from swarm_loc_estimator.sensors.infrared import NO_BRIGHTNESS, BrightnessRows
+from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
+from swarm_loc_estimator.sensors.registry import Batch
+from swarm_loc_estimator.sensors.sensor import chosen, joined
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
@@ -87,9 +80,9 @@ class Recording:
         return replace(self, odometry=chosen(self.odometry, driven), detections=chosen(self.detections, seen))
 
     @property
-    def messages(self) -> RawInputs:
+    def messages(self) -> Batch:
         """Odometry and detections as inputs of the estimator."""
-        return RawInputs(*self.range_ns, self.odometry, self.detections)
+        return Batch.of(*self.range_ns, odometry=self.odometry, detections=self.detections)
 
     def track(self, robot: int) -> Trajectory:
         """A robot's raw odometry in the order of its stamps, each stamp once."""
@@ -108,19 +101,19 @@ def read_recording(bag: Path, swarm: Swarm, progress: Progress = unwatched) -> R
     Raises:
         BagError: Nothing in the bag can be read.
     """
-    parts: list[RawInputs] = []
+    parts: list[Batch] = []
     summary = read_bag(bag, swarm, parts.append, progress)
-    validator = InputValidator(swarm, Settings())
-    odometry = joined([NO_ODOMETRY, *(validator.validate(part).odometry for part in parts)])
-    detections = [part.detections for part in parts if part.detections.robot.size]
-    unused = (f"{count} inputs are not used: {reason}." for reason, count in validator.drops.items())
+    converter = InputConverter(swarm, Settings())
+    odometry = [converter.convert(part).rows.get("odometry", NO_ODOMETRY) for part in parts]
+    detections = [part["detections"] for part in parts if part["detections"].robot.size]
+    unused = (f"{count} inputs are not used: {reason}." for reason, count in converter.drops.items())
     return Recording(
         bag.name,
-        odometry,
+        joined([NO_ODOMETRY, *odometry]),
         joined(detections or [NO_DETECTIONS]),
         {name: _each_stamp_once(track.stamp_ns, track.pose) for name, track in summary.truth.items()},
-        joined([NO_BRIGHTNESS, *(part.brightness for part in parts)]),
-        joined([NO_FIXES, *(part.fixes for part in parts)]),
+        joined([NO_BRIGHTNESS, *(part["brightness"] for part in parts)]),
+        joined([NO_FIXES, *(part["fixes"] for part in parts)]),
         (*summary.remarks, *unused),
     )
 

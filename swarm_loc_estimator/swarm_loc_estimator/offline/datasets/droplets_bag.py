@@ -30,7 +30,7 @@ from swarm_loc_estimator.offline.datasets.droplets import (
     clean,
     read_exchanges,
 )
-from swarm_loc_estimator.sensors.topics import InputKind
+from swarm_loc_estimator.sensors.registry import kinds
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.ir_board import IrPlatform, RobotIr
 from swarm_loc_estimator.swarm.swarm import Pose2, RandomWalk, Robot, Swarm
@@ -45,6 +45,7 @@ FIX_SIGMA = (0.001, 0.001, 0.05)
 WALK = RandomWalk(position=5e-6, heading=3e-2)
 """The robots turn often and move some centimetres per minute."""
 _NS = 1_000_000_000
+_BRIGHTNESS, _FIXES = kinds()["brightness"], kinds()["fixes"]
 
 _QUARTER = 0.5 * math.pi
 _CLEAR = 8.0
@@ -237,7 +238,7 @@ def _write(
     covariance = np.diag(np.square(FIX_SIGMA))
     with BagWriter(folder, compress=True) as bag:
         for robot in swarm.robots:
-            for kind in (InputKind.BRIGHTNESS, InputKind.FIXES):
+            for kind in (_BRIGHTNESS, _FIXES):
                 bag.add_topic(f"{robot.name}/{kind.topic}", kind.message_type)
             bag.add_topic(f"{robot.name}/ground_truth", POSE_STAMPED)
         last_ns = 0
@@ -249,12 +250,12 @@ def _write(
                 bag.write(f"{name_of(robot_id)}/ground_truth", stamp_ns, message)
                 if robot_id == one.receiver:
                     fix = encode_fix("map", stamp_ns, pose, covariance)
-                    bag.write(f"{name_of(robot_id)}/{InputKind.FIXES.topic}", stamp_ns, fix)
+                    bag.write(f"{name_of(robot_id)}/{_FIXES.topic}", stamp_ns, fix)
             receiver = name_of(one.receiver)
             matrix = encode_brightness(
                 f"{receiver}/base_link", stamp_ns, (one.receiver, one.transmitter), one.readings
             )
-            bag.write(f"{receiver}/{InputKind.BRIGHTNESS.topic}", stamp_ns, matrix)
+            bag.write(f"{receiver}/{_BRIGHTNESS.topic}", stamp_ns, matrix)
 
 
 def _counted(counts: Counter[str]) -> list[tuple[str, int]]:

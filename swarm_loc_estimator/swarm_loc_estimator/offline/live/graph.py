@@ -33,7 +33,7 @@ from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.sensors.topics import InputKind
+from swarm_loc_estimator.sensors.registry import kinds
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_msgs.msg import SwarmPoses
 
@@ -198,7 +198,7 @@ def _own_domain() -> Iterator[None]:
 _DEEP = QoSProfile(depth=1000)
 _ESTIMATOR = "estimator"
 _DROPPED = "dropped: "
-_RECEIVED = {f"{kind.topic} received": kind for kind in InputKind}
+_RECEIVED = {f"{kind.topic} received": kind for kind in kinds().values()}
 
 
 class Poses(NamedTuple):

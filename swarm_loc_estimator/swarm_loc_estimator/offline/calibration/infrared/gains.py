@@ -22,7 +22,7 @@ from swarm_loc_estimator.offline.calibration.infrared.reading_limits import (
 )
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.offline.recorded_bag import Progress
-from swarm_loc_estimator.sensors.exchanges import ExchangeKey, MatrixScreening, Readings
+from swarm_loc_estimator.sensors.infrared import ExchangeKey, MatrixScreening, Readings
 from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 

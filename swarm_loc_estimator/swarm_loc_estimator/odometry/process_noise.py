@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.filter.calibration_states import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
+from swarm_loc_estimator.swarm.calibration_states import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
 from swarm_loc_estimator.swarm.swarm import OdometryModel
 
 _MAX_DISTANCE_M = 1e3
@@ -86,7 +86,7 @@ def add_step_jacobian(model: OdometryModel, step: OdometryStep, jacobian: FloatA
 
 
 @cached_njit
-def add_silence(
+def add_dropout_noise(
     model: OdometryModel,
     silence_s: float,
     unknown: bool,

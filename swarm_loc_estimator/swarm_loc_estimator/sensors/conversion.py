@@ -1,0 +1,88 @@
+"""Convert the batches of all sensors to measurements, and count what is dropped."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.filter.measurement_model import MeasurementArray
+from swarm_loc_estimator.sensors.registry import SENSORS, Batch, Measurements
+from swarm_loc_estimator.sensors.sensor import (
+    NO_MEASUREMENTS,
+    NO_ROWS,
+    Accumulator,
+    Converter,
+    Measured,
+    SensorSettings,
+    chosen,
+)
+from swarm_loc_estimator.sensors.validation import REJECT_REASONS, VALID, reject_reasons
+from swarm_loc_estimator.swarm.swarm import Swarm
+
+
+class InputConverter:
+    """Converts batches.
+
+    Args:
+        swarm: Whose sensors.
+        settings: Noise that sensors do not tell, and by how much a stamp may be ahead of its arrival.
+
+    Attributes:
+        drops: Reason -> how much could not be used.
+        accumulators: Sensor -> what makes measurements of its readings later.
+    """
+
+    def __init__(self, swarm: Swarm, settings: SensorSettings) -> None:
+        self.drops: Counter[str] = Counter()
+        self.accumulators: dict[str, Accumulator] = {
+            name: sensor.create_accumulator(swarm)
+            for name, sensor in SENSORS.items()
+            if sensor.create_accumulator is not None
+        }
+        self._converters: dict[str, Converter] = {
+            name: sensor.create_converter(swarm, settings, self.drops)
+            for name, sensor in SENSORS.items()
+            if sensor.create_converter is not None
+        }
+        self._future_ns = round(settings.future_tolerance_s * 1e9)
+
+    def convert(self, batch: Batch) -> Measurements:
+        """Convert what is valid, and count the rest."""
+        self.drops.update(batch.dropped)
+        parts: list[Measured] = []
+        kept: dict[str, Any] = {}
+        for name in SENSORS:
+            rows = batch.rows.get(name)
+            if rows is None or not rows.robot.size:
+                continue
+            late = rows.stamp_ns > rows.arrival_ns + self._future_ns
+            if late.any():
+                self.drops["future_stamp"] += int(np.count_nonzero(late))
+                rows = chosen(rows, ~late)
+            found = self._converters[name](rows) if name in self._converters else rows
+            if isinstance(found, Measured):
+                parts.append(self._valid(found))
+            elif found.robot.size:
+                kept[name] = found
+        return Measurements(batch.begin_ns, batch.end_ns, *_in_order_of_arrival(parts), kept)
+
+    def _valid(self, found: Measured) -> Measured:
+        """Those measurements that are valid; the others are counted."""
+        reasons = reject_reasons(found.measurements)
+        counts = np.bincount(reasons, minlength=len(REJECT_REASONS)).tolist()
+        self.drops.update({REJECT_REASONS[k]: counts[k] for k in range(1, len(REJECT_REASONS)) if counts[k]})
+        return chosen(found, reasons == VALID)
+
+
+def _in_order_of_arrival(parts: list[Measured]) -> tuple[MeasurementArray, IntArray]:
+    """All measurements; of those that arrived at the same instant, the first parts come first."""
+    parts = [part for part in parts if part.measurements.size]
+    if len(parts) < 2:
+        return parts[0] if parts else (NO_MEASUREMENTS, NO_ROWS)
+    measurements = np.concatenate([part.measurements for part in parts])
+    arrival_ns = np.concatenate([part.arrival_ns for part in parts])
+    order = np.argsort(arrival_ns, kind="stable")
+    return measurements[order], arrival_ns[order]

@@ -1,0 +1,135 @@
+"""Absolute fixes: poses of robots in `map`, with or without heading."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.messages.definitions import POSE_WITH_COVARIANCE, SWARM_FIXES
+from swarm_loc_estimator.common.messages.detections import SharedMessage, decode_shared_numbers
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.poses import FixMessage, decode_fix
+from swarm_loc_estimator.common.messages.streams import EachReader, MessageColumns
+from swarm_loc_estimator.filter.measurement_model import (
+    MEASUREMENT_DTYPE,
+    MODELS,
+    NOBODY,
+    Kind,
+    MeasurementArray,
+)
+from swarm_loc_estimator.sensors.sensor import (
+    NO_ROWS,
+    Converter,
+    InputKind,
+    Known,
+    Measured,
+    Sensor,
+    SensorSettings,
+    chosen,
+)
+from swarm_loc_estimator.sensors.shared_topics import FOREIGN_FRAME, shared_kind
+from swarm_loc_estimator.swarm.swarm import Swarm
+
+HEADING_UNKNOWN = math.pi**2
+"""A heading with such a variance [rad^2] or more was not measured: all headings there are vary by less."""
+_GATE = float(MODELS[Kind.CARTESIAN].gate(0.9999))
+
+
+class FixRows(NamedTuple):
+    """Absolute fixes (f,).
+
+    Attributes:
+        robot: (f,) index of the robot.
+        stamp_ns: (f,) when it was there.
+        pose: (f, 3) x [m], y [m], heading [rad] in `map`; heading NaN: not measured.
+        covariance: (f, 3, 3) of it; what it says of a heading not measured does not count.
+        arrival_ns: (f,).
+    """
+
+    robot: IntArray
+    stamp_ns: IntArray
+    pose: FloatArray
+    covariance: FloatArray
+    arrival_ns: IntArray
+
+
+NO_FIXES = FixRows(NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros((0, 3, 3)), NO_ROWS)
+
+
+def has_heading(covariance: FloatArray) -> NDArray[np.bool_]:
+    """Whether fixes with covariances (f, 3, 3) tell a heading (f,)."""
+    return np.asarray((covariance[:, 2, 2] > 0.0) & (covariance[:, 2, 2] < HEADING_UNKNOWN))
+
+
+def _columns(
+    found: MessageColumns[FixMessage], batch: MessageBatch, robot: IntArray, known: Known
+) -> tuple[FixRows, Mapping[str, int]]:
+    """No heading was measured where its variance is no number, not positive, or very large."""
+    messages = found.messages
+    pose = np.array([message.pose for message in messages], dtype=float).reshape(-1, 3)
+    covariance = np.array([message.covariance for message in messages]).reshape(-1, 3, 3)
+    pose[~has_heading(covariance), 2] = np.nan
+    stamp_ns, arrival_ns = found.stamp_ns[found.valid], batch.log_ns[found.valid]
+    rows = FixRows(robot[found.valid], stamp_ns, pose, covariance, arrival_ns)
+    at_home = np.array([m.frame_id == known.map_frame for m in messages], dtype=bool)
+    return chosen(rows, at_home), {FOREIGN_FRAME: int(np.sum(~at_home))}
+
+
+def _shared_rows(message: SharedMessage, arrival_ns: IntArray) -> FixRows:
+    pose, covariance = message.columns[0], message.columns[1].reshape(-1, 3, 3)
+    pose[~has_heading(covariance), 2] = np.nan
+    return FixRows(message.robot, message.reading_ns, pose, covariance, arrival_ns)
+
+
+def about_robots(
+    robots: IntArray | int,
+    stamps_ns: IntArray | int,
+    poses: FloatArray,
+    covariances: FloatArray,
+    kind: int,
+) -> MeasurementArray:
+    """Measurements (m,) without observer of poses (m, 3) in `map` with covariances (m, 3, 3)."""
+    measurements = np.zeros(len(poses), dtype=MEASUREMENT_DTYPE)
+    measurements["stamp_ns"], measurements["kind"] = stamps_ns, kind
+    measurements["received_from"] = measurements["target"] = robots
+    measurements["observer"] = NOBODY
+    measurements["value"], measurements["covariance"] = poses, covariances
+    measurements["has_heading"], measurements["gate"] = 1, _GATE
+    return measurements
+
+
+def take_out_headings(measurements: MeasurementArray, without: NDArray[np.bool_]) -> None:
+    """Take the headings out of those measurements (m,) that have none."""
+    measurements["has_heading"][without], measurements["value"][without, 2] = 0, 0.0
+    covariance = measurements["covariance"]
+    covariance[without, 2, :] = covariance[without, :, 2] = [0.0, 0.0, 1.0]
+
+
+def _create_converter(_swarm: Swarm, _settings: SensorSettings, _drops: Counter[str]) -> Converter:
+    def convert(rows: FixRows) -> Measured:
+        fixes = about_robots(rows.robot, rows.stamp_ns, rows.pose, rows.covariance, Kind.CARTESIAN)
+        take_out_headings(fixes, np.isnan(rows.pose[:, 2]))
+        return Measured(fixes, rows.arrival_ns)
+
+    return convert
+
+
+_OWN = InputKind(
+    "fixes", "fix", POSE_WITH_COVARIANCE, lambda n, _: EachReader(n, decode_fix), _columns, in_map=True
+)
+_decode_shared = partial(decode_shared_numbers, widths=(3, 9))
+_SHARED = shared_kind(_OWN, "swarm/fixes", SWARM_FIXES, _decode_shared, _shared_rows, NO_FIXES)
+FIXES = Sensor(
+    "fixes",
+    NO_FIXES,
+    (_OWN, _SHARED),
+    _create_converter,
+)
+"""The sensor, see `registry.SENSORS`."""
