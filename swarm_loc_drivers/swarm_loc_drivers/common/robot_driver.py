@@ -30,13 +30,16 @@ class RobotDriver(ABC, Generic[SomeSession]):
     Attributes:
         counts: `connections`, `link_failures`, and the counts of the sessions.
         trouble: Why there is no connection; "" while there is one.
+        warning: What is wrong with the connected robot; "" for nothing.
+        may_run: Whether the robot may be moving after the driver has been stopped.
     """
 
     def __init__(self, name: str) -> None:
         self.counts: Counter[str] = Counter()
         self.trouble = f"connecting to {name}"
+        self.warning = ""
         self._stopping = threading.Event()
-        self._may_run = False
+        self.may_run = False
         self._thread = threading.Thread(target=self._run, name=f"driver of {name}")
 
     def start(self) -> None:
@@ -89,7 +92,7 @@ class RobotDriver(ABC, Generic[SomeSession]):
             is_ending, now_s = self._stopping.is_set(), time.monotonic()
             if is_ending:
                 give_up_s = min(give_up_s, now_s + MAX_STOP_S)
-                if not self._may_run or now_s > give_up_s:
+                if not self.may_run or now_s > give_up_s:
                     return
             connected = self.counts["connections"] > connections
             pause_s = _MIN_PAUSE_S if connected or is_ending else min(2.0 * pause_s, _MAX_PAUSE_S)
@@ -102,10 +105,10 @@ class RobotDriver(ABC, Generic[SomeSession]):
         """One connection, until the driver is stopped."""
         link = self._open()
         session = self._begin()
-        self._may_run = True
+        self.may_run = True
         try:
             self._talk(session, link, self._serve)
-            self._may_run = False
+            self.may_run = False
         except (LinkError, SessionError):
             raise
         except BaseException:  # a defect of the driver must not leave the robot moving
@@ -113,6 +116,7 @@ class RobotDriver(ABC, Generic[SomeSession]):
             self._talk(self._begin(), link, lambda _: None)
             raise
         finally:
+            self.warning = ""
             self._lose(session)
             link.close()
 

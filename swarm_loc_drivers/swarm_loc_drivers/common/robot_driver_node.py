@@ -13,7 +13,7 @@ from rclpy.qos import QoSProfile
 from swarm_loc_drivers.common.robot_driver import RobotDriver
 from swarm_loc_drivers.common.ros_messages import OdometryOutput, transform_publisher
 from swarm_loc_drivers.common.velocity_command import Velocity
-from swarm_loc_estimator.common.health import PATIENCE_S, Level, Report
+from swarm_loc_estimator.common.health import PATIENCE_S, Level, Report, level_of
 from swarm_loc_estimator.common.node import ConfiguredNode, Stop
 
 _COMMAND_QOS = QoSProfile(depth=1)
@@ -70,6 +70,8 @@ class RobotDriverNode(ConfiguredNode[Parameters]):
     def destroy_node(self) -> None:
         """Stop the robot first."""
         self._driver.stop()
+        if self._driver.may_run:
+            self.get_logger().error(f"the robot may still be moving: {self._driver.trouble}")
         super().destroy_node()
 
     def _odometry_output(self, topic: str, prefix: str) -> OdometryOutput:
@@ -100,16 +102,18 @@ class RobotDriverNode(ConfiguredNode[Parameters]):
         self.start_diagnostics(self._report)
 
     def _report(self) -> None:
-        trouble, counts = self._driver.trouble, Counter(self._driver.counts)
+        trouble, warning = self._driver.trouble, self._driver.warning
+        counts = Counter(self._driver.counts)
         self._log(trouble, counts)
+        self.health.warn_of("robot", {warning: warning} if warning else {})
         now_s = time.monotonic()
         elapsed_s, self._reported_s = now_s - self._reported_s, now_s
         values: dict[str, object] = dict(sorted(counts.items()))
         for name in self._rates:
             values[f"{name} rate [1/s]"] = f"{(counts[name] - self._reported[name]) / elapsed_s:.4g}"
         self._reported = counts
-        level, name = Level.ERROR if trouble else Level.OK, f"{self._prefix}{self.get_name()}"
-        self.publish_reports(Report(name, trouble or "connected", level, values, self._address))
+        level, name = Level.ERROR if trouble else level_of(warning), f"{self._prefix}{self.get_name()}"
+        self.publish_reports(Report(name, trouble or warning or "connected", level, values, self._address))
 
     def _log(self, trouble: str, counts: Counter[str]) -> None:
         # a robot that is being switched on, or a simulation that starts, does not answer at once

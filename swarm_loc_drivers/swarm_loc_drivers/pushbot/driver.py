@@ -13,7 +13,7 @@ from swarm_loc_drivers.common.velocity_command import Velocity, VelocityCommand
 from swarm_loc_drivers.pushbot.event_packets import EventPacket
 from swarm_loc_drivers.pushbot.hardware import wheel_velocities
 from swarm_loc_drivers.pushbot.odometry import PushbotOdometry
-from swarm_loc_drivers.pushbot.session import PushbotSession, PushbotSettings
+from swarm_loc_drivers.pushbot.session import NO_STOP, PushbotSession, PushbotSettings
 
 _READ_S = 0.02
 _BATCH_S = 0.002
@@ -75,6 +75,7 @@ class PushbotDriver(RobotDriver[PushbotSession]):
         return session.step(data, self._clock(), self._read_s)
 
     def _serve(self, session: PushbotSession) -> None:
+        self.warning = NO_STOP if session.does_not_stop else ""
         found, session.found = session.found, []
         for one in found:
             if one.stamp_ns <= 0:  # no clock yet, or a time before its beginning

@@ -33,6 +33,7 @@ _WRONG = {
     "bad_cmd_vel": "velocities that were not finite or too large",
     "corrupt_events": "wrongly decoded events, as after lost bytes",
     "counter_restarts": "discontinuous wheel ticks",
+    "ignored_stops": "stops that the wheels did not obey within a second",
     "implausible_counters": "wheel ticks beyond the motors' speed",
     "long_lines": "lines of text without an end",
     "refused_commands": "commands that the robot did not understand",

@@ -2,7 +2,9 @@
 
 The board is reset first: this stops its motors, sets its clock and ticks to zero, and its banner identifies
 it. While it streams, a velocity is sent when it changes and repeated before it decays, so a firmware with
-decaying velocities stops the robot by itself soon after the last command.
+decaying velocities stops the robot by itself soon after the last command. The firmware can lose a stop: when
+it parses the command just after a tick of its clock, the pending update of the velocity controller sets the
+duty cycle again, which then lasts. So a stop is repeated until the wheel ticks stand still.
 """
 
 from __future__ import annotations
@@ -72,11 +74,19 @@ class WheelTicks:
 Velocities = Callable[[], tuple[int, int]]
 """Commands for the left and the right wheel [ticks per 21 ms]; called just before they are sent."""
 
+NO_STOP = "the wheels go on turning although the stop is repeated"
+"""What a robot does that does not stop."""
 _BOOT_S = 2.0
 """Time in which a board starts, in addition to that of an answer [s]."""
 _ATTEMPTS = 3
 _REPEAT_S = 0.4
 """A constant velocity is repeated after so long; a decaying one holds for a second [s]."""
+_REPEAT_STOP_S = 0.1
+"""A stop is repeated after so long while the wheels turn [s]."""
+_STILL_S = 0.1
+"""The wheels stand when their ticks have not changed for so long [s]."""
+_STOP_S = 1.0
+"""The wheels must stand so long after a stop, and two periods of their ticks later [s]."""
 
 
 class PushbotSession(TalkSession):
@@ -85,7 +95,8 @@ class PushbotSession(TalkSession):
     Args:
         settings: Settings of the robot.
         velocities: Commands of the wheels.
-        counts: Counts `events`, `readings`, `refused_commands`, `other_lines`, and those of `EventParser`.
+        counts: Counts `events`, `readings`, `refused_commands`, `other_lines`, `repeated_stops`,
+            `ignored_stops`, and those of `EventParser`.
 
     Attributes:
         ending: Set it to stop the robot and end the conversation.
@@ -93,6 +104,7 @@ class PushbotSession(TalkSession):
         ended: Whether the conversation has ended; the robot stands.
         found: Measurements; the reader empties the list.
         generation: Its firmware, once it is known.
+        does_not_stop: Whether the wheels go on turning although the stop has been repeated for a second.
     """
 
     def __init__(self, settings: PushbotSettings, velocities: Velocities, counts: Counter[str]) -> None:
@@ -101,7 +113,13 @@ class PushbotSession(TalkSession):
         self.generation: FirmwareGeneration | None = None
         self._settings = settings
         self._velocities = velocities
+        self.does_not_stop = False
         self._sent, self._sent_s = (0, 0), 0.0
+        self._ticks: tuple[int, int] | None = None
+        self._ticks_s = 0.0  # of the newest reading
+        self._is_turning = False  # by the newest reading
+        self._turned_s = 0.0  # of the last reading that changed, or the last velocity
+        self._stood_s = 0.0  # when the robot last stood, or was commanded to drive
 
     def _run(self) -> Talk[None]:
         yield from self._answer(protocol.RESET, protocol.BANNER, _BOOT_S)
@@ -152,8 +170,8 @@ class PushbotSession(TalkSession):
         clock = EventClock(parser.span_us) if settings.timestamps not in ("", "none") else None
         packets = EventPackets(settings.packet_period_s, settings.on_bit)
         readings = TickClock(_tick_period_ms(settings))
-        ticks_s = self._steady_s
-        while not self.ending:
+        self._ticks_s = self._stood_s = self._steady_s
+        while not (self.ending and self._stands()):
             yield
             received, self._received = self._received, b""
             parsed = parser.feed(received)
@@ -161,11 +179,11 @@ class PushbotSession(TalkSession):
             for before, line in parsed.lines:
                 if before and clock is not None:
                     readings.pass_event(int(parsed.time_us[before - 1]), stamps_ns[before - 1])
-                if self._take_line(line, readings, generation):
-                    ticks_s, self.connected = self._steady_s, True
-            if self._steady_s > ticks_s + settings.reply_timeout_s + settings.tick_period_s:
+                self._take_line(line, readings, generation)
+            if self._steady_s > self._ticks_s + settings.reply_timeout_s + settings.tick_period_s:
                 raise SessionError("the robot has stopped sending wheel ticks")
             self._send_velocity(generation)
+            self._check_stop()
 
     def _take_events(self, parsed: Parsed, clock: EventClock | None, packets: EventPackets) -> list[int]:
         """Stamp and pack events; their stamps [ns], which time the lines between them."""
@@ -183,8 +201,8 @@ class PushbotSession(TalkSession):
         packets.ready.clear()
         return stamps
 
-    def _take_line(self, line: bytes, readings: TickClock, generation: FirmwareGeneration) -> bool:
-        """Take a line; whether it was wheel ticks.
+    def _take_line(self, line: bytes, readings: TickClock, generation: FirmwareGeneration) -> None:
+        """Take wheel ticks, or count another line.
 
         Raises:
             SessionError: The board was reset.
@@ -193,19 +211,50 @@ class PushbotSession(TalkSession):
         if ticks is not None:
             self._counts["readings"] += 1
             self.found.append(WheelTicks(readings.stamp_ns(self._now_ns), *ticks))
-            return True
+            self._is_turning = self._ticks not in (None, ticks)
+            if self._ticks is None or self._is_turning:
+                self._turned_s = self._steady_s
+            self._ticks, self._ticks_s, self.connected = ticks, self._steady_s, True
+            return
         if protocol.BANNER.search(line + b"\n"):
             raise SessionError("the robot has been reset")
         self._counts["refused_commands" if protocol.is_refusal(line) else "other_lines"] += 1
-        return False
 
     def _send_velocity(self, generation: FirmwareGeneration) -> None:
-        """Send a new velocity, and repeat one before it decays; zero until the robot is connected."""
-        wanted = self._velocities() if self.connected else (0, 0)
-        if wanted == self._sent and (wanted == (0, 0) or self._steady_s < self._sent_s + _REPEAT_S):
-            return
-        self._output += protocol.velocity(generation, *wanted) if any(wanted) else protocol.BRAKE
+        """Send a new velocity, and repeat one before it decays; a stop, while the wheels turn."""
+        wanted = self._velocities() if self.connected and not self.ending else (0, 0)
+        if wanted == self._sent:
+            period_s = _REPEAT_S if any(wanted) else _REPEAT_STOP_S
+            if self._steady_s < self._sent_s + period_s or not (any(wanted) or self._is_turning):
+                return
+            if not any(wanted):
+                self._counts["repeated_stops"] += 1
+        if any(wanted):
+            self._output += protocol.velocity(generation, *wanted)
+            self._turned_s = self._stood_s = self._steady_s
+        else:
+            self._output += protocol.BRAKE
         self._sent, self._sent_s = wanted, self._steady_s
+
+    def _stands(self) -> bool:
+        """Whether the wheel ticks stand still."""
+        return self._ticks is not None and self._ticks_s >= self._turned_s + _STILL_S
+
+    def _check_stop(self) -> None:
+        """Note a robot that does not stop.
+
+        Raises:
+            SessionError: It does not stop at the end either; the next session resets the board.
+        """
+        if self._stands():
+            self._stood_s = self._steady_s
+        limit_s = _STOP_S + 2.0 * self._settings.tick_period_s
+        fails = not any(self._sent) and self._steady_s > self._stood_s + limit_s
+        if fails and not self.does_not_stop:
+            self._counts["ignored_stops"] += 1
+        self.does_not_stop = fails
+        if fails and self.ending:
+            raise SessionError(NO_STOP)
 
     def _farewell(self) -> bytes:
         """Commands that turn everything off; the answer to the final query confirms all of them."""

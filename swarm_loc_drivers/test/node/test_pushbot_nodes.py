@@ -15,9 +15,12 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, Twist, Vector3
 from nav_msgs.msg import Odometry
 from node_world import Program, Ros, stamp_ns
+from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from test_world_node import free_ports
 
+from swarm_loc_drivers.pushbot.pushbot_driver_node import PushbotDriverNode
+from swarm_loc_drivers.pushbot.session import NO_STOP
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import FOCAL_PX
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldParameters
@@ -192,6 +195,17 @@ def test_a_driver_that_is_killed_leaves_a_robot_that_stops_by_itself(hall: Hall)
     driver.end(signal.SIGKILL)
     hall.ros.until(hall.stands)
     assert hall.moved() < 2.0
+
+
+def test_a_robot_that_does_not_stop_is_named_in_the_diagnostics(ros: Ros) -> None:
+    diagnostics: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
+    address = [Parameter("address", value="/dev/none")]
+    node = ros.add(PushbotDriverNode(namespace="pushbot1", parameter_overrides=address))
+    node._driver.trouble, node._driver.warning = "", NO_STOP
+    ros.until(lambda: diagnostics)
+    (status,) = diagnostics[-1].status
+    assert (status.name, status.level) == ("pushbot1/pushbot_driver", DiagnosticStatus.WARN)
+    assert status.message == NO_STOP
 
 
 def test_a_world_that_goes_and_comes_back_is_connected_anew(

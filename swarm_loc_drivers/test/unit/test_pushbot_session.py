@@ -7,7 +7,9 @@ import pytest
 from pushbot_rig import PushbotWire, pushbot_settings
 
 from swarm_loc_drivers.pushbot import protocol as commands
+from swarm_loc_drivers.pushbot.driver import PushbotDriver, PushbotListeners
 from swarm_loc_drivers.pushbot.hardware import FIRST_FIRMWARE, SECOND_FIRMWARE, FirmwareGeneration
+from swarm_loc_drivers.pushbot.session import NO_STOP
 from swarm_loc_estimator.common.messages.event_encoding import ENCODING, decode_events
 
 FORMATS = [(one, name) for one in (FIRST_FIRMWARE, SECOND_FIRMWARE) for name in ("", *one.formats)]
@@ -92,10 +94,96 @@ def test_wheels_stand_at_the_end(generation: FirmwareGeneration) -> None:
     assert wire.speed > 0.3
     wire.session.ending = True
     wire.run(0.1)
+    assert wire.speed == 0.0
+    wire.run(0.3)
     assert wire.session.ended
     assert wire.speed == 0.0
+    assert wire.ticks[-1].left == wire.ticks[-4].left
     assert wire.world.lights[0][0].period_us == 0
     assert not wire.firmware.board.is_streaming
+
+
+def deaf_to_stops(wire: PushbotWire) -> None:
+    """Let a robot ignore duty cycles."""
+    drive = wire.firmware.board.drive
+
+    def drive_only(motor: int, value: int, kind: str, *, decays: bool) -> None:
+        if kind == "velocity":
+            drive(motor, value, kind, decays=decays)
+
+    wire.firmware.board.drive = drive_only  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize("generation", [FIRST_FIRMWARE, SECOND_FIRMWARE], ids=lambda one: one.name)
+@pytest.mark.parametrize("ends", [False, True])
+def test_a_stop_that_the_firmware_loses_is_repeated_until_the_wheels_stand(
+    generation: FirmwareGeneration, ends: bool
+) -> None:
+    """Parsed just after a tick of the clock, the stop is overwritten by the controllers' pending update."""
+    wire = streaming(generation=generation)
+    wire.velocities = (60, 60)
+    wire.run(0.5)
+    wire.firmware.late_share = 1.0
+    before = wire.sent.count(commands.BRAKE)
+    wire.velocities, wire.session.ending = (0, 0), ends
+    wire.run(0.03)
+    assert wire.sent.count(commands.BRAKE) == before + 1
+    assert wire.speed > 0.3
+    wire.run(0.2)
+    assert wire.speed == 0.0
+    assert 1 <= wire.counts["repeated_stops"] <= 2  # it coasts a moment
+    wire.run(1.0)
+    assert wire.session.ended is ends
+    assert wire.ticks[-1].left == wire.ticks[-4].left
+    assert wire.sent.count(commands.BRAKE) == before + 1 + wire.counts["repeated_stops"] + ends
+    assert wire.counts["ignored_stops"] == 0
+    assert not wire.errors
+
+
+def test_a_robot_that_does_not_stop_is_reported_and_reset_at_the_end() -> None:
+    wire = streaming(generation=FIRST_FIRMWARE)
+    driver = PushbotDriver(pushbot_settings(), PushbotListeners(print, print), lambda: 0)
+    wire.velocities = (30, 30)
+    wire.run(0.5)
+    deaf_to_stops(wire)
+    wire.velocities = (0, 0)
+    wire.run(0.9)
+    assert wire.counts["ignored_stops"] == 0
+    wire.run(2.0)
+    assert wire.session.does_not_stop
+    assert wire.counts["ignored_stops"] == 1
+    assert 20 < wire.counts["repeated_stops"] <= 30
+    driver._serve(wire.session)
+    assert driver.warning == NO_STOP
+    wire.session.ending = True
+    wire.run(1.5)
+    assert wire.errors == [NO_STOP]
+    assert wire.session.ended
+    assert wire.speed == 0.0
+
+
+def test_a_robot_that_stops_no_more_is_reset_in_time_at_the_end() -> None:
+    wire = streaming(generation=FIRST_FIRMWARE)
+    wire.velocities = (30, 30)
+    wire.run(0.5)
+    deaf_to_stops(wire)
+    wire.session.ending = True
+    wire.run(0.9)
+    assert not wire.errors
+    wire.run(0.5)
+    assert wire.errors == [NO_STOP]
+    assert wire.speed == 0.0
+
+
+def test_wheels_that_are_turned_by_hand_are_reported_until_they_stand() -> None:
+    wire = streaming()
+    for _ in range(400):
+        wire.world.drivetrain.ticks += 2.0
+        wire.step()
+    was_reported = wire.session.does_not_stop
+    wire.run(0.3)
+    assert (was_reported, wire.session.does_not_stop) == (True, False)
+    assert wire.counts["ignored_stops"] == 1
 
 
 def test_a_robot_that_hears_and_is_not_heard_is_stopped() -> None:

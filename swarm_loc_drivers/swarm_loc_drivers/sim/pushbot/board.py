@@ -128,10 +128,15 @@ class _Mode(Enum):
 
 
 class Motor:
-    """One motor: its command, and the resulting duty cycle."""
+    """One motor: its command, and the resulting duty cycle.
+
+    As on the board, a clock tick requests an update of the velocity controller, which the main loop executes
+    after it has parsed the commands, whatever they have set: a duty cycle that is parsed in between is lost.
+    """
 
     def __init__(self) -> None:
         self._mode = _Mode.DIRECT
+        self._needs_update = False
         self._decays = False
         self._decay_left = 0
         self._velocity = self._position = self._prescaled = 0
@@ -165,10 +170,15 @@ class Motor:
         else:
             self._velocity -= (self._velocity > 0) - (self._velocity < 0)
 
-    def control(self, ticks: int) -> None:
-        """A millisecond has passed; `ticks` is where the wheel is now."""
-        if self._mode is _Mode.DIRECT:
+    def request_update(self) -> None:
+        """The clock ticks: request an update of the velocity controller."""
+        self._needs_update = self._mode is _Mode.VELOCITY
+
+    def update(self, ticks: int) -> None:
+        """Update the velocity controller if it was requested; `ticks` is where the wheel is now."""
+        if not self._needs_update:
             return
+        self._needs_update = False
         if self._prescaled == 0:
             self._prescaled = _PRESCALER
             self._position += self._velocity
@@ -321,15 +331,20 @@ class Board:
         else:
             self.ring.clear()
 
+    def request_updates(self) -> None:
+        """The firmware's clock ticks, once a millisecond."""
+        for motor in self._motors:
+            motor.request_update()
+
     def millisecond(self) -> None:
-        """The firmware's clock ticks."""
+        """The main loop does what is due after a tick of the clock."""
         if self.is_blocked:
             return
         self._milliseconds += 1
         for motor, ticks in zip(self._motors, self.ticks(), strict=True):
             if self._milliseconds % 100 == 0:
                 motor.decay()
-            motor.control(ticks)
+            motor.update(ticks)
         self._apply_duties()
         if self._milliseconds % 1000 == 0:
             self._rate, self._seen = self._seen, 0

@@ -168,6 +168,8 @@ def _number(text: str) -> int:
 
 
 _BITS_PER_BYTE = 10
+LATE_SHARE = 0.03
+"""Share of received bytes that are parsed between a tick of the clock and the controllers' update."""
 _MAX_GAP_S = 0.02
 """A wire that was blocked for longer does not catch up."""
 
@@ -179,9 +181,17 @@ class PushbotFirmware:
         body: The robot.
         generation: Which firmware it is.
         baud_rate: Of the wire to the host or its radio [bit/s].
+        seed: Decides which bytes are parsed just after a tick of the clock, see `Motor`.
+
+    Attributes:
+        late_share: Share of these bytes.
     """
 
-    def __init__(self, body: PushbotBody, generation: FirmwareGeneration, baud_rate: int = BAUD_RATE) -> None:
+    def __init__(
+        self, body: PushbotBody, generation: FirmwareGeneration, baud_rate: int = BAUD_RATE, seed: int = 0
+    ) -> None:
+        self.late_share = LATE_SHARE
+        self._rng = np.random.default_rng(seed)
         self._body = body
         self.board = Board(body, generation)
         self.board.was_reset = False
@@ -193,6 +203,7 @@ class PushbotFirmware:
 
     def millisecond(self) -> None:
         """A millisecond has passed in the world."""
+        self.board.request_updates()
         self._work()
         self.board.millisecond()
 
@@ -203,7 +214,8 @@ class PushbotFirmware:
     def receive(self, data: bytes) -> bytes:
         """Take bytes; answers come with `stream`."""
         self._received += data
-        self._work()
+        if not data or self._rng.random() >= self.late_share:
+            self._work()
         return b""
 
     def _work(self) -> None:

@@ -43,7 +43,8 @@ class PushbotWorldNode(WorldNode[PushbotWorldParameters]):
         )
 
     def _firmware_of(self, robot: int) -> PushbotFirmware:
-        firmware = PushbotFirmware(SimulatedPushbot(self._world, robot), GENERATIONS[self.params.firmware])
+        generation = GENERATIONS[self.params.firmware]
+        firmware = PushbotFirmware(SimulatedPushbot(self._world, robot), generation, seed=robot)
         self._world.firmwares[robot] = firmware
         return firmware
 
