@@ -1,4 +1,4 @@
-"""Batch update: many measurements of one period held against one belief, and used together."""
+"""Batch update: many measurements of one period, evaluated against one belief and used together."""
 
 from __future__ import annotations
 

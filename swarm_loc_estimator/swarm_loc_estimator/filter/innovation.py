@@ -49,7 +49,7 @@ class Scratch(NamedTuple):
 
 
 class InnovationBatch(NamedTuple):
-    """Measurements (m,) held against one belief.
+    """Measurements (m,) evaluated against one belief.
 
     Attributes:
         pose: (m, 2, 3) observers and targets in `map` at the stamps, or by what a landmark is moved.
@@ -62,7 +62,7 @@ class InnovationBatch(NamedTuple):
         noise: (m, 3, 3) covariances of the measurements, as they are used.
         pair: (m, PAIR_ROWS, 3) what to remember of its pair when it is used, see `correlated_noise`.
         distance: (m,) squared Mahalanobis distance of the position, small errors left out.
-        whitened: (m, 2) position innovation over its standard deviation, likewise.
+        whitened: (m, 2) position innovation over its standard deviation, without small errors.
         cause: (m,) what may explain the innovation, see `integrity.cause_of`.
         accepted: (m,) whether the gate lets it through.
         nis: (m,) normalised innovation squared.

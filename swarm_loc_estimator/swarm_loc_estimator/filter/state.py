@@ -54,7 +54,7 @@ class Starts(NamedTuple):
         covariance: (k, 3, 3) of their right-invariant errors.
         stamp_ns: (k,) the instants.
         preintegrated_covariance: (k, 3, 3) of the tracks by then.
-        preintegrated_jacobian: (k, 3, 3) likewise.
+        preintegrated_jacobian: (k, 3, 3) of the tracks by then.
     """
 
     transform: FloatArray
@@ -79,7 +79,7 @@ class SwarmState:
         filter: Covariance of the errors: robot i has columns 3i..3i+2 for its pose, right-invariant, and
             those of the table for its parameters; landmarks have those of the table.
         predicted_to_ns: (N,) the instant to which the robot is predicted.
-        preintegrated_covariance: (N, 3, 3) of its track at that instant; likewise preintegrated_jacobian.
+        preintegrated_covariance: (N, 3, 3) of its track at that instant, as is preintegrated_jacobian.
         tracked: (N,) whether the robot is part of the estimate.
         start_pending: (N,) whether the robot may still be initialized at its configured start.
         last_fix_ns: (N,) newest accepted measurement tied to a landmark or an absolute fix.
@@ -193,7 +193,7 @@ class SwarmState:
         self._trust(np.array([robot]), 0)
 
     def augment(self, source: int, pose: FloatArray) -> None:
-        """Estimate what a contradicted robot or landmark was described by, or estimate it anew.
+        """Estimate the parameters of a contradicted robot or landmark, or re-estimate them.
 
         Args:
             source: The robot, or N plus the landmark.
@@ -217,7 +217,7 @@ class SwarmState:
         self.filter.add(robot_columns(np.array([source]))[0], doubt)
 
     def augment_all(self, poses: FloatArray) -> None:
-        """Estimate everything that may be estimated anew, since what is believed rests on what is not so.
+        """Re-estimate all parameters, since the belief rests on a wrong description.
 
         Args:
             poses: (N, 3) of the robots in `map`, which stay where they are believed to be.
@@ -244,7 +244,7 @@ class SwarmState:
         self._table = table
 
     def _augment_landmark(self, landmark: int) -> None:
-        """Estimate a landmark, or estimate it anew."""
+        """Estimate a landmark, or re-estimate it."""
         is_new = self.landmark_column(landmark) < 0
         self._use_table(self._table.with_landmark(landmark))
         columns = self.landmark_column(landmark) + np.arange(3)
@@ -262,7 +262,7 @@ class SwarmState:
                 self.filter.set_prior(first + np.arange(3), survey)
 
     def _trust(self, robots: IntArray, confirmations: int) -> None:
-        """Forget what was held against robots (k,) that begin anew."""
+        """Clear the fault scores of robots (k,) that are initialized again."""
         self.integrity.gated_in_a_row[robots] = 0
         self.integrity.gated_fixes[robots] = 0
         self.integrity.doubt[robots] = 0.0

@@ -19,9 +19,9 @@ class OdometrySample(NamedTuple):
 
     Attributes:
         pose: (m, 3) calibrated odometry pose O, heading not wrapped.
-        raw: (m, 3) the pose that the driver reported, interpolated likewise.
+        raw: (m, 3) the pose that the driver reported, interpolated in the same way.
         covariance: (m, 3, 3) preintegrated by then, see `Preintegrated`.
-        jacobian: (m, 3, 3) likewise.
+        jacobian: (m, 3, 3) preintegrated by then.
         silence_s: (m,) how long after the newest message of its robot the instant lies; 0 within the track.
     """
 

@@ -59,7 +59,7 @@ class TrackArrays(NamedTuple):
         raw: (N, capacity, 3) poses as reported, headings unwrapped.
         pose: (N, capacity, 3) calibrated poses O, headings unwrapped.
         covariance: (N, capacity, 3, 3) preintegrated until the row, see `Preintegrated`.
-        jacobian: (N, capacity, 3, 3) likewise; its columns are those of `estimated_parameters`.
+        jacobian: (N, capacity, 3, 3) until the row; its columns are those of `estimated_parameters`.
         rate: (N, capacity, 3) calibrated velocity forward and left [m/s] and turn rate [rad/s] at the row,
             behind the lag.
         known_ns: (N, capacity) until when the motion is known: the row's own instant, but for jumps.
@@ -68,7 +68,7 @@ class TrackArrays(NamedTuple):
         model: (N,) records of the numbers of `OdometryModel`.
         response: (N, 2, V, W) shares of speed and of turn rate of `MotionResponse`.
         response_speed: (N, V) speeds of its grid, filled up with infinity.
-        response_turn_rate: (N, W) turn rates likewise.
+        response_turn_rate: (N, W) turn rates of its grid.
         begin_ns: (N,) instant of the very first row.
         begin_pose: (N, 3) the pose there, where nothing is preintegrated yet.
         is_stationary: (N,) whether the robot has no odometry: its track never leaves the origin.

@@ -18,11 +18,11 @@ class OdometryStep(NamedTuple):
     """One step of a robot along its track.
 
     Attributes:
-        forward: Way of the body [m]; likewise left.
+        forward: Way of the body [m], as is left.
         turn: [rad]
         turn_rate_change: By how much the turn rate changed, without sign [rad/s].
         duration_s: [s]
-        x: Place on the track in the middle of the step [m]; likewise y.
+        x: Place on the track in the middle of the step [m], as is y.
         theta: Heading there [rad].
     """
 

@@ -96,7 +96,7 @@ class OdometryTracks:
         return np.asarray(self._walk[robots].any(axis=-1))
 
     def has_conflicting_sources(self, now_ns: int) -> BoolArray:
-        """Whether the odometry of each robot (N,) has jumped again and again of late."""
+        """Whether the odometry of each robot (N,) has jumped repeatedly within the last seconds."""
         arrays, robots = self.arrays, np.arange(self._robots)
         before_last_ns = arrays.jump_ns[robots, np.maximum(arrays.filled - 1, 0), 1]
         jumping: BoolArray = (arrays.filled > 0) & (now_ns - before_last_ns < _JUMPING_NS)
@@ -189,7 +189,7 @@ class OdometryTracks:
     def _take_back_later_rows(
         self, robots: IntArray, stamps: IntArray, raw: FloatArray
     ) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
-        """Merge the new rows with those of the tracks that come after them, which are then integrated anew.
+        """Merge the new rows with those of the tracks that come after them, which are then integrated again.
 
         Returns:
             Robots, stamps, raw poses, and per robot the instant after which its track changes.

@@ -41,7 +41,7 @@ _MAX_FREE = 200
 _MOVED = 6.0
 """By so many standard deviations a robot must have moved, or turned by half as many, to be looked for."""
 _MAX_DRIFT_M, _MAX_DRIFT_RAD = 0.3, 0.5
-"""What its own track may have drifted between two images; more, and a robot begins anew."""
+"""What its own track may have drifted between two images; with more a robot starts its search again."""
 _DOUBT_SHARE = 0.1
 """A robot that is believed to be elsewhere, but not seen there, must be so much surer: that is rare."""
 _MAX_DOUBT = 9.0

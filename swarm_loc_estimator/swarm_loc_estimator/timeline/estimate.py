@@ -40,8 +40,8 @@ class Estimate(NamedTuple):
     Attributes:
         stamp_ns: The instant.
         poses: (N, 3) x [m], y [m], theta [rad] in `map`; NaN for robots that are not located.
-        covariances: (N, 3, 3) of x, y, theta; NaN likewise.
-        map_to_odom: (N, 3) from `map` to the driver's own odom frame; NaN likewise.
+        covariances: (N, 3, 3) of x, y, theta; NaN where `poses` are.
+        map_to_odom: (N, 3) from `map` to the driver's own odom frame; NaN where `poses` are.
         status: (N,) of `Status`.
         fix_age_s: (N,) since the newest measurement tied to a landmark or an absolute fix; -1: never.
     """

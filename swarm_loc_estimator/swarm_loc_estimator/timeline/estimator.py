@@ -64,7 +64,7 @@ class Estimator:
         self._odometry: list[OdometryRows] = []
 
     def reset(self) -> None:
-        """Forget all data and begin anew with the configured starts; the counters go on."""
+        """Forget all data and start again at the configured starts; the counters go on."""
         self.drop("reset", sum(rows.robot.size for rows in self._odometry) + self._timeline.waiting)
         self._converter.drops.update(self._timeline_drops())
         self._tracks.clear()
@@ -205,7 +205,7 @@ class Estimator:
         return self._estimate(now_ns)
 
     def _check_clock(self, now_ns: int) -> int:
-        """Begin anew when time has jumped back, as at the loop of a bag; return the newest time since."""
+        """Reset when the clock has jumped back, as at the loop of a bag; return the newest time since."""
         if self._now_ns is not None and now_ns < self._now_ns - self._jump_back_ns:
             self.reset()
             self.time_jumps += 1

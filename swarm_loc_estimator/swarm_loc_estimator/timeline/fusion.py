@@ -53,7 +53,7 @@ _SURER_AT_FIRST = 1.5
 """By this factor a heading must be surer than one that is lost, for a robot to be initialized."""
 _NO_IMAGE_NS = np.iinfo(np.int64).min
 _PAIRS_PER_ROBOT = 32
-"""A robot remembers what so many others have told it by infrared."""
+"""Number of other robots whose infrared measurements each robot remembers."""
 _CONTRADICTED_DESCRIPTION, _CONTRADICTED_WITHIN_NS = 2, 60_000_000_000
 """When so many robots and landmarks are contradicted within that time, so is all that was concluded."""
 
@@ -230,16 +230,16 @@ class Fusion:
             self._fuse_part(state, measurements[part], verdicts[part], nis[part])
 
     def _parts(self, measurements: MeasurementArray) -> list[slice]:
-        """Parts of measurements (m,) in which no pair tells twice what comes again: its mean is to count."""
-        edges, told = [0], set[tuple[int, int]]()
+        """Parts of measurements (m,) with at most one correlated measurement of each pair."""
+        edges, seen = [0], set[tuple[int, int]]()
         if self._pairs:
             comes_again: BoolArray = measurements["systematic_share"].max(axis=1) > 0.0
             pairs = zip(measurements["observer"].tolist(), measurements["target"].tolist(), strict=True)
             for k, pair in itertools.compress(enumerate(pairs), comes_again):
-                if pair in told:
+                if pair in seen:
                     edges.append(k)
-                    told.clear()
-                told.add(pair)
+                    seen.clear()
+                seen.add(pair)
         return [slice(begin, end) for begin, end in itertools.pairwise([*edges, measurements.size])]
 
     def _fuse_part(
@@ -340,7 +340,7 @@ class Fusion:
         return Verdict.CONSTRAINT
 
     def _augment(self, state: SwarmState, source: int, stamp_ns: int) -> None:
-        """Estimate what a contradicted robot or landmark was described by, or locate the robot anew."""
+        """Re-estimate the parameters of a contradicted robot or landmark, or localize the robot again."""
         robots = state.tracked.size
         if source < robots and is_elsewhere(state.integrity, source):
             state.deinitialize(source)
