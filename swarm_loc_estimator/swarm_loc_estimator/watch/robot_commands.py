@@ -137,5 +137,8 @@ def numbers(values: object, count: int) -> list[float] | None:
         return None
     if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in values):
         return None
-    found = [float(one) for one in values]
+    try:
+        found = [float(one) for one in values]
+    except OverflowError:  # a whole number of more than 308 digits
+        return None
     return found if all(map(math.isfinite, found)) else None

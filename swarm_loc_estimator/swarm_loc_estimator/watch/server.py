@@ -26,6 +26,9 @@ _MAX_COMMAND_BYTES = 4096
 _SEND_BUFFER_BYTES = 262144
 _HEARTBEAT_S = 10.0
 _START_PATIENCE_S = 10.0
+REQUEST_PATIENCE_S = 10.0
+"""A connection that has not become a page's WebSocket after so long is closed."""
+_SWEEP_PERIOD_S = 1.0
 
 Command = Mapping[str, Any]
 MAX_NOTES = 64
@@ -43,6 +46,7 @@ class Answer(Protocol):
         """One sentence, and whether the command was obeyed."""
 
 
+Connection = web.RequestHandler
 OnCommand = Callable[[Command, Answer], None]
 """Takes a page's command; called in the server's thread."""
 
@@ -92,6 +96,7 @@ class WatchServer:
         self._on_command = on_command
         self._history = History()
         self._viewers: set[Viewer] = set()
+        self._sockets: set[Connection] = set()
         self._gone = LeftOut(0, 0)
         self._refused = 0
         self._known_left_out: dict[int, int] = {}
@@ -169,6 +174,7 @@ class WatchServer:
         try:
             self._loop.run_until_complete(self._listen(port))
             self._listening.set()
+            self._close_slow_requests({})
             self._loop.run_forever()
         except OSError as error:
             self._faults.append(error)
@@ -182,6 +188,20 @@ class WatchServer:
         await self._runner.setup()
         await web.TCPSite(self._runner, self._access.address, port).start()
 
+    def _close_slow_requests(self, known: Mapping[Connection, float]) -> None:
+        """Close connections that are no page's WebSocket in time, now and once a second.
+
+        Args:
+            known: Such connections, and when each was first seen [s].
+        """
+        now_s = self._loop.time()
+        connections = self._runner.server.connections if self._runner.server else []
+        waiting = {one: known.get(one, now_s) for one in connections if one not in self._sockets}
+        for connection, since_s in waiting.items():
+            if now_s >= since_s + REQUEST_PATIENCE_S and connection.transport:
+                connection.transport.abort()
+        self._loop.call_later(_SWEEP_PERIOD_S, self._close_slow_requests, waiting)
+
     def _application(self) -> web.Application:
         application = web.Application()
         application.router.add_get("/", self._on_page)
@@ -191,8 +211,13 @@ class WatchServer:
 
     def _check(self, request: web.Request) -> None:
         """Refuse who may not look."""
-        origin = request.headers.get("Origin")
-        refusal = self._access.refusal(request.host, origin, request.query.get("token", ""))
+        hosts = request.headers.getall("Host", [])
+        refusal = self._access.refusal(
+            hosts[0] if len(hosts) == 1 else "",
+            request.headers.get("Origin"),
+            request.query.get("token", ""),
+            request.remote or "",
+        )
         if refusal:
             self._refused += 1
             raise web.HTTPForbidden(text=refusal)
@@ -219,6 +244,7 @@ class WatchServer:
         viewer = Viewer(socket, self._rate)
         past = self._history.frames()
         self._viewers.add(viewer)
+        self._sockets.add(request.protocol)
         sending = asyncio.ensure_future(self._send(socket, viewer, past))
         try:
             async for message in socket:
@@ -226,6 +252,7 @@ class WatchServer:
                     self._on_text(viewer, message.data)
         finally:
             self._viewers.discard(viewer)
+            self._sockets.discard(request.protocol)
             self._gone = LeftOut(*map(sum, zip(self._gone, viewer.left_out, strict=True)))
             sending.cancel()
         return socket
@@ -244,16 +271,15 @@ class WatchServer:
         if text == RECEIVED:
             viewer.on_received()
             return
-        try:
-            command = json.loads(text)
-            todo, robot = str(command["do"]), int(command.get("robot", -1))
-        except (ValueError, TypeError, KeyError, AttributeError):
+        command = read_command(text)
+        if command is None:
             viewer.note({"kind": "said", "text": "The page's command cannot be read.", "ok": False})
             return
+        robot = command["robot"]
         if not -1 <= robot < len(self._about["names"]):
             viewer.note({"kind": "said", "text": f"There is no robot number {robot}.", "ok": False})
             return
-        if todo == "select":
+        if command["do"] == "select":
             viewer.selected = robot
             return
 
@@ -261,12 +287,25 @@ class WatchServer:
             message = {"kind": "said", "text": said, "ok": ok}
             self._loop.call_soon_threadsafe(viewer.note, message)
 
-        self._on_command({**command, "do": todo, "robot": robot}, answer)
+        self._on_command(command, answer)
 
     async def _close_all(self, _application: web.Application) -> None:
         """Close the connections, so that pages know."""
         for viewer in tuple(self._viewers):
             await viewer.close()
+
+
+def read_command(text: str) -> Command | None:
+    """A command with the text `do` and the whole number `robot`, -1 by default; None if it is none."""
+    try:
+        command = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(command, dict):
+        return None
+    command.setdefault("robot", -1)
+    is_valid = isinstance(command.get("do"), str) and type(command["robot"]) is int
+    return command if is_valid else None
 
 
 def _own_name() -> str:

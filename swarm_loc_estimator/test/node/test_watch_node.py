@@ -164,8 +164,10 @@ def test_orders_of_a_page_reach_the_estimator_and_the_robots(
 
     viewer.order(do="set_pose", robot=1, pose=[3.0, 0.5, 1.0])
     ros.until(lambda: said("Robot 'beta' is at x 3.000 m, y 0.500 m, theta 1.000 rad."))
-    viewer.order(do="set_pose", robot=1, pose=[3.0, None, 1.0])
-    ros.until(lambda: said("A pose is three finite numbers."))
+    for wrong in (None, float("inf"), 10**400):
+        viewer.notes.clear()
+        viewer.order(do="set_pose", robot=1, pose=[3.0, wrong, 1.0])
+        ros.until(lambda: said("A pose is three finite numbers."))
     viewer.order(do="reset")
     ros.until(lambda: said("All robots restart"))
     viewer.order(do="drive", robot=1, ahead=1, left=0)

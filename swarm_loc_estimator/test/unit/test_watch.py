@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+import socket
 import time
 from collections.abc import Iterator
 
@@ -75,9 +76,20 @@ def test_the_history_begins_anew_when_time_jumps_back() -> None:
         ("127.0.0.1", "", "localhost:8420", "https://elsewhere.example", "", False),
         ("127.0.0.1", "", "localhost:8420", "null", "", False),
         ("127.0.0.1", "", "elsewhere.example:8420", "http://elsewhere.example:8420", "", False),
-        ("0.0.0.0", "secret", "robots.lab:8420", "http://robots.lab:8420", "secret", True),  # noqa: S104
-        ("0.0.0.0", "secret", "robots.lab:8420", "http://robots.lab:8420", "wrong", False),  # noqa: S104
-        ("0.0.0.0", "secret", "robots.lab:8420", "http://other.lab", "secret", False),  # noqa: S104
+        ("127.0.0.1", "", "LocalHost", "http://LocalHost", "", True),
+        ("::1", "", "[::1]:8420", "http://[::1]:8420", "", True),
+        ("127.0.0.1", "", "[::1].evil.com", None, "", False),
+        ("127.0.0.1", "", "[::1]evil.com:8420", "http://[::1]evil.com:8420", "", False),
+        ("127.0.0.1", "", "evil.com\\@127.0.0.1", None, "", False),
+        ("127.0.0.1", "", "evil.com@127.0.0.1:8420", None, "", False),
+        ("127.0.0.1", "", "127.0.0.1/evil.com", None, "", False),
+        ("127.0.0.1", "", "127.0.0.1:8420:80", None, "", False),
+        ("127.0.0.1", "", "127.0.0.1\n", None, "", False),
+        ("127.0.0.1", "", "", None, "", False),
+        ("127.0.0.1", "", "localhost:8420", "ftp://localhost:8420", "", False),
+        ("0.0.0.0", "a secret", "robots.lab:8420", "http://robots.lab:8420", "a secret", True),  # noqa: S104
+        ("0.0.0.0", "a secret", "robots.lab:8420", "http://robots.lab:8420", "wrong", False),  # noqa: S104
+        ("0.0.0.0", "a secret", "robots.lab:8420", "http://other.lab", "a secret", False),  # noqa: S104
     ],
 )
 def test_who_is_let_in(
@@ -91,6 +103,12 @@ def test_an_address_that_others_reach_needs_a_token() -> None:
         AccessError, match=r"address = '0\.0\.0\.0' can be reached by others: set the parameter token"
     ):
         Access("0.0.0.0")  # noqa: S104
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1", "0.0.0.0"])  # noqa: S104
+def test_a_short_token_is_refused(address: str) -> None:
+    with pytest.raises(AccessError, match="parameter token is too short: it needs 8 characters or more"):
+        Access(address, "seven77")
 
 
 def test_the_page_is_whole_and_may_ask_nobody_else() -> None:
@@ -119,24 +137,133 @@ def test_a_taken_port_is_named(server: WatchServer) -> None:
         WatchServer(told, Access("127.0.0.1"), server.port, 20.0, lambda _command, _answer: None)
 
 
-def test_wrong_words_of_a_page_are_answered(server: WatchServer) -> None:
-    async def talk() -> list[str]:
+UNREAD = "The page's command cannot be read."
+
+
+@pytest.mark.parametrize(
+    ("text", "answer"),
+    [
+        ("{", UNREAD),
+        ("[]", UNREAD),
+        ("3", UNREAD),
+        pytest.param("[" * 1000, UNREAD, id="a thousand brackets"),
+        pytest.param("[" * 2000 + "]" * 2000, UNREAD, id="closed brackets"),
+        pytest.param('{"do":' + '{"a":' * 600 + "1" + "}" * 601, UNREAD, id="braces"),
+        ('{"robot": 0}', UNREAD),
+        ('{"do": ["reset"]}', UNREAD),
+        ('{"do": "reset", "robot": "x"}', UNREAD),
+        ('{"do": "reset", "robot": null}', UNREAD),
+        ('{"do": "reset", "robot": 1e999}', UNREAD),
+        ('{"do": "reset", "robot": Infinity}', UNREAD),
+        ('{"do": "reset", "robot": NaN}', UNREAD),
+        ('{"do": "reset", "robot": 7}', "There is no robot number 7."),
+        ('{"do": "reset"}', "done: reset"),
+    ],
+)
+def test_wrong_commands_are_answered(
+    server: WatchServer, caplog: pytest.LogCaptureFixture, text: str, answer: str
+) -> None:
+    async def talk() -> str:
         async with aiohttp.ClientSession() as session, session.ws_connect(f"{server.url}socket") as socket:
             assert (await socket.receive_json())["names"] == ["alpha"]
-            said = []
-            for text in (
-                "{",
-                "[]",
-                '{"do": "reset", "robot": 7}',
-                '{"do": "reset", "robot": "x"}',
-                '{"do": "reset"}',
-            ):
-                await socket.send_str(text)
-                said.append((await socket.receive_json())["text"])
+            await socket.send_str(text)
+            said: str = (await socket.receive_json())["text"]
             return said
 
-    unread = "The page's command cannot be read."
-    assert asyncio.run(talk()) == [unread, unread, "There is no robot number 7.", unread, "done: reset"]
+    assert asyncio.run(talk()) == answer
+    assert not caplog.records
+
+
+def head(
+    server: WatchServer, *, path: str = "/", host: bytes = b"127.0.0.1", client: str = "127.0.0.1"
+) -> str:
+    """The status line and the text that the server answers a request."""
+    with socket.create_connection(("127.0.0.1", server.port), 10.0, source_address=(client, 0)) as one:
+        one.sendall(f"GET {path} HTTP/1.1\r\nConnection: close\r\nHost: ".encode() + host + b"\r\n\r\n")
+        answer = b"".join(iter(lambda: one.recv(65536), b"")).decode()
+    lines = answer.splitlines()
+    return f"{lines[0]} {lines[-1]}"
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        b"[::1].evil.com",
+        b"evil.com\\@127.0.0.1",
+        b"evil.com",
+        b"\xff\xfe",
+        b"",
+    ],
+)
+def test_foreign_host_headers_are_refused(
+    server: WatchServer, caplog: pytest.LogCaptureFixture, host: bytes
+) -> None:
+    assert re.match(r"HTTP/1\.[01] 40[03] ", head(server, host=host))
+    assert not caplog.records
+
+
+def test_two_host_headers_are_refused(server: WatchServer) -> None:
+    assert re.match(r"HTTP/1\.[01] 40[03] ", head(server, host=b"127.0.0.1\r\nHost: evil.com"))
+    assert " 200 " in head(server)
+
+
+@pytest.mark.parametrize(
+    "part",
+    [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: x", b"GET /socket HTTP/1.1\r\nContent-Length: 9\r\n\r\nx"],
+)
+def test_half_a_request_is_closed_in_time(
+    monkeypatch: pytest.MonkeyPatch, server: WatchServer, part: bytes
+) -> None:
+    async def look() -> None:
+        async with aiohttp.ClientSession() as session, session.ws_connect(f"{server.url}socket") as page:
+            with socket.create_connection(("127.0.0.1", server.port), 15.0) as one:
+                one.sendall(part)
+                reader = asyncio.get_running_loop().run_in_executor(None, read_all, one)
+                await asyncio.wait_for(reader, 15.0)
+            await page.receive_json()
+            await page.send_str('{"do": "reset"}')
+            assert (await page.receive_json())["text"] == "done: reset", "a page is closed, too"
+
+    monkeypatch.setattr("swarm_loc_estimator.watch.server.REQUEST_PATIENCE_S", 1.0)
+    asyncio.run(look())
+
+
+def read_all(connection: socket.socket) -> None:
+    """Read until the other side closes."""
+    try:
+        while connection.recv(4096):
+            pass
+    except ConnectionResetError:
+        pass
+
+
+@pytest.fixture
+def guarded() -> Iterator[WatchServer]:
+    served = WatchServer(about(Swarm(), "one"), Access("127.0.0.1", "a secret"), 0, 20.0, lambda *_: None)
+    yield served
+    served.close()
+
+
+def test_guesses_of_the_token_are_slowed_down(guarded: WatchServer) -> None:
+    answers = [head(guarded, path=f"/?token=guess{k}") for k in range(20)]
+    assert ["wait 1 s" in answer for answer in answers[:5]] == [False] * 5
+    assert sum("wait 1 s" in answer for answer in answers) >= 12, "guesses are compared at full speed"
+    assert "wait 1 s" in head(guarded, path="/?token=a%20secret"), (
+        "a pause lets right ones in, and tells them"
+    )
+    assert " 200 " in head(guarded, path="/?token=a%20secret", client="127.0.0.2")
+    time.sleep(1.1)
+    assert " 200 " in head(guarded, path="/?token=a%20secret")
+
+
+def test_an_old_page_that_reconnects_locks_nobody_out(
+    guarded: WatchServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    for query in ("?token=yesterday", "", "?token=yesterday", "?token=") * 5:
+        assert "The token is missing or wrong" in head(guarded, path=f"/{query}")
+    assert "The token is missing or wrong" in head(guarded, path="/?token=%ff%ED%A0%80")
+    assert " 200 " in head(guarded, path="/?token=a%20secret")
+    assert not caplog.records
 
 
 def test_a_page_that_does_not_read_costs_nothing_and_others_see_the_newest(server: WatchServer) -> None:
