@@ -76,7 +76,7 @@ def decode(data: bytes, message_type: str, places: dict[str, list[int]] | None =
     Raises:
         CdrError: The bytes are not one whole message.
     """
-    reader = _Reader(data, places)
+    reader = _CdrReader(data, places)
     message = reader.message(message_type)
     reader.check_end()
     return message
@@ -90,7 +90,7 @@ def encode(message: object, message_type: str) -> bytes:
             zero or empty. A stamp may be given in nanoseconds, points or colours as an array (n, fields).
         message_type: Its type.
     """
-    writer = _Writer()
+    writer = _CdrWriter()
     writer.message(message, message_type)
     return bytes(writer.data)
 
@@ -164,7 +164,7 @@ def _text(raw: bytes) -> str:
         raise CdrError("a string is not UTF-8.") from None
 
 
-class _Reader:
+class _CdrReader:
     """Reads the fields of a message one after the other."""
 
     def __init__(self, data: bytes, places: dict[str, list[int]] | None) -> None:
@@ -235,7 +235,7 @@ class _Reader:
         return begin
 
 
-class _Writer:
+class _CdrWriter:
     """Appends the fields of a message to `data` one after the other."""
 
     def __init__(self) -> None:
