@@ -102,7 +102,7 @@ def _compiled(
         error_model="numpy", fastmath=fastmath, forceinline=forceinline, _nrt=nrt
     )
     dispatcher: Any = compiler(function)
-    if isinstance(dispatcher, Dispatcher):  # else numba is told not to compile
+    if isinstance(dispatcher, Dispatcher):  # else compilation is disabled
         cached: Any = dispatcher
         cached._cache = _ContentCache(dispatcher)  # noqa: SLF001 - numba has no other way in
     return cast("Function", dispatcher)

@@ -42,7 +42,7 @@ _BLOCK, _SLOT = np.divmod(np.arange(PARAMETERS), DRIVES)
 _DOUBTED_SIGMA = (0.0, 0.05, 0.1, 0.03, 0.03)
 """Standard deviations of parameters that were taken to be exact, once they are contradicted."""
 _DOUBTED_SURVEY_SIGMA = (0.02, 0.03)
-"""Likewise of a landmark's place [m] and yaw [rad]."""
+"""Standard deviations of a landmark's place [m] and yaw [rad], once they are contradicted."""
 
 _MIN_SURVEY_SIGMA = 1e-4
 """Of a landmark of which one of position and yaw is exact [m], [rad]: the filter inverts its covariance."""

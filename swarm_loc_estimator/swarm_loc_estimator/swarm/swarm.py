@@ -8,6 +8,7 @@ table; a new parameter is one line in one of these classes.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING
 from swarm_loc_estimator.common.parameters import number
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Mapping
 
     from swarm_loc_estimator.swarm.ir_board import RobotIr
     from swarm_loc_estimator.swarm.motion_response import MotionResponse
@@ -118,9 +119,11 @@ class SensorModel:
         "m",
         0.0,
         10.0,
-        "error forward and left besides the noise that a detection tells, as of calibration",
+        "error forward and left besides the noise of the detection, such as of calibration",
     )
-    residual_heading_sigma: float = number(0.0, "rad", 0.0, 10.0, "likewise of the marker's heading")
+    residual_heading_sigma: float = number(
+        0.0, "rad", 0.0, 10.0, "error of the marker's heading besides the noise of the detection"
+    )
     range_sigma: float = number(
         0.15, "m", 0.0, 10.0, "noise of the range, sightings without heading", above=True
     )
@@ -319,26 +322,26 @@ class Swarm:
     landmarks: tuple[Landmark, ...] = ()
 
     def __post_init__(self) -> None:
-        if twice := _given_twice((robot.name, "") for robot in self.robots):
+        names = Counter(robot.name for robot in self.robots)
+        if twice := [name for name, count in names.items() if count > 1]:
             raise SwarmError(f"robot name '{twice[0]}' is given to two robots; names must be unique.")
-        if twice := _given_twice(self._named_ids()):
-            marker_id, one, other = twice
-            raise SwarmError(f"marker id {marker_id} belongs to both {one} and {other}; ids must be unique.")
-        if twice := _given_twice((r.ir.id, f"robot '{r.name}'") for r in self.robots if r.ir is not None):
-            board, one, other = twice
-            raise SwarmError(f"ir.id {board} belongs to both {one} and {other}; ids must be unique.")
+        faces = [
+            (f"face '{face.name}' of robot '{r.name}'", face.id) for r in self.robots for face in r.faces
+        ]
+        marks = [(f"landmark {mark.id}", mark.id) for mark in self.landmarks]
+        boards = [(f"robot '{r.name}'", r.ir.id) for r in self.robots if r.ir is not None]
+        for what, named in (("marker id", faces + marks), ("ir.id", boards)):
+            owners: dict[int, str] = {}
+            for owner, one_id in named:
+                first = owners.setdefault(one_id, owner)
+                if first is not owner:
+                    raise SwarmError(
+                        f"{what} {one_id} belongs to both {first} and {owner}; ids must be unique."
+                    )
         if walking := [r.name for r in self.robots if r.random_walk.moves and not r.stands]:
             raise SwarmError(
                 f"robot '{walking[0]}' has a random_walk, which must be 0 where odometry is not null."
             )
-
-    def _named_ids(self) -> Iterator[tuple[int, str]]:
-        """Every marker id with its owner in words."""
-        for robot in self.robots:
-            for face in robot.faces:
-                yield face.id, f"face '{face.name}' of robot '{robot.name}'"
-        for landmark in self.landmarks:
-            yield landmark.id, f"landmark {landmark.id}"
 
     @cached_property
     def index_of(self) -> Mapping[str, int]:
@@ -355,13 +358,3 @@ class Swarm:
         }
         owners.update({mark.id: MarkerOwner(-1, index, mark) for index, mark in enumerate(self.landmarks)})
         return owners
-
-
-def _given_twice(owners: Iterable[tuple[object, str]]) -> tuple[object, str, str] | None:
-    """The first key that has two owners, with both."""
-    owner_of: dict[object, str] = {}
-    for key, owner in owners:
-        if key in owner_of:
-            return key, owner_of[key], owner
-        owner_of[key] = owner
-    return None
