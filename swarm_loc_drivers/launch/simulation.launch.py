@@ -1,4 +1,4 @@
-"""Start simulated robots: ros2 launch swarm_loc_drivers simulation.launch.py swarm_file:=FILE."""
+"""Start a complete simulation: ros2 launch swarm_loc_drivers simulation.launch.py swarm_file:=FILE."""
 
 import atexit
 from contextlib import ExitStack
@@ -13,7 +13,7 @@ from swarm_loc_estimator.common.launch import argument_texts, node_action, optio
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The simulation's options as launch arguments, then its nodes."""
+    """Declare the options of `simulate` as launch arguments and start its nodes."""
     return LaunchDescription(
         [
             DeclareLaunchArgument("swarm_file", description="path of the swarm description"),
@@ -22,11 +22,13 @@ def generate_launch_description() -> LaunchDescription:
                 default_value="",
                 choices=["", *(world for kind in ROBOT_TYPES.values() for world in kind.worlds)],
             ),
-            DeclareLaunchArgument("seed", default_value="1", description="fixes the world's errors"),
-            DeclareLaunchArgument("speed", default_value="0.06", description="along the eight [m/s]"),
+            DeclareLaunchArgument("seed", default_value="1", description="random seed of the world's errors"),
+            DeclareLaunchArgument("speed", default_value="0.06", description="speed along the eight [m/s]"),
             DeclareLaunchArgument("rate", default_value="1.0", description="simulated seconds per second"),
             DeclareLaunchArgument("plan", default_value="corridor", description="the hall of PushBots"),
-            DeclareLaunchArgument("aerial", default_value="false", description="an overhead camera alone"),
+            DeclareLaunchArgument(
+                "aerial", default_value="false", description="locate by an overhead camera alone"
+            ),
             DeclareLaunchArgument("params_file", default_value="", description="ROS parameters of all nodes"),
             OpaqueFunction(function=start_nodes),
         ]
@@ -34,7 +36,7 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def start_nodes(context: LaunchContext) -> list[Node]:
-    """The actions that start the simulation's nodes."""
+    """The actions that start the nodes; an argument that cannot be used ends the launch."""
     options = options_from(SimulationOptions, argument_texts(context, SimulationOptions))
     swarm = simulated_swarm(options)
     stack = ExitStack()

@@ -1,4 +1,4 @@
-"""Simulate a swarm and write what its sensors say as a bag with its swarm.yaml.
+"""Simulate a swarm and write its measurements as a bag, with the swarm description.
 
     generate_bag eight bags/eight_five_robots --seed 3 --duration 54 --world w0
     generate_bag pictures bags/eight_pictures --seed 1 --duration 9 --robots 2
@@ -8,11 +8,13 @@
     generate_bag pushbots /tmp/hallway --robots 2 --duration 300 --plan office
     generate_bag droplets /tmp/same_boards --seed 2 --boards 1
 
-The bag holds <robot>/odom, <robot>/detections and <robot>/ground_truth; `swarm.yaml` lies inside its folder.
-`pictures` writes, in place of detections, what the cameras see: <robot>/image_raw/compressed (JPEG) and
-<robot>/camera_info. `droplets` writes <robot>/brightness and <robot>/fix in place of detections;
-`aerial` writes aerial/detections; `pushbots` writes <robot>/laser, <robot>/lights and <robot>/fix, with
---events <robot>/events, and beside them walls.csv and the calibrations of the lasers.
+The bag contains <robot>/odom, <robot>/detections and <robot>/ground_truth, and its folder `swarm.yaml`.
+In place of detections,
+    pictures writes <robot>/image_raw/compressed (JPEG) and <robot>/camera_info
+    droplets writes <robot>/brightness and <robot>/fix
+    aerial writes aerial/detections
+    pushbots writes map, <robot>/laser, <robot>/lights, <robot>/fix and <robot>/goal, with --events also
+        <robot>/events, and beside the bag walls.csv and the calibrations of the lasers
 The same arguments give the same bytes.
 """
 
@@ -51,8 +53,8 @@ _ANY_SEED = number_in(0, 2**31 - 1)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
-    said = {name: value for name, value in vars(options).items() if value is not None}
-    words = [f"{name}={value}" for name, value in said.items() if name not in ("bag", "write")]
+    given = {name: value for name, value in vars(options).items() if value is not None}
+    words = [f"{name}={value}" for name, value in given.items() if name not in ("bag", "write")]
     count = options.write(options, f"Simulated: {', '.join(words)}.")
     print(f"{count} messages of {options.robots} robots written to {options.bag}")
     return 0
@@ -113,45 +115,48 @@ def _parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = command_parser("generate_bag", __doc__)
     swarms = parser.add_subparsers(dest="swarm", required=True, metavar="SWARM")
-    eight = _swarm(swarms, "eight", "e-pucks driving the paper's eight among wall markers", 5, 9, 54.0)
+    eight = _swarm(swarms, "eight", "e-pucks that drive along an eight among wall markers", 5, 9, 54.0)
     eight.set_defaults(write=_eight)
-    images = _swarm(swarms, "pictures", "the same, with what their cameras see", 2, 9, 9.0)
+    images = _swarm(swarms, "pictures", "the same, with images in place of detections", 2, 9, 9.0)
     images.set_defaults(write=_images)
     for one in (eight, images):
         one.add_argument(
             "--world",
             choices=sorted(WORLDS),
             default="w0",
-            help="imperfections; see sim/worlds.py",
+            help="error model; see sim/worlds.py",
         )
         one.add_argument("--speed", type=number_in(0.001, 0.12, "m/s"), default=0.06, help="[m/s]")
-        one.add_argument("--start-unknown", action="store_true", help="swarm.yaml tells no start poses")
-    droplets = _swarm(
-        swarms, "droplets", "Droplets that see each other by infrared, two by a tracker", 20, 1000, 90.0
-    )
+        one.add_argument("--start-unknown", action="store_true", help="leave start poses out of swarm.yaml")
+    droplets = _swarm(swarms, "droplets", "Droplets that measure each other by infrared", 20, 1000, 90.0)
     droplets.set_defaults(write=_droplets)
     droplets.add_argument(
         "--world",
         choices=sorted(DROPLET_WORLDS),
         default="d1",
-        help="imperfections; see sim/droplet/world.py",
+        help="error model; see sim/droplet/world.py",
     )
-    droplets.add_argument("--calibrated", action="store_true", help="swarm.yaml tells the elements' gains")
-    droplets.add_argument("--start-known", action="store_true", help="swarm.yaml tells the start poses")
+    droplets.add_argument("--calibrated", action="store_true", help="write the elements' gains to swarm.yaml")
+    droplets.add_argument("--start-known", action="store_true", help="write start poses to swarm.yaml")
     droplets.add_argument(
         "--boards", type=_ANY_SEED, help="seed of the elements' gains (default: that of --seed)"
     )
-    aerial = _swarm(swarms, "aerial", "e-pucks that wander, seen from above", 5, 20, 60.0)
+    aerial = _swarm(swarms, "aerial", "e-pucks that move at random under an overhead camera", 5, 20, 60.0)
     aerial.set_defaults(write=_aerial)
-    aerial.add_argument("--start-known", action="store_true", help="swarm.yaml tells the start poses")
+    aerial.add_argument("--start-known", action="store_true", help="write start poses to swarm.yaml")
     pushbots = _swarm(swarms, "pushbots", "PushBots that map a hall", 1, 5, 300.0)
     pushbots.set_defaults(write=_pushbots)
     pushbots.add_argument("--plan", choices=sorted(FLOOR_PLANS), default="corridor", help="the hall")
-    pushbots.add_argument("--slip", type=number_in(0.0, 0.1), default=0.02, help="share of turns lost")
     pushbots.add_argument(
-        "--events", type=number_in(0.0, 60.0, "s"), default=0.0, help="of events, at the begin [s]"
+        "--slip", type=number_in(0.0, 0.1), default=0.02, help="share of every turn that is lost by slip"
     )
-    grid = _swarm(swarms, "grid", "many robots, each about its cell of a grid", 100, 10_000, 20.0)
+    pushbots.add_argument(
+        "--events",
+        type=number_in(0.0, 60.0, "s"),
+        default=0.0,
+        help="length of the events at the beginning [s]",
+    )
+    grid = _swarm(swarms, "grid", "many robots, each in its cell of a grid", 100, 10_000, 20.0)
     grid.set_defaults(write=_grid)
     return parser
 
@@ -164,14 +169,14 @@ def _swarm(
     most: int,
     seconds: float,
 ) -> argparse.ArgumentParser:
-    """A sub-command with what all simulated swarms have; of robots there are `most` at most."""
+    """Add a sub-command with the options of all swarms, which have at most `most` robots."""
     parser = swarms.add_parser(name, help=text, description=text)
     parser.add_argument("bag", type=Path, help="bag folder to create")
     parser.add_argument("--seed", type=_ANY_SEED, default=1, help="the same seed gives the same bag")
     parser.add_argument(
         "--duration", type=number_in(2.0, 3600.0, "s"), default=seconds, help="simulated time [s]"
     )
-    parser.add_argument("--robots", type=number_in(1, most), default=robots, help="how many")
+    parser.add_argument("--robots", type=number_in(1, most), default=robots, help="number of robots")
     return parser
 
 

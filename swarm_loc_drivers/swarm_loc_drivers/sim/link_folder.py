@@ -1,4 +1,4 @@
-"""A folder for the serial links of a simulation, which does not outlive the process that made it."""
+"""A temporary folder for the serial ports of a simulation, which is removed even after a kill."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _PREFIX = "swarm_loc-"
 
 @contextmanager
 def link_folder() -> Iterator[str]:
-    """Make a folder and remove it in the end; those of processes that were killed are removed, too."""
+    """Create a folder and remove it at the end; also remove those that killed processes have left."""
     for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
         if (lock := _lock(folder)) is not None:
             _remove(folder, lock)
     while (lock := _lock(folder := Path(tempfile.mkdtemp(prefix=_PREFIX)))) is None:
-        pass  # somebody who cleans up has just taken it
+        pass  # another process that cleans up has locked it
     try:
         yield str(folder)
     finally:
@@ -28,9 +28,9 @@ def link_folder() -> Iterator[str]:
 
 
 def _lock(folder: Path) -> int | None:
-    """A hold on a folder that the system gives up when this process ends, however it does.
+    """Lock a folder until this process ends; the handle of the lock.
 
-    None where another process has it, or where there is no such folder of this user.
+    None if another process holds the lock, or if this user has no such folder.
     """
     try:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)

@@ -1,13 +1,13 @@
-"""Start simulated robots: e-pucks or Droplets and all that locates them, or PushBots that map a hall.
+"""Start a complete simulation of e-pucks, Droplets or PushBots.
 
     simulate bags/eight_five_robots/swarm.yaml --world w2 --seed 1
 
-One world with rendered cameras, robots that answer their drivers' bytes on serial ports, a driver and a
-marker detector for each robot, the steering along the eight, and the estimator; all on simulated time. Robots
-whose type is `droplet` get a table with infrared, a tracker above it and one process of drivers. Robots whose
-type is `pushbot` get a hall, each a driver and an event tracker with its laser calibrated, and together a
-mapper and a node that drives them to its goals.
-`ros2 launch swarm_loc_drivers simulation.launch.py` starts the same.
+All nodes use simulated time. The robots' type in the swarm description selects the world:
+    e-pucks (any other type): rendered cameras; a driver and a marker detector per robot; steering along an
+        eight; the estimator
+    droplet: a table with infrared and a tracker; all drivers in one process; steering; the estimator
+    pushbot: a hall; a driver and an event tracker per robot; mapper, exploration and estimator
+See doc/simulate.md. With ROS 2: `ros2 launch swarm_loc_drivers simulation.launch.py`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def parse(arguments: Sequence[str] | None) -> SimulationOptions:
         "--world",
         choices=[world for kind in ROBOT_TYPES.values() for world in kind.worlds],
         default=defaults.world,
-        help="which errors robots and sensors have (default: w2 of e-pucks, d1 of Droplets)",
+        help="error model of robots and sensors (default: w2 for e-pucks, d1 for Droplets)",
     )
     for name, spec in number_specs(SimulationOptions).items():
         default = getattr(defaults, name)
@@ -60,7 +60,7 @@ def parse(arguments: Sequence[str] | None) -> SimulationOptions:
     parser.add_argument(
         "--aerial",
         action="store_true",
-        help="an overhead camera, which cannot tell robots apart, is all that locates them",
+        help="locate e-pucks only by an overhead camera, which cannot tell them apart",
     )
     parser.add_argument("--params-file", dest="parameter_file", help="ROS parameter file for all nodes")
     return SimulationOptions(**vars(parser.parse_args(arguments)))
@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(arguments)
     swarm = simulated_swarm(options)
     detects = robot_type_of(swarm).has_markers and not options.aerial
-    if detects and not is_precompiled(precompile):  # once, not in every robot's detector at a time
+    if detects and not is_precompiled(precompile):  # once here instead of in every detector
         print_line("compiling the marker detector for this machine: about half a minute")
         precompile()
     with link_folder() as links:

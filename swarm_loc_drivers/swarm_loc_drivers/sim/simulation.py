@@ -50,19 +50,19 @@ class SimulationOptions:
 
     Attributes:
         swarm_file: Path of the swarm description.
-        world: Which errors robots and sensors have; "": the default of the robots' type.
-        seed: Fixes them.
-        speed: Along the eight [m/s].
+        world: Error model of robots and sensors; "": the default of the robots' type.
+        seed: Random seed of these errors.
+        speed: Speed of e-pucks along the eight [m/s].
         rate: Simulated seconds per second, as far as the machine keeps up.
-        plan: The hall, of PushBots.
-        aerial: Whether a camera above, which cannot tell the robots apart, is all that locates them.
+        plan: The hall of PushBots.
+        aerial: Whether e-pucks are located by an overhead camera only, which cannot tell them apart.
         parameter_file: Path of a ROS parameter file for all nodes, None for none.
     """
 
     swarm_file: str
     world: str = ""
-    seed: int = number(1, "1", 0, 2**31 - 1, "fixes them")
-    speed: float = number(0.06, "m/s", 0.001, 0.12, "along the eight")
+    seed: int = number(1, "1", 0, 2**31 - 1, "random seed of these errors")
+    speed: float = number(0.06, "m/s", 0.001, 0.12, "speed of e-pucks along the eight")
     rate: float = number(
         1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
     )
