@@ -99,6 +99,6 @@ def surroundings(stamp_ns: int) -> list[Frame]:
     return [
         places_frame("truth", stamp_ns, [0, 1], PLACES[:2] + np.array([0.03, 0.0, 0.1])),
         places_frame("goals", stamp_ns, [1], np.array([[-1.0, 0.0, 0.0]])),
-        aerial_frame(stamp_ns, seen, {0: (0, 0.97)}),
+        aerial_frame(stamp_ns, seen, np.array([0, -1, -1]), np.array([0.97, 0.0, 0.0])),
         map_frame(stamp_ns, GridMessage(stamp_ns, "map", 0.05, MAP_CORNER, cells)),
     ]

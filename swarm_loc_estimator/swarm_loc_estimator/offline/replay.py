@@ -280,14 +280,14 @@ class AerialImages:
     def images(self) -> tuple[AerialImage, ...]:
         """All images in the order of their stamps."""
         return tuple(
-            AerialImage(stamp_ns, position, _known(self._identities.get(stamp_ns)))
-            for stamp_ns, position in sorted(self._positions.items())
+            self._image(stamp_ns, position) for stamp_ns, position in sorted(self._positions.items())
         )
 
-
-def _known(identities: Identities | None) -> dict[int, tuple[int, float]]:
-    """Detection -> index of its robot and probability of that."""
-    if identities is None:
-        return {}
-    found = np.flatnonzero(identities.place >= 0)
-    return {int(identities.place[k]): (int(k), float(identities.probability[k])) for k in found}
+    def _image(self, stamp_ns: int, position: FloatArray) -> AerialImage:
+        robot, probability = np.full(len(position), -1), np.zeros(len(position))
+        identities = self._identities.get(stamp_ns)
+        if identities is not None:
+            found = np.flatnonzero((identities.place >= 0) & (identities.place < len(position)))
+            robot[identities.place[found]] = found
+            probability[identities.place[found]] = identities.probability[found]
+        return AerialImage(stamp_ns, position, robot, probability)

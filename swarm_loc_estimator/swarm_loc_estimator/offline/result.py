@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.messages import GridMessage, decode_occupancy_grid
 from swarm_loc_estimator.offline.metrics import Errors, ErrorSummary, compare, pool, summarise
@@ -36,12 +36,14 @@ class AerialImage(NamedTuple):
     Attributes:
         stamp_ns: Of the image.
         position: (n, 2) of its detections in map [m].
-        known: Detection -> index of its most probable robot, and the probability of that.
+        robot: (n,) index of the most probable robot of each; -1: unknown.
+        probability: (n,) of these identities.
     """
 
     stamp_ns: int
     position: FloatArray
-    known: Mapping[int, tuple[int, float]]
+    robot: IntArray
+    probability: FloatArray
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,9 @@ class Settings:
     lost_sigma: float = number(
         1.0, "m", 0.01, 1e3, "a position less sure than this and the robot counts as lost"
     )
-    lost_heading_sigma: float = number(0.3, "rad", 0.01, 10.0, "likewise a heading less sure than this")
+    lost_heading_sigma: float = number(
+        0.3, "rad", 0.01, 10.0, "a heading less sure than this and the robot counts as lost"
+    )
     max_doubt: float = number(
         10.0,
         "1",

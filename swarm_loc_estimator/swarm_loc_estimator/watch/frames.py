@@ -108,21 +108,24 @@ def places_frame(
 
 
 def aerial_frame(
-    stamp_ns: int, position: npt.NDArray[np.float64], known: Mapping[int, tuple[int, float]]
+    stamp_ns: int,
+    position: npt.NDArray[np.float64],
+    robot: npt.NDArray[np.integer],
+    probability: npt.NDArray[np.float64],
 ) -> Frame:
     """Detections of an aerial image.
 
     Args:
         stamp_ns: Of the image.
         position: (n, 2) of its detections in map [m].
-        known: Detection -> index of the robot and probability of that identity.
+        robot: (n,) index of the robot that each is; -1: unknown.
+        probability: (n,) of these identities.
     """
-    who = [known.get(place, (-1, 0.0)) for place in range(len(position))]
     columns: dict[str, npt.NDArray[Any]] = {
-        "robot": np.array([robot for robot, _ in who], dtype=np.int32),
+        "robot": robot.astype(np.int32),
         "x": position[:, 0],
         "y": position[:, 1],
-        "probability": np.array([sure for _, sure in who], dtype=np.float32),
+        "probability": probability.astype(np.float32),
     }
     return pack("aerial", stamp_ns, columns)
 

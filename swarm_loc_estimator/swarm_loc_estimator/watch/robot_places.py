@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 from rclpy.node import Node
@@ -12,7 +12,7 @@ from rclpy.subscription import Subscription
 from swarm_loc_estimator.common.messages.cdr import CdrError, nanoseconds
 from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
 from swarm_loc_estimator.watch.frames import Frame, aerial_frame, places_frame
-from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities
+from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities, RobotIdentity
 
 _OLD_NS = 500_000_000
 _IMAGES = 8
@@ -81,26 +81,24 @@ class AerialNames:
         self._images[stamp_ns] = message
         while len(self._images) > _IMAGES:
             del self._images[next(iter(self._images))]
-        return self._frame(stamp_ns, {})
+        return self._frame(stamp_ns, ())
 
     def identities(self, message: RobotIdentities) -> Frame | None:
         """The frame of one of the newest images with identities; None for an older image."""
         stamp_ns = nanoseconds(message.header.stamp)
         if stamp_ns not in self._images:
             return None
-        return self._frame(
-            stamp_ns,
-            {
-                one.detection: (self._index_of[one.name], one.probability)
-                for one in message.identities
-                if one.detection >= 0 and one.name in self._index_of
-            },
-        )
+        return self._frame(stamp_ns, message.identities)
 
-    def _frame(self, stamp_ns: int, known: dict[int, tuple[int, float]]) -> Frame:
+    def _frame(self, stamp_ns: int, identities: Iterable[RobotIdentity]) -> Frame:
         seen = self._images[stamp_ns].detections
         position = np.array([(one.x, one.y) for one in seen]).reshape(-1, 2)
-        return aerial_frame(stamp_ns, position, known)
+        robot, probability = np.full(len(seen), -1), np.zeros(len(seen))
+        for one in identities:
+            if 0 <= one.detection < len(seen) and one.name in self._index_of:
+                robot[one.detection] = self._index_of[one.name]
+                probability[one.detection] = one.probability
+        return aerial_frame(stamp_ns, position, robot, probability)
 
 
 class NewestMessages:

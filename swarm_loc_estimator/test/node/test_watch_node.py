@@ -24,8 +24,16 @@ from visualization_msgs.msg import MarkerArray
 
 from swarm_loc_estimator.watch.frames import unpack
 from swarm_loc_estimator.watch.markers_node import MarkersNode
+from swarm_loc_estimator.watch.robot_places import AerialNames
 from swarm_loc_estimator.watch.watch_node import WatchNode
-from swarm_loc_msgs.msg import SwarmPose, SwarmPoses
+from swarm_loc_msgs.msg import (
+    AnonymousDetection,
+    AnonymousDetectionArray,
+    RobotIdentities,
+    RobotIdentity,
+    SwarmPose,
+    SwarmPoses,
+)
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -175,6 +183,25 @@ def test_orders_of_a_page_reach_the_estimator_and_the_robots(
     assert [one.linear.x for one in driven if one.linear.x] in ([0.05], []), (
         "the first may come before we listen"
     )
+
+
+def test_identities_join_the_detections_of_their_image() -> None:
+    names = AerialNames({"alpha": 0, "beta": 1})
+    seen = AnonymousDetectionArray(detections=[AnonymousDetection(x=float(k)) for k in range(3)])
+    _, columns = unpack(names.detections(seen).data)
+    assert columns["robot"].tolist() == [-1, -1, -1]
+    identities = [
+        RobotIdentity(name=name, detection=detection, probability=0.75)
+        for name, detection in (("beta", 2), ("alpha", 3), ("alpha", -1), ("stranger", 0))
+    ]
+    frame = names.identities(RobotIdentities(identities=identities))
+    assert frame is not None
+    _, columns = unpack(frame.data)
+    assert (columns["x"].tolist(), columns["robot"].tolist()) == ([0.0, 1.0, 2.0], [-1, -1, 1])
+    assert columns["probability"].tolist() == [0.0, 0.0, 0.75]
+    unknown = RobotIdentities()
+    unknown.header.stamp.sec = 1
+    assert names.identities(unknown) is None
 
 
 def test_pages_drive_nobody_unless_that_is_allowed(ros: Ros, swarm_file: Path) -> None:

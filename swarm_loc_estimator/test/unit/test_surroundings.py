@@ -100,7 +100,8 @@ def test_who_is_who_comes_to_the_image_in_which_it_was_so() -> None:
         images.note(Identities(1, np.array([1, -1]), np.array([probability, 0.3])))
     images.note(Identities(7, np.array([0, 1]), np.array([1.0, 1.0])))
     first, second = images.images()
-    assert (first.stamp_ns, first.known, second.known) == (1, {1: (0, 0.9)}, {})
+    assert (first.stamp_ns, first.robot.tolist(), first.probability.tolist()) == (1, [-1, 0], [0.0, 0.9])
+    assert (second.stamp_ns, second.robot.tolist(), second.probability.tolist()) == (2, [-1], [0.0])
     assert first.position.tolist() == [[0.0, 1.0], [3.0, 4.0]]
 
 
