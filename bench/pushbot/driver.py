@@ -10,11 +10,9 @@ import numpy as np
 from bench.pushbot.event_feed import StandingBody
 from bench.pushbot.event_flow import RATE, EventFlow, Measured
 from bench.shared.common import Cell, new_plot, save_plot, table
-from swarm_loc_drivers.common.link import Address
-from swarm_loc_drivers.common.odometry import WheelGeometry
 from swarm_loc_drivers.pushbot.hardware import SECOND_FIRMWARE, TIMESTAMPS
-from swarm_loc_drivers.pushbot.protocol import Lights
-from swarm_loc_drivers.pushbot.session import PushbotSession, PushbotSettings
+from swarm_loc_drivers.pushbot.parameters import PushbotParameters
+from swarm_loc_drivers.pushbot.session import PushbotSession
 from swarm_loc_drivers.sim.pushbot.board import EventRing
 from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 
@@ -23,28 +21,12 @@ _CORES = 2
 _CHUNK_S = 0.003
 
 
-def settings(timestamps: str) -> PushbotSettings:
-    """Settings of a driver that does nothing but take events."""
-    return PushbotSettings(
-        address=Address(device="/dev/none"),
-        baud_rate=4_000_000,
-        geometry=WheelGeometry(1e-4, 0.085),
-        wheel_noise=2e-4,
-        command_timeout_s=0.5,
-        reply_timeout_s=0.5,
-        tick_period_s=0.02,
-        timestamps=timestamps,
-        on_bit=0,
-        packet_period_s=0.005,
-        lights=Lights(0.0, 0.0),
-    )
-
-
 def session_rate(timestamps: str, seed: int) -> float:
     """Events that a session turns from bytes into packets in a second of one core [1/s]."""
     body = StandingBody()
     firmware = PushbotFirmware(body, SECOND_FIRMWARE)
-    session = PushbotSession(settings(timestamps), lambda: (0, 0), Counter())
+    params = PushbotParameters("/dev/none", timestamps=timestamps, laser_frequency=0.0, led_frequency=0.0)
+    session = PushbotSession(params, lambda: (0, 0), Counter())
     while not firmware.board.is_streaming:
         firmware.receive(session.step(firmware.stream(), body.now_ns, time.monotonic()))
     rng = np.random.default_rng(seed)

@@ -13,7 +13,8 @@ from swarm_loc_drivers.common.velocity_command import Velocity, VelocityCommand
 from swarm_loc_drivers.pushbot.event_packets import EventPacket
 from swarm_loc_drivers.pushbot.hardware import wheel_velocities
 from swarm_loc_drivers.pushbot.odometry import PushbotOdometry
-from swarm_loc_drivers.pushbot.session import NO_STOP, PushbotSession, PushbotSettings
+from swarm_loc_drivers.pushbot.parameters import PushbotParameters
+from swarm_loc_drivers.pushbot.session import NO_STOP, PushbotSession
 
 _READ_S = 0.02
 _BATCH_S = 0.002
@@ -37,20 +38,20 @@ class PushbotDriver(RobotDriver[PushbotSession]):
     """Drives one robot in its own thread.
 
     Args:
-        settings: Settings of the robot.
+        params: Parameters of the driver.
         listeners: Receivers of its data.
         clock: The time [ns]; may be simulated, and 0 means no time.
     """
 
     def __init__(
-        self, settings: PushbotSettings, listeners: PushbotListeners, clock: Callable[[], int]
+        self, params: PushbotParameters, listeners: PushbotListeners, clock: Callable[[], int]
     ) -> None:
-        super().__init__(str(settings.address))
-        self._settings = settings
+        super().__init__(str(params.link_address))
+        self._params = params
         self._listeners = listeners
         self._clock = clock
-        self._command = VelocityCommand(settings.command_timeout_s, clock, self.counts)
-        self._odometry = PushbotOdometry(settings.geometry, settings.wheel_noise, self.counts)
+        self._command = VelocityCommand(params.cmd_vel_timeout_s, clock, self.counts)
+        self._odometry = PushbotOdometry(params.geometry, params.wheel_noise, self.counts)
         self._read_s = 0.0
 
     def set_velocity(self, velocity: Velocity) -> None:
@@ -59,12 +60,12 @@ class PushbotDriver(RobotDriver[PushbotSession]):
         self._command.set((forward, 0.0, turn_rate))
 
     def _open(self) -> Link:
-        settings = self._settings
-        return open_link(settings.address, settings.baud_rate, settings.reply_timeout_s)
+        params = self._params
+        return open_link(params.link_address, params.baud_rate, params.reply_timeout_s)
 
     def _begin(self) -> PushbotSession:
         self._odometry.restart()
-        return PushbotSession(self._settings, self._velocities, self.counts)
+        return PushbotSession(self._params, self._velocities, self.counts)
 
     def _step(self, session: PushbotSession, link: Link) -> bytes:
         early_s = self._read_s + _BATCH_S - time.monotonic()
@@ -89,4 +90,4 @@ class PushbotDriver(RobotDriver[PushbotSession]):
     def _velocities(self) -> tuple[int, int]:
         """Commands of the wheels now."""
         speed, _, turn_rate = self._command.velocity()
-        return wheel_velocities(self._settings.geometry, speed, turn_rate)
+        return wheel_velocities(self._params.geometry, speed, turn_rate)

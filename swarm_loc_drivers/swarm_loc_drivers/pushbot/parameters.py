@@ -1,14 +1,13 @@
-"""Parameters of `pushbot_driver_node` and `exploration_node`, and the settings that follow from them."""
+"""Parameters of `pushbot_driver_node` and `exploration_node`, and what follows from them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from swarm_loc_drivers.common.link import parse_address
+from swarm_loc_drivers.common.link import Address, parse_address
 from swarm_loc_drivers.common.odometry import WheelGeometry
 from swarm_loc_drivers.pushbot.hardware import BAUD_RATE, TIMESTAMPS
 from swarm_loc_drivers.pushbot.protocol import Lights
-from swarm_loc_drivers.pushbot.session import PushbotSettings
 from swarm_loc_drivers.pushbot.stop_and_go import StopAndGoSettings
 from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text, texts
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -21,7 +20,11 @@ _MIN_FREQUENCY = 10.0
 
 @dataclass(frozen=True)
 class PushbotParameters:
-    """Parameters of `pushbot_driver_node`."""
+    """Parameters of `pushbot_driver_node`.
+
+    Raises:
+        ParameterError: The address, or the frequency of a light, is invalid.
+    """
 
     address: str = text("", "a serial port such as /dev/ttyUSB0, or tcp://HOST[:56000]", required=True)
     baud_rate: int = number(BAUD_RATE, "bit/s", 9600, 12_000_000, "of a serial port")
@@ -45,36 +48,38 @@ class PushbotParameters:
     base_frame: str = text("base_link", "the pose is that of <robot>/base_frame", required=True)
     publish_tf: bool = flag(True, "publish the transform from odom to base_link")
 
+    def __post_init__(self) -> None:
+        parse_address(self.address, TCP_PORT)
+        for name in ("laser_frequency", "led_frequency"):
+            if 0.0 < (value := getattr(self, name)) < _MIN_FREQUENCY:
+                raise ParameterError(
+                    f"parameter {name} = {value} must be 0, or at least {_MIN_FREQUENCY:g} Hz."
+                )
 
-def pushbot_settings(parameters: PushbotParameters) -> PushbotSettings:
-    """Settings from the parameters.
+    @property
+    def link_address(self) -> Address:
+        """The parsed address."""
+        return parse_address(self.address, TCP_PORT)
 
-    Raises:
-        ParameterError: A parameter is invalid.
-    """
-    lights = Lights(
-        _frequency("laser_frequency", parameters.laser_frequency),
-        _frequency("led_frequency", parameters.led_frequency),
-    )
-    return PushbotSettings(
-        address=parse_address(parameters.address, TCP_PORT),
-        baud_rate=parameters.baud_rate,
-        geometry=WheelGeometry(parameters.metres_per_tick, parameters.wheel_separation),
-        wheel_noise=parameters.wheel_noise,
-        command_timeout_s=parameters.cmd_vel_timeout_s,
-        reply_timeout_s=parameters.reply_timeout_s,
-        tick_period_s=1.0 / parameters.tick_rate,
-        timestamps=parameters.timestamps if parameters.events else "",
-        on_bit=parameters.on_bit,
-        packet_period_s=parameters.packet_period,
-        lights=lights,
-    )
+    @property
+    def geometry(self) -> WheelGeometry:
+        """Geometry of the wheels."""
+        return WheelGeometry(self.metres_per_tick, self.wheel_separation)
 
+    @property
+    def lights(self) -> Lights:
+        """Frequencies of laser and LEDs."""
+        return Lights(self.laser_frequency, self.led_frequency)
 
-def _frequency(name: str, value: float) -> float:
-    if 0.0 < value < _MIN_FREQUENCY:
-        raise ParameterError(f"parameter {name} = {value} must be 0, or at least {_MIN_FREQUENCY:g} Hz.")
-    return value
+    @property
+    def event_timestamps(self) -> str:
+        """Timestamps of events; "" for no events at all."""
+        return self.timestamps if self.events else ""
+
+    @property
+    def tick_period_s(self) -> float:
+        """Time between two readings of the wheel ticks [s]."""
+        return 1.0 / self.tick_rate
 
 
 @dataclass(frozen=True)

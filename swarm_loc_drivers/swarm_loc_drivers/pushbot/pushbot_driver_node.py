@@ -21,7 +21,7 @@ from swarm_loc_drivers.pushbot.driver import PushbotDriver, PushbotListeners
 from swarm_loc_drivers.pushbot.event_packets import EventPacket
 from swarm_loc_drivers.pushbot.event_parser import precompile
 from swarm_loc_drivers.pushbot.hardware import SENSOR_PX
-from swarm_loc_drivers.pushbot.parameters import PushbotParameters, pushbot_settings
+from swarm_loc_drivers.pushbot.parameters import PushbotParameters
 from swarm_loc_estimator.common.messages.event_encoding import ENCODING
 from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import EventPacket as EventPacketMessage
@@ -49,15 +49,14 @@ class PushbotDriverNode(RobotDriverNode[PushbotParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("pushbot_driver", PushbotParameters, **node_arguments)
-        settings = pushbot_settings(self.params)
         precompile()
         odometry = self._odometry_output("odom", self._prefix)
         self._camera_frame = f"{self._prefix}event_camera_optical_frame"
         self._events = self.create_publisher(EventPacketMessage, "events", EVENT_QOS)
         self._driver = PushbotDriver(
-            settings, PushbotListeners(odometry.publish, self._publish), self._now_ns
+            self.params, PushbotListeners(odometry.publish, self._publish), self._now_ns
         )
-        self._start_reports(str(settings.address), _RATES, _WRONG)
+        self._start_reports(str(self.params.link_address), _RATES, _WRONG)
         self._follow("cmd_vel", self._driver.set_velocity)
 
     def _publish(self, packet: EventPacket) -> None:

@@ -14,46 +14,13 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from swarm_loc_drivers.common.link import Address
-from swarm_loc_drivers.common.odometry import WheelGeometry
 from swarm_loc_drivers.common.session import SessionError, Talk, TalkSession
 from swarm_loc_drivers.pushbot import protocol
 from swarm_loc_drivers.pushbot.clocks import EventClock, TickClock
 from swarm_loc_drivers.pushbot.event_packets import EventPacket, EventPackets
 from swarm_loc_drivers.pushbot.event_parser import EventParser, Parsed
 from swarm_loc_drivers.pushbot.hardware import FirmwareGeneration
-from swarm_loc_drivers.pushbot.protocol import Lights
-
-
-@dataclass(frozen=True)
-class PushbotSettings:
-    """How to reach a robot, and what it does.
-
-    Attributes:
-        address: Address of the robot.
-        baud_rate: Baud rate of a serial port [bit/s].
-        geometry: Geometry of its wheels.
-        wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
-        command_timeout_s: How long a velocity is valid [s].
-        reply_timeout_s: How long an answer, or the next wheel ticks, may take [s].
-        tick_period_s: Time between two readings of the wheel ticks [s].
-        timestamps: Timestamps of events, a key of `hardware.TIMESTAMPS`; "" for no events at all.
-        on_bit: The polarity bit of pixels that became brighter.
-        packet_period_s: Period of packets of events [s].
-        lights: Frequencies of laser and LEDs.
-    """
-
-    address: Address
-    baud_rate: int
-    geometry: WheelGeometry
-    wheel_noise: float
-    command_timeout_s: float
-    reply_timeout_s: float
-    tick_period_s: float
-    timestamps: str
-    on_bit: int
-    packet_period_s: float
-    lights: Lights
+from swarm_loc_drivers.pushbot.parameters import PushbotParameters
 
 
 @dataclass(frozen=True)
@@ -93,7 +60,7 @@ class PushbotSession(TalkSession):
     """Session with one PushBot.
 
     Args:
-        settings: Settings of the robot.
+        params: Parameters of the driver.
         velocities: Commands of the wheels.
         counts: Counts `events`, `readings`, `refused_commands`, `other_lines`, `repeated_stops`,
             `ignored_stops`, and those of `EventParser`.
@@ -107,11 +74,11 @@ class PushbotSession(TalkSession):
         does_not_stop: Whether the wheels go on turning although the stop has been repeated for a second.
     """
 
-    def __init__(self, settings: PushbotSettings, velocities: Velocities, counts: Counter[str]) -> None:
+    def __init__(self, params: PushbotParameters, velocities: Velocities, counts: Counter[str]) -> None:
         super().__init__(counts)
         self.found: list[WheelTicks | EventPacket] = []
         self.generation: FirmwareGeneration | None = None
-        self._settings = settings
+        self._params = params
         self._velocities = velocities
         self.does_not_stop = False
         self._sent, self._sent_s = (0, 0), 0.0
@@ -130,17 +97,17 @@ class PushbotSession(TalkSession):
 
     def _set_up(self) -> Talk[FirmwareGeneration]:
         """Identify the firmware, configure it and start the stream."""
-        settings = self._settings
+        params = self._params
         self._output += protocol.NO_ECHO
         listing = yield from self._answer(protocol.LIST_SENSORS, protocol.LAST_SENSORS, 0.0)
         generation = self.generation = protocol.generation_of(listing.string[: listing.end()])
         if generation is None:
             raise SessionError("the board's firmware has no wheels: it is not built for PushBots")
-        if settings.timestamps:
-            yield from self._choose_format(generation, settings.timestamps)
-        self._output += protocol.lights(settings.lights) + protocol.BRAKE + protocol.MOTORS_ON
-        self._output += protocol.stream_ticks(generation, _tick_period_ms(settings))
-        if settings.timestamps:
+        if params.event_timestamps:
+            yield from self._choose_format(generation, params.event_timestamps)
+        self._output += protocol.lights(params.lights) + protocol.BRAKE + protocol.MOTORS_ON
+        self._output += protocol.stream_ticks(generation, _tick_period_ms(params))
+        if params.event_timestamps:
             self._output += protocol.EVENTS_ON
         return generation
 
@@ -158,18 +125,18 @@ class PushbotSession(TalkSession):
     def _answer(self, request: bytes, pattern: re.Pattern[bytes], extra_s: float) -> Talk[re.Match[bytes]]:
         """The answer to a request, which is sent up to three times."""
         for _ in range(_ATTEMPTS):
-            timeout_s = self._settings.reply_timeout_s + extra_s
+            timeout_s = self._params.reply_timeout_s + extra_s
             if (match := (yield from self._ask_once(request, pattern, timeout_s))) is not None:
                 return match
         raise SessionError(f"the robot does not answer {request.split()[0].decode()}")
 
     def _stream(self, generation: FirmwareGeneration) -> Talk[None]:
         """Take measurements and send velocities until the session ends."""
-        settings = self._settings
-        parser = EventParser(settings.timestamps or "none", self._counts)
-        clock = EventClock(parser.span_us) if settings.timestamps not in ("", "none") else None
-        packets = EventPackets(settings.packet_period_s, settings.on_bit)
-        readings = TickClock(_tick_period_ms(settings))
+        params = self._params
+        parser = EventParser(params.event_timestamps or "none", self._counts)
+        clock = EventClock(parser.span_us) if params.event_timestamps not in ("", "none") else None
+        packets = EventPackets(params.packet_period, params.on_bit)
+        readings = TickClock(_tick_period_ms(params))
         self._ticks_s = self._stood_s = self._steady_s
         while not (self.ending and self._stands()):
             yield
@@ -180,7 +147,7 @@ class PushbotSession(TalkSession):
                 if before and clock is not None:
                     readings.pass_event(int(parsed.time_us[before - 1]), stamps_ns[before - 1])
                 self._take_line(line, readings, generation)
-            if self._steady_s > self._ticks_s + settings.reply_timeout_s + settings.tick_period_s:
+            if self._steady_s > self._ticks_s + params.reply_timeout_s + params.tick_period_s:
                 raise SessionError("the robot has stopped sending wheel ticks")
             self._send_velocity(generation)
             self._check_stop()
@@ -248,7 +215,7 @@ class PushbotSession(TalkSession):
         """
         if self._stands():
             self._stood_s = self._steady_s
-        limit_s = _STOP_S + 2.0 * self._settings.tick_period_s
+        limit_s = _STOP_S + 2.0 * self._params.tick_period_s
         fails = not any(self._sent) and self._steady_s > self._stood_s + limit_s
         if fails and not self.does_not_stop:
             self._counts["ignored_stops"] += 1
@@ -263,6 +230,6 @@ class PushbotSession(TalkSession):
         return b"\n" + protocol.BRAKE + off + dark + protocol.QUERY_FORMAT
 
 
-def _tick_period_ms(settings: PushbotSettings) -> int:
+def _tick_period_ms(params: PushbotParameters) -> int:
     """Period of the wheel ticks [ms]."""
-    return max(1, round(1e3 * settings.tick_period_s))
+    return max(1, round(1e3 * params.tick_period_s))

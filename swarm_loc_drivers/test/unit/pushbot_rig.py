@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from swarm_loc_drivers.common.link import Address
 from swarm_loc_drivers.common.odometry import OdometryState, WheelGeometry
 from swarm_loc_drivers.common.session import SessionError
 from swarm_loc_drivers.pushbot.event_packets import EventPacket
 from swarm_loc_drivers.pushbot.hardware import SECOND_FIRMWARE, FirmwareGeneration
 from swarm_loc_drivers.pushbot.odometry import PushbotOdometry
-from swarm_loc_drivers.pushbot.protocol import Lights
-from swarm_loc_drivers.pushbot.session import PushbotSession, PushbotSettings, WheelTicks
+from swarm_loc_drivers.pushbot.parameters import PushbotParameters
+from swarm_loc_drivers.pushbot.session import PushbotSession, WheelTicks
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
 from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, outline
@@ -26,22 +25,10 @@ GEOMETRY = WheelGeometry(metres_per_step=1e-4, wheel_separation=0.085)
 HALL = FloorPlan("hall", outline([(-2.0, -2.0, 3.0, 2.0)], []), np.zeros((1, 2)))
 
 
-def pushbot_settings(**changed: Any) -> PushbotSettings:
-    """Settings for tests."""
-    values: dict[str, Any] = {
-        "address": Address(device="/dev/none"),
-        "baud_rate": 4_000_000,
-        "geometry": GEOMETRY,
-        "wheel_noise": 2e-5,
-        "command_timeout_s": 0.5,
-        "reply_timeout_s": 0.3,
-        "tick_period_s": 0.02,
-        "timestamps": "24bit",
-        "on_bit": 0,
-        "packet_period_s": 0.005,
-        "lights": Lights(laser=450.0, leds=1000.0),
-    }
-    return PushbotSettings(**(values | changed))
+def pushbot_params(**changed: Any) -> PushbotParameters:
+    """Parameters for tests."""
+    values: dict[str, Any] = {"address": "/dev/none", "wheel_noise": 2e-5, "reply_timeout_s": 0.3}
+    return PushbotParameters(**(values | changed))
 
 
 class PushbotWire:
@@ -53,9 +40,9 @@ class PushbotWire:
     """
 
     def __init__(
-        self, settings: PushbotSettings, generation: FirmwareGeneration = SECOND_FIRMWARE, seed: int = 1
+        self, params: PushbotParameters, generation: FirmwareGeneration = SECOND_FIRMWARE, seed: int = 1
     ) -> None:
-        params = PushbotWorldParameters(
+        world_params = PushbotWorldParameters(
             seed=seed,
             metres_per_tick=GEOMETRY.metres_per_step,
             wheel_separation=GEOMETRY.wheel_separation,
@@ -64,7 +51,7 @@ class PushbotWire:
             turn_slip=0.0,
             camera=CameraNoise(noise_rate=0.5),
         )
-        self.world = PushbotWorld([(0.0, 0.0, 0.0)], HALL, params)
+        self.world = PushbotWorld([(0.0, 0.0, 0.0)], HALL, world_params)
         self.firmware = PushbotFirmware(SimulatedPushbot(self.world, 0), generation)
         self.world.firmwares[0] = self.firmware
         self.counts: Counter[str] = Counter()
@@ -75,13 +62,13 @@ class PushbotWire:
         self.packets: list[EventPacket] = []
         self.states: list[OdometryState] = []
         self.errors: list[str] = []
-        self._settings = settings
-        self._odometry = PushbotOdometry(GEOMETRY, settings.wheel_noise, self.counts)
+        self._params = params
+        self._odometry = PushbotOdometry(GEOMETRY, params.wheel_noise, self.counts)
         self.session = self._begin()
 
     def _begin(self) -> PushbotSession:
         self._odometry.restart()
-        return PushbotSession(self._settings, lambda: self.velocities, self.counts)
+        return PushbotSession(self._params, lambda: self.velocities, self.counts)
 
     @property
     def speed(self) -> float:

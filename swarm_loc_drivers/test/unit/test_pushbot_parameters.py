@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.pushbot.parameters import ExplorationParameters, PushbotParameters, pushbot_settings
+from swarm_loc_drivers.pushbot.parameters import ExplorationParameters, PushbotParameters
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.pushbot.world import (
     PushbotWorldParameters,
@@ -51,17 +51,17 @@ def test_pages_have_the_parameters_as_they_are(page: str, parameters: type) -> N
 
 
 def test_tcp_goes_to_the_radios_port() -> None:
-    settings = pushbot_settings(PushbotParameters(address="tcp://10.0.0.1"))
-    assert (settings.address.host, settings.address.port) == ("10.0.0.1", 56000)
-    assert settings.timestamps == "24bit"
-    assert pushbot_settings(PushbotParameters(address="/dev/x", events=False)).timestamps == ""
+    params = PushbotParameters(address="tcp://10.0.0.1")
+    assert (params.link_address.host, params.link_address.port) == ("10.0.0.1", 56000)
+    assert params.event_timestamps == "24bit"
+    assert PushbotParameters(address="/dev/x", events=False).event_timestamps == ""
 
 
 @pytest.mark.parametrize("name", ["laser_frequency", "led_frequency"])
 def test_a_light_that_hardly_blinks_is_refused(name: str) -> None:
     slow: dict[str, Any] = {name: 2.0}
     with pytest.raises(ParameterError, match=f"{name} = 2.0 must be 0, or at least 10 Hz"):
-        pushbot_settings(replace(PushbotParameters(address="/dev/x"), **slow))
+        replace(PushbotParameters(address="/dev/x"), **slow)
 
 
 def test_a_robot_within_a_wall_is_named(swarm_file: Path) -> None:

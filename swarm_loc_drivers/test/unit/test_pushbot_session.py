@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pushbot_rig import PushbotWire, pushbot_settings
+from pushbot_rig import PushbotWire, pushbot_params
 
 from swarm_loc_drivers.pushbot import protocol as commands
 from swarm_loc_drivers.pushbot.driver import PushbotDriver, PushbotListeners
@@ -16,10 +16,10 @@ FORMATS = [(one, name) for one in (FIRST_FIRMWARE, SECOND_FIRMWARE) for name in 
 
 
 def streaming(
-    settings_of: dict[str, object] | None = None, generation: FirmwareGeneration = SECOND_FIRMWARE
+    params_of: dict[str, object] | None = None, generation: FirmwareGeneration = SECOND_FIRMWARE
 ) -> PushbotWire:
     """A robot that is connected."""
-    wire = PushbotWire(pushbot_settings(**(settings_of or {})), generation)
+    wire = PushbotWire(pushbot_params(**(params_of or {})), generation)
     wire.run(0.5)
     assert wire.session.connected
     return wire
@@ -29,7 +29,7 @@ def streaming(
     ("generation", "timestamps"), FORMATS, ids=lambda one: getattr(one, "name", one or "off")
 )
 def test_every_format_of_every_firmware_streams(generation: FirmwareGeneration, timestamps: str) -> None:
-    wire = streaming({"timestamps": timestamps}, generation)
+    wire = streaming({"timestamps": timestamps} if timestamps else {"events": False}, generation)
     wire.velocities = (20, 30)
     wire.run(0.5)
     wire.velocities = (0, 0)
@@ -66,13 +66,13 @@ def test_ticks_among_events_are_stamped_by_the_boards_clock() -> None:
 
 
 def test_a_firmware_without_such_timestamps_is_named() -> None:
-    wire = PushbotWire(pushbot_settings(timestamps="32bit"), FIRST_FIRMWARE)
+    wire = PushbotWire(pushbot_params(timestamps="32bit"), FIRST_FIRMWARE)
     wire.run(0.5)
     assert "has no timestamps '32bit', only none, 16bit, 24bit, delta" in wire.errors[0]
 
 
 def test_a_board_that_is_no_pushbot_is_named() -> None:
-    wire = PushbotWire(pushbot_settings())
+    wire = PushbotWire(pushbot_params())
     say = wire.firmware.board.say
     wire.firmware.board.say = lambda text: say(text.replace(" 28 268435456 MOTOR SENSORS 2\n", ""))  # type: ignore[method-assign]
     wire.run(0.5)
@@ -80,7 +80,7 @@ def test_a_board_that_is_no_pushbot_is_named() -> None:
 
 
 def test_a_robot_that_does_not_answer_is_named() -> None:
-    wire = PushbotWire(pushbot_settings())
+    wire = PushbotWire(pushbot_params())
     wire.hears = False
     wire.run(8.0)
     assert wire.errors == ["the robot does not answer R"]
@@ -142,7 +142,7 @@ def test_a_stop_that_the_firmware_loses_is_repeated_until_the_wheels_stand(
 
 def test_a_robot_that_does_not_stop_is_reported_and_reset_at_the_end() -> None:
     wire = streaming(generation=FIRST_FIRMWARE)
-    driver = PushbotDriver(pushbot_settings(), PushbotListeners(print, print), lambda: 0)
+    driver = PushbotDriver(pushbot_params(), PushbotListeners(print, print), lambda: 0)
     wire.velocities = (30, 30)
     wire.run(0.5)
     deaf_to_stops(wire)
@@ -232,7 +232,7 @@ def test_a_robot_that_was_reset_is_set_up_anew() -> None:
 
 def test_a_stall_of_the_link_loses_events_and_nothing_else() -> None:
     """Nobody takes its bytes for a while: its ring overflows, its ticks and its clock go on."""
-    wire = streaming({"reply_timeout_s": 1.0, "lights": commands.Lights(450.0, 0.0)})
+    wire = streaming({"reply_timeout_s": 1.0, "led_frequency": 0.0})
     wire.velocities = (20, 20)
     wire.run(0.5)
     for _ in range(100):
