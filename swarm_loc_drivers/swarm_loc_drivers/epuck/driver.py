@@ -15,8 +15,9 @@ from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.robot_driver import RobotDriver
 from swarm_loc_drivers.common.velocity_command import Velocity, VelocityCommand
 from swarm_loc_drivers.epuck.odometry import WheelOdometry
+from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.epuck.serial_session import SerialSession
-from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession, EpuckSettings
+from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession
 from swarm_loc_drivers.epuck.wifi_session import WifiSession
 
 _MAX_IDLE_S = 0.5
@@ -43,18 +44,18 @@ class EpuckDriver(RobotDriver[EpuckSession]):
     """Drives one robot in its own thread.
 
     Args:
-        settings: Settings of the robot.
+        params: Parameters of the driver.
         listeners: Receivers of its data.
         clock: The time [ns]; may be simulated, and 0 means no time.
     """
 
-    def __init__(self, settings: EpuckSettings, listeners: EpuckListeners, clock: Callable[[], int]) -> None:
-        super().__init__(str(settings.address))
-        self._settings = settings
+    def __init__(self, params: EpuckParameters, listeners: EpuckListeners, clock: Callable[[], int]) -> None:
+        super().__init__(str(params.link_address))
+        self._params = params
         self._listeners = listeners
         self._clock = clock
-        self._command = VelocityCommand(settings.command_timeout_s, clock, self.counts)
-        self._odometry = WheelOdometry(settings.geometry, settings.wheel_noise, self.counts)
+        self._command = VelocityCommand(params.cmd_vel_timeout_s, clock, self.counts)
+        self._odometry = WheelOdometry(params.geometry, params.wheel_noise, self.counts)
         self._tick = threading.Event()
 
     def tick(self) -> None:
@@ -73,13 +74,13 @@ class EpuckDriver(RobotDriver[EpuckSession]):
         self._tick.set()
 
     def _open(self) -> Link:
-        settings = self._settings
-        return open_link(settings.address, settings.baud_rate, settings.reply_timeout_s)
+        params = self._params
+        return open_link(params.link_address, params.baud_rate, params.reply_timeout_s)
 
     def _begin(self) -> EpuckSession:
-        if self._settings.address.device:
-            return SerialSession(self._settings, self._speeds, self._doubt, self.counts)
-        return WifiSession(self._settings, self._speeds, self.counts)
+        if self._params.link_address.device:
+            return SerialSession(self._params, self._speeds, self._doubt, self.counts)
+        return WifiSession(self._params, self._speeds, self.counts)
 
     def _step(self, session: EpuckSession, link: Link) -> bytes:
         if session.is_idle:
@@ -107,11 +108,11 @@ class EpuckDriver(RobotDriver[EpuckSession]):
     def _speeds(self) -> tuple[int, int]:
         """Commands of the wheels now."""
         speed, _, turn_rate = self._command.velocity()
-        left, right = self._settings.model.wheel_commands(self._settings.geometry, speed, turn_rate)
-        rate = self._settings.model.rate
-        self._odometry.note_rates(self._clock(), rate(left), rate(right))
+        model = self._params.epuck_model
+        left, right = model.wheel_commands(self._params.geometry, speed, turn_rate)
+        self._odometry.note_rates(self._clock(), model.rate(left), model.rate(right))
         return left, right
 
     def _doubt(self) -> None:
         """The rates of the wheels are unknown."""
-        self._odometry.doubt_rates(self._clock(), self._settings.model.max_rate)
+        self._odometry.doubt_rates(self._clock(), self._params.epuck_model.max_rate)

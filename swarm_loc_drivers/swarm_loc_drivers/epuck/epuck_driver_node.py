@@ -36,7 +36,7 @@ from swarm_loc_drivers.epuck.hardware import (
     PROXIMITY_RADIUS_M,
     range_of_raw,
 )
-from swarm_loc_drivers.epuck.parameters import EpuckParameters, camera_calibration, epuck_settings
+from swarm_loc_drivers.epuck.parameters import EpuckParameters, camera_calibration
 from swarm_loc_drivers.epuck.session import CameraImage
 from swarm_loc_estimator.common.node import run_node
 
@@ -61,17 +61,16 @@ class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("epuck_driver", EpuckParameters, **node_arguments)
-        parameters = self.params
-        settings = epuck_settings(parameters)
+        params = self.params
         self._camera_frame = f"{self._prefix}camera_optical_frame"
-        self._calibration = camera_calibration(parameters, settings.camera) if settings.camera else None
+        self._calibration = camera_calibration(params, params.images) if params.images else None
         odometry = self._odometry_output("odom", self._prefix)
         listeners = EpuckListeners(odometry.publish, self._publish_proximity, self._publish_image)
-        self._driver = EpuckDriver(settings, listeners, self._now_ns)
+        self._driver = EpuckDriver(params, listeners, self._now_ns)
         self._advertise()
-        self._start_reports(str(settings.address), _RATES, _WRONG)
+        self._start_reports(str(params.link_address), _RATES, _WRONG)
         self._follow("cmd_vel", self._driver.set_velocity)
-        self.create_timer(1.0 / parameters.reading_rate, self._driver.tick)
+        self.create_timer(1.0 / params.reading_rate, self._driver.tick)
 
     def _advertise(self) -> None:
         # one topic each: eight messages at once would overflow a sensor-data queue

@@ -1,4 +1,4 @@
-"""Parameters of `epuck_driver_node`, and the driver's settings that follow from them."""
+"""Parameters of `epuck_driver_node`, and what follows from them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from swarm_loc_drivers.common.calibration_file import (
     load_calibration,
 )
 from swarm_loc_drivers.common.link import Address, parse_address
+from swarm_loc_drivers.common.odometry import WheelGeometry
 from swarm_loc_drivers.epuck import wifi_protocol as epuck_wifi
 from swarm_loc_drivers.epuck.hardware import EPUCK2, EPUCK_MODELS, EpuckModel, wheel_geometry
-from swarm_loc_drivers.epuck.session import CameraSettings, EpuckSettings
+from swarm_loc_drivers.epuck.session import CameraSettings
 from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text
 from swarm_loc_estimator.swarm.swarm import OdometryModel
 
@@ -22,7 +23,11 @@ _ODOMETRY = OdometryModel()
 
 @dataclass(frozen=True)
 class EpuckParameters:
-    """Parameters of `epuck_driver_node`."""
+    """Parameters of `epuck_driver_node`.
+
+    Raises:
+        ParameterError: A parameter is invalid, or conflicts with another one.
+    """
 
     address: str = text(
         "",
@@ -64,29 +69,52 @@ class EpuckParameters:
     )
     image_period_s: float = number(1.0, "s", 0.05, 60.0, "time between two images over a serial port")
 
+    def __post_init__(self) -> None:
+        if self.link_address.host and self.epuck_model is not EPUCK2:
+            raise ParameterError(
+                f"parameter model = '{self.model}' does not go with address = '{self.link_address}':"
+                " only epuck2 has WiFi."
+            )
+        if self.camera and not self.link_address.host:
+            self._check_images(self.epuck_model)
 
-def epuck_settings(parameters: EpuckParameters) -> EpuckSettings:
-    """Settings from the parameters.
+    def _check_images(self, model: EpuckModel) -> None:
+        """Check the images over a serial port: the robot would silently refuse those beyond its buffer."""
+        size = 2 * self.image_width * self.image_height
+        if size > model.largest_image:
+            raise ParameterError(
+                f"parameters image_width = {self.image_width} and image_height = {self.image_height} make"
+                f" images of {size} bytes, but an {model.name} can send at most {model.largest_image}."
+            )
+        if self.image_zoom not in model.zooms:
+            raise ParameterError(
+                f"parameter image_zoom = {self.image_zoom} must be one of"
+                f" {', '.join(map(str, model.zooms))} for an {model.name}."
+            )
 
-    Raises:
-        ParameterError: A parameter is invalid, or conflicts with another one.
-    """
-    address, model = parse_address(parameters.address, epuck_wifi.PORT), EPUCK_MODELS[parameters.model]
-    if address.host and model is not EPUCK2:
-        raise ParameterError(
-            f"parameter model = '{model.name}' does not go with address = '{address}': only epuck2 has WiFi."
-        )
-    return EpuckSettings(
-        address=address,
-        model=model,
-        geometry=wheel_geometry(parameters.wheel_diameter, parameters.wheel_separation),
-        wheel_noise=parameters.wheel_noise,
-        command_timeout_s=parameters.cmd_vel_timeout_s,
-        baud_rate=parameters.baud_rate,
-        reading_period_s=1.0 / parameters.reading_rate,
-        reply_timeout_s=parameters.reply_timeout_s,
-        camera=_camera(parameters, address, model) if parameters.camera else None,
-    )
+    @property
+    def link_address(self) -> Address:
+        """The parsed address; over TCP the robot is an e-puck2 with the WiFi firmware."""
+        return parse_address(self.address, epuck_wifi.PORT)
+
+    @property
+    def epuck_model(self) -> EpuckModel:
+        """Generation of the robot."""
+        return EPUCK_MODELS[self.model]
+
+    @property
+    def geometry(self) -> WheelGeometry:
+        """Geometry of the wheels."""
+        return wheel_geometry(self.wheel_diameter, self.wheel_separation)
+
+    @property
+    def images(self) -> CameraSettings | None:
+        """Images to request, or None; over TCP they have a fixed size."""
+        if not self.camera:
+            return None
+        if self.link_address.host:
+            return CameraSettings(epuck_wifi.WIDTH, epuck_wifi.HEIGHT, zoom=1, period_s=self.image_period_s)
+        return CameraSettings(self.image_width, self.image_height, self.image_zoom, self.image_period_s)
 
 
 def camera_calibration(parameters: EpuckParameters, camera: CameraSettings) -> CameraCalibration:
@@ -103,22 +131,3 @@ def camera_calibration(parameters: EpuckParameters, camera: CameraSettings) -> C
         return load_calibration(Path(parameters.camera_info_file), camera.width, camera.height)
     except CalibrationFileError as error:
         raise ParameterError(f"parameter camera_info_file: {error}") from error
-
-
-def _camera(parameters: EpuckParameters, address: Address, model: EpuckModel) -> CameraSettings:
-    """Size of the images; the robot would silently refuse one that exceeds its buffer."""
-    if address.host:
-        return CameraSettings(epuck_wifi.WIDTH, epuck_wifi.HEIGHT, zoom=1, period_s=parameters.image_period_s)
-    width, height = parameters.image_width, parameters.image_height
-    size = 2 * width * height
-    if size > model.largest_image:
-        raise ParameterError(
-            f"parameters image_width = {width} and image_height = {height} make"
-            f" images of {size} bytes, but an {model.name} can send at most {model.largest_image}."
-        )
-    if parameters.image_zoom not in model.zooms:
-        raise ParameterError(
-            f"parameter image_zoom = {parameters.image_zoom} must be one of"
-            f" {', '.join(map(str, model.zooms))} for an {model.name}."
-        )
-    return CameraSettings(width, height, parameters.image_zoom, parameters.image_period_s)

@@ -11,7 +11,8 @@ import numpy as np
 from swarm_loc_drivers.common.session import SessionError, Talk, TalkSession
 from swarm_loc_drivers.epuck import serial_protocol as protocol
 from swarm_loc_drivers.epuck.hardware import decode_rgb565
-from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, EpuckSettings, Reading, Speeds
+from swarm_loc_drivers.epuck.parameters import EpuckParameters
+from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, Reading, Speeds
 
 _MAX_MISSED = 5
 """Missed replies in a row after which the link is reopened."""
@@ -22,19 +23,19 @@ class SerialSession(TalkSession):
     """Requests readings at every step that finds it idle, and images in between; see `EpuckSession`.
 
     Args:
-        settings: Settings of the robot.
+        params: Parameters of the driver.
         speeds: Commands of the wheels.
         doubt: Called when it is unknown which commands the robot has received.
         counts: Counts `exchanges`, `missed_replies`, `stray_bytes`, `resyncs`, `bad_images`.
     """
 
     def __init__(
-        self, settings: EpuckSettings, speeds: Speeds, doubt: Callable[[], None], counts: Counter[str]
+        self, params: EpuckParameters, speeds: Speeds, doubt: Callable[[], None], counts: Counter[str]
     ) -> None:
         super().__init__(counts)
         self.is_idle = False
         self.found: list[Reading | CameraImage] = []
-        self._settings = settings
+        self._params = params
         self._wanted_speeds = speeds
         self._doubt = doubt
         self._sent = (0, 0)
@@ -44,7 +45,7 @@ class SerialSession(TalkSession):
 
     def _run(self) -> Talk[None]:
         yield from self._resync()
-        camera = self._settings.camera
+        camera = self._params.images
         if camera is not None:
             yield from self._set_camera(camera)
         self.connected = True
@@ -132,7 +133,7 @@ class SerialSession(TalkSession):
 
     def _timeout_s(self, bytes_in_all: int) -> float:
         """How long an exchange of so many bytes may take [s]."""
-        return self._settings.reply_timeout_s + 20.0 * bytes_in_all / self._settings.baud_rate
+        return self._params.reply_timeout_s + 20.0 * bytes_in_all / self._params.baud_rate
 
     def _set_camera(self, camera: CameraSettings) -> Talk[None]:
         """Set the size of images, and check that the robot has accepted it."""

@@ -1,4 +1,4 @@
-"""Settings and measurements that the serial and the WiFi session of an e-puck share."""
+"""Images and measurements that the serial and the WiFi session of an e-puck share."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.common.link import Address
-from swarm_loc_drivers.common.odometry import WheelGeometry
 from swarm_loc_drivers.common.session import Session
-from swarm_loc_drivers.epuck.hardware import EpuckModel, Image
+from swarm_loc_drivers.epuck.hardware import Image
 
 Speeds = Callable[[], tuple[int, int]]
 """Commands for the left and the right wheel [steps/s]; called just before they are sent."""
@@ -33,33 +31,6 @@ class CameraSettings:
     height: int
     zoom: int
     period_s: float
-
-
-@dataclass(frozen=True)
-class EpuckSettings:
-    """How to reach a robot, and its properties.
-
-    Attributes:
-        address: Address; over TCP it is an e-puck2 with the WiFi firmware.
-        model: Generation of the robot.
-        geometry: Geometry of its wheels.
-        wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
-        command_timeout_s: How long a velocity is valid [s].
-        baud_rate: Of a serial port [bit/s].
-        reading_period_s: Time between two used readings over TCP [s]; over serial the driver's ticks decide.
-        reply_timeout_s: How long an answer may take [s].
-        camera: Images to request, or None; over TCP they have a fixed size.
-    """
-
-    address: Address
-    model: EpuckModel
-    geometry: WheelGeometry
-    wheel_noise: float
-    command_timeout_s: float
-    baud_rate: int
-    reading_period_s: float
-    reply_timeout_s: float
-    camera: CameraSettings | None
 
 
 @dataclass(frozen=True)

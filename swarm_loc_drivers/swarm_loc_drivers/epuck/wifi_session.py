@@ -12,7 +12,8 @@ import numpy as np
 from swarm_loc_drivers.common.session import SessionError
 from swarm_loc_drivers.epuck import wifi_protocol as protocol
 from swarm_loc_drivers.epuck.hardware import decode_rgb565
-from swarm_loc_drivers.epuck.session import CameraImage, EpuckSettings, Reading, Speeds
+from swarm_loc_drivers.epuck.parameters import EpuckParameters
+from swarm_loc_drivers.epuck.session import CameraImage, Reading, Speeds
 
 _REPEAT_S = 0.1
 """A command is repeated after so long, since the robot may have dropped it [s]."""
@@ -44,19 +45,19 @@ class WifiSession:
     a reliable stamp are not used: the first one of a connection, one that arrives late, and its successor.
 
     Args:
-        settings: Settings of the robot.
+        params: Parameters of the driver.
         speeds: Commands of the wheels.
         counts: Counts `messages`, `stray_bytes`, `resyncs`.
     """
 
     is_idle = False
 
-    def __init__(self, settings: EpuckSettings, speeds: Speeds, counts: Counter[str]) -> None:
+    def __init__(self, params: EpuckParameters, speeds: Speeds, counts: Counter[str]) -> None:
         self.ending = self.connected = self.ended = False
         self.found: list[Reading | CameraImage] = []
-        self._camera = settings.camera is not None
-        self._period_ns = round(settings.reading_period_s * 1e9)
-        self._silence_s = _FIRMWARE_PAUSE_S + settings.reply_timeout_s
+        self._camera = params.camera
+        self._period_ns = round(1e9 / params.reading_rate)
+        self._silence_s = _FIRMWARE_PAUSE_S + params.reply_timeout_s
         self._speeds = speeds
         self._counts = counts
         self._parser = protocol.StreamParser()

@@ -14,11 +14,11 @@ import numpy as np
 from epuck_body import GEOMETRY, DrivenBody
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.common.link import Address
 from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.epuck.driver import EpuckDriver, EpuckListeners
 from swarm_loc_drivers.epuck.hardware import EPUCK2, EpuckModel
-from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, EpuckSettings
+from swarm_loc_drivers.epuck.parameters import EpuckParameters
+from swarm_loc_drivers.epuck.session import CameraImage
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware
 from swarm_loc_drivers.sim.link_host import FirmwareHost
@@ -59,7 +59,7 @@ class Emulator:
 class Bench:
     """A driver and what it reports."""
 
-    def __init__(self, settings: EpuckSettings) -> None:
+    def __init__(self, params: EpuckParameters) -> None:
         self.states: list[OdometryState] = []
         self.images: list[CameraImage] = []
         self.proximity: list[NDArray[np.int64]] = []
@@ -68,7 +68,7 @@ class Bench:
         listeners = EpuckListeners(
             self._keep(self.states), lambda _, raw: self.proximity.append(raw), self._keep(self.images)
         )
-        self.driver = EpuckDriver(settings, listeners, time.monotonic_ns)
+        self.driver = EpuckDriver(params, listeners, time.monotonic_ns)
         self._silent = threading.Event()
         self._ended = threading.Event()
         self._ticker = threading.Thread(target=self._tick)
@@ -136,18 +136,16 @@ class Bench:
         self.driver.stop()
 
 
-def settings(address: Address, model: EpuckModel, camera: CameraSettings | None = None) -> EpuckSettings:
+def params_of(address: str, model: str = "epuck2") -> EpuckParameters:
     """A robot with the wheels of `DrivenBody`."""
-    return EpuckSettings(
-        address=address,
-        model=model,
-        geometry=GEOMETRY,
-        wheel_noise=2e-4,
-        command_timeout_s=0.3,
-        baud_rate=115200,
-        reading_period_s=0.02,
+    return EpuckParameters(
+        address,
+        model,
+        reading_rate=50.0,
         reply_timeout_s=0.3,
-        camera=camera,
+        cmd_vel_timeout_s=0.3,
+        wheel_separation=GEOMETRY.wheel_separation,
+        wheel_noise=2e-4,
     )
 
 
@@ -191,18 +189,18 @@ class Robots:
         return emulator
 
     @property
-    def serial_address(self) -> Address:
+    def serial_address(self) -> str:
         """Where `serial` answers."""
-        return Address(device=str(self._device))
+        return str(self._device)
 
     @property
-    def tcp_address(self) -> Address:
+    def tcp_address(self) -> str:
         """Where `wifi` answers."""
-        return Address(host="127.0.0.1", port=self._tcp_port)
+        return f"tcp://127.0.0.1:{self._tcp_port}"
 
-    def bench(self, settings: EpuckSettings) -> Bench:
+    def bench(self, params: EpuckParameters) -> Bench:
         """A driver at work."""
-        bench = Bench(settings)
+        bench = Bench(params)
         bench.start()
         self._benches.callback(bench.stop)
         return bench

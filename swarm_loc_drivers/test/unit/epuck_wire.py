@@ -15,8 +15,9 @@ from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.session import SessionError
 from swarm_loc_drivers.epuck.hardware import EpuckModel
 from swarm_loc_drivers.epuck.odometry import WheelOdometry
+from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.epuck.serial_session import SerialSession
-from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession, EpuckSettings, Reading
+from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession, Reading
 from swarm_loc_drivers.epuck.wifi_session import WifiSession
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware
@@ -30,7 +31,7 @@ class Wire:
     """A robot, its firmware, a session with it, and the odometry of what it reads.
 
     Args:
-        settings: Of the session; with an address over TCP the robot has the WiFi firmware.
+        params: Of the session; with an address over TCP the robot has the WiFi firmware.
         make: Makes the firmware, if not the usual one.
         tick_ns: Between two steps that find the session idle.
 
@@ -45,7 +46,7 @@ class Wire:
 
     def __init__(
         self,
-        settings: EpuckSettings,
+        params: EpuckParameters,
         make: Callable[[DrivenBody], object] | None = None,
         tick_ns: int = 20 * MS,
     ) -> None:
@@ -59,24 +60,24 @@ class Wire:
         self.found: list[Reading | CameraImage] = []
         self.states: list[OdometryState] = []
         self.truth: dict[int, NDArray[np.float64]] = {}
-        self._model: EpuckModel = settings.model
+        self._model: EpuckModel = params.epuck_model
         self._tick_ns = tick_ns
         self._answer = b""
         self._held: bytearray | None = None
         self.odometry = WheelOdometry(GEOMETRY, 2e-4, self.counts)
-        self._settings = settings
-        is_serial = bool(settings.address.device)
+        self._params = params
+        is_serial = bool(params.link_address.device)
         self.firmware: Any = (
-            SerialFirmware(self.body, settings.model) if is_serial else WifiFirmware(self.body)
+            SerialFirmware(self.body, params.epuck_model) if is_serial else WifiFirmware(self.body)
         )
         if make is not None:
             self.firmware = make(self.body)
         self.session = self._begin()
 
     def _begin(self) -> EpuckSession:
-        if self._settings.address.device:
-            return SerialSession(self._settings, self._speeds, self._doubt, self.counts)
-        return WifiSession(self._settings, self._speeds, self.counts)
+        if self._params.link_address.device:
+            return SerialSession(self._params, self._speeds, self._doubt, self.counts)
+        return WifiSession(self._params, self._speeds, self.counts)
 
     def _speeds(self) -> tuple[int, int]:
         left, right = self.speeds

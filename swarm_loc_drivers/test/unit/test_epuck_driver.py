@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 from epuck_body import GEOMETRY
-from epuck_rig import PATIENCE_S, SQUARE, Robots, settings
+from epuck_rig import PATIENCE_S, SQUARE, Robots, params_of
 
-from swarm_loc_drivers.epuck.hardware import EPUCK1, EPUCK2
+from swarm_loc_drivers.epuck.hardware import EPUCK1
 from swarm_loc_estimator.common import se2
 
 
@@ -27,7 +27,7 @@ def robots(tmp_path: Path) -> Iterator[Robots]:
 def test_the_robot_stands_when_the_driver_has_ended(robots: Robots, over: str) -> None:
     emulator = robots.serial() if over == "serial" else robots.wifi()
     address = robots.serial_address if over == "serial" else robots.tcp_address
-    bench = robots.bench(settings(address, EPUCK2))
+    bench = robots.bench(params_of(address))
     bench.velocity = (0.06, 0.5)
     bench.until(lambda: any(emulator.body.rates))
     bench.driver.stop()
@@ -38,7 +38,7 @@ def test_the_robot_stands_when_the_driver_has_ended(robots: Robots, over: str) -
 def test_the_robot_stands_when_velocities_stop_coming(robots: Robots, over: str) -> None:
     emulator = robots.serial(EPUCK1) if over == "serial" else robots.wifi()
     address = robots.serial_address if over == "serial" else robots.tcp_address
-    bench = robots.bench(settings(address, EPUCK1 if over == "serial" else EPUCK2))
+    bench = robots.bench(params_of(address, "epuck1" if over == "serial" else "epuck2"))
     bench.velocity = (0.06, 0.0)
     bench.until(lambda: any(emulator.body.rates))
     bench.fall_silent()
@@ -52,7 +52,7 @@ def test_a_robot_switched_off_and_on_is_found_again(robots: Robots, over: str) -
     emulator = start()
     address = robots.serial_address if over == "serial" else robots.tcp_address
     # the link fails when it is broken here, and not while an emulated robot waits for a processor
-    bench = robots.bench(replace(settings(address, EPUCK2), reply_timeout_s=10.0))
+    bench = robots.bench(replace(params_of(address), reply_timeout_s=10.0))
     bench.drive(SQUARE[:1])
     emulator.kill()
     bench.until(lambda: bench.driver.trouble)
@@ -75,7 +75,7 @@ def test_a_cut_link_costs_no_odometry_of_a_robot_that_runs_on(robots: Robots, ov
     start = robots.serial if over == "serial" else robots.wifi
     emulator = start()
     address = robots.serial_address if over == "serial" else robots.tcp_address
-    bench = robots.bench(settings(address, EPUCK2))
+    bench = robots.bench(params_of(address))
     bench.velocity = (0.06, 0.4)
     bench.until(lambda: any(emulator.body.rates) and len(bench.states) > 10)
     emulator.kill()
@@ -90,9 +90,9 @@ def test_a_cut_link_costs_no_odometry_of_a_robot_that_runs_on(robots: Robots, ov
 
 
 def test_a_port_that_is_not_there_is_named_and_waited_for(robots: Robots) -> None:
-    bench = robots.bench(settings(robots.serial_address, EPUCK1))
+    bench = robots.bench(params_of(robots.serial_address, "epuck1"))
     bench.until(lambda: bench.driver.counts["link_failures"] >= 2)
-    assert robots.serial_address.device in bench.driver.trouble
+    assert robots.serial_address in bench.driver.trouble
     robots.serial(EPUCK1)
     bench.until(lambda: bench.states)
     assert bench.driver.trouble == ""
@@ -107,14 +107,14 @@ def test_a_port_where_nobody_speaks_the_language_is_told(robots: Robots) -> None
             return b""
 
     robots.serial(EPUCK1, wrap=lambda _: Mute())
-    quick = replace(settings(robots.serial_address, EPUCK1), reply_timeout_s=0.02)
+    quick = replace(params_of(robots.serial_address, "epuck1"), reply_timeout_s=0.02)
     bench = robots.bench(quick)
     bench.until(lambda: "does not answer" in bench.driver.trouble)
 
 
 def test_stopping_while_the_link_is_down_still_stops_the_robot(robots: Robots) -> None:
     emulator = robots.wifi()
-    bench = robots.bench(settings(robots.tcp_address, EPUCK2))
+    bench = robots.bench(params_of(robots.tcp_address))
     bench.velocity = (0.06, 0.0)
     bench.until(lambda: any(emulator.body.rates))
     emulator.kill()

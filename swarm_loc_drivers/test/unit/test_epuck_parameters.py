@@ -9,7 +9,7 @@ import pytest
 
 from swarm_loc_drivers.common.calibration_file import CalibrationFileError, load_calibration
 from swarm_loc_drivers.common.link import Address, parse_address
-from swarm_loc_drivers.epuck.parameters import EpuckParameters, camera_calibration, epuck_settings
+from swarm_loc_drivers.epuck.parameters import EpuckParameters, camera_calibration
 from swarm_loc_estimator.common.parameters import ParameterError, markdown_table
 
 PAGE = Path(__file__).parents[2] / "doc" / "epuck_driver_node.md"
@@ -94,25 +94,23 @@ def test_a_wrong_calibration_is_named_in_one_sentence(path: Path, old: str, new:
 
 def test_over_wifi_pictures_have_the_size_that_the_robot_sends(path: Path) -> None:
     parameters = EpuckParameters(address="tcp://robot", camera=True, camera_info_file=str(path))
-    settings = epuck_settings(parameters)
-    assert settings.camera is not None
-    assert (settings.camera.width, settings.camera.height) == (160, 120)
+    assert parameters.images is not None
+    assert (parameters.images.width, parameters.images.height) == (160, 120)
     with pytest.raises(ParameterError, match="40 x 30 px, but the camera's have 160 x 120 px"):
-        camera_calibration(parameters, settings.camera)
+        camera_calibration(parameters, parameters.images)
 
 
 def test_over_a_serial_port_pictures_fit_the_robots_buffer(path: Path) -> None:
     parameters = EpuckParameters(
         address="/dev/x", camera=True, camera_info_file=str(path), image_width=40, image_height=30
     )
-    settings = epuck_settings(parameters)
-    assert settings.camera is not None
-    assert camera_calibration(parameters, settings.camera).width == 40
+    assert parameters.images is not None
+    assert camera_calibration(parameters, parameters.images).width == 40
     with pytest.raises(ParameterError, match="epuck2 can send at most 4128"):
-        epuck_settings(replace(parameters, image_width=60, image_height=40))
+        replace(parameters, image_width=60, image_height=40)
     with pytest.raises(ParameterError, match=r"image_zoom = 8 must be one of 1, 2, 4 for an epuck2\.$"):
-        epuck_settings(replace(parameters, image_zoom=8))
+        replace(parameters, image_zoom=8)
     first = replace(parameters, model="epuck1", image_zoom=8)
-    assert epuck_settings(replace(first, image_width=41, image_height=42)).camera is not None
+    assert replace(first, image_width=41, image_height=42).images is not None
     with pytest.raises(ParameterError, match="images of 3456 bytes, but an epuck1 can send at most 3445"):
-        epuck_settings(replace(first, image_width=48, image_height=36))
+        replace(first, image_width=48, image_height=36)

@@ -5,27 +5,30 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from epuck_body import GEOMETRY, PROXIMITY
-from epuck_rig import SQUARE, settings
+from epuck_rig import SQUARE, params_of
 from epuck_wire import MS, SECOND, Wire
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.common.link import Address
 from swarm_loc_drivers.common.session import SessionError
 from swarm_loc_drivers.epuck import serial_protocol as protocol
-from swarm_loc_drivers.epuck.hardware import EPUCK1, EPUCK2
-from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, EpuckSettings, Reading
+from swarm_loc_drivers.epuck.hardware import EPUCK1
+from swarm_loc_drivers.epuck.parameters import EpuckParameters
+from swarm_loc_drivers.epuck.session import CameraImage, Reading
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.wifi_firmware import DELAY_NS, WifiFirmware
 
 CYCLE_NS = 2 * DELAY_NS
 EXPOSURE_PERIOD_NS = 66 * MS
-CAMERA = CameraSettings(160, 120, 4, 0.1)
-WIFI = replace(settings(Address(host="robot", port=1000), EPUCK2), reply_timeout_s=0.5)
-SERIAL = settings(Address(device="/dev/robot"), EPUCK1)
+WIFI = replace(params_of("tcp://robot"), reply_timeout_s=0.5)
+SERIAL = params_of("/dev/robot", "epuck1")
+IMAGES: dict[str, Any] = {
+    "camera": True, "image_width": 32, "image_height": 24, "image_zoom": 8, "image_period_s": 0.05
+}  # fmt: skip
 
 
 def stamps_ns(found: list[Reading | CameraImage], kind: type) -> NDArray[np.int64]:
@@ -34,7 +37,7 @@ def stamps_ns(found: list[Reading | CameraImage], kind: type) -> NDArray[np.int6
 
 @pytest.mark.parametrize("period_s", [0.02, 0.05, 0.1])
 def test_of_a_stream_as_many_readings_are_used_as_wanted(period_s: float) -> None:
-    wire = Wire(replace(WIFI, reading_period_s=period_s))
+    wire = Wire(replace(WIFI, reading_rate=1.0 / period_s))
     wire.run(8.0)
     gaps_ns = np.diff(stamps_ns(wire.found, Reading))
     assert gaps_ns.size > 50
@@ -54,7 +57,7 @@ def test_a_silent_robot_is_found_out_although_the_clock_has_jumped_back() -> Non
 
 
 def test_over_the_serial_port_every_tick_gives_a_reading_and_images_keep_their_period() -> None:
-    wire = Wire(replace(SERIAL, camera=CameraSettings(32, 24, 8, 0.05)))
+    wire = Wire(replace(SERIAL, **IMAGES))
     wire.body.frame = (np.full((480, 640), 96, np.uint8), 1)
     wire.run(2.1)
     readings, images = stamps_ns(wire.found, Reading), stamps_ns(wire.found, CameraImage)
@@ -73,9 +76,9 @@ def assert_agrees_with_truth(wire: Wire, but_for: str = "") -> None:
 
 
 @pytest.mark.parametrize(
-    "robot", [SERIAL, replace(SERIAL, model=EPUCK2), WIFI], ids=["epuck1", "epuck2", "wifi"]
+    "robot", [SERIAL, replace(SERIAL, model="epuck2"), WIFI], ids=["epuck1", "epuck2", "wifi"]
 )
-def test_a_square(robot: EpuckSettings) -> None:
+def test_a_square(robot: EpuckParameters) -> None:
     wire = Wire(robot)
     wire.drive(SQUARE)
     assert_agrees_with_truth(wire)
@@ -154,7 +157,7 @@ class HoledStream:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_stream_with_holes(seed: int) -> None:
-    wire = Wire(replace(WIFI, camera=CAMERA), lambda body: HoledStream(WifiFirmware(body), seed))
+    wire = Wire(replace(WIFI, camera=True), lambda body: HoledStream(WifiFirmware(body), seed))
     wire.reconnects = True
     frame = np.random.default_rng(seed).integers(0, 256, (120, 160, 3)).astype(np.uint8)
     wire.body.frame = (frame, None)
@@ -172,7 +175,7 @@ def images(wire: Wire) -> list[CameraImage]:
 
 
 def test_images_over_wifi() -> None:
-    wire = Wire(replace(WIFI, camera=CAMERA))
+    wire = Wire(replace(WIFI, camera=True))
     rows, columns = np.mgrid[:120, :160]
     frame = np.stack([rows, columns, rows + columns], axis=-1).astype(np.uint8)
     wire.body.frame = (frame, None)
@@ -184,7 +187,7 @@ def test_images_over_wifi() -> None:
 
 def test_images_over_wifi_are_stamped_when_the_firmware_fetched_them() -> None:
     """When one is sent the next is fetched: taken within a period before, or the first one after."""
-    wire = Wire(replace(WIFI, camera=CAMERA))
+    wire = Wire(replace(WIFI, camera=True))
     exposures_ns = []
     for number in range(31):
         exposures_ns.append(wire.now_ns)
@@ -196,7 +199,7 @@ def test_images_over_wifi_are_stamped_when_the_firmware_fetched_them() -> None:
 
 
 def test_images_over_the_serial_port() -> None:
-    wire = Wire(replace(SERIAL, camera=CameraSettings(32, 24, 8, 0.05)))
+    wire = Wire(replace(SERIAL, **IMAGES))
     wire.body.frame = (np.full((480, 640), 96, np.uint8), 1)
     wire.run(0.5)
     assert images(wire)[0].pixels.shape == (24, 32, 3)
@@ -210,7 +213,7 @@ STALL_S = (0.2, 0.4, 0.6, 0.8, 1.0)
 @pytest.mark.parametrize("stall_s", STALL_S)
 def test_stalls_of_the_stream_cost_no_odometry(stall_s: float, mode: str) -> None:
     """A minute's drive in which the way to the computer is blocked every two to three seconds."""
-    wire = Wire(replace(WIFI, camera=CAMERA if stall_s in {0.4, 0.8} else None, reading_period_s=0.05))
+    wire = Wire(replace(WIFI, camera=stall_s in {0.4, 0.8}, reading_rate=20.0))
     wire.body.frame = (np.zeros((120, 160), np.uint8), None)
     wire.run(0.5)
     rng = np.random.default_rng(round(10 * stall_s))
