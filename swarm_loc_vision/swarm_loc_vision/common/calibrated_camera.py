@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -79,20 +80,45 @@ class CalibratedCamera:
         if size != calibrated:
             shown, wanted = (f"{width} x {height}" for width, height in (size, calibrated))
             raise ImageError(
-                "size", f"the image has {shown} pixels, but the camera is calibrated for {wanted}."
+                "size", f"the image has {shown} pixels, but must have {wanted}, as the calibration says."
             )
         return gray
 
 
 def camera_of(message: Any) -> Camera:
-    """The camera of a sensor_msgs/CameraInfo.
+    """The camera of the images that a sensor_msgs/CameraInfo comes with.
+
+    The calibration is that of the whole sensor. The images show its region of interest, and each of their
+    pixels is the mean of `binning_x` x `binning_y` pixels of the sensor; what is left over at the right and
+    lower rim is not shown.
 
     Raises:
-        CameraError: It is not calibrated, or its images are cropped or binned.
+        CameraError: It is not calibrated, or its region or binning do not fit its size.
     """
+    whole = Camera.from_matrix(
+        (message.width, message.height), np.reshape(message.k, (3, 3)), message.d, message.distortion_model
+    )
     roi = message.roi
-    is_cropped = (roi.width, roi.height) not in ((0, 0), (message.width, message.height))
-    if is_cropped or max(message.binning_x, message.binning_y) > 1:
-        raise CameraError("the camera's images are cropped or binned; only whole images can be read.")
-    matrix = np.reshape(message.k, (3, 3))
-    return Camera.from_matrix((message.width, message.height), matrix, message.d, message.distortion_model)
+    left, top, width, height = roi.x_offset, roi.y_offset, roi.width, roi.height
+    if not any((left, top, width, height)):
+        width, height = whole.width, whole.height
+    if not (0 < width <= whole.width - left and 0 < height <= whole.height - top):
+        raise CameraError(
+            f"the camera's roi has {width} x {height} pixels at ({left}, {top}),"
+            f" but must lie within its {whole.width} x {whole.height} pixels."
+        )
+    across, down = max(message.binning_x, 1), max(message.binning_y, 1)
+    if across > width or down > height:
+        raise CameraError(
+            f"the camera's binning_x and binning_y are {across} and {down},"
+            f" but must be at most the {width} x {height} pixels of its images."
+        )
+    return replace(
+        whole,
+        width=width // across,
+        height=height // down,
+        fx=whole.fx / across,
+        fy=whole.fy / down,
+        cx=(whole.cx - left - 0.5 * (across - 1)) / across,
+        cy=(whole.cy - top - 0.5 * (down - 1)) / down,
+    )

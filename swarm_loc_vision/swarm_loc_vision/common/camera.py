@@ -13,10 +13,11 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 
-LENS_KIND, FX, FY, CX, CY, K1, K2, P1, P2, K3, K4, K5, K6 = range(13)
-LENS_SIZE = 13
-STRAIGHT, RADIAL, FISHEYE = 0.0, 1.0, 2.0
-"""Kinds: no distortion; plumb_bob and rational_polynomial; equidistant with K1, K2, K3, K4."""
+LENS_KIND, FX, FY, CX, CY, K1, K2, P1, P2, K3, K4, K5, K6, S1, S2, S3, S4, TAU_X, TAU_Y = range(19)
+"""From K1 on in the order of OpenCV; S1 to S4 model a thin prism, TAU_X and TAU_Y a tilted sensor [rad]."""
+LENS_SIZE = 19
+STRAIGHT, RADIAL, FISHEYE, TILTED = 0.0, 1.0, 2.0, 3.0
+"""Kinds: no distortion; coefficients up to K6; equidistant with K1, K2, K3, K4; coefficients up to TAU_Y."""
 
 
 @cached_njit
@@ -38,7 +39,17 @@ def distorted(lens: FloatArray, x: float, y: float) -> tuple[float, float]:
     )
     bent_x = x * radial + 2.0 * lens[P1] * x * y + lens[P2] * (r2 + 2.0 * x * x)
     bent_y = y * radial + lens[P1] * (r2 + 2.0 * y * y) + 2.0 * lens[P2] * x * y
-    return bent_x, bent_y
+    if lens[LENS_KIND] != TILTED:
+        return bent_x, bent_y
+    bent_x += r2 * (lens[S1] + r2 * lens[S2])
+    bent_y += r2 * (lens[S3] + r2 * lens[S4])
+    sin_x, cos_x = math.sin(lens[TAU_X]), math.cos(lens[TAU_X])
+    sin_y, cos_y = math.sin(lens[TAU_Y]), math.cos(lens[TAU_Y])
+    along = cos_x * bent_y + sin_x
+    depth = cos_x - sin_x * bent_y
+    across, depth = cos_y * bent_x - sin_y * depth, sin_y * bent_x + cos_y * depth
+    shrink = cos_x * cos_y / depth
+    return shrink * across + sin_y * cos_x, shrink * along - sin_x
 
 
 @cached_njit
@@ -59,12 +70,12 @@ def raw_pixels(lens: FloatArray, pixels: FloatArray) -> FloatArray:
     return raw
 
 
-_MODELS = {"": (0,), "plumb_bob": (0, 4, 5), "rational_polynomial": (0, 8), "equidistant": (0, 4)}
-"""Distortion models of sensor_msgs/CameraInfo, and how many coefficients they may have."""
+_OPENCV = (0, 4, 5, 8, 12, 14)
+_MODELS = {"": (0,), "plumb_bob": _OPENCV, "rational_polynomial": _OPENCV, "equidistant": (0, 4)}
+"""Distortion models of sensor_msgs/CameraInfo, and their numbers of coefficients; only zeros may follow."""
 
-_LONGEST_FOCAL = 100.0
-"""Bound on focal lengths, in widths of the image."""
-_STRONGEST = 1e4
+_MOST_PX, _STRONGEST = 1e6, 1e4
+"""Bounds on intrinsics and on coefficients of the distortion."""
 _MAX_OFF_AXIS = math.tan(math.radians(80.0))
 """Further off the axis a flat image is stretched too much to detect straight sides."""
 _ROUNDS, _EXACT_PX = 50, 1e-4
@@ -87,7 +98,7 @@ class Camera:
         fy: Vertical focal length [px].
         cx: Column of the principal point [px].
         cy: Row of the principal point [px].
-        distortion: Coefficients in the order of OpenCV.
+        distortion: Coefficients in the order of OpenCV; all that are given count.
         model: Distortion model by its name in sensor_msgs/CameraInfo.
 
     Raises:
@@ -104,29 +115,30 @@ class Camera:
     model: str = "plumb_bob"
 
     def __post_init__(self) -> None:
-        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not np.isfinite(numbers).all():
-            raise CameraError("the camera's calibration has numbers that are not finite.")
-        if self.fx <= 0.0 or self.fy <= 0.0:
+        if self.width <= 0 or self.height <= 0:
+            raise CameraError(
+                f"the camera's image has {self.width} x {self.height} pixels, but must have at least 1 x 1."
+            )
+        if not (0.0 < self.fx <= _MOST_PX and 0.0 < self.fy <= _MOST_PX):  # nor NaN
             raise CameraError(
                 f"the camera is not calibrated: its focal lengths are {self.fx:g} and {self.fy:g} px,"
-                " but must be above 0 px."
+                f" but must lie in (0, {_MOST_PX:g}] px."
             )
-        if self.width <= 0 or self.height <= 0:
-            raise CameraError(f"the camera's image has {self.width} x {self.height} pixels.")
-        longest = _LONGEST_FOCAL * max(self.width, self.height)
-        if max(self.fx, self.fy) > longest or max(map(abs, self.distortion), default=0.0) > _STRONGEST:
-            raise CameraError(
-                f"the camera's calibration cannot be: focal lengths must be at most {longest:g} px"
-                f" and distortion coefficients within {_STRONGEST:g}."
-            )
+        numbers = {"cx": (self.cx, _MOST_PX), "cy": (self.cy, _MOST_PX)}
+        numbers |= {f"distortion coefficient {i}": (d, _STRONGEST) for i, d in enumerate(self.distortion)}
+        for name, (number, most) in numbers.items():
+            if not abs(number) <= most:  # nor NaN
+                raise CameraError(
+                    f"the camera's {name} is {number:g}, but must lie in [-{most:g}, {most:g}]."
+                )
         if self.model not in _MODELS:
             known = ", ".join(filter(None, _MODELS))
-            raise CameraError(f"the camera's distortion model '{self.model}' is not one of {known}.")
-        if len(self.distortion) not in _MODELS[self.model]:
+            raise CameraError(f"the camera's distortion model is '{self.model}', but must be one of {known}.")
+        counts = _MODELS[self.model]
+        if any(self.distortion[max(count for count in counts if count <= len(self.distortion)) :]):
             raise CameraError(
                 f"the camera's distortion model '{self.model}' has {len(self.distortion)} coefficients,"
-                f" but must have {' or '.join(map(str, _MODELS[self.model]))}."
+                f" but must have {' or '.join(map(str, counts))}; only zeros may follow."
             )
 
     @classmethod
@@ -153,9 +165,12 @@ class Camera:
         lens = np.zeros(LENS_SIZE)
         lens[[FX, FY, CX, CY]] = self.fx, self.fy, self.cx, self.cy
         if self.model == "equidistant" or any(self.distortion):
-            lens[LENS_KIND] = FISHEYE if self.model == "equidistant" else RADIAL
-            places = [K1, K2, K3, K4] if self.model == "equidistant" else [K1, K2, P1, P2, K3, K4, K5, K6]
-            lens[places[: len(self.distortion)]] = self.distortion
+            places = [K1, K2, K3, K4] if self.model == "equidistant" else list(range(K1, LENS_SIZE))
+            given = self.distortion[: len(places)]
+            lens[places[: len(given)]] = given
+            lens[LENS_KIND] = (
+                FISHEYE if self.model == "equidistant" else TILTED if lens[S1:].any() else RADIAL
+            )
         return lens
 
     def to_ideal(self, pixels: FloatArray) -> FloatArray:
@@ -166,11 +181,10 @@ class Camera:
         if self.lens[LENS_KIND] == STRAIGHT or not pixels.size:
             return np.array(pixels)
         flat = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
-        coefficients = np.array(self.distortion or (0.0,) * 4)
         if self.model == "equidistant":
-            ideal = cv2.fisheye.undistortPoints(flat, self.matrix, coefficients, P=self.matrix)
+            ideal = cv2.fisheye.undistortPoints(flat, self.matrix, self.lens[[K1, K2, K3, K4]], P=self.matrix)
         else:
-            ideal = cv2.undistortPoints(flat, self.matrix, coefficients, P=self.matrix)
+            ideal = cv2.undistortPoints(flat, self.matrix, self.lens[K1:], P=self.matrix)
         found = np.asarray(ideal, np.float64).reshape(pixels.shape)
         missed = pixels - self.to_raw(found)
         for _ in range(_ROUNDS):  # OpenCV stops early, up to a pixel off at the rim of a strong lens

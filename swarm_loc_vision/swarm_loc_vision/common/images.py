@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -29,20 +30,19 @@ class ImageError(ValueError):
 
 @dataclass(frozen=True)
 class _Encoding:
-    """Layout of pixels in memory, and their conversion to gray."""
+    """Layout of pixels in memory, and their conversion to gray.
+
+    Attributes:
+        channels: Of a pixel.
+        to_gray: Converts (height, width, channels).
+        bytes_per_channel: 1 or 2.
+        planes: Rows in memory per row of the image; those below the image hold colours.
+    """
 
     channels: int
-    to_gray: Callable[[Pixels], Pixels]
+    to_gray: Callable[[Pixels], NDArray[Any]]
     bytes_per_channel: int = 1
-
-
-def _converted(code: int) -> Callable[[Pixels], Pixels]:
-    """A conversion of OpenCV."""
-
-    def convert(pixels: Pixels) -> Pixels:
-        return np.asarray(cv2.cvtColor(pixels, code), np.uint8)
-
-    return convert
+    planes: float = 1.0
 
 
 def _highest_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
@@ -51,26 +51,35 @@ def _highest_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     return (pixels >> surplus).astype(np.uint8)
 
 
-_PLAIN = _Encoding(1, lambda pixels: pixels[..., 0])
-_WIDE = _Encoding(1, lambda pixels: _highest_bits(pixels[..., 0]), 2)
+def _of_8_and_16_bits(name: str, channels: int, conversion: int | None = None) -> dict[str, _Encoding]:
+    """An encoding of 8 bits per channel and that of 16; the conversion is one of OpenCV, None: it is gray."""
+
+    def to_gray(pixels: Pixels) -> NDArray[Any]:
+        return pixels[..., 0] if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))
+
+    return {
+        name: _Encoding(channels, to_gray),
+        name.replace("8", "16"): _Encoding(channels, lambda pixels: _highest_bits(to_gray(pixels)), 2),
+    }
+
+
 _ENCODINGS = {
-    "mono8": _PLAIN,
-    "8UC1": _PLAIN,
-    "mono16": _WIDE,
-    "16UC1": _WIDE,
-    "rgb8": _Encoding(3, _converted(cv2.COLOR_RGB2GRAY)),
-    "bgr8": _Encoding(3, _converted(cv2.COLOR_BGR2GRAY)),
-    "8UC3": _Encoding(3, _converted(cv2.COLOR_BGR2GRAY)),
-    "rgba8": _Encoding(4, _converted(cv2.COLOR_RGBA2GRAY)),
-    "bgra8": _Encoding(4, _converted(cv2.COLOR_BGRA2GRAY)),
-    "bayer_rggb8": _Encoding(1, _converted(cv2.COLOR_BayerBG2GRAY)),
-    "bayer_bggr8": _Encoding(1, _converted(cv2.COLOR_BayerRG2GRAY)),
-    "bayer_gbrg8": _Encoding(1, _converted(cv2.COLOR_BayerGR2GRAY)),
-    "bayer_grbg8": _Encoding(1, _converted(cv2.COLOR_BayerGB2GRAY)),
-    "yuv422": _Encoding(2, lambda pixels: pixels[..., 1]),
-    "uyvy": _Encoding(2, lambda pixels: pixels[..., 1]),
-    "yuv422_yuy2": _Encoding(2, lambda pixels: pixels[..., 0]),
-    "yuyv": _Encoding(2, lambda pixels: pixels[..., 0]),
+    **_of_8_and_16_bits("mono8", 1),
+    **_of_8_and_16_bits("8UC1", 1),
+    **_of_8_and_16_bits("rgb8", 3, cv2.COLOR_RGB2GRAY),
+    **_of_8_and_16_bits("bgr8", 3, cv2.COLOR_BGR2GRAY),
+    **_of_8_and_16_bits("8UC3", 3, cv2.COLOR_BGR2GRAY),
+    **_of_8_and_16_bits("rgba8", 4, cv2.COLOR_RGBA2GRAY),
+    **_of_8_and_16_bits("bgra8", 4, cv2.COLOR_BGRA2GRAY),
+    **_of_8_and_16_bits("8UC4", 4, cv2.COLOR_BGRA2GRAY),
+    **_of_8_and_16_bits("bayer_rggb8", 1, cv2.COLOR_BayerBG2GRAY),
+    **_of_8_and_16_bits("bayer_bggr8", 1, cv2.COLOR_BayerRG2GRAY),
+    **_of_8_and_16_bits("bayer_gbrg8", 1, cv2.COLOR_BayerGR2GRAY),
+    **_of_8_and_16_bits("bayer_grbg8", 1, cv2.COLOR_BayerGB2GRAY),
+    **dict.fromkeys(("yuv422", "uyvy"), _Encoding(2, lambda pixels: pixels[..., 1])),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), _Encoding(2, lambda pixels: pixels[..., 0])),
+    **dict.fromkeys(("nv12", "nv21"), _Encoding(1, lambda pixels: pixels[..., 0], planes=1.5)),
+    "nv24": _Encoding(1, lambda pixels: pixels[..., 0], planes=3.0),
 }
 """By the names of sensor_msgs/image_encodings."""
 
@@ -110,20 +119,24 @@ def gray_image(message: Any) -> Gray:
         ImageError: Unknown encoding (`encoding`), or the bytes are not those of such an image (`size`).
     """
     encoding, width, height, step = message.encoding, message.width, message.height, message.step
-    known = _ENCODINGS.get(encoding)
+    known = _ENCODINGS.get(encoding) or _ENCODINGS.get(encoding.lower())  # some drivers write NV12
     if known is None:
-        raise ImageError("encoding", f"the encoding '{encoding}' is not one of {', '.join(_ENCODINGS)}.")
+        raise ImageError(
+            "encoding", f"the image's encoding is '{encoding}', but must be one of {', '.join(_ENCODINGS)}."
+        )
     raw = np.frombuffer(message.data, np.uint8)
     row = width * known.channels * known.bytes_per_channel
-    if width < 1 or height < 1 or step < row or raw.size < step * (height - 1) + row:
+    least = step * (math.ceil(known.planes * height) - 1) + row
+    if width < 1 or height < 1 or step < row or raw.size < least:
         raise ImageError(
             "size",
-            f"{raw.size} bytes, {step} a row, are no image of {width} x {height} pixels in '{encoding}'.",
+            f"the image has {raw.size} bytes, {step} a row, but {width} x {height} pixels in '{encoding}'"
+            f" must have at least {least}, {row} a row.",
         )
     rows = np.lib.stride_tricks.as_strided(raw, (height, row), (step, 1))
     pixels: Pixels = np.ascontiguousarray(rows)
     if known.bytes_per_channel == 2:
-        pixels = pixels.view(">u2" if message.is_bigendian else "<u2")
+        pixels = pixels.view(">u2" if message.is_bigendian else "<u2").astype(np.uint16, copy=False)
     gray = np.ascontiguousarray(known.to_gray(pixels.reshape(height, width, known.channels)), np.uint8)
     return gray if gray.flags.writeable else gray.copy()  # a read-only array would be compiled for separately
 
@@ -131,17 +144,28 @@ def gray_image(message: Any) -> Gray:
 def decoded_image(message: Any) -> Gray:
     """The brightness (height, width) of a sensor_msgs/CompressedImage; an EXIF orientation is ignored.
 
+    Where the format is empty, the first bytes say what it is.
+
     Raises:
         ImageError: The format is unknown (`encoding`), or the bytes are no whole image of it (`corrupt`).
     """
     how = message.format
-    known = next((_COMPRESSIONS[name] for name in _COMPRESSIONS if name in how.lower()), None)
-    if known is None or _COMPRESSED_DEPTH in how:
-        raise ImageError("encoding", f"the format '{how}' is not one of {', '.join(_COMPRESSIONS)}.")
     raw = np.frombuffer(message.data, np.uint8)
-    gray = _decoded(raw) if known.is_whole(raw.tobytes()) else None
+    data = raw.tobytes()
+    if how.strip():
+        known = next((_COMPRESSIONS[name] for name in _COMPRESSIONS if name in how.lower()), None)
+    else:
+        known = next((one for one in (_JPEG, _PNG) if data.startswith(one.begin)), None)
+    if known is None or _COMPRESSED_DEPTH in how:
+        names = ", ".join(_COMPRESSIONS)
+        raise ImageError(
+            "encoding", f"the image's format is '{how}', but must be one of {names}, or empty for these."
+        )
+    gray = _decoded(raw) if known.is_whole(data) else None
     if gray is None:
-        raise ImageError("corrupt", f"{raw.size} bytes are no whole image in '{known.name}'.")
+        raise ImageError(
+            "corrupt", f"the image's data has {raw.size} bytes, but must be a whole image in '{known.name}'."
+        )
     return _highest_bits(gray)
 
 

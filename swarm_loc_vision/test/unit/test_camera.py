@@ -11,6 +11,8 @@ from swarm_loc_vision.common.camera import Camera, CameraError
 
 PLUMB_BOB = (-0.28, 0.09, 1e-3, -5e-4, -0.01)
 RATIONAL = (0.3, -0.1, 1e-3, 5e-4, 0.02, 0.6, -0.05, 0.01)
+PRISM = (*RATIONAL, 2e-3, -1e-3, 3e-3, 5e-4)
+TILTED = (*PRISM, 0.02, -0.03)
 EQUIDISTANT = (-0.02, 0.01, -0.003, 0.0005)
 
 
@@ -32,7 +34,13 @@ def ideal_pixels(one: Camera) -> NDArray[np.float64]:
     [
         ((), "plumb_bob"),
         (PLUMB_BOB, "plumb_bob"),
+        (PLUMB_BOB[:4], "rational_polynomial"),
+        (PLUMB_BOB, "rational_polynomial"),
         (RATIONAL, "rational_polynomial"),
+        (RATIONAL, "plumb_bob"),
+        (PRISM, "rational_polynomial"),
+        (TILTED, "rational_polynomial"),
+        (TILTED, "plumb_bob"),
         (EQUIDISTANT, "equidistant"),
         ((0.0,) * 4, "equidistant"),
         ((), "equidistant"),
@@ -53,6 +61,26 @@ def test_raw_pixels_are_opencvs(distortion: tuple[float, ...], model: str) -> No
     assert one.to_ideal(raw) == pytest.approx(ideal_pixels(one), abs=0.2)
 
 
+@pytest.mark.parametrize(
+    ("distortion", "model"),
+    [
+        ((), "plumb_bob"),
+        ((), ""),
+        (PLUMB_BOB, "plumb_bob"),
+        (PLUMB_BOB, "rational_polynomial"),
+        (RATIONAL, "rational_polynomial"),
+        (TILTED, "rational_polynomial"),
+        (EQUIDISTANT, "equidistant"),
+    ],
+)
+@pytest.mark.parametrize("zeros", [1, 3, 7, 9])
+def test_zeros_that_follow_change_nothing(distortion: tuple[float, ...], model: str, zeros: int) -> None:
+    plain, longer = camera(distortion, model), camera((*distortion, *(0.0,) * zeros), model)
+    raw = plain.to_raw(ideal_pixels(plain))
+    assert (longer.to_raw(ideal_pixels(plain)) == raw).all()
+    assert (longer.to_ideal(raw) == plain.to_ideal(raw)).all()
+
+
 @pytest.mark.parametrize("distortion", [(), (-0.02, 0.01, -0.003, 0.0005), (0.05, -0.01, 0.0, 0.0)])
 def test_what_a_fisheye_sees_far_off_its_axis_has_no_ideal_pixel(distortion: tuple[float, ...]) -> None:
     one = Camera(1600, 1600, 500.0, 500.0, 800.0, 800.0, distortion, "equidistant")
@@ -68,12 +96,23 @@ def test_what_a_fisheye_sees_far_off_its_axis_has_no_ideal_pixel(distortion: tup
     ("changes", "words"),
     [
         ({"fx": 0.0}, "not calibrated: its focal lengths are 0 and 990 px"),
-        ({"cx": float("nan")}, "not finite"),
-        ({"width": 0}, "0 x 960 pixels"),
-        ({"fx": 1e300}, "focal lengths must be at most 128000 px"),
-        ({"distortion": (1e300, 0.0, 0.0, 0.0)}, "distortion coefficients within 10000"),
-        ({"model": "magic"}, "'magic' is not one of plumb_bob, rational_polynomial, equidistant"),
-        ({"distortion": (0.1, 0.2)}, "has 2 coefficients, but must have 0 or 4 or 5"),
+        ({"cx": float("nan")}, r"cx is nan, but must lie in \[-1e\+06, 1e\+06\]"),
+        (
+            {"distortion": (0.0, float("inf"), 0.0, 0.0)},
+            "distortion coefficient 1 is inf, but must lie in",
+        ),
+        ({"fy": float("nan")}, "focal lengths are 1000 and nan px, but must lie in"),
+        ({"width": 0}, "0 x 960 pixels, but must have at least 1 x 1"),
+        ({"fx": 1e300}, r"focal lengths are 1e\+300 and 990 px, but must lie in \(0, 1e\+06\] px"),
+        ({"distortion": (0.0, 1e5, 0.0, 0.0)}, r"coefficient 1 is 100000, but must lie in \[-10000, 10000\]"),
+        ({"model": "magic"}, "is 'magic', but must be one of plumb_bob, rational_polynomial, equidistant"),
+        ({"distortion": (0.1, 0.2)}, "has 2 coefficients, but must have 0 or 4 or 5 or 8 or 12 or 14"),
+        ({"distortion": (0.0,) * 14 + (0.1,)}, "has 15 coefficients, but must have .* 14; only zeros may"),
+        (
+            {"distortion": (*EQUIDISTANT, 0.1), "model": "equidistant"},
+            "has 5 coefficients, but must have 0 or 4",
+        ),
+        ({"distortion": PLUMB_BOB, "model": ""}, "model '' has 5 coefficients, but must have 0"),
     ],
 )
 def test_what_cannot_be_a_camera_is_refused(changes: dict[str, object], words: str) -> None:

@@ -28,8 +28,8 @@ def decoded(how: str, data: object) -> Gray:
     return decoded_image(SimpleNamespace(format=how, data=data))
 
 
-def wide(order: str) -> NDArray[np.uint8]:
-    return (SHADES.astype(order + "u2") * 257).view(np.uint8).reshape(HEIGHT, -1)
+def wide(order: str, pixels: NDArray[np.uint8] = SHADES) -> NDArray[np.uint8]:
+    return (np.ascontiguousarray(pixels).astype(order + "u2") * 257).view(np.uint8).reshape(HEIGHT, -1)
 
 
 @pytest.mark.parametrize(
@@ -41,6 +41,10 @@ def wide(order: str) -> NDArray[np.uint8]:
         ("bgr8", COLOURS[..., ::-1], RGB_GRAY),
         ("rgba8", np.dstack([COLOURS, SHADES]), RGB_GRAY),
         ("bgra8", np.dstack([COLOURS[..., ::-1], SHADES]), RGB_GRAY),
+        ("8UC1", SHADES, SHADES),
+        ("16UC1", wide("<"), SHADES),
+        ("8UC3", COLOURS[..., ::-1], RGB_GRAY),
+        ("8UC4", np.dstack([COLOURS[..., ::-1], SHADES]), RGB_GRAY),
         ("yuyv", np.dstack([SHADES, SHADES[::-1]]), SHADES),
         ("uyvy", np.dstack([SHADES[::-1], SHADES]), SHADES),
     ],
@@ -53,6 +57,39 @@ def test_encodings(encoding: str, data: NDArray[np.uint8], expected: NDArray[np.
         assert (shown == expected).all()
         assert shown.flags.writeable
         assert shown.flags.c_contiguous
+
+
+@pytest.mark.parametrize("encoding", ["rgb", "bgr", "rgba", "bgra"])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_colours_of_16_bits(encoding: str, order: str) -> None:
+    pixels = COLOURS if encoding.startswith("rgb") else COLOURS[..., ::-1]
+    if encoding.endswith("a"):
+        pixels = np.dstack([pixels, SHADES])
+    rows = wide(order, pixels)
+    shown = gray(f"{encoding}16", WIDTH, HEIGHT, rows.shape[1], rows.tobytes(), is_bigendian=order == ">")
+    assert np.abs(shown.astype(int) - RGB_GRAY).max() <= 1
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_bayer_of_16_bits_is_that_of_8(pattern: str, order: str) -> None:
+    expected = gray(f"bayer_{pattern}8", WIDTH, HEIGHT, WIDTH, SHADES.tobytes())
+    raw = wide(order).tobytes()
+    shown = gray(f"bayer_{pattern}16", WIDTH, HEIGHT, 2 * WIDTH, raw, is_bigendian=order == ">")
+    assert np.abs(shown.astype(int) - expected).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("encoding", "colour_rows"), [("nv12", HEIGHT // 2), ("NV12", HEIGHT // 2), ("nv21", 5), ("nv24", 20)]
+)
+@pytest.mark.parametrize("padding", [0, 5])
+def test_planar_yuv_shows_its_first_plane(encoding: str, colour_rows: int, padding: int) -> None:
+    step = WIDTH + padding
+    planes = np.zeros((HEIGHT + colour_rows, step), np.uint8)
+    planes[:HEIGHT, :WIDTH] = SHADES
+    assert (gray(encoding, WIDTH, HEIGHT, step, planes.tobytes()) == SHADES).all()
+    with pytest.raises(ImageError, match=f"but 14 x 10 pixels in '{encoding}' must have at least"):
+        gray(encoding, WIDTH, HEIGHT, step, planes[:-1].tobytes())
 
 
 def test_big_endian() -> None:
@@ -103,6 +140,8 @@ def file_of(pixels: Pixels, suffix: str) -> bytes:
         ("JPG", ".jpg", SHADES, SHADES, 4),
         ("png", ".png", SHADES, SHADES, 0),
         ("rgb8; png compressed bgr8", ".png", COLOURS[..., ::-1], RGB_GRAY, 1),
+        ("", ".jpg", SHADES, SHADES, 4),
+        (" ", ".png", SHADES, SHADES, 0),
         ("mono16; png compressed mono16", ".png", SHADES.astype(np.uint16) * 257, SHADES, 0),
     ],
 )
@@ -138,7 +177,9 @@ def test_a_compressed_image_cut_off_anywhere_is_refused(suffix: str) -> None:
 @pytest.mark.parametrize(
     ("how", "data", "reason"),
     [
-        ("", file_of(SHADES, ".jpg"), "encoding"),
+        ("", file_of(SHADES, ".bmp"), "encoding"),
+        ("", b"", "encoding"),
+        ("", file_of(SHADES, ".jpg")[:-2], "corrupt"),
         ("tiff", file_of(SHADES, ".jpg"), "encoding"),
         ("16UC1; compressedDepth png", bytes(12) + file_of(SHADES, ".png"), "encoding"),
         ("png", file_of(SHADES, ".jpg"), "corrupt"),
