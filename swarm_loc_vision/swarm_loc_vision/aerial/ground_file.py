@@ -40,7 +40,7 @@ def load_ground(path: Path) -> Ground:
         tree = read_tree(path)
     except YamlTreeError as error:
         raise GroundFileError(str(error)) from error
-    return _Reader(path).ground(tree)
+    return _Reader(path, GroundFileError).ground(tree)
 
 
 def save_ground(ground: Ground, path: Path, comment: str = "") -> None:
@@ -58,19 +58,14 @@ def save_ground(ground: Ground, path: Path, comment: str = "") -> None:
     path.write_text(text, encoding="utf-8")
 
 
-class _Reader:
-    """Takes values out of one file."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._checks = path, TreeChecks(path, GroundFileError)
+class _Reader(TreeChecks):
+    """Takes control points out of one file."""
 
     def ground(self, tree: Tree) -> Ground:
-        checks = self._checks
-        known = ("points", "family", "markers", "camera")
-        sections = checks.mapping(tree, WHOLE_FILE, known)
-        points = self._points(checks.mapping(sections.get("points"), "points"))
+        sections = self.mapping(tree, WHOLE_FILE, ("points", "family", "markers", "camera"))
+        points = self._points(self.mapping(sections.get("points"), "points"))
         family = self._family(sections.get("family", "aruco_mip_36h12"))
-        markers = self._markers(checks.mapping(sections.get("markers"), "markers"), family)
+        markers = self._markers(self.mapping(sections.get("markers"), "markers"), family)
         if not markers:
             try:
                 check_points(points)
@@ -79,43 +74,34 @@ class _Reader:
         return Ground(points, markers, family, self._camera(sections.get("camera")))
 
     def _points(self, tree: dict[Any, Tree]) -> ControlPoints:
-        rows = [
-            self._checks.numbers(entry, f"points.{name}", _POINT, required=_REQUIRED)
-            for name, entry in tree.items()
-        ]
+        rows = [self.numbers(entry, f"points.{name}", _POINT, _REQUIRED) for name, entry in tree.items()]
         values = np.array([[row.get(key) or 0.0 for key in _POINT] for row in rows], float).reshape(-1, 5)
         return ControlPoints([str(name) for name in tree], values[:, :3], values[:, 3:])
 
     def _family(self, name: Tree) -> Family:
         known = families()
         if not isinstance(name, str) or name not in known:
-            raise self._checks.said(f"family is {name!r}, which is none{nearest(str(name), known)}")
+            raise self.said(f"family is {name!r}, which is none{nearest(str(name), known)}")
         return known[name]
 
     def _markers(self, tree: dict[Any, Tree], family: Family) -> tuple[FloorMarker, ...]:
         markers = []
         for marker_id, entry in tree.items():
             if not isinstance(marker_id, int) or not 0 <= marker_id < len(family.words):
-                raise self._checks.said(
+                raise self.said(
                     f"markers has {marker_id!r}, but ids of {family.name} are 0 to {len(family.words) - 1}"
                 )
-            numbers = self._checks.numbers(
-                entry, f"markers.{marker_id}", number_specs(FloorMarker), required=("x", "y", "size")
-            )
-            markers.append(
-                FloorMarker(marker_id, **{key: float(value or 0.0) for key, value in numbers.items()})
-            )
+            required = ("x", "y", "size")
+            numbers: Any = self.numbers(entry, f"markers.{marker_id}", number_specs(FloorMarker), required)
+            markers.append(FloorMarker(marker_id, **numbers))
         return tuple(markers)
 
     def _camera(self, tree: Tree) -> Camera | None:
         if tree is None:
             return None
-        section = self._checks.mapping(
-            tree, "camera", (*_CAMERA, "distortion_model", "distortion"), required=tuple(_CAMERA)
-        )
-        plain = {key: value for key, value in section.items() if key in _CAMERA}
-        numbers = {key: float(v or 0.0) for key, v in self._checks.numbers(plain, "camera", _CAMERA).items()}
-        distortion = self._checks.list_of_numbers(section.get("distortion", []), "camera.distortion")
+        section = self.mapping(tree, "camera", (*_CAMERA, "distortion_model", "distortion"), _CAMERA)
+        numbers: Any = {k: self.number(section[k], f"camera.{k}", spec) for k, spec in _CAMERA.items()}
+        distortion = self.list_of_numbers(section.get("distortion", []), "camera.distortion")
         model = str(section.get("distortion_model", "plumb_bob"))
         width, height = (int(numbers.pop(key)) for key in ("width", "height"))
         try:

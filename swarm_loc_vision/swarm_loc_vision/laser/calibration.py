@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number, number_specs
 from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
+from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
 
 STEP_PX = 0.2
 """Distance of two knots: the bias has a period of one pixel, with harmonics."""
@@ -27,13 +28,11 @@ class RowBias:
     """Tracked row minus true row, linear between knots.
 
     Attributes:
-        first_row: Row of the first knot [px].
-        step: From knot to knot [px].
         offsets: (K,) bias at each knot [px]; empty: unknown.
     """
 
-    first_row: float = 0.0
-    step: float = STEP_PX
+    first_row: float = number(0.0, "px", -1000.0, 10_000.0, "row of the first knot")
+    step: float = number(STEP_PX, "px", 0.0, 10.0, "from knot to knot", above=True)
     offsets: tuple[float, ...] = ()
 
     def reaches(self, row: float) -> bool:
@@ -104,8 +103,6 @@ _HEAD = (
     "# Laser and event camera of one robot: the spot of what is at depth d lies at the row p_inf + f b / d.\n"
 )
 _BIAS = "row_bias"
-_FIRST_ROW = NumberSpec("px", -1000.0, 10_000.0, False, "row of the first knot")
-_STEP = NumberSpec("px", 0.0, 10.0, True, "from knot to knot")
 _OFFSET = NumberSpec("px", -10.0, 10.0, False, "tracked row minus true row at each knot")
 _MAX_KNOTS = 10_000
 
@@ -120,24 +117,23 @@ def save_laser(path: Path, calibration: LaserCalibration) -> None:
     Raises:
         LaserFileError: It cannot be written there.
     """
-    specs = number_specs(LaserCalibration)
-    lines = [
-        f"{name}: {getattr(calibration, name):.9g}  # {spec.doc} [{spec.unit}]"
-        for name, spec in specs.items()
-    ]
+    lines = _lines(calibration)
     bias = calibration.row_bias
     if bias.offsets:
         offsets = ", ".join(f"{offset:.4f}" for offset in bias.offsets)
-        lines += [
-            f"{_BIAS}:",
-            f"  first_row: {bias.first_row:.9g}  # {_FIRST_ROW.doc} [px]",
-            f"  step: {bias.step:.9g}  # {_STEP.doc} [px]",
-            f"  offsets: [{offsets}]  # {_OFFSET.doc} [px]",
-        ]
+        within = [*_lines(bias), f"offsets: [{offsets}]  # {_OFFSET.doc} [px]"]
+        lines += [f"{_BIAS}:", *(f"  {line}" for line in within)]
     try:
         path.write_text(_HEAD + "\n".join(lines) + "\n", encoding="utf-8")
     except OSError as error:
         raise LaserFileError(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def _lines(numbers: LaserCalibration | RowBias) -> list[str]:
+    return [
+        f"{name}: {getattr(numbers, name):.9g}  # {spec.doc} [{spec.unit}]"
+        for name, spec in number_specs(type(numbers)).items()
+    ]
 
 
 def load_laser(path: Path) -> LaserCalibration:
@@ -147,36 +143,30 @@ def load_laser(path: Path) -> LaserCalibration:
         LaserFileError: There is none, or a number is missing, unknown or out of its range.
     """
     try:
-        content = read_tree(path)
+        tree = read_tree(path)
     except YamlTreeError as error:
         raise LaserFileError(str(error)) from error
-    specs = number_specs(LaserCalibration)
-    if not isinstance(content, dict) or set(content) - {_BIAS} != set(specs):
-        raise LaserFileError(f"{path} must have exactly the keys {', '.join(specs)}, and may have {_BIAS}.")
-    values = {name: _number(path, name, content[name], spec) for name, spec in specs.items()}
-    if values["min_depth"] >= values["max_depth"]:
-        raise LaserFileError(
-            f"{path}: min_depth = {values['min_depth']} must be below max_depth = {values['max_depth']}."
+    checks, specs = TreeChecks(path, LaserFileError), number_specs(LaserCalibration)
+    content = checks.mapping(tree, WHOLE_FILE, (*specs, _BIAS), required=specs)
+    numbers: Any = {name: checks.number(content[name], name, spec) for name, spec in specs.items()}
+    calibration = LaserCalibration(**numbers, row_bias=_row_bias(checks, content.get(_BIAS)))
+    if calibration.min_depth >= calibration.max_depth:
+        raise checks.error(
+            "min_depth", calibration.min_depth, f"must be below max_depth = {calibration.max_depth}"
         )
-    return LaserCalibration(
-        **values, row_bias=_row_bias(path, content[_BIAS]) if _BIAS in content else RowBias()
-    )
+    return calibration
 
 
-def _row_bias(path: Path, content: Tree) -> RowBias:
-    if not isinstance(content, dict) or set(content) != {"first_row", "step", "offsets"}:
-        raise LaserFileError(f"{path}: {_BIAS} must have exactly the keys first_row, step, offsets.")
-    offsets = content["offsets"]
-    if not isinstance(offsets, list) or len(offsets) > _MAX_KNOTS:
-        raise LaserFileError(f"{path}: {_BIAS}.offsets must be a list of at most {_MAX_KNOTS} numbers.")
-    return RowBias(
-        _number(path, f"{_BIAS}.first_row", content["first_row"], _FIRST_ROW),
-        _number(path, f"{_BIAS}.step", content["step"], _STEP),
-        tuple(_number(path, f"{_BIAS}.offsets", offset, _OFFSET) for offset in offsets),
-    )
-
-
-def _number(path: Path, name: str, value: Tree, spec: NumberSpec) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not spec.allows(value):
-        raise LaserFileError(f"{path}: {name} = {value!r} must be a number in {spec.range_text}.")
-    return float(value)
+def _row_bias(checks: TreeChecks, tree: Tree) -> RowBias:
+    if tree is None:
+        return RowBias()
+    specs, key = number_specs(RowBias), f"{_BIAS}.offsets"
+    section = checks.mapping(tree, _BIAS, (*specs, "offsets"), required=(*specs, "offsets"))
+    offsets = checks.items(section["offsets"], key)
+    if len(offsets) > _MAX_KNOTS:
+        raise checks.said(f"{key} has {len(offsets)} numbers but must have at most {_MAX_KNOTS}")
+    numbers: Any = {
+        name: checks.number(section[name], f"{_BIAS}.{name}", spec) for name, spec in specs.items()
+    }
+    knots: Any = tuple(checks.number(offset, f"{key}[{k}]", _OFFSET) for k, offset in enumerate(offsets))
+    return RowBias(**numbers, offsets=knots)

@@ -170,11 +170,17 @@ def test_a_file_holds_what_was_saved(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("bias", "sentence"),
     [
-        ("[1, 2]", "row_bias must have exactly the keys"),
-        ("{first_row: 1, step: 0, offsets: []}", "row_bias.step = 0 must be a number in"),
-        ("{first_row: 1, step: 1, offsets: 3}", "row_bias.offsets must be a list"),
-        ("{first_row: 1, step: 1, offsets: [.nan]}", "row_bias.offsets = nan must be a number in"),
-        ("{first_row: 1, step: 1, offsets: [a]}", "row_bias.offsets = 'a' must be a number in"),
+        ("[1, 2]", r"row_bias is \[1, 2\] but must be a mapping"),
+        ("{first_row: 1, offsets: []}", "row_bias lacks step"),
+        ("{first_row: 1, step: 1, offsets: [], stop: 1}", "'row_bias.stop' is not a known key"),
+        ("{first_row: 1, step: 0, offsets: []}", r"row_bias.step is 0 but must lie in \(0, 10\] px"),
+        ("{first_row: 1, step: 1, offsets: 3}", "row_bias.offsets is 3 but must be a list"),
+        ("{first_row: 1, step: 1, offsets: [.nan]}", r"row_bias.offsets\[0\] is nan but must lie in"),
+        ("{first_row: 1, step: 1, offsets: [a]}", r"row_bias.offsets\[0\] is 'a' but must be a number in"),
+        (
+            f"{{first_row: 1, step: 1, offsets: {[0] * 10_001}}}",
+            "has 10001 numbers but must have at most 10000",
+        ),
     ],
 )
 def test_a_bias_that_cannot_be_used_is_named(tmp_path: Path, bias: str, sentence: str) -> None:
@@ -189,8 +195,9 @@ def test_a_bias_that_cannot_be_used_is_named(tmp_path: Path, bias: str, sentence
     ("content", "sentence"),
     [
         (None, "laser.yaml"),
-        ("focal_base: 6.3\n", "exactly the keys"),
-        ("a list", "exactly the keys"),
+        ("focal_base: 6.3\n", "the file lacks row_at_infinity"),
+        ("unknown: 1\n", "'unknown' is not a known key; the nearest one is"),
+        ("a list", "the file is 'a list' but must be a mapping"),
         ("focal_base: [", "laser.yaml"),
     ],
 )
@@ -205,9 +212,9 @@ def test_a_file_that_cannot_be_used_is_named(tmp_path: Path, content: str | None
 @pytest.mark.parametrize(
     ("key", "value", "sentence"),
     [
-        ("focal_base", "-1", "focal_base = -1 must be a number in"),
-        ("row_sigma", "abc", "row_sigma = 'abc' must be a number"),
-        ("min_depth", "9.0", "min_depth = 9.0 must be below"),
+        ("focal_base", "-1", r"focal_base is -1 but must lie in \[0.01, 10000\] px m"),
+        ("row_sigma", "abc", "row_sigma is 'abc' but must be a number"),
+        ("min_depth", "9.0", "min_depth is 9.0 but must be below max_depth = 2.5"),
     ],
 )
 def test_a_number_out_of_its_range_is_named(tmp_path: Path, key: str, value: str, sentence: str) -> None:
