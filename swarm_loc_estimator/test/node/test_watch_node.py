@@ -98,7 +98,7 @@ def viewer(page_node: WatchNode) -> Iterator[Viewer]:
         yield looking
 
 
-def test_a_page_is_told_what_the_graph_says(
+def test_a_page_receives_what_the_graph_publishes(
     ros: Ros, robots: Robots, page_node: WatchNode, viewer: Viewer
 ) -> None:
     truth = ros.tester.create_publisher(PoseStamped, "alpha/ground_truth", BEST_EFFORT)
@@ -138,10 +138,10 @@ def test_a_page_is_told_what_the_graph_says(
 
 
 @pytest.mark.usefixtures("page_node")
-def test_what_a_page_cannot_show_is_told_on_diagnostics(ros: Ros) -> None:
+def test_what_a_page_cannot_show_is_counted_in_diagnostics(ros: Ros) -> None:
     maps = ros.tester.create_publisher(OccupancyGrid, "map", LATCHED)
     truth = ros.tester.create_publisher(PoseStamped, "alpha/ground_truth", BEST_EFFORT)
-    told = ros.listen(DiagnosticArray, "/diagnostics")
+    received = ros.listen(DiagnosticArray, "/diagnostics")
     poses = ros.tester.create_publisher(SwarmPoses, "swarm/poses", QoSProfile(depth=10))
     maps.publish(OccupancyGrid(data=[0, 0, 0]))  # its width and height are 0
     nowhere = PoseStamped()
@@ -150,11 +150,13 @@ def test_what_a_page_cannot_show_is_told_on_diagnostics(ros: Ros) -> None:
     def values() -> dict[str, str]:
         poses.publish(SwarmPoses(poses=[SwarmPose(name="stranger")]))
         truth.publish(nowhere)
-        newest = [one for message in told for one in message.status if one.name == "watch"][-1:]
+        newest = [one for message in received for one in message.status if one.name == "watch"][-1:]
         return {pair.key: pair.value for one in newest for pair in one.values}
 
     ros.until(lambda: {"dropped: map malformed", "dropped: swarm/poses other_swarm"} <= values().keys())
-    levels = [(one.level, one.message) for message in told for one in message.status if one.name == "watch"]
+    levels = [
+        (one.level, one.message) for message in received for one in message.status if one.name == "watch"
+    ]
     assert any(level == DiagnosticStatus.WARN and "map malformed" in said for level, said in levels)
     assert values()["dropped: map malformed"] == "1"
     assert values()["pages"] == "0"

@@ -1,4 +1,4 @@
-"""What the page is told and who may open it, without a browser."""
+"""The page's server, its frames and its access control, without a browser."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ def test_the_history_stays_within_its_bounds(steps: list[tuple[str, int]]) -> No
         newest[kind] = Frame(kind, now_ns, bytes(100))
         history.add(newest[kind])
         assert history.size <= 5000
-    told = history.frames()
-    assert all(frame in told for frame in newest.values()), "the newest of each kind must be told"
-    assert all(frame.stamp_ns >= now_ns - 60 * SECOND for frame in told if frame not in newest.values())
+    kept = history.frames()
+    assert all(frame in kept for frame in newest.values()), "the newest of each kind must be kept"
+    assert all(frame.stamp_ns >= now_ns - 60 * SECOND for frame in kept if frame not in newest.values())
 
 
-def test_the_history_begins_anew_when_time_jumps_back() -> None:
+def test_the_history_restarts_when_time_jumps_back() -> None:
     history = History()
     assert not any(history.add(Frame("poses", k * SECOND, b"x")) for k in range(10))
     assert history.add(Frame("poses", 2 * SECOND, b"y"))
@@ -132,9 +132,9 @@ def server() -> Iterator[WatchServer]:
 
 
 def test_a_taken_port_is_named(server: WatchServer) -> None:
-    told = about(Swarm(), "none")
+    first = about(Swarm(), "none")
     with pytest.raises(ServerError, match=f"parameter port = {server.port}: 127.0.0.1 cannot be listened on"):
-        WatchServer(told, Access("127.0.0.1"), server.port, 20.0, lambda _command, _answer: None)
+        WatchServer(first, Access("127.0.0.1"), server.port, 20.0, lambda _command, _answer: None)
 
 
 UNREAD = "The page's command cannot be read."
@@ -222,7 +222,7 @@ def test_half_a_request_is_closed_in_time(
                 await asyncio.wait_for(reader, 15.0)
             await page.receive_json()
             await page.send_str('{"do": "reset"}')
-            assert (await page.receive_json())["text"] == "done: reset", "a page is closed, too"
+            assert (await page.receive_json())["text"] == "done: reset", "an open page was closed, too"
 
     monkeypatch.setattr("swarm_loc_estimator.watch.server.REQUEST_PATIENCE_S", 1.0)
     asyncio.run(look())
@@ -249,7 +249,7 @@ def test_guesses_of_the_token_are_slowed_down(guarded: WatchServer) -> None:
     assert ["wait 1 s" in answer for answer in answers[:5]] == [False] * 5
     assert sum("wait 1 s" in answer for answer in answers) >= 12, "guesses are compared at full speed"
     assert "wait 1 s" in head(guarded, path="/?token=a%20secret"), (
-        "a pause lets right ones in, and tells them"
+        "the right token is accepted during the pause, which reveals it"
     )
     assert " 200 " in head(guarded, path="/?token=a%20secret", client="127.0.0.2")
     time.sleep(1.1)
@@ -288,7 +288,7 @@ def test_a_page_that_does_not_read_costs_nothing_and_others_see_the_newest(serve
     assert asyncio.run(look()) < 0.5, "publishing waits for a page"
 
 
-def test_a_page_that_is_behind_is_told_as_slow(server: WatchServer) -> None:
+def test_a_page_that_is_behind_is_counted_as_slow(server: WatchServer) -> None:
     async def look() -> tuple[ServerLoad, ServerLoad]:
         async with aiohttp.ClientSession() as session:
             sleeper = await session.ws_connect(f"{server.url}socket")

@@ -1,4 +1,4 @@
-// Where frames come from: the server's WebSocket, which is opened anew whenever it breaks, or a recording in the page.
+// Where frames come from: the server's WebSocket, which is opened again when it breaks, or a recording in the page.
 const AGAIN_MS = [250, 500, 1000, 2000];
 
 class Link {
@@ -37,7 +37,7 @@ class Link {
   }
 }
 
-// A run that the page holds: base64 of gzip of a length, what is told first as JSON, and frames; see recording.py.
+// A run that the page holds: base64 of gzip of a length, the first message as JSON, and frames; see page.py.
 async function readRecording(text) {
   const packed = Uint8Array.from(atob(text), (one) => one.charCodeAt(0));
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));

@@ -234,7 +234,7 @@ class App {
     if (document.activeElement !== slider || !this.paused) if (slider.value !== String(share)) slider.value = share;
     const behind = (time - last) / 1e3;
     const text = this.playing ? `${((time - first) / 1e3).toFixed(1)} of ${((last - first) / 1e3).toFixed(1)} s` : behind > -0.05 ? "now" : `${behind.toFixed(1)} s`;
-    if (text !== this.timeText) element("time").textContent = this.timeText = text; // else the page would be laid out anew
+    if (text !== this.timeText) element("time").textContent = this.timeText = text; // else the page would be laid out again
     const counts = STATUS.map(() => 0);
     if (poses) for (const status of poses.columns.status) counts[status]++;
     if (counts.join() === this.counted) return;

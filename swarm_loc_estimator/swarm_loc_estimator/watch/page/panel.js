@@ -165,7 +165,7 @@ function element(id) {
   return document.getElementById(id);
 }
 
-// Only what has changed: else all of the page would be laid out anew.
+// Only what has changed: else the whole page would be laid out again.
 function fill(table, rows) {
   while (table.rows.length > rows.length) table.deleteRow(-1);
   rows.forEach((row, k) => {
