@@ -23,7 +23,7 @@ from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
 from swarm_loc_drivers.common.ros_messages import stamp_message
 from swarm_loc_drivers.droplet.driver import OWN, DropletDriver, DropletListeners
 from swarm_loc_drivers.droplet.exchange import Brightness
-from swarm_loc_drivers.droplet.parameters import DropletParameters, droplet_settings
+from swarm_loc_drivers.droplet.parameters import DropletParameters
 from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import BrightnessMatrix
 
@@ -49,20 +49,19 @@ class DropletDriverNode(RobotDriverNode[DropletParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("droplet_driver", DropletParameters, **node_arguments)
-        settings = droplet_settings(self.params)
         robot = self.get_namespace().strip("/")
         self._brightness = self.create_publisher(BrightnessMatrix, "brightness", _BRIGHTNESS_QOS)
         self._odometry = {OWN: self._odometry_output("odom", self._prefix)}
-        for name in settings.relayed:
+        for name in self.params.relayed_ids:
             path = _relayed_path(robot, name)
             self._odometry[name] = self._odometry_output(f"/{path}/odom", f"{path}/")
         listeners = DropletListeners(self._publish_odometry, self._publish_brightness)
-        self._driver = DropletDriver(settings, listeners, self._now_ns)
+        self._driver = DropletDriver(self.params, listeners, self._now_ns)
         for name in self._odometry:
             topic = f"/{_relayed_path(robot, name)}/cmd_vel" if name else "cmd_vel"
             self._follow(topic, partial(self._driver.set_velocity, name))
         self.create_service(Trigger, "~/measure", self._on_measure)
-        self._start_reports(settings.device, _RATES, _WRONG)
+        self._start_reports(self.params.address, _RATES, _WRONG)
 
     def _on_measure(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self.params.turns or not self.params.partners:

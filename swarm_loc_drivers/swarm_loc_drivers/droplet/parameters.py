@@ -1,11 +1,10 @@
-"""Parameters of the Droplets' driver nodes, and the drivers' settings that follow from them."""
+"""Parameters of the Droplets' driver nodes, and what follows from them."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass, fields
 
-from swarm_loc_drivers.droplet.driver import DropletSettings
 from swarm_loc_drivers.droplet.exchange import PollingSettings
 from swarm_loc_drivers.droplet.hardware import DROPLET_MODELS, ELEMENTS, FULL_POWER
 from swarm_loc_drivers.droplet.odometry import MotionNoise
@@ -44,7 +43,11 @@ class DropletTraits:
 
 @dataclass(frozen=True)
 class DropletParameters(DropletTraits):
-    """Parameters of `droplet_driver_node`."""
+    """Parameters of `droplet_driver_node`.
+
+    Raises:
+        ParameterError: A parameter is invalid, or conflicts with another one.
+    """
 
     address: str = text("", "the serial port of the Droplet at the cable", required=True)
     partners: tuple[str, ...] = texts("ids of the Droplets to measure, in hexadecimal as they print them")
@@ -68,6 +71,64 @@ class DropletParameters(DropletTraits):
     )
     relay_loss: float = number(0.1, "1", 0.0, 1.0, "share of commands by infrared that are lost")
 
+    def __post_init__(self) -> None:
+        if not self.address.startswith("/"):
+            raise ParameterError(
+                f"parameter address = '{self.address}' must be the path of a serial port,"
+                " such as /dev/ttyUSB0."
+            )
+        _ = self.session, self.relayed_ids
+
+    @property
+    def session(self) -> SessionSettings:
+        """Settings of the session."""
+        return SessionSettings(DROPLET_MODELS[self.model], ELEMENTS, self.reply_timeout_s, self._exchanges())
+
+    @property
+    def motion_noise(self) -> MotionNoise:
+        """Noise of commanded motion."""
+        return MotionNoise(self.walk_noise, self.veer_noise, self.turn_noise)
+
+    @property
+    def relayed_ids(self) -> dict[str, int]:
+        """Names and ids of the robots without a cable."""
+        found: dict[str, int] = {}
+        for one in self.relayed:
+            match = _RELAYED.fullmatch(one)
+            if match is None:
+                raise ParameterError(f"parameter relayed has '{one}' but must have entries as droplet2=6B6F.")
+            name, robot = match[1], _id("relayed", match[2])
+            if name in found or robot in found.values():
+                raise ParameterError(
+                    f"parameter relayed has '{one}', but each name and each id may stand once."
+                )
+            found[name] = robot
+        return found
+
+    def _exchanges(self) -> PollingSettings | TdmaSettings:
+        """Settings of the exchanges."""
+        partners = self._partner_ids()
+        far, near = self.far_power, self.near_power
+        if near >= far:
+            raise ParameterError(f"parameter near_power = {near} must be below far_power = {far}.")
+        powers = (far, near) if near else (far,)
+        if not self.turns:
+            period_s = 1.0 / self.exchange_rate if self.exchange_rate else 0.0
+            return PollingSettings(partners, period_s, self.retries, powers, self.least_brightness)
+        if self.turn >= self.turns:
+            raise ParameterError(f"parameter turn = {self.turn} must be below turns = {self.turns}.")
+        return TdmaSettings(self.turn, self.turns, self.turn_s, powers, partners)
+
+    def _partner_ids(self) -> tuple[int, ...]:
+        """Ids of the robots to ask."""
+        found: list[int] = []
+        for one in self.partners:
+            robot = _id("partners", one)
+            if robot in found:
+                raise ParameterError(f"parameter partners has '{one}', but each id may stand once.")
+            found.append(robot)
+        return tuple(found)
+
 
 @dataclass(frozen=True)
 class DropletFleetParameters(DropletTraits):
@@ -82,71 +143,6 @@ class DropletFleetParameters(DropletTraits):
     def traits(self) -> dict[str, Value]:
         """Parameters for the driver of every robot."""
         return {one.name: getattr(self, one.name) for one in fields(DropletTraits)}
-
-
-def droplet_settings(parameters: DropletParameters) -> DropletSettings:
-    """Settings from the parameters.
-
-    Raises:
-        ParameterError: A parameter is invalid, or conflicts with another one.
-    """
-    if not parameters.address.startswith("/"):
-        raise ParameterError(
-            f"parameter address = '{parameters.address}' must be the path of a serial port,"
-            " such as /dev/ttyUSB0."
-        )
-    return DropletSettings(
-        device=parameters.address,
-        session=SessionSettings(
-            DROPLET_MODELS[parameters.model], ELEMENTS, parameters.reply_timeout_s, _exchanges(parameters)
-        ),
-        noise=MotionNoise(parameters.walk_noise, parameters.veer_noise, parameters.turn_noise),
-        stride_s=parameters.stride_s,
-        relayed=_relayed(parameters),
-        relay_loss=parameters.relay_loss,
-        command_timeout_s=parameters.cmd_vel_timeout_s,
-        odometry_period_s=1.0 / parameters.odom_rate,
-    )
-
-
-def _exchanges(parameters: DropletParameters) -> PollingSettings | TdmaSettings:
-    """Settings of the exchanges."""
-    partners = _partners(parameters)
-    far, near = parameters.far_power, parameters.near_power
-    if near >= far:
-        raise ParameterError(f"parameter near_power = {near} must be below far_power = {far}.")
-    powers = (far, near) if near else (far,)
-    if not parameters.turns:
-        period_s = 1.0 / parameters.exchange_rate if parameters.exchange_rate else 0.0
-        return PollingSettings(partners, period_s, parameters.retries, powers, parameters.least_brightness)
-    if parameters.turn >= parameters.turns:
-        raise ParameterError(f"parameter turn = {parameters.turn} must be below turns = {parameters.turns}.")
-    return TdmaSettings(parameters.turn, parameters.turns, parameters.turn_s, powers, partners)
-
-
-def _partners(parameters: DropletParameters) -> tuple[int, ...]:
-    """Ids of the robots to ask."""
-    found: list[int] = []
-    for one in parameters.partners:
-        robot = _id("partners", one)
-        if robot in found:
-            raise ParameterError(f"parameter partners has '{one}', but each id may stand once.")
-        found.append(robot)
-    return tuple(found)
-
-
-def _relayed(parameters: DropletParameters) -> dict[str, int]:
-    """Names and ids of the robots without a cable."""
-    found: dict[str, int] = {}
-    for one in parameters.relayed:
-        match = _RELAYED.fullmatch(one)
-        if match is None:
-            raise ParameterError(f"parameter relayed has '{one}' but must have entries as droplet2=6B6F.")
-        name, robot = match[1], _id("relayed", match[2])
-        if name in found or robot in found.values():
-            raise ParameterError(f"parameter relayed has '{one}', but each name and each id may stand once.")
-        found[name] = robot
-    return found
 
 
 def _id(parameter: str, value: str) -> int:

@@ -11,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from droplet_rig import IDEAL, IDS, LINK, NOISE, SECOND, TRIANGLE, asking, session_settings, world_of
+from droplet_rig import IDEAL, IDS, LINK, NOISE, SECOND, TRIANGLE, world_of
 
 from swarm_loc_drivers.common.odometry import OdometryState
-from swarm_loc_drivers.droplet.driver import OWN, DropletDriver, DropletListeners, DropletSettings
-from swarm_loc_drivers.droplet.exchange import Brightness, PollingSettings
+from swarm_loc_drivers.droplet.driver import OWN, DropletDriver, DropletListeners
+from swarm_loc_drivers.droplet.exchange import Brightness
+from swarm_loc_drivers.droplet.parameters import DropletParameters
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
 from swarm_loc_drivers.sim.droplet.world import STEP_NS, DropletWorld, SimulatedDroplet, nominal_gait
 from swarm_loc_drivers.sim.link_host import FirmwareHost
@@ -61,15 +62,15 @@ class Emulator:
 class Desk:
     """A driver, what it reports, and the velocity that it is told again and again."""
 
-    def __init__(self, settings: DropletSettings, clock: Callable[[], int]) -> None:
-        self.states: dict[str, list[OdometryState]] = {name: [] for name in (OWN, *settings.relayed)}
+    def __init__(self, params: DropletParameters, clock: Callable[[], int]) -> None:
+        self.states: dict[str, list[OdometryState]] = {name: [] for name in (OWN, *params.relayed_ids)}
         self.matrices: list[Brightness] = []
         self.velocity: dict[str, tuple[float, float, float]] = {}
         listeners = DropletListeners(
             lambda name, state: self.states[name].append(state),
             lambda _, one: self.matrices.append(one),
         )
-        self.driver = DropletDriver(settings, listeners, clock)
+        self.driver = DropletDriver(params, listeners, clock)
         self._ended = threading.Event()
         self._ticker = threading.Thread(target=self._tick)
         self.driver.start()
@@ -108,19 +109,20 @@ class Lab:
         self._stack.callback(emulator.kill)
         return emulator
 
-    def desk(self, exchanges: PollingSettings, **relayed: int) -> Desk:
+    def desk(self, *partners: int, **relayed: int) -> Desk:
         """A driver at work."""
-        settings = DropletSettings(
-            device=str(self.device),
-            session=session_settings(exchanges),
-            noise=NOISE,
-            stride_s=2.0,
-            relayed=relayed,
-            relay_loss=0.1,
-            command_timeout_s=1.0,
-            odometry_period_s=0.1,
+        params = DropletParameters(
+            address=str(self.device),
+            partners=tuple(f"{one:X}" for one in partners),
+            exchange_rate=0.0,
+            walk_noise=NOISE.walk_noise,
+            veer_noise=NOISE.veer_noise,
+            turn_noise=NOISE.turn_noise,
+            cmd_vel_timeout_s=1.0,
+            odom_rate=10.0,
+            relayed=tuple(f"{name}={one:X}" for name, one in relayed.items()),
         )
-        desk = Desk(settings, lambda: self.world.now_ns)
+        desk = Desk(params, lambda: self.world.now_ns)
         self._stack.callback(desk.stop)
         return desk
 
@@ -138,7 +140,7 @@ def moved(world: DropletWorld, robot: int = 0) -> FloatArray:
 
 def test_it_walks_as_told_and_measures_on_request(lab: Lab) -> None:
     emulator = lab.emulator()
-    desk = lab.desk(asking(*IDS[1:]))
+    desk = lab.desk(*IDS[1:])
     desk.until(lambda: desk.states[OWN])
     desk.velocity[OWN] = (0.01, 0.0, 0.0)
     desk.until(lambda: desk.states[OWN][-1].pose[0] > 0.012)
@@ -158,7 +160,7 @@ def test_it_walks_as_told_and_measures_on_request(lab: Lab) -> None:
 def test_a_robot_without_a_cable_is_driven_through_the_one_that_has_it(lab: Lab) -> None:
     errors = replace(IDEAL, infrared=replace(LINK, loss=0.0))
     lab.emulator(world_of(errors=errors))
-    desk = lab.desk(asking(), other=IDS[1])
+    desk = lab.desk(other=IDS[1])
     desk.until(lambda: desk.states["other"])
     desk.velocity["other"] = (-0.01, 0.0, 0.0)
     desk.until(lambda: desk.states["other"][-1].pose[0] < -0.008)
@@ -172,7 +174,7 @@ def test_a_robot_without_a_cable_is_driven_through_the_one_that_has_it(lab: Lab)
 @pytest.mark.parametrize("how", ["stop", "silence"])
 def test_the_robot_stands_at_the_end_and_when_velocities_stop_coming(lab: Lab, how: str) -> None:
     emulator = lab.emulator()
-    desk = lab.desk(asking())
+    desk = lab.desk()
     desk.until(lambda: desk.states[OWN])
     desk.velocity[OWN] = (0.01, 0.0, 0.0)
     desk.until(lambda: emulator.moves)
@@ -187,7 +189,7 @@ def test_the_robot_stands_at_the_end_and_when_velocities_stop_coming(lab: Lab, h
 
 def test_a_robot_whose_cable_was_pulled_is_found_again(lab: Lab) -> None:
     emulator = lab.emulator()
-    desk = lab.desk(asking())
+    desk = lab.desk()
     desk.velocity[OWN] = (0.01, 0.0, 0.0)
     desk.until(lambda: emulator.moves and desk.states[OWN])
     emulator.kill()
@@ -202,7 +204,7 @@ def test_a_robot_whose_cable_was_pulled_is_found_again(lab: Lab) -> None:
 
 
 def test_a_port_that_is_not_there_is_named_and_waited_for(lab: Lab) -> None:
-    desk = lab.desk(asking())
+    desk = lab.desk()
     desk.until(lambda: desk.driver.counts["link_failures"] >= 2)
     assert str(lab.device) in desk.driver.trouble
     lab.emulator()

@@ -13,7 +13,6 @@ from swarm_loc_drivers.droplet.hardware import AUDIO_DROPLET
 from swarm_loc_drivers.droplet.parameters import (
     DropletFleetParameters,
     DropletParameters,
-    droplet_settings,
 )
 from swarm_loc_drivers.droplet.tdma import TdmaSettings
 from swarm_loc_drivers.sim.droplet.world import DropletWorldParameters
@@ -37,27 +36,27 @@ def test_the_page_says_what_the_table_says(page: str, parameters: type) -> None:
 
 def test_partners_are_asked_unless_turns_are_taken() -> None:
     parameters = replace(PLAIN, model="audio_droplet", partners=("6B6F", "0x0029", "df64"), exchange_rate=0.5)
-    session = droplet_settings(parameters).session
+    session = parameters.session
     assert session.model is AUDIO_DROPLET
     assert isinstance(session.exchanges, PollingSettings)
     assert session.exchanges.partners == (0x6B6F, 0x29, 0xDF64)
     assert session.exchanges.period_s == 2.0
     assert session.exchanges.powers == (256, 40)
-    turns = droplet_settings(replace(parameters, turns=20, turn=19)).session.exchanges
+    turns = replace(parameters, turns=20, turn=19).session.exchanges
     assert isinstance(turns, TdmaSettings)
     assert (turns.turn, turns.turns, turns.known) == (19, 20, (0x6B6F, 0x29, 0xDF64))
 
 
 def test_without_a_rate_or_a_near_power() -> None:
-    exchanges = droplet_settings(replace(PLAIN, exchange_rate=0.0, near_power=0)).session.exchanges
+    exchanges = replace(PLAIN, exchange_rate=0.0, near_power=0).session.exchanges
     assert isinstance(exchanges, PollingSettings)
     assert exchanges.period_s == 0.0
     assert exchanges.powers == (256,)
 
 
 def test_robots_without_a_cable_have_names_and_ids() -> None:
-    settings = droplet_settings(replace(PLAIN, relayed=("droplet2=6B6F", "b=29")))
-    assert settings.relayed == {"droplet2": 0x6B6F, "b": 0x29}
+    parameters = replace(PLAIN, relayed=("droplet2=6B6F", "b=29"))
+    assert parameters.relayed_ids == {"droplet2": 0x6B6F, "b": 0x29}
 
 
 @pytest.mark.parametrize(
@@ -77,5 +76,5 @@ def test_robots_without_a_cable_have_names_and_ids() -> None:
 )
 def test_what_cannot_be_is_told_in_one_sentence(wrong: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError) as caught:
-        droplet_settings(replace(PLAIN, **wrong))
+        replace(PLAIN, **wrong)
     assert sentence in str(caught.value)
