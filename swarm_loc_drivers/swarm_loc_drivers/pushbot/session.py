@@ -85,8 +85,8 @@ class PushbotSession(TalkSession):
         self._ticks: tuple[int, int] | None = None
         self._ticks_s = 0.0  # of the newest reading
         self._is_turning = False  # by the newest reading
-        self._turned_s = 0.0  # of the last reading that changed, or the last velocity
-        self._stood_s = 0.0  # when the robot last stood, or was commanded to drive
+        self._turned_s = 0.0  # of the last reading that changed, the last velocity or the first stop after it
+        self._stood_s = 0.0  # when the robot last stood, was commanded to drive or was first stopped
 
     def _run(self) -> Talk[None]:
         yield from self._answer(protocol.RESET, protocol.BANNER, _BOOT_S)
@@ -196,16 +196,15 @@ class PushbotSession(TalkSession):
                 return
             if not any(wanted):
                 self._counts["repeated_stops"] += 1
-        if any(wanted):
-            self._output += protocol.velocity(generation, *wanted)
+        if any(wanted) or any(self._sent):
             self._turned_s = self._stood_s = self._steady_s
-        else:
-            self._output += protocol.BRAKE
+        self._output += protocol.velocity(generation, *wanted) if any(wanted) else protocol.BRAKE
         self._sent, self._sent_s = wanted, self._steady_s
 
     def _stands(self) -> bool:
-        """Whether the wheel ticks stand still."""
-        return self._ticks is not None and self._ticks_s >= self._turned_s + _STILL_S
+        """Whether the robot is stopped and its wheel ticks stand still."""
+        is_stopped = self._ticks is not None and not any(self._sent)
+        return is_stopped and self._ticks_s >= self._turned_s + _STILL_S
 
     def _check_stop(self) -> None:
         """Note a robot that does not stop.

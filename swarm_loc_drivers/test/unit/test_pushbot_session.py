@@ -175,6 +175,22 @@ def test_a_robot_that_stops_no_more_is_reset_in_time_at_the_end() -> None:
     assert wire.speed == 0.0
 
 
+def test_a_robot_that_is_held_is_stopped_before_the_session_ends() -> None:
+    wire = streaming()
+    ticks = wire.firmware.board.ticks()
+    wire.firmware.board.ticks = lambda: ticks  # type: ignore[method-assign]
+    wire.velocities = (30, 30)
+    wire.run(0.3)
+    before = wire.sent.count(commands.BRAKE)
+    wire.session.ending = True
+    wire.run(0.05)
+    assert wire.sent.count(commands.BRAKE) == before + 1
+    assert wire.speed == 0.0
+    wire.run(0.2)
+    assert wire.session.ended
+    assert wire.sent.count(commands.BRAKE) == before + 2
+
+
 def test_wheels_that_are_turned_by_hand_are_reported_until_they_stand() -> None:
     wire = streaming()
     for _ in range(400):
