@@ -5,7 +5,6 @@ Messages may be those of rclpy or of rosbags, whose fields have the same names.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,12 +15,11 @@ from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, enco
 from swarm_loc_vision.aerial.detector import AerialDetections, AerialDetector
 from swarm_loc_vision.aerial.ground_camera import GroundCamera
 from swarm_loc_vision.aerial.ground_control import NO_GROUND, Ground, GroundControl
-from swarm_loc_vision.aerial.ground_file import load_ground
-from swarm_loc_vision.aerial.parameters import AerialParameters, AerialSettings
+from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.aerial.rectification import RectificationError
 from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, GrayOf
 from swarm_loc_vision.common.camera import Camera
-from swarm_loc_vision.common.images import TRANSPORTS, Gray, ImageError
+from swarm_loc_vision.common.images import Gray, ImageError
 
 MAP = "map"
 
@@ -115,15 +113,3 @@ def anonymous_rows(detections: AerialDetections) -> NDArray[np.void]:
     rows["covariance"] = detections.covariance
     rows["u_px"], rows["v_px"] = detections.pixel.T
     return rows
-
-
-def aerial_camera(parameters: AerialParameters) -> AerialCamera:
-    """The camera that the parameters describe.
-
-    Raises:
-        GroundFileError: The control points cannot be used.
-    """
-    path = parameters.control_points_file
-    ground = load_ground(Path(path)) if path else Ground()
-    gray_of = TRANSPORTS[parameters.image_transport].gray_of
-    return AerialCamera(parameters.settings, parameters.polarity, ground, gray_of)

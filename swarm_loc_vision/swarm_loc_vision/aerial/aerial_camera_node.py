@@ -9,16 +9,20 @@ in `map` with the stamps of the images, and `/diagnostics`. Parameters: see `doc
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from rclpy.qos import QoSProfile
 
 from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import AnonymousDetectionArray
-from swarm_loc_vision.aerial.aerial_camera import aerial_camera
+from swarm_loc_vision.aerial.aerial_camera import AerialCamera
 from swarm_loc_vision.aerial.control_points import PoseFit
+from swarm_loc_vision.aerial.ground_control import Ground
+from swarm_loc_vision.aerial.ground_file import load_ground
 from swarm_loc_vision.aerial.parameters import AerialParameters
 from swarm_loc_vision.common.camera_node import CameraNode
+from swarm_loc_vision.common.images import TRANSPORTS
 
 
 class AerialCameraNode(CameraNode[AerialParameters]):
@@ -26,10 +30,13 @@ class AerialCameraNode(CameraNode[AerialParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("aerial_camera", AerialParameters, **node_arguments)
-        self._camera = aerial_camera(self.params)
+        params, path = self.params, self.params.control_points_file
+        ground = load_ground(Path(path)) if path else Ground()
+        gray_of = TRANSPORTS[params.image_transport].gray_of
+        self._camera = AerialCamera(params.settings, params.polarity, ground, gray_of)
         self._said = ""
         publisher = self.create_publisher(AnonymousDetectionArray, "detections", QoSProfile(depth=10))
-        self.watch(self._camera, self.params.image_transport, publisher)
+        self.watch(self._camera, params.image_transport, publisher)
         self.trouble()
 
     def detect(self, message: Any) -> bytes:
@@ -54,12 +61,9 @@ class AerialCameraNode(CameraNode[AerialParameters]):
         """Why no robots can be found; logged whenever it changes."""
         why = self._camera.why_nothing
         if why and why != self._said:
-            self._say(why)
+            self._said = why
+            self.get_logger().error(why)
         return why
-
-    def _say(self, why: str) -> None:
-        self._said = why
-        self.get_logger().error(why)
 
 
 def _pose_figures(fit: PoseFit | None) -> dict[str, str]:
