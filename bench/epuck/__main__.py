@@ -146,7 +146,7 @@ def _self_calibrating(robot: Robot) -> Robot:
 
 FILTERS: dict[str, tuple[Prepare, Settings]] = {
     "white": (as_described, Settings()),
-    "paper": (papers_own, Settings(state_period_s=PAPER_STATE_PERIOD_S, max_doubt=1e9)),
+    "paper": (papers_own, Settings(state_period_s=PAPER_STATE_PERIOD_S, max_fault_score=1e9)),
     "selfcal": (self_calibrating, Settings()),
 }
 

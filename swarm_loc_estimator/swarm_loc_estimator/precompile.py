@@ -12,10 +12,10 @@ from swarm_loc_estimator.common.messages.detections import (
     encode_brightness,
     encode_detections,
 )
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometry
 from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS, record_pair
-from swarm_loc_estimator.filter.integrity.fault_detection import is_elsewhere
+from swarm_loc_estimator.filter.integrity.fault_detection import is_kidnapped
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.infrared.brightness import expected_brightness
@@ -86,7 +86,7 @@ def _run(settings: Settings, *, infrared: bool) -> None:
         # what came late is taken in by code of its own
         late_ns = now_ns - _SECOND // 8
         backlog.append((ingest.handle_of["a/odom"], _odometry(late_ns, 0.01 * step, 0.001 * step), now_ns))
-        for messages in ingest.read(MessageBatch.of(backlog)):
+        for messages in ingest.read(MessageBatch.of([SerializedMessage(*one) for one in backlog])):
             estimator.receive(messages)
         estimator.tick(now_ns)
         estimator.contradictions(now_ns)
@@ -96,7 +96,7 @@ def _run(settings: Settings, *, infrared: bool) -> None:
 def _call_rare(swarm: Swarm) -> None:
     """What is called once something contradicts, or once many infrared exchanges are fused together."""
     state = SwarmState(ParameterTable.of(swarm.robots, swarm.landmarks), pairs=2)
-    is_elsewhere(state.integrity, 0)
+    is_kidnapped(state.integrity, 0)
     columns = MeasurementColumns.of(np.zeros(2, MEASUREMENT_DTYPE))
     record_pair(columns, 0, state.arrays(), np.zeros((PAIR_ROWS, 3)))
 

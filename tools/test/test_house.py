@@ -16,8 +16,8 @@ LIMITS = {
     "files_over_400": 0,
     "import_circles": 0,
     "duplicate_class_names": 0,
-    "tuple_parameters": 10,
-    "private_words": 70,
+    "tuple_parameters": 0,
+    "private_words": 0,
 }
 MIN_DOCUMENTED = 0.96
 

@@ -22,7 +22,7 @@ from swarm_loc_estimator.filter.integrity.divergence import (
     count_gated,
     is_uncertain,
 )
-from swarm_loc_estimator.filter.integrity.fault_detection import assess, is_set_aside
+from swarm_loc_estimator.filter.integrity.fault_detection import assess, is_excluded
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, has_kernel
 from swarm_loc_estimator.odometry.look_up import look_up, look_up_pose, new_sample
 from swarm_loc_estimator.odometry.preintegration import Preintegrated, TrackArrays
@@ -126,7 +126,9 @@ def assess_all(
     measurements: MeasurementColumns,
     belief: BeliefArrays,
     limits: LossLimits,
-    looks: tuple[FloatArray, FloatArray, IntArray],
+    distance: FloatArray,
+    whitened: FloatArray,
+    cause: IntArray,
     accepted: BoolArray,
 ) -> BoolArray:
     """Assess all measurements (m,); return which robots and landmarks (N + L,) are contradicted.
@@ -134,15 +136,15 @@ def assess_all(
     Those of excluded pairs do not pass. Measurements of models without a kernel take no part: they neither
     count as evidence nor are excluded.
     """
-    contradicted = np.zeros(belief.integrity.doubt.size, dtype=np.bool_)
+    contradicted = np.zeros(belief.integrity.fault_score.size, dtype=np.bool_)
     for k in range(accepted.size):
         if not has_kernel(measurements, k):
             continue
-        look = (looks[0][k], (looks[1][k, 0], looks[1][k, 1]), looks[2][k])
-        source = assess(measurements, k, belief, limits.max_doubt, look)
+        pair = (whitened[k, 0], whitened[k, 1])
+        source = assess(measurements, k, belief, limits.max_fault_score, distance[k], pair, cause[k])
         if source >= 0:
             contradicted[source] = True
-        accepted[k] &= not is_set_aside(measurements, k, belief)
+        accepted[k] &= not is_excluded(measurements, k, belief)
     return contradicted
 
 

@@ -23,14 +23,14 @@ class IntegrityArrays(NamedTuple):
         source: (N, S) the sources that each robot has measured last; -1: none.
         source_ns: (N, S) when.
         counted_ns: (N, S) when a look of the pair was last counted as evidence.
-        surprised: (N, S) whether the last one was a surprise.
+        outlier: (N, S) whether the last one was an outlier.
         unexplained: (N, S) whether a wrong description could not explain it.
         trending: (N, S) whether the last few had a trend.
-        evidence: (N, S) how much speaks against the pair.
+        evidence: (N, S) evidence against the pair.
         whitened: (N, S, 2) sum of the whitened innovations since the last look for a trend.
-        squares: (N, S) sum of their squares; likewise looks, their number.
-        looks: (N, S)
-        doubt: (N + L,) how much speaks against each robot and landmark.
+        squares: (N, S) sum of their squares.
+        looks: (N, S) their number.
+        fault_score: (N + L,) of each robot and landmark.
         confirmations: (N,) sightings that agreed with where the robot was initialized.
         confirmed_ns: (N,) when such a sighting was counted last.
         gated_in_a_row: (N,) times that another source was gated since the last accepted measurement.
@@ -38,21 +38,21 @@ class IntegrityArrays(NamedTuple):
         gated_ns: (N,) when.
         gated_fixes: (N,) absolute fixes that were gated since the last accepted one or the last landmark.
         gated_fix_ns: (N,) when such a fix was counted last.
-        hidden_noise: (N,) units by which each robot's measurements scatter more than described, see
-            `integrity/hidden_noise.py`.
+        noise_inflation: (N,) units by which each robot's measurements scatter more than described, see
+            `integrity/noise_inflation.py`.
     """
 
     source: IntArray
     source_ns: IntArray
     counted_ns: IntArray
-    surprised: BoolArray
+    outlier: BoolArray
     unexplained: BoolArray
     trending: BoolArray
     evidence: FloatArray
     whitened: FloatArray
     squares: FloatArray
     looks: IntArray
-    doubt: FloatArray
+    fault_score: FloatArray
     confirmations: IntArray
     confirmed_ns: IntArray
     gated_in_a_row: IntArray
@@ -60,7 +60,7 @@ class IntegrityArrays(NamedTuple):
     gated_ns: IntArray
     gated_fixes: IntArray
     gated_fix_ns: IntArray
-    hidden_noise: FloatArray
+    noise_inflation: FloatArray
 
 
 class BeliefArrays(NamedTuple):

@@ -1,28 +1,29 @@
 """Correlated errors of repeated measurements by one pair of robots.
 
-An infrared exchange errs by the elements' unknown gains much more than by noise, and those are the same the
-next time. So of the variance c of a measurement a part s = b c comes again, and n alike exchanges of a pair
-can tell no more than their mean does, of the variance V = s + w, w = (c - s) / n. Another exchange takes part
-in this mean with the weight that is best for what does not come again, o = c - s; what comes again in both is
-the same error, if not always as large:
+The error of an infrared exchange comes from the unknown gains of the elements much more than from noise, and
+the gains are the same in the next exchange. So a part s = b c of the variance c of a measurement is
+systematic, and n similar exchanges of a pair have only the information of their mean, of the variance V = s +
+w with the random part w = (c - s) / n. A further exchange enters the mean with the weight that is optimal for
+its random part o = c - s; the systematic parts of mean and exchange are the same error, though not always
+equally large:
 
     a = w / (w + o),   w' = w o / (w + o),   sqrt(s') = (1 - a) sqrt(s) + a sqrt(s of the exchange).
 
-The filter, to which errors are independent, is to know what the mean z' tells, and nothing twice. It has been
-told z before with the information L, and what the exchange adds to that is
+The filter treats errors as independent. It must receive the information of the mean z' and nothing twice. It
+has already fused z with the information L, so the exchange adds
 
     the information V'^-1 - L   of the value   z' + (V'^-1 - L)^-1 L (z' - z).
 
-This holds whatever others tell of the two robots meanwhile; but it is linearised about a belief that errs
-most at first, when pairs tell most. So the noise r is enlarged where a variance e was expected that is not
-small beside it, by e^2 / (e + r): what is not told now, the next exchange tells. For the same reason a
-measurement counts by two thirds when it locates a robot.
+This holds whatever other measurements of the two robots are fused in between; but it is linearised about an
+estimate that is worst at first, when pairs have most information. So the noise r is inflated where the
+predicted variance e is not small beside it, by e^2 / (e + r); the information held back enters with the next
+exchange. For the same reason a measurement counts by two thirds when it initializes a robot.
 
-Where the robots have moved, which odometry knows but roughly, a new mean begins. What was told before grows
-old, by as much as what is believed of their relative pose becomes less sure; and it does not count where they
-have turned, for then they use other elements, whose gains are others. Range, bearing and heading grow old
-apart. Errors of pairs that share a robot are taken as independent, though they share its elements: of ranges
-measured by, or to, one robot they correlate by about .15.
+A new mean starts where the robots have moved, because odometry is uncertain. The fused information of the old
+mean decays as the predicted variance of their relative pose grows. It does not count after turns, which use
+other elements with other gains. Range, bearing and heading decay separately. Errors of pairs that share a
+robot are treated as independent, although they share its elements: ranges measured by, or to, one robot have
+a correlation of about 0.15.
 """
 
 from __future__ import annotations
@@ -40,26 +41,26 @@ from swarm_loc_estimator.filter.measurement_model import MeasurementArray, Measu
 from swarm_loc_estimator.odometry.look_up import OdometrySample
 
 PAIR_ROWS = 10
-"""Rows of three numbers that are remembered of a pair."""
-_MEAN, _OBSERVER, _TARGET, _TOLD, _VARIANCE, _OWN, _LASTING, _NOISE = 0, 1, 2, 3, 6, 7, 8, 9
-"""The mean z; where both robots were on their tracks; the rows of L; the variances of their relative pose
-that were left in the belief; w; s; the variances that the two tracks had gathered, and nothing."""
-_FORGOTTEN = 0.5
-"""After a turn of so much, errors have a correlation of exp(-1/2) with those before [rad]."""
-_AT_FIRST = 1.5
-"""By so much the variances of a measurement are enlarged that locates a robot."""
-_STILL = 1e-4
-"""Robots stand whose tracks have gathered a smaller standard deviation [m, rad]."""
-_NOTHING_NEW = 1e-8
-"""The share of a measurement's information below which something does not count."""
+"""Rows of three numbers stored per pair."""
+_MEAN, _OBSERVER, _TARGET, _FUSED, _VARIANCE, _RANDOM, _SYSTEMATIC, _NOISE = 0, 1, 2, 3, 6, 7, 8, 9
+"""The mean z; the poses of both robots on their tracks; the rows of L; the variances of their relative pose
+after the update; w; s; the accumulated variances of the two tracks, and an unused number."""
+_DECORRELATION_ANGLE = 0.5
+"""Turn after which errors have a correlation of exp(-1/2) with those before [rad]."""
+_INITIAL_INFLATION = 1.5
+"""Factor on the variances of a measurement that initializes a robot."""
+_STATIONARY_SIGMA = 1e-4
+"""Robots are stationary while their tracks accumulate a smaller standard deviation [m, rad]."""
+_NEGLIGIBLE = 1e-8
+"""Share of the information of a measurement that is neglected."""
 
 
-def at_first(measurement: MeasurementArray) -> MeasurementArray:
-    """A measurement (1,) as it counts when it locates a robot: by two thirds where errors come again."""
+def at_initialization(measurement: MeasurementArray) -> MeasurementArray:
+    """A measurement (1,) with the noise that it has when it initializes a robot."""
     if not (measurement["systematic_share"] > 0.0).any():
         return measurement
     wider: MeasurementArray = measurement.copy()
-    wider["covariance"] *= _AT_FIRST
+    wider["covariance"] *= _INITIAL_INFLATION
     return wider
 
 
@@ -68,107 +69,109 @@ def use_mean(
     measurements: MeasurementColumns,
     k: int,
     belief: BeliefArrays,
-    expected: tuple[FloatArray, FloatArray, FloatArray],
+    poses: FloatArray,
+    predicted: FloatArray,
+    variances: FloatArray,
     innovation: FloatArray,
     noise: FloatArray,
     pair: FloatArray,
 ) -> None:
-    """Turn a measurement of a pair into what it adds to what the pair has told before.
+    """Replace a measurement of a pair by the information that it adds to what has been fused of the pair.
 
     Args:
         measurements: (m,).
-        k: Which.
-        belief: With what pairs have told.
-        expected: Poses (2, 3) of observer and target in `map`, the value (3,) predicted from them, and its
-            variances (3,).
+        k: Index of the measurement.
+        belief: With the memory of pairs.
+        poses: (2, 3) of observer and target in `map`.
+        predicted: (3,) value predicted from them.
+        variances: (3,) of the predicted value.
         innovation: (3,) measured minus predicted, changed.
         noise: (3, 3) covariance of the measurement, changed.
-        pair: (PAIR_ROWS, 3) written: what to remember when it is used.
+        pair: (PAIR_ROWS, 3) written: the memory of the pair if the measurement is used.
     """
     place = _place(measurements, k, belief)
     if place < 0:
         return
     observer, target = measurements.observer[k], measurements.target[k]
-    poses, predicted, variances = expected
     _write_track(belief.transform[observer], poses[0], pair[_OBSERVER])
     _write_track(belief.transform[target], poses[1], pair[_TARGET])
     pair[_NOISE, 0] = _gathered(belief.preintegrated_covariance[observer])
     pair[_NOISE, 1] = _gathered(belief.preintegrated_covariance[target])
     for i in range(3):
         again = min(measurements.systematic_share[k, i], 1.0) * measurements.covariance[k, i, i]
-        pair[_OWN, i], pair[_LASTING, i] = max(noise[i, i] - again, 0.0), again
+        pair[_RANDOM, i], pair[_SYSTEMATIC, i] = max(noise[i, i] - again, 0.0), again
         pair[_MEAN, i] = predicted[i] + innovation[i]
         pair[_VARIANCE, i] = max(variances[i], 0.0)  # a difference, which rounding may have made less
     if belief.pair_robot[observer, place] == target:
         _join(belief.pair_history[observer, place], predicted, innovation, noise, pair)
     else:
-        _begin(noise, pair)
+        _start_mean(noise, pair)
     for i in range(3):
         pair[_VARIANCE, i] *= noise[i, i] / (variances[i] + noise[i, i])
 
 
 @cached_njit
-def _begin(noise: FloatArray, pair: FloatArray) -> None:
-    """A pair's first measurement, of covariance `noise` (3, 3), is all that the pair has told."""
-    _postpone(noise, pair)
-    assign_matrix(pair[_TOLD : _TOLD + 3], _inverse(noise))
+def _start_mean(noise: FloatArray, pair: FloatArray) -> None:
+    """Start a mean with the first measurement of a pair, of covariance `noise` (3, 3)."""
+    _hold_back(noise, pair)
+    assign_matrix(pair[_FUSED : _FUSED + 3], _inverse(noise))
 
 
 @cached_njit
 def _join(
     known: FloatArray, predicted: FloatArray, innovation: FloatArray, noise: FloatArray, pair: FloatArray
 ) -> None:
-    """Let a measurement join the mean that is known of its pair, see `use_mean`."""
-    carried, stand = _carried(known, pair), _stand(known, pair)
-    left, told = _left(known, carried, pair[_VARIANCE]), np.empty((3, 3))
+    """Let a measurement join the mean of its pair, see `use_mean`."""
+    carried, stand = _carried(known, pair), _are_stationary(known, pair)
+    left, fused = _remaining(known, carried, pair[_VARIANCE]), np.empty((3, 3))
     for i in range(3):
         for j in range(3):
-            told[i, j] = known[_TOLD + i, j] * math.sqrt(left[i] * left[j])
-    before = _inverse(told)
+            fused[i, j] = known[_FUSED + i, j] * math.sqrt(left[i] * left[j])
+    before = _inverse(fused)
     step, weights = np.zeros(3), 0.0
     for i in range(3):
-        variance = (known[_LASTING, i] + known[_OWN, i]) / left[i] if stand else before[i, i]
-        weight = _take_part(known, pair, i, variance)
+        variance = (known[_SYSTEMATIC, i] + known[_RANDOM, i]) / left[i] if stand else before[i, i]
+        weight = _join_component(known, pair, i, variance)
         weights += weight
         if stand:
             step[i] = weight * _difference(i, pair[_MEAN, i], carried[i])
             pair[_MEAN, i] = carried[i] + step[i]
             innovation[i] = _difference(i, pair[_MEAN, i], predicted[i])
-    assign_matrix(noise, _noise_beside(told, _covariance(before, noise, weights / 3.0, pair)))
-    _postpone(noise, pair)
-    step = np.dot(noise, np.dot(told, step))
-    told += _inverse(noise)
+    assign_matrix(noise, _noise_beside(fused, _covariance(before, noise, weights / 3.0, pair)))
+    _hold_back(noise, pair)
+    step = np.dot(noise, np.dot(fused, step))
+    fused += _inverse(noise)
     for i in range(3):
         innovation[i] += step[i]
         for j in range(3):
-            pair[_TOLD + i, j] = 0.5 * (told[i, j] + told[j, i])
+            pair[_FUSED + i, j] = 0.5 * (fused[i, j] + fused[j, i])
 
 
 @cached_njit
-def _take_part(known: FloatArray, pair: FloatArray, i: int, variance: float) -> float:
-    """The weight of a measurement in the mean of component i, of such variance; write w' and s'."""
-    lasting, own = known[_LASTING, i], pair[_OWN, i]
-    rest = max(variance - lasting, 0.0)
-    weight = rest / (rest + own) if rest > _NOTHING_NEW * variance else 0.0
-    root = (1.0 - weight) * math.sqrt(lasting) + weight * math.sqrt(pair[_LASTING, i])
-    pair[_OWN, i], pair[_LASTING, i] = weight * own, root * root
+def _join_component(known: FloatArray, pair: FloatArray, i: int, variance: float) -> float:
+    """Weight of a measurement in the mean of component i of the given variance; writes w' and s'."""
+    systematic, own = known[_SYSTEMATIC, i], pair[_RANDOM, i]
+    rest = max(variance - systematic, 0.0)
+    weight = rest / (rest + own) if rest > _NEGLIGIBLE * variance else 0.0
+    root = (1.0 - weight) * math.sqrt(systematic) + weight * math.sqrt(pair[_SYSTEMATIC, i])
+    pair[_RANDOM, i], pair[_SYSTEMATIC, i] = weight * own, root * root
     return weight
 
 
 @cached_njit
 def _difference(i: int, value: float, other: float) -> float:
-    """By what component i, a range or an angle, differs from another one."""
+    """Difference of component i, a range or an angle."""
     return wrap(value - other) if i > 0 else value - other
 
 
 @cached_njit
 def _covariance(before: FloatArray, now: FloatArray, weight: float, pair: FloatArray) -> FloatArray:
-    """The covariance (3, 3) of a pair's mean: its variances w + s, and the mean of the correlations.
+    """Covariance (3, 3) of the mean of a pair: variances w + s, and the mean of the correlations.
 
     Args:
         before: (3, 3) covariance of the mean before.
         now: (3, 3) covariance of the measurement that joined it.
-        weight: Of the measurement.
+        weight: Weight of the measurement.
         pair: (PAIR_ROWS, 3) with w and s.
     """
     covariance = np.empty((3, 3))
@@ -176,32 +179,32 @@ def _covariance(before: FloatArray, now: FloatArray, weight: float, pair: FloatA
         for j in range(3):
             correlation = (1.0 - weight) * before[i, j] / math.sqrt(before[i, i] * before[j, j])
             correlation += weight * now[i, j] / math.sqrt(now[i, i] * now[j, j])
-            variances = (pair[_OWN, i] + pair[_LASTING, i]) * (pair[_OWN, j] + pair[_LASTING, j])
+            variances = (pair[_RANDOM, i] + pair[_SYSTEMATIC, i]) * (pair[_RANDOM, j] + pair[_SYSTEMATIC, j])
             covariance[i, j] = correlation * math.sqrt(variances)
     return covariance
 
 
 @cached_njit
-def _postpone(noise: FloatArray, pair: FloatArray) -> None:
-    """Enlarge the noise (3, 3) of what a pair tells where the variances expected are not small beside it."""
+def _hold_back(noise: FloatArray, pair: FloatArray) -> None:
+    """Inflate the noise (3, 3) of a pair where the predicted variances are not small beside it."""
     for i in range(3):
         expected = pair[_VARIANCE, i]
         noise[i, i] += expected * expected / (expected + noise[i, i])
 
 
 @cached_njit
-def _noise_beside(told: FloatArray, covariance: FloatArray) -> FloatArray:
-    """The noise (3, 3) of what adds to an information (3, 3) until all has a covariance (3, 3)."""
+def _noise_beside(fused: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Noise (3, 3) whose information, added to a fused information (3, 3), gives a covariance (3, 3)."""
     factor = cholesky3(covariance)
-    new, directions = np.linalg.eigh(np.eye(3) - np.dot(factor.T, np.dot(told, factor)))
-    root = np.dot(factor, directions) / np.sqrt(np.maximum(new, _NOTHING_NEW))
+    new, directions = np.linalg.eigh(np.eye(3) - np.dot(factor.T, np.dot(fused, factor)))
+    root = np.dot(factor, directions) / np.sqrt(np.maximum(new, _NEGLIGIBLE))
     noise: FloatArray = np.dot(root, root.T)
     return noise
 
 
 @cached_njit
 def _inverse(matrix: FloatArray) -> FloatArray:
-    """The inverse of a matrix (3, 3)."""
+    """Inverse (3, 3), contiguous."""
     inverse = np.empty((3, 3))
     inverse[:] = np.linalg.inv(matrix)
     return inverse
@@ -209,7 +212,7 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 
 @cached_njit
 def _carried(known: FloatArray, pair: FloatArray) -> FloatArray:
-    """The mean known of a pair (3,), carried on by odometry to where the two robots are now."""
+    """The mean of a pair (3,), predicted by odometry to the present poses of the two robots."""
     distance, bearing, heading = known[_MEAN, 0], known[_MEAN, 1], known[_MEAN, 2]
     o, t = _motion(pair[_OBSERVER], known[_OBSERVER]), _motion(known[_TARGET], pair[_TARGET])
     x, y, theta = composed(
@@ -222,15 +225,15 @@ def _carried(known: FloatArray, pair: FloatArray) -> FloatArray:
 
 
 @cached_njit
-def _stand(known: FloatArray, pair: FloatArray) -> bool:
-    """Whether neither robot may have moved since the pair was last recorded.
+def _are_stationary(known: FloatArray, pair: FloatArray) -> bool:
+    """Whether neither robot can have moved since the pair was last recorded.
 
-    Where a robot is on its track does not tell: without odometry it may be anywhere.
+    Decided by the accumulated variance: without odometry the pose on the track is no evidence.
     """
     gathered = 0.0
     for i in range(2):
         gathered = max(gathered, abs(pair[_NOISE, i] - known[_NOISE, i]))
-    return gathered < _STILL * _STILL
+    return gathered < _STATIONARY_SIGMA * _STATIONARY_SIGMA
 
 
 @cached_njit
@@ -240,35 +243,35 @@ def _motion(start: FloatArray, end: FloatArray) -> tuple[float, float, float]:
 
 
 @cached_njit
-def _left(known: FloatArray, carried: FloatArray, variances: FloatArray) -> FloatArray:
-    """What share of what a pair has told is not old (3,), at the variances (3,) that are now expected."""
-    arrival = wrap(carried[1] - known[_MEAN, 1]) / _FORGOTTEN
-    departure = wrap(carried[1] - carried[2] - known[_MEAN, 1] + known[_MEAN, 2]) / _FORGOTTEN
+def _remaining(known: FloatArray, carried: FloatArray, variances: FloatArray) -> FloatArray:
+    """Shares (3,) of the fused information that still count, at the variances (3,) predicted now."""
+    arrival = wrap(carried[1] - known[_MEAN, 1]) / _DECORRELATION_ANGLE
+    departure = wrap(carried[1] - carried[2] - known[_MEAN, 1] + known[_MEAN, 2]) / _DECORRELATION_ANGLE
     sensors, emitters = math.exp(-0.5 * arrival * arrival), math.exp(-0.5 * departure * departure)
     left = np.full(3, 0.5 * (sensors + emitters))
-    left[1] = sensors  # a bearing errs by them alone
+    left[1] = sensors  # bearings depend on sensors only
     for i in range(3):
         if variances[i] > known[_VARIANCE, i]:  # never where both are zero
             left[i] *= known[_VARIANCE, i] / variances[i]
-        left[i] = max(left[i], _NOTHING_NEW)
+        left[i] = max(left[i], _NEGLIGIBLE)
     return left
 
 
 @cached_njit
 def _write_track(transform: FloatArray, pose: FloatArray, out: FloatArray) -> None:
-    """Write where on its track (3,) a robot is whose pose (3,) in `map` is given."""
+    """Write the pose on its track (3,) of a robot with this pose (3,) in `map`."""
     out[0], out[1], out[2] = between(transform[0], transform[1], transform[2], pose[0], pose[1], pose[2])
 
 
 @inlined_njit
 def _gathered(covariance: FloatArray) -> float:
-    """The variance that a track has gathered: the trace of its covariance (3, 3)."""
+    """Accumulated variance of a track: the trace of its covariance (3, 3)."""
     return float(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
 
 
 @cached_njit
 def record_pair(measurements: MeasurementColumns, k: int, belief: BeliefArrays, pair: FloatArray) -> None:
-    """Record that a measurement was used, with what `use_mean` has written of its pair (PAIR_ROWS, 3)."""
+    """Store the memory of a pair (PAIR_ROWS, 3) that `use_mean` has written, once its measurement is used."""
     place = _place(measurements, k, belief)
     if place >= 0:
         _keep(measurements, k, belief, place, pair)
@@ -278,11 +281,11 @@ def record_pair(measurements: MeasurementColumns, k: int, belief: BeliefArrays, 
 def record_constraint(
     measurements: MeasurementColumns, k: int, belief: BeliefArrays, tracks: OdometrySample
 ) -> None:
-    """Record that a measurement may locate a robot, which then errs as the measurement does.
+    """Store a measurement that may initialize a robot, whose error is then that of the measurement.
 
     Args:
         measurements: (m,).
-        k: Which.
+        k: Index of the measurement.
         belief: Its memory of pairs is changed.
         tracks: (2,) of observer and target.
     """
@@ -295,9 +298,9 @@ def record_constraint(
     pair[_NOISE, 0], pair[_NOISE, 1] = _gathered(tracks.covariance[0]), _gathered(tracks.covariance[1])
     for i in range(3):
         again = min(measurements.systematic_share[k, i], 1.0) * noise[i, i]
-        pair[_OWN, i], pair[_LASTING, i] = noise[i, i] - again, again
+        pair[_RANDOM, i], pair[_SYSTEMATIC, i] = noise[i, i] - again, again
         pair[_VARIANCE, i] = noise[i, i]
-    _begin(noise, pair)
+    _start_mean(noise, pair)
     for i in range(3):
         pair[_VARIANCE, i] = noise[i, i]
     _keep(measurements, k, belief, place, pair)
@@ -305,7 +308,7 @@ def record_constraint(
 
 @inlined_njit
 def _place(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int:
-    """Where the pair of measurement k is remembered or is to be, in place of the oldest; -1: needs not."""
+    """Slot of the pair of measurement k, or of the oldest pair; -1: no systematic errors."""
     places, best = belief.pair_robot.shape[1], 0
     if places == 0 or measurements.observer[k] < 0 or measurements.target[k] < 0:
         return -1
@@ -334,7 +337,7 @@ def _place(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> in
 def _keep(
     measurements: MeasurementColumns, k: int, belief: BeliefArrays, place: int, pair: FloatArray
 ) -> None:
-    """Write what is remembered of the pair of measurement k (PAIR_ROWS, 3)."""
+    """Write the memory of the pair of measurement k (PAIR_ROWS, 3)."""
     observer = measurements.observer[k]
     belief.pair_robot[observer, place] = measurements.target[k]
     belief.pair_stamp_ns[observer, place] = measurements.stamp_ns[k]

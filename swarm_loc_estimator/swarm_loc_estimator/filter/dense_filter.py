@@ -37,13 +37,13 @@ class DenseFilter:
         return other
 
     def set_prior(self, columns: IntArray, covariance: FloatArray) -> None:
-        """Give the columns (k,) this covariance (k, k), independent of the rest, whatever was known."""
+        """Give columns (k,) this covariance (k, k), independent of all others."""
         self.covariance[columns, :] = 0.0
         self.covariance[:, columns] = 0.0
         self.covariance[columns[:, None], columns[None, :]] = covariance
 
     def set_body_priors(self, bodies: IntArray, covariances: FloatArray) -> None:
-        """Likewise the columns of bodies (k,), each with a covariance (k, 3, 3) of its own."""
+        """Give bodies (k,) covariances (k, 3, 3), each independent of all others."""
         for body, covariance in zip(bodies.tolist(), covariances, strict=True):
             self.set_prior(3 * body + np.arange(3), covariance)
 

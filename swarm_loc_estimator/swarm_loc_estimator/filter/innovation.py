@@ -18,7 +18,7 @@ from swarm_loc_estimator.filter.integrity.fault_detection import (
     noise_of_frequent_looks,
     small_variances,
 )
-from swarm_loc_estimator.filter.integrity.noise_inflation import add_hidden_noise, stamp_variance
+from swarm_loc_estimator.filter.integrity.noise_inflation import add_noise_inflation, stamp_variance
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, predict_one, write_innovation
 from swarm_loc_estimator.odometry.look_up import rate_at
 from swarm_loc_estimator.odometry.preintegration import TrackArrays
@@ -144,7 +144,7 @@ def evaluate(
     predict_one(measurements, k, pose[0], pose[1], camera, predicted, value_jacobian)
     _write_jacobian(value_jacobian, bodies, camera_columns, columns, jacobian)
     assign_matrix(noise, measurements.covariance[k])
-    add_hidden_noise(measurements, k, belief, noise)
+    add_noise_inflation(measurements, k, belief, noise)
     of_stamp = stamp_variance(measurements, k, belief)
     if of_stamp > 0.0:
         _add_stamp_noise(value_jacobian, motion, of_stamp, noise)
@@ -153,7 +153,8 @@ def evaluate(
         _read_cross_covariance(belief.covariance, bodies, camera_columns, batch.cross_covariance[row])
     _add_uncertainty(
         belief,
-        (bodies, camera_columns),
+        bodies,
+        camera_columns,
         value_jacobian,
         batch.cross_covariance[row],
         scratch.relative_covariance,
@@ -185,7 +186,7 @@ def evaluate(
     for i in range(3):
         for j in range(3):
             noise[i, j] *= scale
-    use_mean(measurements, k, belief, (pose, predicted, variances), innovation, noise, batch.pair[row])
+    use_mean(measurements, k, belief, pose, predicted, variances, innovation, noise, batch.pair[row])
 
 
 @inlined_njit
@@ -310,7 +311,8 @@ def _read_cross_covariance(
 @inlined_njit
 def _add_uncertainty(
     belief: BeliefArrays,
-    columns: tuple[tuple[int, int], tuple[int, int]],
+    bodies: tuple[int, int],
+    camera: tuple[int, int],
     value_jacobian: FloatArray,
     cross_covariance: FloatArray,
     relative: FloatArray,
@@ -322,13 +324,13 @@ def _add_uncertainty(
 
     Args:
         belief: Not changed.
-        columns: First of the observer and of the target, and those of the camera's parameters; -1: none.
+        bodies: First columns of the observer and of the target; -1: none.
+        camera: Columns of the camera's parameters; -1: none.
         value_jacobian: (3, 5).
         cross_covariance: (3, 5) of the observer, the target and the camera, see `InnovationBatch`.
         relative: (3, 3) workspace.
         s: (3, 3) added to.
     """
-    bodies, camera = columns
     o, t = max(bodies[0], 0), max(bodies[1], 0)
     of_observer, of_target = 1.0 if bodies[0] >= 0 else 0.0, 1.0 if bodies[1] >= 0 else 0.0
     for i in range(3):

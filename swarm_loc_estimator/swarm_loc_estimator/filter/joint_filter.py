@@ -56,13 +56,13 @@ class JointFilter(Protocol):
         """An independent copy."""
 
     def set_prior(self, columns: IntArray, covariance: FloatArray) -> None:
-        """Give columns (k,) this covariance (k, k), independent of the rest, whatever was known.
+        """Give columns (k,) this covariance (k, k), independent of all others.
 
         They are those of one body, or of parameters, independent of each other.
         """
 
     def set_body_priors(self, bodies: IntArray, covariances: FloatArray) -> None:
-        """Likewise the columns of bodies (k,), each with a covariance (k, 3, 3) of its own."""
+        """Give bodies (k,) covariances (k, 3, 3), each independent of all others."""
 
     def add(self, columns: IntArray, covariance: FloatArray) -> None:
         """Add a covariance (k, k) to that of columns (k,) as of `block`: errors are larger than was known."""

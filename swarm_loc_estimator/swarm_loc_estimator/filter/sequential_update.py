@@ -19,7 +19,7 @@ from swarm_loc_estimator.filter.integrity.divergence import (
     count_gated,
     is_uncertain,
 )
-from swarm_loc_estimator.filter.integrity.fault_detection import assess, is_set_aside
+from swarm_loc_estimator.filter.integrity.fault_detection import assess, is_excluded
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, has_kernel
 from swarm_loc_estimator.odometry.look_up import look_up, new_sample
 from swarm_loc_estimator.odometry.preintegration import Preintegrated, TrackArrays
@@ -76,11 +76,13 @@ def update_in_order(
             assign(pose[1], belief.landmark[measurements.landmark[k] - 1])
         relative_motion(measurements, k, tracks, belief, pose, batch.motion[0])
         evaluate(measurements, k, belief, batch, 0, scratch)
-        look = (batch.distance[0], (batch.whitened[0, 0], batch.whitened[0, 1]), batch.cause[0])
-        contradicted = assess(measurements, k, belief, limits.max_doubt, look)
+        whitened = (batch.whitened[0, 0], batch.whitened[0, 1])
+        contradicted = assess(
+            measurements, k, belief, limits.max_fault_score, batch.distance[0], whitened, batch.cause[0]
+        )
         if contradicted >= 0:
             return k, CONTRADICTED, contradicted
-        accepted, nis[k] = batch.accepted[0] and not is_set_aside(measurements, k, belief), batch.nis[0]
+        accepted, nis[k] = batch.accepted[0] and not is_excluded(measurements, k, belief), batch.nis[0]
         verdicts[k] = USED if accepted else GATED
         contradicted = confirm(measurements, k, belief, accepted)
         if contradicted >= 0:

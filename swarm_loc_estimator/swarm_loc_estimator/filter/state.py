@@ -13,7 +13,7 @@ from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityA
 from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS
 from swarm_loc_estimator.filter.dense_filter import DenseFilter
 from swarm_loc_estimator.filter.integrity.fault_detection import new_integrity
-from swarm_loc_estimator.filter.integrity.noise_inflation import doubt_noise
+from swarm_loc_estimator.filter.integrity.noise_inflation import inflate_all_noise
 from swarm_loc_estimator.filter.joint_filter import JointFilter
 from swarm_loc_estimator.filter.measurement_model import NOBODY
 from swarm_loc_estimator.identification.memory import IdentityMemory
@@ -200,7 +200,7 @@ class SwarmState:
             pose: (3,) of the robot in `map`, which becomes less certain, too.
         """
         robots = self.tracked.size
-        self.integrity.doubt[source] = 0.0
+        self.integrity.fault_score[source] = 0.0
         self.integrity.evidence[self.integrity.source == source] = 0.0
         if source < robots:
             self.integrity.evidence[source] = 0.0
@@ -235,8 +235,8 @@ class SwarmState:
         covariances = np.where(self.tracked[:, None, None], error_covariance(poses, sigma), np.eye(3))
         self.filter.set_body_priors(np.arange(robots), covariances)
         self._set_described_priors()
-        self.integrity.doubt[:], self.integrity.evidence[:] = 0.0, 0.0
-        doubt_noise(self.integrity)
+        self.integrity.fault_score[:], self.integrity.evidence[:] = 0.0, 0.0
+        inflate_all_noise(self.integrity)
 
     def _use_table(self, table: ParameterTable) -> None:
         """Go on with more columns."""
@@ -265,7 +265,7 @@ class SwarmState:
         """Clear the fault scores of robots (k,) that are initialized again."""
         self.integrity.gated_in_a_row[robots] = 0
         self.integrity.gated_fixes[robots] = 0
-        self.integrity.doubt[robots] = 0.0
+        self.integrity.fault_score[robots] = 0.0
         self.integrity.confirmations[robots] = confirmations
         self.integrity.source[robots] = -1
         self.integrity.evidence[np.isin(self.integrity.source, robots)] = 0.0

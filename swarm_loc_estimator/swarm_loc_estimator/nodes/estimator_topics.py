@@ -18,6 +18,7 @@ from tf2_msgs.msg import TFMessage
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.messages.detections import encode_identities
 from swarm_loc_estimator.common.messages.estimates import SwarmPosesEncoder, TransformsEncoder
+from swarm_loc_estimator.common.messages.message_batch import SerializedMessage
 from swarm_loc_estimator.common.messages.poses import encode_poses
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
@@ -89,7 +90,7 @@ class EstimatorInputs:
         self._quota = max(_MIN_PER_TOPIC, _MAX_PER_TAKE // len(topics))
         self._subscriptions = [self._subscribe(k, ReliabilityPolicy.RELIABLE) for k in range(len(topics))]
 
-    def take(self, time_ns: Callable[[], int]) -> list[tuple[int, bytes, int]]:
+    def take(self, time_ns: Callable[[], int]) -> list[SerializedMessage]:
         """Messages as handle, bytes and arrival in order of arrival; those above the limit remain queued.
 
         Args:
@@ -111,7 +112,10 @@ class EstimatorInputs:
         # time must not seem to go back to where it was looked at before
         begin_ns = now_ns if self._node.get_clock().ros_time_is_active else self._looked_ns
         self._looked_ns = now_ns
-        return [(handle, data, min(max(at_ns, begin_ns), now_ns)) for at_ns, handle, data in taken]
+        return [
+            SerializedMessage(handle, data, min(max(at_ns, begin_ns), now_ns))
+            for at_ns, handle, data in taken
+        ]
 
     def _count_gap(self, handle: int, number: int | None) -> None:
         """Count what is missing between the newest message and this one, if one publisher numbers them."""

@@ -189,7 +189,7 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
         assign(tracks.pose[robot, row], start)
         rate.fill(0.0)
         unknown_s = (tracks.stamp_ns[robot, row - 1] - known_ns) * 1e-9, (stamp_ns - known_ns) * 1e-9
-        _add_unknown(model, unknown_s, (start, rate), covariance)
+        _add_unknown(model, unknown_s, start, rate, covariance)
         tracks.known_ns[robot, row] = known_ns if contradictory else stamp_ns
         return bool(jump)
     tracks.known_ns[robot, row] = stamp_ns
@@ -218,7 +218,8 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
 def _add_unknown(
     model: OdometryModel,
     unknown_s: tuple[float, float],
-    at: tuple[FloatArray, FloatArray],
+    pose: FloatArray,
+    rate: FloatArray,
     covariance: FloatArray,
 ) -> None:
     """Add the noise of a motion that goes on being unknown, at a pose (3,) and rate (3,).
@@ -226,13 +227,14 @@ def _add_unknown(
     Args:
         model: The robot's.
         unknown_s: For how long it was unknown at the row before, and at this one [s].
-        at: The pose and the rate.
+        pose: (3,).
+        rate: (3,).
         covariance: (3, 3) added to.
     """
-    add_dropout_noise(model, unknown_s[1], True, at[0], at[1], covariance)
+    add_dropout_noise(model, unknown_s[1], True, pose, rate, covariance)
     if unknown_s[0] > 0.0:  # it has grown so far already
         known = np.zeros((3, 3))
-        add_dropout_noise(model, unknown_s[0], True, at[0], at[1], known)
+        add_dropout_noise(model, unknown_s[0], True, pose, rate, known)
         add_scaled(covariance, known, -1.0)
 
 

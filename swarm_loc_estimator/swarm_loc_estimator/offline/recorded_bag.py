@@ -11,7 +11,7 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.reader import BagReader, BagTopic
 from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
 from swarm_loc_estimator.common.messages.streams import PoseReader
 from swarm_loc_estimator.common.trajectory import Trajectory
@@ -113,7 +113,7 @@ def read_truth(swarm: Swarm, messages: Mapping[str, Sequence[bytes]]) -> dict[st
     """
     reader = TruthReader(swarm)
     topics = ((swarm.index_of[name], data) for name, all_of in messages.items() for data in all_of)
-    reader.add(MessageBatch.of([(topic, data, 0) for topic, data in topics]))
+    reader.add(MessageBatch.of([SerializedMessage(topic, data, 0) for topic, data in topics]))
     return reader.tracks()
 
 

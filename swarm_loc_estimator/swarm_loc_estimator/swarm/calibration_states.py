@@ -39,9 +39,9 @@ BLOCKS = -(-PARAMETERS // DRIVES)
 _BLOCK, _SLOT = np.divmod(np.arange(PARAMETERS), DRIVES)
 """In which block each stands, and where there."""
 
-_DOUBTED_SIGMA = (0.0, 0.05, 0.1, 0.03, 0.03)
+_CONTRADICTED_SIGMA = (0.0, 0.05, 0.1, 0.03, 0.03)
 """Standard deviations of parameters that were taken to be exact, once they are contradicted."""
-_DOUBTED_SURVEY_SIGMA = (0.02, 0.03)
+_CONTRADICTED_SURVEY_SIGMA = (0.02, 0.03)
 """Standard deviations of a landmark's place [m] and yaw [rad], once they are contradicted."""
 
 _MIN_SURVEY_SIGMA = 1e-4
@@ -82,7 +82,7 @@ class ParameterTable(NamedTuple):
                 sigma[i, CAMERA_YAW] = robot.camera.yaw_sigma
                 sigma[i, CAMERA_SCALE] = robot.sensor.distance_scale_sigma
         wanted = sigma > 0.0
-        doubted = np.where(wanted, sigma, _DOUBTED_SIGMA)
+        doubted = np.where(wanted, sigma, _CONTRADICTED_SIGMA)
         doubted[[robot.camera is None for robot in robots], DRIVES:] = 0.0
         times = np.array([robot.odometry.turn_bias_time_s for robot in robots], dtype=float)
         surveys = np.array([_survey(mark) for mark in landmarks]).reshape(-1, 3, 3)
@@ -136,6 +136,6 @@ class ParameterTable(NamedTuple):
 
 def _survey(mark: Landmark) -> FloatArray:
     """Covariance (3, 3) of the right-invariant error of a landmark's survey when it is opened."""
-    position, yaw = (mark.position_sigma, mark.yaw_sigma) if mark.is_estimated else _DOUBTED_SURVEY_SIGMA
+    position, yaw = (mark.position_sigma, mark.yaw_sigma) if mark.is_estimated else _CONTRADICTED_SURVEY_SIGMA
     sigma = np.maximum([position, position, yaw], _MIN_SURVEY_SIGMA)
     return error_covariance([mark.x, mark.y, mark.yaw or 0.0], np.diag(sigma**2))

@@ -14,7 +14,7 @@ import numpy as np
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.filter.gating import gate_threshold
-from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED, note_missed, note_seen
+from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED, count_missed, count_seen
 from swarm_loc_estimator.filter.integrity.fault_detection import is_contradicted
 from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
@@ -37,17 +37,17 @@ from swarm_loc_estimator.timeline.settings import Settings
 
 _GATE = float(gate_threshold(0.9999))
 _MAX_FREE = 200
-"""With more detections that nobody has than this, nobody looks for itself among them."""
+"""With more unassigned detections than this, no robot is searched among them."""
 _MOVED = 6.0
-"""By so many standard deviations a robot must have moved, or turned by half as many, to be looked for."""
+"""Standard deviations by which a robot must have moved, or turned by half as many, to be searched."""
 _MAX_DRIFT_M, _MAX_DRIFT_RAD = 0.3, 0.5
-"""What its own track may have drifted between two images; with more a robot starts its search again."""
+"""Largest drift of a robot's track between two images; beyond it the search restarts."""
 _DOUBT_SHARE = 0.1
-"""A robot that is believed to be elsewhere, but not seen there, must be so much surer: that is rare."""
-_MAX_DOUBT = 9.0
-"""As doubtful a robot becomes that may have left the view: not told as tracked, but not lost either."""
+"""Factor on the allowed error probability of a robot whose estimate is at another place."""
+_MAX_FAULT_SCORE = 9.0
+"""Highest fault score of a robot that may have left the view: it is not tracked, but not lost either."""
 _HEADING_SIGMA = 0.2
-"""An answer with a heading less sure than this is none."""
+"""Largest standard deviation of the heading of an identified robot [rad]."""
 
 
 class PictureFusion:
@@ -89,8 +89,10 @@ class PictureFusion:
             self._miss_robot(state, robot)
         strangers = int(np.sum(found.robot == UNSEEN)) - int(np.sum(~state.tracked & self._moves))
         for robot in robots[unseen & ~in_view].tolist() if strangers > 0 else ():
-            # it may have left the view, or be who nobody else is
-            note_missed(state.integrity, robot, min(self._miss, _MAX_DOUBT - state.integrity.doubt[robot]))
+            # it may have left the view, or be one of the unassigned detections
+            count_missed(
+                state.integrity, robot, min(self._miss, _MAX_FAULT_SCORE - state.integrity.fault_score[robot])
+            )
         place = np.full(state.tracked.size, UNSEEN)
         probability = np.zeros(state.tracked.size)
         place[robots], probability[robots] = found.place, found.probability
@@ -104,8 +106,8 @@ class PictureFusion:
     def _miss_robot(self, state: SwarmState, robot: int) -> None:
         """Hold against a robot that it is not where it should be seen."""
         unconfirmed = state.integrity.confirmations[robot] < CONFIRMED
-        doubt = note_missed(state.integrity, robot, self._miss)
-        if unconfirmed or doubt >= self._settings.max_doubt:
+        doubt = count_missed(state.integrity, robot, self._miss)
+        if unconfirmed or doubt >= self._settings.max_fault_score:
             state.deinitialize(robot)
 
     def identify(self, state: SwarmState, image: MeasurementArray, assignment: Assignment) -> bool:
@@ -215,7 +217,7 @@ class PictureFusion:
 def relieve_seen(state: SwarmState, robots: IntArray) -> None:
     """Count for robots (k,) that they were seen where they are believed to be."""
     for robot in robots.tolist():
-        note_seen(state.integrity, robot)
+        count_seen(state.integrity, robot)
 
 
 def picture_of(image: MeasurementArray) -> Picture:

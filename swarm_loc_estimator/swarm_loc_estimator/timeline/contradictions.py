@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.filter.belief import NEVER_NS
-from swarm_loc_estimator.filter.integrity.fault_detection import is_contradicted, pairs_set_aside
+from swarm_loc_estimator.filter.integrity.fault_detection import excluded_pairs, is_contradicted
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -54,13 +54,13 @@ def contradictions(
     robots = np.flatnonzero(state.tracked).tolist()
     denied = [robot for robot in robots if is_contradicted(state.integrity, robot)]
     contradicted = np.flatnonzero(state.contradicted_ns > NEVER_NS).tolist()
-    aside = pairs_set_aside(state.integrity, now_ns)
+    aside = excluded_pairs(state.integrity, now_ns)
     return [
         *(_odometry(names[robot]) for robot in jumping),
         *(_pose(names[robot]) for robot in denied),
         *(_sightings(names[observer], names[source]) for observer, source in aside),
         *(_description(names[source], source, state) for source in contradicted),
-        *(_noise(names[robot]) for robot in np.flatnonzero(state.integrity.hidden_noise).tolist()),
+        *(_noise(names[robot]) for robot in np.flatnonzero(state.integrity.noise_inflation).tolist()),
     ]
 
 

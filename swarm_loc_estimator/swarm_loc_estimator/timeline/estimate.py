@@ -12,7 +12,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.se2_scalar import composed, wrap
 from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
-from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED, add_hidden_errors
+from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED, inflate_suspect_covariance
 from swarm_loc_estimator.filter.integrity.fault_detection import is_contradicted
 from swarm_loc_estimator.filter.prediction import new_scratch, write_predicted
 from swarm_loc_estimator.filter.state import SwarmState
@@ -98,7 +98,7 @@ def _write_all(belief: BeliefArrays, tracks: TrackArrays, timeout_s: FloatArray,
         x, y, theta = composed(t[0], t[1], t[2], track[0], track[1], track[2])
         out.poses[i, 0], out.poses[i, 1], out.poses[i, 2] = x, y, wrap(theta)
         _pose_covariance(x, y, error, out.covariances[i])
-        add_hidden_errors(belief.integrity, i, out.covariances[i])
+        inflate_suspect_covariance(belief.integrity, i, out.covariances[i])
         cos, sin = np.cos(theta - raw[2]), np.sin(theta - raw[2])
         out.map_to_odom[i, 0] = x - cos * raw[0] + sin * raw[1]
         out.map_to_odom[i, 1] = y - sin * raw[0] - cos * raw[1]

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.belief import NEVER_NS
-from swarm_loc_estimator.filter.measurement_model import NO_MODEL, Command, MeasurementArray
+from swarm_loc_estimator.filter.measurement_model import NO_MODEL, Command
 from swarm_loc_estimator.identification.memory import Identities, Outcome
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.conversion import InputConverter
@@ -24,6 +23,7 @@ from swarm_loc_estimator.timeline.estimate import Estimate, Status, estimate_at
 from swarm_loc_estimator.timeline.fusion import Fusion, Verdict
 from swarm_loc_estimator.timeline.self_calibration import learned, learns
 from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.sightings import Recent
 from swarm_loc_estimator.timeline.timeline import HasBudget, Timeline
 
 __all__ = ["Estimate", "Estimator", "Status"]
@@ -160,9 +160,9 @@ class Estimator:
         others |= {f"identities {one.name.lower().replace('_', ' ')}": int(outcomes[one]) for one in Outcome}
         return {"measurements used": self.used} | {name: count for name, count in others.items() if count}
 
-    def recent(self) -> tuple[MeasurementArray, NDArray[np.uint8], FloatArray]:
-        """The measurements within the horizon, their verdicts and normalised innovations squared."""
-        return self._timeline.measurements, self._timeline.verdicts, self._timeline.nis
+    def recent(self) -> Recent:
+        """The measurements within the horizon."""
+        return Recent(self._timeline.measurements, self._timeline.verdicts, self._timeline.nis)
 
     @property
     def identities(self) -> Identities | None:

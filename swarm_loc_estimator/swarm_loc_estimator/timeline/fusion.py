@@ -20,11 +20,11 @@ from swarm_loc_estimator.filter.batch_update import (
     related_columns,
 )
 from swarm_loc_estimator.filter.belief import correct
-from swarm_loc_estimator.filter.correlated_noise import at_first, record_constraint, record_pair
+from swarm_loc_estimator.filter.correlated_noise import at_initialization, record_constraint, record_pair
 from swarm_loc_estimator.filter.dense_filter import update_one
 from swarm_loc_estimator.filter.innovation import InnovationBatch, new_batch
 from swarm_loc_estimator.filter.integrity.divergence import WELL_CONFIRMED, LossLimits
-from swarm_loc_estimator.filter.integrity.fault_detection import is_elsewhere
+from swarm_loc_estimator.filter.integrity.fault_detection import is_kidnapped
 from swarm_loc_estimator.filter.joint_filter import JointFilter, Robots
 from swarm_loc_estimator.filter.measurement_model import (
     MODELS,
@@ -87,7 +87,7 @@ class Fusion:
         self._tracks = tracks
         self._policy = settings.policy
         self._limits = LossLimits(
-            settings.lost_sigma, settings.lost_heading_sigma, settings.lost_after, settings.max_doubt
+            settings.lost_sigma, settings.lost_heading_sigma, settings.lost_after, settings.max_fault_score
         )
         self._period_ns = round(settings.fusion_period_s * 1e9)
         self.is_sparse = self._period_ns > 0 and len(swarm.robots) >= settings.sparse_from
@@ -300,8 +300,9 @@ class Fusion:
         )
         evaluate_all(fields, belief, batch)
         evaluate_by_records(rows, self._tracks.arrays, belief, state.filter, batch)
-        looks = (batch.distance, batch.whitened, batch.cause)
-        contradicted = assess_all(fields, belief, self._limits, looks, accepted)
+        contradicted = assess_all(
+            fields, belief, self._limits, batch.distance, batch.whitened, batch.cause, accepted
+        )
         lost = confirm_all(fields, belief, accepted)
         systematic = (fields.systematic_share > 0.0).any(axis=1)
         for k in np.flatnonzero(accepted & systematic).tolist():
@@ -331,7 +332,7 @@ class Fusion:
     def _note(self, state: SwarmState, one: MeasurementArray) -> Verdict:
         """Keep a measurement (1,) as a constraint if it ties a waiting robot to something located."""
         constraint = MODELS[int(one["kind"][0])].constraint
-        if constraint is None or not self._initializer.note(state, at_first(constraint(one))):
+        if constraint is None or not self._initializer.note(state, at_initialization(constraint(one))):
             return Verdict.NOT_LOCALIZED
         sides = np.array([one["observer"][0], one["target"][0]])
         if self._pairs and (sides >= 0).all():
@@ -342,7 +343,7 @@ class Fusion:
     def _augment(self, state: SwarmState, source: int, stamp_ns: int) -> None:
         """Re-estimate the parameters of a contradicted robot or landmark, or localize the robot again."""
         robots = state.tracked.size
-        if source < robots and is_elsewhere(state.integrity, source):
+        if source < robots and is_kidnapped(state.integrity, source):
             state.deinitialize(source)
             return
         poses = self._poses(state, stamp_ns)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.filter.integrity.noise_inflation import with_hidden_noise
+from swarm_loc_estimator.filter.integrity.noise_inflation import with_noise_inflation
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.swarm.calibration_states import (
     CAMERA_SCALE,
@@ -28,10 +28,10 @@ def learns(swarm: Swarm) -> bool:
 
 
 def learned(swarm: Swarm, state: SwarmState) -> Swarm:
-    """The swarm with all that is estimated where the belief has it, and as unsure as it is.
+    """The swarm with all estimated parameters and their standard deviations.
 
-    The bias of a turn rate is left out, since it changes. The landmarks' sigmas are those of each alone: an
-    error that all of them share is not told apart.
+    The bias of a turn rate is left out, because it changes. The sigmas of landmarks are marginal: they
+    include errors that all landmarks share.
     """
     return Swarm(
         tuple(
@@ -66,7 +66,7 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
             yaw_sigma=sigma[CAMERA_YAW],
         ),
         sensor=replace(
-            with_hidden_noise(sensor, float(state.integrity.hidden_noise[index])),
+            with_noise_inflation(sensor, float(state.integrity.noise_inflation[index])),
             distance_scale=seen * sensor.distance_scale,
             distance_scale_sigma=sigma[CAMERA_SCALE] / seen,
         ),

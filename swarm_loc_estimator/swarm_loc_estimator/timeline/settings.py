@@ -64,40 +64,38 @@ class Settings:
     jump_back_s: float = number(
         0.5, "s", 0.0, 3600.0, "a clock that goes back by more than this resets the filter"
     )
-    lost_after: int = number(
-        12, "1", 2, 1_000_000, "so many gated measurements in a row and the robot counts as lost"
-    )
+    lost_after: int = number(12, "1", 2, 1_000_000, "gated measurements in a row after which a robot is lost")
     lost_sigma: float = number(
-        1.0, "m", 0.01, 1e3, "a position less sure than this and the robot counts as lost"
+        1.0, "m", 0.01, 1e3, "standard deviation of the position beyond which a robot is lost"
     )
     lost_heading_sigma: float = number(
-        0.3, "rad", 0.01, 10.0, "a heading less sure than this and the robot counts as lost"
+        0.3, "rad", 0.01, 10.0, "standard deviation of the heading beyond which a robot is lost"
     )
-    max_doubt: float = number(
+    max_fault_score: float = number(
         10.0,
         "1",
         2.0,
         1e9,
-        "how much must speak against a robot or landmark until what describes it is estimated; 1e9: never",
+        "fault score from which the description of a robot or landmark is re-estimated; 1e9: never",
     )
     fix_window_s: float = number(
-        20.0, "s", 0.1, 600.0, "a waiting robot is located from sightings no older than this"
+        20.0, "s", 0.1, 600.0, "age up to which sightings initialize a robot without a pose"
     )
 
     aerial_probability: float = number(
-        0.99, "1", 0.5, 0.999999, "a robot that finds itself in aerial images must be so sure of it"
+        0.99, "1", 0.5, 0.999999, "probability from which a robot is identified in aerial images"
     )
     aerial_detection_probability: float = number(
         0.95, "1", 0.1, 0.999, "share of the robots in an aerial image that are detected"
     )
     aerial_scale_sigma: float = number(
-        0.02, "1", 1e-4, 1.0, "how unsure the scale of aerial images is, relative"
+        0.02, "1", 1e-4, 1.0, "relative standard deviation of the scale of aerial images"
     )
     aerial_scale_drift: float = number(
-        0.0, "1/s^0.5", 0.0, 0.1, "random walk of that scale, relative, as of a camera that is not still"
+        0.0, "1/s^0.5", 0.0, 0.1, "relative random walk of that scale, as of a moving camera"
     )
     aerial_position_sigma: float = number(
-        0.02, "m", 1e-4, 10.0, "noise of aerial detections that tell no covariance, along x and y"
+        0.02, "m", 1e-4, 10.0, "noise of aerial detections without covariance, along x and y"
     )
     aerial_heading_sigma: float = number(0.1, "rad", 1e-4, 10.0, "noise of the headings of such detections")
 

@@ -16,6 +16,20 @@ RECENT_NS = 2_000_000_000
 """Older measurements do not tell what a robot sees now."""
 
 
+class Recent(NamedTuple):
+    """Recent measurements and what became of them.
+
+    Attributes:
+        measurements: (m,) in order of their stamps.
+        verdicts: (m,) of `Verdict`.
+        nis: (m,) normalised innovations squared.
+    """
+
+    measurements: MeasurementArray
+    verdicts: NDArray[np.uint8]
+    nis: NDArray[np.float64]
+
+
 class Sightings(NamedTuple):
     """One row per pair (M,), in the order of observer and target.
 
@@ -34,13 +48,11 @@ class Sightings(NamedTuple):
     age_s: NDArray[np.float32]
 
 
-def newest_sightings(
-    recent: tuple[MeasurementArray, NDArray[np.uint8], NDArray[np.float64]], now_ns: int
-) -> Sightings:
+def newest_sightings(recent: Recent, now_ns: int) -> Sightings:
     """The newest measurement of each pair within the last two seconds.
 
     Args:
-        recent: Measurements (m,) in the order of their stamps, their verdicts and NIS.
+        recent: Measurements in the order of their stamps.
         now_ns: The instant.
     """
     rows, verdicts, nis = recent

@@ -19,7 +19,7 @@ from swarm_loc_estimator.common.messages.detections import (
     encode_anonymous,
     encode_identities,
 )
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.sensors.aerial import MAX_ANONYMOUS
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import Batch
@@ -40,7 +40,7 @@ def detections(count: int, seed: int = 1) -> NDArray[np.void]:
 def read(*messages: tuple[bytes, int]) -> tuple[Batch, Ingest]:
     ingest = Ingest(Swarm((Robot("a"), Robot("b"))))
     handle = ingest.handle_of["aerial/detections"]
-    (found,) = ingest.read(MessageBatch.of([(handle, data, at) for data, at in messages]))
+    (found,) = ingest.read(MessageBatch.of([SerializedMessage(handle, data, at) for data, at in messages]))
     return found, ingest
 
 

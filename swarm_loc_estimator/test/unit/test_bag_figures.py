@@ -51,7 +51,7 @@ def test_five_robots_that_calibrate_themselves_are_located_to_millimetres() -> N
     """3.3 mm in the world of systematic errors, 7 mm if not described, 21 mm by the paper's filter."""
     assert_good(replayed("eight_five_robots_w2", "self_calibrating.yaml"), 0.0045, 1.5, (0.8, 3.5))
     assert_good(replayed("eight_five_robots_w2"), 0.0095, 1.8, (0.8, 4.5))
-    paper = replayed("eight_five_robots_w2", settings=Settings(max_doubt=1e9))
+    paper = replayed("eight_five_robots_w2", settings=Settings(max_fault_score=1e9))
     assert paper.overall.position_rmse > 0.015
 
 

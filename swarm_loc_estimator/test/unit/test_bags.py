@@ -19,7 +19,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from swarm_loc_estimator.common.bags.reader import BagError, BagReader, BagTopic, RawMessage
 from swarm_loc_estimator.common.bags.writer import RELIABLE, BagWriter, typestore
 from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, merge_streams
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage, merge_streams
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -390,7 +390,7 @@ def test_streams_of_batches_merge_in_order_of_time_and_of_streams(streams: list[
         batches.append([])
         for part in stream:
             messages = [(number, bytes([number, t]), t) for t, _ in zip(times, part, strict=False)]
-            batches[-1].append(MessageBatch.of(messages))
+            batches[-1].append(MessageBatch.of([SerializedMessage(*one) for one in messages]))
             rows += messages
     merged = [row for batch in merge_streams([iter(s) for s in batches]) for row in batch.messages()]
     assert merged == [(n, t, data) for n, data, t in sorted(rows, key=lambda row: row[2])]

@@ -14,7 +14,7 @@ from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.cdr import CdrError
 from swarm_loc_estimator.common.messages.definitions import BRIGHTNESS, POSE_WITH_COVARIANCE
 from swarm_loc_estimator.common.messages.detections import decode_brightness, encode_brightness
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.messages.poses import decode_fix, encode_fix, encode_odometry
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import Batch
@@ -37,7 +37,9 @@ def big_endian(data: bytes, message_type: str) -> bytes:
 def read(*messages: tuple[str, bytes, int]) -> tuple[Batch, Ingest]:
     """Messages by topic and arrival."""
     ingest = Ingest(SWARM)
-    batch = MessageBatch.of([(ingest.handle_of[topic], data, at) for topic, data, at in messages])
+    batch = MessageBatch.of(
+        [SerializedMessage(ingest.handle_of[topic], data, at) for topic, data, at in messages]
+    )
     (found,) = ingest.read(batch)
     return found, ingest
 
@@ -155,7 +157,7 @@ def test_fixes_locate_robots_that_stand_and_robots_that_drive() -> None:
         if k < 5:
             messages.append(("b/fix", encode_fix("map", now_ns, (2.0, 3.0, 0.5), 1e-6 * np.eye(3))))
         rows = [(ingest.handle_of[topic], data, now_ns) for topic, data in messages]
-        for part in ingest.read(MessageBatch.of(rows)):
+        for part in ingest.read(MessageBatch.of([SerializedMessage(*one) for one in rows])):
             estimator.receive(part)
         estimate = estimator.tick(now_ns)
     assert estimate.status.tolist() == [Status.TRACKED, Status.TRACKED]

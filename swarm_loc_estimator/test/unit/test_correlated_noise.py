@@ -94,15 +94,13 @@ def use_of(
 ) -> Use:
     """How an exchange is used where robots are at `poses`, by default at what it measured."""
     value = np.array(exchange.value)
-    expected = (
-        standing(exchange.value) if poses is None else poses,
-        value if predicted is None else predicted,
-        variances,
-    )
-    innovation = value - expected[1]
+    poses = standing(exchange.value) if poses is None else poses
+    predicted = value if predicted is None else predicted
+    innovation = value - predicted
     innovation[1:] = se2.wrap_angle(innovation[1:])
     use = Use(innovation, np.diag(VARIANCES * exchange.size), np.zeros((PAIR_ROWS, 3)))
-    use_mean(MeasurementColumns.of(exchange.row()), 0, state.arrays(), expected, *use)
+    columns = MeasurementColumns.of(exchange.row())
+    use_mean(columns, 0, state.arrays(), poses, predicted, variances, *use)
     return use
 
 

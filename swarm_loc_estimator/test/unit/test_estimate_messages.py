@@ -23,6 +23,7 @@ from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.fusion import Verdict
 from swarm_loc_estimator.timeline.sightings import (
+    Recent,
     Sightings,
     decode_sightings,
     encode_sightings,
@@ -102,7 +103,7 @@ def test_of_each_pair_the_newest_measurement_is_published(measured: list[tuple[i
         row["stamp_ns"], row["observer"], row["kind"] = at_ms * 1_000_000, observer, Kind.POLAR
         row["target"], row["landmark"] = (target, 0) if target >= 0 else (-1, -target)
     verdicts = np.array([verdict for *_, verdict in measured], dtype=np.uint8)
-    found = newest_sightings((rows, verdicts, np.ones(len(measured))), 3 * SECOND)
+    found = newest_sightings(Recent(rows, verdicts, np.ones(len(measured))), 3 * SECOND)
     expected = {(a, b): (at_ms, verdict) for at_ms, a, b, verdict in measured if at_ms >= 1000}
     pairs = list(zip(found.observer.tolist(), found.target.tolist(), strict=True))
     assert sorted(pairs) == sorted(expected)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, encode_detections
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE
 from swarm_loc_estimator.nodes.estimator_diagnostics import Diagnostics, Recent, TickCost, load_report
@@ -47,7 +47,11 @@ class World:
     def detections(self, now_ns: int) -> None:
         """A picture of robot a without any marker."""
         data = encode_detections("a/camera_optical_frame", now_ns, np.zeros(0, DETECTION_DTYPE))
-        list(self.ingest.read(MessageBatch.of([(self.ingest.handle_of["a/detections"], data, now_ns)])))
+        list(
+            self.ingest.read(
+                MessageBatch.of([SerializedMessage(self.ingest.handle_of["a/detections"], data, now_ns)])
+            )
+        )
 
     def odometry(self, robot: str, stamp_ns: int, now_ns: int, frame: str | None = None) -> None:
         """One message."""
@@ -60,7 +64,11 @@ class World:
             np.eye(6),
             np.eye(6),
         )
-        list(self.ingest.read(MessageBatch.of([(self.ingest.handle_of[f"{robot}/odom"], data, now_ns)])))
+        list(
+            self.ingest.read(
+                MessageBatch.of([SerializedMessage(self.ingest.handle_of[f"{robot}/odom"], data, now_ns)])
+            )
+        )
 
 
 def estimate(now_ns: int, *status: Status) -> Estimate:

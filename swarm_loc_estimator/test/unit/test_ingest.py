@@ -16,7 +16,7 @@ from swarm_loc_estimator.common.messages.detections import (
     decode_detections,
     encode_detections,
 )
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.messages.poses import (
     decode_odometry,
     decode_pose_stamped,
@@ -57,7 +57,7 @@ def batch_of(
     messages: Sequence[bytes], topics: Sequence[int] = (), times: Sequence[int] = ()
 ) -> MessageBatch:
     n = len(messages)
-    return MessageBatch.of(list(zip(topics or [0] * n, messages, times or [0] * n, strict=True)))
+    return MessageBatch.of(list(map(SerializedMessage, topics or [0] * n, messages, times or [0] * n)))
 
 
 @given(

@@ -87,7 +87,7 @@ def test_what_was_learned_may_be_trusted_from_then_on() -> None:
         world = simulate(PLAN, 10 + seed)
         taught, _ = run(world)
         for swarm, squared in ((world.swarm, before), (taught, after)):
-            _, errors = run(replace(world, swarm=exact(swarm)), Settings(max_doubt=1e9))
+            _, errors = run(replace(world, swarm=exact(swarm)), Settings(max_fault_score=1e9))
             squared.append(float(np.nanmean(np.square(errors[5:, :, :2]))))  # not a number where one got lost
     assert np.mean(after) < 0.25 * np.mean(before)
 
@@ -138,5 +138,5 @@ def test_the_replay_command_writes_what_it_learned_and_reports_it(
     exact = [*command, "--swarm", str(BAG / "swarm.yaml"), "--learned", str(learned)]
     assert main(exact) == 0  # what is described as exact is contradicted
     assert any(robot.camera and robot.camera.yaw_sigma > 0.0 for robot in load_swarm(learned).robots)
-    assert main([*exact, "--set", "max_doubt=1e9"]) == 1
+    assert main([*exact, "--set", "max_fault_score=1e9"]) == 1
     assert "nothing to learn" in capsys.readouterr().err

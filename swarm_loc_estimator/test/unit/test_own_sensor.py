@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.messages.streams import EachReader, MessageColumns
 from swarm_loc_estimator.filter.measurement_model import (
     MEASUREMENT_DTYPE,
@@ -165,7 +165,7 @@ def run(
     messages.sort(key=lambda message: message[2])
     estimates, begin_ns = [], T0 - 1
     for now_ns in ticks(T0, int(world.stamp_ns[-1]) + 2 * SECOND, 0.25):
-        batch = MessageBatch.of([one for one in messages if begin_ns < one[2] <= now_ns])
+        batch = MessageBatch.of([SerializedMessage(*one) for one in messages if begin_ns < one[2] <= now_ns])
         for part in ingest.read(batch):
             estimator.receive(part)
         estimates += play(estimator, [(t, e) for t, e in events if begin_ns < t <= now_ns], [now_ns])

@@ -18,7 +18,7 @@ from swarm_loc_estimator.common.messages.detections import (
     encode_shared_numbers,
     swarm_key,
 )
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.precompile import precompile
 from swarm_loc_estimator.sensors.ingest import Ingest
@@ -111,7 +111,9 @@ def shared(inputs: Batch, ingest: Ingest, swarm: Swarm) -> Batch:
         "swarm/odom": encode_shared_numbers(odometry, inputs["odometry"].pose),
         "swarm/detections": encode_shared_detections(seen, seen_detections),
     }
-    batch = MessageBatch.of([(ingest.handle_of[name], data, now_ns) for name, data in messages.items()])
+    batch = MessageBatch.of(
+        [SerializedMessage(ingest.handle_of[name], data, now_ns) for name, data in messages.items()]
+    )
     (relayed,) = ingest.read(batch)
     return relayed
 

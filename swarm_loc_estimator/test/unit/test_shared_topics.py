@@ -24,7 +24,7 @@ from swarm_loc_estimator.common.messages.detections import (
     encode_shared_numbers,
     swarm_key,
 )
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometry
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import Batch, live_topics
@@ -51,7 +51,7 @@ def read(*messages: tuple[str, bytes]) -> Batch:
     """What comes of messages by topic, one after the other."""
     ingest = Ingest(SWARM)
     rows = [(ingest.handle_of[topic], data, 10 + k) for k, (topic, data) in enumerate(messages)]
-    (inputs,) = ingest.read(MessageBatch.of(rows))
+    (inputs,) = ingest.read(MessageBatch.of([SerializedMessage(*one) for one in rows]))
     return inputs
 
 

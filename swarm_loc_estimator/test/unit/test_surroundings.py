@@ -18,7 +18,7 @@ from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
 from swarm_loc_estimator.common.messages.cdr import CdrError
 from swarm_loc_estimator.common.messages.definitions import OCCUPANCY_GRID, ODOMETRY, POSE_STAMPED
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry, encode_pose_stamped
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.mapping.messages import MAX_CELLS, decode_occupancy_grid
@@ -83,7 +83,7 @@ def test_maps_are_thinned_out_and_the_newest_is_kept(later_s: list[int]) -> None
     reader, log_ns = MapReader(SWARM, max_bytes=10 * len(data)), 0
     for step_s in later_s:
         log_ns += step_s * SECOND
-        reader.add(MessageBatch.of([(0, data, log_ns)]))
+        reader.add(MessageBatch.of([SerializedMessage(0, data, log_ns)]))
     kept = [one.log_ns for one in reader.maps()]
     assert 1 <= len(kept) <= 11
     assert kept == sorted(kept)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from swarm_loc_estimator.common.bags.bag_file import MAX_LOG_NS, BagError, BagTopic, ReadErrors
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -88,7 +88,7 @@ class SqliteFile:
                 if topic_id in numbers and type(data) is bytes
             ]
             skipped += len(rows) - len(valid)
-            yield MessageBatch.of([row for row in valid if row[0] != _UNWANTED])
+            yield MessageBatch.of([SerializedMessage(*row) for row in valid if row[0] != _UNWANTED])
         if skipped:
             self.losses.add(f"{skipped} messages without a known topic or data were skipped.")
 

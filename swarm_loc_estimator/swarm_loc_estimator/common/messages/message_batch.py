@@ -13,6 +13,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 
+class SerializedMessage(NamedTuple):
+    """One serialized message: number of its topic, bytes, and when it was recorded or arrived [ns]."""
+
+    topic: int
+    data: bytes
+    log_ns: int
+
+
 class MessageBatch(NamedTuple):
     """Messages (n,) of several topics.
 
@@ -31,8 +39,8 @@ class MessageBatch(NamedTuple):
     length: IntArray
 
     @classmethod
-    def of(cls, messages: Sequence[tuple[int, bytes, int]]) -> MessageBatch:
-        """Messages given as number of the topic, bytes and time."""
+    def of(cls, messages: Sequence[SerializedMessage]) -> MessageBatch:
+        """A batch of single messages."""
         length = np.array([len(data) for _, data, _ in messages], dtype=np.int64)
         return cls(
             np.frombuffer(b"".join([data for _, data, _ in messages]), dtype=np.uint8),

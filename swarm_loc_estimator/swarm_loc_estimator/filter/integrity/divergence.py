@@ -13,8 +13,8 @@ from swarm_loc_estimator.filter.measurement_model import MeasurementColumns
 CONFIRMED = 2
 """Number of agreeing sightings after which an assumed pose counts as known."""
 WELL_CONFIRMED = 12
-_DOUBTFUL = 2.0
-_HIDDEN_SIGMA = (0.03, 0.03, 0.06)
+_SUSPECT = 2.0
+_SUSPECT_SIGMA = (0.03, 0.03, 0.06)
 """Standard deviations added while a pose is suspect or little confirmed: x [m], y [m], heading [rad]."""
 _SEEN_RELIEF = 1.0
 """Decrease of the fault score by a detection from above, which depends on no other estimate."""
@@ -32,13 +32,13 @@ class LossLimits(NamedTuple):
         position_sigma: Standard deviation of its position [m].
         heading_sigma: Of its heading [rad].
         gated_in_a_row: Gated measurements since the last accepted one.
-        max_doubt: Fault score from which a robot or landmark is contradicted.
+        max_fault_score: Fault score from which a robot or landmark is contradicted.
     """
 
     position_sigma: float
     heading_sigma: float
     gated_in_a_row: int
-    max_doubt: float
+    max_fault_score: float
 
 
 @inlined_njit
@@ -81,22 +81,22 @@ def is_uncertain(belief: BeliefArrays, robot: int, pose: FloatArray, limits: Los
 
 
 @inlined_njit
-def add_hidden_errors(state: IntegrityArrays, robot: int, covariance: FloatArray) -> None:
+def inflate_suspect_covariance(state: IntegrityArrays, robot: int, covariance: FloatArray) -> None:
     """Inflate the covariance (3, 3) of a pose that is suspect or little confirmed."""
-    if state.doubt[robot] > _DOUBTFUL or state.confirmations[robot] < WELL_CONFIRMED:
+    if state.fault_score[robot] > _SUSPECT or state.confirmations[robot] < WELL_CONFIRMED:
         for i in range(3):
-            covariance[i, i] += _HIDDEN_SIGMA[i] ** 2
+            covariance[i, i] += _SUSPECT_SIGMA[i] ** 2
 
 
-def note_missed(state: IntegrityArrays, robot: int, weight: float) -> float:
+def count_missed(state: IntegrityArrays, robot: int, weight: float) -> float:
     """Raise the fault score of a robot that was not detected where it was expected; return the score."""
-    state.doubt[robot] += weight
-    return float(state.doubt[robot])
+    state.fault_score[robot] += weight
+    return float(state.fault_score[robot])
 
 
-def note_seen(state: IntegrityArrays, robot: int) -> None:
+def count_seen(state: IntegrityArrays, robot: int) -> None:
     """Lower the fault score of a robot that was detected from above where it was expected."""
-    state.doubt[robot] = max(0.0, state.doubt[robot] - _SEEN_RELIEF)
+    state.fault_score[robot] = max(0.0, state.fault_score[robot] - _SEEN_RELIEF)
 
 
 @inlined_njit

@@ -17,20 +17,20 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
-from swarm_loc_estimator.filter.integrity.noise_inflation import raise_hidden_noise
+from swarm_loc_estimator.filter.integrity.noise_inflation import inflate_noise
 from swarm_loc_estimator.filter.measurement_model import POLAR, MeasurementColumns
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW
 
-_ASIDE, _MAX_EVIDENCE = 10.0, 15.0
+_EXCLUDED, _MAX_EVIDENCE = 10.0, 15.0
 """Evidence from which a pair is excluded, and its maximum."""
-_DENIED = 7.5
+_SUSPECT = 7.5
 """Fault score from which a robot is not reported as tracked."""
 
 _SOURCES = 16
-_SURPRISE = 6.0
+_OUTLIER = 6.0
 _MAX_WEIGHT = 3.0
 _UNEXPLAINED_WEIGHT = 2.0
-NOISE, DESCRIPTION, ELSEWHERE = 0, 1, 2
+NOISE, DESCRIPTION, KIDNAPPED = 0, 1, 2
 """Possible causes of an innovation: noise, a wrong description, or a robot at another place."""
 _NOISE_M = 0.05
 _EXPLAINED_M, _EXPLAINED_SHARE = 0.1, 0.35
@@ -43,10 +43,10 @@ _MAX_SINGLE_DOUBT = 5.0
 """A single source raises the fault score of an observer up to here, which does not contradict it."""
 _SHARED_WEIGHT = 0.2
 """Weight for the source where observer and source are equally likely to be wrong."""
-_RELIEF = 0.25
+_INLIER_WEIGHT = 0.25
 RECENT_NS = 400_000_000
 _ONE_IMAGE_NS = 20_000_000
-_TOLD_NS = 3_000_000_000
+_REPORTED_NS = 3_000_000_000
 _AGAIN_NS = 90_000_000
 """A measurement sooner after the last one of its pair is no new evidence."""
 _INDEPENDENT_NS = 100_000_000
@@ -65,14 +65,14 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
         source=np.full((robots, _SOURCES), -1),
         source_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
         counted_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
-        surprised=np.zeros((robots, _SOURCES), dtype=bool),
+        outlier=np.zeros((robots, _SOURCES), dtype=bool),
         unexplained=np.zeros((robots, _SOURCES), dtype=bool),
         trending=np.zeros((robots, _SOURCES), dtype=bool),
         evidence=np.zeros((robots, _SOURCES)),
         whitened=np.zeros((robots, _SOURCES, 2)),
         squares=np.zeros((robots, _SOURCES)),
         looks=np.zeros((robots, _SOURCES), dtype=np.int64),
-        doubt=np.zeros(robots + landmarks),
+        fault_score=np.zeros(robots + landmarks),
         confirmations=np.zeros(robots, dtype=np.int64),
         confirmed_ns=np.full(robots, NEVER_NS // 2),
         gated_in_a_row=np.zeros(robots, dtype=np.int64),
@@ -80,7 +80,7 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
         gated_ns=np.full(robots, NEVER_NS // 2),
         gated_fixes=np.zeros(robots, dtype=np.int64),
         gated_fix_ns=np.full(robots, NEVER_NS // 2),
-        hidden_noise=np.zeros(robots),
+        noise_inflation=np.zeros(robots),
     )
 
 
@@ -89,8 +89,10 @@ def assess(
     measurements: MeasurementColumns,
     k: int,
     belief: BeliefArrays,
-    max_doubt: float,
-    look: tuple[float, tuple[float, float], int],
+    max_fault_score: float,
+    distance: float,
+    whitened: tuple[float, float],
+    cause: int,
 ) -> int:
     """Update fault scores and evidence by measurement k.
 
@@ -98,9 +100,10 @@ def assess(
         measurements: (m,).
         k: Which one.
         belief: Its integrity is changed.
-        max_doubt: Fault score from which a robot or landmark is contradicted.
-        look: Squared Mahalanobis distance of the position, the innovation over its standard deviation (2,),
-            and what may explain it, see `cause_of`.
+        max_fault_score: Fault score from which a robot or landmark is contradicted.
+        distance: Squared Mahalanobis distance of the position.
+        whitened: The innovation over its standard deviation.
+        cause: What may explain it, see `cause_of`.
 
     Returns:
         The robot or landmark (as N + l) that is contradicted; -1: nobody.
@@ -109,30 +112,29 @@ def assess(
     if observer < 0 or source < 0:
         return -1
     state, now_ns = belief.integrity, measurements.stamp_ns[k]
-    distance, whitened, cause = look
     place = _find(measurements, k, belief)
     if place < 0:
         place = _new_place(state, observer, source)
     state.source_ns[observer, place] = max(now_ns, state.source_ns[observer, place])
-    state.surprised[observer, place] = distance > _SURPRISE
-    state.unexplained[observer, place] = cause == ELSEWHERE
+    state.outlier[observer, place] = distance > _OUTLIER
+    state.unexplained[observer, place] = cause == KIDNAPPED
     if now_ns - state.counted_ns[observer, place] < _AGAIN_NS:
         return -1
     state.counted_ns[observer, place] = now_ns
-    weight = min(distance / _SURPRISE, _MAX_WEIGHT) if distance > _SURPRISE else 0.0
+    weight = min(distance / _OUTLIER, _MAX_WEIGHT) if distance > _OUTLIER else 0.0
     if weight == 0.0:
         weight = _weight_of_trend(state, observer, place, whitened)
     if weight == 0.0:
         if not state.trending[observer, place]:
-            _relieve(state, observer, source, place)
+            _count_inlier(state, observer, source, place)
         return -1
-    if not _blame(state, (observer, source), weight, cause == ELSEWHERE, now_ns):
+    if not _attribute(state, (observer, source), weight, cause == KIDNAPPED, now_ns):
         state.evidence[observer, place] = min(state.evidence[observer, place] + weight, _MAX_EVIDENCE)
     for node in (observer, source):
-        if state.doubt[node] >= max_doubt:
-            if cause != NOISE or not _is_estimated(belief, node) or not raise_hidden_noise(belief, observer):
+        if state.fault_score[node] >= max_fault_score:
+            if cause != NOISE or not _is_estimated(belief, node) or not inflate_noise(belief, observer):
                 return node
-            _forgive(state, node)
+            _reset_evidence(state, node)
     return -1
 
 
@@ -146,9 +148,9 @@ def _is_estimated(belief: BeliefArrays, node: int) -> bool:
 
 
 @cached_njit
-def _forgive(state: IntegrityArrays, node: int) -> None:
+def _reset_evidence(state: IntegrityArrays, node: int) -> None:
     """Reset the fault score of a robot or landmark, and the evidence against its pairs."""
-    state.doubt[node] = 0.0
+    state.fault_score[node] = 0.0
     robots, places = state.source.shape
     for robot in range(robots):
         for place in range(places):
@@ -156,17 +158,17 @@ def _forgive(state: IntegrityArrays, node: int) -> None:
                 state.evidence[robot, place] = 0.0
 
 
-def pairs_set_aside(state: IntegrityArrays, now_ns: int) -> list[tuple[int, int]]:
+def excluded_pairs(state: IntegrityArrays, now_ns: int) -> list[tuple[int, int]]:
     """The excluded pairs of observer and source among those measured recently."""
-    aside = (state.evidence >= _ASIDE) & (now_ns - state.source_ns < _TOLD_NS)
+    aside = (state.evidence >= _EXCLUDED) & (now_ns - state.source_ns < _REPORTED_NS)
     return [(int(observer), int(state.source[observer, place])) for observer, place in np.argwhere(aside)]
 
 
 @inlined_njit
-def is_set_aside(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> bool:
+def is_excluded(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> bool:
     """Whether the pair of measurement k is excluded."""
     observer, place = measurements.observer[k], _find(measurements, k, belief)
-    aside: bool = place >= 0 and belief.integrity.evidence[observer, place] >= _ASIDE
+    aside: bool = place >= 0 and belief.integrity.evidence[observer, place] >= _EXCLUDED
     return aside
 
 
@@ -180,7 +182,7 @@ def cause_of(kind: int, innovation: FloatArray, predicted: FloatArray) -> int:
         along, across = abs(innovation[0]), abs(innovation[1])
     error = math.hypot(along, across)
     if error > _EXPLAINED_M + _EXPLAINED_SHARE * distance:
-        return ELSEWHERE
+        return KIDNAPPED
     return DESCRIPTION if error > _NOISE_M else NOISE
 
 
@@ -193,14 +195,14 @@ def small_variances(kind: int, predicted: FloatArray) -> tuple[float, float]:
 
 
 @inlined_njit
-def is_elsewhere(state: IntegrityArrays, robot: int, within_ns: int = RECENT_NS) -> bool:
+def is_kidnapped(state: IntegrityArrays, robot: int, within_ns: int = RECENT_NS) -> bool:
     """Whether most recent measurements of a robot can only mean that it is at another place."""
     newest_ns, elsewhere, count = state.source_ns[robot, 0], 0, 0
     for place in range(state.source.shape[1]):
         newest_ns = max(newest_ns, state.source_ns[robot, place])
     for place in range(state.source.shape[1]):
         recent = newest_ns - state.source_ns[robot, place] < within_ns
-        if recent and state.source[robot, place] >= 0 and state.evidence[robot, place] < _ASIDE:
+        if recent and state.source[robot, place] >= 0 and state.evidence[robot, place] < _EXCLUDED:
             count += 1
             elsewhere += 1 if state.unexplained[robot, place] else 0
     return 2 * elsewhere > count
@@ -210,45 +212,45 @@ def is_elsewhere(state: IntegrityArrays, robot: int, within_ns: int = RECENT_NS)
 def is_contradicted(state: IntegrityArrays, robot: int) -> bool:
     """Whether the newest measurements contradict the pose of a robot; it is not tracked then."""
     contradicted: bool = (
-        state.doubt[robot] >= _DENIED
+        state.fault_score[robot] >= _SUSPECT
         or state.gated_fixes[robot] > 0
-        or is_elsewhere(state, robot, _ONE_IMAGE_NS)
+        or is_kidnapped(state, robot, _ONE_IMAGE_NS)
     )
     return contradicted
 
 
 @inlined_njit
-def _relieve(state: IntegrityArrays, observer: int, source: int, place: int) -> None:
+def _count_inlier(state: IntegrityArrays, observer: int, source: int, place: int) -> None:
     """Lower evidence and fault scores by an inlier."""
-    state.evidence[observer, place] = max(0.0, state.evidence[observer, place] - _RELIEF)
+    state.evidence[observer, place] = max(0.0, state.evidence[observer, place] - _INLIER_WEIGHT)
     for node in (observer, source):
-        state.doubt[node] = max(0.0, state.doubt[node] - _RELIEF)
+        state.fault_score[node] = max(0.0, state.fault_score[node] - _INLIER_WEIGHT)
 
 
 @cached_njit
-def _blame(
+def _attribute(
     state: IntegrityArrays, pair: tuple[int, int], weight: float, unexplained: bool, now_ns: int
 ) -> bool:
     """Attribute an outlier to whichever of a pair has the larger share of them; False: to neither."""
     observer, source = pair
-    bad_observer, share_observer = _surprises(state, observer, now_ns)
-    _, share_source = _surprises(state, source, now_ns)
+    bad_observer, share_observer = _outliers(state, observer, now_ns)
+    _, share_source = _outliers(state, source, now_ns)
     if share_observer > 0.5 and share_observer >= share_source:
         if bad_observer >= 2:
-            state.doubt[observer] += weight * (_UNEXPLAINED_WEIGHT if unexplained else 1.0)
-        elif state.doubt[observer] < _MAX_SINGLE_DOUBT:
-            state.doubt[observer] += _SINGLE_WEIGHT * weight
-        if share_observer == share_source and state.doubt[source] < _MAX_SINGLE_DOUBT:
-            state.doubt[source] += _SHARED_WEIGHT * weight
+            state.fault_score[observer] += weight * (_UNEXPLAINED_WEIGHT if unexplained else 1.0)
+        elif state.fault_score[observer] < _MAX_SINGLE_DOUBT:
+            state.fault_score[observer] += _SINGLE_WEIGHT * weight
+        if share_observer == share_source and state.fault_score[source] < _MAX_SINGLE_DOUBT:
+            state.fault_score[source] += _SHARED_WEIGHT * weight
         return True
     if share_source > 0.5:
-        state.doubt[source] += weight
+        state.fault_score[source] += weight
         return True
     return False
 
 
 @cached_njit
-def _surprises(state: IntegrityArrays, node: int, now_ns: int) -> tuple[int, float]:
+def _outliers(state: IntegrityArrays, node: int, now_ns: int) -> tuple[int, float]:
     """Number and share of outliers among the pairs of a robot or landmark, as observer and as source."""
     robots, places = state.source.shape
     bad, count = 0, 0
@@ -261,7 +263,7 @@ def _surprises(state: IntegrityArrays, node: int, now_ns: int) -> tuple[int, flo
             about = source >= 0 and node in (robot, source)
             if about and now_ns - state.source_ns[robot, place] < RECENT_NS:
                 count += 1
-                bad += 1 if state.surprised[robot, place] or state.trending[robot, place] else 0
+                bad += 1 if state.outlier[robot, place] or state.trending[robot, place] else 0
     return bad, bad / max(1, count)
 
 
@@ -312,7 +314,7 @@ def _new_place(state: IntegrityArrays, observer: int, source: int) -> int:
     state.source[observer, oldest], state.source_ns[observer, oldest] = source, NEVER_NS // 2
     state.counted_ns[observer, oldest] = NEVER_NS // 2
     state.evidence[observer, oldest] = 0.0
-    state.surprised[observer, oldest] = state.trending[observer, oldest] = False
+    state.outlier[observer, oldest] = state.trending[observer, oldest] = False
     _forget_trend(state, observer, oldest)
     return oldest
 

@@ -20,7 +20,7 @@ from swarm_loc_estimator.swarm.swarm import SensorModel
 
 _POSITION_SIGMA, _BEARING_SIGMA, _HEADING_SIGMA, _STAMP_SIGMA = 0.004, 0.01, 0.03, 0.03
 """One unit of inflation [m], [rad], [rad], [s]."""
-_DOUBTED_UNITS, MAX_UNITS = 2.0, 5.0
+_SUSPECT_UNITS, MAX_UNITS = 2.0, 5.0
 
 
 @inlined_njit
@@ -29,17 +29,17 @@ def stamp_variance(measurements: MeasurementColumns, k: int, belief: BeliefArray
     variance: float = measurements.stamp_variance[k]
     observer = measurements.observer[k]
     if observer >= 0:
-        variance += (belief.integrity.hidden_noise[observer] * _STAMP_SIGMA) ** 2
+        variance += (belief.integrity.noise_inflation[observer] * _STAMP_SIGMA) ** 2
     return variance
 
 
 @inlined_njit
-def add_hidden_noise(
+def add_noise_inflation(
     measurements: MeasurementColumns, k: int, belief: BeliefArrays, noise: FloatArray
 ) -> None:
     """Add the noise inflation of its observer to the noise (3, 3) of measurement k."""
     observer = measurements.observer[k]
-    units = belief.integrity.hidden_noise[observer] if observer >= 0 else 0.0
+    units = belief.integrity.noise_inflation[observer] if observer >= 0 else 0.0
     if units > 0.0:
         noise[0, 0] += (units * _POSITION_SIGMA) ** 2
         noise[1, 1] += (units * (_BEARING_SIGMA if measurements.kind[k] == POLAR else _POSITION_SIGMA)) ** 2
@@ -47,20 +47,20 @@ def add_hidden_noise(
 
 
 @cached_njit
-def raise_hidden_noise(belief: BeliefArrays, observer: int) -> bool:
+def inflate_noise(belief: BeliefArrays, observer: int) -> bool:
     """Inflate the noise of an observer by one unit; False: it is at its maximum."""
-    units = belief.integrity.hidden_noise[observer]
-    belief.integrity.hidden_noise[observer] = min(units + 1.0, MAX_UNITS)
+    units = belief.integrity.noise_inflation[observer]
+    belief.integrity.noise_inflation[observer] = min(units + 1.0, MAX_UNITS)
     raised: bool = units < MAX_UNITS
     return raised
 
 
-def doubt_noise(state: IntegrityArrays) -> None:
+def inflate_all_noise(state: IntegrityArrays) -> None:
     """Inflate the noise of all robots, because their description has proved wrong."""
-    np.maximum(state.hidden_noise, _DOUBTED_UNITS, out=state.hidden_noise)
+    np.maximum(state.noise_inflation, _SUSPECT_UNITS, out=state.noise_inflation)
 
 
-def with_hidden_noise(sensor: SensorModel, units: float) -> SensorModel:
+def with_noise_inflation(sensor: SensorModel, units: float) -> SensorModel:
     """A sensor model with the noise inflation included."""
     unit_of = {
         "forward_sigma": _POSITION_SIGMA,

@@ -7,11 +7,11 @@ import pytest
 
 from swarm_loc_estimator.filter.integrity.noise_inflation import (
     MAX_UNITS,
-    add_hidden_noise,
-    doubt_noise,
-    raise_hidden_noise,
+    add_noise_inflation,
+    inflate_all_noise,
+    inflate_noise,
     stamp_variance,
-    with_hidden_noise,
+    with_noise_inflation,
 )
 from swarm_loc_estimator.filter.measurement_model import (
     MEASUREMENT_DTYPE,
@@ -36,10 +36,10 @@ def measurements() -> MeasurementColumns:
 def test_each_unit_adds_noise_up_to_a_limit_and_to_its_observer_only() -> None:
     belief, columns = SwarmState(ParameterTable.of(ROBOTS)).arrays(), measurements()
     variances = []
-    while raise_hidden_noise(belief, 1):
+    while inflate_noise(belief, 1):
         noise = [np.zeros((3, 3)) for _ in range(3)]
         for k in range(3):
-            add_hidden_noise(columns, k, belief, noise[k])
+            add_noise_inflation(columns, k, belief, noise[k])
         assert (noise[0] == 0.0).all()
         assert (noise[2] == 0.0).all()
         assert stamp_variance(columns, 0, belief) == stamp_variance(columns, 2, belief) == 0.0
@@ -52,15 +52,15 @@ def test_each_unit_adds_noise_up_to_a_limit_and_to_its_observer_only() -> None:
 
 def test_a_description_that_has_proved_wrong_makes_all_noise_doubtful_but_lowers_none() -> None:
     state = SwarmState(ParameterTable.of(ROBOTS))
-    state.integrity.hidden_noise[0] = 4.0
-    doubt_noise(state.integrity)
-    assert state.integrity.hidden_noise[0] == 4.0
-    assert 0.0 < state.integrity.hidden_noise[1] < 4.0
+    state.integrity.noise_inflation[0] = 4.0
+    inflate_all_noise(state.integrity)
+    assert state.integrity.noise_inflation[0] == 4.0
+    assert 0.0 < state.integrity.noise_inflation[1] < 4.0
 
 
 def test_the_noise_that_was_found_is_written_into_the_description() -> None:
     sensor = SensorModel(forward_sigma=0.003, residual_position_sigma=0.003, time_sigma_s=0.04)
-    found = with_hidden_noise(sensor, 1.0)
+    found = with_noise_inflation(sensor, 1.0)
     assert found.forward_sigma == found.residual_position_sigma == pytest.approx(0.005)
     assert found.time_sigma_s == pytest.approx(0.05)
-    assert with_hidden_noise(sensor, 0.0) == sensor
+    assert with_noise_inflation(sensor, 0.0) == sensor
