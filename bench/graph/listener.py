@@ -19,8 +19,8 @@ from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY, POSE_STAMPED
 from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
 from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.offline.ground_truth import read_truth
 from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveError, LiveGraph
-from swarm_loc_estimator.offline.recorded_bag import read_truth
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_msgs.msg import MarkerDetectionArray
 

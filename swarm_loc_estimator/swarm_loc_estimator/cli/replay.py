@@ -46,6 +46,7 @@ _NOTHING_TO_LEARN = (
     "--learned: the swarm description has no sigma of a camera, of odometry or of a landmark, and nothing"
     " contradicted it, so there is nothing to learn; give for instance camera.yaw_sigma."
 )
+_NO_POSES = "No robot was located at any time; see what the report says of the bag and of what was dropped."
 _COVARIANCE = ("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
 _COLUMNS = ("stamp_ns", "robot", "x_m", "y_m", "theta_rad", *_COVARIANCE)
 
@@ -72,6 +73,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     print(files.text.read_text(encoding="utf-8"))
     print(f"Report:  {files.page}\nPicture: {files.overview}")
+    if not np.isfinite(result.poses).all(axis=2).any():
+        print(_NO_POSES, file=sys.stderr)
+        return 1
     return 0
 
 

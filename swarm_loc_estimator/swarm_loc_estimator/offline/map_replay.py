@@ -21,7 +21,7 @@ from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
 from swarm_loc_estimator.mapping.settings import MapperSettings
-from swarm_loc_estimator.offline.recorded_bag import TruthReader
+from swarm_loc_estimator.offline.ground_truth import TruthReader
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 _REPORT_EVERY = 1000
@@ -66,8 +66,8 @@ def replay_map(
 
 def truth_of(bag: Path, swarm: Swarm) -> dict[str, Trajectory]:
     """Ground truth of a bag by robot, for evaluation only; empty without any."""
-    truth = TruthReader(swarm)
     with BagReader(bag) as reader:
+        truth = TruthReader(swarm, reader.topics)
         for batch in reader.batches(truth.topics):
             truth.add(batch)
     return truth.tracks()

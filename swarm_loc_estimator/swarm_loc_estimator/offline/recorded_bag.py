@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.reader import BagReader, BagTopic
 from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
-from swarm_loc_estimator.common.messages.streams import PoseReader
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
+from swarm_loc_estimator.offline.ground_truth import TruthReader
 from swarm_loc_estimator.offline.result import RecordedMap
-from swarm_loc_estimator.offline.spool import Spool
-from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
 from swarm_loc_estimator.sensors.registry import Batch, kinds
 from swarm_loc_estimator.swarm.swarm import Swarm
 
@@ -39,6 +37,7 @@ class BagSummary:
         truth: Robot name -> ground truth; robots without are missing.
         received: Messages for the estimator by kind of topic.
         remarks: What could not be read or used, one sentence each.
+        unusable: Why no message at all can be used, one sentence each; empty: some can, or none is expected.
         maps: Messages of `map`, thinned out to `MAX_MAP_BYTES`.
         goals: Robot name -> its goals by their stamps.
     """
@@ -47,6 +46,7 @@ class BagSummary:
     truth: Mapping[str, Trajectory]
     received: Mapping[str, int]
     remarks: tuple[str, ...]
+    unusable: tuple[str, ...]
     maps: tuple[RecordedMap, ...] = ()
     goals: Mapping[str, Trajectory] = field(default_factory=dict)
 
@@ -63,10 +63,10 @@ def read_bag(bag: Path, swarm: Swarm, take: Callable[[Batch], None], progress: P
     Raises:
         BagError: Nothing in the bag can be read.
     """
-    ingest, truth, maps = Ingest(swarm), TruthReader(swarm), MapReader(swarm)
-    first_truth = len(ingest.topics)
-    first_map = first_truth + len(truth.topics)
     with BagReader(bag) as reader:
+        ingest, truth, maps = Ingest(swarm), TruthReader(swarm, reader.topics), MapReader(swarm)
+        first_truth = len(ingest.topics)
+        first_map = first_truth + len(truth.topics)
         range_ns = reader.time_range_ns
         for batch in reader.batches([*ingest.handle_of, *truth.topics, *maps.topics]):
             for inputs in ingest.read(batch.chosen(batch.topic < first_truth)):
@@ -74,9 +74,18 @@ def read_bag(bag: Path, swarm: Swarm, take: Callable[[Batch], None], progress: P
             truth.add(_from(batch.chosen(batch.topic < first_map), first_truth))
             maps.add(_from(batch, first_map))
             progress(reader.progress, "reading")
-        found = (*_strangers(reader.topics, ingest), *_missing(ingest))
+        unusable = _unusable(reader.topics, ingest, swarm)
+        found = (*_strangers(reader.topics, ingest), *_missing(ingest), *unusable)
         remarks = (*reader.losses, *found, *truth.remarks(), *maps.remarks())
-        return BagSummary(range_ns, truth.tracks(), ingest.received(), remarks, maps.maps(), maps.goals())
+        return BagSummary(
+            range_ns,
+            truth.tracks(),
+            ingest.received(),
+            remarks,
+            unusable if not any(map(_usable, ingest.statistics)) else (),
+            maps.maps(),
+            maps.goals(),
+        )
 
 
 def _from(batch: MessageBatch, first: int) -> MessageBatch:
@@ -96,7 +105,7 @@ def _missing(ingest: Ingest) -> list[str]:
     ]
 
 
-def _strangers(topics: Iterable[BagTopic], ingest: Ingest) -> list[str]:
+def _strangers(topics: Sequence[BagTopic], ingest: Ingest) -> list[str]:
     """One sentence if the bag holds inputs of robots that the swarm does not have."""
     types = {kind.topic: kind.message_type for kind in kinds().values()}
     names = [t.name for t in topics if types.get(t.name.rpartition("/")[2]) == t.type]
@@ -104,68 +113,57 @@ def _strangers(topics: Iterable[BagTopic], ingest: Ingest) -> list[str]:
     return [f"No robot of the swarm description has the topics {', '.join(strange)}."] if strange else []
 
 
-def read_truth(swarm: Swarm, messages: Mapping[str, Sequence[bytes]]) -> dict[str, Trajectory]:
-    """Decode serialized ground truth.
-
-    Args:
-        swarm: The robots.
-        messages: Robot name -> its serialized PoseStamped.
-    """
-    reader = TruthReader(swarm)
-    topics = ((swarm.index_of[name], data) for name, all_of in messages.items() for data in all_of)
-    reader.add(MessageBatch.of([SerializedMessage(topic, data, 0) for topic, data in topics]))
-    return reader.tracks()
+def _usable(statistics: InputStatistics) -> int:
+    return statistics.received - statistics.malformed
 
 
-class TruthReader:
-    """Collects ground truth for evaluation; the estimator does not see it.
-
-    Args:
-        swarm: The robots.
-
-    Attributes:
-        topics: The index of a topic is its number in a batch.
-    """
-
-    def __init__(self, swarm: Swarm) -> None:
-        self.topics = [f"{robot.name}/ground_truth" for robot in swarm.robots]
-        self._names = [robot.name for robot in swarm.robots]
-        self._reader = PoseReader(len(self.topics), decode_pose_stamped, names=1)
-        self._spool = Spool()
-        self._malformed = 0
-
-    def add(self, batch: MessageBatch) -> None:
-        """Add messages."""
-        if not batch.size:
-            return
-        columns = self._reader.read(batch)
-        self._malformed += int(np.sum(~columns.valid))
-        usable = np.flatnonzero(columns.valid & np.isfinite(columns.pose).all(axis=1))
-        robot = batch.topic[usable]
-        order = usable[np.lexsort([columns.stamp_ns[usable], robot])]
-        ends = np.searchsorted(batch.topic[order], np.arange(len(self.topics) + 1))
-        for index in np.flatnonzero(np.diff(ends)).tolist():
-            rows = order[ends[index] : ends[index + 1]]
-            self._spool.append((index, "stamp_ns"), columns.stamp_ns[rows])
-            self._spool.append((index, "pose"), columns.pose[rows])
-
-    def tracks(self) -> dict[str, Trajectory]:
-        """Robot name -> ground truth, for robots that have any; may be called once."""
-        return {name: track for index, name in enumerate(self._names) if (track := self._track(index))}
-
-    def remarks(self) -> tuple[str, ...]:
-        """Sentences for the user."""
-        return (f"{self._malformed} messages of ground truth are malformed.",) if self._malformed else ()
-
-    def _track(self, index: int) -> Trajectory | None:
-        stamp_ns: IntArray = self._spool.array((index, "stamp_ns"), np.int64)
-        pose = self._spool.array((index, "pose"), np.float64, 3)
-        if np.any(stamp_ns[1:] < stamp_ns[:-1]):
-            order = np.argsort(stamp_ns, kind="stable")
-            stamp_ns, pose = stamp_ns[order], pose[order]
-        return Trajectory(stamp_ns, pose) if stamp_ns.size else None
+def _unusable(topics: Sequence[BagTopic], ingest: Ingest, swarm: Swarm) -> tuple[str, ...]:
+    """For each expected kind of input without a usable message, one sentence about what the bag holds."""
+    pairs = [*zip(ingest.topics, ingest.statistics, strict=True)]
+    used = {topic.kind.rows for topic, statistics in pairs if _usable(statistics)}
+    sentences = []
+    for kind in kinds().values():
+        if not kind.of_each or kind.rows in used or not any(map(kind.expected_of, swarm.robots)):
+            continue
+        names = {topic.name for topic in ingest.topics if topic.kind.name == kind.name}
+        malformed = sum(statistics.malformed for topic, statistics in pairs if topic.kind.name == kind.name)
+        others = [
+            topic
+            for topic in topics
+            if _plain(topic.type) == _plain(kind.message_type)
+            and topic.name not in ingest.handle_of
+            and not topic.name.endswith("/ground_truth")
+        ]
+        expected = f"Expected {kind.message_type} on {kind.pattern}; "
+        if malformed:
+            own = _listed([topic for topic in topics if topic.name in names])
+            sentences.append(
+                f"{expected}none of the {malformed} messages on {own}"
+                " is one as ROS 2 serializes it: convert a bag of ROS 1 or JSON first, as by rosbags-convert."
+            )
+        elif others:
+            sentences.append(
+                f"{expected}the bag has this type on {_listed(others)}: rename the robots of the swarm"
+                " description, or play the bag with --remap and record it again."
+            )
+        elif not used:
+            sentences.append(f"{expected}the bag has no topic of this type.")
+    return tuple(sentences)
 
 
+def _plain(message_type: str) -> str:
+    """A type as ROS 1 writes it, too: nav_msgs/Odometry."""
+    return message_type.replace("/msg/", "/")
+
+
+def _listed(topics: Sequence[BagTopic]) -> str:
+    """Names and types of a few topics."""
+    shown = ", ".join(f"{topic.name} ({topic.type or 'no type'})" for topic in topics[:_LISTED])
+    return shown + (f" and {len(topics) - _LISTED} others" if len(topics) > _LISTED else "")
+
+
+_LISTED = 6
+"""Topics named in one sentence."""
 MAX_MAP_BYTES = 48_000_000
 """Beyond this, maps are thinned out evenly over time."""
 MAX_GOALS = 20_000

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.bags.bag_file import BagError
 from swarm_loc_estimator.common.command_line import swarm_beside
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.identification.memory import Identities
@@ -57,7 +58,7 @@ def replay(
         progress: Called now and then with the share done and what is being done.
 
     Raises:
-        BagError: Nothing in the bag can be read.
+        BagError: Nothing in the bag can be read, or no message of it can be used.
         SwarmFileError: The swarm description cannot be used.
     """
     bag = Path(bag)
@@ -66,6 +67,10 @@ def replay(
     schedule = periodic if stamp_ns is None else ListedSchedule(stamp_ns)
     runner = Runner(Estimator(swarm, settings), schedule, keep_sightings=keep_sightings)
     summary = read_bag(bag, swarm, runner.take, progress)
+    if summary.unusable:
+        raise BagError(
+            "\n".join([f"'{bag}' holds no message that the estimator can use.", *summary.unusable])
+        )
     runner.finish(summary.range_ns[1])
     remarks = list(summary.remarks)
     if periodic.jumps:

@@ -1,15 +1,36 @@
-"""Ground truth that was heard: by robot, in order of its stamps, and only what can be."""
+"""Ground truth: by robot, in order of its stamps, of all usual message types."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
+from mcap.writer import Writer
+from rosbags.typesys import Stores, get_typestore
 
+from swarm_loc_estimator.cli.replay import main
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.bags.writer import BagWriter, copy_beginning
 from swarm_loc_estimator.common.messages.poses import encode_pose_stamped
-from swarm_loc_estimator.offline.recorded_bag import read_truth
+from swarm_loc_estimator.offline.calibration.recording import read_recording
+from swarm_loc_estimator.offline.ground_truth import read_truth
+from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
+from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 SWARM = Swarm((Robot("a"), Robot("b"), Robot("silent")))
+DEMO = Path(__file__).parents[3] / "bags" / "eight_five_robots"
+STORE = get_typestore(Stores.ROS2_JAZZY)
+TYPES = STORE.types
+POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
+TRANSFORM_STAMPED = "geometry_msgs/msg/TransformStamped"
+WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+ODOMETRY = "nav_msgs/msg/Odometry"
+POINT = "geometry_msgs/msg/PointStamped"
 
 
 def test_truth_is_read_by_robot_in_order_of_its_stamps() -> None:
@@ -21,3 +42,161 @@ def test_truth_is_read_by_robot_in_order_of_its_stamps() -> None:
     assert tracks["a"].stamp_ns.tolist() == [10]
     assert tracks["b"].stamp_ns.tolist() == [10, 30]
     assert tracks["b"].pose == pytest.approx(poses[[1, 0]])
+
+
+def converted(data: bytes, message_type: str) -> bytes:
+    """A PoseStamped as another type, serialized by rosbags."""
+    old: Any = STORE.deserialize_cdr(data, POSE_STAMPED)
+    header, pose = old.header, old.pose
+    place = pose.position
+    vector = TYPES["geometry_msgs/msg/Vector3"](place.x, place.y, place.z)
+    with_covariance = TYPES["geometry_msgs/msg/PoseWithCovariance"](pose, np.arange(36.0))
+    still = TYPES["geometry_msgs/msg/Twist"](vector, vector)
+    twist = TYPES["geometry_msgs/msg/TwistWithCovariance"](still, np.arange(36.0))
+    create: dict[str, Callable[[], object]] = {
+        POSE_STAMPED: lambda: old,
+        WITH_COVARIANCE: lambda: TYPES[WITH_COVARIANCE](header, with_covariance),
+        ODOMETRY: lambda: TYPES[ODOMETRY](header, "base", with_covariance, twist),
+        TRANSFORM_STAMPED: lambda: TYPES[TRANSFORM_STAMPED](
+            header, "base", TYPES["geometry_msgs/msg/Transform"](vector, pose.orientation)
+        ),
+        POINT: lambda: TYPES[POINT](header, place),
+    }
+    return bytes(STORE.serialize_cdr(create[message_type](), message_type))
+
+
+def rewritten(bag: Path, source: Path, types: Sequence[str]) -> Path:
+    """A bag whose robots have ground truth of these types."""
+    with BagReader(source) as reader, BagWriter(bag) as writer:
+        type_of = {f"epuck{number}/ground_truth": name for number, name in enumerate(types, 1)}
+        for topic in reader.topics:
+            writer.add_topic(topic.name, type_of.get(topic.name, topic.type))
+        for name, _, log_ns, data in reader.messages():
+            writer.write(name, log_ns, converted(data, type_of[name]) if name in type_of else data)
+    return bag
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first seconds of the demo's bag."""
+    folder = tmp_path_factory.mktemp("bags") / "short"
+    copy_beginning(DEMO, folder, 4.0)
+    return folder
+
+
+def test_truth_of_all_usual_types_gives_the_same_errors(tmp_path: Path, short: Path) -> None:
+    swarm = load_swarm(DEMO / "swarm.yaml")
+    bag = rewritten(tmp_path / "bag", short, (POSE_STAMPED, WITH_COVARIANCE, ODOMETRY, TRANSFORM_STAMPED))
+    expected, result = replay(short, swarm), replay(bag, swarm)
+    assert result.summaries == expected.summaries
+    assert len(result.summaries) == 5
+    assert not result.remarks
+    assert result.poses.tobytes() == expected.poses.tobytes()
+    truth = read_recording(bag, swarm).truth
+    for name, track in read_recording(short, swarm).truth.items():
+        assert truth[name].pose.tobytes() == track.pose.tobytes()
+        assert truth[name].stamp_ns.tobytes() == track.stamp_ns.tobytes()
+
+
+def test_truth_of_another_type_is_named_with_the_types_allowed(tmp_path: Path, short: Path) -> None:
+    bag = rewritten(tmp_path / "bag", short, (POINT,))
+    summary = read_bag(bag, load_swarm(DEMO / "swarm.yaml"), lambda _: None, unwatched)
+    (remark,) = summary.remarks
+    assert f"epuck1/ground_truth has the type {POINT}, which is no ground truth" in remark
+    assert all(name in remark for name in (POSE_STAMPED, WITH_COVARIANCE, ODOMETRY, TRANSFORM_STAMPED))
+    assert len(summary.truth) == 4
+
+
+def test_malformed_truth_is_named(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("a/ground_truth", TRANSFORM_STAMPED)
+        good = converted(encode_pose_stamped("map", np.array([10]), np.zeros((1, 3)))[0], TRANSFORM_STAMPED)
+        for data in (good, good[:-8], good + bytes(8), good):
+            writer.write("a/ground_truth", 10, data)
+    summary = read_bag(tmp_path / "bag", SWARM, lambda _: None, unwatched)
+    assert f"2 messages on a/ground_truth are malformed: no {TRANSFORM_STAMPED} of ROS 2." in summary.remarks
+    assert summary.truth["a"].stamp_ns.tolist() == [10, 10]
+
+
+def renamed(bag: Path, source: Path, rename: Callable[[str, str, bytes], tuple[str, str, bytes]]) -> Path:
+    """A bag with other names, types or messages."""
+    with BagReader(source) as reader, BagWriter(bag) as writer:
+        for topic in reader.topics:
+            name, message_type, _ = rename(topic.name, topic.type, b"")
+            writer.add_topic(name, message_type)
+        for name, message_type, log_ns, data in reader.messages():
+            new, _, changed = rename(name, message_type, data)
+            writer.write(new, log_ns, changed)
+    return bag
+
+
+def error_of(capsys: pytest.CaptureFixture[str], bag: Path, out: Path) -> list[str]:
+    """Lines of standard error of a replay that fails."""
+    assert main([str(bag), "--swarm", str(DEMO / "swarm.yaml"), "--out", str(out)]) == 1
+    return capsys.readouterr().err.strip().splitlines()
+
+
+def test_a_bag_with_other_topics_fails_and_names_the_candidates(
+    tmp_path: Path, short: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = {"odom": "odometry/filtered", "detections": "markers", "ground_truth": "ground_truth"}
+
+    def rename(topic: str, message_type: str, data: bytes) -> tuple[str, str, bytes]:
+        robot, name = topic.split("/")
+        return f"{robot}/{names[name]}", message_type, data
+
+    bag = renamed(tmp_path / "bag", short, rename)
+    first, odometry, detections = error_of(capsys, bag, tmp_path / "out")
+    assert first.endswith("holds no message that the estimator can use.")
+    assert f"Expected {ODOMETRY} on <robot>/odom; the bag has this type on epuck" in odometry
+    assert odometry.count("/odometry/filtered") == 5
+    assert "ground_truth" not in odometry
+    assert detections.count("/markers") == 5
+
+
+def ros1_odometry() -> bytes:
+    """A message as ROS 1 serializes it."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    header = store.types["std_msgs/msg/Header"](1, TYPES["builtin_interfaces/msg/Time"](1, 0), "odom")
+    (data,) = encode_pose_stamped("odom", np.array([10]), np.zeros((1, 3)))
+    message: Any = STORE.deserialize_cdr(converted(data, ODOMETRY), ODOMETRY)
+    ros1 = store.types[ODOMETRY](header, "base", message.pose, message.twist)
+    return bytes(store.serialize_ros1(ros1, ODOMETRY))
+
+
+@pytest.mark.parametrize(
+    ("schema", "encoding", "data"),
+    [
+        ("nav_msgs/Odometry", "ros1", ros1_odometry()),
+        (ODOMETRY, "json", b'{"header": {"frame_id": "odom"}}'),
+    ],
+    ids=["ros1", "json"],
+)
+def test_a_bag_of_ros_1_or_json_fails_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], schema: str, encoding: str, data: bytes
+) -> None:
+    bag = tmp_path / "bag.mcap"
+    with bag.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channel = writer.register_channel(
+            "/epuck1/odom", encoding, writer.register_schema(schema, encoding, b"")
+        )
+        for log_ns in range(10):
+            writer.add_message(channel, log_ns, data, log_ns)
+        writer.finish()  # type: ignore[no-untyped-call]
+    _, odometry, detections = error_of(capsys, bag, tmp_path / "out")
+    assert f"none of the 10 messages on epuck1/odom ({schema}) is one as ROS 2 serializes it" in odometry
+    assert "convert a bag of ROS 1 or JSON first" in odometry
+    assert detections.endswith("the bag has no topic of this type.")
+
+
+def test_a_replay_that_locates_nobody_fails(
+    tmp_path: Path, short: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def rename(topic: str, message_type: str, data: bytes) -> tuple[str, str, bytes]:
+        return topic.replace("/odom", "/odometry/filtered"), message_type, data
+
+    bag = renamed(tmp_path / "bag", short, rename)
+    assert error_of(capsys, bag, tmp_path / "out")[-1].startswith("No robot was located at any time")
+    assert "/odometry/filtered" in (tmp_path / "out" / "report.txt").read_text(encoding="utf-8")

@@ -16,6 +16,7 @@ from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.launch import GraphOptions, NodeSpec, ParameterValue, graph_nodes
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
+from swarm_loc_estimator.offline.ground_truth import TruthReader
 from swarm_loc_estimator.offline.live.graph import (
     START_PATIENCE_S,
     LiveError,
@@ -25,7 +26,6 @@ from swarm_loc_estimator.offline.live.graph import (
     read_poses,
     resident_mb,
 )
-from swarm_loc_estimator.offline.recorded_bag import TruthReader
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.sensors.registry import input_topics
@@ -105,8 +105,9 @@ def read_content(bag: Path, swarm: Swarm) -> BagContent:
     Raises:
         BagError: Nothing in the bag can be read.
     """
-    truth, inputs = TruthReader(swarm), [topic.name for topic in input_topics(swarm)]
+    inputs = [topic.name for topic in input_topics(swarm)]
     with BagReader(bag) as reader:
+        truth = TruthReader(swarm, reader.topics)
         begin_ns, end_ns = reader.time_range_ns
         recorded = [topic.name for topic in reader.topics if topic.name in set(inputs)]
         arrivals = [[np.zeros(0, dtype=np.int64)] for _ in recorded]
