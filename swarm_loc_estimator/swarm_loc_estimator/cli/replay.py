@@ -40,6 +40,7 @@ from swarm_loc_estimator.offline.report.report import write_report
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.timeline.self_calibration import swapped_signs
 from swarm_loc_estimator.timeline.settings import Settings
 
 _NOTHING_TO_LEARN = (
@@ -66,11 +67,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         write_poses(result, options.out / "poses.csv")
         if options.mcap:
             write_mcap(result, options.mcap)
-        if options.learned and result.self_calibrated:
-            save_swarm(result.self_calibrated, options.learned, f"Learned from {result.title}.")
     if options.learned and not result.self_calibrated:
         print(_NOTHING_TO_LEARN, file=sys.stderr)
         return 1
+    swapped = swapped_signs(result.self_calibrated) if options.learned and result.self_calibrated else []
+    if swapped:
+        print("\n".join([*swapped, f"{options.learned} was not written."]), file=sys.stderr)
+        return 1
+    if options.learned and result.self_calibrated:
+        save_swarm(result.self_calibrated, options.learned, f"Learned from {result.title}.")
     print(files.text.read_text(encoding="utf-8"))
     print(f"Report:  {files.page}\nPicture: {files.overview}")
     if not np.isfinite(result.poses).all(axis=2).any():

@@ -29,6 +29,7 @@ from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
+from swarm_loc_estimator.timeline.self_calibration import swapped_signs
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.sightings import Sightings, newest_sightings
 
@@ -76,8 +77,10 @@ def replay(
     if periodic.jumps:
         jumps = f"The log time jumps ahead by more than an hour, {periodic.jumps} x"
         remarks.append(f"{jumps}; no poses are given meanwhile.")
-    result = runner.result(bag.name, summary.range_ns, summary.truth, summary.received, tuple(remarks))
-    return replace(result, maps=summary.maps, goals=summary.goals)
+    result = runner.result(bag.name, summary.range_ns, summary.truth, summary.received)
+    if result.self_calibrated:
+        remarks += swapped_signs(result.self_calibrated)
+    return replace(result, remarks=tuple(remarks), maps=summary.maps, goals=summary.goals)
 
 
 MAX_DETECTIONS = 200_000

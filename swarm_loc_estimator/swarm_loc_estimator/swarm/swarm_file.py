@@ -137,6 +137,19 @@ def load_swarm(path: Path | str) -> Swarm:
         tree = read_tree(path)
     except YamlTreeError as error:
         raise SwarmFileError(str(error)) from error
+    return parse_swarm(tree, path)
+
+
+def parse_swarm(tree: Tree, path: Path) -> Swarm:
+    """Check the content of a swarm description.
+
+    Args:
+        tree: The content.
+        path: The file that it stands in, or shall stand in; paths inside begin at its folder.
+
+    Raises:
+        SwarmFileError: One sentence with file, dotted key, value and what is allowed.
+    """
     return _Loader(path, SwarmFileError).swarm(tree)
 
 

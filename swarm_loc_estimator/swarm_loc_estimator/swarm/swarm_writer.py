@@ -17,7 +17,7 @@ from swarm_loc_estimator.swarm.swarm import (
     Robot,
     Swarm,
 )
-from swarm_loc_estimator.swarm.swarm_file import FILE_VERSION, LANDMARK_DEFAULTS, MODELS
+from swarm_loc_estimator.swarm.swarm_file import FILE_VERSION, LANDMARK_DEFAULTS, MODELS, parse_swarm
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -33,10 +33,15 @@ def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
         swarm: What to write.
         path: The file; replaced when it exists, its folder created when missing.
         comment: Lines that say where the numbers come from.
+
+    Raises:
+        SwarmFileError: It has numbers that `load_swarm` refuses; nothing is written.
     """
     path = Path(path)
+    tree = _tree(swarm, path.parent)
+    parse_swarm(tree, path)
     text = "".join(f"# {line}\n" for line in [*comment.splitlines(), *_units()])
-    text += tree_text(_tree(swarm, path.parent))
+    text += tree_text(tree)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".part")
     temporary.write_text(text, encoding="utf-8")

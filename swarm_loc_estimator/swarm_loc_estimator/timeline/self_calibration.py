@@ -45,6 +45,20 @@ def learned(swarm: Swarm, state: SwarmState) -> Swarm:
     )
 
 
+def swapped_signs(swarm: Swarm) -> list[str]:
+    """One sentence for each robot whose path or turn has the wrong sign, as its estimated scale says."""
+    return [
+        f"{robot.name}: its odometry reports the {what} with the wrong sign ({key} is {scale:.3f});"
+        f" negate the {cure} in its driver."
+        for robot in swarm.robots
+        for what, key, scale, cure in (
+            ("path", "distance_scale", robot.odometry.distance_scale, "distance driven"),
+            ("turn", "turn_scale", robot.odometry.turn_scale, "turn, or exchange left and right wheel,"),
+        )
+        if scale < 0.0
+    ]
+
+
 def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
     """A robot with its parameters."""
     value, sigma = state.parameter[index].tolist(), state.parameter_sigma(index).tolist()
@@ -55,9 +69,9 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
         odometry=replace(
             odometry,
             distance_scale=path * odometry.distance_scale,
-            distance_scale_sigma=sigma[DISTANCE_SCALE] / path,
+            distance_scale_sigma=_relative(sigma[DISTANCE_SCALE], path),
             turn_scale=turn * odometry.turn_scale,
-            turn_scale_sigma=sigma[TURN_SCALE] / turn,
+            turn_scale_sigma=_relative(sigma[TURN_SCALE], turn),
         ),
         camera=camera
         and replace(
@@ -68,9 +82,14 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
         sensor=replace(
             with_noise_inflation(sensor, float(state.integrity.noise_inflation[index])),
             distance_scale=seen * sensor.distance_scale,
-            distance_scale_sigma=sigma[CAMERA_SCALE] / seen,
+            distance_scale_sigma=_relative(sigma[CAMERA_SCALE], seen),
         ),
     )
+
+
+def _relative(sigma: float, scale: float) -> float:
+    """The sigma of a scale relative to it, at most 1, which a description may say."""
+    return min(1.0, sigma / abs(scale)) if scale else 1.0
 
 
 def _landmark(mark: Landmark, number: int, state: SwarmState) -> Landmark:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,11 +13,16 @@ from core_world import MOUNT, SENSOR, Plan, World, lasting_errors, simulate
 
 from swarm_loc_estimator.cli.replay import main
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.bags.writer import copy_beginning
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.bags.writer import BagWriter, copy_beginning
+from swarm_loc_estimator.common.messages.cdr import decode, encode
+from swarm_loc_estimator.common.messages.definitions import ODOMETRY
+from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.report.table import SELF_CALIBRATED
 from swarm_loc_estimator.sensors.camera import SightingConverter
-from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.swarm import Landmark, OdometryModel, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.self_calibration import learns
 from swarm_loc_estimator.timeline.settings import Settings
@@ -140,3 +146,50 @@ def test_the_replay_command_writes_what_it_learned_and_reports_it(
     assert any(robot.camera and robot.camera.yaw_sigma > 0.0 for robot in load_swarm(learned).robots)
     assert main([*exact, "--set", "max_fault_score=1e9"]) == 1
     assert "nothing to learn" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("what", "description", "key"),
+    [("path", "swarm.yaml", "distance_scale"), ("turn", "self_calibrating.yaml", "turn_scale")],
+)
+def test_odometry_with_a_swapped_sign_is_named_and_not_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str, description: str, key: str
+) -> None:
+    copy_beginning(BAG, tmp_path / "right", 20.0)
+    with BagReader(tmp_path / "right") as reader, BagWriter(tmp_path / "bag") as writer:
+        for topic in reader.topics:
+            writer.add_topic(topic.name, topic.type)
+        for name, _, log_ns, data in reader.messages():
+            writer.write(name, log_ns, swapped(data, what) if name == "epuck2/odom" else data)
+    learned = tmp_path / "learned.yaml"
+    command = [str(tmp_path / "bag"), "--swarm", str(BAG / description), "--out", str(tmp_path / "out")]
+    assert main([*command, "--learned", str(learned)]) == 1
+    named, unwritten = capsys.readouterr().err.strip().splitlines()
+    assert named.startswith(f"epuck2: its odometry reports the {what} with the wrong sign ({key} is -")
+    assert "negate the" in named
+    assert unwritten == f"{learned} was not written."
+    assert not learned.exists()
+    assert named in (tmp_path / "out" / "report.txt").read_text(encoding="utf-8")
+    found = replay(tmp_path / "bag", load_swarm(BAG / description)).self_calibrated
+    assert found is not None
+    assert all(0.0 < getattr(robot.odometry, f"{key}_sigma") <= 1.0 for robot in found.robots)
+
+
+def swapped(data: bytes, what: str) -> bytes:
+    """Odometry with the sign of path or turn negated, as that of a robot with exchanged wires."""
+    message: Any = decode(data, ODOMETRY)
+    position, orientation = message.pose.pose.position, message.pose.pose.orientation
+    twist = message.twist.twist
+    if what == "path":
+        position.x, position.y, twist.linear.x = -position.x, -position.y, -twist.linear.x
+    else:
+        position.y, orientation.z, twist.angular.z = -position.y, -orientation.z, -twist.angular.z
+    return encode(message, ODOMETRY)
+
+
+@pytest.mark.parametrize("scale", [-1.0, 0.05, 20.0])
+def test_the_writer_refuses_what_the_reader_refuses(tmp_path: Path, scale: float) -> None:
+    swarm = Swarm((Robot("a", odometry=OdometryModel(distance_scale=scale)),))
+    with pytest.raises(SwarmFileError, match=r"swarm.yaml: robots.a.odometry.distance_scale .* \[0.1, 10\]"):
+        save_swarm(swarm, tmp_path / "swarm.yaml")
+    assert not any(tmp_path.iterdir())
