@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with ProgressLine() as progress:
         recording = read_recording(options.bag, swarm, progress)
         done = calibrate(recording, swarm, chosen, progress)
-    save_swarm(done.swarm, options.out, f"Calibrated with {options.bag.name}.")
+    save_swarm(done.swarm, options.out, f"Calibrated with {options.bag.name}. {done.warning}".rstrip())
     print("\n".join([text_of(done), *recording.remarks, *_unused(recording)]))
     print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
     return 0

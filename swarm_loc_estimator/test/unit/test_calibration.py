@@ -13,7 +13,7 @@ from calibration_world import World, record, robot
 
 from swarm_loc_estimator.cli.calibrate import main
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
+from swarm_loc_estimator.common.bags.writer import BagWriter, copy_beginning, typestore
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.offline.calibration.fit import Options, calibrate, fit_models
 from swarm_loc_estimator.offline.calibration.motion import (
@@ -148,6 +148,27 @@ def test_a_plain_fit_changes_nothing_but_noise() -> None:
     noise = {**asdict(robot_before.odometry), **asdict(robot_before.sensor)}
     assert with_noise(done.swarm, {name: noise[name] for name in done.noise}) == swarm
     assert done.noise["range_sigma_per_m"] > 0.0
+
+
+def test_a_recording_that_is_too_short_to_fit_is_named() -> None:
+    recording, swarm = record(World((robot(1, HONEST),), 2, duration_s=60.0, turn_sigma=0.03))
+    warning = calibrate(recording, swarm, Options(evaluations=8), quiet).warning
+    assert warning.startswith("The recording is too short to fit, or the description was as good before")
+    fitted, described = (float(text) for text in re.findall(r"([\d.]+) mm", warning))
+    assert fitted > described
+    recording, swarm = record(World((robot(1, TRUE),), 2, duration_s=60.0, turn_sigma=0.03))
+    assert not calibrate(recording, swarm, Options(evaluations=8), quiet).warning
+
+
+def test_the_command_names_a_bag_that_is_cut_too_short(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy_beginning(BAGS / "eight_five_robots", tmp_path / "bag", 75.0)
+    out = tmp_path / "out.yaml"
+    command = [str(tmp_path / "bag"), "--swarm", str(BAGS / "eight_five_robots" / "swarm.yaml")]
+    assert main([*command, "--out", str(out), "--evaluations", "4"]) == 0
+    assert "The recording is too short to" in capsys.readouterr().out
+    assert "The recording is too short to" in out.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(("from_share", "to_share"), [(0.0, 0.7), (0.4, 1.0)])

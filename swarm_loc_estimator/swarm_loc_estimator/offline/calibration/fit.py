@@ -118,6 +118,7 @@ class Calibration:
         noise: Fitted noise parameters by name.
         before: Score of the estimator on the recording, started at the true poses.
         after: The same, calibrated.
+        warning: One sentence if the models do not help in a part that they were not fitted to; else "".
     """
 
     swarm: Swarm
@@ -125,6 +126,7 @@ class Calibration:
     noise: dict[str, float] = field(default_factory=dict)
     before: Score | None = None
     after: Score | None = None
+    warning: str = ""
 
 
 def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Progress) -> Calibration:
@@ -161,7 +163,27 @@ def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Pr
     progress(0.96, "before and after")
     calibrated = with_noise(whole.swarm, noise)
     scores = [score([rerun(recording, started_at_truth(s, recording), _TICK_S)]) for s in (swarm, calibrated)]
-    return Calibration(calibrated, whole, noise, *scores)
+    warning = "" if options.plain else _warning(folds, swarm, noise)
+    return Calibration(calibrated, whole, noise, scores[0], scores[1], warning)
+
+
+def _warning(folds: Sequence[Fold], swarm: Swarm, noise: dict[str, float]) -> str:
+    """A sentence if a half is not better with the models of the other half than with the description."""
+    if not all(fold.is_held_out for fold in folds):
+        return "The recording is too short to check the fit: half of it is too little to fit anything."
+    for fold in folds:
+        described = started_at_truth(swarm, fold.recording)
+        fitted_m, *described_m = (
+            score([rerun(fold.recording, one, _TICK_S)]).position_rmse
+            for one in (with_noise(fold.swarm, noise), described, with_noise(described, noise))
+        )
+        if fitted_m >= min(described_m):
+            return (
+                "The recording is too short to fit, or the description was as good before: fitted to one"
+                f" half, the position RMSE of the other half is {1e3 * fitted_m:.1f} mm, as described"
+                f" {1e3 * min(described_m):.1f} mm."
+            )
+    return ""
 
 
 def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: Progress) -> FittedModels:
@@ -254,7 +276,7 @@ def _folds(recording: Recording, swarm: Swarm, whole: FittedModels, options: Opt
             models = fit_models(fitted, swarm, options, unwatched)
         except CalibrationError:
             models = whole
-        folds.append(Fold(run, started_at_truth(models.swarm, run)))
+        folds.append(Fold(run, started_at_truth(models.swarm, run), models is not whole))
     return folds
 
 

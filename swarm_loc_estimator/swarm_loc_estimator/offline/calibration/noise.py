@@ -50,10 +50,12 @@ class Fold:
     Attributes:
         recording: Input of the estimator.
         swarm: With the true starts.
+        is_held_out: Whether the swarm was calibrated without this part.
     """
 
     recording: Recording
     swarm: Swarm
+    is_held_out: bool = True
 
 
 @dataclass(frozen=True)

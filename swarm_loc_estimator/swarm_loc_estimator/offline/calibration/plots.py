@@ -44,7 +44,7 @@ def text_of(done: Calibration) -> str:
     if done.before is not None and done.after is not None:
         lines += _score_lines(done.before, done.after)
     lines += [f"{name} = {value:g}" for name, value in done.noise.items()]
-    return "\n".join([*lines, *done.models.remarks])
+    return "\n".join([*lines, *done.models.remarks, *([done.warning] if done.warning else [])])
 
 
 def draw(done: Calibration, path: Path) -> Path:
