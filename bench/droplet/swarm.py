@@ -27,6 +27,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
+from bench.shared.bags import read_truth
 from bench.shared.common import OUT, Cell, new_plot, save_plot, table, write_figures
 from swarm_loc_drivers.sim.scenarios.bags import write_droplet_bag
 from swarm_loc_drivers.sim.scenarios.droplets import (
@@ -41,7 +42,6 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue
 from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_infrared
 from swarm_loc_estimator.offline.calibration.recording import read_recording
-from swarm_loc_estimator.offline.ground_truth import read_truth
 from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveGraph, read_poses
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.result import ReplayResult

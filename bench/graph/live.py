@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.shared.bags import copy_beginning
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
-from swarm_loc_estimator.common.bags.writer import copy_beginning
 from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.offline.datasets.mrclam import read_dataset
 from swarm_loc_estimator.offline.datasets.mrclam_bag import Delay, convert
@@ -50,6 +50,7 @@ def run_mrclam(folder: Path, work: Path, duration_s: float, rate: float) -> Outc
 def figures_of(outcome: Outcome) -> dict[str, float]:
     """All figures of one bag."""
     live, compared = outcome
+    settled_m = compared.distance_m[compared.settled]
     figures = {
         "lost_messages": float(live.lost),
         "estimator_core": live.estimator_core,
@@ -58,7 +59,7 @@ def figures_of(outcome: Outcome) -> dict[str, float]:
         "replay_position_rmse_m": compared.replayed.overall.position_rmse,
         "difference_rms_m": compared.rms_m,
         "equal_share": compared.equal_share,
-        "settled_difference_max_m": compared.settled_max_m,
+        "settled_difference_max_m": float(np.nanmax(settled_m)) if settled_m.size else float("nan"),
         "settled_stamps": float(compared.settled.sum()),
     }
     return {name: value for name, value in figures.items() if np.isfinite(value)}

@@ -20,9 +20,10 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from bench.mrclam.sets import import_set
+from bench.shared.bags import copy_beginning
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.bags.writer import copy_beginning, typestore
+from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY
 from swarm_loc_estimator.common.messages.poses import decode_odometry, yaw_of

@@ -129,7 +129,7 @@ class _Covered:
 
     def __init__(self, plan: FloorPlan, mapper: CooperativeMapper | ParticleMapper) -> None:
         self._mapper = mapper
-        self._points = plan.wall_points(0.04)
+        self._points = wall_points(plan, 0.04)
         self._next_s = 0.0
         self.since_s = math.nan
 
@@ -142,6 +142,16 @@ class _Covered:
             self.since_s = time_s
 
 
+def wall_points(plan: FloorPlan, spacing: float) -> FloatArray:
+    """Points (P, 2) [m] in the middle of equal pieces of the walls, at most `spacing` long."""
+    pieces = []
+    for x0, y0, x1, y1 in plan.walls:
+        count = max(1, int(np.ceil(np.hypot(x1 - x0, y1 - y0) / spacing)))
+        share = ((np.arange(count) + 0.5) / count)[:, None]
+        pieces.append(np.array([x0, y0]) + share * np.array([x1 - x0, y1 - y0]))
+    return np.concatenate(pieces)
+
+
 def coverage(cells: FloatArray, points: FloatArray) -> float:
     """Share of points (p, 2) of walls with a cell (n, 2) nearby."""
     return float((cKDTree(cells).query(points)[0] < COVERED_M).mean()) if len(cells) else 0.0
@@ -149,7 +159,7 @@ def coverage(cells: FloatArray, points: FloatArray) -> float:
 
 def wall_distance_cm(cells: FloatArray, plan: FloorPlan) -> float:
     """Mean distance of cells (n, 2) from the nearest wall [cm]."""
-    return 100.0 * float(cKDTree(plan.wall_points(0.01)).query(cells)[0].mean()) if len(cells) else math.inf
+    return 100.0 * float(cKDTree(wall_points(plan, 0.01)).query(cells)[0].mean()) if len(cells) else math.inf
 
 
 def rigid_fit(points: FloatArray, to: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -211,7 +221,7 @@ def _score(
         aligned_cm=100.0 * float(np.sqrt(np.square(aligned).sum(axis=1).mean())),
         wall_cm=wall_distance_cm(cells, plan),
         wall_aligned_cm=wall_distance_cm(cells @ rotation.T + shift, plan),
-        coverage=coverage(cells, plan.wall_points(0.04)),
+        coverage=coverage(cells, wall_points(plan, 0.04)),
         coverage_90_s=coverage_90_s,
         cpu_s_per_s=exploration.cpu_s / (60.0 * settings.minutes),
         bumps=sum(one.bumps for one in exploration.robots.values()),

@@ -11,7 +11,7 @@ from bench.pushbot.calibration import calibrate
 from bench.pushbot.driver import robots_on_two_cores
 from bench.pushbot.event_flow import RATE, Measured
 from bench.pushbot.mapping import MappingEffort, figures_of, planned
-from bench.pushbot.runs import RunResult, RunSettings, coverage, rigid_fit, run, wall_distance_cm
+from bench.pushbot.runs import RunResult, RunSettings, coverage, rigid_fit, run, wall_distance_cm, wall_points
 from bench.pushbot.tracker import BAR_NOISE, TRACKERS, packet, scene, score
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_estimator.common.messages.event_encoding import Events
@@ -28,7 +28,7 @@ def test_a_rigid_fit_undoes_a_motion() -> None:
 
 def test_walls_are_covered_by_cells_on_them() -> None:
     plan = floor_plan("ring")
-    points = plan.wall_points(0.04)
+    points = wall_points(plan, 0.04)
     assert coverage(points, points) == 1.0
     assert coverage(np.zeros((0, 2)), points) == 0.0
     assert coverage(points + 1.0, points) < 0.3

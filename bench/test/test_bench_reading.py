@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from bench.peers import reading
-from swarm_loc_estimator.common.bags.writer import copy_beginning
+from bench.shared.bags import copy_beginning
 from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY
 
 

@@ -19,13 +19,13 @@ from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from test_world_node import free_ports
 
+from bench.shared.parameter_table import markdown_table
 from swarm_loc_drivers.pushbot.pushbot_driver_node import PushbotDriverNode
 from swarm_loc_drivers.pushbot.session import NO_STOP
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import FOCAL_PX
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldParameters
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
-from swarm_loc_estimator.common.parameters import markdown_table
 from swarm_loc_msgs.msg import EventPacket, LaserDistance, LightBearingArray, SwarmPose, SwarmPoses
 from swarm_loc_vision.laser.calibrate_laser_node import CalibrateLaserParameters
 from swarm_loc_vision.laser.calibration import LaserCalibration, load_laser, save_laser

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from bench.shared.parameter_table import markdown_table
 from swarm_loc_drivers.droplet.exchange import PollingSettings
 from swarm_loc_drivers.droplet.hardware import AUDIO_DROPLET
 from swarm_loc_drivers.droplet.parameters import (
@@ -16,7 +17,7 @@ from swarm_loc_drivers.droplet.parameters import (
 )
 from swarm_loc_drivers.droplet.tdma import TdmaSettings
 from swarm_loc_drivers.sim.droplet.world import DropletWorldParameters
-from swarm_loc_estimator.common.parameters import ParameterError, markdown_table
+from swarm_loc_estimator.common.parameters import ParameterError
 
 DOC = Path(__file__).parents[2] / "doc"
 PLAIN = DropletParameters(address="/dev/ttyUSB0")

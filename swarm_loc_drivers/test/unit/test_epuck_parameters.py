@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from bench.shared.parameter_table import markdown_table
 from swarm_loc_drivers.common.calibration_file import CalibrationFileError, load_calibration
 from swarm_loc_drivers.common.link import Address, parse_address
 from swarm_loc_drivers.epuck.parameters import EpuckParameters, camera_calibration
-from swarm_loc_estimator.common.parameters import ParameterError, markdown_table
+from swarm_loc_estimator.common.parameters import ParameterError
 
 PAGE = Path(__file__).parents[2] / "doc" / "epuck_driver_node.md"
 CALIBRATION = """

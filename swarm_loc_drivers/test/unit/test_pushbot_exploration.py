@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bench.pushbot.runs import wall_points
 from swarm_loc_drivers.sim.pushbot.exploration import Exploration, KinematicPushBot, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import (
     FLOOR_PLANS,
@@ -68,7 +69,7 @@ def test_robots_start_inside_closed_halls(name: str) -> None:
             math.isfinite(ray_distance(plan.walls, nobody, 0.0, x, y, a)) for a in np.linspace(0, 6, 50)
         )
     lengths = np.hypot(*(plan.walls[:, 2:] - plan.walls[:, :2]).T)
-    assert len(plan.wall_points(0.1)) >= lengths.sum() / 0.1
+    assert len(wall_points(plan, 0.1)) >= lengths.sum() / 0.1
 
 
 def test_an_unknown_hall_is_told() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bench.shared.parameter_table import markdown_table
 from swarm_loc_drivers.pushbot.parameters import ExplorationParameters, PushbotParameters
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.pushbot.world import (
@@ -17,7 +18,7 @@ from swarm_loc_drivers.sim.pushbot.world import (
 )
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
 from swarm_loc_drivers.sim.worlds import WorldError
-from swarm_loc_estimator.common.parameters import ParameterError, markdown_table
+from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_vision.laser.calibration import load_laser
 
 DOC = Path(__file__).parents[2] / "doc"

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.shared.parameter_table import markdown_table
 from swarm_loc_drivers.sim.epuck.world import EpuckWorldParameters, make_world
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, EightSteering, describe
 from swarm_loc_drivers.sim.worlds import WORLDS
-from swarm_loc_estimator.common.parameters import ParameterError, markdown_table, parameter_specs
+from swarm_loc_estimator.common.parameters import ParameterError, parameter_specs
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 START = np.array([[0.1, 0.2, 0.3], [0.5, -0.2, 1.0]])

@@ -67,14 +67,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         write_poses(result, options.out / "poses.csv")
         if options.mcap:
             write_mcap(result, options.mcap)
-    if options.learned and not result.self_calibrated:
-        print(_NOTHING_TO_LEARN, file=sys.stderr)
-        return 1
-    swapped = swapped_signs(result.self_calibrated) if options.learned and result.self_calibrated else []
-    if swapped:
-        print("\n".join([*swapped, f"{options.learned} was not written."]), file=sys.stderr)
-        return 1
-    if options.learned and result.self_calibrated:
+    if options.learned:
+        if not result.self_calibrated:
+            print(_NOTHING_TO_LEARN, file=sys.stderr)
+            return 1
+        if swapped := swapped_signs(result.self_calibrated):
+            print("\n".join([*swapped, f"{options.learned} was not written."]), file=sys.stderr)
+            return 1
         save_swarm(result.self_calibrated, options.learned, f"Learned from {result.title}.")
     print(files.text.read_text(encoding="utf-8"))
     print(f"Report:  {files.page}\nPicture: {files.overview}")

@@ -44,11 +44,6 @@ class ConstraintLists:
         self._bearings.append((begin, end, np.array([turn, sigma])))
 
     @property
-    def tie_count(self) -> int:
-        """How many relative poses there are."""
-        return len(self._ties)
-
-    @property
     def bearing_count(self) -> int:
         """How many bearings there are."""
         return len(self._bearings)
@@ -57,10 +52,6 @@ class ConstraintLists:
         """Remove all constraints on a stop."""
         for rows in (self._priors, self._departures, self._ties, self._bearings):
             rows[:] = [one for one in rows if stop not in one[:2]]
-
-    def remove_departure_to(self, stop: int) -> None:
-        """Remove the odometry to a stop, as when the robot was carried there."""
-        self._departures[:] = [one for one in self._departures if one[1] != stop]
 
     def linearised(self, states: FloatArray) -> Iterator[model.Linearised]:
         """All of them at states (k, 4)."""

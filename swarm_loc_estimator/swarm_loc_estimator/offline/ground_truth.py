@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
@@ -16,8 +16,9 @@ from swarm_loc_estimator.common.messages.definitions import (
     POSE_WITH_COVARIANCE,
     TRANSFORM_STAMPED,
 )
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.messages.poses import (
+    FixMessage,
     OdometryMessage,
     PoseMessage,
     decode_fix,
@@ -31,11 +32,6 @@ from swarm_loc_estimator.offline.spool import Spool
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 
-def _decode_pose_with_covariance(data: bytes) -> PoseMessage:
-    message = decode_fix(data)
-    return PoseMessage(message.stamp_ns, message.frame_id, message.pose)
-
-
 def _decode_transform(data: bytes) -> PoseMessage:
     message = decode(data, TRANSFORM_STAMPED)
     place, turn = message.transform.translation, message.transform.rotation
@@ -43,26 +39,13 @@ def _decode_transform(data: bytes) -> PoseMessage:
     return PoseMessage(nanoseconds(message.header.stamp), message.header.frame_id, pose)
 
 
-_READ: Mapping[str, tuple[Callable[[bytes], OdometryMessage | PoseMessage], int]] = {
+_READ: Mapping[str, tuple[Callable[[bytes], OdometryMessage | PoseMessage | FixMessage], int]] = {
     POSE_STAMPED: (decode_pose_stamped, 1),
-    POSE_WITH_COVARIANCE: (_decode_pose_with_covariance, 1),
+    POSE_WITH_COVARIANCE: (decode_fix, 1),
     ODOMETRY: (decode_odometry, 2),
     TRANSFORM_STAMPED: (_decode_transform, 2),
 }
 """Type of a message -> how to read it, and how many frame names lie before its pose."""
-
-
-def read_truth(swarm: Swarm, messages: Mapping[str, Sequence[bytes]]) -> dict[str, Trajectory]:
-    """Decode serialized ground truth.
-
-    Args:
-        swarm: The robots.
-        messages: Robot name -> its serialized PoseStamped.
-    """
-    reader = TruthReader(swarm, [BagTopic(f"{name}/ground_truth", POSE_STAMPED) for name in messages])
-    topics = ((swarm.index_of[name], data) for name, all_of in messages.items() for data in all_of)
-    reader.add(MessageBatch.of([SerializedMessage(topic, data, 0) for topic, data in topics]))
-    return reader.tracks()
 
 
 class TruthReader:
@@ -100,12 +83,11 @@ class TruthReader:
 
     def remarks(self) -> tuple[str, ...]:
         """Sentences for the user."""
-        allowed = ", ".join(_READ)
         return (
             *(
-                f"{topic} has the type {message_type}, which is no ground truth; allowed are {allowed}."
-                for topic, message_type in zip(self.topics, self._types, strict=True)
-                if message_type and message_type not in _READ
+                f"{topic} has the type {found}, which is no ground truth; allowed are {', '.join(_READ)}."
+                for topic, found in zip(self.topics, self._types, strict=True)
+                if found and found not in _READ
             ),
             *(
                 f"{count} messages on {self.topics[index]} are malformed: no {self._types[index]} of ROS 2."

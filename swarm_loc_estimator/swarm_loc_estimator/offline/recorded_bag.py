@@ -16,7 +16,7 @@ from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
 from swarm_loc_estimator.offline.ground_truth import TruthReader
 from swarm_loc_estimator.offline.result import RecordedMap
-from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
+from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import Batch, kinds
 from swarm_loc_estimator.swarm.swarm import Swarm
 
@@ -77,15 +77,9 @@ def read_bag(bag: Path, swarm: Swarm, take: Callable[[Batch], None], progress: P
         unusable = _unusable(reader.topics, ingest, swarm)
         found = (*_strangers(reader.topics, ingest), *_missing(ingest), *unusable)
         remarks = (*reader.losses, *found, *truth.remarks(), *maps.remarks())
-        return BagSummary(
-            range_ns,
-            truth.tracks(),
-            ingest.received(),
-            remarks,
-            unusable if not any(map(_usable, ingest.statistics)) else (),
-            maps.maps(),
-            maps.goals(),
-        )
+        unusable = () if any(one.received > one.malformed for one in ingest.statistics) else unusable
+        tracks, shown = truth.tracks(), (maps.maps(), maps.goals())
+        return BagSummary(range_ns, tracks, ingest.received(), remarks, unusable, *shown)
 
 
 def _from(batch: MessageBatch, first: int) -> MessageBatch:
@@ -113,57 +107,47 @@ def _strangers(topics: Sequence[BagTopic], ingest: Ingest) -> list[str]:
     return [f"No robot of the swarm description has the topics {', '.join(strange)}."] if strange else []
 
 
-def _usable(statistics: InputStatistics) -> int:
-    return statistics.received - statistics.malformed
-
-
 def _unusable(topics: Sequence[BagTopic], ingest: Ingest, swarm: Swarm) -> tuple[str, ...]:
     """For each expected kind of input without a usable message, one sentence about what the bag holds."""
     pairs = [*zip(ingest.topics, ingest.statistics, strict=True)]
-    used = {topic.kind.rows for topic, statistics in pairs if _usable(statistics)}
+    used = {topic.kind.rows for topic, statistics in pairs if statistics.received > statistics.malformed}
     sentences = []
     for kind in kinds().values():
         if not kind.of_each or kind.rows in used or not any(map(kind.expected_of, swarm.robots)):
             continue
-        names = {topic.name for topic in ingest.topics if topic.kind.name == kind.name}
-        malformed = sum(statistics.malformed for topic, statistics in pairs if topic.kind.name == kind.name)
+        own = {
+            topic.name: statistics.malformed for topic, statistics in pairs if topic.kind.rows == kind.rows
+        }
         others = [
             topic
             for topic in topics
-            if _plain(topic.type) == _plain(kind.message_type)
+            if topic.type.replace("/msg/", "/")
+            == kind.message_type.replace("/msg/", "/")  # ROS 1 has no /msg/
             and topic.name not in ingest.handle_of
             and not topic.name.endswith("/ground_truth")
         ]
-        expected = f"Expected {kind.message_type} on {kind.pattern}; "
-        if malformed:
-            own = _listed([topic for topic in topics if topic.name in names])
-            sentences.append(
-                f"{expected}none of the {malformed} messages on {own}"
-                " is one as ROS 2 serializes it: convert a bag of ROS 1 or JSON first, as by rosbags-convert."
+        if malformed := sum(own.values()):
+            found = f"none of the {malformed} messages on {_listed([t for t in topics if t.name in own])}"
+            found += (
+                " is one as ROS 2 serializes it: convert a bag of ROS 1 or JSON first, as by rosbags-convert"
             )
         elif others:
-            sentences.append(
-                f"{expected}the bag has this type on {_listed(others)}: rename the robots of the swarm"
-                " description, or play the bag with --remap and record it again."
-            )
+            found = f"the bag has this type on {_listed(others)}: rename the robots of the swarm description,"
+            found += " or play the bag with --remap and record it again"
         elif not used:
-            sentences.append(f"{expected}the bag has no topic of this type.")
+            found = "the bag has no topic of this type"
+        else:
+            continue
+        sentences.append(f"Expected {kind.message_type} on {kind.pattern}; {found}.")
     return tuple(sentences)
-
-
-def _plain(message_type: str) -> str:
-    """A type as ROS 1 writes it, too: nav_msgs/Odometry."""
-    return message_type.replace("/msg/", "/")
 
 
 def _listed(topics: Sequence[BagTopic]) -> str:
     """Names and types of a few topics."""
-    shown = ", ".join(f"{topic.name} ({topic.type or 'no type'})" for topic in topics[:_LISTED])
-    return shown + (f" and {len(topics) - _LISTED} others" if len(topics) > _LISTED else "")
+    shown = ", ".join(f"{topic.name} ({topic.type or 'no type'})" for topic in topics[:6])
+    return shown + (f" and {len(topics) - 6} others" if len(topics) > 6 else "")
 
 
-_LISTED = 6
-"""Topics named in one sentence."""
 MAX_MAP_BYTES = 48_000_000
 """Beyond this, maps are thinned out evenly over time."""
 MAX_GOALS = 20_000

@@ -206,7 +206,6 @@ class Runner:
         range_ns: tuple[int, int],
         truth: Mapping[str, Trajectory],
         received: Mapping[str, int],
-        remarks: tuple[str, ...] = (),
     ) -> ReplayResult:
         """The poses of all ticks beside ground truth; may be called once.
 
@@ -215,7 +214,6 @@ class Runner:
             range_ns: First and last arrival.
             truth: Robot name -> ground truth.
             received: Messages by topic.
-            remarks: Sentences for the user.
         """
         self._flush()
         estimator, robots = self._estimator, len(self._estimator.swarm.robots)
@@ -235,7 +233,6 @@ class Runner:
                 **estimator.counters,
                 **estimator.drops,
             },
-            remarks=remarks,
             data_s=(range_ns[1] - range_ns[0]) * 1e-9,
             wall_s=time.perf_counter() - self._began_s,
         )

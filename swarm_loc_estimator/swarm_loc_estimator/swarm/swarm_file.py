@@ -141,15 +141,7 @@ def load_swarm(path: Path | str) -> Swarm:
 
 
 def parse_swarm(tree: Tree, path: Path) -> Swarm:
-    """Check the content of a swarm description.
-
-    Args:
-        tree: The content.
-        path: The file that it stands in, or shall stand in; paths inside begin at its folder.
-
-    Raises:
-        SwarmFileError: One sentence with file, dotted key, value and what is allowed.
-    """
+    """Check the content of a swarm description as `load_swarm`; its paths begin at the folder of `path`."""
     return _Loader(path, SwarmFileError).swarm(tree)
 
 

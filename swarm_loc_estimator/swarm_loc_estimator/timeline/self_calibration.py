@@ -49,13 +49,10 @@ def swapped_signs(swarm: Swarm) -> list[str]:
     """One sentence for each robot whose path or turn has the wrong sign, as its estimated scale says."""
     return [
         f"{robot.name}: its odometry reports the {what} with the wrong sign ({key} is {scale:.3f});"
-        f" negate the {cure} in its driver."
+        f" negate the {what} in its driver."
         for robot in swarm.robots
-        for what, key, scale, cure in (
-            ("path", "distance_scale", robot.odometry.distance_scale, "distance driven"),
-            ("turn", "turn_scale", robot.odometry.turn_scale, "turn, or exchange left and right wheel,"),
-        )
-        if scale < 0.0
+        for what, key in (("path", "distance_scale"), ("turn", "turn_scale"))
+        if (scale := getattr(robot.odometry, key)) < 0.0
     ]
 
 
@@ -69,9 +66,9 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
         odometry=replace(
             odometry,
             distance_scale=path * odometry.distance_scale,
-            distance_scale_sigma=_relative(sigma[DISTANCE_SCALE], path),
+            distance_scale_sigma=min(1.0, sigma[DISTANCE_SCALE] / abs(path)),
             turn_scale=turn * odometry.turn_scale,
-            turn_scale_sigma=_relative(sigma[TURN_SCALE], turn),
+            turn_scale_sigma=min(1.0, sigma[TURN_SCALE] / abs(turn)),
         ),
         camera=camera
         and replace(
@@ -82,14 +79,9 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
         sensor=replace(
             with_noise_inflation(sensor, float(state.integrity.noise_inflation[index])),
             distance_scale=seen * sensor.distance_scale,
-            distance_scale_sigma=_relative(sigma[CAMERA_SCALE], seen),
+            distance_scale_sigma=min(1.0, sigma[CAMERA_SCALE] / abs(seen)),
         ),
     )
-
-
-def _relative(sigma: float, scale: float) -> float:
-    """The sigma of a scale relative to it, at most 1, which a description may say."""
-    return min(1.0, sigma / abs(scale)) if scale else 1.0
 
 
 def _landmark(mark: Landmark, number: int, state: SwarmState) -> Landmark:

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from machines import PORT, Machines, Radio
 
-from swarm_loc_estimator.common.bags.writer import copy_beginning
+from bench.shared.bags import copy_beginning
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue, node_command
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_five_robots"

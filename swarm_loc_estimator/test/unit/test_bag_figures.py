@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.common.bags.writer import copy_beginning
+from bench.shared.bags import copy_beginning
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm_file import load_swarm

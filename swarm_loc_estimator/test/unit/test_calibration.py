@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from calibration_world import World, record, robot
 
+from bench.shared.bags import copy_beginning
 from swarm_loc_estimator.cli.calibrate import main
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.bags.writer import BagWriter, copy_beginning, typestore
+from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.offline.calibration.fit import Options, calibrate, fit_models
 from swarm_loc_estimator.offline.calibration.motion import (

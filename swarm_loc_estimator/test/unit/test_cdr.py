@@ -18,13 +18,15 @@ from swarm_loc_estimator.common.messages.cdr import encode as our_encode
 from swarm_loc_estimator.common.messages.definitions import (
     DETECTION,
     DETECTIONS,
+    MESSAGE_PACKAGE,
     NUMBERS,
     ODOMETRY,
     POSE_STAMPED,
     SEQUENCE,
+    STANDARD,
     DefinitionsNotFoundError,
     fields_of,
-    known_types,
+    message_folder,
 )
 from swarm_loc_estimator.common.messages.detections import decode_detections, encode_detections
 from swarm_loc_estimator.common.messages.poses import (
@@ -57,7 +59,11 @@ def theirs(field: Any) -> tuple[str, int, bool]:
     return theirs(element)[0], SEQUENCE if kind.name == "SEQUENCE" else size, True
 
 
-@pytest.mark.parametrize("message_type", known_types())
+KNOWN = [f"{MESSAGE_PACKAGE}/msg/{path.stem}" for path in sorted(message_folder().glob("*.msg"))]
+KNOWN += [line.partition(": ")[0].replace("/", "/msg/") for line in STANDARD.splitlines() if ": " in line]
+
+
+@pytest.mark.parametrize("message_type", KNOWN)
 def test_definitions_are_those_of_ros(message_type: str) -> None:
     _, fields = typestore().fielddefs[message_type]
     assert [tuple(field) for field in fields_of(message_type)] == [(n, *theirs(one)) for n, one in fields]
@@ -81,7 +87,7 @@ def some_message(message_type: str, random: np.random.Generator) -> dict[str, An
     }
 
 
-@pytest.mark.parametrize("message_type", known_types())
+@pytest.mark.parametrize("message_type", KNOWN)
 @given(seed=st.integers(0, 2**32), little_endian=st.booleans())
 def test_every_type_is_written_and_read_as_by_the_type_store(
     message_type: str, seed: int, little_endian: bool

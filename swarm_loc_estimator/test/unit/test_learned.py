@@ -11,10 +11,11 @@ from core_messages import POSE, T0, detection
 from core_run import on_time, play, ticks
 from core_world import MOUNT, SENSOR, Plan, World, lasting_errors, simulate
 
+from bench.shared.bags import copy_beginning
 from swarm_loc_estimator.cli.replay import main
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.bags.writer import BagWriter, copy_beginning
+from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import decode, encode
 from swarm_loc_estimator.common.messages.definitions import ODOMETRY
 from swarm_loc_estimator.offline.replay import replay

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from bench.shared.parameter_table import markdown_table
 from swarm_loc_estimator.common.command_line import parameters_of
 from swarm_loc_estimator.common.parameters import (
     ParameterError,
     ParameterSpec,
     choice,
     from_values,
-    markdown_table,
     parameter_specs,
 )
 from swarm_loc_estimator.nodes.parameters import (

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 from compiled_code import compiled_since, printed_by_process, signatures
 
+from bench.shared.bags import encode_shared_detections, encode_shared_numbers
 from swarm_loc_estimator.common.messages.detections import (
     DETECTION_DTYPE,
     SharedHead,
-    encode_shared_detections,
-    encode_shared_numbers,
     swarm_key,
 )
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.shared.bags import copy_beginning
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.bags.writer import BagWriter, copy_beginning
+from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bench.shared.bags import encode_shared_detections, encode_shared_numbers
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.cdr import CdrError
@@ -20,8 +21,6 @@ from swarm_loc_estimator.common.messages.detections import (
     decode_shared_detections,
     decode_shared_numbers,
     encode_detections,
-    encode_shared_detections,
-    encode_shared_numbers,
     swarm_key,
 )
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage

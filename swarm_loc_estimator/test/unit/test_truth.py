@@ -11,12 +11,12 @@ import pytest
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
+from bench.shared.bags import copy_beginning, read_truth
 from swarm_loc_estimator.cli.replay import main
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.bags.writer import BagWriter, copy_beginning
+from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.poses import encode_pose_stamped
 from swarm_loc_estimator.offline.calibration.recording import read_recording
-from swarm_loc_estimator.offline.ground_truth import read_truth
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm

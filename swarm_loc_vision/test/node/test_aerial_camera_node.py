@@ -14,8 +14,8 @@ from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from bench.aerial.pictures import DIAMETER, Look, control_pixels, draw_picture
+from bench.shared.parameter_table import markdown_table
 from swarm_loc_estimator.common import node
-from swarm_loc_estimator.common.parameters import markdown_table
 from swarm_loc_msgs.msg import AnonymousDetectionArray
 from swarm_loc_vision.aerial.aerial_camera_node import AerialCameraNode
 from swarm_loc_vision.aerial.control_points import ControlPoints

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.shared.bags import copy_beginning
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.bags.writer import BagWriter, copy_beginning
+from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.detections import decode_detections
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.offline.replay import replay

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.common.parameters import ParameterError, markdown_table
+from bench.shared.parameter_table import markdown_table
+from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_vision.events.parameters import (
     EventTrackerParameters,
     laser_calibration,

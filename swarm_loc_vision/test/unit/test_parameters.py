@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.shared.parameter_table import markdown_table
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
-from swarm_loc_estimator.common.parameters import markdown_table
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_vision.common.camera import Camera

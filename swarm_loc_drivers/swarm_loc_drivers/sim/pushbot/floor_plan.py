@@ -37,15 +37,6 @@ class FloorPlan:
     walls: FloatArray
     starts: FloatArray
 
-    def wall_points(self, spacing: float) -> FloatArray:
-        """Points (P, 2) [m] in the middle of equal pieces of the walls, at most `spacing` long."""
-        pieces = []
-        for x0, y0, x1, y1 in self.walls:
-            count = max(1, int(np.ceil(np.hypot(x1 - x0, y1 - y0) / spacing)))
-            share = ((np.arange(count) + 0.5) / count)[:, None]
-            pieces.append(np.array([x0, y0]) + share * np.array([x1 - x0, y1 - y0]))
-        return np.concatenate(pieces)
-
 
 def outline(free: Sequence[Rectangle], solid: Sequence[Rectangle]) -> FloatArray:
     """The walls (S, 4) around free rectangles without the solid ones."""

@@ -27,7 +27,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from typing_extensions import Self
 
 from swarm_loc_estimator.common.bags.bag_file import BagError
-from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.messages.definitions import MESSAGE_PACKAGE, message_folder
 
 if TYPE_CHECKING:
@@ -175,30 +174,3 @@ class BagWriter:
         else:
             self._writer.abort()
             shutil.rmtree(self._path, ignore_errors=True)
-
-
-def copy_beginning(bag: Path, folder: Path, duration_s: float) -> int:
-    """Copy the first seconds of a bag to a new one.
-
-    Args:
-        bag: rosbag2 folder, .mcap or .db3 file, which a crash may have cut off.
-        folder: The new bag, created; must not exist.
-        duration_s: How much to copy, by log time [s].
-
-    Returns:
-        Number of messages.
-
-    Raises:
-        BagError: The bag cannot be read, or the new one not be created.
-    """
-    count = 0
-    with BagReader(bag) as reader, BagWriter(folder) as writer:
-        end_ns = reader.time_range_ns[0] + round(duration_s * 1e9)
-        for topic in reader.topics:
-            writer.add_topic(topic.name, topic.type)
-        for name, _, log_ns, data in reader.messages():
-            if log_ns > end_ns:
-                break
-            writer.write(name, log_ns, bytes(data))
-            count += 1
-    return count

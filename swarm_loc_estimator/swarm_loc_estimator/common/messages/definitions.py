@@ -38,7 +38,7 @@ SWARM_SIGHTINGS = f"{MESSAGE_PACKAGE}/msg/SwarmSightings"
 LASER = f"{MESSAGE_PACKAGE}/msg/LaserDistance"
 LIGHTS = f"{MESSAGE_PACKAGE}/msg/LightBearingArray"
 
-_STANDARD = """
+STANDARD = """
 builtin_interfaces/Time: int32 sec, uint32 nanosec
 builtin_interfaces/Duration: int32 sec, uint32 nanosec
 std_msgs/Header: builtin_interfaces/Time stamp, string frame_id
@@ -142,17 +142,6 @@ def message_folder() -> Path:
     )
 
 
-def known_types() -> list[str]:
-    """All types that `fields_of` knows.
-
-    Raises:
-        DefinitionsNotFoundError: This workspace's own are not there.
-    """
-    own = [f"{MESSAGE_PACKAGE}/msg/{path.stem}" for path in sorted(message_folder().glob("*.msg"))]
-    titles = [line.partition(": ")[0].split("/") for line in _STANDARD.splitlines() if ": " in line]
-    return own + [f"{package}/msg/{name}" for package, name in titles]
-
-
 @lru_cache(maxsize=256)
 def fields_of(message_type: str) -> tuple[Field, ...]:
     """The fields of a type such as nav_msgs/msg/Odometry.
@@ -165,7 +154,7 @@ def fields_of(message_type: str) -> tuple[Field, ...]:
         path = message_folder() / f"{name}.msg"
         if path.is_file():
             return parse(path.read_text(encoding="utf-8"), package)
-    for line in _STANDARD.splitlines():
+    for line in STANDARD.splitlines():
         title, _, fields = line.partition(": ")
         if title == f"{package}/{name}":
             return parse(fields.replace(",", "\n"), package)

@@ -19,7 +19,6 @@ from swarm_loc_estimator.common.messages.cdr import (
     nanoseconds,
     renamed,
     row_dtype,
-    stamp_rows,
 )
 from swarm_loc_estimator.common.messages.definitions import (
     ANONYMOUS_DETECTION,
@@ -259,19 +258,3 @@ def _shared(message: Any, *columns: NDArray[Any]) -> SharedMessage:
     robot = message.robot.astype(np.int64)
     stamp_ns, frame_id = nanoseconds(message.header.stamp), message.header.frame_id
     return SharedMessage(stamp_ns, frame_id, message.swarm, robot, reading_ns, columns)
-
-
-def encode_shared_numbers(head: SharedHead, *columns: FloatArray) -> bytes:
-    """Serialize a SwarmOdometry from poses (n, 3), or SwarmFixes from these and covariances (n, 9)."""
-    message = _written(head) | dict(zip(("pose", "covariance"), columns, strict=False))
-    return encode(message, SWARM_ODOMETRY if len(columns) == 1 else SWARM_FIXES)
-
-
-def encode_shared_detections(head: SharedHead, detections: Rows) -> bytes:
-    """Serialize a SwarmDetections from (n,) detections of `DETECTION_DTYPE`."""
-    return encode(_written(head) | {"detections": detections}, SWARM_DETECTIONS)
-
-
-def _written(head: SharedHead) -> dict[str, Any]:
-    header = {"stamp": head.stamp_ns, "frame_id": head.frame_id}
-    return {"header": header, "swarm": head.swarm, "robot": head.robot, "stamp": stamp_rows(head.reading_ns)}

@@ -25,7 +25,7 @@ from swarm_loc_estimator.common.messages.detections import (
     decode_detections,
 )
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.messages.poses import OdometryMessage, PoseMessage, yaw_of
+from swarm_loc_estimator.common.messages.poses import FixMessage, OdometryMessage, PoseMessage, yaw_of
 
 BytesArray = NDArray[np.uint8]
 
@@ -109,7 +109,7 @@ class PoseReader:
     """
 
     def __init__(
-        self, topics: int, decode: Callable[[bytes], OdometryMessage | PoseMessage], names: int
+        self, topics: int, decode: Callable[[bytes], OdometryMessage | PoseMessage | FixMessage], names: int
     ) -> None:
         self.frame_ids = [""] * topics
         self._decode = decode
@@ -130,7 +130,7 @@ class PoseReader:
             k = _read_poses(batch, self._models, k + 1, columns.stamp_ns, columns.pose)
         return columns
 
-    def _learn(self, topic: int, data: bytes) -> OdometryMessage | PoseMessage:
+    def _learn(self, topic: int, data: bytes) -> OdometryMessage | PoseMessage | FixMessage:
         """Read one message completely; the next ones are compared with it."""
         message = self._decode(data)
         self.frame_ids[topic] = message.frame_id

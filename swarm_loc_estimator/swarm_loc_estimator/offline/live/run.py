@@ -253,12 +253,6 @@ class Agreement:
         """Root mean square distance where both are located [m]."""
         return float(np.sqrt(np.mean(self.distance_m[np.isfinite(self.distance_m)] ** 2)))
 
-    @property
-    def settled_max_m(self) -> float:
-        """Largest distance at settled stamps [m]; NaN when there are none."""
-        settled = self.distance_m[self.settled]
-        return float(np.nanmax(settled)) if settled.size else float("nan")
-
 
 def compare_with_replay(live: LiveRun, bag: Path, settings: Settings | None = None) -> Agreement:
     """Replay a bag at the stamps of live poses.
