@@ -19,6 +19,11 @@ LIMITS = {
     "tuple_parameters": 0,
     "private_words": 0,
 }
+ORDER = (
+    *("common", "swarm", "odometry", "identification", "filter", "initialization", "infrared", "mapping"),
+    *("sensors", "timeline", "nodes", "watch", "offline", "cli"),
+)
+"""The folders of the estimator package: each imports only those before it."""
 MIN_DOCUMENTED = 0.96
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
@@ -31,6 +36,19 @@ def test_a_figure_keeps_its_limit(figure: str) -> None:
         return
     places = house.places()[figure]
     assert len(places) <= LIMITS[figure], "\n".join(places)
+
+
+def test_the_folders_of_the_estimator_import_in_one_order() -> None:
+    place = {f"swarm_loc_estimator.{folder}": k for k, folder in enumerate(ORDER)}
+    against = [
+        f"{name} imports {other}"
+        for name, imported in house.import_graph(house.product_modules()).items()
+        for other in imported
+        if place.get(house.folder_of(other), -1) > place.get(house.folder_of(name), len(ORDER))
+    ]
+    assert against == []
+    folders = {path.name for path in (ROOT / "swarm_loc_estimator" / "swarm_loc_estimator").iterdir()}
+    assert {name for name in folders - {"config", "__pycache__"} if "." not in name} == set(ORDER)
 
 
 def product_and_tools() -> list[house.Module]:
