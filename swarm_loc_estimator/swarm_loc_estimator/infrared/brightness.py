@@ -1,8 +1,8 @@
 """The forward model: brightness that each sensor reads of each emitter, eqs (1)-(4) of the Droplet paper.
 
-The paper's vectors live in two frames. Here all are in RX's: an emitter's direction is turned by the
-heading phi before it enters (1), r = R - rho i + rho Rot(phi) j, which is not said there. Angles are signed
-and wrapped.
+The paper mixes the frames of both robots. Here all vectors are in the receiver's frame: emitter directions
+are rotated by the heading phi before eq. (1), r = R - rho i + rho Rot(phi) j, a step that the paper omits.
+Angles are signed and wrapped.
 
 A relative pose is range [m] from centre to centre, bearing [rad] of the transmitter in the receiver's
 base_link, and heading [rad] of the transmitter's base_link relative to the receiver's.
@@ -29,7 +29,7 @@ def expected_brightness(platform: IrPlatform, poses: ArrayLike, gains: PairGains
     Args:
         platform: The board of both robots.
         poses: (k, 3) range [m], bearing [rad], heading [rad].
-        gains: Of the k pairs; None: all ones.
+        gains: Of the k pairs; None: unit gains.
     """
     return _at(platform, poses, gains)[0]
 
@@ -37,7 +37,7 @@ def expected_brightness(platform: IrPlatform, poses: ArrayLike, gains: PairGains
 def expected_with_slopes(
     platform: IrPlatform, poses: ArrayLike, gains: PairGains | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Besides, their derivatives (k, modes, n, n, 3) by range [count/m], bearing and heading [count/rad]."""
+    """Readings and their derivatives (k, modes, n, n, 3) by range [count/m], bearing, heading [count/rad]."""
     readings, slopes = _at(platform, poses, gains)
     return readings, np.moveaxis(slopes, 1, -1)
 
@@ -56,25 +56,25 @@ def _at(platform: IrPlatform, poses: ArrayLike, gains: PairGains | None) -> tupl
 
 
 WAY_ROWS = 22
-"""How many numbers a way has while brightness is predicted."""
+"""Number of rows of the workspace of `predict_brightness`."""
 
 
 class _Ways(NamedTuple):
-    """What the ways from every sensor to every emitter have, one behind the other, sensor by sensor.
+    """Quantities of the W = n * n paths from each sensor to each emitter, ordered by sensor.
 
-    Every step of a prediction is a loop over all W of them, without a branch, which is vectorized.
+    Every step of a prediction is a vectorized loop over all paths, without branches.
 
     Attributes:
         x, y: (W,) from sensor to emitter in the receiver's frame [m].
         length, direction: (W,) polar coordinates of that vector [m], [rad].
         emitter_x, emitter_y: (W,) the emitter's direction in the receiver's frame.
-        at_sensor, at_emitter: (W,) the angles of incidence, and to the emitter's axis [rad].
-        piece: (W,) of the curves.
+        at_sensor, at_emitter: (W,) angles between the path and the axes of sensor and emitter [rad].
+        piece: (W,) workspace of `curves_at`.
         seen, seen_slope, lit, lit_slope: (W,) the curves S and E.
         share: (W,) their product.
         bright, bright_slope: (W,) the amplitude of one power.
-        by_length, by_turn: (3, W) what a change of the pose does by the way's length, and by all angles: what
-            the amplitude's slope, and the amplitude, is multiplied by.
+        by_length, by_turn: (3, W) factors of the amplitude's slope and of the amplitude in the derivatives by
+            range, bearing and heading.
     """
 
     x: FloatArray
@@ -99,7 +99,7 @@ class _Ways(NamedTuple):
 
 @cached_njit
 def _predict_all(model: IrModel, poses: FloatArray, readings: FloatArray, slopes: FloatArray) -> None:
-    """All poses."""
+    """Predict the readings and slopes of all poses."""
     work = np.empty((WAY_ROWS, model.angles.size**2))
     for k in range(poses.shape[0]):
         predict_brightness(model, poses[k, 0], poses[k, 1], poses[k, 2], work, readings[k], slopes[k])
@@ -158,7 +158,7 @@ def predict_brightness(
 
 @norefcount_njit
 def _lay(model: IrModel, distance: float, bearing: float, heading: float, ways: _Ways) -> None:
-    """Write where emitters are, and the ways to them."""
+    """Write the emitters' directions and the paths to them."""
     n, units, rho = model.angles.size, model.units, model.radius
     cos, sin = math.cos(heading), math.sin(heading)
     x, y = distance * math.cos(bearing), distance * math.sin(bearing)
@@ -173,7 +173,7 @@ def _lay(model: IrModel, distance: float, bearing: float, heading: float, ways: 
 
 @cached_njit
 def _measure(x: FloatArray, y: FloatArray, length: FloatArray, direction: FloatArray) -> None:
-    """Write lengths, none of them zero, and directions [rad] of vectors."""
+    """Write nonzero lengths and directions [rad] of vectors."""
     for k in range(x.size):
         length[k] = math.sqrt(max(x[k] * x[k] + y[k] * y[k], 1e-12))
         direction[k] = direction_of(y[k], x[k])
@@ -181,7 +181,7 @@ def _measure(x: FloatArray, y: FloatArray, length: FloatArray, direction: FloatA
 
 @norefcount_njit
 def _write_angles(angles: FloatArray, heading: float, ways: _Ways) -> None:
-    """Write at which angles sensors and emitters of these directions [rad] have the ways."""
+    """Write the angles of the paths at sensors and emitters with axes `angles` [rad]."""
     n = angles.size
     for i in range(n):
         for j in range(n):
@@ -192,7 +192,7 @@ def _write_angles(angles: FloatArray, heading: float, ways: _Ways) -> None:
 
 @norefcount_njit
 def _write_changes(rho: float, distance: float, bearing: float, ways: _Ways) -> None:
-    """Write what a change of the pose does."""
+    """Write `by_length` and `by_turn`."""
     ux, uy = math.cos(bearing), math.sin(bearing)
     by_length, by_turn = ways.by_length, ways.by_turn
     for w in range(ways.share.size):
@@ -201,8 +201,8 @@ def _write_changes(rho: float, distance: float, bearing: float, ways: _Ways) -> 
         vx, vy = ways.x[w] * per_r, ways.y[w] * per_r
         seen, lit = ways.seen[w], ways.lit[w]
         share, of_emitter = seen * lit, seen * ways.lit_slope[w]
-        turned = (ways.seen_slope[w] * lit + of_emitter) * per_r  # by the direction
-        # how far the emitter moves along the way and across it
+        turned = (ways.seen_slope[w] * lit + of_emitter) * per_r  # by the direction of the path
+        # motion of the emitter along the path and across it
         forward, aside = vx * ux + vy * uy, vx * uy - vy * ux
         ways.share[w] = share
         by_length[0, w], by_turn[0, w] = share * forward, turned * aside

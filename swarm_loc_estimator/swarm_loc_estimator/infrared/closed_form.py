@@ -1,12 +1,12 @@
 """The Droplet paper's closed form for range, bearing and heading, eqs (5)-(18), corrected.
 
-Of the print are wrong: the sign in (10); "- arg(R)" in (12), which must be "- phi"; (18), which adds a number
-to vectors and means the length of a sum of vectors. Everywhere the emitters' directions are turned by phi
-into the receiver's frame, the arc tangent is that of two arguments, and angles are wrapped. The bound (16) is
-broken in a fifth of all poses and only a start. Repeating (11)-(18) does not help.
+Errata of the paper: the sign in (10); "- arg(R)" in (12), which must be "- phi"; (18), which adds a scalar to
+vectors instead of taking the length of a sum of vectors. Emitter directions are rotated by phi into the
+receiver's frame, the arc tangent has two arguments, and angles are wrapped. The bound (16) is violated in a
+fifth of all poses and serves only as a start. Iterating (11)-(18) does not help.
 
-The bearing has an error of its own that repeats with the elements, 3 to 6 degrees on average with six of
-them. The covariance contains it: it is the mean squared error at such a range, tabulated by simulation.
+The bearing has a systematic error that is periodic in the elements: 3 to 6 degrees on average with six of
+them. The covariance includes it: it is the mean squared error at the given range, tabulated by simulation.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 
 _FOUND, _TOO_WEAK, _UNDETERMINED = int(IrOutcome.FOUND), int(IrOutcome.TOO_WEAK), int(IrOutcome.UNDETERMINED)
 _FAINTEST = 15.0
-"""The brightest reading must be brighter than this [sigma]; far robots would seem near for noise alone."""
+"""Minimum of the brightest reading [sigma]; below it, noise makes far robots appear near."""
 _CLEAR = 0.05
-"""Light that is less one-sided comes from no direction."""
+"""Minimum length of the mean direction of light; below it, the direction is undetermined."""
 _LEVELS, _SAMPLES = 32, 300
-"""Ranges for which errors are tabulated, and poses at each."""
+"""Number of tabulated ranges, and of simulated poses at each."""
 _FEWEST, _CORE = 30, 0.99
-"""So many must have ended near such a range, and this share of them makes the covariance."""
+"""Minimum number of simulated poses per tabulated range, and share of them that enters the covariance."""
 _SYSTEMATIC = 0.95
-"""The share of errors that is the same the next time, by the form or by the gains: nearly all."""
+"""Systematic share of the variance, from the approximation and from gains."""
 _SIGMA_STEP = 0.02
-"""Errors are tabulated for elements that differ by multiples of this."""
+"""Resolution of the standard deviation of log-gains for which errors are tabulated."""
 
 
 class ClosedForm:
@@ -70,21 +70,21 @@ class ClosedForm:
         return solutions
 
     def _covariances(self, ranges: FloatArray, step: int) -> FloatArray:
-        """Mean squared errors (k, 3, 3) of ranges (k,), for elements that differ by so many `_SIGMA_STEP`."""
+        """Mean squared errors (k, 3, 3) of ranges (k,), for log-gains with sigma step * `_SIGMA_STEP`."""
         if step not in self._errors:
             self._errors[step] = self._tabulate(step * _SIGMA_STEP)
         covariances: FloatArray = self._errors[step][self._level(ranges)]
         return covariances
 
     def _level(self, ranges: FloatArray) -> NDArray[np.int64]:
-        """The tabulated range next to each."""
+        """Index of the nearest tabulated range."""
         logs = np.log(self._ranges)
         levels = np.interp(np.log(np.maximum(ranges, 1e-6)), logs, np.arange(_LEVELS))
         return np.rint(levels).astype(np.int64)
 
     def _tabulate(self, sigma: float) -> FloatArray:
-        """Mean squared errors (L, 3, 3) by estimated range, of all directions, for elements that differ."""
-        rng = np.random.default_rng(0)  # always the same: solutions must repeat
+        """Mean squared errors (L, 3, 3) by estimated range, for log-gains with this standard deviation."""
+        rng = np.random.default_rng(0)  # fixed seed: solutions must be reproducible
         platform, count = self._platform, _LEVELS * _SAMPLES
         poses = rng.uniform(-np.pi, np.pi, (count, 3))
         poses[:, 0] = np.repeat(self._ranges, _SAMPLES)
@@ -104,7 +104,7 @@ class ClosedForm:
 
 
 def _core_squares(errors: FloatArray) -> FloatArray:
-    """Mean squares (3, 3) of errors (s, 3), without the few far robots that seem near."""
+    """Mean squares (3, 3) of errors (s, 3), without the few far robots that appear near."""
     size = np.abs(errors[:, 0])
     core = errors[size <= np.quantile(size, _CORE)]
     squares: FloatArray = core.T @ core / len(core)
@@ -120,7 +120,7 @@ def _solve_all(
     poses: FloatArray,
     outcomes: NDArray[np.int64],
 ) -> None:
-    """All pairs, one after the other."""
+    """Solve all pairs; writes poses and outcomes."""
     n = readings.shape[2]
     matrix, sums = np.empty((n, n)), np.empty((2, n))
     for k in range(readings.shape[0]):
@@ -131,7 +131,7 @@ def _solve_all(
         for i in range(n):
             for j in range(n):
                 reading = readings[k, mode, i, j]
-                light = reading / (gains.sensor[k, i] * gains.emitter[k, j])  # NaN where one is dead
+                light = reading / (gains.sensor[k, i] * gains.emitter[k, j])  # NaN where an element is dead
                 light_there = math.isfinite(light) and reading > DARKEST * model.noise
                 matrix[i, j] = light if light_there else 0.0
         outcomes[k] = _solve_one(model, model.amplitudes[mode], matrix, sums, poses[k])
@@ -193,7 +193,7 @@ def _solve_one(
 
 @cached_njit
 def _direction(units: FloatArray, light: FloatArray) -> tuple[float, float]:
-    """The direction of unit vectors (n, 2) weighed by light (n,), and how one-sided it is, in [0, 1]."""
+    """Direction of the mean of unit vectors (n, 2) weighted by light (n,), and its length in [0, 1]."""
     x, y, total = 0.0, 0.0, 1e-300
     for i in range(light.size):
         x += light[i] * units[i, 0]

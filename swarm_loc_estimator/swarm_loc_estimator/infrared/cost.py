@@ -1,8 +1,8 @@
 """The negative log likelihood of readings, with gradient and Hessian by pose and gains.
 
-The unknowns are the pose and, where gains are unknown, the log-gain of every sensor and emitter, which has a
-prior. Most readings cost the square of their residual in sigmas: vectorized loops add them up. The others
-are evaluated one by one, by `reading_cost`.
+The unknowns are the pose and, if gains are unknown, the log-gain of every sensor and emitter, each with a
+Gaussian prior. Most readings have a Gaussian likelihood and are summed in vectorized loops. The others
+(saturated readings and possible outliers) are evaluated one by one by `reading_cost`.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ _MOST = math.sqrt(2.0 * BELIEVED)
 
 
 class Costs(NamedTuple):
-    """Which of F readings cost what, for a model.
+    """The likelihood model of each of F readings.
 
     Attributes:
-        per_sigma: (F,) one over the noise of readings whose distance from expectation is squared, else 0.
-        most: (F,) from so many sigmas on, by which expectation is brighter, a reading is taken for blocked.
-        others: (F,) which readings are, or may be, taken otherwise.
-        counts: (2,) how many there are of both.
+        per_sigma: (F,) inverse standard deviation of readings with a Gaussian likelihood, else 0.
+        most: (F,) maximum residual, expected minus read [sigma]; beyond it the reading counts as blocked.
+        others: (F,) indices of readings evaluated by `reading_cost`; the first `counts[1]` are valid.
+        counts: (2,) number of Gaussian readings and of `others`.
     """
 
     per_sigma: FloatArray
@@ -40,7 +40,7 @@ class Costs(NamedTuple):
 
 @cached_njit
 def new_costs(readings: int) -> Costs:
-    """Memory for so many readings."""
+    """Memory for the given number of readings."""
     return Costs(np.empty(readings), np.empty(readings), np.empty(readings, np.int64), np.empty(2, np.int64))
 
 
@@ -50,15 +50,15 @@ class Pair(NamedTuple):
     Attributes:
         readings: (F,) [count].
         cut: (F,) readings cut at saturation; 0 where MISSING.
-        stable: (F,) these by `stabilized` [sigma].
+        stable: (F,) `cut` after the variance-stabilizing transform `stabilized` [sigma].
         kinds: (F,) MISSING, MEASURED or SATURATED.
-        costs: What they cost.
+        costs: Their likelihood model.
         sensor: (n,) gains of the receiver's sensors.
         emitter: (n,) gains of the transmitter's emitters.
-        prior: (2, 2) of sensors and emitters: what weighs every log-gain's square, and the share of their
-            common part that this weight leaves free; weights of zero: gains are exact.
-        nearest: The least range to seek [m].
-        farthest: The largest.
+        prior: (2, 2) per side (sensors, emitters): w and c of the information matrix w (I - c 1 1^T) of the
+            prior on its log-gains; w = 0: gains are exact.
+        nearest: Minimum range of the search [m].
+        farthest: Maximum range of the search [m].
     """
 
     readings: FloatArray
@@ -74,29 +74,29 @@ class Pair(NamedTuple):
 
 
 class CostWorkspace(NamedTuple):
-    """Memory of a search; its P unknowns are the log-gains of sensors and emitters, if sought, and the pose.
+    """Memory of a search over P unknowns: the log-gains of sensors and emitters, if estimated, and the pose.
 
     The pose comes last, so that the last rows of the Hessian's factor are those of the pose alone.
 
     Attributes:
-        ways: (WAY_ROWS, n * n) to predict brightness.
-        expected: (F,) without gains.
-        slopes: (3, F) their derivatives by the pose, without gains.
-        pulls: (F,) what slopes are multiplied by for the gradient.
-        weights: (F,) what products of slopes are multiplied by for the Hessian.
-        at: (P,) the best so far.
-        trial: (P,).
+        ways: (WAY_ROWS, n * n) workspace of `predict_brightness`.
+        expected: (F,) expected readings for unit gains [count].
+        slopes: (3, F) derivatives of `expected` by range, bearing and heading.
+        pulls: (F,) first derivative of each reading's cost by `expected`.
+        weights: (F,) second derivative of each reading's cost by `expected`.
+        at: (P,) best estimate so far.
+        trial: (P,) next estimate to evaluate.
         factors: (F,) products of a sensor's and an emitter's gain.
-        gradients: (2, P) of the cost at the best so far, or at the trial.
-        hessians: (2, P, P) of the cost at the same places, by Gauss-Newton; lower triangles.
-        factor: (P, P) lower triangle.
-        step: (P,).
-        tally: (3,) squares of what is left of priors and of the readings that are no outliers, the degrees of
-            freedom of these, and squares of what is left of all.
-        systematic: (3, 3) the part of the information on the pose by whose noise it errs the same every time.
-        of_gains: (3,) the part of the pose's variances that comes from unknown gains.
-        root: (3, 3) inverse of the pose's part of the factor, lower triangle.
-        first_root: (3, 3) that inverse at a minimum.
+        gradients: (2, P) gradients of the cost at `at` and at `trial`, in either order.
+        hessians: (2, P, P) Gauss-Newton Hessians at the same estimates; lower triangles.
+        factor: (P, P) Cholesky factor of the damped Hessian; lower triangle.
+        step: (P,) Gauss-Newton step.
+        tally: (3,) sum of squared residuals of priors and inlier readings, degrees of freedom of these
+            readings, and sum of squared residuals of all readings.
+        systematic: (3, 3) pose information from readings, weighted by the systematic share of their noise.
+        of_gains: (3,) share of the pose's variances that comes from unknown gains.
+        root: (3, 3) inverse of the pose block of `factor`; lower triangle.
+        first_root: (3, 3) `root` at a minimum.
     """
 
     ways: FloatArray
@@ -120,7 +120,7 @@ class CostWorkspace(NamedTuple):
 
 @cached_njit
 def new_cost_workspace(modes: int, n: int, gains: bool) -> CostWorkspace:
-    """Memory for a platform, with or without gains to seek."""
+    """Memory for a board with n elements per side; `gains`: whether gains are estimated."""
     size, readings = 3 + 2 * n if gains else 3, modes * n * n
     return CostWorkspace(
         np.empty((WAY_ROWS, n * n)),
@@ -145,7 +145,7 @@ def new_cost_workspace(modes: int, n: int, gains: bool) -> CostWorkspace:
 
 @cached_njit
 def with_stray_light(model: IrModel, readings: FloatArray) -> IrModel:
-    """The platform with the noise that an exchange has whose readings (F,) are so bright."""
+    """The model with its noise increased by the stray light of the brightest of these readings (F,)."""
     brightest, e = 0.0, model.errors
     for reading in readings:
         if math.isfinite(reading):
@@ -168,7 +168,7 @@ def with_stray_light(model: IrModel, readings: FloatArray) -> IrModel:
 
 @norefcount_njit
 def write_costs(errors: ReadingErrors, pair: Pair) -> None:
-    """Write `Pair.costs` for readings that err like this."""
+    """Write `Pair.costs` for readings with these errors."""
     costs, squared, others = pair.costs, 0, 0
     one_by_one = errors.bright < math.inf or errors.systematic > 0.0
     for f in range(pair.kinds.size):
@@ -191,7 +191,7 @@ def write_costs(errors: ReadingErrors, pair: Pair) -> None:
 def cost_of(
     model: IrModel, pair: Pair, at: FloatArray, work: CostWorkspace, gradient: FloatArray, hessian: FloatArray
 ) -> float:
-    """The cost at some place; writes its gradient and Hessian there."""
+    """The cost of an estimate (P,); writes its gradient (P,) and Hessian (P, P)."""
     size, sought = at.size, at.size > 3
     predict_brightness(model, at[size - 3], at[size - 2], at[size - 1], work.ways, work.expected, work.slopes)
     _write_factors(pair, at, work.factors)
@@ -214,7 +214,7 @@ def cost_of(
 
 @norefcount_njit
 def _write_factors(pair: Pair, at: FloatArray, factors: FloatArray) -> None:
-    """Write the products of gains, with log-gains where they are sought; 0 for dead elements."""
+    """Write the products of gains, scaled by the log-gains if these are estimated; 0 for dead elements."""
     n, sought = pair.sensor.size, at.size > 3
     for i in range(n):
         sensor = pair.sensor[i] * (math.exp(at[i]) if sought else 1.0)
@@ -225,7 +225,7 @@ def _write_factors(pair: Pair, at: FloatArray, factors: FloatArray) -> None:
         gain = math.exp(at[n + j])
         for i in range(n):
             factors[i * n + j] *= gain
-    for f in range(n * n, factors.size):  # all powers alike
+    for f in range(n * n, factors.size):  # the same for all powers
         factors[f] = factors[f - n * n]
 
 
@@ -239,7 +239,7 @@ def _squares(
     pulls: FloatArray,
     weights: FloatArray,
 ) -> float:
-    """The cost of readings by their distance from expectation; writes its derivatives."""
+    """The cost of all readings with a Gaussian likelihood; writes its derivatives."""
     cost = 0.0
     for w in range(expected.size):
         slope = factors[w] * per_sigma[w]
@@ -252,7 +252,7 @@ def _squares(
 
 @norefcount_njit
 def _add_others(errors: ReadingErrors, pair: Pair, work: CostWorkspace) -> float:
-    """What other readings cost besides what they were taken for; corrects the derivatives and the tally."""
+    """The correction of the cost for `Costs.others`; also corrects the derivatives and the tally."""
     total, tally, costs = 0.0, work.tally, pair.costs
     for p in range(3):
         for q in range(3):
@@ -262,7 +262,7 @@ def _add_others(errors: ReadingErrors, pair: Pair, work: CostWorkspace) -> float
         factor, kind = work.factors[f], pair.kinds[f]
         expected = factor * work.expected[f]
         taken = min(costs.per_sigma[f] * (expected - pair.cut[f]), costs.most[f])
-        if costs.per_sigma[f] > 0.0:  # dark, and may be blocked where it is expected to be brighter
+        if costs.per_sigma[f] > 0.0:  # a dark reading may be blocked if a brighter one is expected
             if taken < 0.0:
                 continue
             tally[0], tally[1] = tally[0] - taken * taken, tally[1] - 1.0
@@ -291,7 +291,7 @@ def _add_by_pose(
     gradient: FloatArray,
     hessian: FloatArray,
 ) -> None:
-    """Write the derivatives by the pose, of slopes by range, bearing and heading (F,)."""
+    """Write the derivatives by the pose; `by_r`, `by_b`, `by_h`: (F,) slopes by range, bearing, heading."""
     r, b, h = 0.0, 0.0, 0.0
     rr, br, bb, hr, hb, hh = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for f in range(pulls.size):
@@ -307,7 +307,7 @@ def _add_by_pose(
 
 @norefcount_njit
 def _add_by_gains(n: int, work: CostWorkspace, gradient: FloatArray, hessian: FloatArray) -> None:
-    """Add the derivatives by log-gains; by its sensor's and its emitter's a reading has the same slope."""
+    """Add the derivatives by log-gains; a reading has the same slope by its sensor's and its emitter's."""
     expected, pulls, slopes, x = work.expected, work.pulls, work.slopes, gradient.size - 3
     for w in range(n * n):
         i, j = w // n, n + w % n
@@ -330,7 +330,7 @@ def _add_by_gains(n: int, work: CostWorkspace, gradient: FloatArray, hessian: Fl
 
 @norefcount_njit
 def _add_prior(pair: Pair, at: FloatArray, gradient: FloatArray, hessian: FloatArray) -> float:
-    """Add the priors of log-gains: independent errors, and one common to all of a side."""
+    """Add the prior of log-gains: independent errors, and one error common to all elements of a side."""
     n, cost = pair.sensor.size, 0.0
     for side in range(2):
         weight, common = pair.prior[side, 0], pair.prior[side, 1]
@@ -349,7 +349,7 @@ def _add_prior(pair: Pair, at: FloatArray, gradient: FloatArray, hessian: FloatA
 
 @norefcount_njit
 def _add_systematic(weight: float, slopes: FloatArray, systematic: FloatArray) -> None:
-    """Add a reading whose noise has a part that is the same every time."""
+    """Add the information of a reading, weighted by the systematic share of its noise."""
     for p in range(3):
         for q in range(3):
             systematic[p, q] += weight * slopes[p] * slopes[q]

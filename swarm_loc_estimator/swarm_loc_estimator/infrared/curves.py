@@ -30,9 +30,9 @@ def curves_at(
     """Write the values and slopes of `curve_at` at many angles (k,), without a branch.
 
     Args:
-        table: Of the curve.
-        angles: Of any size; wrapped when it returns [rad].
-        piece: (k,) workspace for the pieces of the curve that the angles are in.
+        table: The curve.
+        angles: Any angles [rad]; wrapped in place.
+        piece: (k,) workspace for the index of the piece that contains each angle.
         values: (k,) written.
         slopes: (k,) written [1/rad].
     """
@@ -53,7 +53,7 @@ def curves_at(
 
 @cached_njit
 def _cubic_at(c: FloatArray, t: float, per_radian: float) -> tuple[float, float]:
-    """The value and slope [1/rad] of one cell's cubic, of which the share t is passed."""
+    """The value and slope [1/rad] of one cell's cubic at t in [0, 1]."""
     return c[0] + t * (c[1] + t * (c[2] + t * c[3])), (c[1] + t * (2.0 * c[2] + 3.0 * t * c[3])) * per_radian
 
 
@@ -72,7 +72,7 @@ def amplitude_at(law: FloatArray, r: float) -> tuple[float, float]:
 @cached_njit
 def amplitudes_at(law: FloatArray, r: FloatArray, values: FloatArray, slopes: FloatArray) -> None:
     """Write the values and slopes of `amplitude_at` at many distances (k,)."""
-    if law[2] == 2.0:  # apart, since a loop that may raise to a power is not vectorized
+    if law[2] == 2.0:  # a separate loop, since one with a power is not vectorized
         for k in range(r.size):
             closeness = _closeness(law, r[k])
             values[k], slopes[k] = _amplitude(law, r[k], closeness, closeness * closeness)
@@ -89,7 +89,7 @@ def _closeness(law: FloatArray, r: float) -> float:
 
 @cached_njit
 def _amplitude(law: FloatArray, r: float, closeness: float, power: float) -> tuple[float, float]:
-    """The law's value and slope, with the power of the closeness."""
+    """The law's value and slope; `power` is the closeness raised to the law's exponent."""
     value = law[0] * power
     slope = -law[2] * value * closeness
     return value + law[3] + slope * min(r - law[4], 0.0), slope
@@ -97,7 +97,7 @@ def _amplitude(law: FloatArray, r: float, closeness: float, power: float) -> tup
 
 @cached_njit
 def distance_at(law: FloatArray, brightness: float) -> float:
-    """The distance [m] at which an aligned pair is so bright [count], eq. (22); infinite where it never is.
+    """The distance [m] at which an aligned pair has this brightness [count], eq. (22); infinite if none.
 
     The printed 118 is the root of 14000, rounded.
     """

@@ -1,10 +1,10 @@
 """Calibration of the gains of sensors and emitters from brightness matrices.
 
-Gauss-Newton estimates all gains and the relative pose of every exchange together; each pose, and the ambient
-light that a sensor did not subtract, is eliminated from its own readings. Without known poses, only near
-robots separate the common part of a robot's gains from range, since their pattern depends on it; far robots
-with brighter elements just appear nearer. `IrGains.common_sigma` has this uncertainty. Known poses determine
-the common part except for a factor between sensors and emitters, which cancels.
+Gauss-Newton estimates all gains and the relative pose of every exchange together; the pose of an
+exchange and the residual ambient light of each sensor are eliminated by the Schur complement. Without known
+poses, only near robots separate the common gain of a robot from range; far robots with brighter elements just
+appear nearer. `IrGains.common_sigma` includes this uncertainty. Known poses determine the common gain except
+for a factor between sensors and emitters, which cancels.
 """
 
 from __future__ import annotations
@@ -27,34 +27,34 @@ Progress = Callable[[str], None]
 
 _ROUNDS = 8
 _STILL = 1e-3
-"""Rounds end when no log-gain moves by more."""
+"""Maximum change of a log-gain at convergence."""
 POSE_SIGMA = (0.0005, 0.005, 0.005)
-"""How well known poses are known: range [m], bearing, heading [rad]."""
+"""Standard deviations of known poses: range [m], bearing, heading [rad]."""
 _BACKGROUND = 0.5
-"""How much of the ambient light a sensor may read besides, one standard deviation [sigma of a reading]."""
+"""Standard deviation of the residual ambient light of a sensor [sigma of a reading]."""
 _SEARCH_SIGMA = 0.02
-"""Sigma of gains while poses are searched with them."""
+"""Standard deviation of log-gains in the search for poses."""
 _MAX_ODDS = 0.05
 _MAX_MISFIT = 3.0
-"""Exchanges whose second-best pose is likelier, or that fit worse, are left out; where most fit worse though
-gains are free, the curves are wrong."""
+"""Maximum odds of the second-best pose and maximum misfit of exchanges that are used; where most exchanges
+fit worse with free gains, the curves are wrong."""
 _CLEAR_OF_SATURATION = 3.0
-"""Readings expected nearer to saturation than this are left out [sigma]."""
+"""Minimum distance of the expected reading from saturation [sigma]."""
 _WORST = 5.0
-"""Exchanges whose residuals' mean square is above the median by more than this factor are left out."""
+"""Maximum mean squared residual of an exchange, relative to the median."""
 _LONGEST_STEP = 0.3
 _MIN_SIGMA = 0.003
-"""Smallest sigma of gains that is reported."""
+"""Minimum reported standard deviation of gains."""
 
 
 class Exchanges(NamedTuple):
-    """What robots read of each other.
+    """Readings of robots of each other.
 
     Attributes:
         receiver: (k,) index of the robot that measured.
         transmitter: (k,) index of the robot that lit its emitters.
         readings: (k, modes, n, n) [count], [mode, sensor, emitter], NaN where not measured.
-        saturation: (k, modes) from where on readings tell no more [count].
+        saturation: (k, modes) minimum of saturated readings [count].
         poses: (k, 3) of the transmitter seen from the receiver, range [m], bearing, heading [rad]; NaN where
             not known.
     """
@@ -66,17 +66,17 @@ class Exchanges(NamedTuple):
     poses: FloatArray
 
     def select(self, rows: NDArray[np.bool_]) -> Exchanges:
-        """Those of some rows, which are marked (k,)."""
+        """The exchanges where `rows` (k,) is True."""
         return Exchanges._make(column[rows] for column in self)
 
 
 @dataclass(frozen=True)
 class GainsFit:
-    """Gains of all robots, and how well they explain what was read.
+    """Gains of all robots, and the residuals without and with them.
 
     Attributes:
-        gains: One per robot; as if never calibrated where its exchanges contradict each other by so much that
-            they would be less sure than that.
+        gains: One per robot; the uncalibrated default where contradictory exchanges would make the estimate
+            less certain than that.
         used: (k,) which exchanges were used.
         before: (k, modes, n, n) residuals with all gains 1, in sigmas; NaN where a reading was not used.
         after: (k, modes, n, n) those residuals with the gains.
@@ -98,13 +98,13 @@ def estimate_gains(
     """Estimate the gains of all robots.
 
     Args:
-        platform: Of all robots; its `element_sigma` is by how much elements may differ.
-        robots: How many there are.
-        exchanges: What they read.
+        platform: Of all robots; its `element_sigma` is the prior standard deviation of gains.
+        robots: Number of robots.
+        exchanges: Their readings.
         progress: Called with the name of each step.
 
     Raises:
-        GainsError: Elements cannot differ, the platform's curves do not hold, or no exchange can be used.
+        GainsError: `element_sigma` is 0, the platform's curves do not hold, or no exchange can be used.
     """
     if platform.element_sigma == 0.0:
         raise GainsError("element_sigma of the platform is 0, so that all gains are 1.")
@@ -133,7 +133,7 @@ def _pairs(exchanges: Exchanges, logs: FloatArray, sigma: float) -> PairGains:
 
 
 def _check_curves(estimator: MaximumLikelihood, exchanges: Exchanges, unknown: PairGains) -> None:
-    """Refuse to estimate gains where most exchanges fit no pose, whatever the gains.
+    """Check that most exchanges fit some pose with free gains.
 
     Raises:
         GainsError: Most exchanges do not fit.
@@ -150,12 +150,12 @@ def _check_curves(estimator: MaximumLikelihood, exchanges: Exchanges, unknown: P
 def _poses(
     estimator: MaximumLikelihood, exchanges: Exchanges, pairs: PairGains
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """The pose (k, 3) of every exchange, and which of them can be relied on.
+    """The pose (k, 3) of every exchange, and which of them are reliable.
 
-    Readings have a say even where the pose is known: robots may have moved while they exchanged.
+    Known poses are combined with the readings, since robots may have moved during the exchange.
 
     Raises:
-        GainsError: None of them.
+        GainsError: No pose is reliable.
     """
     solutions = estimator.solve(exchanges.readings, pairs, exchanges.saturation)
     known = _known(exchanges)
@@ -172,7 +172,7 @@ def _poses(
 
 
 def _apart(poses: FloatArray, others: FloatArray) -> FloatArray:
-    """Poses (k, 3) less others, angles wrapped."""
+    """Differences of poses (k, 3), angles wrapped."""
     apart = poses - others
     apart[:, 1:] = wrap_angle(apart[:, 1:])
     return apart
@@ -191,7 +191,7 @@ def _residuals(
     poses: FloatArray,
     used: NDArray[np.bool_],
 ) -> FloatArray:
-    """(k, modes, n, n) what readings differ from expectation by [sigma]; NaN where not used."""
+    """Residuals (k, modes, n, n) [sigma]; NaN where not used."""
     linear = _linearized(platform, exchanges, logs, poses, used)
     residuals = np.full(exchanges.readings.shape, np.nan)
     residuals[used] = np.where(linear.weight > 0.0, linear.residual * np.sqrt(linear.weight), np.nan)
@@ -199,7 +199,7 @@ def _residuals(
 
 
 def _without_worst(residuals: FloatArray, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which exchanges are used of those that were: not the few that fit far worse than most."""
+    """The used exchanges without the few that fit far worse than most."""
     kept: NDArray[np.bool_] = used.copy()
     squares = np.nanmean(residuals[used] ** 2, axis=(1, 2, 3))
     kept[used] = squares <= _WORST * max(float(np.median(squares)), 1.0)
@@ -207,13 +207,13 @@ def _without_worst(residuals: FloatArray, used: NDArray[np.bool_]) -> NDArray[np
 
 
 class _Linear(NamedTuple):
-    """Readings about expectation, for the u exchanges used.
+    """Readings of the u exchanges used, linearized at the current estimate.
 
     Attributes:
-        weight: (u, modes, n, n) one over the variance, 0 where there is no reading to use.
-        residual: (u, modes, n, n) reading less expectation.
-        expected: (u, modes, n, n), which is the slope by a log-gain.
-        slopes: (u, modes, n, n, 3) by the pose.
+        weight: (u, modes, n, n) inverse variance, 0 where a reading is not used.
+        residual: (u, modes, n, n) reading minus expectation.
+        expected: (u, modes, n, n) expectation, equal to its derivative by a log-gain.
+        slopes: (u, modes, n, n, 3) derivatives by the pose.
     """
 
     weight: FloatArray
@@ -229,7 +229,7 @@ def _linearized(
     poses: FloatArray,
     used: NDArray[np.bool_],
 ) -> _Linear:
-    """The readings of the exchanges used."""
+    """Linearize the readings of the exchanges used."""
     pairs = PairGains(*(values[used] for values in _pairs(exchanges, logs, 0.0)))
     expected, slopes = expected_with_slopes(platform, poses[used], pairs)
     readings, limit = exchanges.readings[used], exchanges.saturation[used][..., None, None]
@@ -249,10 +249,10 @@ def _improved(
     poses: FloatArray,
     used: NDArray[np.bool_],
 ) -> tuple[FloatArray, FloatArray, float]:
-    """One step of Gauss-Newton: log-gains, two covariances (2, P, P), and the largest change.
+    """One Gauss-Newton step: log-gains, two covariances (2, P, P), and the largest change.
 
-    The first is that of the noise. The second, White's sandwich, is wider where exchanges pull apart more
-    than noise explains, as those of robots do that move meanwhile.
+    The first covariance follows from the noise. The second, White's sandwich estimator, is larger where
+    exchanges disagree more than noise explains, as when robots move during an exchange.
     """
     linear = _linearized(platform, exchanges, logs, poses, used)
     to_known = _apart(exchanges.poses[used], poses[used])
@@ -275,14 +275,14 @@ def _improved(
 
 
 def _without_pose(linear: _Linear, to_known: FloatArray, background: float) -> tuple[FloatArray, FloatArray]:
-    """The information (u, 2n, 2n) on log-gains of each exchange's sensors and emitters, and its pull (u, 2n).
+    """Information matrices (u, 2n, 2n) and vectors (u, 2n) of each exchange on log-gains of its elements.
 
-    The pose is eliminated, with what is known of it, and so is the background of each sensor.
+    The pose, with its prior, and the background of each sensor are eliminated.
 
     Args:
         linear: The readings.
-        to_known: (u, 3) from the poses to those that are known; NaN where none is.
-        background: Standard deviation of each sensor's [count].
+        to_known: (u, 3) known minus estimated poses; NaN where unknown.
+        background: Standard deviation of each sensor's background [count].
     """
     weight, expected, slopes = linear.weight, linear.expected, linear.slopes
     bright = weight * expected
@@ -308,10 +308,10 @@ def _without_pose(linear: _Linear, to_known: FloatArray, background: float) -> t
 
 
 def _of_background(linear: _Linear, sigma: float) -> FloatArray:
-    """What not knowing the background of each sensor takes away from all products of weighted columns.
+    """The part of the normal equations that is lost to the unknown background of each sensor.
 
     Returns:
-        (u, 2n + 4, 2n + 4) for sensors, emitters, pose and residual.
+        (u, 2n + 4, 2n + 4) products of the columns of sensors, emitters, pose and residual.
     """
     weight, own = linear.weight, np.arange(linear.weight.shape[2])
     bright = (weight * linear.expected).sum(axis=1)
@@ -330,7 +330,7 @@ def _as_gains(
     covariances: FloatArray,
     used: NDArray[np.bool_],
 ) -> tuple[IrGains, ...]:
-    """Gains with how unsure they are, by the covariance (2, P, P) that is wider; see `GainsFit`."""
+    """Gains with standard deviations from the larger of the covariances (2, P, P); see `GainsFit`."""
     unseen = platform.element_sigma**2 / platform.n
     sigmas = [_sigmas(exchanges, covariance, logs.shape, unseen, used) for covariance in covariances]
     own, shared = np.max(sigmas, axis=0)
@@ -355,10 +355,10 @@ def _sigmas(
     unseen: float,
     used: NDArray[np.bool_],
 ) -> FloatArray:
-    """How unsure each robot's gains are (2, robots): each by itself, and all of a robot together.
+    """Standard deviations (2, robots) of log-gains: individual, and common to all elements of a robot.
 
-    The latter is what a receiver's sensors and a transmitter's emitters have in common, halved between them:
-    sensors that read more and emitters that shine less by the same factor are no different.
+    The common variance of a receiver's sensors and a transmitter's emitters is divided equally between them,
+    since only the product of their gains is observable.
     """
     _, robots, n = shape
     blocks = covariance.reshape(2 * robots, n, 2 * robots, n)

@@ -1,8 +1,8 @@
 """Maximum likelihood estimate of the relative pose of two robots, from all readings of all powers.
 
-`search` starts at the poses of `start_table`, so that no wrong minimum is found. The inverse
-information is the covariance, inflated where readings fit worse than the platform's noise allows. Unknown
-gains are estimated together with the pose, so that the covariance contains them.
+`search` starts at the poses of `start_table` to find the global minimum. The covariance is the inverse
+information, inflated where residuals exceed the platform's noise. Unknown gains are estimated together with
+the pose, so the covariance includes their uncertainty.
 """
 
 from __future__ import annotations
@@ -40,45 +40,45 @@ from swarm_loc_estimator.infrared.start_table import (
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 
 _WORSE = 2.0
-"""A start that fits worse than the best one by more than this factor is not tried."""
+"""Maximum misfit of a start relative to that of the best start."""
 _LOOSE, _STILL = 0.1, 1e-4
-"""A step that promises to lower the cost by less ends a search, of the soft and of the exact model."""
+"""Minimum predicted decrease of the cost per step, for the blurred and for the exact model."""
 _SAME = 0.02
-"""Two minima whose costs differ by less are one."""
+"""Maximum difference in cost of two searches that reached the same minimum."""
 _SUSPICIOUS = 1.3
-"""A misfit that is seldom so large by chance."""
+"""Threshold of the misfit above which a minimum may be wrong."""
 _FEWEST = 9
 _FAINTEST = 6.0
-"""Readings must be brighter than noise by so many sigmas of the sum of their squares."""
+"""Minimum excess of the readings' sum of squares over noise [sigma]."""
 _FAINTEST_OF_OUTLIERS = 3.0
-"""That limit where the probability of all poses is computed as well, so that noise alone gives no pose."""
+"""The same for platforms with bright outliers, where the posterior over all poses also rejects noise."""
 _EXPLAINED = 0.5
-"""The share of what is read, in squares, that a pose must explain."""
+"""Minimum share of the readings' sum of squares that a pose must explain."""
 _EXPLAINED_OF_OUTLIERS = 0.2
-"""That share where readings may be blocked or too bright."""
+"""The same where readings may be blocked or too bright."""
 _WIDEST = 1.0
-"""A bearing or heading less sure than this, by the best minimum alone, is open [rad]."""
+"""Maximum standard deviation of bearing and heading around the best minimum [rad]."""
 _WIDEST_OF_ALL = 0.9
-"""That limit by the probability of all poses."""
+"""The same for the posterior over all poses."""
 _APART = 0.1
-"""Two minima farther apart than this, in bearing, heading [rad] or relative in range, are two poses."""
+"""Minimum distance of two distinct minima in bearing, heading [rad] or relative range."""
 _AROUND = [(b, h) for b in (-0.2, 0.0, 0.2) for h in (-0.2, 0.0, 0.2) if b or h]
 _ASIDE = np.array([(0.0, 0.1, 0.3), (0.0, -0.1, -0.3), *((0.0, b, h) for b, h in _AROUND)])
-"""Where to look besides: two from the best minimum, where the second-best often is, and others from the
-table's best start; range, bearing, heading [m, rad]."""
+"""Offsets (range [m], bearing, heading [rad]) of additional starts: two from the best minimum, near which the
+second-best often is, the others from the table's best start."""
 _OF_SECOND = 2
-"""How many of these are of the second-best minimum."""
+"""Number of these offsets that start from the best minimum."""
 _MIN_ODDS = 1e-4
 _WORTH_WEIGHING = 8.0
-"""Minima whose costs differ by more are not weighed by what is around them."""
+"""Maximum difference in cost of two minima compared by the probability around them."""
 _NO_MINIMUM = np.full(4, math.inf)
 _EXACT = 1e-4
-"""The own sigma of gains of which only the common part is unsure."""
+"""Standard deviation of each log-gain where only the common log-gain is uncertain."""
 _FOUND, _TOO_WEAK, _TOO_FEW, _UNDETERMINED, _MISFIT = (int(outcome) for outcome in IrOutcome)
 
 
 class MaximumLikelihood:
-    """Most likely poses for one platform.
+    """Maximum likelihood poses for one platform.
 
     Args:
         platform: The board of both robots.
@@ -98,12 +98,12 @@ class MaximumLikelihood:
 
 
 class Models(NamedTuple):
-    """What is known of a platform.
+    """The models of a platform.
 
     Attributes:
-        exact: The platform.
-        blurred: Its soft version, whose minimum is near the right one.
-        table: What is read all around.
+        exact: The platform's model.
+        blurred: The model with smoothed curves, which has fewer local minima.
+        table: Expected readings at coarse poses.
     """
 
     exact: IrModel
@@ -113,7 +113,7 @@ class Models(NamedTuple):
 
 @cached_njit
 def _solve_all(models: Models, readings: FloatArray, gains: PairGains, saturation: FloatArray) -> IrSolutions:
-    """All pairs, first those of known gains, then the others, each kind with a workspace of its own."""
+    """Solve all pairs: first those with known gains, then the others, each group with its own workspace."""
     out = no_solutions(len(readings))
     for known in (True, False):
         some = [k for k in range(len(readings)) if known == (gains.sigma[k].max() == 0.0)]
@@ -134,7 +134,7 @@ def _solve_at(
     out: IrSolutions,
     k: int,
 ) -> None:
-    """One pair."""
+    """Solve pair k."""
     pair = Pair(
         readings[k],
         work.cut,
@@ -155,7 +155,7 @@ def _solve_at(
 
 @norefcount_njit
 def _write_prior(sigma: FloatArray, n: int, prior: FloatArray) -> None:
-    """Write `Pair.prior` for the sigmas (4,) of `PairGains`."""
+    """Write `Pair.prior` for the standard deviations (4,) of `PairGains`."""
     for side in range(2):
         own, common = max(sigma[2 * side], _EXACT) ** 2, sigma[2 * side + 1] ** 2
         prior[side, 0], prior[side, 1] = 1.0 / own, common / (own + n * common)
@@ -165,7 +165,7 @@ def _write_prior(sigma: FloatArray, n: int, prior: FloatArray) -> None:
 def _solve_one(
     models: Models, saturation: FloatArray, pair: Pair, work: Workspace, out: IrSolutions, k: int
 ) -> int:
-    """One pair; returns the outcome."""
+    """Solve one pair; returns the outcome."""
     measured, saturated, bright = classify(models.exact, saturation, pair)
     if measured < _FEWEST:
         return _UNDETERMINED if saturated > 0 else _TOO_FEW
@@ -207,9 +207,9 @@ def _solve_one(
 
 @norefcount_njit
 def _weigh_minima(model: IrModel, pair: Pair, work: Workspace) -> None:
-    """Judge the two minima by the probability around them, not its density; writes the better one first.
+    """Rank the two minima by the probability mass around them instead of its density; the better one first.
 
-    A pose that takes most readings for outliers can fit the few others in a tiny region only.
+    A pose that explains most readings as outliers can fit the rest, but only in a tiny region.
     """
     best, other, at = work.minima[0], work.minima[1], work.full.at
     if not other[3] - best[3] < _WORTH_WEIGHING or not pose_covariance(
@@ -243,7 +243,7 @@ def _log_volume(covariance: FloatArray) -> float:
 
 @norefcount_njit
 def _unexplained(model: IrModel, pair: Pair, work: Workspace, bright: float) -> bool:
-    """Whether a pose leaves most of what was read, mean square `bright`, unexplained."""
+    """Whether the pose fails to explain most of the readings, whose mean square is `bright`."""
     tally = work.full.tally
     if model.errors.bright == math.inf:
         misfit = tally[0] / max(tally[1], 1.0)
@@ -264,7 +264,7 @@ def _apart(a: FloatArray, b: FloatArray, p: int) -> float:
 
 @norefcount_njit
 def _find_minima(models: Models, pair: Pair, work: Workspace, measured: int) -> None:
-    """Search from all starts that are worth it; writes the best minimum of all and another one."""
+    """Search from all promising starts; writes the best minimum and the best distinct one."""
     work.minima[:, 3] = math.inf
     reached = 0
     for s in range(_list_starts(models, pair, work)):
@@ -273,7 +273,7 @@ def _find_minima(models: Models, pair: Pair, work: Workspace, measured: int) -> 
     assign(first, work.starts[1])
     for aside in range(_ASIDE.shape[0]):
         of_second = aside < _OF_SECOND
-        if _in_doubt(work, reached, measured) or (of_second and work.full.at.size > 3):  # gains are sought
+        if _in_doubt(work, reached, measured) or (of_second and work.full.at.size > 3):  # gains are estimated
             origin = work.minima[0] if of_second else first
             for p in range(3):
                 start[p] = origin[p] + _ASIDE[aside, p]
@@ -287,13 +287,13 @@ def _find_minima(models: Models, pair: Pair, work: Workspace, measured: int) -> 
 
 @norefcount_njit
 def _in_doubt(work: Workspace, reached: int, measured: int) -> bool:
-    """Whether the best minimum may not be the best of all: reached but once, or it fits badly."""
+    """Whether the best minimum may not be global: it was reached only once, or it fits badly."""
     return reached < 2 or 2.0 * work.minima[0, 3] > _SUSPICIOUS * (measured - 3)
 
 
 @norefcount_njit
 def _search_from(models: Models, pair: Pair, work: Workspace, start: FloatArray, reached: int) -> int:
-    """Search from a start, keep where it ends; how often the best minimum was reached, before and now."""
+    """Search from a start and keep its minimum; returns how often the best minimum has been reached."""
     at, best = work.full.at, work.minima[0, 3]
     cost = search(models.exact, pair, start, _STILL, work.full, work.minima[0])
     if _keep(work.minima, at[at.size - 3 :], cost):
@@ -305,10 +305,10 @@ def _search_from(models: Models, pair: Pair, work: Workspace, start: FloatArray,
 
 @norefcount_njit
 def _list_starts(models: Models, pair: Pair, work: Workspace) -> int:
-    """Write poses to begin at; returns how many.
+    """Write the start poses; returns their number.
 
-    First where the soft model's search ends, then the best of the table, then others that fit there nearly as
-    well. More are in `_ASIDE`, and at last those for readings of which some are blocked.
+    The first is the minimum of the blurred model, the others are the best poses of the table. `_find_minima`
+    adds starts by `_ASIDE` and starts that assume blocked readings.
     """
     compress_readings(models.exact, pair, work.pattern, work.present)
     starts, found = work.starts, work.starts[1 : 1 + TABLE_STARTS]
@@ -322,7 +322,7 @@ def _list_starts(models: Models, pair: Pair, work: Workspace) -> int:
 
 @norefcount_njit
 def _search_blurred(model: IrModel, pair: Pair, work: Workspace, start: FloatArray) -> None:
-    """Write where the soft model's search ends as the first start."""
+    """Write the minimum of the blurred model as the first start."""
     p = pair
     soft = Pair(
         p.readings,
@@ -344,7 +344,7 @@ def _search_blurred(model: IrModel, pair: Pair, work: Workspace, start: FloatArr
 
 @norefcount_njit
 def _keep(minima: FloatArray, pose: FloatArray, cost: float) -> bool:
-    """Sort a minimum into the best two that lie apart (2, 4); whether it is the best."""
+    """Insert a minimum into the best two distinct ones (2, 4); returns whether it is the best."""
     best, other = minima[0], minima[1]
     better = cost < best[3]
     turned = max(abs(wrap(pose[1] - best[1])), abs(wrap(pose[2] - best[2])))

@@ -1,9 +1,8 @@
-"""The negative log likelihood of one reading, and its derivatives by what is expected.
+"""The negative log likelihood of one reading, and its derivatives by the expected reading.
 
-A measured reading is its expectation plus noise, Gaussian on the scale on which its variance is the same
-everywhere. A saturated one says only that expectation plus noise is at saturation or above, which has the
-probability of a normal tail. One that shows no light where some is expected may be blocked by another robot;
-on some boards others are too bright.
+A measured reading is the expected one plus noise that is Gaussian after a variance-stabilizing transform. A
+saturated reading is a lower bound, with the probability of a normal tail. A dark reading where light is
+expected may be blocked by another robot; on some boards readings may also be too bright.
 """
 
 from __future__ import annotations
@@ -16,23 +15,23 @@ from swarm_loc_estimator.swarm.ir_board import ReadingErrors
 MISSING, MEASURED, SATURATED = 0, 1, 2
 
 _TAIL = -6.0
-"""Below, the normal distribution is asymptotic [sigma]."""
+"""Threshold below which the normal tail uses its asymptotic series [sigma]."""
 DARK = 4.0
-"""Only darker readings can be blocked ones [sigma]."""
+"""Maximum of blocked readings [sigma]."""
 BELIEVED = 2.0
-"""A reading that costs less is no outlier."""
+"""Maximum cost of an inlier."""
 _STRAY = 5.0
-"""Light that the model has not is so bright on average [sigma]."""
+"""Mean brightness of light that is not modelled [sigma]."""
 _STRAY_DENSITY = math.log(_STRAY / math.sqrt(2.0 * math.pi))
 _SURELY = 6.0
-"""An explanation whose cost is higher by this is out of the question."""
+"""Minimum difference in cost at which the outlier hypothesis is ignored."""
 
 
 @cached_njit
 def stabilized(errors: ReadingErrors, value: float) -> tuple[float, float]:
-    """A brightness on the scale on which noise is one everywhere, and the slope of this scale [1/count].
+    """The variance-stabilizing transform of a brightness [sigma], and its slope [1/count].
 
-    With the variance noise^2 + (relative value)^2 it is asinh(relative value / noise) / relative.
+    For the variance noise^2 + (relative value)^2 it is asinh(relative value / noise) / relative.
     """
     per_noise = 1.0 / errors.noise
     if errors.relative == 0.0:
@@ -55,24 +54,24 @@ def spread(errors: ReadingErrors, value: float) -> float:
 def reading_cost(
     errors: ReadingErrors, kind: int, reading: float, stable: float, expected: float
 ) -> tuple[float, float, float, bool, float, float]:
-    """The cost of a reading and its two derivatives by the expectation.
+    """The cost of a reading and its first two derivatives by the expected reading.
 
     Args:
-        errors: Of the platform.
+        errors: Noise and outliers of the platform.
         kind: MEASURED or SATURATED.
         reading: Cut at saturation [count].
         stable: The reading by `stabilized` [sigma].
-        expected: At this pose with these gains [count].
+        expected: The expected reading with gains [count].
 
     Returns:
-        Besides, whether it is no outlier for sure, the share of its variance that is the same every time, and
-        the square of what it is off as if it were none.
+        Cost, first and second derivative, whether the reading is certainly an inlier, the systematic share of
+        its variance, and its squared residual as an inlier.
     """
     two_sided = errors.bright < math.inf
     if two_sided:
         more, slope = stabilized(errors, expected)
         more -= stable
-    else:  # by the reading, as good where noise is small, and simpler
+    else:  # noise by the reading: simpler, and as accurate where noise is small
         slope = 1.0 / spread(errors, reading)
         more = (expected - reading) * slope
     if kind == SATURATED:
@@ -98,10 +97,9 @@ def reading_cost(
 
 @cached_njit
 def _of_outlier(cost: float, pull: float, weight: float, limit: float) -> tuple[float, float, float]:
-    """The cost of a reading that may be an outlier, and its derivatives by the expectation.
+    """The cost of a reading that may be blocked, and its derivatives by the expected reading.
 
-    It may be blocked by something in between, or lit by something else: the farther it is from expectation,
-    the less it counts, and its cost ends at a limit.
+    The loss is robust: the weight decreases with the residual, and the cost saturates at a limit.
     """
     if cost < BELIEVED:
         return cost, pull, weight
@@ -113,9 +111,9 @@ def _of_outlier(cost: float, pull: float, weight: float, limit: float) -> tuple[
 def _of_bright(
     errors: ReadingErrors, more: float, cost: float, pull: float, weight: float
 ) -> tuple[float, float, float]:
-    """The cost of a reading that is so much brighter than expected [count], and its derivatives.
+    """The cost of a reading that is brighter than expected by `more` [count], and its derivatives.
 
-    Light that the model has not is seldom strong: how bright it is has an exponential distribution.
+    The brightness of light that is not modelled has an exponential distribution.
     """
     per_count = 1.0 / (_STRAY * errors.noise)
     other = errors.bright + _STRAY_DENSITY + per_count * more
@@ -128,7 +126,7 @@ def _of_bright(
 
 @cached_njit
 def _of_saturated(per_sigma: float, z: float) -> tuple[float, float, float]:
-    """The cost of a saturated reading, and its derivatives by the expectation, z sigmas beyond saturation."""
+    """The cost of a saturated reading whose expectation is z sigmas above saturation, and its derivatives."""
     if z > -_TAIL:
         return 0.0, 0.0, 0.0
     if z > _TAIL:

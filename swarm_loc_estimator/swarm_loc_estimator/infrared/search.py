@@ -1,7 +1,7 @@
-"""Search for the pose of least cost: preparation of readings, workspace and search.
+"""Levenberg-Marquardt search for the pose of minimum cost: preparation of readings, workspace and search.
 
-At a kink of the curves the slope is one-sided, which the damping bears. The covariance looks beyond a kink
-that is near.
+At a kink of the curves the slope is one-sided; damping copes with it. The covariance is averaged over points
+on both sides of a near kink.
 """
 
 from __future__ import annotations
@@ -36,27 +36,27 @@ from swarm_loc_estimator.infrared.start_table import (
 from swarm_loc_estimator.swarm.ir_board import IrModel
 
 TABLE_STARTS = 3
-"""How many starts are taken of the table at most."""
+"""Maximum number of starts from the table."""
 
 
 class Workspace(NamedTuple):
     """Memory of one search, reused for all pairs.
 
     Attributes:
-        plain: To search the pose only.
-        full: To search gains besides where they are not known, else the same.
-        start: To look for starts.
+        plain: Workspace for a search over the pose only.
+        full: Workspace that includes the gains where they are unknown, else `plain`.
+        start: Workspace of the search for starts.
         starts: (S, 4) range, bearing, heading, misfit.
         pattern: (F,) compressed readings.
         present: (F,) 1 where there is a reading, else 0.
         cut, stable, kinds: (F,) of `Pair`.
-        exact, soft: What readings cost by either model.
+        exact, soft: Likelihoods of the readings for the exact and the blurred model.
         prior: (2, 2) of `Pair`.
-        minima: (2, 4) range, bearing, heading and cost of the best two minima that lie apart.
-        best: (P,) the best with its gains.
-        found: (P,) another one.
+        minima: (2, 4) range, bearing, heading and cost of the best two distinct minima.
+        best: (P,) the best minimum with its gains.
+        found: (P,) another minimum.
         first: (4,) the table's best start.
-        covariance: (3, 3) of its pose.
+        covariance: (3, 3) pose covariance at a minimum.
     """
 
     plain: CostWorkspace
@@ -80,7 +80,7 @@ class Workspace(NamedTuple):
 
 @cached_njit
 def new_workspace(table: StartTable, modes: int, n: int, known: bool) -> Workspace:
-    """Memory for one platform, with gains known or not."""
+    """Memory for one platform; `known`: whether gains are known."""
     plain = new_cost_workspace(modes, n, False)
     full = plain if known else new_cost_workspace(modes, n, True)
     readings = modes * n * n
@@ -107,7 +107,7 @@ def new_workspace(table: StartTable, modes: int, n: int, known: bool) -> Workspa
 
 @norefcount_njit
 def compress_readings(model: IrModel, pair: Pair, pattern: Float32Array, present: Float32Array) -> None:
-    """Write the readings as they would be without the elements' gains, in the form of the table."""
+    """Write the readings divided by the gains and compressed as in the table."""
     n = pair.sensor.size
     for f in range(pair.kinds.size):
         there = pair.kinds[f] != MISSING
@@ -118,15 +118,15 @@ def compress_readings(model: IrModel, pair: Pair, pattern: Float32Array, present
 
 @norefcount_njit
 def classify(model: IrModel, saturation: FloatArray, pair: Pair) -> tuple[int, int, float]:
-    """Write `cut`, `stable` and `kinds`; returns how many are measured and saturated, and how bright all are.
+    """Write `cut`, `stable`, `kinds`; returns the numbers of measured and saturated readings, and brightness.
 
     Args:
         model: Of the platform.
-        saturation: (modes,) from where on readings are SATURATED [count].
+        saturation: (modes,) minimum of SATURATED readings [count].
         pair: The readings.
 
     Returns:
-        The brightness is the sum of squares in sigmas.
+        The brightness is the sum of squared readings in sigmas.
     """
     n, measured, saturated, bright = pair.sensor.size, 0, 0, 0.0
     for f in range(pair.kinds.size):
@@ -152,13 +152,13 @@ _ROUNDS = 40
 _FIRST_DAMPING = 1e-3
 _MAX_DAMPING = 1e8
 _LONGEST_TURN = 0.4
-"""Of one step [rad]."""
+"""Maximum change of bearing and heading per step [rad]."""
 _LONGEST_SHARE = 0.4
-"""Of one step in range, relative."""
+"""Maximum relative change of range per step."""
 _BESIDE = 0.03
-"""A search that has come so near a known minimum [rad, relative in range], at its cost, would end there."""
+"""Distance from a known minimum [rad, relative in range] within which a search ends early."""
 _AWAY = 2.5
-"""How far around a minimum its covariance looks [sigma]."""
+"""Distance from a minimum of the points over which its covariance is averaged [sigma]."""
 _CORNER = 3.0**-0.5
 _AROUND = (
     (_CORNER, _CORNER, _CORNER),
@@ -166,20 +166,20 @@ _AROUND = (
     (-_CORNER, _CORNER, -_CORNER),
     (-_CORNER, -_CORNER, _CORNER),
 )
-"""Where to: the corners of a tetrahedron."""
+"""Directions of these points: the corners of a tetrahedron."""
 
 
 @norefcount_njit
 def search(
     model: IrModel, pair: Pair, start: FloatArray, still: float, work: CostWorkspace, known: FloatArray
 ) -> float:
-    """Go down from a start (range, bearing, heading, ...) to a minimum; returns its cost.
+    """Minimize the cost from a start (range, bearing, heading, ...); returns the cost of the minimum.
 
-    It ends when a step promises to lower the cost by less than `still`, or in the basin of a minimum that is
-    known (4,), range, bearing, heading, and the cost that is returned then; infinite: none is.
+    The search ends when the predicted decrease of the cost is below `still`, or near the minimum `known`:
+    (4,) range, bearing, heading and cost; infinite cost: none is known.
 
-    The cost is half the weighed sum of squares, of readings and priors, and minus the logarithms of the
-    probabilities of saturated readings. `work.at` has the minimum.
+    The cost is half the weighted sum of squared residuals of readings and priors, minus the log-probabilities
+    of saturated readings. The minimum is written to `work.at`.
     """
     at, size, gradients, hessians = work.at, work.at.size, work.gradients, work.hessians
     for p in range(size - 3):
@@ -210,7 +210,7 @@ def search(
 
 @norefcount_njit
 def _beside(known: FloatArray, at: FloatArray) -> bool:
-    """Whether a search has come to a known minimum."""
+    """Whether the estimate `at` is near a known minimum."""
     x = at.size - 3
     turned = max(abs(wrap(at[x + 1] - known[1])), abs(wrap(at[x + 2] - known[2])))
     return bool(max(turned, abs(at[x] / known[0] - 1.0)) < _BESIDE)
@@ -220,10 +220,10 @@ def _beside(known: FloatArray, at: FloatArray) -> bool:
 def _step(
     pair: Pair, work: CostWorkspace, gradient: FloatArray, hessian: FloatArray, damping: float
 ) -> float:
-    """Write the next trial; returns by how much the quadratic model lowers the cost there."""
+    """Write the next trial; returns the decrease of the cost that the quadratic model predicts."""
     step, size = work.step, work.step.size
     distance = work.at[size - 3]
-    # where the range is at its limit and would go beyond, it stays
+    # the range stays fixed where a step would exceed its limit
     held = (distance <= pair.nearest and gradient[size - 3] > 0.0) or (
         distance >= pair.farthest and gradient[size - 3] < 0.0
     )
@@ -254,13 +254,13 @@ def _step(
 
 @norefcount_njit
 def _factorize(matrix: FloatArray, damping: float, factor: FloatArray, held: bool) -> bool:
-    """Cholesky of the lower triangle with its diagonal grown by a share; whether it is positive definite.
+    """Cholesky factorization with a damped diagonal; returns whether the matrix is positive definite.
 
     Args:
-        matrix: (P, P).
-        damping: The share.
+        matrix: (P, P); the lower triangle is used.
+        damping: Relative increase of the diagonal.
         factor: (P, P) written.
-        held: Leave the third last row and column out, which is the range.
+        held: Whether to leave out the range, the third last row and column.
     """
     size = matrix.shape[0]
     for p in range(size):
@@ -297,11 +297,11 @@ def _solve(factor: FloatArray, vector: FloatArray) -> None:
 def pose_covariance(
     model: IrModel, pair: Pair, at: FloatArray, work: CostWorkspace, covariance: FloatArray
 ) -> bool:
-    """Write the pose's covariance (3, 3) at a minimum (P,); whether the readings determine the pose.
+    """Write the pose's covariance (3, 3) at a minimum (P,); returns whether the readings determine the pose.
 
-    It is the mean of the inverse information there and around: beyond a kink of the curves, readings may tell
-    much less of the pose. `work.tally` is that of the minimum, `work.of_gains` there the share of the
-    gains, and of other noise that is the same every time.
+    The covariance is the mean of the inverse information at the minimum and at points around it, since beyond
+    a kink of the curves readings may be much less informative. `work.tally` and `work.of_gains` (the share
+    of gains or of systematic noise) refer to the minimum.
     """
     hessian = work.hessians[0]
     cost_of(model, pair, at, work, work.gradients[0], hessian)
@@ -329,10 +329,10 @@ def pose_covariance(
 
 @norefcount_njit
 def _write_share_of_gains(pair: Pair, work: CostWorkspace) -> None:
-    """Write which share of the pose's variances, by the factor, comes from errors of the gains.
+    """Write the share of the pose's variances that comes from errors of the gains.
 
-    With the inverse Hessian C and the prior weight W of the gains, the pose errs by -C_pose,gains W times
-    their errors.
+    With the inverse Hessian C and the prior information W of the gains, their errors e cause the pose error
+    -C_pose,gains W e. Without gains as unknowns, the share is that of systematic noise.
     """
     x, n, row = work.at.size - 3, pair.sensor.size, work.step
     for p in range(3):
@@ -354,7 +354,7 @@ def _write_share_of_gains(pair: Pair, work: CostWorkspace) -> None:
 
 @norefcount_njit
 def _systematic_share(work: CostWorkspace, p: int) -> float:
-    """Which share of a pose's variance, by the factor, comes from noise that is the same every time."""
+    """Share of the variance of the pose's component p that comes from systematic noise."""
     row, part = work.step, 0.0
     for q in range(3):
         row[q] = 1.0 if q == p else 0.0
@@ -367,7 +367,7 @@ def _systematic_share(work: CostWorkspace, p: int) -> float:
 
 @norefcount_njit
 def _invert(information: FloatArray, work: CostWorkspace) -> bool:
-    """Write the inverse of the pose's part of the information's factor; whether there is one."""
+    """Write the inverse of the pose block of the information's factor; returns whether it exists."""
     if not _factorize(information, 0.0, work.factor, False):
         return False
     factor, root, x = work.factor, work.root, information.shape[0] - 3
@@ -381,7 +381,7 @@ def _invert(information: FloatArray, work: CostWorkspace) -> bool:
 
 @norefcount_njit
 def _add_square(root: FloatArray, matrix: FloatArray, weight: float, keep: float) -> None:
-    """Matrix becomes keep * matrix + weight * root^T root, all (3, 3)."""
+    """Set matrix = keep * matrix + weight * root^T root, all (3, 3)."""
     for p in range(3):
         for q in range(3):
             value = 0.0

@@ -13,17 +13,17 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
 
 DARKEST = -6.0
-"""What a sensor reads below is no light, and counts as missing [sigma]."""
+"""Minimum of a valid reading; lower ones count as missing [sigma]."""
 
 
 class IrOutcome(IntEnum):
-    """Whether there is a pose, or the reason why there is none."""
+    """Whether a pose was found, or why not."""
 
     FOUND = 0
-    TOO_WEAK = 1  # what was read is no more than noise
-    TOO_FEW = 2  # most readings are missing or no light at all, such as far below zero
-    UNDETERMINED = 3  # the readings leave range, bearing or heading open, as where all are saturated
-    MISFIT = 4  # no pose explains most of what was read
+    TOO_WEAK = 1  # readings do not exceed noise
+    TOO_FEW = 2  # most readings are missing or invalid, such as far below zero
+    UNDETERMINED = 3  # range, bearing or heading is not observable, as where all readings are saturated
+    MISFIT = 4  # no pose explains most of the readings
 
 
 class IrSolutions(NamedTuple):
@@ -35,9 +35,9 @@ class IrSolutions(NamedTuple):
         outcomes: (k,) of `IrOutcome`.
         alternatives: (k, 3) the second-best pose where it is nearly as likely, else NaN.
         odds: (k,) its likelihood relative to the best one's, in [0, 1].
-        systematic_share: (k, 3) share of each variance that is the unknown gains' and the same every time.
-        misfits: (k,) squares of what is left of the readings, per degree of freedom; about 1 where the
-            platform's noise is that of the readings.
+        systematic_share: (k, 3) share of each variance that is systematic, mostly from unknown gains.
+        misfits: (k,) sum of squared residuals per degree of freedom; about 1 where the platform's noise
+            matches the readings.
     """
 
     poses: FloatArray
@@ -50,13 +50,13 @@ class IrSolutions(NamedTuple):
 
     @classmethod
     def none(cls, count: int) -> IrSolutions:
-        """Without any pose."""
+        """Solutions of `count` pairs, all without a pose."""
         return no_solutions(count)
 
 
 @cached_njit
 def no_solutions(count: int) -> IrSolutions:
-    """Of so many pairs without any pose, also for compiled code."""
+    """Solutions of `count` pairs, all without a pose; also for compiled code."""
     return IrSolutions(
         np.full((count, 3), np.nan),
         np.full((count, 3, 3), np.nan),
@@ -83,7 +83,7 @@ class IrEstimator(Protocol):
         Args:
             readings: (k, modes, n, n) [count], [mode, sensor, emitter], NaN where not measured.
             gains: Of the k pairs; None: never calibrated.
-            saturation: (k, modes) a reading of it or more tells only that it is at least so bright [count];
+            saturation: (k, modes) minimum of saturated readings, which are only lower bounds [count];
                 None: the platform's.
 
         Raises:
@@ -94,7 +94,7 @@ class IrEstimator(Protocol):
 def checked(
     platform: IrPlatform, readings: ArrayLike, gains: PairGains | None, saturation: ArrayLike | None
 ) -> tuple[FloatArray, PairGains, FloatArray]:
-    """Readings (k, modes, n, n), gains and saturation (k, modes) as estimators take them.
+    """Validate readings (k, modes, n, n), gains and saturation (k, modes), and fill in defaults.
 
     Raises:
         ReadingsError: They have another shape.

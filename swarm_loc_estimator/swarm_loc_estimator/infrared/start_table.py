@@ -1,11 +1,11 @@
-"""Start values: a table of coarse poses, and the coarse posterior over it.
+"""Start values: a table of readings expected at coarse poses, and the coarse posterior over these poses.
 
-A minimum of the cost tells nothing of other minima. Readings of which some are blocked and others too bright
-often have several, some of them wide: how uncertain a pose is then follows from the probability of all poses.
+Blocked or too bright readings often cause several minima of the cost, some of them wide. The uncertainty of a
+pose then follows from the posterior over all poses, not from one minimum.
 
-One start from the closed form ends in a wrong minimum in up to a fifth of the poses where the far power
-saturates and the near one is weak (12-15 cm). Here every direction of the table is tried, and the range
-follows from how bright it is in all: brightness falls with range whatever the direction.
+A search from the closed form ends in a wrong minimum in up to a fifth of the poses where the far power
+saturates and the near one is weak (12-15 cm). Instead, every bearing and heading of the table is tried. The
+range follows from the total brightness, which decreases with range in every direction.
 """
 
 from __future__ import annotations
@@ -27,26 +27,25 @@ from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform
 from swarm_loc_estimator.swarm.ir_curves import AngleCurve, TabulatedCurve
 
 _NEGLIGIBLE = 16.0
-"""Poses whose costs are higher by this are left out."""
+"""Maximum cost of a pose above the minimum; others are left out."""
 _BESIDE = 1.5
-"""What is nearer than so many steps of the table, in range, bearing and heading, is the same minimum."""
+"""Maximum distance of poses that belong to one minimum, in steps of the table."""
 
 
 @cached_njit
 def add_spread(table: StartTable, work: StartWorkspace, pose: FloatArray, covariance: FloatArray) -> float:
-    """Add to a pose's covariance (3, 3) what other poses that are likely make it uncertain by.
+    """Add the spread of other likely poses to a pose's covariance (3, 3).
 
-    Where robots stand is as likely everywhere in the plane. Ranges are spaced as a geometric series, so each
-    counts by its square.
+    The prior is uniform over the plane. Ranges form a geometric series, so each is weighted by its square.
 
     Args:
-        table: Of the platform.
-        work: Whose costs are those of the readings.
+        table: Start table of the platform.
+        work: Workspace with the costs of the readings.
         pose: (3,) range [m], bearing, heading [rad].
-        covariance: Added to.
+        covariance: (3, 3) increased in place.
 
     Returns:
-        The larger of the mean squares by which bearing and heading of all poses differ from this one's.
+        The larger of the mean squared deviations of all poses in bearing and heading from this pose.
     """
     size, least = table.angles.size, work.costs.min()
     step = 2.0 * math.pi / size
@@ -81,29 +80,29 @@ def add_spread(table: StartTable, work: StartWorkspace, pose: FloatArray, covari
 
 
 _DIRECTIONS = (16, 24)
-"""Bearings, and headings, at least and at most; between them two per element."""
+"""Minimum and maximum number of bearings, and of headings; in between, two per element."""
 _LEVELS = 16
 _KNEE = 10.0
-"""Readings count linearly up to here, then by their logarithm [sigma]."""
+"""Brightness above which compression is logarithmic instead of linear [sigma]."""
 _SHOWN = 2.0
-"""The table ends where an aligned pair is so bright [sigma]."""
+"""Brightness of an aligned pair at the maximum range of the table [sigma]."""
 
 _BLOCKED = np.float32(0.2)
-"""What a blocked reading adds to the misfit at most."""
+"""Maximum contribution of a blocked reading to the misfit."""
 _PER_SIGMA = np.float32(_KNEE)
-"""What one standard deviation of noise is on the table's scale, to the power of -1."""
+"""Inverse standard deviation of noise on the table's compressed scale."""
 _DARKEST = np.float32(3.0)
-"""The cost of a reading that may be blocked, at most, where others may be too bright."""
+"""Maximum cost of a possibly blocked reading where others may be too bright."""
 _BLUR = 0.1
-"""By how much `blurred` softens the curves [rad]."""
+"""Standard deviation of the Gaussian by which `blurred` smooths the curves [rad]."""
 _BLUR_NOISE = 0.1
-"""Its noise, relative to readings."""
+"""Relative noise of the blurred model."""
 
 Float32Array = NDArray[np.float32]
 
 
 class StartTable(NamedTuple):
-    """What is read at poses all around, compressed so that bright readings do not outweigh all others.
+    """Expected readings at coarse poses, compressed so that bright readings do not dominate.
 
     Attributes:
         ranges: (L,) ascending [m].
@@ -147,10 +146,10 @@ def new_start_workspace(table: StartTable) -> StartWorkspace:
 
 
 def blurred(platform: IrPlatform) -> IrModel:
-    """The platform with soft curves, and bright readings weighed less.
+    """The platform's model with smoothed curves and a lower weight of bright readings.
 
-    Kinks and steep flanks of the curves make minima of their own around the true one. Where this model's
-    search ends, the exact one's seldom goes astray.
+    Kinks and steep flanks of the curves cause local minima around the true one. A search with the exact model
+    from the minimum of this one seldom ends in them.
     """
     soft = replace(
         platform,
@@ -171,7 +170,7 @@ def _soft(curve: AngleCurve) -> TabulatedCurve:
 
 
 def start_table(platform: IrPlatform) -> StartTable:
-    """The table of a platform, of a megabyte or so."""
+    """The table of a platform; about a megabyte."""
     model = platform.model
     farthest = distance_at(model.amplitudes[0], _SHOWN * model.noise)
     ranges = np.geomspace(2.0 * platform.radius, min(max(farthest, 4.0 * platform.radius), 1e3), _LEVELS)
@@ -195,16 +194,16 @@ def find_starts(
     work: StartWorkspace,
     starts: FloatArray,
 ) -> int:
-    """Write the best poses to begin at, best first, each the best of its neighbours; returns how many.
+    """Write the best start poses, best first, each a local minimum of the table; returns their number.
 
     Args:
-        table: Of the platform.
-        pattern: (modes * n * n,) the readings by `compress`, something finite where missing.
+        table: Start table of the platform.
+        pattern: (modes * n * n,) the readings by `compress`, any finite value where missing.
         present: (modes * n * n,) 1 where there is a reading, else 0.
-        dark: Readings darker than this, by `compress`, may be blocked ones; how bright they are in all then
-            does not tell the range, and all ranges are tried; infinite: any may be blocked or too bright.
-        work: To work in.
-        starts: (S, 4) range, bearing, heading, and how badly they fit.
+        dark: Maximum of possibly blocked readings, by `compress`. If finite, all ranges are tried, since the
+            total brightness is unreliable; inf: any may be blocked or too bright; -inf: none is blocked.
+        work: Workspace.
+        starts: (S, 4) written: range, bearing, heading, misfit.
     """
     total, count = np.float32(0.0), np.float32(0.0)
     for f in range(pattern.size):
@@ -236,13 +235,13 @@ def find_starts(
 
 @norefcount_njit
 def compress(model: IrModel, reading: float) -> float:
-    """A reading as the table has it."""
+    """A reading on the compressed scale of the table."""
     return math.asinh(min(reading, model.saturation) / (_KNEE * model.noise))
 
 
 @cached_njit
 def _level(totals: Float32Array, total: np.float32) -> int:
-    """Where among falling totals one is nearest, halving without a branch, which could not be predicted."""
+    """Index of the nearest of decreasing totals, by a binary search without branches."""
     low, size = 0, totals.size - 1
     while size > 1:
         half = size // 2
@@ -255,7 +254,7 @@ def _level(totals: Float32Array, total: np.float32) -> int:
 def _best_level(
     patterns: Float32Array, pattern: Float32Array, present: Float32Array, dark: np.float32
 ) -> tuple[int, float]:
-    """The range of patterns (L, modes * n * n) that fits best, and how badly it does."""
+    """Index of the range whose pattern (of L, modes * n * n) fits best, and its misfit."""
     best, least = 0, np.float32(math.inf)
     for level in range(patterns.shape[0]):
         misfit = _misfit(patterns[level], pattern, present, dark)
@@ -266,7 +265,7 @@ def _best_level(
 
 @reassociated_njit
 def _sum_of_present(pattern: Float32Array, present: Float32Array) -> np.float32:
-    """The total of those readings that there are."""
+    """The sum of the readings that are present."""
     total: np.float32 = np.float32(0.0)
     for f in range(present.size):
         total += present[f] * pattern[f]
@@ -277,7 +276,7 @@ def _sum_of_present(pattern: Float32Array, present: Float32Array) -> np.float32:
 def _misfit(
     expected_here: Float32Array, pattern: Float32Array, present: Float32Array, dark: np.float32
 ) -> np.float32:
-    """The sum of squares of the differences, for readings that may be blocked up to a limit."""
+    """The sum of squared differences, limited for readings that may be blocked."""
     total: np.float32 = np.float32(0.0)
     for f in range(pattern.size):
         difference = pattern[f] - expected_here[f]
@@ -292,9 +291,9 @@ def _misfit(
 def _cost_with_outliers(
     expected_here: Float32Array, pattern: Float32Array, present: Float32Array
 ) -> np.float32:
-    """The negative log likelihood of readings each of which may be blocked or too bright.
+    """The negative log likelihood of readings, each of which may be blocked or too bright.
 
-    How bright one is that is too bright has an exponential distribution.
+    The excess of a reading that is too bright has an exponential distribution.
     """
     total: np.float32 = np.float32(0.0)
     for f in range(pattern.size):
@@ -306,7 +305,7 @@ def _cost_with_outliers(
 
 @norefcount_njit
 def _best_minima(table: StartTable, work: StartWorkspace, starts: FloatArray) -> int:
-    """The directions that no neighbour betters, the best `starts` of them."""
+    """Write the best local minima over directions to `starts`; returns their number."""
     misfit, size, found = work.misfit, table.angles.size, 0
     for b in range(size):
         for h in range(size):
@@ -328,7 +327,7 @@ def _best_minima(table: StartTable, work: StartWorkspace, starts: FloatArray) ->
 
 @norefcount_njit
 def _is_minimum(misfit: Float32Array, size: int, b: int, h: int) -> bool:
-    """Whether no neighbour on the torus of directions is better."""
+    """Whether no neighbour on the torus of bearing and heading has a lower misfit."""
     here = misfit[b * size + h]
     left, right = (h if h > 0 else size) - 1, h + 1 if h + 1 < size else 0
     for row in ((b if b > 0 else size) - 1, b, b + 1 if b + 1 < size else 0):

@@ -1,4 +1,4 @@
-"""Calibration of a board: its recording and its parameters."""
+"""Calibration of an infrared board from a recording with ground truth."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains, R
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 MAX_RANGE = 0.3
-"""Robots farther away show little more than noise [m]."""
+"""Maximum distance of exchanges that are used [m]; farther readings are mostly noise."""
 _BODIES = 2.0
-"""A robot within so many radii of the line between two others may be in their way."""
+"""Maximum distance of an occluding robot from the line of sight between two others [robot radii]."""
 _TRUTH_GAP_NS = 200_000_000
 
 
@@ -40,10 +40,10 @@ class BoardRecording:
     """Exchanges of a recording with one kind of board.
 
     Attributes:
-        platform: The board to begin with.
+        platform: The initial model of the board.
         robots: Their indices in the swarm, in ascending order.
-        data: All exchanges whose poses are known; by place in `robots`.
-        clear: (k,) whether no other robot is known to be in between.
+        data: All exchanges with ground truth; robots by place in `robots`.
+        clear: (k,) True where no other robot is known to occlude the line of sight.
     """
 
     platform: IrPlatform
@@ -53,7 +53,7 @@ class BoardRecording:
 
     @property
     def to_fit(self) -> BoardReadings:
-        """Those that a board is fitted to."""
+        """The exchanges to which a board is fitted."""
         return self.data.select(self.clear & (self.data.poses[:, 0] < MAX_RANGE))
 
 
@@ -61,7 +61,7 @@ def read_board(recording: Recording, swarm: Swarm) -> BoardRecording:
     """The exchanges with ground truth of the first kind of board of a swarm.
 
     Raises:
-        CalibrationError: There is none.
+        CalibrationError: There are none.
     """
     group, stamp_ns = exchanges_of(recording, swarm)
     known = np.isfinite(group.exchanges.poses[:, 0])
@@ -79,7 +79,7 @@ def read_board(recording: Recording, swarm: Swarm) -> BoardRecording:
 def calibrate_from(
     recording: Recording, swarm: Swarm, progress: Progress
 ) -> tuple[BoardRecording, BoardCalibration]:
-    """Find what the board of a recording is.
+    """Calibrate the board of a recording.
 
     Raises:
         CalibrationError: There is too little ground truth.
@@ -91,7 +91,7 @@ def calibrate_from(
 
 
 def with_board(swarm: Swarm, board: BoardRecording, done: BoardCalibration, path: Path) -> Swarm:
-    """The swarm with the board that was found, in a file at `path`, and robots' gains and dead elements."""
+    """The swarm with the calibrated board, written to `path`, and the robots' gains and dead elements."""
     robots = list(swarm.robots)
     for place, index in enumerate(board.robots):
         ir = robots[index].ir
@@ -116,7 +116,7 @@ def with_board(swarm: Swarm, board: BoardRecording, done: BoardCalibration, path
 def _clear(
     recording: Recording, swarm: Swarm, robots: tuple[int, ...], data: BoardReadings, width: float
 ) -> BoolArray:
-    """(k,) whether no robot is known to be within `width` of the line between the two of an exchange."""
+    """(k,) True where no other robot is known to be within `width` of the line of sight of an exchange."""
     places = np.full((len(swarm.robots), len(data.stamp_ns), 2), np.nan)
     for k, robot in enumerate(swarm.robots):
         if robot.name in recording.truth:
@@ -132,38 +132,38 @@ def _clear(
 
 
 def _distance_to_line(points: FloatArray, begin: FloatArray, end: FloatArray) -> FloatArray:
-    """(k,) from points to the lines between two ends, all (k, 2)."""
+    """Distances (k,) from points to line segments; all arguments (k, 2)."""
     way = end - begin
     share = np.sum((points - begin) * way, axis=1) / np.maximum(np.sum(way**2, axis=1), 1e-12)
     return np.asarray(np.linalg.norm(points - begin - np.clip(share, 0.0, 1.0)[:, None] * way, axis=1))
 
 
 GAIN_SIGMA = 0.05
-"""How unsure gains still are that were found, relative.
+"""Relative standard deviation of calibrated gains.
 
-Set by hand: a jackknife over blocks of time says .03 to .17 on the recordings of 2016, for some sensors are
-dark at times, and other recordings then come out less well: 10.6 instead of 10.4 deg of heading.
+Set by hand: a jackknife over blocks of time gives .03 to .17 on the recordings of 2016, where some sensors
+are sometimes dark, and yields worse results on other recordings: 10.6 instead of 10.4 deg of heading.
 """
 MIN_EXCHANGES = 100
-"""Fewer exchanges with ground truth tell too little of a board."""
+"""Minimum number of exchanges with ground truth."""
 BLOCKS = 3
 _STRAY = (0.0, 0.01, 0.02, 0.03, 0.04, 0.06)
-"""Stray light that is tried."""
+"""Candidate values of stray light."""
 _MISFIT = 3.0
-"""Where the stock platform's residuals are beyond so many sigmas, its curves are wrong, not the robots."""
+"""Maximum RMS residual of the initial platform; beyond it its curves are considered wrong [sigma]."""
 _TAIL_SHARE, _TAIL_BOUND = 0.97, 11.345
-"""Covariances are grown until this share of errors is within the bound that 99 % of normal ones are in."""
+"""Share of errors that must lie within the 99 % bound of the normal distribution; covariances are scaled."""
 _MAX_SCALE = 30.0
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Errors in blocks of time that a fit has not seen.
+    """Errors in blocks of time held out of the fit.
 
     Attributes:
-        errors: (s, 3) range [m], bearing, heading [rad] of the exchanges that were solved.
-        nees: (s,) normalised errors squared.
-        asked: How many exchanges there were.
+        errors: (s, 3) range [m], bearing, heading [rad] of the solved exchanges.
+        nees: (s,) normalised estimation errors squared.
+        asked: Number of exchanges.
     """
 
     errors: FloatArray
@@ -172,12 +172,12 @@ class HeldOut:
 
     @property
     def solved_share(self) -> float:
-        """Share of the exchanges that gave a pose."""
+        """Share of the exchanges with a pose."""
         return len(self.errors) / max(self.asked, 1)
 
     @property
     def badness(self) -> float:
-        """Logarithms of median and 90 % of all three errors, on average, and of the share solved."""
+        """Mean log of the medians and 90 % quantiles of the errors, minus the log of the share solved."""
         if len(self.errors) < 2:
             return np.inf
         sizes = np.quantile(np.abs(self.errors), (0.5, 0.9), axis=0)
@@ -185,21 +185,21 @@ class HeldOut:
 
     @property
     def medians(self) -> FloatArray:
-        """(3,) of the errors' sizes [m, rad, rad]."""
+        """Medians (3,) of the absolute errors [m, rad, rad]."""
         return np.median(np.abs(self.errors), axis=0) if len(self.errors) else np.full(3, np.nan)
 
 
 @dataclass(frozen=True)
 class BoardCalibration:
-    """A board as it was found.
+    """A calibrated board.
 
     Attributes:
-        model: Fitted to everything.
-        stock_sigma: RMS residual of the platform to begin with, at the true poses [sigma].
-        held_out: Errors of the fitted board in blocks that it has not seen.
-        with_gains: Whether gains of sensors helped there and are kept.
-        elements: Which are dead or shaded, by the fitted board.
-        saturation: (n,) the largest count each sensor read, by sensor.
+        model: Model fitted to all exchanges.
+        stock_sigma: RMS residual of the initial platform at the true poses [sigma].
+        held_out: Errors in blocks held out of the fit (cross-validation).
+        with_gains: Whether sensor gains reduced these errors and are kept.
+        elements: Dead or shaded elements, according to the fitted board.
+        saturation: (n,) maximum count of each sensor.
     """
 
     model: BoardModel
@@ -211,17 +211,17 @@ class BoardCalibration:
 
     @property
     def curves_wrong(self) -> bool:
-        """Whether the platform to begin with fits so badly that no robot may be blamed."""
+        """Whether the initial platform fits too badly to attribute residuals to single robots."""
         return self.stock_sigma > _MISFIT
 
 
 def calibrate_board(start: IrPlatform, data: BoardReadings, robots: int) -> BoardCalibration:
-    """Find what a board is.
+    """Calibrate a board.
 
     Args:
-        start: The platform to begin with: its arrangement and saturation count.
-        data: What was read with the poses known.
-        robots: How many there are.
+        start: Initial platform, which defines the arrangement and the saturation count.
+        data: Exchanges with known poses.
+        robots: Number of robots.
 
     Raises:
         CalibrationError: There are too few exchanges.
@@ -231,7 +231,7 @@ def calibrate_board(start: IrPlatform, data: BoardReadings, robots: int) -> Boar
             f"{len(data.receiver)} exchanges with ground truth are too few for a board,"
             f" {MIN_EXCHANGES} are the least."
         )
-    # the curves to begin with may be wrong, and outliers hardly count in a fit
+    # the initial curves may be wrong, and the robust loss limits outliers
     first = fit_board(start, data, robots)
     elements, alive = without_dead(first.platform, data, robots)
     validated = _cross_validated(start, alive, robots)
@@ -240,7 +240,7 @@ def calibrate_board(start: IrPlatform, data: BoardReadings, robots: int) -> Boar
     ranges = {known: one.medians[0] / max(one.solved_share, 0.01) for known, one in tried.items()}
     gains = bool(ranges[True] < ranges[False])
     model, held = fit_board(start, alive, robots) if elements.dead.any() else first, tried[gains]
-    # robots whose gains are not known have the platform, too
+    # the platform also serves robots with unknown gains
     scales = [np.quantile(one.nees, _TAIL_SHARE) / _TAIL_BOUND for one in tried.values() if one.nees.size]
     scale = round(float(np.clip(max(scales, default=1.0), 1.0, _MAX_SCALE)), 2)
     platform = replace(model.platform, stray_noise=stray, covariance_scale=scale)
@@ -251,7 +251,7 @@ def calibrate_board(start: IrPlatform, data: BoardReadings, robots: int) -> Boar
 
 
 def pair_gains(model: BoardModel, data: BoardReadings, *, known: bool = True) -> PairGains:
-    """Gains of the exchanges' pairs; what was not sought, or is not to be known, is unsure by the spread."""
+    """Gains of the exchanges' pairs; unknown gains have the standard deviation `element_sigma`."""
     sensor, count = model.sensor_gains[data.receiver], len(data.receiver)
     if not known:
         return model.platform.unknown_gains(count)
@@ -262,7 +262,7 @@ def pair_gains(model: BoardModel, data: BoardReadings, *, known: bool = True) ->
 
 
 def errors_of(model: BoardModel, data: BoardReadings, *, known: bool = True) -> HeldOut:
-    """Errors of a board on exchanges whose poses are known, with or without the gains that were found."""
+    """Errors of a board on exchanges with known poses, with or without the calibrated gains."""
     solutions = MaximumLikelihood(model.platform).solve(
         data.readings[:, None], pair_gains(model, data, known=known)
     )
@@ -276,7 +276,7 @@ def errors_of(model: BoardModel, data: BoardReadings, *, known: bool = True) -> 
 
 
 def stock_residual(platform: IrPlatform, data: BoardReadings) -> float:
-    """RMS of what readings differ from expectation at the true poses [sigma], without saturated ones."""
+    """RMS residual of unsaturated readings at the true poses [sigma]."""
     bright = expected_brightness(replace(platform, amplitudes=platform.amplitudes[:1]), data.poses)[:, 0]
     usable = (
         np.isfinite(data.readings) & (data.readings < platform.saturation) & (bright < platform.saturation)
@@ -290,10 +290,10 @@ def stock_residual(platform: IrPlatform, data: BoardReadings) -> float:
 def without_dead(
     platform: IrPlatform, data: BoardReadings, robots: int
 ) -> tuple[ElementVerdicts, BoardReadings]:
-    """Which elements are dead or shaded, from the exchanges alone, and the exchanges without them.
+    """Detect dead or shaded elements without known poses; returns them and the exchanges without them.
 
-    The platform's share of readings that something in between darkens counts, too: that of a fitted board is
-    of exchanges with nobody in between.
+    The share of blocked readings is at least that of the initial platform, since the board is fitted to
+    exchanges without occlusion.
     """
     count = len(data.receiver)
     limits, unknown = np.full((count, 1), platform.saturation), np.full((count, 3), np.nan)
@@ -303,7 +303,7 @@ def without_dead(
 
 
 def _cross_validated(start: IrPlatform, data: BoardReadings, robots: int) -> dict[float, dict[bool, HeldOut]]:
-    """Errors in each block of time of a board fitted to all others, by stray light and known gains."""
+    """Cross-validated errors by stray light and by whether gains are used."""
     parts: dict[float, dict[bool, list[HeldOut]]] = {stray: {True: [], False: []} for stray in _STRAY}
     blocks = _blocks(data)
     for block in range(BLOCKS):
@@ -320,7 +320,7 @@ def _cross_validated(start: IrPlatform, data: BoardReadings, robots: int) -> dic
 
 
 def _blocks(data: BoardReadings) -> NDArray[np.int64]:
-    """In which block of time (k,) each exchange is, of those with its receiver."""
+    """Block of time (k,) of each exchange; blocks divide the exchanges of each receiver evenly."""
     blocks = np.zeros(len(data.receiver), dtype=np.int64)
     for receiver in np.unique(data.receiver).tolist():
         rows = np.flatnonzero(data.receiver == receiver)
@@ -331,7 +331,7 @@ def _blocks(data: BoardReadings) -> NDArray[np.int64]:
 
 
 def _joined(parts: list[HeldOut]) -> HeldOut:
-    """Those of several blocks."""
+    """Concatenate the errors of several blocks."""
     return HeldOut(
         np.concatenate([part.errors for part in parts]),
         np.concatenate([part.nees for part in parts]),

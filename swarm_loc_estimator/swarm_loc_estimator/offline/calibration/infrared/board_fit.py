@@ -1,8 +1,8 @@
-"""Fit what an infrared board is, from exchanges of robots whose relative poses are known.
+"""Fit the model of an infrared board to exchanges of robots with known relative poses.
 
 The unknowns are the amplitude law, the symmetric curves of sensors and emitters as tables, and the offset of
-each robot's heading in ground truth. Readings are compared on the scale on which their noise is one, a robust
-loss limits outliers, and second differences of the curves' logarithms are regularized.
+each robot's heading in ground truth. Residuals are computed after a variance-stabilizing transform, with a
+robust loss. Second differences of the log curves are regularized.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from swarm_loc_estimator.swarm.ir_curves import Amplitude, TabulatedCurve
 _KNOTS = np.radians([0, 15, 30, 40, 50, 60, 70, 80, 90, 110, 135, 180])
 _TABLE = np.radians(np.arange(0, 181, 10))
 _FALLS_FROM = 5
-"""From this knot on curves fall."""
+"""Index of the first knot from which curves must decrease."""
 _STEEPNESS, _BEND = 5.0, 0.8
-"""What weighs a rise where curves fall, and by how much logarithms bend from knot to knot."""
+"""Weights of an increase beyond that knot, and of second differences of the log curves."""
 _YAW_SIGMA = np.radians(4.0)
 _OFFSET, _OFFSET_SIGMA, _EXPONENT, _EXPONENT_SIGMA = 0.05, 0.05, 2.5, 1.0
 _PRIOR = 3.0
 _STEP = 1e-5
 _GAIN_SIGMA, _MIN_SPREAD = 0.25, 0.01
 _MIN_MEASURED = 100
-"""Sensors of robots that measured in fewer exchanges have no gains."""
+"""Minimum number of exchanges of a receiver for sensor gains."""
 _LIMIT = 2.0
-"""Largest residual of an outlier after the robust loss [sigma]."""
+"""Maximum residual after the robust loss [sigma]."""
 _DIM = 3.0
-"""Readings within so many sigmas of the median show the noise, for most elements do not face each other."""
+"""Maximum distance from the median of readings that determine the noise [sigma]; most show no light."""
 _LIT = 8.0
-"""Readings expected above so many sigmas show how far curves are off."""
+"""Minimum expectation of readings that determine the error of the curves [sigma]."""
 _OUTLIER = 3.0
 _MIN_SHARE, _MAX_SHARE = 0.02, 0.3
 _ROUNDS = 2
 _MAX_EVALUATIONS = 10
 _TO_SIGMA = 1.4826
-"""Median absolute deviation of a normal distribution to its standard deviation."""
+"""Standard deviation of a normal distribution per median absolute deviation."""
 
 
 class BoardReadings(NamedTuple):
@@ -65,21 +65,21 @@ class BoardReadings(NamedTuple):
     stamp_ns: NDArray[np.int64]
 
     def select(self, rows: NDArray[np.bool_]) -> BoardReadings:
-        """Those of some rows, which are marked (k,)."""
+        """The exchanges where `rows` (k,) is True."""
         return BoardReadings._make(column[rows] for column in self)
 
 
 @dataclass(frozen=True)
 class BoardModel:
-    """A board as it was found.
+    """A fitted board.
 
     Attributes:
         platform: The board.
-        sensor_gains: (robots, n) factors of the receivers' sensors; ones where not sought.
-        gains_sought: (robots,) whether they were; what they differ by is the platform's `element_sigma`.
-        truth_yaw: (robots,) by how much each robot's heading is ahead of its ground truth's [rad].
-        scatter: (k, n, n) residuals of the readings it was fitted to [sigma].
-        angles: (2, k, n, n) at which sensors and emitters are met [rad].
+        sensor_gains: (robots, n) gains of the receivers' sensors; 1 where not estimated.
+        gains_sought: (robots,) True where estimated; their spread is the platform's `element_sigma`.
+        truth_yaw: (robots,) heading of each robot minus that of its ground truth [rad].
+        scatter: (k, n, n) residuals of the fitted readings [sigma].
+        angles: (2, k, n, n) angles of the paths at sensors and emitters [rad].
     """
 
     platform: IrPlatform
@@ -91,13 +91,13 @@ class BoardModel:
 
 
 def fit_board(start: IrPlatform, data: BoardReadings, robots: int, *, gains: bool = True) -> BoardModel:
-    """Fit a board, from the arrangement, saturation and noise of one that is roughly right.
+    """Fit a board, starting from an approximate platform.
 
     Args:
-        start: Whose arrangement, saturation and, to begin with, noise count.
-        data: What was read; poses must be finite.
-        robots: How many there are.
-        gains: Whether sensors of robots that measured often may have gains.
+        start: Platform that defines arrangement, saturation and initial noise.
+        data: Exchanges; poses must be finite.
+        robots: Number of robots.
+        gains: Whether to estimate gains of sensors with enough exchanges.
     """
     noise = round(noise_floor(data), 2)
     platform = replace(start, noise=noise, curve_sigma=0.3, relative_noise=0.0, element_sigma=0.0)
@@ -118,7 +118,7 @@ def fit_board(start: IrPlatform, data: BoardReadings, robots: int, *, gains: boo
 
 
 def turned(poses: FloatArray, receiver_yaw: FloatArray, transmitter_yaw: FloatArray) -> FloatArray:
-    """Relative poses (k, 3) of robots whose headings are ahead of their ground truth by (k,) [rad]."""
+    """Relative poses (k, 3) after adding yaw offsets (k,) to the true headings [rad]."""
     moved: FloatArray = poses.copy()
     moved[:, 1] = wrap_angle(poses[:, 1] - receiver_yaw)
     moved[:, 2] = wrap_angle(poses[:, 2] + transmitter_yaw - receiver_yaw)
@@ -126,10 +126,10 @@ def turned(poses: FloatArray, receiver_yaw: FloatArray, transmitter_yaw: FloatAr
 
 
 def noise_floor(data: BoardReadings) -> float:
-    """Robust standard deviation of readings where there is no light [count].
+    """Robust standard deviation of dark readings [count].
 
-    It is computed from the differences of one element's dark readings in successive exchanges of a receiver,
-    so that the offset and drift of an amplifier do not count.
+    It is computed from differences of one element's dark readings in successive exchanges of a receiver, so
+    offset and drift of the amplifier cancel.
     """
     middle = float(np.nanmedian(data.readings))
     limit = _DIM * max(_TO_SIGMA * float(np.nanmedian(np.abs(data.readings - middle))), 0.5)
@@ -161,7 +161,7 @@ class _Problem:
         self._units = np.stack([np.cos(platform.angles), np.sin(platform.angles)], axis=-1)
 
     def first_unknowns(self) -> FloatArray:
-        """Curves of a cosine's kind, and the amplitude that brings most of the brightest readings out."""
+        """Initial values: cosine-like curves, and the amplitude of most of the brightest readings."""
         data = self._data
         shape = np.log(np.interp(_KNOTS[1:], np.radians([0, 40, 90, 180]), [1.0, 0.8, 0.05, 0.01]))
         gap = data.poses[:, 0] - 2.0 * self._platform.radius + _OFFSET
@@ -177,7 +177,7 @@ class _Problem:
         return law, np.r_[0.0, sensor], np.r_[0.0, emitter], rest[: self._robots]
 
     def log_gains(self, unknowns: FloatArray) -> FloatArray:
-        """(robots, n) of sensors."""
+        """Log-gains (robots, n) of sensors."""
         n = self._platform.n
         logs = np.zeros((self._robots, n))
         logs[self._often] = unknowns[unknowns.size - self._often.size * n :].reshape(-1, n)
@@ -202,7 +202,7 @@ class _Problem:
         return np.hypot(way[..., 0], way[..., 1]), np.stack([sensor, emitter])
 
     def expected(self, unknowns: FloatArray) -> FloatArray:
-        """Readings (k, n, n)."""
+        """Expected readings (k, n, n) [count]."""
         law, sensor, emitter, yaw = self.parts(unknowns)
         distance, (alpha, beta) = self.angles(yaw)
         logs = law[0] - law[2] * np.log(np.maximum(distance + law[1], 1e-3))
@@ -211,13 +211,13 @@ class _Problem:
         return readings
 
     def scatter(self, unknowns: FloatArray) -> FloatArray:
-        """What readings are above expectation (k, n, n) [sigma]; NaN where there is none."""
+        """Residuals (k, n, n) of readings [sigma]; NaN where there is no reading."""
         more = self._read - self._stable(self.expected(unknowns))
         more = np.where(self._saturated, np.maximum(more, 0.0), more)
         return np.where(self._known, more, np.nan)
 
     def residuals(self, unknowns: FloatArray) -> FloatArray:
-        """Residuals of readings, each with a limit, and of the regularization."""
+        """Residuals of readings after the robust loss, and of the regularization."""
         limited = _limited(np.nan_to_num(self.scatter(unknowns)))[0]
         return np.concatenate([limited.ravel(), self._held(unknowns)])
 
@@ -254,7 +254,7 @@ class _Problem:
         return np.concatenate([columns.reshape(unknowns.size, -1).T, self._held_slopes(unknowns)])
 
     def _held_slopes(self, unknowns: FloatArray) -> FloatArray:
-        """Jacobian of the regularization, by differences, since it is cheap."""
+        """Jacobian of the regularization by finite differences, which are cheap here."""
         here, slopes = self._held(unknowns), []
         for k in range(unknowns.size):
             ahead = unknowns.copy()
@@ -274,7 +274,7 @@ class _Problem:
         return _PRIOR * np.concatenate(held)
 
     def platform_of(self, unknowns: FloatArray) -> IrPlatform:
-        """The platform with law and curves."""
+        """The platform with the law and curves of these unknowns."""
         law, sensor, emitter, _ = self.parts(unknowns)
         amplitude = Amplitude(float(np.exp(law[0])), float(law[1]), float(law[2]), nearest=_nearest(law[1]))
         return replace(
@@ -285,7 +285,7 @@ class _Problem:
         )
 
     def _curve(self, logs: FloatArray) -> TabulatedCurve:
-        """A symmetric table that falls beyond its top."""
+        """A symmetric table that decreases beyond its maximum."""
         values = np.exp(self._spline(_TABLE) @ logs)
         top = int(values.argmax())
         values[top:] = np.minimum.accumulate(values[top:])
@@ -294,13 +294,13 @@ class _Problem:
         return TabulatedCurve(tuple(angles.tolist()), tuple(both.tolist()))
 
     def _stable(self, values: FloatArray) -> FloatArray:
-        """Brightness on the scale on which noise is one."""
+        """Variance-stabilizing transform of brightness [sigma]."""
         relative, noise = self._platform.relative, self._platform.noise
         return np.asarray(np.arcsinh(relative * values / noise) / relative)
 
 
 def _limited(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Residuals whose size ends at a limit, and their slopes by the residuals."""
+    """Residuals after the robust loss, and their derivatives by the residuals."""
     part = np.exp(-(values**2) / (2.0 * _LIMIT**2))
     size = np.sqrt(2.0 * _LIMIT**2 * (1.0 - part))
     slope = np.where(size > 1e-6, np.abs(values) * part / np.maximum(size, 1e-12), 1.0)
@@ -308,12 +308,12 @@ def _limited(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _nearest(offset: float) -> float:
-    """From where on a law with this offset is believed [m]."""
+    """Minimum distance at which a law with this offset is valid [m]."""
     return 0.0 if offset > 0.0 else 0.005 - offset
 
 
 def _with_noise(platform: IrPlatform, problem: _Problem, unknowns: FloatArray) -> IrPlatform:
-    """The platform with the noise, and the shares of outliers, that its residuals show."""
+    """The platform with noise and outlier shares estimated from its residuals."""
     expected, scatter = problem.expected(unknowns), problem.scatter(unknowns)
     known = np.isfinite(scatter)
     lit = known & (expected > _LIT * platform.noise) & (expected < platform.saturation)
@@ -329,5 +329,5 @@ def _with_noise(platform: IrPlatform, problem: _Problem, unknowns: FloatArray) -
 
 
 def _robust_sigma(values: FloatArray) -> float:
-    """Robust standard deviation about zero, by the median."""
+    """Robust standard deviation about zero, from the median."""
     return float(_TO_SIGMA * np.median(np.abs(values)))

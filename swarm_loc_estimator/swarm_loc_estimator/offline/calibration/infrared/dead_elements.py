@@ -32,16 +32,16 @@ from swarm_loc_estimator.swarm.ir_board import IrPlatform
 FALSE_ALARM = 0.01
 """Probability of a false alarm for any element."""
 _LOST, _WHOLE_SHARES = slice(0, 3), slice(3, None)
-"""Shares of light of elements that are dead or shaded, and of others."""
+"""Relative gains (of `SHARES`) under the hypotheses dead or shaded, and working."""
 _SAME_GEOMETRY = 1.5
-"""Directions within so many steps of the grid are the same geometry."""
+"""Maximum difference of directions within one geometry, in steps of the grid."""
 _BRIGHT = 10.0
-"""Exchanges whose brightest reading is below are not used: out of reach, or out of sight [sigma]."""
+"""Minimum of the brightest reading of a usable exchange [sigma]; below, robots are out of range or sight."""
 _MIN_BLOCKED = 0.05
-"""Geometries in which something is in between, where the board says that fewer readings are blocked."""
+"""Minimum assumed share of geometries with an obstacle on the line of sight."""
 
 _MIN_SIGMA = 0.05
-"""By how much elements that work differ at least, relative."""
+"""Minimum relative standard deviation of the gains of working elements."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ class ElementVerdicts:
 
     Attributes:
         dead: (2, robots, n) sensors and emitters that are dead or shaded.
-        works: (2, robots, n) those that are not, for sure.
-        share: (2, robots, n) the likeliest share of their light.
+        works: (2, robots, n) sensors and emitters that certainly work.
+        share: (2, robots, n) most likely relative gain.
     """
 
     dead: BoolArray
@@ -76,11 +76,11 @@ class ElementVerdicts:
 
 
 def find_dead_elements(platform: IrPlatform, robots: int, exchanges: Exchanges) -> ElementVerdicts:
-    """Judge all sensors and emitters of robots with one kind of board; known poses are not used.
+    """Test all sensors and emitters of robots with one kind of board; known poses are not used.
 
-    Elements that are named are left out, and the others judged again, for one fault looks like another in
-    some geometries: of two elements of a robot's ring between which exchanges do not decide (by the same
-    probability), both are named.
+    Detected elements are excluded and the others are tested again, since in some geometries two faults are
+    ambiguous. If exchanges do not discriminate between two elements of a robot (at the same probability),
+    both are reported.
     """
     n, bright = platform.n, _bright(platform, exchanges)
     readings: FloatArray = exchanges.readings[bright, 0]
@@ -110,7 +110,7 @@ def find_dead_elements(platform: IrPlatform, robots: int, exchanges: Exchanges) 
 
 
 def _bright(platform: IrPlatform, exchanges: Exchanges) -> BoolArray:
-    """(k,) whether an exchange shows light enough."""
+    """(k,) True where an exchange is bright enough."""
     bright: BoolArray = np.nan_to_num(exchanges.readings[:, 0]).max(axis=(1, 2)) > _BRIGHT * platform.noise
     return bright
 

@@ -1,9 +1,9 @@
-"""Likelihood of exchanges by the share of its light that one element still gives, over all poses.
+"""Likelihood of exchanges as a function of the relative gain of one element, marginalized over poses.
 
 The relative pose is unknown, so the likelihood is marginalized over a grid of relative poses. It is computed
-for a few shares of the light of each sensor of the receiver and each emitter of the transmitter, with all
-other elements as the board describes them. Readings are compared on the scale on which their noise is one;
-any may be blocked, or lit from elsewhere, at the rates of the board.
+for a few relative gains of each sensor of the receiver and emitter of the transmitter; all other elements
+follow the board. Residuals are computed after a variance-stabilizing transform. Any reading may be blocked or
+too bright, at the rates of the board.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from swarm_loc_estimator.infrared.start_table import start_table
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
 SHARES: FloatArray = np.array([0.0, 0.15, 0.35, 0.7, 1.0, 1.4])
-"""Of an element's light that are compared; the first is none of it."""
+"""Relative gains of an element that are compared; the first is zero."""
 WHOLE = 4
-"""Which of them is all of it."""
+"""Index of the relative gain one."""
 _PER_ELEMENT, _MAX_DIRECTIONS = 4, 24
-"""Bearings, and headings, of the grid."""
+"""Number of bearings, and of headings, of the grid."""
 _SHOWN = 10.0
-"""Readings that show how much the grid errs are brighter [sigma]."""
+"""Minimum of readings that determine the discretization error of the grid [sigma]."""
 _NOISE_RATIO = 1.2
-"""Exchanges whose noise differs by less are compared with one table."""
+"""Maximum relative difference in noise of exchanges that share a table."""
 _NEGLIGIBLE = 8.0
-"""Poses whose log likelihoods are lower by this are left out."""
+"""Maximum log-likelihood ratio to the best pose; less likely poses are skipped."""
 BRIGHT_SPAN = 20.0
-"""Light from elsewhere is as likely at any brightness on a span of so many sigmas."""
+"""Width of the uniform distribution of readings that are too bright [sigma]."""
 MIN_SHARE = 1e-3
-"""Of outliers, where a board is said to have fewer."""
+"""Minimum assumed share of outliers."""
 PEAK = 1.0 / math.sqrt(2.0 * math.pi)
 LOWEST = 1e-300
 _FAR_OFF = 8.0
-"""Readings off by more sigmas have no density to speak of."""
+"""Maximum residual with a non-negligible likelihood [sigma]."""
 
 Float32Array = NDArray[np.float32]
 
@@ -50,9 +50,9 @@ class ElementLikelihoods(NamedTuple):
     """Likelihoods of the elements of exchanges.
 
     Attributes:
-        log: (k, 2, n, S) log likelihood by the share, of `SHARES`, of the receiver's sensors and the
-            transmitter's emitters.
-        directions: (k, 2) bearing and heading [rad] of the likeliest pose.
+        log: (k, 2, n, S) log likelihood for each relative gain of `SHARES`, of the receiver's sensors and
+            the transmitter's emitters.
+        directions: (k, 2) bearing and heading [rad] of the most likely pose.
     """
 
     log: FloatArray
@@ -62,7 +62,7 @@ class ElementLikelihoods(NamedTuple):
 def element_likelihoods(
     platform: IrPlatform, readings: FloatArray, saturation: FloatArray
 ) -> ElementLikelihoods:
-    """Log likelihoods of k exchanges by the share of light that each of their elements gives.
+    """Log likelihoods of k exchanges as functions of the relative gain of each element.
 
     Args:
         platform: The board of both robots.
@@ -98,12 +98,12 @@ def element_likelihoods(
 
 
 def direction_step(platform: IrPlatform) -> float:
-    """Between neighbouring bearings, or headings, of the grid [rad]."""
+    """Step of the grid in bearing and heading [rad]."""
     return 2.0 * math.pi / min(_PER_ELEMENT * platform.n, _MAX_DIRECTIONS)
 
 
 def _grid(platform: IrPlatform) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Poses (g, 3), what is read there (g, n, n), and the log prior (g,): as likely all over the plane."""
+    """Poses (g, 3), expected readings (g, n, n), and log prior (g,), uniform over the plane."""
     full = replace(platform, amplitudes=platform.amplitudes[:1])
     ranges = start_table(full).ranges
     angles = np.arange(-math.pi, math.pi - 1e-9, direction_step(platform))
@@ -112,7 +112,7 @@ def _grid(platform: IrPlatform) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _grid_variance(platform: IrPlatform, light: FloatArray) -> float:
-    """Mean square by which readings differ, relative, from those of the nearest pose of the grid."""
+    """Mean squared relative error of readings due to the discretization of poses."""
     n, size = platform.n, round(2.0 * math.pi / direction_step(platform))
     logs = np.log(np.clip(light, platform.noise, platform.saturation)).reshape(-1, size, size, n * n)
     shown = logs > math.log(_SHOWN * platform.noise)
@@ -125,7 +125,7 @@ def _grid_variance(platform: IrPlatform, light: FloatArray) -> float:
 
 
 def _stabilized(values: FloatArray, noise: float, relative: float) -> Float32Array:
-    """On the scale on which noise, with what is relative to the reading, is one."""
+    """Variance-stabilizing transform of readings with additive and relative noise [sigma]."""
     stable: Float32Array = (np.arcsinh(relative / noise * values) / relative).astype(np.float32)
     return stable
 
@@ -140,14 +140,14 @@ def _marginalize(
     found: FloatArray,
     best: NDArray[np.int64],
 ) -> None:
-    """Write `found` (k, 2, n, S) and the likeliest pose of each exchange.
+    """Write `found` (k, 2, n, S) and the most likely pose of each exchange.
 
     Args:
-        table: (S, g, n, n) expectations by share.
+        table: (S, g, n, n) expected readings by relative gain.
         log_prior: (g,).
         stable: (k, n, n) readings.
         kinds: (k, n, n) 0 missing, 1 measured, 2 saturated.
-        outlier: (k, n, n) densities of readings that are blocked, or lit from elsewhere.
+        outlier: (k, n, n) densities under the outlier hypotheses.
         found: Written.
         best: (k,) written.
     """
@@ -185,7 +185,7 @@ def _marginalize(
 
 @cached_njit
 def _counts(log: float, base: float, sides: FloatArray, dark: FloatArray, tops: FloatArray) -> bool:
-    """Whether a pose is likely enough to count, with all elements whole or any one of them dark."""
+    """Whether a pose is not negligible, with all elements working or any one of them dead."""
     if log > base - _NEGLIGIBLE:
         return True
     for side in range(2):
@@ -203,7 +203,7 @@ def _by_side(
     outlier: FloatArray,
     sides: FloatArray,
 ) -> float:
-    """Write the log likelihood of each sensor's and each emitter's readings (2, n); returns that of all."""
+    """Write the log likelihood of each sensor's and each emitter's readings (2, n); returns the total."""
     n, total = stable.shape[0], 0.0
     for e in range(n):
         sides[1, e] = 1.0

@@ -1,14 +1,13 @@
-"""Which robots' gains improve exchanges that they were not estimated from: cross-validation over time.
+"""Cross-validation of gains over blocks of time.
 
-Gains are estimated without one block at a time, and the exchanges of each block are compared by their
-likelihood under those gains. Gains help where exchanges are likelier with them than with all elements alike,
-and than with unknown gains. Errors of the curves are correlated within a stretch of time, so the sum over all
-robots must exceed its scatter over blocks; single robots need only a positive sum, for some read little.
+Gains are estimated with one block held out at a time, and the likelihood of the held-out exchanges is
+evaluated. Gains are accepted where it is higher than with unit gains and with unknown gains.
+Errors of the curves are correlated over time, so the sum over all robots must exceed its scatter over blocks.
+Single robots need only a positive sum, since some have few readings.
 
-The relative pose of an exchange is unknown or known only roughly, so its likelihood is marginalized over the
-pose, by importance sampling about the poses that the solver finds with gains and without. All hypotheses on a
-pair's gains are compared at the same poses. Any reading may be blocked, or lit from elsewhere, at the rates
-of the board.
+The relative pose of an exchange is unknown or uncertain, so the likelihood is marginalized over the pose by
+importance sampling around the solutions with and without gains. All hypotheses on a pair's gains are compared
+at the same poses. Any reading may be an outlier, blocked or too bright, at the rates of the board.
 """
 
 from __future__ import annotations
@@ -37,13 +36,13 @@ from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains
 
 BLOCKS = 4
 _EVIDENCE = math.log(100.0)
-"""By so much the log likelihood of all exchanges must be larger."""
+"""Minimum increase of the log likelihood of all exchanges."""
 GAINS, ALIKE, UNKNOWN = range(3)
-"""Hypotheses on a robot's elements: they differ as was found; they do not, which is as sure; they differ by
-what the board says, nobody knows how."""
+"""Hypotheses on a robot's gains: the estimate; unit gains with the same uncertainty; unknown gains with the
+board's `element_sigma`."""
 HYPOTHESES = 3
 _POINTS = 48
-"""Poses drawn about each that the solver finds."""
+"""Number of poses sampled around each solution."""
 _SEED = 1
 
 
@@ -53,13 +52,13 @@ def helpful_gains(
     exchanges: Exchanges,
     progress: Callable[[str], None] = lambda _: None,
 ) -> BoolArray:
-    """Whether the gains (robots,) that `estimate_gains` finds of these exchanges help in others.
+    """True (robots,) where gains estimated by `estimate_gains` improve held-out exchanges.
 
     Args:
         platform: Of all robots.
-        robots: How many there are.
-        exchanges: What they read, in the order of time.
-        progress: Called with a word on what is being done.
+        robots: Number of robots.
+        exchanges: Their exchanges in order of time.
+        progress: Called with the name of each step.
     """
     count = len(exchanges.receiver)
     logs, blocks = np.full((count, HYPOTHESES, HYPOTHESES), np.nan), np.arange(count) * BLOCKS // count
@@ -77,13 +76,13 @@ def helpful_gains(
 def _chosen_robots(
     pairs: NDArray[np.int64], logs: FloatArray, blocks: NDArray[np.int64], robots: int
 ) -> BoolArray:
-    """Leave out the robot whose gains help least, until each of the others' help, and all of them for sure.
+    """Remove the robot with the least improvement until each remaining one and their sum pass the test.
 
     Args:
         pairs: (2, k) receivers and transmitters.
         logs: (k, H, H) log likelihoods by the hypotheses on both.
-        blocks: (k,) of time.
-        robots: How many there are.
+        blocks: (k,) index of the block of time.
+        robots: Number of robots.
     """
     helps = np.ones(robots, dtype=np.bool_)
     while helps.any():
@@ -105,7 +104,7 @@ def _by_block(
     helps: BoolArray,
     judged: BoolArray,
 ) -> list[FloatArray]:
-    """By how much (blocks,) gains of robots that are judged are likelier than each other hypothesis."""
+    """Log-likelihood ratios by block of the estimated gains to each other hypothesis."""
     receiver, transmitter = np.where(helps, GAINS, UNKNOWN)[pairs]
     rows, gains = np.arange(len(blocks)), []
     for hypothesis in (ALIKE, UNKNOWN):
@@ -116,12 +115,12 @@ def _by_block(
 
 
 def _beyond_chance(by_block: FloatArray) -> float:
-    """By how much a sum over blocks is larger than it must be."""
+    """The margin by which a sum over blocks exceeds its threshold."""
     return float(by_block.sum() - max(_EVIDENCE, np.linalg.norm(by_block)))
 
 
 class _PairElements(NamedTuple):
-    """Factors (H, n) of the receiver's sensors and the transmitter's emitters, and their sigmas (H,)."""
+    """Gains (H, n) of the receiver's sensors and the transmitter's emitters, and their sigmas (H,)."""
 
     sensor: FloatArray
     emitter: FloatArray
@@ -134,12 +133,12 @@ def held_out_likelihoods(
 ) -> FloatArray:
     """Log likelihoods (k, H, H) of exchanges by the hypotheses on receiver and transmitter.
 
-    They are up to a constant of each exchange; NaN where no pose is found.
+    A constant per exchange is omitted; NaN where no pose is found.
 
     Args:
         platform: Of all robots.
-        gains: Of every robot, estimated from other exchanges than these.
-        exchanges: What they read.
+        gains: Of every robot, estimated without these exchanges.
+        exchanges: Held-out exchanges.
     """
     found = np.full((len(exchanges.receiver), HYPOTHESES, HYPOTHESES), np.nan)
     factors, sigmas = _by_hypothesis(platform, gains)
@@ -166,7 +165,7 @@ def held_out_likelihoods(
 
 
 def _by_hypothesis(platform: IrPlatform, gains: tuple[IrGains, ...]) -> tuple[FloatArray, FloatArray]:
-    """Factors (2, robots, H, n) of sensors and emitters, and how unsure they are (robots, H)."""
+    """Gains (2, robots, H, n) of sensors and emitters, and their standard deviations (robots, H)."""
     factors = np.ones((2, len(gains), HYPOTHESES, platform.n))
     sigmas = np.full((len(gains), HYPOTHESES), platform.element_sigma)
     for robot, one in enumerate(gains):
@@ -178,7 +177,7 @@ def _by_hypothesis(platform: IrPlatform, gains: tuple[IrGains, ...]) -> tuple[Fl
 def _samples(
     platform: IrPlatform, gains: tuple[IrGains, ...], exchanges: Exchanges
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Poses (P, 3) of each exchange and their log weights (P,), none where the solver finds none."""
+    """Sampled poses (P, 3) of each exchange and log weights (P,); empty where the solver finds no pose."""
     of_pair = [
         [gains[robot] for robot in side.tolist()] for side in (exchanges.receiver, exchanges.transmitter)
     ]
@@ -198,7 +197,7 @@ def _samples(
 
 
 def _about_known(pose: FloatArray, draws: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Poses about one that is known, all of the same weight."""
+    """Samples around a known pose, with equal weights."""
     poses = pose + draws.reshape(-1, 3) * POSE_SIGMA
     return poses, np.zeros(len(poses))
 
@@ -206,7 +205,7 @@ def _about_known(pose: FloatArray, draws: FloatArray) -> tuple[FloatArray, Float
 def _about_found(
     solved: list[IrSolutions], k: int, draws: FloatArray, radius: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses about those that were found of exchange k, which is as likely to be all over the plane."""
+    """Samples around the solutions of exchange k, with a uniform prior over the plane."""
     centres = np.array([pose[k] for one in solved for pose in (one.poses, one.alternatives)])
     spreads = np.array([one.covariances[k] for one in solved for _ in range(2)])
     there = np.isfinite(centres).all(axis=1)
@@ -234,13 +233,13 @@ def _write_likelihoods(
     """Write the log likelihoods (H, H, P) of one exchange at P poses.
 
     Args:
-        light: (P, modes, n, n) expectations without gains [count].
+        light: (P, modes, n, n) expected readings for unit gains [count].
         readings: (modes, n, n) [count]; NaN where not measured.
-        saturation: (modes,) from where on they tell no more [count].
-        elements: Of both robots.
-        noise: Standard deviation of every reading [count].
-        curves: Standard deviation besides, relative to the reading.
-        shares: Of readings that are blocked, and that are lit from elsewhere.
+        saturation: (modes,) minimum of saturated readings [count].
+        elements: Gains of both robots.
+        noise: Additive standard deviation of a reading [count].
+        curves: Additional relative standard deviation of a reading.
+        shares: Shares of readings that are blocked, and that are too bright.
         logs: Written.
     """
     sensor, emitter, of_receiver, of_transmitter = elements

@@ -27,20 +27,20 @@ from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 MIN_EXCHANGES = 20
-"""Fewer exchanges between robots of one kind are not fitted to."""
+"""Minimum number of exchanges between robots with one kind of board."""
 _MAX_EXCHANGES = 10_000
 _DECIMALS = 5
 
 
 @dataclass(frozen=True)
 class BoardGroup:
-    """The robots with one kind of board, and what they read of each other.
+    """The robots with one kind of board, and their exchanges.
 
     Attributes:
         source: Name or path of the platform.
-        platform: What the board is.
+        platform: Model of the board.
         robots: Their indices in the swarm.
-        exchanges: By place in `robots`, in the order of their stamps.
+        exchanges: Exchanges in order of time; robots by place in `robots`.
     """
 
     source: str
@@ -54,11 +54,11 @@ class BoardFit:
     """The calibration of one kind of board.
 
     Attributes:
-        group: Who, and what was read.
+        group: Robots and exchanges.
         fit: Gains, by place in the group's `robots`.
-        elements: Which elements are dead or shaded, by place; they are not used.
-        limits: Where their sensors saturate and how noisy they are, by place.
-        helps: (robots,) whether a robot's gains help in blocks of time that they were not estimated from.
+        elements: Dead or shaded elements, by place; they are not used.
+        limits: Saturation and noise of sensors, by place.
+        helps: (robots,) True where a robot's gains pass the cross-validation over blocks of time.
     """
 
     group: BoardGroup
@@ -68,7 +68,7 @@ class BoardFit:
     helps: BoolArray
 
     def of_robot(self, place: int) -> tuple[int, float, float]:
-        """How many exchanges of a robot were used, and the rms residuals before and after [sigma]."""
+        """Number of exchanges of a robot used, and its RMS residuals before and after [sigma]."""
         exchanges = self.group.exchanges
         own = self.fit.used & ((exchanges.receiver == place) | (exchanges.transmitter == place))
         return int(own.sum()), rms(self.fit.before[own]), rms(self.fit.after[own])
@@ -79,7 +79,7 @@ class InfraredCalibration:
     """Result of a calibration of infrared boards.
 
     Attributes:
-        swarm: With the gains and dead elements that were found.
+        swarm: The swarm with calibrated gains and dead elements.
         boards: The fit of each kind of board.
         remarks: What could not be used or calibrated, one sentence each.
     """
@@ -92,16 +92,16 @@ class InfraredCalibration:
 def calibrate_infrared(
     recording: Recording, swarm: Swarm, progress: Progress, *, with_truth: bool = True
 ) -> InfraredCalibration:
-    """Find the gains of all robots with infrared boards.
+    """Calibrate the gains of all robots with infrared boards.
 
     Args:
         recording: With brightness matrices.
-        swarm: Whose; gains that it has are forgotten.
+        swarm: The swarm of the recording; its gains are ignored.
         progress: Called with the share done and the name of the step.
-        with_truth: Whether ground truth is used, where there is some.
+        with_truth: Whether to use ground truth where available.
 
     Raises:
-        CalibrationError: There is nothing to fit to, or nothing comes out.
+        CalibrationError: No exchange can be used, or no gains are determined.
     """
     groups, dropped = _groups(recording, swarm, with_truth=with_truth)
     remarks = [f"Matrices not used: {_counts(dropped)}."] if dropped else []
@@ -125,23 +125,23 @@ def calibrate_infrared(
 
 
 def exchanges_of(recording: Recording, swarm: Swarm) -> tuple[BoardGroup, IntArray]:
-    """What the robots with the first kind of board read of each other, and the stamps (k,).
+    """The exchanges of the robots with the first kind of board, and their stamps (k,).
 
     Raises:
-        CalibrationError: Nothing can be used.
+        CalibrationError: No exchange can be used.
     """
     (group, stamps_ns), *_ = _groups(recording, swarm, with_truth=True)[0]
     return group, stamps_ns
 
 
 def rms(residuals: FloatArray) -> float:
-    """Root mean square of those that there are; NaN without any."""
+    """Root mean square of the values that are not NaN; NaN if there are none."""
     known = residuals[np.isfinite(residuals)]
     return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
 
 
 class _Share:
-    """Progress of one of several fits, which reports an unknown number of steps."""
+    """Progress of one of several fits with an unknown number of steps."""
 
     def __init__(self, progress: Progress, number: int, count: int) -> None:
         self._progress, self._begin, self._left = progress, number / count, 1.0 / count
@@ -173,10 +173,10 @@ def _fit(group: BoardGroup, limits: ReadingLimits, progress: _Share) -> BoardFit
 def _groups(
     recording: Recording, swarm: Swarm, *, with_truth: bool
 ) -> tuple[list[tuple[BoardGroup, IntArray]], Counter[str]]:
-    """Exchanges by kind of board with their stamps, and which matrices could not be used.
+    """Exchanges by kind of board with their stamps, and the number of unusable matrices by reason.
 
     Raises:
-        CalibrationError: None could be used.
+        CalibrationError: No matrix can be used.
     """
     screening = MatrixScreening(swarm)
     if not screening.boards:
@@ -218,7 +218,7 @@ def _true_poses(recording: Recording, swarm: Swarm, columns: IntArray) -> FloatA
 
     Args:
         recording: With ground truth.
-        swarm: Whose names it goes by.
+        swarm: The swarm with the robots' names.
         columns: (3, k) stamp, receiver and transmitter.
     """
     stamp_ns, *sides = columns
@@ -236,7 +236,7 @@ def _true_poses(recording: Recording, swarm: Swarm, columns: IntArray) -> FloatA
 def _with_fits(
     robots: Sequence[Robot], boards: Iterable[BoardFit]
 ) -> tuple[tuple[Robot, ...], dict[str, list[str]]]:
-    """The robots with the gains that were found, and the names of those without by why there are none."""
+    """The robots with calibrated gains, and the names of those without gains by reason."""
     changed, left = list(robots), dict[str, list[str]]()
     for board in boards:
         for place, index in enumerate(board.group.robots):
@@ -256,7 +256,7 @@ def _with_fits(
 
 
 def _without_dead(robot: Robot, elements: ElementVerdicts, place: int) -> Robot:
-    """The robot with its dead elements; one described as dead stays so unless it works for sure."""
+    """The robot with its dead elements; an element described as dead stays so unless it certainly works."""
     if robot.ir is None:
         return robot
     described = (robot.ir.dead_sensors, robot.ir.dead_emitters)
@@ -270,7 +270,7 @@ def _without_dead(robot: Robot, elements: ElementVerdicts, place: int) -> Robot:
 
 
 def _with_gains(robot: Robot, gains: IrGains) -> Robot:
-    """The robot with gains, to the digits that mean something."""
+    """The robot with gains, rounded to significant digits."""
     if robot.ir is None:
         return robot
     sensor, emitter = (tuple(round(v, _DECIMALS) for v in part) for part in (gains.sensor, gains.emitter))

@@ -48,7 +48,7 @@ def text_of(done: InfraredCalibration) -> str:
 
 
 def dead_lines(elements: ElementVerdicts, names: list[str]) -> list[str]:
-    """A line per robot that has dead elements, and one for elements of which not enough was read."""
+    """A line per robot with dead elements, and one for undecided elements."""
     lines = []
     for place, name in enumerate(names):
         found = zip(("sensors", "emitters"), elements.numbers(place), strict=True)
@@ -66,7 +66,7 @@ def dead_lines(elements: ElementVerdicts, names: list[str]) -> list[str]:
 
 
 def _limits(board: BoardFit, names: list[str]) -> list[str]:
-    """A line per robot with saturation and noise by sensor, and one with how many sensors were determined."""
+    """A line per robot with saturation and noise by sensor, and one with the number of determined sensors."""
     limits, lines = board.limits, []
     columns = (
         ("saturation [count]", limits.saturation + board.group.platform.dark_level, 0),
@@ -87,12 +87,12 @@ def _limits(board: BoardFit, names: list[str]) -> list[str]:
 
 
 def _bracketed(values: FloatArray, digits: int) -> str:
-    """Numbers in brackets, a dash where there is none."""
+    """Numbers in brackets; a dash for NaN."""
     return f"[{' '.join(f'{value:.{digits}f}' if np.isfinite(value) else '-' for value in values)}]"
 
 
 def draw(done: InfraredCalibration, path: Path) -> Path:
-    """Residuals before and after, all and by brightness, and all gains; one row per kind of board."""
+    """Plot residuals before and after, in total and by brightness, and gains; one row per kind of board."""
     figure = Figure(figsize=(12.0, 3.2 * len(done.boards)))
     rows: list[Any] = list(figure.subplots(len(done.boards), 3, squeeze=False, width_ratios=(1.0, 1.0, 1.4)))
     for axes, board in zip(rows, done.boards, strict=True):
@@ -119,7 +119,7 @@ def _residuals(axis: Any, board: BoardFit) -> None:
 
 
 def _by_brightness(axis: Any, board: BoardFit) -> None:
-    """Their size by how bright it was: gains show where it is bright, blocked light where it is dim."""
+    """Residuals by brightness: wrong gains show in bright readings, blocked light in dark ones."""
     readings = board.group.exchanges.readings
     style(axis)
     for label, residuals, colour in (
@@ -145,7 +145,7 @@ def _by_brightness(axis: Any, board: BoardFit) -> None:
 
 
 def _sizes(readings: FloatArray, residuals: FloatArray) -> tuple[list[float], list[float]]:
-    """Middles of levels of brightness, and the rms of the residuals there."""
+    """Centres of brightness bins, and the RMS residuals in them."""
     known = np.isfinite(residuals)
     bright, error = readings[known], residuals[known]
     edges = np.linspace(bright.min(initial=0.0), bright.max(initial=1.0), _LEVELS + 1)
@@ -156,7 +156,7 @@ def _sizes(readings: FloatArray, residuals: FloatArray) -> tuple[list[float], li
 
 
 def _gains(axis: Any, board: BoardFit, names: list[str]) -> None:
-    """The factors of each robot's elements, with what each is unsure by."""
+    """Gains of each robot's elements with standard deviations."""
     style(axis)
     for number, part in enumerate(("sensor", "emitter")):
         factors = np.array([getattr(gains, part) for gains in board.fit.gains])
@@ -188,7 +188,7 @@ _MAX_POINTS = 4000
 
 
 def board_text(board: BoardRecording, done: BoardCalibration, swarm: Swarm) -> str:
-    """What was found, a line each."""
+    """The parameters and errors of a calibrated board, one line each."""
     platform, held = done.model.platform, done.held_out
     law = platform.amplitudes[0]
     metres, bearing, heading = held.medians
@@ -217,7 +217,7 @@ def board_text(board: BoardRecording, done: BoardCalibration, swarm: Swarm) -> s
 
 
 def draw_board(board: BoardRecording, done: BoardCalibration, path: Path) -> Path:
-    """Curves of sensor and emitter beside those of before, with the residuals' scatter about them."""
+    """Plot the curves of sensor and emitter before and after, with single readings."""
     figure = Figure(figsize=(11.0, 4.0))
     axes: list[Any] = list(figure.subplots(1, 2))
     for side, name in enumerate(("sensor", "emitter")):
@@ -235,14 +235,14 @@ def draw_board(board: BoardRecording, done: BoardCalibration, path: Path) -> Pat
 
 
 def _values(curve: AngleCurve) -> FloatArray:
-    """At `_DEGREES`, relative to straight ahead."""
+    """Values of a curve at `_DEGREES`, relative to its value at zero."""
     table = curve.table()
     values = np.array([curve_at(table, angle)[0] for angle in np.radians(_DEGREES)])
     return np.asarray(values / values[0])
 
 
 def _scatter(done: BoardCalibration, side: int, curve: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Angles [deg] and what the curve would be by single readings where light is bright."""
+    """Angles [deg] and values of the curve according to single bright readings."""
     scatter, angles = done.model.scatter, np.degrees(done.model.angles[side])
     known = np.isfinite(scatter)
     step = max(1, int(known.sum()) // _MAX_POINTS)

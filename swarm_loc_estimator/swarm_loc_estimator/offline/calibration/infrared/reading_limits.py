@@ -1,16 +1,15 @@
-"""Find the saturation and noise of sensors from the robots' readings of each other alone.
+"""Estimate the saturation and noise of sensors from exchanges alone.
 
-Neither poses nor curves are used, for a board's curves may be what is wrong.
+Neither poses nor curves are used, since a board's curves may be wrong.
 
-Saturation: below a sensor's highest reading the readings of different geometries get rarer the brighter they
-are, however they are distributed otherwise. So of those within a span below the highest one at most the share
-of a window's width lies within a narrow window at the top, and the binomial distribution tells how probable
-it is that so many lie there by chance. A sensor that saturates piles them up.
+Saturation: without saturation, the density of a sensor's readings over different geometries decreases with
+brightness near its maximum. Of the readings within a span below the maximum, at most the share window / span
+then lies within a narrow window at the top. A binomial test detects the accumulation that saturation causes.
 
-Noise: what one pair reads twice in a row differs by the noise of both readings, while the two stand. Robots
-that moved in between change readings in proportion (their range), and towards neighbouring sensors (bearing)
-and emitters (heading). An F test separates these three directions from all others, whatever the scale of the
-noise; changes in the other directions are noise.
+Noise: consecutive readings of a pair differ by the noise of both readings while the robots are stationary.
+Motion scales all readings (range) or shifts light to neighbouring sensors (bearing) and emitters (heading).
+An F test compares the change along these three directions with that along all others, independently of the
+scale of the noise. Changes along the other directions are noise.
 """
 
 from __future__ import annotations
@@ -29,39 +28,39 @@ from swarm_loc_estimator.infrared.gains import Exchanges
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
 FALSE_ALARM = 0.01
-"""Probability that any sensor is said to saturate that does not."""
+"""Probability of any false detection of saturation."""
 _SPAN, _WIDTHS = 0.3, (0.0, 0.005, 0.01, 0.02, 0.04)
-"""How far below the highest reading they are compared, and the windows at the top, relative to it."""
+"""Span below the highest reading, and widths of the windows at the top, relative to it."""
 _MIN_EMITTERS = 3
-"""So many emitters must be at the top: one that faces a sensor at a lasting distance is no saturation."""
+"""Minimum number of emitters at the top: a single one may face the sensor at a constant distance."""
 _SAME = 0.2
-"""Exchanges in which no reading differs by more are of one geometry, relative to the brightest."""
+"""Maximum change of a reading within one geometry, relative to the brightest."""
 _CLEAR_OF_TOP = 0.9
-"""Readings above this share of saturation are not asked for noise."""
+"""Maximum reading used for noise, relative to saturation."""
 _BRIGHT = 10.0
-"""Pairs whose brightest reading is below are not tested for standing [sigma of a change]."""
+"""Minimum of the brightest reading of pairs tested for motion [sigma of a change]."""
 _MAX_CHANGE = 0.3
-"""Pairs whose readings changed by more, besides noise, have moved: relative, root of the sum of squares."""
+"""Maximum change of a stationary pair beyond noise: relative root sum of squares."""
 _MOTIONS, _MOVED = 3, 0.05
-"""Range, bearing and heading; the F test's probability to take a pair for moved that stands."""
+"""Number of motion directions (range, bearing, heading); false alarm probability of the F test for motion."""
 _MIN_STANDING = 0.2
-"""Where a smaller share of exchanges passes for standing, robots moved all the time, and it is by chance."""
+"""Minimum share of stationary pairs; fewer may pass the test by chance while all robots move."""
 _MIN_READINGS = 60
-"""Differences of a sensor, for its noise."""
+"""Minimum number of differences for the noise of a sensor."""
 _MIN_FREE = 0.2
-"""Changes of which motion may explain all but this share are not used for noise."""
+"""Minimum share of a change that motion cannot explain, for its use in the noise estimate."""
 _TRIM, _TRIMMED = 3.0, 0.9733
-"""Differences beyond so many sigmas are outliers; the variance of the others, relative."""
+"""Outlier threshold of differences [sigma], and the relative variance of a normal truncated there."""
 _MAX_UNSURE = 0.03
-"""Relative noise is reported where it would be detected at this size, or is twice its own sigma."""
+"""Relative noise is reported if this value were detectable, or if it exceeds twice its standard deviation."""
 _ROUNDS, _FIT_ROUNDS = 4, 30
 _TINY = 1e-300
 _FIRST_RELATIVE, _LEAST_NOISE = 0.03, 0.3
-"""What the search begins with, relative, and at least [count]."""
+"""Initial noise: relative, and minimum [count]."""
 _LOWER, _FACTOR = 0.97, 1.5
-"""A saturation below this share of what is said contradicts it, and noise that differs by this factor."""
+"""Thresholds of a contradiction: saturation relative to the described one, and factor between noises."""
 _LEAST_RELATIVE = 0.05
-"""Robots that shuffle where they stand look like relative noise of some percent."""
+"""Minimum relative noise of a contradiction: small motions cause apparent noise of some percent."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +68,9 @@ class ReadingLimits:
     """Saturation and noise of sensors; NaN where exchanges do not determine them.
 
     Attributes:
-        saturation: (robots, n) where readings pile up [count], what is read in the dark taken off.
+        saturation: (robots, n) saturation above the dark level [count].
         noise: (robots, n) standard deviation of a dark reading [count].
-        relative_noise: (robots, n) noise besides, relative to the reading.
+        relative_noise: (robots, n) additional noise relative to the reading.
     """
 
     saturation: FloatArray
@@ -85,13 +84,13 @@ class ReadingLimits:
 
 
 class _Repeats(NamedTuple):
-    """Two exchanges in a row of one receiver with one transmitter.
+    """Pairs of consecutive exchanges of one receiver with one transmitter.
 
     Attributes:
-        receiver: (p,).
-        change: (p, n, n) by how much readings changed [count]; 0 where one of the two is unusable.
-        level: (p, n, n) their mean.
-        known: (p, n, n) whether both are usable.
+        receiver: (p,) index of the receiver.
+        change: (p, n, n) change of readings [count]; 0 where one of the two is unusable.
+        level: (p, n, n) mean of both readings.
+        known: (p, n, n) True where both are usable.
     """
 
     receiver: NDArray[np.int64]
@@ -104,9 +103,9 @@ def find_reading_limits(platform: IrPlatform, robots: int, exchanges: Exchanges)
     """Saturation and noise of all sensors of robots with one kind of board, by readings at full power.
 
     Args:
-        platform: Only the directions of its elements count.
-        robots: How many there are.
-        exchanges: What they read, in the order of time; known poses are not used.
+        platform: Its saturation and the directions of its elements are used.
+        robots: Number of robots.
+        exchanges: Exchanges in order of time; known poses are not used.
     """
     saturation = np.full((robots, platform.n), np.nan)
     firsts = _first_of_geometries(exchanges)
@@ -123,13 +122,13 @@ def find_reading_limits(platform: IrPlatform, robots: int, exchanges: Exchanges)
 def contradictions(
     platform: IrPlatform, exchanges: Exchanges, limits: ReadingLimits, names: Sequence[str]
 ) -> list[str]:
-    """Where exchanges contradict what is said of the board, one sentence each.
+    """Contradictions between exchanges and the description of the board, one sentence each.
 
     Args:
-        platform: What is said.
-        exchanges: Whose matrices say a saturation, too.
-        limits: What was found of them.
-        names: Of the robots.
+        platform: Description of the board.
+        exchanges: Exchanges, whose matrices also state a saturation.
+        limits: Limits estimated from them.
+        names: Names of the robots.
     """
     low = []
     for robot, name in enumerate(names):
@@ -163,7 +162,7 @@ def _median_of_known(values: FloatArray) -> float:
 
 
 def _first_of_geometries(exchanges: Exchanges) -> BoolArray:
-    """(k,) which exchanges are the first of their pair in a geometry."""
+    """(k,) True for the first exchange of a pair in each geometry."""
     first = np.zeros(len(exchanges.receiver), dtype=np.bool_)
     readings = np.nan_to_num(exchanges.readings[:, 0])
     for rows in _rows_of_pairs(exchanges):
@@ -178,7 +177,7 @@ def _first_of_geometries(exchanges: Exchanges) -> BoolArray:
 
 
 def _rows_of_pairs(exchanges: Exchanges) -> list[NDArray[np.int64]]:
-    """The rows of each receiver with each transmitter, in the order of time."""
+    """Row indices of each ordered pair of robots, in order of time."""
     pairs = np.stack([exchanges.receiver, exchanges.transmitter])
     _, number = np.unique(pairs, axis=1, return_inverse=True)
     in_order = np.argsort(number.ravel(), kind="stable")
@@ -186,7 +185,7 @@ def _rows_of_pairs(exchanges: Exchanges) -> list[NDArray[np.int64]]:
 
 
 def _tops(exchanges: Exchanges) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Each sensor's brightest reading (k, n) of each exchange, and the number of the emitter it was of."""
+    """Brightest reading (k, n) of each sensor in each exchange, and the index of its emitter."""
     readings = np.nan_to_num(exchanges.readings[:, 0], nan=-np.inf)
     emitter = readings.argmax(axis=2)
     top: FloatArray = np.take_along_axis(readings, emitter[..., None], axis=2)[..., 0]
@@ -194,7 +193,7 @@ def _tops(exchanges: Exchanges) -> tuple[FloatArray, NDArray[np.int64]]:
 
 
 def _pile(tops: FloatArray, emitters: NDArray[np.int64], alarm: float) -> float:
-    """Where a sensor's readings (k,) pile up [count]; NaN where chance may do it more often than `alarm`."""
+    """Saturation of a sensor from its readings (k,) [count]; NaN where not significant at level `alarm`."""
     highest = float(tops.max())
     if not highest > 0.0:
         return math.nan
@@ -202,7 +201,7 @@ def _pile(tops: FloatArray, emitters: NDArray[np.int64], alarm: float) -> float:
     best, level = alarm / len(_WIDTHS), math.nan
     for width in _WIDTHS:
         piled = tops >= (1.0 - width) * highest
-        # readings are whole counts, of which a window has one more than its width
+        # readings are integers: a window contains one more of them than its width
         share = (width * highest + 1.0) / (_SPAN * highest + 1.0)
         chance = float(bdtrc(np.count_nonzero(piled) - 2, others, share)) if piled.sum() > 1 else 1.0
         if chance < best and np.unique(emitters[piled]).size >= _MIN_EMITTERS:
@@ -211,13 +210,13 @@ def _pile(tops: FloatArray, emitters: NDArray[np.int64], alarm: float) -> float:
 
 
 def _repeats(exchanges: Exchanges, saturation: FloatArray) -> _Repeats:
-    """All exchanges in a row, without readings near saturation, as described or found."""
+    """All pairs of consecutive exchanges, without readings near described or estimated saturation."""
     rows = _rows_of_pairs(exchanges)
     one, other = (np.concatenate([part[s] for part in rows]) for s in (slice(None, -1), slice(1, None)))
     first, second = exchanges.readings[one, 0], exchanges.readings[other, 0]
     receiver, level = exchanges.receiver[one], 0.5 * (first + second)
     limit = np.fmin(exchanges.saturation[one, 0, None], saturation[receiver])[..., None]
-    known = level < _CLEAR_OF_TOP * limit  # never where one is NaN
+    known = level < _CLEAR_OF_TOP * limit  # False where one is NaN
     return _Repeats(receiver, np.where(known, second - first, 0.0), np.where(known, level, 0.0), known)
 
 
@@ -226,7 +225,7 @@ def _noise(platform: IrPlatform, robots: int, repeats: _Repeats) -> FloatArray:
     found = np.full((2, robots, platform.n), np.nan)
     if not repeats.known.any():
         return found
-    # most readings are dark, where pairs that move change nothing, too
+    # most readings are dark and unaffected by motion
     dark = float(np.median(np.abs(repeats.change[repeats.known]))) / (0.6745 * math.sqrt(2.0))
     dark = max(dark, _LEAST_NOISE)
     order = np.argsort(np.mod(platform.angles, 2.0 * np.pi))
@@ -247,11 +246,11 @@ def _noise(platform: IrPlatform, robots: int, repeats: _Repeats) -> FloatArray:
 def _unexplained(
     repeats: _Repeats, sigma: FloatArray, order: NDArray[np.int64]
 ) -> tuple[FloatArray, BoolArray]:
-    """What no motion explains of the changes, as noise of one reading (p, n, n), and where it is determined.
+    """Changes not explained by motion, scaled to one reading (p, n, n), and where they are determined.
 
     Args:
-        repeats: What was read twice.
-        sigma: (p, n, n) of a change [count].
+        repeats: Pairs of consecutive exchanges.
+        sigma: (p, n, n) standard deviation of a change [count].
         order: (n,) elements around the ring.
     """
     weight = np.where(repeats.known, 1.0 / sigma, 0.0)
@@ -269,14 +268,14 @@ def _unexplained(
 
 
 def _motions(level: FloatArray, order: NDArray[np.int64]) -> list[FloatArray]:
-    """How readings (p, n, n) change, up to a factor, as range, bearing and heading do."""
+    """Directions of change of readings (p, n, n) with range, bearing and heading, unnormalized."""
     back = np.argsort(order)
     ahead, behind = order[(back + 1) % len(order)], order[back - 1]
     return [level, level[:, ahead] - level[:, behind], level[:, :, ahead] - level[:, :, behind]]
 
 
 def _stands(repeats: _Repeats, sigma: FloatArray, moving: FloatArray, rest: FloatArray) -> BoolArray:
-    """Whether both robots stand (p,), by the squares of the change along motions and across [sigma]."""
+    """(p,) True for stationary pairs; `moving`, `rest`: squared changes along motions and across [sigma]."""
     free = np.maximum(repeats.known.sum(axis=(1, 2)) - _MOTIONS, 1.0)
     chance = fdtrc(_MOTIONS, free, moving / _MOTIONS / np.maximum(rest / free, 1e-12))
     excess = np.sum(repeats.change**2 - np.where(repeats.known, sigma**2, 0.0), axis=(1, 2))
@@ -289,7 +288,7 @@ def _stands(repeats: _Repeats, sigma: FloatArray, moving: FloatArray, rest: Floa
 
 
 def _fitted(level: FloatArray, error: FloatArray, start: float) -> tuple[float, float]:
-    """Noise [count] and relative noise by errors (m,) at some levels [count]: a fit of their variance."""
+    """Noise [count] and relative noise, fitted to errors (m,) at brightness levels [count]."""
     if level.size < _MIN_READINGS:
         return math.nan, math.nan
     terms = np.stack([np.ones_like(level), np.maximum(level, 0.0) ** 2])
@@ -299,7 +298,7 @@ def _fitted(level: FloatArray, error: FloatArray, start: float) -> tuple[float, 
         kept = error**2 < _TRIM**2 * variance
         weighted = terms[:, kept] / variance[kept] ** 2
         normal, right = weighted @ terms[:, kept].T, weighted @ (error[kept] ** 2 / _TRIMMED)
-        parts = np.linalg.lstsq(normal, right)[0]  # a sensor that is never lit leaves one open
+        parts = np.linalg.lstsq(normal, right)[0]  # singular for a sensor that is never lit
         if parts.min() < 0.0:
             single = np.maximum(right / np.maximum(np.diag(normal), _TINY), 1e-9)
             parts = np.where(parts < 0.0, 0.0, single)
