@@ -1,4 +1,4 @@
-"""Batch update: many measurements of one period, evaluated against one belief and used together."""
+"""Batch update: many measurements of one period, linearized about one belief and fused at once."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ def predict_all(
     batch: InnovationBatch,
     uncertain: BoolArray,
 ) -> None:
-    """Predict every robot involved to one instant, and find where all were at their measurements' stamps.
+    """Predict every involved robot to one instant, and compute poses at the measurements' stamps.
 
     Args:
-        measurements: (m,) between robots that are located.
-        stamp_ns: The instant.
+        measurements: (m,) between localized robots.
+        stamp_ns: Instant of the prediction.
         tracks: Odometry.
-        belief: Changed in place.
-        limits: Beyond which a robot is given up.
-        batch: (m,) its `pose` and `motion` are written; nobody's pose is not.
-        uncertain: (N,) written: robots involved that no longer know where they are.
+        belief: Updated in place.
+        limits: Thresholds beyond which a robot is lost.
+        batch: (m,) `pose` and `motion` are written, except the pose of NOBODY.
+        uncertain: (N,) written, True for involved robots beyond the thresholds.
     """
     involved, sample = np.zeros(belief.tracked.size, dtype=np.bool_), new_sample(1)
     scratch = prediction.new_scratch()
@@ -73,7 +73,7 @@ def _write_poses(
     batch: InnovationBatch,
     uncertain: BoolArray,
 ) -> None:
-    """Write what `predict_all` does of measurement k, by the belief predicted."""
+    """Write the row of measurement k for `predict_all`, from the predicted belief."""
     sides = (measurements.observer[k], measurements.target[k])
     for i in range(2):
         if sides[i] >= 0:
@@ -91,7 +91,7 @@ def _write_poses(
 
 @inlined_njit
 def _is_of_same_image(measurements: MeasurementColumns, k: int, side: int) -> bool:
-    """Whether the observer of measurement k was looked up at the same instant for the one before it."""
+    """Whether measurement k - 1 has the same observer and stamp, so that its look-up can be reused."""
     if side != 0 or k == 0 or measurements.observer[k] != measurements.observer[k - 1]:
         return False
     same: bool = measurements.stamp_ns[k] == measurements.stamp_ns[k - 1]
@@ -100,7 +100,7 @@ def _is_of_same_image(measurements: MeasurementColumns, k: int, side: int) -> bo
 
 @cached_njit
 def related_columns(measurements: MeasurementColumns, belief: BeliefArrays) -> IntArray:
-    """The first columns (m, 3) of observers, targets and observers' cameras; -1: there is none."""
+    """First filter columns (m, 3) of observers, targets and observers' cameras; -1: none."""
     columns = np.empty((measurements.stamp_ns.size, 3), dtype=np.int64)
     for k in range(columns.shape[0]):
         columns[k, 0], columns[k, 1] = body_columns(measurements, k, belief)
@@ -114,7 +114,7 @@ def related_columns(measurements: MeasurementColumns, belief: BeliefArrays) -> I
 
 @cached_njit
 def evaluate_all(measurements: MeasurementColumns, belief: BeliefArrays, batch: InnovationBatch) -> None:
-    """Evaluate the innovations of all measurements (m,) that have a kernel against one belief."""
+    """Evaluate the innovations of all measurements (m,) that have a kernel, at one belief."""
     scratch = new_scratch()
     for k in range(measurements.stamp_ns.size):
         if has_kernel(measurements, k):
@@ -131,10 +131,10 @@ def assess_all(
     cause: IntArray,
     accepted: BoolArray,
 ) -> BoolArray:
-    """Assess all measurements (m,); return which robots and landmarks (N + L,) are contradicted.
+    """Run fault detection on measurements (m,); return contradicted robots and landmarks (N + L,).
 
-    Those of excluded pairs do not pass. Measurements of models without a kernel take no part: they neither
-    count as evidence nor are excluded.
+    Measurements of excluded pairs are rejected. Measurements of models without a kernel are ignored: they
+    are no evidence and are never excluded.
     """
     contradicted = np.zeros(belief.integrity.fault_score.size, dtype=np.bool_)
     for k in range(accepted.size):
@@ -150,9 +150,9 @@ def assess_all(
 
 @cached_njit
 def confirm_all(measurements: MeasurementColumns, belief: BeliefArrays, accepted: BoolArray) -> BoolArray:
-    """Compare all measurements (m,) with assumed poses; return which robots (N,) they refute.
+    """Confirm initial poses by measurements (m,); return robots (N,) whose initial pose is refuted.
 
-    Measurements of models without a kernel confirm poses, but refute none.
+    Measurements of models without a kernel can confirm a pose, but not refute it.
     """
     lost = np.zeros(belief.tracked.size, dtype=np.bool_)
     for k in range(accepted.size):
@@ -167,7 +167,7 @@ def confirm_all(measurements: MeasurementColumns, belief: BeliefArrays, accepted
 def count_all_gated(
     measurements: MeasurementColumns, belief: BeliefArrays, accepted: BoolArray, limits: LossLimits
 ) -> BoolArray:
-    """Count the gated of all measurements (m,); return whether each robot (N,) has had too many in a row."""
+    """Count gated measurements (m,); return robots (N,) that exceed the maximum number in a row."""
     lost = np.zeros(belief.tracked.size, dtype=np.bool_)
     for k in range(accepted.size):
         robot = count_gated(measurements, k, belief, accepted[k], limits)

@@ -1,4 +1,4 @@
-"""The arrays of a `SwarmState` as compiled code reads and writes them."""
+"""Arrays of a `SwarmState` for compiled code."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ NEVER_NS = np.iinfo(np.int64).min
 
 
 class IntegrityArrays(NamedTuple):
-    """What the newest measurements say of the belief; see `integrity/`.
+    """Statistics of recent innovations for fault detection; see `integrity/`.
 
-    A source is what a robot measures: the robot of that index, or landmark l as N + l.
+    A source is a measured object: robot i has index i, landmark l has index N + l.
 
     Attributes:
-        source: (N, S) the sources that each robot has measured last; -1: none.
-        source_ns: (N, S) when.
-        counted_ns: (N, S) when a look of the pair was last counted as evidence.
-        outlier: (N, S) whether the last one was an outlier.
-        unexplained: (N, S) whether a wrong description could not explain it.
-        trending: (N, S) whether the last few had a trend.
+        source: (N, S) sources measured most recently by each robot; -1: none.
+        source_ns: (N, S) stamp of the last measurement of the pair.
+        counted_ns: (N, S) stamp of the last measurement counted as evidence.
+        outlier: (N, S) True if the last measurement was an outlier.
+        unexplained: (N, S) True if no parameter error could explain it.
+        trending: (N, S) True if the last innovations had a trend.
         evidence: (N, S) evidence against the pair.
-        whitened: (N, S, 2) sum of the whitened innovations since the last look for a trend.
+        whitened: (N, S, 2) sum of whitened innovations since the last test for a trend.
         squares: (N, S) sum of their squares.
-        looks: (N, S) their number.
+        looks: (N, S) number of these innovations.
         fault_score: (N + L,) of each robot and landmark.
-        confirmations: (N,) sightings that agreed with where the robot was initialized.
-        confirmed_ns: (N,) when such a sighting was counted last.
-        gated_in_a_row: (N,) times that another source was gated since the last accepted measurement.
-        gated_source: (N,) the source that was gated last.
-        gated_ns: (N,) when.
-        gated_fixes: (N,) absolute fixes that were gated since the last accepted one or the last landmark.
-        gated_fix_ns: (N,) when such a fix was counted last.
-        noise_inflation: (N,) units by which each robot's measurements scatter more than described, see
+        confirmations: (N,) number of sightings that agree with the robot's initial pose.
+        confirmed_ns: (N,) stamp of the last counted confirmation.
+        gated_in_a_row: (N,) number of changes of the gated source since the last accepted measurement.
+        gated_source: (N,) source of the last gated measurement.
+        gated_ns: (N,) stamp of the last gated measurement.
+        gated_fixes: (N,) absolute fixes gated since the last accepted fix or landmark sighting.
+        gated_fix_ns: (N,) stamp of the last counted gated fix.
+        noise_inflation: (N,) level of noise inflation of each robot's measurements, see
             `integrity/noise_inflation.py`.
     """
 
@@ -64,7 +64,7 @@ class IntegrityArrays(NamedTuple):
 
 
 class BeliefArrays(NamedTuple):
-    """The arrays of a `SwarmState`, as compiled code reads and writes them; see there and `JointFilter`."""
+    """Views of the arrays of a `SwarmState` and its `JointFilter`, which describe them."""
 
     transform: FloatArray
     covariance: FloatArray
@@ -87,7 +87,7 @@ class BeliefArrays(NamedTuple):
 
 @cached_njit
 def own_covariance(belief: BeliefArrays, robot: int) -> FloatArray:
-    """The covariance, to be changed in place, in which `own_columns` are those of a robot."""
+    """Writable covariance matrix that `own_column` indexes: joint, or the robot's marginal."""
     if belief.is_dense:
         return belief.covariance
     own: FloatArray = belief.marginal[robot]
@@ -96,7 +96,7 @@ def own_covariance(belief: BeliefArrays, robot: int) -> FloatArray:
 
 @inlined_njit
 def own_column(belief: BeliefArrays, robot: int, which: int) -> int:
-    """A column of `own_covariance`: of the robot's pose, or, from 3 on, of its parameters; -1: has none."""
+    """Column of `own_covariance`: `which` 0 to 2 for the pose, from 3 on for parameters; -1: none."""
     column: int = 3 * robot + which if which < 3 else belief.table.column[robot, which - 3]
     if not belief.is_dense and column >= 0:
         column = which
@@ -105,7 +105,7 @@ def own_column(belief: BeliefArrays, robot: int, which: int) -> int:
 
 @inlined_njit
 def covariance_within(belief: BeliefArrays, column: int, i: int, j: int) -> float:
-    """A number of the covariance (3, 3) of the body whose first column is given."""
+    """Element (i, j) of the covariance (3, 3) of the body with this first column."""
     whole, own = belief.covariance, belief.marginal
     within: float = whole[column + i, column + j] if belief.is_dense else own[column // 3, i, j]
     return within
@@ -113,7 +113,7 @@ def covariance_within(belief: BeliefArrays, column: int, i: int, j: int) -> floa
 
 @inlined_njit
 def own_within(belief: BeliefArrays, robot: int, i: int, j: int) -> float:
-    """A number of the covariance of a robot's pose and parameters, by `own_column`."""
+    """Element of the covariance of a robot's pose and parameters, indexed as by `own_column`."""
     whole, own = belief.covariance, belief.marginal
     if belief.is_dense:
         within: float = whole[own_column(belief, robot, i), own_column(belief, robot, j)]
@@ -124,7 +124,7 @@ def own_within(belief: BeliefArrays, robot: int, i: int, j: int) -> float:
 
 @inlined_njit
 def to_map(belief: BeliefArrays, robot: int, pose: FloatArray) -> None:
-    """Change a pose (3,) on the robot's track to its pose in `map`, in place."""
+    """Transform a pose (3,) from the robot's track to `map`, in place."""
     t = belief.transform[robot]
     pose[0], pose[1], theta = composed(t[0], t[1], t[2], pose[0], pose[1], pose[2])
     pose[2] = wrap(theta)
@@ -132,7 +132,7 @@ def to_map(belief: BeliefArrays, robot: int, pose: FloatArray) -> None:
 
 @cached_njit
 def correct(belief: BeliefArrays, correction: FloatArray) -> None:
-    """Apply a filter's correction (n,) to transforms and parameters of robots located, and to landmarks."""
+    """Apply a filter's correction (n,) to localized robots, their parameters and landmarks."""
     for i in range(belief.tracked.size):
         if belief.tracked[i]:
             t, c = belief.transform[i], correction[3 * i : 3 * i + 3]

@@ -56,7 +56,7 @@ _NEGLIGIBLE = 1e-8
 
 
 def at_initialization(measurement: MeasurementArray) -> MeasurementArray:
-    """A measurement (1,) with the noise that it has when it initializes a robot."""
+    """A measurement (1,) with the inflated noise for initialization."""
     if not (measurement["systematic_share"] > 0.0).any():
         return measurement
     wider: MeasurementArray = measurement.copy()
@@ -76,7 +76,7 @@ def use_mean(
     noise: FloatArray,
     pair: FloatArray,
 ) -> None:
-    """Replace a measurement of a pair by the information that it adds to what has been fused of the pair.
+    """Replace a measurement of a pair by the information that it adds to the pair's fused information.
 
     Args:
         measurements: (m,).
@@ -101,7 +101,7 @@ def use_mean(
         again = min(measurements.systematic_share[k, i], 1.0) * measurements.covariance[k, i, i]
         pair[_RANDOM, i], pair[_SYSTEMATIC, i] = max(noise[i, i] - again, 0.0), again
         pair[_MEAN, i] = predicted[i] + innovation[i]
-        pair[_VARIANCE, i] = max(variances[i], 0.0)  # a difference, which rounding may have made less
+        pair[_VARIANCE, i] = max(variances[i], 0.0)  # rounding may make the difference negative
     if belief.pair_robot[observer, place] == target:
         _join(belief.pair_history[observer, place], predicted, innovation, noise, pair)
     else:
@@ -281,7 +281,7 @@ def record_pair(measurements: MeasurementColumns, k: int, belief: BeliefArrays, 
 def record_constraint(
     measurements: MeasurementColumns, k: int, belief: BeliefArrays, tracks: OdometrySample
 ) -> None:
-    """Store a measurement that may initialize a robot, whose error is then that of the measurement.
+    """Store a measurement that may initialize a robot, with correlated initial error.
 
     Args:
         measurements: (m,).

@@ -1,6 +1,6 @@
-"""The full covariance of the joint state, and its updates.
+"""Joint filter with a full covariance matrix.
 
-See `joint_filter.py` for what a filter is.
+Implements `JointFilter` of `joint_filter.py`.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from swarm_loc_estimator.swarm.calibration_states import DRIVES, ParameterTable
 
 
 class DenseFilter:
-    """A full covariance matrix, held symmetric positive definite by the form of every update.
+    """Full covariance matrix; every update keeps it symmetric positive definite.
 
     Args:
-        size: Number of columns; each starts with unit variance, independent.
+        size: Number of columns; the prior is the identity.
     """
 
     is_dense = True
@@ -37,29 +37,29 @@ class DenseFilter:
         return other
 
     def set_prior(self, columns: IntArray, covariance: FloatArray) -> None:
-        """Give columns (k,) this covariance (k, k), independent of all others."""
+        """Set the covariance (k, k) of columns (k,), independent of all others."""
         self.covariance[columns, :] = 0.0
         self.covariance[:, columns] = 0.0
         self.covariance[columns[:, None], columns[None, :]] = covariance
 
     def set_body_priors(self, bodies: IntArray, covariances: FloatArray) -> None:
-        """Give bodies (k,) covariances (k, 3, 3), each independent of all others."""
+        """Set covariances (k, 3, 3) of bodies (k,), each independent of all others."""
         for body, covariance in zip(bodies.tolist(), covariances, strict=True):
             self.set_prior(3 * body + np.arange(3), covariance)
 
     def add(self, columns: IntArray, covariance: FloatArray) -> None:
-        """Add a covariance (k, k) to that of columns (k,): their errors are larger than was known."""
+        """Add a covariance (k, k) to that of columns (k,)."""
         self.covariance[columns[:, None], columns[None, :]] += covariance
 
     def append_columns(self, table: ParameterTable) -> None:
-        """Append the columns that a table has more, without error as yet: they are placed next."""
+        """Append the new columns of a table with zero variance; `set_prior` must follow."""
         size = self.covariance.shape[0]
         grown = np.zeros((table.filter_size, table.filter_size))
         grown[:size, :size] = self.covariance
         self.covariance = grown
 
     def correlate(self, columns: IntArray, others: IntArray, mapping: FloatArray) -> None:
-        """Add the errors of other columns (m,), mapped by (k, m), to those of independent columns (k,)."""
+        """Add the errors of other columns (m,), mapped by (k, m), to independent columns (k,)."""
         common = mapping @ self.covariance[others]
         added = common[:, others] @ mapping.T
         self.covariance[columns, :] += common
@@ -72,19 +72,19 @@ class DenseFilter:
         return covariance
 
     def prepare_update(self, columns: IntArray, robots: Robots, cross_covariance: FloatArray) -> None:
-        """Leave all as it is: `covariance` has every pair."""
+        """Do nothing: `covariance` contains all cross-covariances."""
 
     def update(
         self, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
     ) -> FloatArray:
-        """Use many measurements with independent errors at once; return the correction (n,) of all columns.
+        """Fuse measurements with independent errors as one batch; return the correction (n,).
 
         Eqs. (11)-(14) of the e-puck paper in information form, P = (P^-1 + H^T R^-1 H)^-1: two inversions,
         whose cost does not grow with the number of measurements.
 
         Args:
-            columns: (m, c) what each measurement depends on; a column may be named twice.
-            jacobian: (m, r, c) its Jacobian; a zero row is a component that was not measured.
+            columns: (m, c) filter columns of each measurement; may contain duplicates.
+            jacobian: (m, r, c) Jacobians; a zero row for a component that was not measured.
             innovation: (m, r) measured minus predicted.
             noise: (m, r, r) covariance of the measurement.
         """
@@ -128,14 +128,14 @@ def update_one(
     innovation: FloatArray,
     noise: FloatArray,
 ) -> FloatArray:
-    """Use one measurement: change the covariance (n, n) in place, return the correction (n,) of all columns.
+    """Fuse one measurement: update the covariance (n, n) in place, return the correction (n,).
 
-    Eqs. (11), (13), (14), and (12) in Joseph's form, which keeps the covariance positive definite, multiplied
-    out to P - K H P - (P H^T - K S) K^T, where the last term is what rounding left, and taken symmetrically.
+    Eqs. (11), (13), (14), and (12) in Joseph's form, which keeps the covariance positive definite, expanded
+    to P - K H P - (P H^T - K S) K^T, where the last term is the rounding error, and made symmetric.
 
     Args:
-        covariance: (n, n) of everything estimated.
-        columns: (c,) what the measurement depends on; a column may be named twice.
+        covariance: (n, n) of all states.
+        columns: (c,) filter columns of the measurement; may contain duplicates.
         jacobian: (3, c).
         innovation: (3,) measured minus predicted.
         noise: (3, 3) covariance of the measurement.
@@ -156,9 +156,7 @@ def update_one(
     for i in range(size):
         k0, k1, k2 = gain[0, i], gain[1, i], gain[2, i]
         c0, c1, c2 = change[0, i], change[1, i], change[2, i]
-        for j in range(
-            size
-        ):  # each pair of terms is the same for (i, j) and (j, i): symmetry to the last bit
+        for j in range(size):  # each pair of terms is the same for (i, j) and (j, i): exactly symmetric
             value = k0 * change[0, j] + c0 * gain[0, j]
             value += k1 * change[1, j] + c1 * gain[1, j]
             value += k2 * change[2, j] + c2 * gain[2, j]

@@ -14,7 +14,7 @@ _STUDENT_DOF = 4.0
 
 
 def gate_threshold(probability: ArrayLike, degrees_of_freedom: int = 2) -> FloatArray:
-    """The squared distance of so many components that good measurements exceed with 1 - probability."""
+    """Chi-square quantile: gate threshold of the squared distance for an acceptance probability."""
     half = 0.5 * degrees_of_freedom
     threshold: FloatArray = 2.0 * gammaincinv(half, np.asarray(probability, dtype=float))
     return threshold
@@ -22,7 +22,7 @@ def gate_threshold(probability: ArrayLike, degrees_of_freedom: int = 2) -> Float
 
 @inlined_njit
 def squared_distance(innovation: FloatArray, covariance: FloatArray) -> float:
-    """Normalised innovation squared of an innovation (3,) under its covariance (3, 3)."""
+    """Normalized innovation squared of an innovation (3,) with covariance (3, 3)."""
     aa, ba, bb, ca, cb, cc = factor_numbers(covariance)
     a = innovation[0] / aa
     b = (innovation[1] - ba * a) / bb
@@ -38,14 +38,14 @@ def squared_distance(innovation: FloatArray, covariance: FloatArray) -> float:
 def position_distance(
     innovation: FloatArray, covariance: FloatArray, more: tuple[float, float] = (0.0, 0.0)
 ) -> float:
-    """Normalised square of the first two components, on which alone the gate decides.
+    """Squared Mahalanobis distance of the first two components, the only ones that are gated.
 
-    The heading has no vote: the planar ambiguity of a square marker flips it in otherwise good sightings.
+    The heading is not gated: the planar ambiguity of a square marker flips it in otherwise good sightings.
 
     Args:
         innovation: (3,).
-        covariance: (3, 3) of it.
-        more: Variances added to those of both components.
+        covariance: (3, 3) of the innovation.
+        more: Variances added to both components.
     """
     a, b, d = covariance[0, 0] + more[0], covariance[0, 1], covariance[1, 1] + more[1]
     x, y = innovation[0], innovation[1]
@@ -55,9 +55,9 @@ def position_distance(
 
 @inlined_njit
 def soften_heading(innovation: FloatArray, covariance: FloatArray, noise: FloatArray) -> None:
-    """Enlarge the heading's part of `noise` (3, 3) where its innovation is unlikely: flips count little.
+    """Inflate the heading variance in `noise` (3, 3) if its innovation is large, to down-weight flips.
 
-    Student's t with 4 degrees of freedom instead of a normal; `covariance` (3, 3) is the innovation's.
+    Weight of Student's t with 4 degrees of freedom; `covariance` (3, 3) is that of the innovation.
     """
     normalised = innovation[2] * innovation[2] / covariance[2, 2]
     factor = (_STUDENT_DOF + normalised) / (_STUDENT_DOF + 1.0)

@@ -1,4 +1,4 @@
-"""Innovations: measurements linearised about the belief and gated."""
+"""Innovations: measurements linearized about the belief and gated."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from swarm_loc_estimator.odometry.preintegration import TrackArrays
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YAW
 
 DEPENDS_ON = 8
-"""Filter columns that a measurement depends on: both bodies, observer first, yaw and scale of the camera."""
+"""Filter columns per measurement: three of the observer, three of the target, camera yaw and camera scale."""
 
 
 class Scratch(NamedTuple):
-    """Where one evaluation after the other is worked out: memory of its own for each would cost more.
+    """Buffers for one evaluation, reused to avoid allocation.
 
     Attributes:
         predicted: (3,) value.
@@ -49,23 +49,23 @@ class Scratch(NamedTuple):
 
 
 class InnovationBatch(NamedTuple):
-    """Measurements (m,) evaluated against one belief.
+    """Measurements (m,) evaluated at one belief.
 
     Attributes:
-        pose: (m, 2, 3) observers and targets in `map` at the stamps, or by what a landmark is moved.
-        motion: (m, 3) how fast xi_target - xi_observer changes by driving [1/s], see `relative_motion`.
-        cross_covariance: (m, 3, 5) of the observer's error with the target's, and of the target's with those
-            of yaw and scale of the observer's camera.
-        columns: (m, DEPENDS_ON) what each depends on.
-        jacobian: (m, 3, DEPENDS_ON) of the innovation.
+        pose: (m, 2, 3) observers and targets in `map` at the stamps; of a landmark, its pose correction.
+        motion: (m, 3) rate of change of xi_target - xi_observer by driving [1/s], see `relative_motion`.
+        cross_covariance: (m, 3, 5) of the observer's error with the target's, and of the target's with
+            yaw and scale of the observer's camera.
+        columns: (m, DEPENDS_ON) filter columns.
+        jacobian: (m, 3, DEPENDS_ON) Jacobian of the innovation.
         innovation: (m, 3) measured minus predicted.
-        noise: (m, 3, 3) covariances of the measurements, as they are used.
-        pair: (m, PAIR_ROWS, 3) what to remember of its pair when it is used, see `correlated_noise`.
+        noise: (m, 3, 3) measurement covariances for the update.
+        pair: (m, PAIR_ROWS, 3) new mean of the pair, stored if used, see `correlated_noise`.
         distance: (m,) squared Mahalanobis distance of the position, small errors left out.
         whitened: (m, 2) position innovation over its standard deviation, without small errors.
-        cause: (m,) what may explain the innovation, see `integrity.cause_of`.
-        accepted: (m,) whether the gate lets it through.
-        nis: (m,) normalised innovation squared.
+        cause: (m,) possible cause of the innovation, see `integrity.cause_of`.
+        accepted: (m,) True if the innovation passes the gate.
+        nis: (m,) normalized innovation squared.
     """
 
     pose: FloatArray
@@ -85,7 +85,7 @@ class InnovationBatch(NamedTuple):
 
 @cached_njit
 def new_batch(count: int) -> InnovationBatch:
-    """Room for `count` measurements."""
+    """Allocate a batch of `count` measurements."""
     return InnovationBatch(
         np.zeros((count, 2, 3)),
         np.zeros((count, 3)),
@@ -105,7 +105,7 @@ def new_batch(count: int) -> InnovationBatch:
 
 @cached_njit
 def new_scratch() -> Scratch:
-    """Room to evaluate measurements in."""
+    """Allocate buffers for `evaluate`."""
     return Scratch(
         np.zeros(3), np.zeros(3), np.zeros((3, 5)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
     )
@@ -120,16 +120,16 @@ def evaluate(
     row: int,
     scratch: Scratch,
 ) -> None:
-    """Linearise measurement k about the belief and gate it; of two planar solutions the likelier counts.
+    """Linearize measurement k about the belief and gate it; of two planar solutions, use the likelier one.
 
     Args:
         measurements: (m,).
-        k: Which one.
+        k: Index of the measurement.
         belief: Not changed.
-        batch: Its `pose` and `motion` are read, all others written; of a sparse filter `cross_covariance` is
-            read, too.
-        row: Where in the batch.
-        scratch: Written.
+        batch: Input: `pose`, `motion` and, for a sparse filter, `cross_covariance`. Output: all other
+            fields.
+        row: Row of the batch.
+        scratch: Buffers.
     """
     columns, jacobian, innovation = batch.columns[row], batch.jacobian[row], batch.innovation[row]
     pose, motion, noise = batch.pose[row], batch.motion[row], batch.noise[row]
@@ -198,13 +198,13 @@ def relative_motion(
     pose: FloatArray,
     motion: FloatArray,
 ) -> None:
-    """Write how fast xi_target - xi_observer (3,) of measurement k changes by both robots' driving [1/s].
+    """Write the rate of change of xi_target - xi_observer (3,) of measurement k by driving [1/s].
 
-    Zero where the stamp is exact, and it does not matter.
+    Zero for an exact stamp, where the rate is not needed.
 
     Args:
         measurements: (m,).
-        k: Which one.
+        k: Index of the measurement.
         tracks: Odometry.
         belief: Not changed.
         pose: (2, 3) of observer and target in `map`.
@@ -226,7 +226,7 @@ def relative_motion(
 
 @inlined_njit
 def _camera(belief: BeliefArrays, observer: int) -> tuple[tuple[float, float], tuple[int, int]]:
-    """Yaw and scale of an observer's camera, and their columns; -1: has none."""
+    """Yaw and scale of an observer's camera, and their filter columns; -1: not estimated."""
     if observer < 0:
         return (0.0, 0.0), (-1, -1)
     parameter, column = belief.parameter, belief.table.column
@@ -244,9 +244,9 @@ def _write_jacobian(
     columns: IntArray,
     jacobian: FloatArray,
 ) -> None:
-    """Write the Jacobian of an innovation (3, DEPENDS_ON) by the state's columns (DEPENDS_ON,).
+    """Write the Jacobian of an innovation (3, DEPENDS_ON) and its filter columns (DEPENDS_ON,).
 
-    Columns of nobody do not matter: their Jacobian is zero.
+    Missing columns are arbitrary: their Jacobian is zero.
     """
     for j in range(3):
         columns[j], columns[3 + j] = max(bodies[0], 0) + j, max(bodies[1], 0) + j
@@ -263,7 +263,7 @@ def _write_jacobian(
 def _add_stamp_noise(
     value_jacobian: FloatArray, motion: FloatArray, variance: float, noise: FloatArray
 ) -> None:
-    """Add to `noise` (3, 3) what a stamp of such variance does to a value that changes by `motion` (3,)."""
+    """Add the covariance due to the stamp's variance [s^2] at the rate `motion` (3,) to `noise` (3, 3)."""
     change = (
         _along(value_jacobian, 0, motion),
         _along(value_jacobian, 1, motion),
@@ -276,7 +276,7 @@ def _add_stamp_noise(
 
 @inlined_njit
 def _along(value_jacobian: FloatArray, row: int, motion: FloatArray) -> float:
-    """How fast a component of the value changes."""
+    """Rate of change of one component of the value."""
     speed: float = (
         value_jacobian[row, 0] * motion[0]
         + value_jacobian[row, 1] * motion[1]
@@ -287,7 +287,7 @@ def _along(value_jacobian: FloatArray, row: int, motion: FloatArray) -> float:
 
 @inlined_njit
 def body_columns(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> tuple[int, int]:
-    """The first of the three columns of the observer and of the target of measurement k; -1: has none."""
+    """First filter columns of the observer and the target of measurement k; -1: none."""
     observer, target = measurements.observer[k], measurements.target[k]
     first = 3 * target if target >= 0 else -1
     if measurements.landmark[k] > 0:
@@ -299,7 +299,7 @@ def body_columns(measurements: MeasurementColumns, k: int, belief: BeliefArrays)
 def _read_cross_covariance(
     p: FloatArray, bodies: tuple[int, int], camera: tuple[int, int], out: FloatArray
 ) -> None:
-    """Write `cross_covariance` (3, 5) of one measurement; undefined where a side is missing."""
+    """Write `cross_covariance` (3, 5) of one measurement; undefined if a side is missing."""
     o, t = max(bodies[0], 0), max(bodies[1], 0)
     for i in range(3):
         for j in range(3):
@@ -320,7 +320,7 @@ def _add_uncertainty(
 ) -> None:
     """Add H P H^T (3, 3), eq. (13) of the e-puck paper, where H is `value_jacobian`.
 
-    The covariance of xi_target - xi_observer is taken first: a third of the work.
+    The covariance of xi_target - xi_observer is computed first, which saves two thirds of the work.
 
     Args:
         belief: Not changed.
@@ -328,8 +328,8 @@ def _add_uncertainty(
         camera: Columns of the camera's parameters; -1: none.
         value_jacobian: (3, 5).
         cross_covariance: (3, 5) of the observer, the target and the camera, see `InnovationBatch`.
-        relative: (3, 3) workspace.
-        s: (3, 3) added to.
+        relative: (3, 3) buffer.
+        s: (3, 3) sum to add to.
     """
     o, t = max(bodies[0], 0), max(bodies[1], 0)
     of_observer, of_target = 1.0 if bodies[0] >= 0 else 0.0, 1.0 if bodies[1] >= 0 else 0.0

@@ -10,7 +10,7 @@ from swarm_loc_estimator.common.lapack import invert_positive
 
 
 def inverse(matrix: FloatArray) -> FloatArray:
-    """The inverse (n, n) of a symmetric positive definite matrix, symmetric to the last bit.
+    """Inverse (n, n) of a symmetric positive definite matrix; exactly symmetric.
 
     Raises:
         LinAlgError: The matrix is not positive definite.
@@ -21,7 +21,7 @@ def inverse(matrix: FloatArray) -> FloatArray:
 
 
 def invert(matrix: FloatArray) -> None:
-    """Invert a matrix (n, n) where it stands; see `inverse`."""
+    """Invert a matrix (n, n) in place; see `inverse`."""
     if not invert_positive(matrix.reshape(-1), matrix.shape[0]):
         raise np.linalg.LinAlgError("the covariance is not positive definite")
     _mirror(matrix)
@@ -29,7 +29,7 @@ def invert(matrix: FloatArray) -> None:
 
 @cached_njit
 def _mirror(matrix: FloatArray) -> None:
-    """Copy the upper triangle, which is the lower one in Fortran's order, to the other one."""
+    """Copy the upper triangle, the lower one in Fortran order, to the other triangle."""
     for i in range(matrix.shape[0]):
         for j in range(i):
             matrix[i, j] = matrix[j, i]

@@ -1,8 +1,8 @@
-"""What the estimator asks of a filter: a joint covariance of errors, of which two implementations exist.
+"""Interface of the joint filter, the covariance of all errors; it has a dense and a sparse implementation.
 
-A filter knows columns and Jacobians, not robots or sensors. The mean lives outside: an update gives the
-correction, which its owner applies on the manifold. Columns 3i..3i+2 are the error of body i, a twist; those
-of parameters are behind those of the robots.
+A filter operates on columns and Jacobians, not on robots or sensors. It does not hold the mean: an update
+returns the correction, which the caller applies on the manifold. Columns 3i..3i+2 are the error twist of
+body i; columns of parameters follow those of the robots.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 
 
 class Robots(NamedTuple):
-    """Where robots are, so that a filter knows who is near whom.
+    """Positions of robots, from which a sparse filter selects neighbours.
 
     Attributes:
-        places: (N, 2) [m] in `map`.
-        active: (N,) whether each is part of the estimate; what is known of others is forgotten.
+        places: (N, 2) positions in `map` [m].
+        active: (N,) True if the robot is part of the estimate; correlations of others are dropped.
     """
 
     places: FloatArray
@@ -26,11 +26,11 @@ class Robots(NamedTuple):
 
 
 class JointFilter(Protocol):
-    """The covariance of the errors of all bodies and parameters.
+    """Covariance of the errors of all bodies and parameters.
 
     Attributes:
-        covariance: (n, n) of all columns; (0, 0) where only parts of it are kept. Predictions write to it.
-        is_dense: Whether it keeps the whole covariance; measurements may then be used one by one, too.
+        covariance: (n, n) of all columns, (0, 0) for a sparse filter. Predictions write to it.
+        is_dense: True for a full covariance, which also supports sequential updates.
     """
 
     covariance: FloatArray
@@ -38,64 +38,64 @@ class JointFilter(Protocol):
 
     @property
     def marginal(self) -> FloatArray:
-        """(bodies, w, w) of each body's error; (0, 3, 3) where `covariance` has it.
+        """Marginal covariances (bodies, w, w); (0, 3, 3) for a dense filter. Predictions write to them.
 
-        Where anything is calibrated w is 9, of each robot's pose and its parameters, else 3. Either is
-        written to by predictions.
+        w is 9 if parameters are estimated, for each robot's pose and its parameters, else 3. A dense filter
+        has these blocks in `covariance`.
         """
 
     @property
     def transition(self) -> FloatArray:
-        """(robots, 4, DRIVES) how predictions have moved errors since the last update, besides by noise.
+        """Transition (robots, 4, DRIVES) of the errors by predictions since the last update.
 
-        Those of a pose by those of the parameters of its motion (3, DRIVES), and what is left of the latter
-        (DRIVES,). Where it is not needed it is of no robot.
+        Jacobian of the pose by the parameters of its motion (3, DRIVES), then the decay factors of the
+        parameters (DRIVES,). Has no rows if it is not needed.
         """
 
     def copy(self) -> JointFilter:
         """An independent copy."""
 
     def set_prior(self, columns: IntArray, covariance: FloatArray) -> None:
-        """Give columns (k,) this covariance (k, k), independent of all others.
+        """Set the covariance (k, k) of columns (k,), independent of all others.
 
-        They are those of one body, or of parameters, independent of each other.
+        The columns are those of one body, or of mutually independent parameters.
         """
 
     def set_body_priors(self, bodies: IntArray, covariances: FloatArray) -> None:
-        """Give bodies (k,) covariances (k, 3, 3), each independent of all others."""
+        """Set covariances (k, 3, 3) of bodies (k,), each independent of all others."""
 
     def add(self, columns: IntArray, covariance: FloatArray) -> None:
-        """Add a covariance (k, k) to that of columns (k,) as of `block`: errors are larger than was known."""
+        """Add a covariance (k, k) to that of columns (k,); columns as in `block`."""
 
     def append_columns(self, table: ParameterTable) -> None:
-        """Append the columns that a table has more, without error as yet: they are placed next."""
+        """Append the new columns of a table with zero variance; `set_prior` must follow."""
 
     def correlate(self, columns: IntArray, others: IntArray, mapping: FloatArray) -> None:
-        """Add the errors of other columns (m,), mapped by (k, m), to those of columns (k,) just placed."""
+        """Add the errors of other columns (m,), mapped by (k, m), to independent columns (k,)."""
 
     def block(self, columns: IntArray) -> FloatArray:
-        """Covariance (k, k) of columns (k,): of one body, or of one robot's parameters."""
+        """Covariance (k, k) of columns (k,) of one body or of one robot's parameters."""
 
     def prepare_update(self, columns: IntArray, robots: Robots, cross_covariance: FloatArray) -> None:
-        """Prepare an update, and write covariances of what its measurements (m,) depend on.
+        """Prepare an update with measurements (m,), and write their cross-covariances.
 
         Args:
-            columns: (m, 3) the first columns of observers, targets and observers' cameras; -1: there is none.
-            robots: Where all are.
-            cross_covariance: (m, 3, 5) written, unless `covariance` has it: of the observers' errors with
-                the targets', and of these with those of the cameras.
+            columns: (m, 3) first columns of observers, targets and observers' cameras; -1: none.
+            robots: Positions of all robots.
+            cross_covariance: (m, 3, 5) written by a sparse filter: of the observers with the targets, and of
+                the targets with the cameras.
         """
 
     def update(
         self, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
     ) -> FloatArray:
-        """Use measurements (m,) with independent errors at once; return the correction (n,) of all columns.
+        """Fuse measurements (m,) with independent errors as one batch; return the correction (n,).
 
-        `prepare_update` comes before each update.
+        `prepare_update` must be called before each update.
 
         Args:
-            columns: (m, c) what each depends on, the two bodies' first; a column may be named twice.
-            jacobian: (m, 3, c) its Jacobian; a zero row is a component that was not measured.
+            columns: (m, c) filter columns of each, first those of the two bodies; may contain duplicates.
+            jacobian: (m, 3, c) Jacobians; a zero row for a component that was not measured.
             innovation: (m, 3) measured minus predicted.
             noise: (m, 3, 3) covariance of the measurement.
         """

@@ -1,19 +1,18 @@
 """Measurements and their models: predicted values, Jacobians, innovations and gates.
 
-A model is one record, see `MeasurementModel`; all of them stand in `MODELS`. Those of `Kind` are built in:
-they are compiled, and kernels switch on their numbers. Each of their measurements
-observes the pose of a marker in a sensor's frame,
+A model is a `MeasurementModel` record; `MODELS` lists all. Those of `Kind` are built in: compiled kernels
+switch on their numbers. Each of their measurements observes the pose of a marker in a sensor's frame,
 
     rel = (X_observer S)^-1 (X_target M),
 
-the transform chains (3) and (5) of the e-puck paper in the plane (whose printed eq. (6) has three wrong
-signs: the chain is used, not the print). S is the sensor on the observer, M the marker on the target. A
-landmark has no target robot (M is its pose in `map`, moved by X_target when its place is estimated), an
-absolute fix has no observer (S is the identity).
+the transform chains (3) and (5) of the e-puck paper in the plane (its printed eq. (6) has three wrong signs,
+which the chain avoids). S is the sensor on the observer, M the marker on the target. A landmark has no target
+robot: M is its pose in `map`, corrected by X_target if the landmark is estimated. An absolute fix has no
+observer: S is the identity.
 
 With right-invariant errors X = exp(xi) X_hat the chain depends on xi_target - xi_observer only, so one
-Jacobian (3 x 3) serves both robots, with opposite signs. Two more columns are for the sensor's own yaw and
-scale, see CAMERA_YAW and CAMERA_SCALE of swarm/calibration_states.py.
+Jacobian (3 x 3) serves both robots, with opposite signs. Two more columns are for the camera's yaw offset
+and scale error, see CAMERA_YAW and CAMERA_SCALE of swarm/calibration_states.py.
 """
 
 from __future__ import annotations
@@ -33,33 +32,33 @@ from swarm_loc_estimator.common.se2_scalar import composed, wrap
 from swarm_loc_estimator.filter.gating import gate_threshold
 
 NOBODY = -1
-"""Index in place of a robot: the observer of an absolute fix, the target of a landmark sighting."""
+"""Robot index for the observer of an absolute fix and the target of a landmark sighting."""
 
 
 class Kind(IntEnum):
-    """Numbers of the built-in models, by the first two components of a value."""
+    """Numbers of the built-in models, named by the first two components of the value."""
 
     CARTESIAN = 0  # forward [m], left [m]
     POLAR = 1  # range [m], bearing [rad], positive to the left
-    ANONYMOUS = 2  # some robot, seen from above, was at `value` in map; marker_id: its number in the image
+    ANONYMOUS = 2  # an unknown robot was at `value` in map; marker_id: index of the detection in the image
 
 
 class Command(IntEnum):
-    """Orders about the target robot, which are kept in order of time among the measurements."""
+    """Commands for the target robot, executed at their stamps among the measurements."""
 
     NONE = 0  # a measurement
-    SET_POSE = 1  # the target is at `value` in map with `covariance`, whatever was believed
-    FORGET = 2  # the target is not where it was believed to be
+    SET_POSE = 1  # set the target to `value` in map with `covariance`
+    FORGET = 2  # deinitialize the target
 
 
 POLAR = int(Kind.POLAR)
-"""As a plain number, for compiled code."""
+"""`Kind.POLAR` as a plain int, for compiled code."""
 NO_MODEL = -1
 """The `kind` of a command."""
 
 MEASUREMENT_DTYPE = np.dtype(
     [
-        ("stamp_ns", np.int64),  # when it was true
+        ("stamp_ns", np.int64),  # time of measurement
         ("received_from", np.int64),  # robot whose message it came in; -1 for a message about the whole swarm
         ("observer", np.int64),  # robot index or NOBODY
         ("target", np.int64),  # robot index or NOBODY
@@ -69,26 +68,26 @@ MEASUREMENT_DTYPE = np.dtype(
         ("kind", np.int64),  # number of its model in MODELS
         ("has_heading", np.int64),  # 1 when value[2] was measured, else 0
         ("has_alternative", np.int64),  # 1 when `alternative` is a second, mirrored solution, else 0
-        ("stamp_variance", np.float64),  # of stamp_ns [s^2], times how many measurements share this error
-        ("gate", np.float64),  # largest squared distance of its gated components that is accepted
+        ("stamp_variance", np.float64),  # of stamp_ns [s^2], times how many measurements share its error
+        ("gate", np.float64),  # maximum accepted squared distance of the gated components
         ("sensor", np.float64, (3,)),  # S: x [m], y [m], yaw [rad] in the observer's base_link
         ("marker", np.float64, (3,)),  # M: in the target's base_link, or in map
         (
             "value",
             np.float64,
             (3,),
-        ),  # built-in models: two by kind, then the heading [rad] of the face
+        ),  # built-in models: two components by kind, then the heading of the face [rad]
         ("alternative", np.float64, (3,)),
         (
             "covariance",
             np.float64,
             (3, 3),
-        ),  # of value; a component not measured has no covariance and variance 1
+        ),  # of value; a component not measured has variance 1 and no correlation
         (
             "systematic_share",
             np.float64,
             (3,),
-        ),  # share of each variance that comes again, see filter/correlated_noise.py
+        ),  # systematic share of each variance, see filter/correlated_noise.py
     ]
 )
 
@@ -96,7 +95,7 @@ MeasurementArray = NDArray[np.void]
 
 
 class MeasurementColumns(NamedTuple):
-    """The fields of measurements (m,) as compiled code takes them."""
+    """Fields of measurements (m,) as separate arrays, for compiled code."""
 
     stamp_ns: NDArray[np.int64]
     observer: NDArray[np.int64]
@@ -116,33 +115,33 @@ class MeasurementColumns(NamedTuple):
 
     @classmethod
     def of(cls, measurements: MeasurementArray) -> MeasurementColumns:
-        """The columns of an array of MEASUREMENT_DTYPE, to be read.
+        """Contiguous copies of the columns of an array of MEASUREMENT_DTYPE, for reading.
 
-        Each is contiguous. As views they would be so only of a single measurement, for which everything
-        that takes them would be compiled a second time, perhaps while robots wait.
+        Views are contiguous only for a single measurement; for this second array type, numba would compile
+        all kernels again at runtime.
         """
         return cls(*(np.ascontiguousarray(measurements[name]) for name in cls._fields))
 
     @classmethod
     def views(cls, measurements: MeasurementArray) -> MeasurementColumns:
-        """The columns as views, to be written."""
+        """Views of the columns, for writing."""
         return cls(*(measurements[name] for name in cls._fields))
 
 
 @inlined_njit
 def has_kernel(measurements: MeasurementColumns, k: int) -> bool:
-    """Whether compiled code can evaluate measurement k: no command, and a model that is built in."""
+    """Whether compiled code can evaluate measurement k: not a command, and a built-in model."""
     kind: int = measurements.kind[k]
     return 0 <= kind <= POLAR
 
 
 class Prediction(NamedTuple):
-    """What a model expects of a measurement of n components, n up to 3.
+    """Predicted value of a measurement with n components, n up to 3.
 
     Attributes:
-        value: (n,).
+        value: (n,) predicted value.
         observer_jacobian: (n, 3) by the observer's right-invariant error X = exp(xi) X_hat.
-        target_jacobian: (n, 3) by the target's.
+        target_jacobian: (n, 3) by the target's right-invariant error.
     """
 
     value: FloatArray
@@ -152,21 +151,21 @@ class Prediction(NamedTuple):
 
 @dataclass(frozen=True)
 class MeasurementModel:
-    """How a kind of measurement depends on the poses of its observer and its target.
+    """Model of a kind of measurement as a function of the poses of its observer and its target.
 
     A model without a compiled kernel is evaluated by its record, see `filter/model_evaluation.py`.
 
     Attributes:
-        name: For people.
-        number: What `kind` of its measurements holds.
-        degrees_of_freedom: So many components of a value, the first ones, decide whether it is accepted.
-        predict: From a measurement (1,) and the poses (3,) in `map` of observer and target. The pose of a
-            target that is a landmark is by what it is moved from its survey; one that is missing is not to be
-            used.
-        innovation: From a measurement (1,) and the predicted value (n,) the measured value minus it (n,),
-            angles wrapped.
-        constraint: From a measurement (1,) the same as one of `Kind.CARTESIAN` or `Kind.POLAR`, which can
-            locate a robot that waits; None: it locates nobody.
+        name: Human-readable name.
+        number: Value of the field `kind` of its measurements.
+        degrees_of_freedom: Number of leading components that are gated.
+        predict: Predicts from a measurement (1,) and the poses (3,) in `map` of observer and target. For a
+            landmark, the pose of the target is the correction of its survey. The pose of a missing side is
+            undefined.
+        innovation: Returns measured minus predicted (n,), angles wrapped, for a measurement (1,) and a
+            predicted value (n,).
+        constraint: Converts a measurement (1,) to `Kind.CARTESIAN` or `Kind.POLAR`, to initialize a robot;
+            None if not supported.
     """
 
     name: str
@@ -177,7 +176,7 @@ class MeasurementModel:
     constraint: Callable[[MeasurementArray], MeasurementArray] | None = None
 
     def gate(self, probability: ArrayLike) -> FloatArray:
-        """The squared distance that good measurements exceed with 1 - probability."""
+        """Gate threshold of the squared distance for an acceptance probability."""
         return gate_threshold(probability, self.degrees_of_freedom)
 
 
@@ -200,21 +199,21 @@ MODELS: dict[int, MeasurementModel] = {
     int(kind): MeasurementModel(
         kind.name.lower(),
         int(kind),
-        2,  # the heading has no vote, see `gating.position_distance`
+        2,  # the heading is not gated, see `gating.position_distance`
         _predict_built_in,
         _innovation_built_in,
         None if kind == Kind.ANONYMOUS else _itself,
     )
     for kind in Kind
 }
-"""All models by their numbers."""
+"""All models by number."""
 
 
 def register(model: MeasurementModel) -> None:
-    """Add a model.
+    """Add a model to `MODELS`.
 
     Raises:
-        ValueError: Its number is not free, or not positive.
+        ValueError: The number is in use or not positive.
     """
     if model.number <= 0 or model.number in MODELS:
         raise ValueError(f"the number {model.number} of the measurement model {model.name!r} is not free")
@@ -234,9 +233,9 @@ def predict(
     Args:
         measurements: (m,) of MEASUREMENT_DTYPE.
         observer_pose: (m, 3) in `map`; rows without an observer are ignored.
-        target_pose: (m, 3), or what moves a landmark from its surveyed place; rows with neither are ignored.
-        camera: (m, 2) by how much the sensor is turned to the left besides [rad], and stretches distances;
-            zero if not given.
+        target_pose: (m, 3), or correction of a landmark's survey; rows with neither are ignored.
+        camera: (m, 2) yaw offset of the sensor, positive to the left [rad], and relative error of distances;
+            zero by default.
     """
     value, jacobian = np.zeros((measurements.size, 3)), np.zeros((measurements.size, 3, 5))
     errors = np.zeros((measurements.size, 2)) if camera is None else camera
@@ -295,7 +294,7 @@ def write_innovation(
 ) -> None:
     """Write measured minus predicted (3,), angles wrapped, zero for a heading that was not measured.
 
-    Eq. (11) of the e-puck paper subtracts without wrapping, which is wrong across +-pi.
+    Eq. (11) of the e-puck paper does not wrap angles, which is wrong across +-pi.
     """
     out[0] = measured[0] - predicted[0]
     out[1] = measured[1] - predicted[1]

@@ -1,9 +1,9 @@
-"""Evaluate measurements whose models have no compiled kernel, by their records.
+"""Evaluation of measurements whose models have no compiled kernel.
 
 Such a measurement is gated with the degrees of freedom of its model. When accepted it confirms the poses of
 its robots; when gated it counts towards their loss (`integrity/divergence.py`), but does not refute a
 configured start. It takes no part in the attribution of faults (`integrity/fault_detection.py`), in noise
-inflation or in the mean of repeated measurements (`correlated_noise.py`): these know positions and headings.
+inflation or in the mean of repeated measurements (`correlated_noise.py`): these need positions and headings.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ def evaluate_by_records(
     joint: JointFilter,
     batch: InnovationBatch,
 ) -> None:
-    """Evaluate those of measurements (m,) whose models have no kernel, as `evaluate_all` does the others.
+    """Evaluate those measurements (m,) whose models have no kernel; `evaluate_all` does the others.
 
     Args:
-        measurements: Between robots that are located.
+        measurements: (m,) between localized robots.
         tracks: Odometry.
-        belief: Predicted.
+        belief: Predicted belief.
         joint: Its filter, prepared for an update with these measurements.
-        batch: (m,) its `pose` and, of a sparse filter, `cross_covariance` are read, the rest is written.
+        batch: (m,) input: `pose` and, for a sparse filter, `cross_covariance`; output: the other fields.
     """
     for k in np.flatnonzero(measurements["kind"] > POLAR).tolist():
         _evaluate(measurements[k : k + 1], k, tracks, belief, joint, batch)
@@ -49,7 +49,7 @@ def _evaluate(
     joint: JointFilter,
     batch: InnovationBatch,
 ) -> None:
-    """Write row k of a batch; components that the model does not have get zero rows and unit noise."""
+    """Write row k of a batch; missing components get zero rows and unit noise."""
     model, stamp_ns = MODELS[int(one["kind"][0])], int(one["stamp_ns"][0])
     predicted = model.predict(one, batch.pose[k, 0], batch.pose[k, 1])
     count, sides = predicted.value.size, (int(one["observer"][0]), int(one["target"][0]))
@@ -76,7 +76,7 @@ def _evaluate(
 
 
 def _columns(one: MeasurementArray, belief: BeliefArrays) -> tuple[int, int]:
-    """The first columns of observer and target of a measurement (1,); -1: it has none."""
+    """First filter columns of observer and target of a measurement (1,); -1: none."""
     observer, target, landmark = (int(one[name][0]) for name in ("observer", "target", "landmark"))
     first = 3 * target if target >= 0 else -1
     if landmark > 0:
@@ -87,7 +87,7 @@ def _columns(one: MeasurementArray, belief: BeliefArrays) -> tuple[int, int]:
 def _covariance(
     columns: tuple[int, int], belief: BeliefArrays, joint: JointFilter, cross_covariance: FloatArray
 ) -> FloatArray:
-    """Covariance (6, 6) of the errors of observer and target; zero for one without columns."""
+    """Covariance (6, 6) of the errors of observer and target; zero for a side without columns."""
     covariance = np.zeros((6, 6))
     for i, first in enumerate(columns):
         if first >= 0:
@@ -100,7 +100,7 @@ def _covariance(
 
 
 def _motion(tracks: TrackArrays, robot: int, stamp_ns: int, pose: FloatArray) -> FloatArray:
-    """How fast the right-invariant error (3,) of a stamp moves a robot at a pose (3,) in `map` [1/s]."""
+    """Right-invariant velocity twist (3,) of a robot at a pose (3,) in `map` [1/s]."""
     forward, left, turn = rate_at(tracks, robot, stamp_ns)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     return np.array(

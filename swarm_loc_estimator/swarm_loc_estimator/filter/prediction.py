@@ -1,14 +1,14 @@
 """Prediction of one robot along its odometry track.
 
-A robot's pose is X = T O with the track O. Between two instants T gathers noise, and drifts with the
-parameters z of the robot's motion (`swarm/calibration_states.py`):
+A robot's pose is X = T O with the track O. Between two instants, process noise is added to T, and T drifts
+with the parameters z of the robot's motion (`swarm/calibration_states.py`):
 
     T <- T exp((D2 - D1) z) = exp(A z) T,    P <- F P F^T + Ad(T) (G2 - G1) Ad(T)^T,    A = Ad(T) (D2 - D1).
 
-The right-invariant error does not change by the move itself, whatever z is, but by the error of z:
-xi <- xi + Ad(exp(A z / 2)) A dz, which is F. So what moves all robots and landmarks alike is never taken for
-observed. The turn rate's bias is a first-order Gauss-Markov process: it decays, and between the instants it
-was what it was on average.
+The right-invariant error does not depend on z, only on the error of z: xi <- xi + Ad(exp(A z / 2)) A dz,
+which is F. So a common motion of all robots and landmarks stays unobservable. The bias of the turn rate is a
+first-order Gauss-Markov process: it decays, and between the two instants its mean over this interval is
+used.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from swarm_loc_estimator.swarm.calibration_states import DRIVES, TURN_BIAS
 
 
 class _Drift(NamedTuple):
-    """How a robot's parameters move its pose from where its belief stands to another instant.
+    """Drift of a robot's pose by its parameters, from the instant of the belief to another one.
 
     Attributes:
-        twist: (3,) T is moved by exp(twist).
-        drive: (3, DRIVES) the error of the pose there per error of each parameter before.
-        left: Share of the turn bias that is left.
-        gained: Variance that its mean over the time gained, in units of its column of `drive`, squared.
-        shared: Covariance that the mean gained with the bias there, in those units.
+        twist: (3,) T changes to exp(twist) T.
+        drive: (3, DRIVES) Jacobian of the final pose error by the initial errors of the parameters.
+        left: Remaining share of the turn bias.
+        gained: Process noise variance of the mean turn bias, in squared units of its column of `drive`.
+        shared: Process noise covariance of the mean and the final turn bias, in those units.
     """
 
     twist: FloatArray
@@ -52,7 +52,7 @@ class _Drift(NamedTuple):
 
 @cached_njit
 def new_scratch() -> FloatArray:
-    """Room (3, 3, 3) to predict in: memory of its own for each robot would cost more."""
+    """Allocate buffers (3, 3, 3) for `predict`, to be reused."""
     return np.empty((3, 3, 3))
 
 
@@ -84,12 +84,12 @@ def write_predicted(
     transform: FloatArray,
     covariance: FloatArray,
 ) -> None:
-    """Write T (3,) and the covariance (3, 3) of its error where `predict` would take them; change nothing.
+    """Write the predicted T (3,) and the covariance (3, 3) of its error; do not change the belief.
 
     Args:
-        belief: Where all are.
-        robot: Whose T it is.
-        to: The instant.
+        belief: Belief to predict from.
+        robot: Index of the robot.
+        to: Instant and preintegrated odometry.
         scratch: From `new_scratch`.
         transform: (3,) written.
         covariance: (3, 3) written.
@@ -111,7 +111,7 @@ def write_predicted(
 def _write_drifted(
     belief: BeliefArrays, robot: int, to: Preintegrated, transform: FloatArray, covariance: FloatArray
 ) -> None:
-    """Move T (3,) as the parameters of its motion do, and write the covariance (3, 3) of its error there."""
+    """Apply the drift to T (3,), and write the covariance (3, 3) of its error."""
     drift = _new_drift(belief, robot, to)
     _move(drift.twist, transform)
     columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))
@@ -121,9 +121,9 @@ def _write_drifted(
 
 @inlined_njit
 def _new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, scratch: FloatArray) -> bool:
-    """Write Ad(T) (G2 - G1) Ad(T)^T to `scratch[0]`, and return whether it is a covariance.
+    """Write Ad(T) (G2 - G1) Ad(T)^T to `scratch[0]`, and return whether it is positive semidefinite.
 
-    It is none only when odometry comes so late that more was assumed of a silence beyond the horizon.
+    It is not if odometry from beyond the horizon arrives after a larger dropout noise was assumed.
     """
     before, difference, work = belief.preintegrated_covariance[robot], scratch[1], scratch[2]
     rounding = 1e-12
@@ -151,11 +151,11 @@ def _has_drives(belief: BeliefArrays, robot: int) -> bool:
 
 @cached_njit
 def _new_drift(belief: BeliefArrays, robot: int, to: Preintegrated) -> _Drift:
-    """How the pose moves until an instant."""
+    """Compute the drift of the pose until an instant."""
     x = max(0, to.stamp_ns - belief.predicted_to_ns[robot]) * 1e-9 / belief.table.turn_bias_time_s[robot]
     left, variance = math.exp(-x), belief.table.sigma[robot, TURN_BIAS] ** 2
-    reach = -math.expm1(-x)  # of the bias now, over the time, in units of its time constant
-    # of what arises meanwhile; a series where the closed form would be rounding
+    reach = -math.expm1(-x)  # integral of the decaying bias, in units of its time constant
+    # process noise; a series for small x, where the closed form cancels
     spread = 2.0 * x - 3.0 + 4.0 * left - left * left if x > 1e-2 else x**3 * (2.0 / 3.0 - 0.5 * x)
     gained, shared = spread / max(reach, 1e-12) ** 2, (1.0 - left) ** 2 / max(reach, 1e-12)
     out = _Drift(np.zeros(3), np.zeros((3, DRIVES)), left, variance * gained, variance * shared)
@@ -179,7 +179,7 @@ def _new_drift(belief: BeliefArrays, robot: int, to: Preintegrated) -> _Drift:
 
 @cached_njit
 def _own(belief: BeliefArrays, robot: int, drift: _Drift, columns: IntArray, weight: FloatArray) -> int:
-    """Write which columns (3 + DRIVES,) the pose's error comes from, with what weight; return how many."""
+    """Write source columns (3 + DRIVES,) and weights of the pose's error; return their number."""
     count = 0
     for m in range(3 + DRIVES):
         column = own_column(belief, robot, m)
@@ -207,7 +207,7 @@ def _block(
 
 @cached_njit
 def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
-    """Apply the drift to T and to the covariance of its error with everything, and let the bias decay."""
+    """Apply the drift to T, to its covariances with all states and to the turn bias."""
     drift = _new_drift(belief, robot, to)
     _move(drift.twist, belief.transform[robot])
     first, p = own_column(belief, robot, 0), own_covariance(belief, robot)
@@ -241,7 +241,7 @@ def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
 
 @cached_njit
 def _note_transition(belief: BeliefArrays, robot: int, drift: _Drift) -> None:
-    """Note how the drift changes the covariance of the pose's error with those of others."""
+    """Accumulate the transition of the drift, for cross-covariances of a sparse filter."""
     transition = belief.transition[robot]
     for m in range(DRIVES):
         if belief.table.column[robot, m] >= 0:
@@ -253,6 +253,6 @@ def _note_transition(belief: BeliefArrays, robot: int, drift: _Drift) -> None:
 
 @cached_njit
 def _move(twist: FloatArray, transform: FloatArray) -> None:
-    """Move a transform (3,), in place, by exp(twist)."""
+    """Left-multiply a transform (3,) by exp(twist), in place."""
     x, y, theta = moved_by_twist(twist[0], twist[1], twist[2], transform[0], transform[1], transform[2])
     transform[0], transform[1], transform[2] = x, y, theta

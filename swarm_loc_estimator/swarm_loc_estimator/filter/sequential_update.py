@@ -1,4 +1,4 @@
-"""Sequential update: predict two robots, evaluate one innovation, correct all, measurement by measurement."""
+"""Sequential update: predict two robots, evaluate one innovation and update, for each measurement."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ OPEN, USED, GATED = 0, 1, 2
 """Verdicts, see `fusion.Verdict`."""
 
 FINISHED, LEFT_OUT, LOST, CONTRADICTED = 0, 1, 2, 3
-"""Why `update_in_order` returned: all done; a command, a model without a kernel or a measurement not between
-robots located; a robot is lost; a robot or landmark is contradicted."""
+"""Reasons to return from `update_in_order`: all fused; a command, a model without a kernel or a measurement
+of a robot that is not localized; a robot is lost; a robot or landmark is contradicted."""
 
 
 @cached_njit
@@ -42,19 +42,19 @@ def update_in_order(
     verdicts: NDArray[np.uint8],
     nis: FloatArray,
 ) -> tuple[int, int, int]:
-    """Fuse measurements one after the other, each at its exact stamp, linearised at the newest belief.
+    """Fuse measurements sequentially, each at its exact stamp, linearized about the newest belief.
 
     Args:
-        measurements: (m,) in order of their stamps.
-        begin: The first one to fuse.
+        measurements: (m,) sorted by stamp.
+        begin: Index of the first measurement to fuse.
         tracks: Odometry.
-        belief: Changed in place.
-        limits: Beyond which a robot is given up.
+        belief: Updated in place.
+        limits: Thresholds beyond which a robot is lost.
         verdicts: (m,) written.
-        nis: (m,) normalised innovations squared, written.
+        nis: (m,) normalized innovation squared, written.
 
     Returns:
-        The first measurement not dealt with, why, and the robot or landmark that it is about.
+        Index of the first measurement not processed, the reason, and the robot or landmark concerned.
     """
     batch, sample, scratch, room = new_batch(1), new_sample(2), new_scratch(), prediction.new_scratch()
     pose = batch.pose[0]

@@ -1,4 +1,4 @@
-"""The filter's state at one instant: enough to go on from there, so a copy is a checkpoint."""
+"""Complete filter state at one instant; a copy is a checkpoint."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.swarm.calibration_states import PARAMETERS, ParameterTable
 
 _DOUBTED_POSE_SIGMA = (0.02, 0.02, 0.03)
-"""By how much less certain the pose of a contradicted robot becomes [m], [m], [rad]."""
+"""Standard deviation added to the pose of a contradicted robot [m], [m], [rad]."""
 _REOPENED_POSE_SIGMA = (0.06, 0.06, 0.12)
-"""How certain poses are that rest on a description that is not so."""
+"""Standard deviation of poses after all parameters are reset to their priors [m], [m], [rad]."""
 _ALONE: IntArray = np.zeros(0, dtype=np.int64)
 _NO_SHARES: FloatArray = np.zeros((0, 3, 3))
 
 
 class InitialPose(NamedTuple):
-    """Where the track of a robot lies that is to be initialized.
+    """Pose of an odometry track, to initialize a robot.
 
-    Its error is one of its own, and a share of those of what it was located by.
+    The error is the sum of an independent part and of mapped errors of other bodies.
 
     Attributes:
         transform: (3,) T, from `map` to the track's frame.
-        covariance: (3, 3) of the part of its right-invariant error that is its own.
-        columns: (s,) first filter columns of the others' errors.
-        shares: (s, 3, 3) how they enter its own.
+        covariance: (3, 3) of the independent part of the right-invariant error.
+        columns: (s,) first filter columns of the other bodies.
+        shares: (s, 3, 3) Jacobians of the error with respect to theirs.
     """
 
     transform: FloatArray
@@ -47,14 +47,14 @@ class InitialPose(NamedTuple):
 
 
 class Starts(NamedTuple):
-    """Where and when the tracks of robots (k,) begin to count, whose errors are their own.
+    """Initial poses of the tracks of robots (k,), with independent errors.
 
     Attributes:
         transform: (k, 3) T, from `map` to the tracks' frames.
-        covariance: (k, 3, 3) of their right-invariant errors.
-        stamp_ns: (k,) the instants.
-        preintegrated_covariance: (k, 3, 3) of the tracks by then.
-        preintegrated_jacobian: (k, 3, 3) of the tracks by then.
+        covariance: (k, 3, 3) of the right-invariant errors.
+        stamp_ns: (k,) instants of initialization.
+        preintegrated_covariance: (k, 3, 3) of the tracks at these instants.
+        preintegrated_jacobian: (k, 3, 3) of the tracks at these instants.
     """
 
     transform: FloatArray
@@ -68,30 +68,30 @@ class SwarmState:
     """Joint belief over all robots.
 
     Args:
-        table: Which parameters are estimated besides the poses.
-        pairs: Of how many others each robot remembers what it has measured.
-        joint: A filter of the table's size in which nothing is known; a dense one if not given.
+        table: Parameters estimated besides the poses.
+        pairs: Maximum number of observed robots per robot with a stored mean.
+        joint: A new filter of the table's size; dense by default.
 
     Attributes:
         transform: (N, 3) T, from `map` to the frame of the robot's odometry track.
         parameter: (N, PARAMETERS) see `swarm/calibration_states.py`.
-        landmark: (L, 3) by what each landmark is moved from its surveyed place, in `map`.
-        filter: Covariance of the errors: robot i has columns 3i..3i+2 for its pose, right-invariant, and
-            those of the table for its parameters; landmarks have those of the table.
-        predicted_to_ns: (N,) the instant to which the robot is predicted.
+        landmark: (L, 3) correction of each landmark's surveyed pose, in `map`.
+        filter: Covariance of the errors: columns 3i..3i+2 for the right-invariant pose error of robot i,
+            columns of the table for its parameters and for landmarks.
+        predicted_to_ns: (N,) instant to which the robot is predicted.
         preintegrated_covariance: (N, 3, 3) of its track at that instant, as is preintegrated_jacobian.
-        tracked: (N,) whether the robot is part of the estimate.
-        start_pending: (N,) whether the robot may still be initialized at its configured start.
-        last_fix_ns: (N,) newest accepted measurement tied to a landmark or an absolute fix.
-        integrity: What the newest measurements say of all this.
-        contradicted_ns: (N + L,) when each robot and landmark was contradicted last; NEVER_NS: never.
-        all_augmented: Whether everything was, at once.
-        pair_robot: (N, pairs) whom each has measured; -1: nobody.
-        pair_stamp_ns: (N, pairs) when last.
-        pair_history: (N, pairs, PAIR_ROWS, 3) what was measured, see `correlated_noise.py`.
-        constraints: Per robot that is not tracked, sightings which may locate it (see `initializer.py`).
-        next_attempt_ns: (N,) before this instant nothing more is made of its constraints.
-        images: What is remembered of aerial images.
+        tracked: (N,) True if the robot is part of the estimate.
+        start_pending: (N,) True if the robot may still be initialized at its configured start.
+        last_fix_ns: (N,) stamp of the newest accepted landmark sighting or absolute fix.
+        integrity: Statistics of recent innovations.
+        contradicted_ns: (N + L,) last contradiction of each robot and landmark; NEVER_NS if none.
+        all_augmented: True after `augment_all`.
+        pair_robot: (N, pairs) robots observed by each robot; -1 for an empty slot.
+        pair_stamp_ns: (N, pairs) stamp of the last measurement of the pair.
+        pair_history: (N, pairs, PAIR_ROWS, 3) mean of the measurements, see `correlated_noise.py`.
+        constraints: Stored sightings per robot that is not tracked (see `initializer.py`).
+        next_attempt_ns: (N,) earliest instant of the next attempt to initialize the robot.
+        images: Memory of aerial images.
     """
 
     def __init__(self, table: ParameterTable, pairs: int = 0, joint: JointFilter | None = None) -> None:
@@ -120,10 +120,10 @@ class SwarmState:
         self.images = IdentityMemory()
 
     def copy(self) -> SwarmState:
-        """An independent copy."""
+        """Return an independent copy."""
         other = SwarmState.__new__(SwarmState)
         for name, value in vars(self).items():
-            # a table never changes; the arrays inside `constraints` are replaced, never written to
+            # the table is immutable; the arrays inside `constraints` are replaced, never written to
             setattr(other, name, value if name in {"_table", "integrity", "all_augmented"} else value.copy())
         other.integrity = IntegrityArrays(*(column.copy() for column in self.integrity))
         return other
@@ -151,17 +151,17 @@ class SwarmState:
         )
 
     def is_known(self, side: int) -> bool:
-        """Whether a side of a measurement is located: a robot, or NOBODY in place of what is in `map`."""
+        """Whether a side of a measurement is localized: a tracked robot, or NOBODY for `map` itself."""
         return side == NOBODY or bool(self.tracked[side])
 
     def initialize(self, robot: int, initial: InitialPose, at: Preintegrated, confirmations: int = 0) -> None:
-        """Take the robot into the estimate.
+        """Add the robot to the estimate.
 
         Args:
             robot: Its index.
-            initial: Where its track lies.
-            at: The instant, and what its track has preintegrated by then.
-            confirmations: How many sightings agree with that.
+            initial: Pose of its track.
+            at: Instant and preintegrated odometry of its track.
+            confirmations: Number of sightings that agree with this pose.
         """
         alone = (initial.transform, initial.covariance, at.stamp_ns, at.covariance, at.jacobian)
         self.start(np.array([robot]), Starts(*(np.array([one]) for one in alone)), confirmations)
@@ -170,7 +170,7 @@ class SwarmState:
         self.filter.correlate(robot_columns(np.array([robot]))[0], others, mapping)
 
     def start(self, robots: IntArray, starts: Starts, confirmations: int = 0) -> None:
-        """Take robots (k,) into the estimate whose errors are their own, see `initialize`."""
+        """Add robots (k,) with independent errors to the estimate, see `initialize`."""
         for robot in robots[self.tracked[robots]].tolist():
             self._forget_pairs(robot)
         self.transform[robots] = starts.transform
@@ -185,7 +185,7 @@ class SwarmState:
             self.constraints.pop(robot, None)
 
     def deinitialize(self, robot: int) -> None:
-        """Take the robot out of the estimate; it waits for a fix."""
+        """Remove the robot from the estimate until a fix initializes it."""
         self._decorrelate(np.array([robot]), np.eye(3)[None])
         self._forget_pairs(robot)
         self.tracked[robot] = False
@@ -193,11 +193,11 @@ class SwarmState:
         self._trust(np.array([robot]), 0)
 
     def augment(self, source: int, pose: FloatArray) -> None:
-        """Estimate the parameters of a contradicted robot or landmark, or re-estimate them.
+        """Estimate, or re-estimate, the parameters of a contradicted robot or landmark.
 
         Args:
-            source: The robot, or N plus the landmark.
-            pose: (3,) of the robot in `map`, which becomes less certain, too.
+            source: Index of the robot, or N plus the index of the landmark.
+            pose: (3,) of the robot in `map`; its covariance is inflated.
         """
         robots = self.tracked.size
         self.integrity.fault_score[source] = 0.0
@@ -217,10 +217,10 @@ class SwarmState:
         self.filter.add(robot_columns(np.array([source]))[0], doubt)
 
     def augment_all(self, poses: FloatArray) -> None:
-        """Re-estimate all parameters, since the belief rests on a wrong description.
+        """Reset all parameters to their priors and re-estimate them.
 
         Args:
-            poses: (N, 3) of the robots in `map`, which stay where they are believed to be.
+            poses: (N, 3) of the robots in `map`; these means are kept.
         """
         robots, landmarks = self.tracked.size, self.landmark.shape[0]
         self.all_augmented = True
@@ -239,7 +239,7 @@ class SwarmState:
         inflate_all_noise(self.integrity)
 
     def _use_table(self, table: ParameterTable) -> None:
-        """Go on with more columns."""
+        """Extend the filter to the columns of a larger table."""
         self.filter.append_columns(table)
         self._table = table
 
@@ -254,7 +254,7 @@ class SwarmState:
             self.filter.add(columns, self._table.survey[landmark])
 
     def _set_described_priors(self) -> None:
-        """Let all that is estimated besides poses be as certain as it is described."""
+        """Set the described priors of all parameters and landmarks."""
         estimated = self._table.column >= 0
         self.filter.set_prior(self._table.column[estimated], np.diag(self._table.sigma[estimated] ** 2))
         for first, survey in zip(self._table.survey_column, self._table.survey, strict=True):
@@ -262,7 +262,7 @@ class SwarmState:
                 self.filter.set_prior(first + np.arange(3), survey)
 
     def _trust(self, robots: IntArray, confirmations: int) -> None:
-        """Clear the fault scores of robots (k,) that are initialized again."""
+        """Reset the integrity statistics of robots (k,)."""
         self.integrity.gated_in_a_row[robots] = 0
         self.integrity.gated_fixes[robots] = 0
         self.integrity.fault_score[robots] = 0.0
@@ -271,31 +271,31 @@ class SwarmState:
         self.integrity.evidence[np.isin(self.integrity.source, robots)] = 0.0
 
     def _forget_pairs(self, robot: int) -> None:
-        """Forget what the robot has measured, and others of it: its errors now are others."""
+        """Clear the stored means of all pairs of the robot: its new errors are independent of them."""
         for gone in (self.pair_robot == robot, np.s_[robot]):
             self.pair_robot[gone], self.pair_stamp_ns[gone] = -1, NEVER_NS
 
     def _decorrelate(self, robots: IntArray, covariances: FloatArray) -> None:
-        """Give poses (k,) covariances (k, 3, 3); what was learned of the robots' sensors stays."""
-        known = robots[self.tracked[robots]]  # what is estimated of others has nothing to do with anything
+        """Set independent covariances (k, 3, 3) of poses (k,); keep the variances of parameters."""
+        known = robots[self.tracked[robots]]  # parameters of other robots are uncorrelated already
         for robot in known[(self._table.column[known] >= 0).any(axis=1)].tolist():
             columns = self._table.column[robot, self._table.column[robot] >= 0]
             self.filter.set_prior(columns, np.diag(np.diag(self.filter.block(columns))))
         self.filter.set_body_priors(robots, covariances)
 
     def parameter_sigma(self, robot: int) -> FloatArray:
-        """Standard deviations (PARAMETERS,) of a robot's parameters; zero of those not estimated."""
+        """Standard deviations (PARAMETERS,) of a robot's parameters; zero if not estimated."""
         column = self._table.column[robot]
         sigma, estimated = np.zeros(column.size), column >= 0
         sigma[estimated] = np.sqrt(np.diag(self.filter.block(column[estimated])))
         return sigma
 
     def landmark_covariance(self, landmark: int) -> FloatArray:
-        """Covariance (3, 3) of the right-invariant error of a landmark that is estimated."""
+        """Covariance (3, 3) of the right-invariant error of an estimated landmark."""
         return self.filter.block(self.landmark_column(landmark) + np.arange(3))
 
     def landmark_column(self, landmark: int) -> int:
-        """First filter column of the error of a landmark that is estimated."""
+        """First filter column of an estimated landmark."""
         return int(self._table.survey_column[landmark])
 
 

@@ -1,4 +1,4 @@
-"""Where tracks are at any instant, between their rows and past the newest one."""
+"""Interpolation and extrapolation of odometry tracks."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class OdometrySample(NamedTuple):
 
     Attributes:
         pose: (m, 3) calibrated odometry pose O, heading not wrapped.
-        raw: (m, 3) the pose that the driver reported, interpolated in the same way.
-        covariance: (m, 3, 3) preintegrated by then, see `Preintegrated`.
-        jacobian: (m, 3, 3) preintegrated by then.
-        silence_s: (m,) how long after the newest message of its robot the instant lies; 0 within the track.
+        raw: (m, 3) pose reported by the driver, interpolated in the same way.
+        covariance: (m, 3, 3) preintegrated covariance, see `Preintegrated`.
+        jacobian: (m, 3, 3) preintegrated Jacobian.
+        silence_s: (m,) time since the newest message of the robot [s]; 0 within the track.
     """
 
     pose: FloatArray
@@ -34,7 +34,7 @@ class OdometrySample(NamedTuple):
 
 @cached_njit
 def new_sample(count: int) -> OdometrySample:
-    """Room for `count` look-ups."""
+    """Allocate a sample of `count` look-ups."""
     return OdometrySample(
         np.zeros((count, 3)),
         np.zeros((count, 3)),
@@ -46,11 +46,11 @@ def new_sample(count: int) -> OdometrySample:
 
 @inlined_njit
 def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample, k: int) -> None:
-    """Write where the track of a robot is at an instant, in row k of a sample.
+    """Look a robot's track up at an instant, and write row k of a sample.
 
-    Within a step the motion is an arc of constant twist. Past the newest row the last twist goes on, less and
-    less sure; after `timeout_s` the motion since that row counts as unknown. Before the first row the robot
-    stands. One without odometry stands, or walks at random, in body directions about where it is.
+    Within a step the twist is constant. Past the newest row the last twist is extrapolated with growing
+    covariance; after `timeout_s` the motion since that row is unknown. Before the first row the robot is
+    stationary. A robot without odometry is stationary or a random walk in its body frame.
     """
     count = tracks.filled[robot]
     out.silence_s[k] = 0.0
@@ -60,7 +60,7 @@ def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample,
         out.covariance[k].fill(0.0)
         out.jacobian[k].fill(0.0)
         out.silence_s[k] = 0.0 if tracks.is_stationary[robot] else math.inf
-        for i in range(3):  # of a random walk only the differences between instants count
+        for i in range(3):  # for a random walk, only differences between instants matter
             out.covariance[k, i, i] = tracks.walk[robot, i // 2] * (1e-9 * stamp_ns)
         return
     row, fraction = _find_step(tracks, robot, stamp_ns)
@@ -83,7 +83,7 @@ def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample,
 
 @inlined_njit
 def look_up_pose(tracks: TrackArrays, robot: int, stamp_ns: int, out: FloatArray) -> None:
-    """Write the pose (3,) that `look_up` finds, and nothing else."""
+    """Write only the pose (3,) of `look_up`."""
     if tracks.filled[robot] == 0:
         out.fill(0.0)
         return
@@ -96,9 +96,9 @@ def look_up_pose(tracks: TrackArrays, robot: int, stamp_ns: int, out: FloatArray
 
 @inlined_njit
 def _find_step(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[int, float]:
-    """The row behind which an instant lies on a track that has some, and at what fraction of the step.
+    """Row before an instant on a track that is not empty, and the fraction of the step to the next row.
 
-    From 1 on the instant lies past the newest row; below 0: the robot stands at the row, as far as is known.
+    A fraction of 1 or more extrapolates past the newest row; below 0, the robot is stationary at the row.
     """
     count = tracks.filled[robot]
     stamps, timeout_ns = tracks.stamp_ns[robot, :count], tracks.model[robot].timeout_s * 1e9
@@ -113,10 +113,10 @@ def _find_step(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[int, flo
 
 @inlined_njit
 def rate_at(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[float, float, float]:
-    """The velocity forward and left [m/s] and the turn rate [rad/s] of base_link at an instant.
+    """Velocity forward and left [m/s] and turn rate [rad/s] of base_link at an instant.
 
-    At a row it is that of the step to it, so what comes later does not change it. Up to the first row, and
-    where the motion is unknown, it is zero.
+    At a row, the rate is that of the step before, so that later rows do not change it. It is zero up to the
+    first row and where the motion is unknown.
     """
     count = tracks.filled[robot]
     stamps, timeout_ns = tracks.stamp_ns[robot, :count], tracks.model[robot].timeout_s * 1e9
@@ -137,7 +137,7 @@ def rate_at(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[float, floa
 def _along_step(
     tracks: TrackArrays, robot: int, row: int, fraction: float, out: OdometrySample, k: int
 ) -> None:
-    """Write what `look_up` does at a fraction of the step from a row to the next, or beyond it."""
+    """Write row k of `look_up` at a fraction of the step from a row to the next; may exceed 1."""
     _interpolate(tracks.pose[robot, row], tracks.pose[robot, row + 1], fraction, out.pose[k])
     _interpolate(tracks.raw[robot, row], tracks.raw[robot, row + 1], fraction, out.raw[k])
     for i in range(3):
@@ -158,7 +158,7 @@ def look_up_all(tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray) -> O
 
 @inlined_njit
 def _interpolate(start: FloatArray, end: FloatArray, fraction: float, out: FloatArray) -> None:
-    """The pose on the arc of constant twist from `start` to `end`; a `fraction` past 1 runs on."""
+    """Interpolate from `start` to `end` with constant twist; a `fraction` above 1 extrapolates."""
     turn = end[2] - start[2]
     back = -0.5 * (1.0 - fraction) * turn
     cos, sin = math.cos(back), math.sin(back)

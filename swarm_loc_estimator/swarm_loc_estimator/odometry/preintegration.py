@@ -25,19 +25,19 @@ UNCHANGED_NS = np.iinfo(np.int64).max
 BEFORE_ALL_NS = np.iinfo(np.int64).min
 
 _CONTRADICTORY_NS = 1_000_000_000
-"""Two jumps within such a time, and odometry tells nothing until it has been smooth for as long."""
+"""After two jumps within this time, odometry is ignored until it has been smooth for this time."""
 
 MODEL_DTYPE = np.dtype([(f.name, np.float64) for f in fields(OdometryModel)])
-"""The numbers of an `OdometryModel` as a record."""
+"""Record of the numbers of an `OdometryModel`."""
 
 
 class Preintegrated(NamedTuple):
-    """What the steps of a track have added up to by an instant, in the track's frame.
+    """Preintegrated odometry from the start of a track to an instant, in the track's frame.
 
     Attributes:
         stamp_ns: The instant.
-        covariance: (3, 3) G of the pose's right-invariant error.
-        jacobian: (3, 3) D, by how much the pose moves per unit of each parameter of the motion.
+        covariance: (3, 3) covariance G of the right-invariant error.
+        jacobian: (3, 3) Jacobian D of the pose by the parameters of the motion.
     """
 
     stamp_ns: int
@@ -46,33 +46,33 @@ class Preintegrated(NamedTuple):
 
     @classmethod
     def begin(cls, stamp_ns: int) -> Preintegrated:
-        """Where a track begins: nothing yet."""
+        """Start of a track: zero covariance and Jacobian."""
         return cls(stamp_ns, np.zeros((3, 3)), np.zeros((3, 3)))
 
 
 class TrackArrays(NamedTuple):
-    """The rows of all tracks and the models behind them, as compiled code reads them.
+    """Rows and models of all tracks, for compiled code.
 
     Attributes:
-        filled: (N,) rows in use per robot.
+        filled: (N,) number of rows in use.
         stamp_ns: (N, capacity) instants, calibrated for delay.
         raw: (N, capacity, 3) poses as reported, headings unwrapped.
         pose: (N, capacity, 3) calibrated poses O, headings unwrapped.
-        covariance: (N, capacity, 3, 3) preintegrated until the row, see `Preintegrated`.
-        jacobian: (N, capacity, 3, 3) until the row; its columns are those of `estimated_parameters`.
+        covariance: (N, capacity, 3, 3) preintegrated to the row, see `Preintegrated`.
+        jacobian: (N, capacity, 3, 3) preintegrated to the row; columns as in `estimated_parameters`.
         rate: (N, capacity, 3) calibrated velocity forward and left [m/s] and turn rate [rad/s] at the row,
-            behind the lag.
-        known_ns: (N, capacity) until when the motion is known: the row's own instant, but for jumps.
-        jump_ns: (N, capacity, 2) the instants of the last two jumps, the last one first.
+            after the lag.
+        known_ns: (N, capacity) end of the known motion: the row's instant, earlier after a jump.
+        jump_ns: (N, capacity, 2) instants of the last two jumps, newest first.
         delay_ns: (N,) delay of the stamps.
-        model: (N,) records of the numbers of `OdometryModel`.
+        model: (N,) of MODEL_DTYPE.
         response: (N, 2, V, W) shares of speed and of turn rate of `MotionResponse`.
-        response_speed: (N, V) speeds of its grid, filled up with infinity.
+        response_speed: (N, V) speeds of its grid, padded with infinity.
         response_turn_rate: (N, W) turn rates of its grid.
         begin_ns: (N,) instant of the very first row.
-        begin_pose: (N, 3) the pose there, where nothing is preintegrated yet.
-        is_stationary: (N,) whether the robot has no odometry: its track never leaves the origin.
-        walk: (N, 2) variances per second of its position [m^2/s] and heading [rad^2/s] then.
+        begin_pose: (N, 3) pose of the very first row.
+        is_stationary: (N,) True for a robot without odometry: its track stays at the origin.
+        walk: (N, 2) its variances per second of position [m^2/s] and heading [rad^2/s].
     """
 
     filled: IntArray
@@ -104,12 +104,12 @@ def continue_tracks(
     raw: FloatArray,
     changed_from_ns: IntArray,
 ) -> int:
-    """Append rows (k,) in their order, if all are newer than what their tracks hold and not too old.
+    """Append rows (k,) if all are newer than their tracks and not older than `oldest_ns`.
 
-    Stamps are as reported, not calibrated for delay. Writes (N,) after which instant each track changes.
+    Stamps are as reported, not calibrated for delay. Writes `changed_from_ns` (N,), see `TrackChange`.
 
     Returns:
-        How many rows are jumps; -1, and nothing is changed, when some are not new, or there is no room.
+        Number of jumps; -1, without any change, if some rows are not newer or there is no space.
     """
     newest, filled = np.empty(tracks.filled.size, dtype=np.int64), tracks.filled.copy()
     for robot in range(newest.size):
@@ -136,7 +136,7 @@ def continue_tracks(
 def integrate(
     tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray, raw: FloatArray, new: NDArray[np.bool_]
 ) -> tuple[int, int]:
-    """Append rows sorted by robot and stamp; return how many were duplicates, how many new ones jumps."""
+    """Append rows sorted by robot and stamp; return the numbers of duplicates and of new jumps."""
     duplicates, jumps = 0, 0
     for k in range(robots.size):
         robot = robots[k]
@@ -146,7 +146,7 @@ def integrate(
             continue
         tracks.stamp_ns[robot, row] = stamps_ns[k]
         assign(tracks.raw[robot, row], raw[k])
-        if row == 0:  # a track begins where its driver says
+        if row == 0:  # a track starts at the reported pose
             assign(tracks.pose[robot, 0], raw[k])
             tracks.covariance[robot, 0].fill(0.0)
             tracks.jacobian[robot, 0].fill(0.0)
@@ -165,14 +165,14 @@ def integrate(
 
 @inlined_njit
 def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
-    """Fill a row from the row before and its raw pose; return whether no robot can drive so fast."""
+    """Integrate from the previous row to the raw pose of a row; return whether the step is a jump."""
     model = tracks.model[robot]
     before, after = tracks.raw[robot, row - 1], tracks.raw[robot, row]
     duration_s = (tracks.stamp_ns[robot, row] - tracks.stamp_ns[robot, row - 1]) * 1e-9
     turn = after[2] - before[2]
     middle = before[2] + 0.5 * turn
     dx, dy = after[0] - before[0], after[1] - before[1]
-    # half a robot's width of slack: stamps jitter
+    # tolerance of half a robot's width, because stamps jitter
     jump = math.hypot(dx, dy) > model.max_speed * duration_s + 0.5 * model.wheel_separation
     start, rate = tracks.pose[robot, row - 1], tracks.rate[robot, row]
     covariance, jacobian = tracks.covariance[robot, row], tracks.jacobian[robot, row]
@@ -183,9 +183,9 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
     jumps_ns[0], jumps_ns[1] = tracks.jump_ns[robot, row - 1, 0], tracks.jump_ns[robot, row - 1, 1]
     if jump:
         jumps_ns[0], jumps_ns[1] = stamp_ns, jumps_ns[0]
-    # one jump is a driver that has started again; several are two of them that contradict each other
+    # one jump: the driver has restarted; several: two drivers publish conflicting odometry
     contradictory = stamp_ns - jumps_ns[1] < _CONTRADICTORY_NS
-    if jump or contradictory or duration_s > model.timeout_s:  # where it went is unknown
+    if jump or contradictory or duration_s > model.timeout_s:  # the motion is unknown
         assign(tracks.pose[robot, row], start)
         rate.fill(0.0)
         unknown_s = (tracks.stamp_ns[robot, row - 1] - known_ns) * 1e-9, (stamp_ns - known_ns) * 1e-9
@@ -197,7 +197,7 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
     reported = (cos * dx + sin * dy, cos * dy - sin * dx, turn)
     before_rate = tracks.rate[robot, row - 1]
     forward, left, turn = _true_motion(tracks, robot, reported, duration_s, before_rate, rate)
-    # the way of the axle, then that of base_link ahead of it
+    # displacement of the axle, then of base_link ahead of it
     cos, sin = math.cos(model.course_offset), math.sin(model.course_offset)
     way_x, way_y = cos * forward - sin * left, sin * forward + cos * left + model.axle_offset * turn
     middle = start[2] + 0.5 * turn
@@ -222,17 +222,17 @@ def _add_unknown(
     rate: FloatArray,
     covariance: FloatArray,
 ) -> None:
-    """Add the noise of a motion that goes on being unknown, at a pose (3,) and rate (3,).
+    """Add the noise of one step of unknown motion.
 
     Args:
-        model: The robot's.
-        unknown_s: For how long it was unknown at the row before, and at this one [s].
-        pose: (3,).
-        rate: (3,).
-        covariance: (3, 3) added to.
+        model: Odometry model of the robot.
+        unknown_s: Duration of the unknown motion at the previous row and at this row [s].
+        pose: (3,) pose at the start of the unknown motion.
+        rate: (3,) rate at the start of the unknown motion.
+        covariance: (3, 3) sum to add to.
     """
     add_dropout_noise(model, unknown_s[1], True, pose, rate, covariance)
-    if unknown_s[0] > 0.0:  # it has grown so far already
+    if unknown_s[0] > 0.0:  # already added at the previous row
         known = np.zeros((3, 3))
         add_dropout_noise(model, unknown_s[0], True, pose, rate, known)
         add_scaled(covariance, known, -1.0)
@@ -247,14 +247,14 @@ def _true_motion(
     before_rate: FloatArray,
     rate: FloatArray,
 ) -> tuple[float, float, float]:
-    """Calibrated way forward and left and turn of a reported step; writes their rates (3,) at its end."""
+    """Calibrated displacement forward and left and turn of a reported step; writes the final rate (3,)."""
     model = tracks.model[robot]
     speed = math.hypot(reported[0], reported[1]) / duration_s
     speed_share, turn_share = _response(tracks, robot, speed, abs(reported[2]) / duration_s)
     scale, turn_scale = model.distance_scale * speed_share, model.turn_scale * turn_share
     ahead, aside, turning = reported
     true_rate = (scale * ahead / duration_s, scale * aside / duration_s, turn_scale * turning / duration_s)
-    remaining, mean = 0.0, 0.0  # of what is left to follow: at the end, and on average over the step
+    remaining, mean = 0.0, 0.0  # remaining share of the lag's transient: at the end, and mean over the step
     if model.lag_s > 0.0:
         remaining = math.exp(-duration_s / model.lag_s)
         mean = (1.0 - remaining) * model.lag_s / duration_s
@@ -274,7 +274,7 @@ def _true_motion(
 
 @inlined_njit
 def _response(tracks: TrackArrays, robot: int, speed: float, turn_rate: float) -> tuple[float, float]:
-    """Shares of speed and turn rate that are true, bilinear in the grid of the robot's response."""
+    """True shares of speed and turn rate, bilinear in the grid of the robot's response."""
     i, a = _bracket(tracks.response_speed[robot], speed)
     j, b = _bracket(tracks.response_turn_rate[robot], turn_rate)
     table = tracks.response[robot]
@@ -283,7 +283,7 @@ def _response(tracks: TrackArrays, robot: int, speed: float, turn_rate: float) -
 
 @inlined_njit
 def _bilinear(table: FloatArray, i: int, j: int, a: float, b: float) -> float:
-    """A number of a table (V, W), by shares a and b of the way to the next row and column."""
+    """Bilinear interpolation of a table (V, W) at fractions a and b to the next row and column."""
     ii, jj = min(i + 1, table.shape[0] - 1), min(j + 1, table.shape[1] - 1)
     low: float = table[i, j] * (1.0 - b) + table[i, jj] * b
     high: float = table[ii, j] * (1.0 - b) + table[ii, jj] * b
@@ -292,7 +292,7 @@ def _bilinear(table: FloatArray, i: int, j: int, a: float, b: float) -> float:
 
 @inlined_njit
 def _bracket(axis: FloatArray, value: float) -> tuple[int, float]:
-    """The interval of an ascending axis nearest to the value, and how far in the value lies (0 to 1)."""
+    """Interval of an ascending axis that is nearest to the value, and the fraction within it (0 to 1)."""
     i = max(0, min(np.searchsorted(axis, value, side="right") - 1, axis.size - 1))
     if i + 1 == axis.size or math.isinf(axis[i + 1]):
         return i, 0.0

@@ -18,12 +18,12 @@ class OdometryStep(NamedTuple):
     """One step of a robot along its track.
 
     Attributes:
-        forward: Way of the body [m], as is left.
-        turn: [rad]
-        turn_rate_change: By how much the turn rate changed, without sign [rad/s].
-        duration_s: [s]
-        x: Place on the track in the middle of the step [m], as is y.
-        theta: Heading there [rad].
+        forward: Displacement of the body [m], as is left.
+        turn: Change of heading [rad].
+        turn_rate_change: Absolute change of the turn rate [rad/s].
+        duration_s: Duration [s].
+        x: Position on the track in the middle of the step [m], as is y.
+        theta: Heading in the middle of the step [rad].
     """
 
     forward: float
@@ -41,8 +41,8 @@ def add_step_noise(model: OdometryModel, step: OdometryStep, covariance: FloatAr
     """Add a step's noise to a covariance (3, 3) in the track's frame.
 
     Wheels: covar(ds_r, ds_l) = diag(k |ds_r|, k |ds_l|) (Siegwart and Nourbakhsh), the U Q U^T of the e-puck
-    paper's eq. (9), whose Q is not printed. Whichever way a robot moves, its noise is that of one that drives
-    there: along the way, across it and in heading, so walking sideways is no surer than walking ahead.
+    paper's eq. (9), whose Q is not printed. The noise along, across and in heading is relative to the
+    direction of motion, so a sideways step has the noise of a forward step of that length.
     """
     turn, duration_s = step.turn, step.duration_s
     separation, wheel, path = model.wheel_separation, model.wheel_noise, math.hypot(step.forward, step.left)
@@ -63,12 +63,12 @@ def add_step_noise(model: OdometryModel, step: OdometryStep, covariance: FloatAr
 
 @cached_njit
 def add_step_jacobian(model: OdometryModel, step: OdometryStep, jacobian: FloatArray) -> None:
-    """Add by how much a step moves the pose per unit of each parameter: Ad(O) times its body direction.
+    """Add the Jacobian of a step's motion by the parameters: Ad(O) times their body directions.
 
     Args:
-        model: Where the axle is.
+        model: Gives the position of the axle.
         step: The step.
-        jacobian: (3, 3) added to.
+        jacobian: (3, 3) sum to add to.
     """
     forward, left, turn = step.forward, step.left, step.turn
     if forward == 0.0 and left == 0.0 and turn == 0.0:
@@ -76,7 +76,7 @@ def add_step_jacobian(model: OdometryModel, step: OdometryStep, jacobian: FloatA
     cos, sin = math.cos(step.theta + model.course_offset), math.sin(step.theta + model.course_offset)
     jacobian[0, DISTANCE_SCALE] += cos * forward - sin * left
     jacobian[1, DISTANCE_SCALE] += sin * forward + cos * left
-    # the axle turns, base_link ahead of it moves sideways besides
+    # when the axle turns, base_link ahead of it also moves sideways
     turned_x = step.y - math.sin(step.theta) * model.axle_offset
     turned_y = -step.x + math.cos(step.theta) * model.axle_offset
     for parameter, angle in ((TURN_BIAS, step.duration_s), (TURN_SCALE, turn)):
@@ -94,15 +94,15 @@ def add_dropout_noise(
     rate: FloatArray,
     covariance: FloatArray,
 ) -> None:
-    """Add the noise of a robot silent since it was at `pose` (3,) on its track and moved with `rate` (3,).
+    """Add the noise of an odometry dropout that started at `pose` (3,) on the track with `rate` (3,).
 
-    At first its speed and turn rate walk at random; once its motion is unknown it may have driven anywhere.
-    Both act about the last pose known: so the noise never shrinks with time.
+    Speed and turn rate are random walks at first; if the motion is `unknown`, any feasible motion is covered.
+    Both noises act about the last known pose, so the covariance never decreases with time.
     """
-    # bounded: beside much larger numbers the noise of the steps after it would be lost to rounding
+    # bounded, so that rounding does not lose the noise of later steps
     reach = min(model.max_speed * silence_s, _MAX_DISTANCE_M) ** 2 / 3.0
     turned = min(model.max_turn_rate * silence_s, math.pi) ** 2 / 3.0  # pi: any heading
-    if model.max_turn_rate * silence_s > math.pi:  # it goes on turning: what was known meanwhile grows old
+    if model.max_turn_rate * silence_s > math.pi:  # the noise grows further while the robot may turn
         turned += min(silence_s - math.pi / model.max_turn_rate, _MAX_TURNING_S) * math.pi**2 / 3.0
     along, across, heading = reach, reach, turned
     if not unknown:

@@ -39,13 +39,13 @@ _ROWS = ("stamp_ns", "raw", "pose", "covariance", "jacobian", "rate", "known_ns"
 
 @dataclass(frozen=True)
 class TrackChange:
-    """What `OdometryTracks.extend` did.
+    """Result of `OdometryTracks.extend`.
 
     Attributes:
-        changed_from_ns: (N,) per robot the instant after which look-ups may now differ, or UNCHANGED_NS.
-        duplicates: Rows dropped because the robot has a row with that stamp.
-        too_old: Rows dropped because they are older than the oldest accepted.
-        jumps: New rows to which no robot can have driven; the step was replaced by unknown motion.
+        changed_from_ns: (N,) instant after which look-ups of each robot have changed, or UNCHANGED_NS.
+        duplicates: Number of dropped rows with the stamp of an earlier row.
+        too_old: Number of dropped rows older than the oldest accepted stamp.
+        jumps: Number of new rows beyond the robot's maximum speed; their steps are unknown motion.
     """
 
     changed_from_ns: IntArray
@@ -55,10 +55,10 @@ class TrackChange:
 
 
 class OdometryTracks:
-    """The recent odometry of all robots, in any order of arrival.
+    """Recent odometry of all robots; rows may arrive in any order.
 
     Args:
-        robots: Whose; of each its motion model and response are used.
+        robots: All robots; their odometry models and motion responses are used.
     """
 
     def __init__(self, robots: Sequence[Robot]) -> None:
@@ -74,25 +74,25 @@ class OdometryTracks:
         self.clear()
 
     def clear(self) -> None:
-        """Forget every row."""
+        """Remove all rows."""
         self._oldest_ns = BEFORE_ALL_NS
         self._trimmed_ns = BEFORE_ALL_NS
         self.arrays = self._allocated(_FIRST_CAPACITY)
 
     @property
     def lookback_ns(self) -> int:
-        """How far before its stamp a row may change look-ups."""
+        """Maximum time before its stamp at which a row may change look-ups [ns]."""
         timeout_ns = np.ceil(self._model["timeout_s"] * 1e9).astype(np.int64)
         return int(np.max(timeout_ns - np.minimum(0, self._delay_ns), initial=0))
 
     def has_started(self, robots: IntArray | int, stamps_ns: IntArray | int) -> BoolArray:
-        """Whether the odometry of robots (k,) has begun by instants (k,); those without have always stood."""
+        """Whether robots (k,) have odometry before instants (k,); always True for robots without odometry."""
         arrays = self.arrays
         begun = (arrays.filled[robots] > 0) & (arrays.begin_ns[robots] <= stamps_ns)
         return np.asarray(begun | self._is_stationary[robots])
 
     def is_random_walk(self, robots: IntArray | int) -> BoolArray:
-        """Whether robots (k,) walk at random, without odometry."""
+        """Whether robots (k,) are random walks, without odometry."""
         return np.asarray(self._walk[robots].any(axis=-1))
 
     def has_conflicting_sources(self, now_ns: int) -> BoolArray:
@@ -103,7 +103,7 @@ class OdometryTracks:
         return jumping
 
     def extend(self, robots: IntArray, stamps_ns: IntArray, raw: FloatArray) -> TrackChange:
-        """Add rows, whatever their order and age.
+        """Add rows in any order and of any age.
 
         Args:
             robots: (k,) robot index of each row.
@@ -119,7 +119,7 @@ class OdometryTracks:
         robots, stamps, raw, new = robots[young], stamps[young], raw[young], young[young]
         robots, stamps, raw, changed_from = self._take_back_later_rows(robots, stamps, raw)
         order = np.lexsort((wrap_angle(raw[:, 2]), raw[:, 1], raw[:, 0], stamps, robots))
-        new = (np.arange(robots.size) < new.size)[order]  # not those taken back
+        new = (np.arange(robots.size) < new.size)[order]  # False for rows taken from the tracks
         robots, stamps, raw = robots[order], stamps[order], raw[order]
         while np.any(
             self.arrays.filled + np.bincount(robots, minlength=self._robots) > self.arrays.stamp_ns.shape[1]
@@ -129,7 +129,7 @@ class OdometryTracks:
         return TrackChange(changed_from, duplicates, int((~young).sum()), jumps)
 
     def at(self, robots: IntArray, stamps_ns: IntArray) -> OdometrySample:
-        """Look tracks up, see `look_up`.
+        """Look up tracks, see `look_up`.
 
         Args:
             robots: (m,) robot indices.
@@ -138,7 +138,7 @@ class OdometryTracks:
         return look_up_all(self.arrays, robots, stamps_ns)
 
     def trim(self, oldest_ns: int, kept_ns: int) -> None:
-        """Refuse rows stamped before `oldest_ns`; let those go that no look-up from `kept_ns` on needs."""
+        """Reject new rows before `oldest_ns`; remove rows not needed for look-ups from `kept_ns` on."""
         self._oldest_ns = oldest_ns
         if kept_ns < self._trimmed_ns + _TRIM_EVERY_NS:
             return
@@ -174,7 +174,7 @@ class OdometryTracks:
             is_stationary=self._is_stationary,
             walk=self._walk,
         )
-        for name in _ROWS:  # so that the system finds the memory now, and not when data are there
+        for name in _ROWS:  # touch the memory now, so that page faults do not delay the first data
             getattr(arrays, name).fill(0)
         return arrays
 
@@ -189,17 +189,17 @@ class OdometryTracks:
     def _take_back_later_rows(
         self, robots: IntArray, stamps: IntArray, raw: FloatArray
     ) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
-        """Merge the new rows with those of the tracks that come after them, which are then integrated again.
+        """Merge new rows with later rows of the tracks, which are removed to be integrated again.
 
         Returns:
-            Robots, stamps, raw poses, and per robot the instant after which its track changes.
+            Robots, stamps, raw poses, and the instant (N,) after which each track changes.
         """
         arrays = self.arrays
         taken: list[tuple[IntArray, IntArray, FloatArray]] = [(robots, stamps, raw)]
         newest = arrays.stamp_ns[robots, np.maximum(arrays.filled[robots] - 1, 0)]
         late = (arrays.filled[robots] > 0) & (
             stamps <= newest
-        )  # of two rows with one stamp the order decides
+        )  # of two rows with the same stamp, the earlier one is kept
         for robot in np.unique(robots[late]):
             count = arrays.filled[robot]
             first = int(
@@ -224,7 +224,7 @@ class OdometryTracks:
 
 
 def _stacked(responses: Sequence[MotionResponse]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Shares (N, 2, V, W), speeds (N, V) and turn rates (N, W) of all robots, smaller grids filled up."""
+    """Shares (N, 2, V, W), speeds (N, V) and turn rates (N, W) of all robots; smaller grids are padded."""
     v = max((len(r.speeds) for r in responses), default=1)
     w = max((len(r.turn_rates) for r in responses), default=1)
     shares = np.ones((len(responses), 2, v, w))

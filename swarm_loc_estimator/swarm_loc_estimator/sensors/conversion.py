@@ -1,4 +1,4 @@
-"""Convert the batches of all sensors to measurements, and count what is dropped."""
+"""Conversion of batches to measurements, with counts of dropped readings."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 
 
 class InputConverter:
-    """Converts batches.
+    """Converts batches to measurements.
 
     Args:
-        swarm: Whose sensors.
-        settings: Noise that sensors do not tell, and by how much a stamp may be ahead of its arrival.
+        swarm: Swarm with the sensors.
+        settings: Default noise of sensors, and tolerance of stamps in the future.
 
     Attributes:
-        drops: Reason -> how much could not be used.
-        accumulators: Sensor -> what makes measurements of its readings later.
+        drops: Number of dropped readings by reason.
+        accumulators: Accumulators by sensor.
     """
 
     def __init__(self, swarm: Swarm, settings: SensorSettings) -> None:
@@ -50,7 +50,7 @@ class InputConverter:
         self._future_ns = round(settings.future_tolerance_s * 1e9)
 
     def convert(self, batch: Batch) -> Measurements:
-        """Convert what is valid, and count the rest."""
+        """Convert valid readings; count the others in `drops`."""
         self.drops.update(batch.dropped)
         parts: list[Measured] = []
         kept: dict[str, Any] = {}
@@ -70,7 +70,7 @@ class InputConverter:
         return Measurements(batch.begin_ns, batch.end_ns, *_in_order_of_arrival(parts), kept)
 
     def _valid(self, found: Measured) -> Measured:
-        """Those measurements that are valid; the others are counted."""
+        """Select valid measurements; count the others in `drops`."""
         reasons = reject_reasons(found.measurements)
         counts = np.bincount(reasons, minlength=len(REJECT_REASONS)).tolist()
         self.drops.update({REJECT_REASONS[k]: counts[k] for k in range(1, len(REJECT_REASONS)) if counts[k]})
@@ -78,7 +78,7 @@ class InputConverter:
 
 
 def _in_order_of_arrival(parts: list[Measured]) -> tuple[MeasurementArray, IntArray]:
-    """All measurements; of those that arrived at the same instant, the first parts come first."""
+    """Concatenate measurements and sort them by arrival; the sort is stable."""
     parts = [part for part in parts if part.measurements.size]
     if len(parts) < 2:
         return parts[0] if parts else (NO_MEASUREMENTS, NO_ROWS)

@@ -1,4 +1,4 @@
-"""All sensors in one table, the topics of a swarm, and the batches of their readings."""
+"""Table of all sensors, input topics of a swarm, and batches of readings."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 SENSORS: dict[str, Sensor] = {
     sensor.name: sensor for sensor in (ODOMETRY, DETECTIONS, BRIGHTNESS, FIXES, AERIAL)
 }
-"""All sensors by name. Measurements that arrive at one instant are used in this order."""
+"""All sensors by name. Simultaneous measurements are fused in this order."""
 
 THE_SWARM = -1
-"""In place of a robot: a topic about all of them."""
+"""Robot index of topics about the whole swarm."""
 
 
 def kinds() -> dict[str, InputKind]:
-    """All kinds of topics by name, shared ones last."""
+    """All kinds of topics by name, shared topics last."""
     found = [kind for sensor in SENSORS.values() for kind in sensor.kinds]
     return {kind.name: kind for kind in sorted(found, key=lambda kind: bool(kind.stands_for))}
 
 
 @dataclass(frozen=True)
 class InputTopic:
-    """One input.
+    """Input topic.
 
     Attributes:
         name: Relative topic name, such as `<robot>/odom`.
-        kind: What it carries.
+        kind: Kind of the topic.
         robot: Index into `Swarm.robots`, or THE_SWARM.
-        expected: Whether something is wrong when nothing comes; a robot without camera detects nothing.
+        expected: True if missing messages are an error; False for detections of a robot without camera.
     """
 
     name: str
@@ -51,7 +51,7 @@ class InputTopic:
 
 
 def input_topics(swarm: Swarm) -> tuple[InputTopic, ...]:
-    """All inputs that a swarm may have, robot by robot, then those about all of them."""
+    """All possible input topics of a swarm: those of each robot, then those of the swarm."""
     of_robots = (
         InputTopic(f"{robot.name}/{kind.topic}", kind, index, kind.expected_of(robot))
         for index, robot in enumerate(swarm.robots)
@@ -67,7 +67,7 @@ def input_topics(swarm: Swarm) -> tuple[InputTopic, ...]:
 
 
 def live_topics(swarm: Swarm, *, shared: bool) -> tuple[InputTopic, ...]:
-    """What to listen to: topics of each robot, or in their place those that carry the same of many."""
+    """Topics to subscribe to: those of each robot or, with `shared`, the shared topics that replace them."""
     stood_for = {kind.stands_for for kind in kinds().values() if kind.stands_for}
     if not shared:
         return tuple(topic for topic in input_topics(swarm) if not topic.kind.stands_for)
@@ -81,19 +81,19 @@ def live_topics(swarm: Swarm, *, shared: bool) -> tuple[InputTopic, ...]:
 
 
 def _is_sent(topic: InputTopic, swarm: Swarm, stood_for: Collection[str]) -> bool:
-    """Whether a robot has what it sends on a topic of its own that no other one stands for."""
+    """Whether the robot publishes this topic and no shared topic replaces it."""
     return topic.kind.rows not in stood_for and topic.kind.expected_of(swarm.robots[topic.robot])
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Readings as the robots sent them, of a stretch in which time does not go back.
+    """Raw readings of an interval of monotonic arrival time.
 
     Attributes:
         begin_ns: Arrival of the first message.
-        end_ns: Arrival of the last one.
-        rows: Sensor -> its readings, in order of arrival; sensors without are missing.
-        dropped: Reason -> how many more could not even be read.
+        end_ns: Arrival of the last message.
+        rows: Readings by sensor, in order of arrival; sensors without readings are omitted.
+        dropped: Number of unreadable readings by reason.
     """
 
     begin_ns: int
@@ -103,7 +103,7 @@ class Batch:
 
     @classmethod
     def of(cls, begin_ns: int, end_ns: int, **rows: Any) -> Batch:
-        """A batch of readings given by the names of their sensors."""
+        """Create a batch; keywords are names of sensors."""
         return cls(begin_ns, end_ns, rows)
 
     def __getitem__(self, sensor: str) -> Any:
@@ -113,14 +113,14 @@ class Batch:
 
 @dataclass(frozen=True)
 class Measurements:
-    """What a batch measures, in order of arrival.
+    """Measurements of a batch, in order of arrival.
 
     Attributes:
         begin_ns: Arrival of the first message.
-        end_ns: Arrival of the last one.
+        end_ns: Arrival of the last message.
         measurements: (m,) with finite values and valid covariances.
-        arrival_ns: (m,).
-        rows: Sensor -> valid readings that are used as they are: odometry, and those of accumulators.
+        arrival_ns: (m,) arrival times.
+        rows: Valid unconverted readings by sensor: odometry and inputs of accumulators.
     """
 
     begin_ns: int
@@ -130,7 +130,7 @@ class Measurements:
     rows: Mapping[str, Any]
 
     def until_each(self, stamps_ns: IntArray) -> Iterator[Measurements]:
-        """What arrived before the first instant (s,), between it and the next, ..., and from the last on."""
+        """Split at instants (s,) into s + 1 parts by arrival time."""
         rows = {name: _between(one.arrival_ns, stamps_ns) for name, one in self.rows.items()}
         measured, begin_ns = _between(self.arrival_ns, stamps_ns), self.begin_ns
         for k, end_ns in enumerate([*stamps_ns.tolist(), self.end_ns]):
@@ -146,6 +146,6 @@ class Measurements:
 
 
 def _between(arrivals_ns: IntArray, stamps_ns: IntArray) -> list[slice]:
-    """Which arrivals (k,), not decreasing, lie before, between and behind instants (s,): s + 1 slices."""
+    """Split sorted arrivals (k,) at instants (s,) into s + 1 slices."""
     ends = [*np.searchsorted(arrivals_ns, stamps_ns).tolist(), arrivals_ns.size]
     return [slice(begin, end) for begin, end in zip([0, *ends], ends, strict=False)]

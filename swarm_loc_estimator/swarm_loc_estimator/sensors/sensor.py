@@ -1,7 +1,7 @@
-"""What a sensor is: one record of its topics, columns, checks and conversion to measurements.
+"""Sensor record: topics, columns, validation and conversion to measurements.
 
-The readings of a sensor are a tuple of columns of one length, among them `robot` (the first one), `stamp_ns`
-and `arrival_ns` (the last one), in order of arrival.
+Readings of a sensor are a NamedTuple of columns of equal length, sorted by arrival. The first column is
+`robot`, the last `arrival_ns`; one is `stamp_ns`.
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ NO_MEASUREMENTS: MeasurementArray = np.zeros(0, dtype=MEASUREMENT_DTYPE)
 
 
 def chosen(rows: Rows, some: slice | NDArray[np.bool_]) -> Rows:
-    """Some of the rows of a tuple of columns."""
+    """Select rows of a tuple of columns by a slice or a mask."""
     return type(rows)(*(column[some] for column in rows))
 
 
 def joined(parts: Sequence[Rows]) -> Rows:
-    """All rows of tuples of columns, one part after the other; their types are those of the first."""
+    """Concatenate tuples of columns; dtypes are those of the first."""
     if len(parts) == 1:
         return parts[0]
-    # records would lose their padding otherwise, and compiled code take them for others
+    # without dtype, records lose their padding and numba compiles again for the new type
     columns = (np.concatenate(column, dtype=column[0].dtype) for column in zip(*parts, strict=True))
     return type(parts[0])(*columns)
 
 
 def in_order_of_arrival(parts: Sequence[Rows]) -> Rows:
-    """All rows of tuples of columns; those that arrived together in the order of the parts."""
+    """Concatenate tuples of columns and sort them by arrival; the sort is stable."""
     rows = joined(parts)
     order = np.argsort(rows[-1], kind="stable")  # the last column is the arrival
     return type(rows)(*(column[order] for column in rows))
 
 
 class Known(NamedTuple):
-    """What the columns of a message are checked against.
+    """Expected contents of messages.
 
     Attributes:
         map_frame: Name of the frame `map` in messages.
-        robots: How many robots the swarm has.
-        swarm: The number by which messages of many robots name the swarm, see `swarm_key`.
+        robots: Number of robots in the swarm.
+        swarm: Number that identifies the swarm in messages of many robots, see `swarm_key`.
     """
 
     map_frame: str
@@ -63,7 +63,7 @@ class Reader(Protocol):
     """Decodes the messages of all topics of one kind.
 
     Attributes:
-        frame_ids: Per topic the frame of the newest message, "" before the first.
+        frame_ids: Frame of the newest message of each topic, "" before the first.
     """
 
     frame_ids: list[str]
@@ -72,7 +72,7 @@ class Reader(Protocol):
         """Decode messages (n,) in order of arrival.
 
         Returns:
-            What was found, with `stamp_ns` (n,) and `valid` (n,): whether a message is whole and of the type.
+            Decoded messages, with `stamp_ns` (n,) and `valid` (n,), True if complete and of the right type.
         """
 
 
@@ -82,19 +82,19 @@ def _never(_: Robot) -> bool:
 
 @dataclass(frozen=True)
 class InputKind:
-    """A kind of topic.
+    """Kind of input topic.
 
     Attributes:
-        name: Of the kind, which is that of the sensor for topics of each robot.
-        topic: Its name below the robot's, or its whole name where it is about the swarm.
-        message_type: Type of its messages, such as nav_msgs/msg/Odometry.
-        create_reader: Makes a reader of so many topics.
-        columns_of: From what the reader found in messages (n,), the messages, and the robots (n,) on whose
-            topics they came: the readings, and by reason how many more are whole, but not used.
-        expected_of: Whether something is wrong when a robot sends none.
-        of_each: Whether each robot has a topic of its own.
-        in_map: Whether its readings must be in the frame `map`.
-        stands_for: The sensor whose topics of each robot it replaces; "" where it replaces none.
+        name: Name of the kind; equal to that of the sensor for topics of single robots.
+        topic: Name relative to the robot's namespace, or full name of a topic of the swarm.
+        message_type: Message type, such as nav_msgs/msg/Odometry.
+        create_reader: Creates a reader for a number of topics.
+        columns_of: Converts decoded messages (n,), the messages and the robots (n,) of their topics to
+            readings; also returns the number of unused valid readings by reason.
+        expected_of: True if a missing topic of the robot is an error.
+        of_each: True if each robot has its own topic.
+        in_map: True if readings must be in the frame `map`.
+        stands_for: Name of the sensor whose topics of single robots it replaces; "" if none.
     """
 
     name: str
@@ -109,21 +109,21 @@ class InputKind:
 
     @property
     def rows(self) -> str:
-        """Name of the sensor whose readings it carries."""
+        """Name of the sensor of its readings."""
         return self.stands_for or self.name
 
     @property
     def pattern(self) -> str:
-        """Names of its topics, such as `<robot>/odom`."""
+        """Pattern of its topic names, such as `<robot>/odom`."""
         return f"<robot>/{self.topic}" if self.of_each else self.topic
 
 
 class Measured(NamedTuple):
-    """What readings measure.
+    """Measurements of a sensor.
 
     Attributes:
         measurements: (m,) of MEASUREMENT_DTYPE.
-        arrival_ns: (m,) when they arrived.
+        arrival_ns: (m,) arrival times.
     """
 
     measurements: MeasurementArray
@@ -131,11 +131,11 @@ class Measured(NamedTuple):
 
 
 class Change(NamedTuple):
-    """What new readings change of a sensor's measurements.
+    """Change of a sensor's measurements by new readings.
 
     Attributes:
-        added: (m,) measurements to use from now on.
-        withdrawn: (w,) measurements given before that no longer hold.
+        added: (m,) new measurements.
+        withdrawn: (w,) earlier measurements that are replaced.
     """
 
     added: MeasurementArray
@@ -143,60 +143,60 @@ class Change(NamedTuple):
 
 
 class Accumulator(Protocol):
-    """Makes measurements of readings that belong together and arrive one by one."""
+    """Combines readings that arrive one by one into measurements."""
 
     @property
     def drops(self) -> Counter[str]:
-        """Readings not used, by reason."""
+        """Number of unused readings by reason."""
 
     @property
     def counters(self) -> dict[str, int]:
-        """What was used since the last `restart`, by name."""
+        """Numbers of used readings by name, since the last `restart`."""
 
     def take(self, rows: Any) -> Change:
-        """Add readings."""
+        """Add readings; return the change of the measurements."""
 
     def forget_before(self, oldest_ns: int) -> None:
-        """Forget what is older than an instant."""
+        """Discard readings older than an instant."""
 
     def restart(self) -> None:
-        """Forget everything."""
+        """Discard all readings."""
 
 
 class SensorSettings(Protocol):
-    """The settings of the estimator that sensors use, see `timeline.settings.Settings`."""
+    """Estimator settings used by sensors, see `timeline.settings.Settings`."""
 
     @property
     def future_tolerance_s(self) -> float:
-        """Stamps further ahead of their arrival than this are dropped."""
+        """Maximum time of a stamp after its arrival [s]; later stamps are dropped."""
 
     @property
     def aerial_position_sigma(self) -> float:
-        """Noise of aerial detections without a covariance [m]."""
+        """Standard deviation of the position of aerial detections without covariance [m]."""
 
     @property
     def aerial_heading_sigma(self) -> float:
-        """Noise of their headings [rad]."""
+        """Standard deviation of the heading of aerial detections without covariance [rad]."""
 
 
 Converter = Callable[[Any], Any]
-"""From readings to `Measured`, or, where they are needed as they are, to those readings that are valid."""
+"""Converts readings to `Measured`, or filters valid readings for odometry and accumulators."""
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor of robots, or one above them; all of them stand in `registry.SENSORS`.
+    """Sensor on the robots or an overhead camera; `registry.SENSORS` lists all.
 
     Attributes:
-        name: Of its readings in a batch.
-        nothing: Readings of length 0.
-        kinds: The topics on which they come.
-        create_converter: Makes a converter for a swarm, which counts what it drops by reason; None: readings
-            are used as they are.
-        create_accumulator: For a sensor that makes one measurement of several readings, and another one
-            when more of them come.
-        unit: Columns; readings equal in all of them are used or shed together. None: odometry, never shed.
-        keeps_units: Whether readings of one unit may come in several batches.
+        name: Name of its readings in a batch.
+        nothing: Empty readings.
+        kinds: Kinds of its topics.
+        create_converter: Creates a converter for a swarm, which counts dropped readings by reason; if None,
+            readings are used unchanged.
+        create_accumulator: Creates an accumulator for a sensor that combines several readings into one
+            measurement; None for other sensors.
+        unit: Columns that group readings: a group is used or dropped as a whole. None: never dropped.
+        keeps_units: True if readings of one group may arrive in several batches.
     """
 
     name: str

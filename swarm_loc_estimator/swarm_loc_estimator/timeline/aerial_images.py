@@ -1,7 +1,7 @@
-"""Anonymous detections of aerial images: whose they are, by where robots are or by how they moved.
+"""Identification of anonymous detections in aerial images, by the robots' poses or by their motion.
 
-An image is looked at as a whole, at its stamp, when the timeline comes to it; when older data come, it is
-looked at again. So who is who does not depend on the order of arrival.
+The timeline processes each image as a whole, at its stamp, and again when older data arrive. So identities
+do not depend on the order of arrival.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ from swarm_loc_estimator.timeline.settings import Settings
 
 _GATE = float(gate_threshold(0.9999))
 _MAX_FREE = 200
-"""With more unassigned detections than this, no robot is searched among them."""
+"""Maximum number of unassigned detections among which robots are searched."""
 _MOVED = 6.0
-"""Standard deviations by which a robot must have moved, or turned by half as many, to be searched."""
+"""Minimum motion of a robot to be searched, in standard deviations; half of it for a turn."""
 _MAX_DRIFT_M, _MAX_DRIFT_RAD = 0.3, 0.5
-"""Largest drift of a robot's track between two images; beyond it the search restarts."""
+"""Maximum drift of a robot's track between two images; beyond it the search restarts."""
 _DOUBT_SHARE = 0.1
-"""Factor on the allowed error probability of a robot whose estimate is at another place."""
+"""Factor on the allowed error probability for a robot that is localized at another place."""
 _MAX_FAULT_SCORE = 9.0
-"""Highest fault score of a robot that may have left the view: it is not tracked, but not lost either."""
+"""Maximum fault score from missed detections of a robot that may have left the view."""
 _HEADING_SIGMA = 0.2
-"""Largest standard deviation of the heading of an identified robot [rad]."""
+"""Maximum standard deviation of the heading of an identified robot [rad]."""
 
 
 class PictureFusion:
-    """Finds out who is who in aerial images.
+    """Identifies robots in aerial images.
 
     Args:
-        swarm: Whose robots are seen.
-        settings: How sure an answer must be, what is assumed of images, when a robot is lost.
-        tracks: The robots' odometry.
+        swarm: Robots in the images.
+        settings: Required probability, model of the images, thresholds of lost robots.
+        tracks: Odometry of the robots.
     """
 
     def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks) -> None:
@@ -72,7 +72,7 @@ class PictureFusion:
         )
 
     def assigned(self, state: SwarmState, image: MeasurementArray) -> Assignment:
-        """Which detections (n,) of an image are robots that are localized, of all robots (N,)."""
+        """Assign the detections (n,) of an image to localized robots; indices are of all robots (N,)."""
         stamp_ns = int(image["stamp_ns"][0])
         picture = picture_of(image)
         estimate = estimate_at(state, self._tracks.arrays, self._timeout_s, stamp_ns)
@@ -84,12 +84,12 @@ class PictureFusion:
         sigma = np.sqrt(np.maximum(covariances[:, 0, 0], covariances[:, 1, 1]))
         unseen, in_view = found.place == UNSEEN, state.images.is_in_view(poses[:, :2], 3.0 * sigma)
         before_ns = state.images.newest.stamp_ns if state.images.newest is not None else stamp_ns
-        unseen &= state.last_fix_ns[robots] <= before_ns  # nothing else has confirmed its place since
+        unseen &= state.last_fix_ns[robots] <= before_ns  # no other fix since the previous image
         for robot in robots[unseen & in_view].tolist():
             self._miss_robot(state, robot)
         strangers = int(np.sum(found.robot == UNSEEN)) - int(np.sum(~state.tracked & self._moves))
         for robot in robots[unseen & ~in_view].tolist() if strangers > 0 else ():
-            # it may have left the view, or be one of the unassigned detections
+            # the robot may have left the view, or be one of the unassigned detections
             count_missed(
                 state.integrity, robot, min(self._miss, _MAX_FAULT_SCORE - state.integrity.fault_score[robot])
             )
@@ -104,22 +104,22 @@ class PictureFusion:
         return Assignment(place, robot, probability)
 
     def _miss_robot(self, state: SwarmState, robot: int) -> None:
-        """Hold against a robot that it is not where it should be seen."""
+        """Increase the fault score of a robot that was not detected at its estimated position."""
         unconfirmed = state.integrity.confirmations[robot] < CONFIRMED
         doubt = count_missed(state.integrity, robot, self._miss)
         if unconfirmed or doubt >= self._settings.max_fault_score:
             state.deinitialize(robot)
 
     def identify(self, state: SwarmState, image: MeasurementArray, assignment: Assignment) -> bool:
-        """Let robots that are not localized, or not where they should be, look for themselves in an image.
+        """Search an image for robots that are not localized or were not detected at their estimate.
 
         Args:
-            state: Changed in place.
+            state: Updated in place.
             image: (n,) detections, all of one image.
-            assignment: Of the robots that are.
+            assignment: Assignment of the localized robots.
 
         Returns:
-            Whether there were such robots.
+            Whether any robot was searched.
         """
         images, stamp_ns = state.images, int(image["stamp_ns"][0])
         looking = self._moves & (~state.tracked | (assignment.place == UNSEEN))
@@ -146,7 +146,7 @@ class PictureFusion:
     def _look(
         self, state: SwarmState, robot: int, image: MeasurementArray
     ) -> tuple[Outcome, Identity | None]:
-        """Let a robot look for itself among detections (n,) that nobody has."""
+        """Search one robot among unassigned detections (n,)."""
         stamp_ns = int(image["stamp_ns"][0]) if image.size else 0
         if not image.size:
             return Outcome.UNDECIDED, None
@@ -171,7 +171,7 @@ class PictureFusion:
         return Outcome.UNDECIDED, answer if sure else None
 
     def _is_sure(self, answer: Identity, *, is_believed: bool) -> bool:
-        """Whether an answer may be given."""
+        """Whether the probability and the heading of an identity are good enough to use it."""
         x, y, heading = np.sqrt(np.diag(answer.covariance)).tolist()
         settings = self._settings
         doubt = (1.0 - settings.aerial_probability) * (_DOUBT_SHARE if is_believed else 1.0)
@@ -179,7 +179,7 @@ class PictureFusion:
         return certain and max(x, y) < settings.lost_sigma and heading < _HEADING_SIGMA
 
     def _initialize(self, state: SwarmState, robot: int, stamp_ns: int, claim: Identity) -> None:
-        """Take a robot into the estimate where it has found itself; later images have to confirm it."""
+        """Initialize a robot at its identified pose; later images have to confirm it."""
         track = self._tracks.at(np.array([robot]), np.array([stamp_ns]))
         at = Preintegrated(stamp_ns, track.covariance[0], track.jacobian[0])
         transform = se2.compose(claim.pose, se2.inverse(track.pose[0]))
@@ -197,7 +197,7 @@ class PictureFusion:
         claims: dict[int, Identity],
         taken: Counter[int],
     ) -> None:
-        """Note what robots that look for themselves found among detections (n,)."""
+        """Record the results of the search among detections (n,)."""
         newest = state.images.newest
         if newest is None or not looking.any():
             return
@@ -215,38 +215,38 @@ class PictureFusion:
 
 
 def relieve_seen(state: SwarmState, robots: IntArray) -> None:
-    """Count for robots (k,) that they were seen where they are believed to be."""
+    """Reduce the fault scores of robots (k,) that were detected at their estimated positions."""
     for robot in robots.tolist():
         count_seen(state.integrity, robot)
 
 
 def picture_of(image: MeasurementArray) -> Picture:
-    """The detections (n,) of an image without all else."""
+    """Poses and covariances of the detections (n,) of an image."""
     return Picture(image["value"], image["covariance"], image["has_heading"].astype(bool))
 
 
 def as_fixes(image: MeasurementArray, robots: IntArray) -> MeasurementArray:
-    """Detections (k,) as absolute measurements of the robots (k,) that they are."""
+    """Convert identified detections (k,) to absolute fixes of robots (k,)."""
     fixes: MeasurementArray = image.copy()
     fixes["kind"], fixes["target"], fixes["marker_id"] = Kind.CARTESIAN, robots, 0
     return fixes
 
 
 def _numbers(image: MeasurementArray, places: IntArray) -> IntArray:
-    """The numbers in their message of detections at some places (k,); any where a place is negative."""
+    """Indices (k,) in the message of the detections at `places` (k,); arbitrary for negative places."""
     numbers: IntArray = image["marker_id"][np.maximum(places, 0)]
     return numbers
 
 
 def _log_density(picture: Picture) -> float:
-    """Of detections over what they cover [1/m^2]."""
+    """Logarithm of the density of detections in their bounding box [1/m^2]."""
     extent = np.ptp(picture.pose[:, :2], axis=0)
     sigma = math.sqrt(float(picture.variance.max()))
     return math.log(len(picture.pose) / float(np.prod(np.maximum(extent, 100.0 * sigma))))
 
 
 def _has_moved(before: TrackPoint, now: TrackPoint, picture: Picture) -> bool:
-    """Whether a robot has moved, or turned where headings are shown, by more than noise could."""
+    """Whether a robot has moved, or turned if headings are measured, significantly."""
     gathered = gathered_between(before, now)
     variance = 2.0 * float(picture.variance.min()) + max(gathered[0, 0], gathered[1, 1])
     if np.hypot(*(now.pose[:2] - before.pose[:2])) ** 2 > _MOVED**2 * variance:
@@ -258,6 +258,6 @@ def _has_moved(before: TrackPoint, now: TrackPoint, picture: Picture) -> bool:
 
 
 def _has_drifted(before: TrackPoint, now: TrackPoint) -> bool:
-    """Whether a track tells next to nothing of how a robot has moved since a point."""
+    """Whether the covariance of the track since a point exceeds the maximum drift."""
     drift: FloatArray = np.diag(gathered_between(before, now))
     return bool(max(drift[0], drift[1]) > _MAX_DRIFT_M**2 or drift[2] > _MAX_DRIFT_RAD**2)

@@ -1,4 +1,4 @@
-"""The central estimator: odometry and sightings of a swarm in, poses out; no ROS, no clock of its own."""
+"""Central estimator: poses of a swarm from odometry and sightings, independent of ROS and of any clock."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ __all__ = ["Estimate", "Estimator", "Status"]
 
 
 class Estimator:
-    """Joint, buffered estimation of all poses of a swarm.
+    """Joint estimator of all poses of a swarm, with out-of-sequence measurements.
 
-    Data may come in any order and late; each counts at its own stamp when it is no older than the
-    horizon. All that arrives is used at the next `tick`. Every datum not used has a reason in `drops`.
+    Data may arrive late and in any order; each is fused at its own stamp unless it is older than the
+    horizon. `tick` processes all data received since the last one. `drops` counts unused data by reason.
 
     Args:
         swarm: Robots and landmarks.
-        settings: How to buffer and gate.
+        settings: Horizon, periods and thresholds; defaults if None.
     """
 
     def __init__(self, swarm: Swarm, settings: Settings | None = None) -> None:
@@ -50,7 +50,7 @@ class Estimator:
         grouped_s = self.settings.state_period_s + self.settings.fusion_period_s
         self._lookback_ns = self._tracks.lookback_ns + round(
             0.5e9 * grouped_s
-        )  # used so far from their stamps
+        )  # maximum shift of a measurement from its stamp
         self._timeline = Timeline(
             self.settings, self._fusion.step, self._fusion.new_state(), self._lookback_ns
         )
@@ -64,7 +64,7 @@ class Estimator:
         self._odometry: list[OdometryRows] = []
 
     def reset(self) -> None:
-        """Forget all data and start again at the configured starts; the counters go on."""
+        """Discard all data and restart at the configured starts; counters in `drops` are kept."""
         self.drop("reset", sum(rows.robot.size for rows in self._odometry) + self._timeline.waiting)
         self._converter.drops.update(self._timeline_drops())
         self._tracks.clear()
@@ -75,7 +75,7 @@ class Estimator:
 
     @property
     def note(self) -> str:
-        """What users should know of how the swarm is estimated, as a sentence; "" when there is nothing."""
+        """Hint about the choice of filter for this swarm, one sentence; "" if there is none."""
         count, largest = len(self.swarm.robots), self.settings.sparse_from
         if count < largest or self._fusion.is_sparse:
             return ""
@@ -86,11 +86,11 @@ class Estimator:
         )
 
     def convert(self, batch: Batch) -> Measurements:
-        """Convert readings to measurements, to be received in parts; invalid ones are counted."""
+        """Convert readings to measurements for `receive`; invalid ones are counted in `drops`."""
         return self._converter.convert(batch)
 
     def receive(self, inputs: Batch | Measurements) -> None:
-        """Add what has arrived since the last tick; if it shows that the clock jumped back, reset first."""
+        """Add new data; reset first if their arrival times show that the clock jumped back."""
         self._check_clock(inputs.begin_ns)
         self._check_clock(inputs.end_ns)
         arrivals = self.convert(inputs) if isinstance(inputs, Batch) else inputs
@@ -106,10 +106,10 @@ class Estimator:
                 self._timeline.withdraw(change.withdrawn)
 
     def set_pose(self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike) -> str:
-        """Set a robot to a pose (3,) in `map` with covariance (3, 3), whatever was believed.
+        """Set a robot to a pose (3,) in `map` with covariance (3, 3); its estimate is replaced.
 
         Returns:
-            Why that cannot be, a reason of `drops`: "not_localized" before its odometry; "" when it is done.
+            "" on success, else a reason of `drops`, such as "not_localized" before its first odometry.
         """
         if self._odometry:
             self._use_odometry()
@@ -125,19 +125,19 @@ class Estimator:
         return fault
 
     def forget(self, robot: int, stamp_ns: int) -> None:
-        """Take a robot out of the estimate; it waits for a fix."""
+        """Remove a robot from the estimate until a fix initializes it."""
         command = about_robots(robot, stamp_ns, np.zeros((1, 3)), np.eye(3)[None], NO_MODEL)
         command["command"] = Command.FORGET
         self._timeline.add(command)
 
     def drop(self, reason: str, count: int = 1) -> None:
-        """Count data that could not even be handed in."""
+        """Count data that were dropped before they reached the estimator."""
         if count:
             self._converter.drops[reason] += count
 
     @property
     def drops(self) -> dict[str, int]:
-        """Data not used, by reason, since construction."""
+        """Number of unused data by reason, since construction."""
         total = self._converter.drops + Counter(self._timeline_drops())
         for accumulator in self._converter.accumulators.values():
             total += accumulator.drops
@@ -145,12 +145,12 @@ class Estimator:
 
     @property
     def used(self) -> int:
-        """Measurements used since the last reset."""
+        """Number of measurements used since the last reset."""
         return int(self._timeline.verdict_counts()[Verdict.USED])
 
     @property
     def counters(self) -> dict[str, int]:
-        """What was used since the last reset, by name."""
+        """Numbers of used data by name, since the last reset."""
         others = {
             "constraints kept": int(self._timeline.verdict_counts()[Verdict.CONSTRAINT]),
         }
@@ -161,37 +161,37 @@ class Estimator:
         return {"measurements used": self.used} | {name: count for name, count in others.items() if count}
 
     def recent(self) -> Recent:
-        """The measurements within the horizon."""
+        """Measurements within the horizon, with verdicts and NIS."""
         return Recent(self._timeline.measurements, self._timeline.verdicts, self._timeline.nis)
 
     @property
     def identities(self) -> Identities | None:
-        """Who is who in the newest aerial image; None before the first."""
+        """Identities in the newest aerial image; None before the first image."""
         return self._timeline.state.images.newest
 
     def contradictions(self, now_ns: int) -> list[Contradiction]:
-        """What contradicts the belief or the description at an instant, robots first."""
+        """Contradicted robots and landmarks at an instant, robots first."""
         return contradictions(self.swarm, self._timeline.state, self._tracks, now_ns)
 
     @property
     def is_self_calibrated(self) -> bool:
-        """Whether there is anything to learn: described with a sigma, or contradicted."""
+        """Whether parameters are estimated: described with a standard deviation, or contradicted."""
         return learns(self.swarm) or bool((self._timeline.state.contradicted_ns > NEVER_NS).any())
 
     def learned(self) -> Swarm:
-        """The swarm with cameras, odometry and landmarks as they are now estimated."""
+        """Swarm with the estimated parameters of cameras, odometry and landmarks."""
         return learned(self.swarm, self._timeline.state)
 
     @property
     def is_fusing(self) -> bool:
-        """Whether some of what the last `tick` began to fuse was left to the next ones."""
+        """Whether the last `tick` ran out of budget before all its measurements were fused."""
         return self._timeline.is_busy
 
     def tick(self, now_ns: int, *, fuse: bool = True, has_budget: HasBudget = lambda: True) -> Estimate:
-        """Use all that has arrived and give the poses at `now_ns`; measurements wait unless `fuse`.
+        """Process the received data and return the poses at `now_ns`; without `fuse`, odometry only.
 
-        Fusing stops when `has_budget` returns False, and continues at the next tick. Until then poses are
-        predicted by odometry from the state before.
+        Fusion stops when `has_budget` returns False and continues at the next tick. Until then poses are
+        predicted by odometry from the last complete state.
         """
         newest_ns = self._check_clock(now_ns)
         oldest_ns = newest_ns - self._horizon_ns
@@ -205,7 +205,7 @@ class Estimator:
         return self._estimate(now_ns)
 
     def _check_clock(self, now_ns: int) -> int:
-        """Reset when the clock has jumped back, as at the loop of a bag; return the newest time since."""
+        """Reset if the clock jumped back, as when a bag loops; return the newest time since the reset."""
         if self._now_ns is not None and now_ns < self._now_ns - self._jump_back_ns:
             self.reset()
             self.time_jumps += 1

@@ -1,4 +1,4 @@
-"""Steps of the joint EKF: robots are initialized and lost, measurements fused in order or together."""
+"""Steps of the joint EKF: initialize and deinitialize robots, fuse measurements in order or in batches."""
 
 from __future__ import annotations
 
@@ -50,36 +50,36 @@ from swarm_loc_estimator.timeline.scheduling import middle_of_period
 from swarm_loc_estimator.timeline.settings import Settings
 
 _SURER_AT_FIRST = 1.5
-"""By this factor a heading must be surer than one that is lost, for a robot to be initialized."""
+"""`lost_heading_sigma` over the maximum standard deviation of the heading at initialization."""
 _NO_IMAGE_NS = np.iinfo(np.int64).min
 _PAIRS_PER_ROBOT = 32
-"""Number of other robots whose infrared measurements each robot remembers."""
+"""Maximum number of observed robots per robot with a stored mean of infrared measurements."""
 _CONTRADICTED_DESCRIPTION, _CONTRADICTED_WITHIN_NS = 2, 60_000_000_000
-"""When so many robots and landmarks are contradicted within that time, so is all that was concluded."""
+"""All parameters are re-estimated if this number of robots and landmarks is contradicted in this time."""
 
 
 class Verdict(IntEnum):
-    """What became of a measurement."""
+    """Outcome of a measurement."""
 
-    OPEN = sequential_update.OPEN  # not looked at yet
+    OPEN = sequential_update.OPEN  # not processed yet
     USED = sequential_update.USED
-    GATED = sequential_update.GATED  # its innovation is too unlikely
-    CONSTRAINT = 3  # kept to locate a robot that waits
-    NOT_LOCALIZED = 4  # neither side is located, or a robot has sent no odometry
-    UNASSIGNED = 5  # an anonymous detection that is no robot's
-    AMBIGUOUS = 6  # an anonymous detection that may be one robot's or another one's
+    GATED = sequential_update.GATED  # rejected by the innovation gate
+    CONSTRAINT = 3  # stored to initialize a robot
+    NOT_LOCALIZED = 4  # neither side is localized, or a robot has no odometry yet
+    UNASSIGNED = 5  # an anonymous detection that matches no robot
+    AMBIGUOUS = 6  # an anonymous detection that matches several robots
 
 
 class Fusion:
-    """The steps of the filter over one swarm.
+    """Filter steps for one swarm.
 
     Args:
-        swarm: Who takes part.
-        settings: Limits for giving a robot up.
-        tracks: The robots' odometry.
+        swarm: Robots and landmarks.
+        settings: Fusion period and thresholds.
+        tracks: Odometry of the robots.
 
     Attributes:
-        is_sparse: Whether only covariances of neighbours are kept: in a large swarm.
+        is_sparse: True for a large swarm: only covariances of neighbours are kept.
         starts: Initializes robots at their configured starts.
     """
 
@@ -99,7 +99,7 @@ class Fusion:
         self._pairs = _PAIRS_PER_ROBOT if any(robot.ir is not None for robot in swarm.robots) else 0
 
     def new_state(self) -> SwarmState:
-        """Nothing is known yet."""
+        """Create the initial state, without localized robots."""
         joint: JointFilter | None = SparseFilter(self._table) if self.is_sparse else None
         return SwarmState(self._table, self._pairs, joint)
 
@@ -108,15 +108,15 @@ class Fusion:
     ) -> None:
         """Fuse measurements into the state.
 
-        One after the other, each at its exact stamp; or, where many share a period of `fusion_period_s`,
-        together: each is related to the poses at its own stamp, but the noise gathered between the stamps
-        is taken in the middle of the period.
+        Few measurements are fused sequentially, each at its exact stamp. Many within `fusion_period_s` are
+        fused as one batch: each uses the poses at its own stamp, but the process noise at the middle of the
+        period.
 
         Args:
-            state: Changed in place.
-            measurements: (m,) in order of their stamps.
+            state: Updated in place.
+            measurements: (m,) sorted by stamp.
             verdicts: (m,) written, of `Verdict`.
-            nis: (m,) normalised innovations squared, written; NaN where there is none.
+            nis: (m,) normalized innovation squared, written; NaN if not evaluated.
         """
         nis[:] = np.nan
         anonymous = measurements["kind"] == Kind.ANONYMOUS
@@ -133,7 +133,7 @@ class Fusion:
     def _fuse(
         self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
     ) -> None:
-        """Fuse measurements that name their robots."""
+        """Fuse measurements of identified robots."""
         measured = measurements["command"] == Command.NONE
         if state.filter.is_dense:
             if self._period_ns and measurements.size >= self._policy.batch_from and measured.all():
@@ -200,12 +200,12 @@ class Fusion:
             k += 1
 
     def _fuse_by_record(self, state: SwarmState, one: MeasurementArray, nis: FloatArray) -> Verdict:
-        """Fuse a measurement (1,) of a model without a kernel; OPEN: one of its robots was lost instead.
+        """Fuse a measurement (1,) of a model without a kernel; OPEN if one of its robots was lost.
 
         Args:
-            state: Changed in place; its filter is dense.
-            one: Between robots that are located.
-            nis: (1,) written.
+            state: Updated in place; its filter is dense.
+            one: Measurement (1,) between localized robots.
+            nis: (1,) normalized innovation squared, written.
         """
         fields = MeasurementColumns.of(one)
         batch, lost = self._predict(state, fields, int(one["stamp_ns"][0]))
@@ -230,7 +230,7 @@ class Fusion:
             self._fuse_part(state, measurements[part], verdicts[part], nis[part])
 
     def _parts(self, measurements: MeasurementArray) -> list[slice]:
-        """Parts of measurements (m,) with at most one correlated measurement of each pair."""
+        """Split measurements (m,) into parts with at most one correlated measurement per pair."""
         edges, seen = [0], set[tuple[int, int]]()
         if self._pairs:
             comes_again: BoolArray = measurements["systematic_share"].max(axis=1) > 0.0
@@ -245,9 +245,9 @@ class Fusion:
     def _fuse_part(
         self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
     ) -> None:
-        """Fuse measurements (m,) together, against one belief."""
+        """Fuse measurements (m,) as one batch, linearized about one belief."""
         self.starts.initialize_measured(state, measurements)
-        known = np.append(state.tracked, True)  # NOBODY (-1) finds the last
+        known = np.append(state.tracked, True)  # index NOBODY (-1) selects the last element
         tied = known[measurements["observer"]] & known[measurements["target"]]
         if tied.any():
             rows = measurements if tied.all() else measurements[tied]
@@ -263,7 +263,7 @@ class Fusion:
         untied = np.flatnonzero(~tied)
         sides = zip(measurements["observer"][untied], measurements["target"][untied], strict=True)
         for k, (observer, target) in zip(untied.tolist(), sides, strict=True):
-            # most of what comes before a swarm is located; who is known changes on the way
+            # the common case before a swarm is localized; the loop itself may initialize robots
             if state.is_known(observer) == state.is_known(target):
                 verdicts[k] = Verdict.NOT_LOCALIZED
             else:
@@ -272,10 +272,10 @@ class Fusion:
     def _predict(
         self, state: SwarmState, fields: MeasurementColumns, stamp_ns: int
     ) -> tuple[InnovationBatch, BoolArray]:
-        """Predict the robots involved to an instant; those too uncertain leave.
+        """Predict the involved robots to an instant; deinitialize those that are too uncertain.
 
         Returns:
-            A batch (m,) with poses and motion, and (N + 1,) whether each robot, and nobody, was lost.
+            A batch (m,) with poses and motion, and (N + 1,) True for lost robots; the last element is NOBODY.
         """
         batch, lost = new_batch(fields.stamp_ns.size), np.zeros(state.tracked.size + 1, dtype=bool)
         predict_all(fields, stamp_ns, self._tracks.arrays, state.arrays(), self._limits, batch, lost[:-1])
@@ -286,12 +286,12 @@ class Fusion:
     def _update(
         self, state: SwarmState, rows: MeasurementArray, fields: MeasurementColumns, batch: InnovationBatch
     ) -> tuple[NDArray[np.uint8], FloatArray]:
-        """Gate measurements (m,), use those accepted together; return verdicts and NIS (m,).
+        """Gate measurements (m,) and update with the accepted ones; return verdicts and NIS (m,).
 
         Args:
-            state: Changed in place, with the robots involved predicted.
-            rows: (m,) between robots that are located.
-            fields: (m,) the same as columns.
+            state: Updated in place; the involved robots are predicted.
+            rows: (m,) measurements between localized robots.
+            fields: (m,) the same measurements as columns.
             batch: (m,) with poses and motion.
         """
         belief, accepted, newest_ns = state.arrays(), batch.accepted, int(fields.stamp_ns[-1])
@@ -311,7 +311,7 @@ class Fusion:
             used = slice(None) if accepted.all() else accepted
             evaluated = (batch.jacobian[used], batch.innovation[used], batch.noise[used])
             correction = state.filter.update(batch.columns[used], *evaluated)
-            belief = state.arrays()  # the filter may have new ones
+            belief = state.arrays()  # the update may have reallocated them
             correct(belief, correction)
         lost |= count_all_gated(fields, belief, accepted, self._limits)
         for robot in np.flatnonzero(lost):
@@ -321,7 +321,7 @@ class Fusion:
         return np.where(accepted, Verdict.USED, Verdict.GATED).astype(np.uint8), batch.nis
 
     def _robots(self, state: SwarmState, stamp_ns: int) -> Robots:
-        """Where all robots are at an instant."""
+        """Positions in `map` and tracked flags of all robots at an instant."""
         return Robots(self._poses(state, stamp_ns)[:, :2], state.tracked.copy())
 
     def _poses(self, state: SwarmState, stamp_ns: int) -> FloatArray:
@@ -330,7 +330,7 @@ class Fusion:
         return se2.compose(state.transform, self._tracks.at(robots, np.full(robots.size, stamp_ns)).pose)
 
     def _note(self, state: SwarmState, one: MeasurementArray) -> Verdict:
-        """Keep a measurement (1,) as a constraint if it ties a waiting robot to something located."""
+        """Store a measurement (1,) as a constraint if it can initialize a robot."""
         constraint = MODELS[int(one["kind"][0])].constraint
         if constraint is None or not self._initializer.note(state, at_initialization(constraint(one))):
             return Verdict.NOT_LOCALIZED
@@ -341,7 +341,7 @@ class Fusion:
         return Verdict.CONSTRAINT
 
     def _augment(self, state: SwarmState, source: int, stamp_ns: int) -> None:
-        """Re-estimate the parameters of a contradicted robot or landmark, or localize the robot again."""
+        """Re-estimate the parameters of a contradicted robot or landmark; deinitialize a kidnapped robot."""
         robots = state.tracked.size
         if source < robots and is_kidnapped(state.integrity, source):
             state.deinitialize(source)
@@ -359,7 +359,7 @@ class Fusion:
             state.augment_all(poses)
 
     def _apply_command(self, state: SwarmState, command: MeasurementArray) -> Verdict:
-        """Set the pose of a robot or forget it, as the command (1,) says."""
+        """Execute a command (1,): set the pose of a robot or deinitialize it."""
         robot, stamp_ns = int(command["target"][0]), int(command["stamp_ns"][0])
         if command["command"][0] == Command.FORGET:
             state.deinitialize(robot)

@@ -1,4 +1,4 @@
-"""Settings of the estimator, apart from the swarm itself."""
+"""Settings of the estimator."""
 
 from __future__ import annotations
 
@@ -13,91 +13,91 @@ if TYPE_CHECKING:
 
 
 class SettingsError(UserError):
-    """A setting outside its range; the message is one sentence."""
+    """A setting is out of range; the message is one sentence."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How measurements are buffered, gated and fused; each number with its range beside it.
+    """Parameters of buffering, gating and fusion, with default, unit, range and description.
 
-    `policy` holds the sizes from which on swarms are fused differently; it is no ROS parameter.
+    `policy` holds the swarm sizes at which the fusion strategy changes; it is not a ROS parameter.
 
     Raises:
         SettingsError: A value is out of range.
     """
 
     horizon_s: float = number(
-        2.0, "s", 0.05, 60.0, "data up to this late count at their own time; older are dropped"
+        2.0, "s", 0.05, 60.0, "maximum delay of data, fused at their own stamps; older data are dropped"
     )
     fusion_period_s: float = number(
         -1.0,
         "s",
         -1.0,
         1.0,
-        "where a large swarm has many measurements in such a period, they are fused together; 0: never;"
-        " below: 0.2, or 0.4 where odometry of 250 robots and more is calibrated, 0.5 from 600 on",
+        "period in which many measurements of a large swarm are fused as one batch; 0: never; negative:"
+        " 0.2, or 0.4 if the odometry of 250 robots or more is calibrated, 0.5 from 600 on",
     )
     fusion_delay_s: float = number(
         0.3,
         "s",
         0.0,
         1.0,
-        "from 64 robots on a period is fused so long after its end; what comes later has it fused again",
+        "delay from the end of a period to its fusion, from 64 robots on; later data cause a re-fusion",
     )
     sparse_from: int = number(
         250,
         "1",
         2,
         1_000_000,
-        "from so many robots on only covariances of neighbours are kept",
+        "minimum number of robots for the sparse filter, which keeps only covariances of neighbours",
     )
     state_period_s: float = number(
         0.0,
         "s",
         0.0,
         1.0,
-        "period of stored states, measurements count at the closest (e-puck paper V-B); 0: exact",
+        "period of stored states; measurements use the closest one (e-puck paper V-B); 0: exact stamps",
     )
     future_tolerance_s: float = number(
-        0.1, "s", 0.0, 10.0, "stamps further ahead of the clock than this are dropped"
+        0.1, "s", 0.0, 10.0, "maximum time of stamps ahead of the clock; data beyond it are dropped"
     )
     jump_back_s: float = number(
-        0.5, "s", 0.0, 3600.0, "a clock that goes back by more than this resets the filter"
+        0.5, "s", 0.0, 3600.0, "minimum backward jump of the clock that resets the filter"
     )
     lost_after: int = number(12, "1", 2, 1_000_000, "gated measurements in a row after which a robot is lost")
     lost_sigma: float = number(
-        1.0, "m", 0.01, 1e3, "standard deviation of the position beyond which a robot is lost"
+        1.0, "m", 0.01, 1e3, "maximum standard deviation of the position; beyond it a robot is lost"
     )
     lost_heading_sigma: float = number(
-        0.3, "rad", 0.01, 10.0, "standard deviation of the heading beyond which a robot is lost"
+        0.3, "rad", 0.01, 10.0, "maximum standard deviation of the heading; beyond it a robot is lost"
     )
     max_fault_score: float = number(
         10.0,
         "1",
         2.0,
         1e9,
-        "fault score from which the description of a robot or landmark is re-estimated; 1e9: never",
+        "fault score above which the parameters of a robot or landmark are re-estimated; 1e9: never",
     )
-    fix_window_s: float = number(
-        20.0, "s", 0.1, 600.0, "age up to which sightings initialize a robot without a pose"
-    )
+    fix_window_s: float = number(20.0, "s", 0.1, 600.0, "maximum age of sightings that initialize a robot")
 
     aerial_probability: float = number(
-        0.99, "1", 0.5, 0.999999, "probability from which a robot is identified in aerial images"
+        0.99, "1", 0.5, 0.999999, "minimum probability to identify a robot in aerial images"
     )
     aerial_detection_probability: float = number(
-        0.95, "1", 0.1, 0.999, "share of the robots in an aerial image that are detected"
+        0.95, "1", 0.1, 0.999, "probability that a robot in an aerial image is detected"
     )
     aerial_scale_sigma: float = number(
         0.02, "1", 1e-4, 1.0, "relative standard deviation of the scale of aerial images"
     )
     aerial_scale_drift: float = number(
-        0.0, "1/s^0.5", 0.0, 0.1, "relative random walk of that scale, as of a moving camera"
+        0.0, "1/s^0.5", 0.0, 0.1, "relative random walk of the scale of aerial images, for a moving camera"
     )
     aerial_position_sigma: float = number(
-        0.02, "m", 1e-4, 10.0, "noise of aerial detections without covariance, along x and y"
+        0.02, "m", 1e-4, 10.0, "standard deviation of x and y of aerial detections without covariance"
     )
-    aerial_heading_sigma: float = number(0.1, "rad", 1e-4, 10.0, "noise of the headings of such detections")
+    aerial_heading_sigma: float = number(
+        0.1, "rad", 1e-4, 10.0, "standard deviation of the heading of such detections"
+    )
 
     policy: Policy = field(default_factory=Policy, metadata={"is_internal": True})
 
@@ -108,7 +108,7 @@ class Settings:
                 raise SettingsError(f"parameter {name} = {value} must lie in {spec.range_text}.")
 
     def resolved_for(self, swarm: Swarm) -> Settings:
-        """The settings with the default fusion period for a swarm where none is given."""
+        """Settings with the default fusion period of a swarm if `fusion_period_s` is negative."""
         if self.fusion_period_s >= 0.0:
             return self
         calibrated = sum(robot.odometry.is_calibrated for robot in swarm.robots)
