@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import gc
 import json
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 from numba.core.dispatcher import Dispatcher
 
 
 def printed_by_process(script: str) -> list[str]:
     """The names that a script prints, run by itself: in this process other tests have compiled already."""
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    root = str(Path(__file__).parents[3])  # for `bench`, as in this process
+    path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+    env = {**os.environ, "PYTHONPATH": path}
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, env=env)
     assert done.returncode == 0, done.stderr
     names: list[str] = json.loads(done.stdout)
     return names
